@@ -1,0 +1,7 @@
+"""Reinforcement learning for packing with a suction robot: where to pick, where to place, and how to turn."""
+
+from pickplace.env import PickPlaceEnv
+from pickplace.geometry import Failure, Item, Rules
+
+__version__ = "0.1.0"
+__all__ = ["Failure", "Item", "PickPlaceEnv", "Rules", "__version__"]

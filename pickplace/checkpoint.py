@@ -1,0 +1,142 @@
+"""Checkpoints: what is saved, how it is written, how it is trusted.
+
+A checkpoint is a folder with ``state.safetensors`` (every tensor, random generators included) and ``state.json``
+(config, counters, and the checksum of the tensors). It is data, not code: nothing in it is unpickled or imported.
+It is written beside its place and renamed into it, so that a reader finds the old one or the new one, never half of one.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor
+
+SCHEMA = 1
+TENSORS, FACTS = "state.safetensors", "state.json"
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that is missing, damaged, or does not fit; the message is one sentence."""
+
+
+def flatten(tree, prefix: str = "") -> tuple[dict[str, Tensor], dict]:
+    """Split nested dicts and lists into tensors by path, and the rest as JSON with paths for leaves."""
+    tensors, facts = {}, {}
+    items = enumerate(tree) if isinstance(tree, (list, tuple)) else tree.items()
+    for key, value in items:
+        path = f"{prefix}{key}"
+        if isinstance(value, Tensor):
+            # A clone: safetensors refuses tensors that share memory.
+            tensors[path] = value.detach().cpu().contiguous().clone()
+        elif isinstance(value, (dict, list, tuple)):
+            more_tensors, more_facts = flatten(value, path + "|")
+            tensors.update(more_tensors)
+            facts.update(more_facts)
+            if not value:
+                facts[path] = [] if isinstance(value, (list, tuple)) else {}
+        else:
+            facts[path] = value
+    return tensors, facts
+
+
+def unflatten(tensors: dict[str, Tensor], facts: dict) -> dict:
+    """The inverse of :func:`flatten`; lists come back as dicts with whole-number keys."""
+    tree = {}
+    for path, value in [*tensors.items(), *facts.items()]:
+        node = tree
+        *parents, leaf = (int(part) if part.isdecimal() else part for part in path.split("|"))
+        for parent in parents:
+            node = node.setdefault(parent, {})
+        node[leaf] = value
+    return tree
+
+
+def write(folder: Path, state: dict, facts: dict) -> None:
+    """Write a checkpoint folder, replacing an older one as a whole.
+
+    Args:
+        folder: where the checkpoint shall be.
+        state: nested dicts of tensors and plain values.
+        facts: what to keep beside it as readable JSON: config, counters, metrics.
+    """
+    folder = Path(folder)
+    fresh, old = folder.with_name(f".{folder.name}.new"), folder.with_name(f".{folder.name}.old")
+    tensors, rest = flatten(state)
+    shutil.rmtree(fresh, ignore_errors=True)
+    fresh.mkdir(parents=True)
+    blob = save(tensors)
+    digest = hashlib.sha256(blob).hexdigest()
+    text = json.dumps({"schema": SCHEMA, "sha256": digest, **facts, "state": rest}, indent=1)
+    for name, content in ((TENSORS, blob), (FACTS, text.encode())):
+        with open(fresh / name, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        folder.rename(old)  # if we are killed right here, locate() finds the old one
+    fresh.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def locate(path, prefer: str = "best") -> Path:
+    """The checkpoint folder that a user means: a run folder (then its ``checkpoints/<prefer>``) or a checkpoint.
+
+    Raises:
+        CheckpointError: if there is none.
+    """
+    path = Path(path)
+    for folder in (path / "checkpoints" / prefer, path):
+        for candidate in (folder, folder.with_name(f".{folder.name}.old")):
+            if (candidate / FACTS).is_file():
+                return candidate
+    raise CheckpointError(
+        f"checkpoint={str(path)!r}: no checkpoint there; expected a run folder, or its checkpoints/last or "
+        "checkpoints/best."
+    )
+
+
+def read(folder: Path) -> tuple[dict, dict]:
+    """Read a checkpoint folder: the state as written, and its facts.
+
+    Raises:
+        CheckpointError: if a file is missing, truncated or altered, or of another schema.
+    """
+    folder = Path(folder)
+    try:
+        facts = json.loads((folder / FACTS).read_bytes())
+        blob = (folder / TENSORS).read_bytes()
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{folder}: the checkpoint cannot be read ({error}).") from error
+    if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
+        found = facts.get("schema") if isinstance(facts, dict) else None
+        raise CheckpointError(f"{folder}: schema {found!r}, expected {SCHEMA}; another version wrote it.")
+    if hashlib.sha256(blob).hexdigest() != facts.get("sha256"):
+        raise CheckpointError(f"{folder}: {TENSORS} is truncated or altered, its checksum does not match {FACTS}.")
+    try:
+        tensors = load(blob)
+    except SafetensorError as error:
+        raise CheckpointError(f"{folder}: {TENSORS} cannot be read ({error}).") from error
+    return unflatten(tensors, facts.pop("state")), facts
+
+
+def load_module(module: torch.nn.Module, state: dict, what: str) -> None:
+    """Load parameters into a module.
+
+    Raises:
+        CheckpointError: naming the first parameter that is missing, unexpected or of another shape.
+    """
+    own = module.state_dict()
+    for key in sorted({*own, *state}):
+        mine = tuple(own[key].shape) if key in own else None
+        theirs = tuple(state[key].shape) if key in state else None
+        if mine != theirs:
+            raise CheckpointError(
+                f"The checkpoint's {what} does not fit these settings: {key} has shape {theirs}, expected {mine}."
+            )
+    module.load_state_dict(state)

@@ -1,0 +1,277 @@
+"""The environment: one TorchRL ``EnvBase`` that simulates a batch of bins and totes as tensors."""
+
+from dataclasses import replace
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from pickplace.geometry import Failure, Item, Rules
+from pickplace.items import STREAMS, ItemDistribution, Kinds
+
+PAPER_KINDS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1))
+
+
+class PickPlaceEnv(EnvBase):
+    """Pick an item from a bin and place it in a tote, in one action, until nothing more fits.
+
+    ``num_envs`` independent problems advance together as one TensorDict of ``batch_size=[num_envs]``.
+
+    Action space:
+        ``action``, int64 ``[N]``: the flat index of (pick cell, place cell, rotation) in ``[0, N_a)``,
+        ``(((x_B * D_B + y_B) * W_T + x_T) * D_T + y_T) * R + r``.
+
+    Observation space:
+        * ``bin_depth``, float32 ``[N, W_B, D_B]``: height above the bin's floor, 0 where empty.
+        * ``tote_depth``, float32 ``[N, W_T, D_T]``: remaining height, ``H_T - height``.
+        * ``tote_height``, int64 ``[N, 1]``: ``H_T`` of the running episode.
+        * ``action_mask``, bool ``[N, N_a]``: True where and only where the action would succeed.
+        * ``outcome_mask``, bool ``[N, Q * W_T * D_T]``, only with ``masks`` naming it: the distinct footprints
+          ``(parity, x, y)`` that some action reaches.
+        * ``occupancy``, float32 ``[N, 1]``: volume placed / volume of the tote.
+
+    Rewards:
+        The volume placed, in cells, float32 ``[N, 1]``; 0 for a failed action.
+
+    Starting state:
+        An empty tote of the height given as ``tote_height`` (int64 ``[N, 1]``) in the TensorDict handed to ``reset``,
+        by default ``tote_size[2]``, and a bin with the episode's first item.
+
+    Episode end:
+        ``terminated`` after a failed action, or when nothing can be done with the item that arrives (``stuck``);
+        ``truncated`` when a recorded item stream has ended. ``failure``, int64 ``[N, 1]``, is a :class:`Failure`.
+
+    Args:
+        bin_size, tote_size, effector_size, rotations, pick_rule, min_support, strict_support: see
+            :class:`pickplace.geometry.Rules`.
+        items: an :class:`~pickplace.items.ItemDistribution`; by default the paper's four kinds.
+        num_envs: ``N``.
+        seed: seed of the item stream.
+        device: where the tensors live.
+        stream: family of item streams, ``"train"``, ``"validation"`` or ``"test"``; they never meet.
+        masks: which masks to emit, any of ``"action"`` and ``"outcome"``.
+        first_episode: number of the episode that slot 0 plays first; slot ``i`` plays ``first_episode + i``.
+        episode_stride: after an episode a slot plays the one that comes this much later; by default ``num_envs``.
+
+    Raises:
+        ValueError: for impossible settings, among them a kind of item that has no feasible action on the empty tote
+            for some position in the bin.
+    """
+
+    def __init__(
+        self,
+        bin_size=(5, 5, 1),
+        tote_size=(6, 6, 5),
+        effector_size=(3, 3),
+        rotations: int = 4,
+        items: ItemDistribution | None = None,
+        pick_rule: str = "contain",
+        min_support: float = 0.5,
+        strict_support: bool = False,
+        num_envs: int = 128,
+        seed: int = 0,
+        device="cpu",
+        stream: str = "train",
+        masks: tuple[str, ...] = ("action",),
+        first_episode: int = 0,
+        episode_stride: int | None = None,
+    ):
+        rules = Rules(bin_size, tote_size, effector_size, rotations, pick_rule, min_support, strict_support)
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise ValueError(f"num_envs={num_envs!r}: expected a whole number >= 1.")
+        if stream not in STREAMS:
+            raise ValueError(f"stream={stream!r}: expected one of {', '.join(STREAMS)}.")
+        if not set(masks) <= {"action", "outcome"}:
+            raise ValueError(f"masks={masks!r}: expected any of 'action', 'outcome'.")
+        items = Kinds(PAPER_KINDS) if items is None else items
+        if not isinstance(items, ItemDistribution):
+            raise ValueError(f"items={items!r}: expected an ItemDistribution, such as pickplace.items.Kinds.")
+        check_items(rules, items)
+        rules = replace(rules, longest_side=int(items.sizes[:, :2].max()))
+        super().__init__(device=device, batch_size=[num_envs])
+        self.rules, self.items, self.stream, self.masks = rules, items, stream, tuple(masks)
+        self.min_tote_height = int(items.sizes[:, 2].max())
+        self.first_episode, self.episode_stride = first_episode, episode_stride or num_envs
+        self._make_specs()
+
+        def zeros(*shape, dtype=torch.int64):
+            return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
+
+        # All run-time state, in buffers, so that state_dict() has it.
+        self.register_buffer("heights", zeros(*rules.tote_size[:2], dtype=torch.int32))
+        self.register_buffer("tote_height", zeros() + rules.tote_size[2])
+        self.register_buffer("item", zeros(5))  # x, y, w, d, h
+        self.register_buffer("volume", zeros())
+        self.register_buffer("steps", zeros())
+        self.register_buffer("episode", zeros())
+        self.register_buffer("item_seed", torch.tensor(0, device=self.device))
+        self.register_buffer("feasible", zeros(dtype=torch.bool))
+        sizes = {"action": rules.num_actions, "outcome": rules.num_outcomes}
+        for name in self.masks:
+            self.register_buffer(f"{name}_mask", zeros(sizes[name], dtype=torch.bool))
+        self.set_seed(seed)
+
+    def _make_specs(self):
+        rules, n, device = self.rules, self.num_envs, self.device
+        w_b, d_b, _ = rules.bin_size
+        w_t, d_t, h_t = rules.tote_size
+        tallest = int(self.items.sizes[:, 2].max())
+        tote_height = Bounded(self.min_tote_height, h_t, (n, 1), dtype=torch.int64, device=device)
+        observation = {
+            "bin_depth": Bounded(0, tallest, (n, w_b, d_b), dtype=torch.float32, device=device),
+            "tote_depth": Bounded(0, h_t, (n, w_t, d_t), dtype=torch.float32, device=device),
+            "tote_height": tote_height,
+            "occupancy": Bounded(0, 1, (n, 1), dtype=torch.float32, device=device),
+            "failure": Categorical(len(Failure), (n, 1), dtype=torch.int64, device=device),
+        }
+        if "action" in self.masks:
+            observation["action_mask"] = Binary(rules.num_actions, (n, rules.num_actions), device, torch.bool)
+        if "outcome" in self.masks:
+            observation["outcome_mask"] = Binary(rules.num_outcomes, (n, rules.num_outcomes), device, torch.bool)
+        self.observation_spec = Composite(observation, shape=(n,), device=device)
+        # Declared as state too, so that reset() is handed the height that a curriculum writes.
+        self.state_spec = Composite({"tote_height": tote_height.clone()}, shape=(n,), device=device)
+        self.action_spec = Categorical(rules.num_actions, (n,), dtype=torch.int64, device=device)
+        self.reward_spec = Unbounded((n, 1), dtype=torch.float32, device=device)
+        flag = Categorical(2, (n, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(
+            {key: flag.clone() for key in ("done", "terminated", "truncated")}, shape=(n,), device=device
+        )
+
+    @property
+    def num_envs(self) -> int:
+        """``N``, the number of problems that advance together."""
+        return self.batch_size[0]
+
+    # ------------------------------------------------------------------ EnvBase
+    def _set_seed(self, seed: int | None):
+        """Start the item stream over: the next reset of slot ``i`` plays episode ``first_episode + i``."""
+        self.item_seed.fill_(0 if seed is None else seed)
+        slots = torch.arange(self.num_envs, device=self.device)
+        self.episode.copy_(self.first_episode + slots - self.episode_stride)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        rows = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        height = None
+        if tensordict is not None:
+            rows = tensordict.get("_reset", rows).reshape(self.num_envs)
+            height = tensordict.get("tote_height", None)
+        if height is None:
+            height = torch.full_like(self.tote_height, self.rules.tote_size[2])
+        height = height.reshape(self.num_envs).to(torch.int64)
+        low, high = self.min_tote_height, self.rules.tote_size[2]
+        if bool((rows & ((height < low) | (height > high))).any()):
+            bad = height[rows & ((height < low) | (height > high))][0].item()
+            raise ValueError(f"tote_height={bad}: expected between {low} (the tallest item) and {high} (tote_size[2]).")
+        self.heights.masked_fill_(rows[:, None, None], 0)
+        self.tote_height.copy_(torch.where(rows, height, self.tote_height))
+        self.volume.masked_fill_(rows, 0)
+        self.steps.masked_fill_(rows, 0)
+        self.episode.add_(rows * self.episode_stride)
+        item = torch.stack(self._arriving(), -1)
+        self.item.copy_(torch.where(rows[:, None], item, self.item))
+        self._update_masks(rows)
+        done = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+        return self._observation().update({"done": done, "terminated": done.clone(), "truncated": done.clone()})
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict["action"].reshape(self.num_envs)
+        if bool(((action < 0) | (action >= self.rules.num_actions)).any()):
+            bad = action[(action < 0) | (action >= self.rules.num_actions)][0].item()
+            raise ValueError(f"action={bad}: expected between 0 and {self.rules.num_actions - 1} (N_a - 1).")
+        item = self.current_item
+        step = self.rules.apply(self.heights, self.tote_height, item, action)
+        done = step.failure == 0
+        gained = torch.where(done, item.w * item.d * item.h, 0)
+        self.heights.copy_(step.heights)
+        self.volume.add_(gained)
+        self.steps.add_(done)
+        arriving = torch.stack(self._arriving(), -1)
+        self.item.copy_(torch.where(done[:, None], arriving, self.item))
+        self._update_masks(done)
+        ended = done & (self.item[:, 4] == 0)  # a recorded stream has no further item
+        stuck = done & ~self.feasible & ~ended
+        failure = torch.where(stuck, int(Failure.STUCK), step.failure)
+        result = {
+            "reward": gained.float(),
+            "failure": failure,
+            "terminated": failure > 0,
+            "truncated": ended,
+            "done": (failure > 0) | ended,
+        }
+        return self._observation().update({key: value[:, None] for key, value in result.items()})
+
+    # ------------------------------------------------------------------ state
+    @property
+    def current_item(self) -> Item:
+        """The item that lies in each bin."""
+        return Item(*self.item.unbind(-1))
+
+    def _arriving(self) -> Item:
+        """The item at each slot's (episode, step)."""
+        seed = self.item_seed.expand_as(self.episode)
+        return self.items.sample(self.stream, seed, self.episode, self.steps, self.rules.bin_size)
+
+    def _update_masks(self, rows: Tensor):
+        """Recompute the masks of the problems in ``rows``, bool ``[N]``; the others' states did not change."""
+        rules = self.rules
+        index = slice(None) if bool(rows.all()) else rows.nonzero()[:, 0]
+        item = Item(*self.item[index].unbind(-1))
+        placements = rules.placements(self.heights[index], self.tote_height[index], item)
+        outcomes = rules.outcome_mask(placements).flatten(1)
+        self.feasible[index] = outcomes.any(1)
+        if "outcome" in self.masks:
+            self.outcome_mask[index] = outcomes
+        if "action" in self.masks:
+            self.action_mask[index] = rules.action_mask(placements)
+
+    def _observation(self) -> TensorDictBase:
+        """What the agent sees, with ``failure`` 0."""
+        capacity = self.tote_height * self.rules.num_places
+        observation = {
+            "bin_depth": self.rules.bin_depth(self.current_item),
+            "tote_depth": (self.tote_height[:, None, None] - self.heights).float(),
+            "tote_height": self.tote_height[:, None].clone(),
+            "occupancy": (self.volume.double() / capacity).float()[:, None],
+            "failure": torch.zeros_like(self.tote_height)[:, None],
+        }
+        for name in self.masks:
+            observation[f"{name}_mask"] = getattr(self, f"{name}_mask").clone()
+        return TensorDict(observation, batch_size=self.batch_size, device=self.device)
+
+
+def check_items(rules: Rules, items: ItemDistribution) -> None:
+    """Refuse items that could make a fresh episode impossible.
+
+    Every kind needs a feasible action on the empty tote for every position in the bin. The full tote height decides:
+    a lower rim is only easier to clear, as long as it is not below the item's top.
+
+    Raises:
+        ValueError: naming the kind, the position and the tote height.
+    """
+    w_b, d_b, _ = rules.bin_size
+    height = rules.tote_size[2]
+    problems = []
+    for kind, (w, d, h) in enumerate(items.sizes.tolist()):
+        for (room_w, room_d), what in (((w_b, d_b), "bin_size"), (rules.effector_size, "effector_size")):
+            if (w > room_w or d > room_d) and (what == "bin_size" or rules.pick_rule == "contain"):
+                raise ValueError(f"{items.label(kind)} does not fit {what}: expected at most {room_w}x{room_d} cells.")
+        if h > height:
+            raise ValueError(f"{items.label(kind)} is higher than the tote: expected at most tote_size[2]={height}.")
+        for x, y in items.corners(kind, rules.bin_size):
+            if x + w > w_b or y + d > d_b:
+                raise ValueError(f"{items.label(kind)} at x={x}, y={y} leaves the bin: expected it inside {w_b}x{d_b}.")
+            problems.append((x, y, w, d, h, kind))
+    for chunk in torch.tensor(problems).split(1024):
+        item = Item(*chunk[:, :5].unbind(-1))
+        empty = torch.zeros(len(chunk), *rules.tote_size[:2], dtype=torch.int32)
+        placements = rules.placements(empty, torch.full((len(chunk),), height), item)
+        feasible = rules.outcome_mask(placements).flatten(1).any(1)
+        if not feasible.all():
+            x, y, *_, kind = chunk[~feasible][0].tolist()
+            raise ValueError(
+                f"{items.label(kind)} at x={x}, y={y} in the bin has no feasible action on the empty tote of height "
+                f"{height} ({rules.describe()}): expected every item to fit somewhere."
+            )

@@ -1,0 +1,184 @@
+"""Evaluation: one code path for every planner, on fixed item streams; and the ``pickplace-evaluate`` command."""
+
+import json
+import logging
+import platform
+import subprocess
+import time
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+from torchrl.envs.utils import step_mdp
+
+from pickplace import checkpoint, config
+from pickplace.env import PickPlaceEnv
+from pickplace.geometry import Failure
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Episodes:
+    """What a planner achieved, one entry an episode."""
+
+    occupancy: Tensor  # float64 [E]
+    items_placed: Tensor  # int64 [E]
+    failure: Tensor  # int64 [E], a Failure; NONE where a recorded stream ended
+    feasible_share: float  # mean share of the N_a actions that were feasible, over all decisions
+    final_heights: Tensor  # int32 [E, W_T, D_T]: the tote when the episode ended
+    decisions: int  # over all episodes
+    seconds: float  # spent in the planner
+    placed: list = field(default_factory=list)  # of the first episode: (x, y, z, w, d, h) of each item
+
+
+def confidence95(values: Tensor) -> tuple[float, float]:
+    """95% confidence interval of the mean, by Student's t.
+
+    Args:
+        values: ``[E]``; fewer than two give the whole range of an occupancy.
+    """
+    if len(values) < 2:
+        return 0.0, 1.0
+    from scipy.stats import t  # takes a second to import, and only evaluation needs it
+
+    mean, error = values.double().mean(), values.double().std() / len(values) ** 0.5
+    margin = t.ppf(0.975, len(values) - 1) * error
+    return float(mean - margin), float(mean + margin)
+
+
+@torch.no_grad()
+def play(make_env, planner, episodes: int, batch_size: int) -> Episodes:
+    """Play episodes ``0 .. episodes - 1``, each in a slot of its own, all finished and all counted.
+
+    Collecting "the first n episodes to finish" would favour short ones, and short ones are the bad ones.
+
+    Args:
+        make_env: ``make_env(first_episode, num_envs)`` builds the environment for a share of the episodes.
+        planner: anything with ``decide``, see :mod:`pickplace.planners`.
+        batch_size: episodes played side by side; it does not change any result.
+    """
+    parts, placed, feasible, decisions, seconds = [], [], 0.0, 0, 0.0
+    for first in range(0, episodes, batch_size):
+        env = make_env(first, min(batch_size, episodes - first))
+        rules, count = env.rules, env.num_envs
+        observation = env.reset()
+        running = torch.ones(count, dtype=torch.bool, device=env.device)
+        occupancy = torch.zeros(count, dtype=torch.float64, device=env.device)
+        placed_items = torch.zeros(count, dtype=torch.int64, device=env.device)
+        failure = torch.zeros(count, dtype=torch.int64, device=env.device)
+        final = env.heights.clone()
+        while running.any():
+            item, heights = env.current_item, env.heights.clone()
+            placements = rules.placements(env.heights, env.tote_height, item)
+            feasible += float((rules.num_feasible(placements) / rules.num_actions)[running].sum())
+            decisions += int(running.sum())
+            start = time.perf_counter()
+            action = planner.decide(observation)
+            seconds += time.perf_counter() - start
+            if first == 0 and running[0]:
+                step = rules.apply(heights, env.tote_height, item, action)
+                if step.failure[0] == 0:
+                    x, y, w, d = step.footprint[0].tolist()
+                    h = int(item.h[0])
+                    placed.append((x, y, int(step.top[0]) - h, w, d, h))
+            after = env.step(observation.set("action", action))["next"]
+            done = after["done"][:, 0]
+            ends = running & done
+            reached = env.volume.double() / (env.tote_height * rules.num_places)
+            occupancy = torch.where(ends, reached, occupancy)
+            placed_items = torch.where(ends, env.steps, placed_items)
+            failure = torch.where(ends, after["failure"][:, 0], failure)
+            final = torch.where(ends[:, None, None], env.heights, final)
+            running = running & ~done
+            observation = step_mdp(observation)
+            if done.any() and running.any():  # a finished slot plays on, uncounted, until all have finished
+                observation = env.reset(observation.set("_reset", after["done"]))
+        parts.append((occupancy, placed_items, failure, final))
+    occupancy, placed_items, failure, final = (torch.cat(column).cpu() for column in zip(*parts, strict=True))
+    return Episodes(occupancy, placed_items, failure, feasible / decisions, final, decisions, seconds, placed)
+
+
+@torch.no_grad()
+def decision_latency(make_env, planner, decisions: int) -> dict[str, float] | None:
+    """Milliseconds of one decision for one tote, over the states of an episode: ``{"p50": ..., "p95": ...}``."""
+    if decisions < 1:
+        return None
+    env = make_env(0, 1)
+    observation, times = env.reset(), []
+    planner.decide(observation)  # warm up
+    for _ in range(decisions):
+        start = time.perf_counter()
+        action = planner.decide(observation)
+        times.append((time.perf_counter() - start) * 1e3)
+        _, observation = env.step_and_maybe_reset(observation.set("action", action))
+    times = torch.tensor(times, dtype=torch.float64)
+    return {"p50": float(times.quantile(0.5)), "p95": float(times.quantile(0.95))}
+
+
+def summarise(result: Episodes) -> dict:
+    """The figures of ``evaluation.json`` that come from the episodes."""
+    low, high = confidence95(result.occupancy)
+    reasons = Counter(Failure(code).name.lower() for code in result.failure.tolist())
+    return {
+        "occupancy": {
+            "mean": float(result.occupancy.mean()),
+            "ci95": [low, high],
+            "min": float(result.occupancy.min()),
+            "per_episode": result.occupancy.tolist(),
+        },
+        "items_placed": float(result.items_placed.double().mean()),
+        "failures": dict(sorted(reasons.items())),
+        "feasible_action_share": result.feasible_share,
+    }
+
+
+def evaluate(cfg: DictConfig, make_env, planner, facts: dict) -> tuple[dict, Episodes]:
+    """Evaluate a planner as the config group ``evaluation`` says: what goes into ``evaluation.json``."""
+    ev = cfg.evaluation
+    result = play(make_env, planner, ev.episodes, ev.batch_size)
+    report = {
+        "planner": planner.name,
+        **facts,
+        "env": OmegaConf.to_container(cfg.env, resolve=True),
+        "items": OmegaConf.to_container(cfg["items"], resolve=True),
+        "stream": ev.stream,
+        "episodes": ev.episodes,
+        "seed": ev.seed,
+        **summarise(result),
+        "latency_ms": decision_latency(make_env, planner, ev.latency_decisions),
+        "versions": versions(),
+        "commit": commit(),
+    }
+    return report, result
+
+
+def versions() -> dict[str, str]:
+    """What a result was computed with."""
+    import tensordict
+    import torchrl
+
+    import pickplace
+
+    return {
+        "pickplace": pickplace.__version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "torchrl": torchrl.__version__,
+        "tensordict": tensordict.__version__,
+    }
+
+
+def commit() -> str | None:
+    """The commit of the checkout that the package runs from, with ``+`` if it was altered; None outside a checkout."""
+    root = config.PACKAGE.parent
+    if not (root / ".git").exists():
+        return None
+    try:
+        run = lambda *args: subprocess.run(["git", "-C", root, *args], capture_output=True, text=True, check=True).stdout
+        return run("rev-parse", "HEAD").strip() + ("+" if run("status", "--porcelain", "-uno").strip() else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None

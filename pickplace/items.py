@@ -1,0 +1,181 @@
+"""Item distributions: which item arrives next, and where it lies in its bin.
+
+An item is a counter-based hash of (stream, seed, episode, step), so there is no generator to save, the items do not
+depend on the batch size, and every method that plays an episode meets the same ones.
+"""
+
+import csv
+from itertools import product
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pickplace.geometry import Item
+
+#: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
+STREAMS = ("train", "validation", "test")
+
+
+def _mix(x: Tensor) -> Tensor:
+    """Scramble int64 counters (the finalizer of MurmurHash3, Appleby 2011)."""
+    for factor in (-0x00AE502812AA7333, -0x3B314601E57A13AD):
+        x = x ^ ((x >> 33) & 0x7FFFFFFF)
+        x = x * factor
+    return x ^ ((x >> 33) & 0x7FFFFFFF)
+
+
+def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, count: int) -> Tensor:
+    """Uniform numbers in [0, 1) from the item's address, float64 ``[count, N]``: the same address, the same numbers."""
+    family = STREAMS.index(stream) + 1
+    key = seed
+    for part in (family, episode, step):
+        key = _mix(key * 0x2545F4914F6CDD1D + part + 0x1B873593)
+    key = _mix(key + torch.arange(1, count + 1, device=key.device)[:, None] * 0x1E3779B97F4A7C15)
+    return ((key >> 11) & ((1 << 53) - 1)).double() / float(1 << 53)
+
+
+class ItemDistribution:
+    """What an item distribution offers to the environment.
+
+    Attributes:
+        sizes: int64 ``[K, 3]``, every size ``(w, d, h)`` that may arrive, in cells.
+        length: number of items in an episode, or None if they never end.
+    """
+
+    sizes: Tensor
+    length: int | None = None
+
+    def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size) -> Item:
+        """The ``step``-th item (from 0) of each ``episode``, int64 ``[N]``; size 0 after the last one."""
+        kind, across, along = hashed_uniform(stream, seed, episode, step, 3)
+        w, d, h = self.sizes.to(step.device)[self._index(kind, step)].unbind(-1)
+        x = (across * (bin_size[0] - w + 1)).long()
+        y = (along * (bin_size[1] - d + 1)).long()
+        return Item(x, y, w, d, h)
+
+    def _index(self, uniform: Tensor, step: Tensor) -> Tensor:
+        """Which row of ``sizes`` arrives, int64 ``[N]``."""
+        raise NotImplementedError
+
+    def corners(self, kind: int, bin_size) -> list[tuple[int, int]]:
+        """Every bin position ``(x, y)`` at which kind number ``kind`` may arrive."""
+        w, d, _ = self.sizes[kind].tolist()
+        return list(product(range(bin_size[0] - w + 1), range(bin_size[1] - d + 1)))
+
+    def label(self, kind: int) -> str:
+        """What to call kind number ``kind`` in a message."""
+        return "item {}x{}x{}".format(*self.sizes[kind].tolist())
+
+
+class Kinds(ItemDistribution):
+    """A list of kinds with weights.
+
+    Args:
+        kinds: ``(w, d, h)`` triples, in cells.
+        weights: a relative frequency for each kind; None means equally likely.
+
+    Raises:
+        ValueError: an empty list, a size that is not a positive whole number, or weights that do not fit the kinds.
+    """
+
+    def __init__(self, kinds, weights=None):
+        kinds = [tuple(kind) for kind in kinds]
+        for kind in kinds:
+            if len(kind) != 3 or any(int(v) != v or v < 1 for v in kind):
+                raise ValueError(f"items.kinds: got {kind!r}, expected (w, d, h) in positive whole cells.")
+        if not kinds:
+            raise ValueError("items.kinds=[]: expected at least one (w, d, h).")
+        weights = [1.0] * len(kinds) if weights is None else [float(v) for v in weights]
+        if len(weights) != len(kinds):
+            raise ValueError(f"items.weights: got {len(weights)} numbers, expected {len(kinds)}, one for each kind.")
+        if not all(0 <= v < float("inf") for v in weights) or sum(weights) <= 0:
+            raise ValueError(f"items.weights={weights!r}: expected finite numbers >= 0 that are not all 0.")
+        used = [i for i, v in enumerate(weights) if v > 0]
+        self.sizes = torch.tensor([kinds[i] for i in used], dtype=torch.int64)
+        share = torch.tensor([weights[i] for i in used], dtype=torch.float64)
+        self._edges = (share.cumsum(0) / share.sum())[:-1]
+
+    def _index(self, uniform, step):
+        return torch.searchsorted(self._edges.to(uniform.device), uniform, right=True)
+
+
+class Uniform(Kinds):
+    """Cuboids whose sides and heights are drawn uniformly and independently from closed ranges.
+
+    Args:
+        width, depth, height: ``(least, greatest)``, in cells.
+    """
+
+    def __init__(self, width=(1, 3), depth=(1, 3), height=(1, 3)):
+        ranges = {"width": width, "depth": depth, "height": height}
+        for name, (low, high) in ranges.items():
+            if int(low) != low or int(high) != high or not 1 <= low <= high:
+                raise ValueError(f"items.{name}={[low, high]!r}: expected [least, greatest] with 1 <= least <= greatest.")
+        super().__init__(list(product(*(range(low, high + 1) for low, high in ranges.values()))))
+
+
+class Recorded(ItemDistribution):
+    """A recorded stream: the items of a CSV file in their order; every episode starts at the first row.
+
+    Args:
+        path: a file with a header ``w,d,h`` and optionally ``x,y`` (the item's min corner in the bin), one item a row.
+            Without ``x,y`` the position is random.
+        loop: after the last row start over, instead of ending (truncating) the episode.
+
+    Raises:
+        ValueError: a missing file or column, or a value that is not a whole number, naming the row.
+    """
+
+    def __init__(self, path, loop=False):
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise ValueError(f"items.path={str(path)!r}: no such file; expected a CSV with columns w,d,h (and x,y).")
+        with self.path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            header = [name.strip() for name in reader.fieldnames or []]
+            reader.fieldnames = header
+            if header not in (["w", "d", "h"], ["w", "d", "h", "x", "y"]):
+                raise ValueError(f"{path}: the header is {','.join(header)!r}, expected 'w,d,h' or 'w,d,h,x,y'.")
+            rows = [self._row(reader.line_num, row, header) for row in reader]
+        if not rows:
+            raise ValueError(f"{path}: no items, expected at least one row below the header.")
+        table = torch.tensor(rows, dtype=torch.int64)
+        self.sizes = table[:, :3]
+        self._corner = table[:, 3:] if len(header) == 5 else None
+        self._loop = bool(loop)
+        self.length = None if loop else len(rows)
+
+    def _row(self, line, row, header):
+        try:
+            values = [int(row[name]) for name in header]
+        except (TypeError, ValueError):
+            values = []
+        if not values or None in row or min(values[:3]) < 1 or min(values) < 0:
+            given = ",".join(str(v) for v in row.values())
+            raise ValueError(
+                f"{self.path}, line {line}: got {given!r}, expected {','.join(header)} as whole numbers "
+                "with w, d, h >= 1 and x, y >= 0."
+            )
+        return values
+
+    def sample(self, stream, seed, episode, step, bin_size):
+        item = super().sample(stream, seed, episode, step, bin_size)
+        if self._corner is not None:
+            x, y = self._corner.to(step.device)[self._index(None, step)].unbind(-1)
+            item = item._replace(x=x, y=y)
+        if self.length is None:
+            return item
+        left = step < self.length
+        return Item(*(torch.where(left, part, 0) for part in item))
+
+    def _index(self, uniform, step):
+        return step % len(self.sizes) if self._loop else step.clamp(max=len(self.sizes) - 1)
+
+    def corners(self, kind, bin_size):
+        if self._corner is None:
+            return super().corners(kind, bin_size)
+        return [tuple(self._corner[kind].tolist())]
+
+    def label(self, kind):
+        return f"{self.path}, row {kind + 1}: " + super().label(kind)

@@ -1,0 +1,245 @@
+"""Policies over joint (pick, place, rotation) actions, and how TorchRL sees them.
+
+A policy chooses among *choices*: flat actions, or classes of flat actions that it has no reason to tell apart. The
+probability of a choice is spread evenly over the flat actions of its class, so PPO's ratio and entropy are those of the
+choice. Every policy offers
+
+* ``choice_key``: the name of its choice in the TensorDict, and ``in_keys``: what ``forward`` reads;
+* ``masks``: the masks that the environment must emit for training it;
+* ``forward(...) -> logits [N, choices]``, float32;
+* ``to_action(choice, bin_depth, tote_depth, tote_height) -> int64 [N]``: a flat action of the class, drawn evenly
+  (the lowest one when exploration is off);
+* ``action_log_probs(bin_depth, tote_depth) -> [N, N_a]``: the distribution over flat actions, without any mask.
+"""
+
+import torch
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import TensorDictSequential
+from torch import Tensor, nn
+from torch.distributions import Categorical
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from pickplace.geometry import Rules
+from pickplace.models.conv4d import Conv4dPolicy
+from pickplace.models.fcn_grasp import ItemConditionedFcn
+
+MASKED = -1e9  # the logit of what must not be chosen: its probability is exactly 0 in float32
+
+
+class Choice(Categorical):
+    """A categorical distribution over choices, without the checks that dominate a small PPO update."""
+
+    def __init__(self, logits: Tensor):
+        super().__init__(logits=logits, validate_args=False)
+
+    def sample(self, sample_shape=()):
+        """Inverse-CDF sampling with one uniform number a row."""
+        if sample_shape:
+            return super().sample(sample_shape)
+        edges = self.probs.double().cumsum(-1)
+        uniform = torch.rand(edges.shape[:-1], dtype=torch.float64, device=edges.device) * edges[..., -1]
+        return torch.searchsorted(edges, uniform[..., None], right=True)[..., 0].clamp(max=edges.shape[-1] - 1)
+
+
+class FlatPolicy(nn.Module):
+    """Chooses among all ``N_a`` flat actions; the paper's ``fcn4d``.
+
+    Args:
+        rules: the task's sizes.
+        mask_infeasible: choose among feasible actions only (the paper does not).
+        network: arguments of :class:`~pickplace.models.conv4d.Conv4dPolicy`.
+    """
+
+    choice_key = "action"
+
+    def __init__(self, rules: Rules, mask_infeasible: bool = False, **network):
+        super().__init__()
+        self.rules, self.mask_infeasible = rules, mask_infeasible
+        self.masks = ("action",) if mask_infeasible else ()
+        self.in_keys = ["bin_depth", "tote_depth"] + ["action_mask"] * mask_infeasible
+        self.network = Conv4dPolicy(rules.rotations, **network)
+
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        logits = self.network(bin_depth, tote_depth)
+        return logits if action_mask is None else torch.where(action_mask, logits, MASKED)
+
+    def to_action(self, choice: Tensor, *_) -> Tensor:
+        return choice
+
+    def action_log_probs(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
+        return self(bin_depth, tote_depth).log_softmax(-1)
+
+
+class OutcomePolicy(nn.Module):
+    """``fcn_grasp`` with masking: chooses among the distinct footprints that some action reaches.
+
+    What the tote looks like after a success depends on the footprint alone; the grasp only decides whether it can be
+    reached, and the mask knows that.
+
+    Args:
+        rules: the task's sizes.
+        network: arguments of :class:`~pickplace.models.fcn_grasp.ItemConditionedFcn`.
+    """
+
+    choice_key = "outcome"
+    masks = ("outcome",)
+    mask_infeasible = True
+    in_keys = ["bin_depth", "tote_depth", "outcome_mask"]
+
+    def __init__(self, rules: Rules, **network):
+        super().__init__()
+        self.rules = rules
+        self.network = ItemConditionedFcn(rules.parities, **network)
+
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor, outcome_mask: Tensor) -> Tensor:
+        return torch.where(outcome_mask, self.network(bin_depth, tote_depth).flatten(1), MASKED)
+
+    def to_action(self, choice: Tensor, bin_depth: Tensor, tote_depth: Tensor, tote_height: Tensor) -> Tensor:
+        placements = self.rules.placements_from_depth(bin_depth, tote_depth, tote_height)
+        return pick_one(self.rules.actions_reaching(placements, choice))
+
+    def action_log_probs(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
+        """Without a mask: an action whose pick misses, or that leaves the tote, has no outcome, so probability 0."""
+        item = self.rules.read_item(bin_depth)
+        outcome = self.rules.action_outcomes(item)  # [N, N_a], -1 where nothing reaches the tote
+        ways = outcome.new_zeros(len(outcome), self.rules.num_outcomes + 1)
+        ways.scatter_add_(1, outcome + 1, torch.ones_like(outcome))
+        logits = self.network(bin_depth, tote_depth).flatten(1)
+        logits = torch.where(ways[:, 1:] > 0, logits, MASKED)
+        share = logits.log_softmax(-1) - ways[:, 1:].clamp(min=1).log()
+        return torch.where(outcome >= 0, share.gather(1, outcome.clamp(min=0)), MASKED)
+
+
+class GraspPolicy(nn.Module):
+    """``fcn_grasp`` without masking: chooses among (grasp class, place cell), feasible or not, or to miss the item.
+
+    The grasp class is how the item lies under the rotated end effector. All picks that lift nothing are one more
+    choice, which the policy must learn to avoid, as it must learn walls, collisions and support.
+
+    Args:
+        rules: the task's sizes.
+        network: arguments of :class:`~pickplace.models.fcn_grasp.ItemConditionedFcn`.
+    """
+
+    choice_key = "grasp"
+    masks = ()
+    mask_infeasible = False
+    in_keys = ["bin_depth", "tote_depth"]
+
+    def __init__(self, rules: Rules, **network):
+        super().__init__()
+        self.rules = rules
+        self.network = ItemConditionedFcn(rules.parities * rules.num_offsets**2, **network)
+        self.miss = nn.Parameter(torch.zeros(()))
+
+    def _choices(self, bin_depth: Tensor, tote_depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Logit per flat action of each choice, the choice's number of flat actions, and each pick's grasp class."""
+        maps = self.network(bin_depth, tote_depth).flatten(2)  # [N, Q*O*O, W_T*D_T]
+        logits = torch.cat([maps.flatten(1), self.miss.expand(len(maps), 1)], 1)
+        picks = self._pick_classes(bin_depth)
+        missing = (picks < 0).sum((1, 2)) * self.rules.num_places
+        counts = maps.new_zeros(len(maps), maps.shape[1] + 1).scatter_add_(
+            1, picks.flatten(1) + 1, torch.ones_like(picks, dtype=maps.dtype).flatten(1)
+        )
+        ways = torch.cat([counts[:, 1:].repeat_interleave(self.rules.num_places, 1), missing[:, None]], 1)
+        return logits, ways, picks
+
+    def _pick_classes(self, bin_depth: Tensor) -> Tensor:
+        """The grasp class of every pick cell and rotation, int64 ``[N, P, R]``, -1 if the pick fails."""
+        failure, offset = self.rules.grasps(self.rules.read_item(bin_depth))
+        return torch.where((failure == 0)[..., None], self.rules.grasp_class(offset), -1)
+
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
+        logits, ways, _ = self._choices(bin_depth, tote_depth)
+        return torch.where(ways > 0, logits + ways.clamp(min=1).log(), MASKED)
+
+    def to_action(self, choice: Tensor, bin_depth: Tensor, *_) -> Tensor:
+        rules, places = self.rules, self.rules.num_places
+        missed = choice == rules.parities * rules.num_offsets**2 * places
+        wanted = torch.where(missed, -1, choice // places)
+        pairs = self._pick_classes(bin_depth).flatten(1) == wanted[:, None]  # [N, P*R]
+        pair = pick_one(torch.where(pairs, torch.arange(pairs.shape[1], device=choice.device), -1))
+        anywhere = torch.zeros_like(choice)
+        if exploration_type() == ExplorationType.RANDOM:
+            anywhere = torch.randint(places, choice.shape, device=choice.device)
+        place = torch.where(missed, anywhere, choice % places)
+        return (pair // rules.rotations * places + place) * rules.rotations + pair % rules.rotations
+
+    def action_log_probs(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
+        logits, ways, picks = self._choices(bin_depth, tote_depth)
+        total = torch.where(ways > 0, logits + ways.clamp(min=1).log(), MASKED).logsumexp(1, keepdim=True)
+        maps = (logits - total)[:, :-1].unflatten(1, (-1, self.rules.num_places))
+        missed = (logits - total)[:, -1:, None].expand(-1, 1, self.rules.num_places)
+        rows = torch.cat([missed, maps], 1)  # row 0 is a miss
+        batch = torch.arange(len(rows), device=rows.device)[:, None, None]
+        return rows[batch, picks + 1].transpose(2, 3).flatten(1)  # [N, P, R, places] -> [N, N_a]
+
+
+def pick_one(candidates: Tensor) -> Tensor:
+    """One entry >= 0 of each row of int64 ``[N, M]``: drawn evenly when exploring, else the lowest; -1 if none."""
+    if exploration_type() == ExplorationType.RANDOM:
+        draw = torch.rand(candidates.shape, device=candidates.device)
+        index = torch.where(candidates >= 0, draw, -1.0).argmax(1, keepdim=True)
+    else:
+        highest = torch.iinfo(candidates.dtype).max
+        index = torch.where(candidates >= 0, candidates, highest).argmin(1, keepdim=True)
+    return candidates.gather(1, index)[:, 0]
+
+
+def fcn4d(rules: Rules, mask_infeasible: bool, **network) -> FlatPolicy:
+    """The paper's policy (config ``model=fcn4d``)."""
+    return FlatPolicy(rules, mask_infeasible, **network)
+
+
+def fcn_grasp(rules: Rules, mask_infeasible: bool, **network) -> nn.Module:
+    """The default policy (config ``model=fcn_grasp``): by outcomes with masking, by grasps without."""
+    return (OutcomePolicy if mask_infeasible else GraspPolicy)(rules, **network)
+
+
+def as_actor(policy: nn.Module) -> ProbabilisticTensorDictSequential:
+    """The policy as TorchRL's PPO loss wants it: observation -> ``logits`` -> a sampled choice and its log-probability."""
+    return ProbabilisticTensorDictSequential(
+        TensorDictModule(policy, in_keys=policy.in_keys, out_keys=["logits"]),
+        ProbabilisticTensorDictModule(
+            in_keys=["logits"],
+            out_keys=[policy.choice_key],
+            distribution_class=Choice,
+            default_interaction_type=ExplorationType.RANDOM,
+            return_log_prob=True,
+            log_prob_key="log_prob",
+        ),
+    )
+
+
+def as_collection_policy(policy: nn.Module) -> TensorDictSequential:
+    """The policy as the collector runs it: a choice, its log-probability, and a flat action; no logits are kept."""
+    choose = as_actor(policy)
+    if policy.choice_key == "action":
+        return TensorDictSequential(choose, selected_out_keys=["action", "log_prob"])
+    decide = TensorDictModule(
+        policy.to_action, in_keys=[policy.choice_key, "bin_depth", "tote_depth", "tote_height"], out_keys=["action"]
+    )
+    return TensorDictSequential(choose, decide, selected_out_keys=[policy.choice_key, "log_prob", "action"])
+
+
+def check_sizes(policy: nn.Module, rules: Rules) -> list[str]:
+    """The paper's conditions on sizes in training: eq. 2 on the items, eq. 3 on the bin and the tote.
+
+    Returns:
+        A sentence for each condition that an ``fcn_grasp`` policy does not meet; it trains all the same.
+
+    Raises:
+        ValueError: for the 4D networks, which cannot learn then.
+    """
+    field, side = policy.network.receptive_field, rules.longest_side or rules.max_side
+    broken = []
+    if side > field / 2 + 1:
+        broken.append(f"items: the longest side is {side}, expected at most {field / 2 + 1:g} (receptive field {field}, eq. 2).")
+    for key, size in (("bin_size", rules.bin_size), ("tote_size", rules.tote_size)):
+        if min(size[:2]) < field:
+            broken.append(
+                f"env.{key}={list(size)}: expected sides of at least {field} (receptive field {field}, eq. 3)."
+            )
+    if broken and isinstance(policy, FlatPolicy):
+        raise ValueError(" ".join(broken))
+    return broken

@@ -1,0 +1,54 @@
+"""The planner that follows a trained policy."""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from pickplace.geometry import Rules
+from pickplace.models.actors import MASKED
+
+
+class PolicyPlanner:
+    """Tries the policy's most probable actions in a forward simulation and plays the first that succeeds.
+
+    Args:
+        rules: the task's sizes.
+        policy: a policy of :mod:`pickplace.models.actors` made for these rules.
+        candidates: ``K``, how many of the most probable flat actions, over all ``N_a`` and without a mask, are tried;
+            if none succeeds the most probable one is played, and fails. ``"all"`` plays the best feasible one.
+    """
+
+    name = "policy"
+
+    def __init__(self, rules: Rules, policy: nn.Module, candidates: int | str = "all"):
+        whole = isinstance(candidates, int) and not isinstance(candidates, bool)
+        if candidates != "all" and not (whole and candidates >= 1):
+            raise ValueError(f"planner.candidates={candidates!r}: expected 'all' or a whole number >= 1.")
+        self.rules, self.policy, self.candidates = rules, policy, candidates
+
+    @torch.no_grad()
+    def decide(self, observation: TensorDictBase) -> Tensor:
+        bin_depth, tote_depth = observation["bin_depth"], observation["tote_depth"]
+        tote_height = observation["tote_height"].reshape(-1)
+        rules = self.rules
+        if self.candidates == "all":
+            placements = rules.placements_from_depth(bin_depth, tote_depth, tote_height)
+            if self.policy.choice_key == "outcome":  # never looks at the N_a actions one by one
+                mask = rules.outcome_mask(placements).flatten(1)
+                outcome = self.policy(bin_depth, tote_depth, mask).argmax(1)
+                with set_exploration_type(ExplorationType.DETERMINISTIC):
+                    return self.policy.to_action(outcome, bin_depth, tote_depth, tote_height).clamp(min=0)
+            score = self.policy.action_log_probs(bin_depth, tote_depth)
+            return torch.where(rules.action_mask(placements), score, 2 * MASKED).argmax(1)
+        count = min(self.candidates, rules.num_actions)
+        tried = self.policy.action_log_probs(bin_depth, tote_depth).topk(count, dim=1).indices  # [N, K]
+        heights = (tote_height[:, None, None] - tote_depth).int()
+        item = rules.read_item(bin_depth)
+
+        def repeat(x: Tensor) -> Tensor:
+            return x.repeat_interleave(count, 0)
+
+        step = rules.apply(repeat(heights), repeat(tote_height), type(item)(*map(repeat, item)), tried.flatten())
+        first = (step.failure.view_as(tried) == 0).int().argmax(1, keepdim=True)  # 0, the most probable, if none
+        return tried.gather(1, first)[:, 0]

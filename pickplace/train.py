@@ -1,0 +1,352 @@
+"""Training by PPO, and the ``pickplace-train`` command. :func:`train` reads from top to bottom."""
+
+import logging
+import os
+import signal
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.modules import ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from pickplace import checkpoint, config
+from pickplace.curriculum import Curriculum, push_level
+from pickplace.evaluate import commit, play, summarise, versions
+from pickplace.geometry import Failure
+from pickplace.models.actors import as_actor, as_collection_policy, check_sizes
+from pickplace.report import learning_curve
+
+log = logging.getLogger(__name__)
+
+
+def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = None) -> float:
+    """Train a policy as the config says.
+
+    Args:
+        cfg: the composed config, see ``conf/train.yaml``.
+        run_dir: where checkpoints, metrics and figures go.
+        resume: state and facts of the checkpoint to continue from, as :func:`pickplace.checkpoint.read` gives them.
+
+    Returns:
+        Mean occupancy of the final policy at full tote height on the validation stream, so that sweepers can optimise it.
+    """
+    algo, device = cfg.algo, torch.device(cfg.device)
+    check_settings(cfg)
+    if cfg.threads:
+        torch.set_num_threads(cfg.threads)
+    torch.manual_seed(cfg.seed)
+
+    # What is trained, and where it acts.
+    items = config.instantiate(cfg["items"])
+    build_env = partial(config.instantiate, cfg.env, items=items, device=cfg.device)
+    probe = build_env(num_envs=1, masks=())
+    rules = probe.rules
+    policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=algo.mask_infeasible).to(device)
+    for warning in check_sizes(policy, rules):
+        log.warning(warning)
+    critic = ValueOperator(config.instantiate(cfg.model.critic, rules=rules), ["bin_depth", "tote_depth"]).to(device)
+    curriculum: Curriculum = config.instantiate(cfg.curriculum)
+    curriculum.setup(probe.min_tote_height, rules.tote_size[2], cfg.total_frames)
+    state, facts = resume or ({}, {})
+    frames, iteration, best, latest = (facts.get(k, d) for k, d in COUNTERS.items())
+    if resume:
+        curriculum.load_state_dict(facts["curriculum"])
+        checkpoint.load_module(policy, state["policy"], "policy")
+        checkpoint.load_module(critic, state["critic"], "critic")
+    if warning := curriculum.check_budget(cfg.total_frames):
+        log.warning(warning)
+
+    # TorchRL's parts: collector, advantage, loss.
+    env_config = OmegaConf.to_container(cfg.env, resolve=True)
+    make_env = partial(training_env, env_config, items, cfg.device, policy.masks, cfg.env.num_envs, curriculum)
+    acting = as_collection_policy(policy)
+    collector = config.instantiate(
+        cfg.collector,
+        make_env=make_env,
+        policy=acting,
+        num_envs=cfg.env.num_envs,
+        rollout_length=algo.rollout_length,
+        seed=cfg.seed,
+    )
+    advantage = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=critic, average_gae=False, deactivate_vmap=True)
+    loss = ClipPPOLoss(
+        as_actor(policy),
+        critic,
+        clip_epsilon=algo.clip_epsilon,
+        entropy_coeff=algo.entropy_coeff,
+        critic_coeff=algo.critic_coeff,
+        loss_critic_type="l2",
+        normalize_advantage=algo.normalize_advantage,
+    )
+    loss.set_keys(action=policy.choice_key, sample_log_prob="log_prob")
+    learned = [*policy.in_keys, policy.choice_key, "log_prob", "advantage", "value_target"]
+    optimizer = torch.optim.Adam(loss.parameters(), lr=algo.lr, eps=1e-5)
+    if resume:
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
+        collector.load_state_dict(state["collector"])
+        torch.set_rng_state(state["rng"])  # last: everything above may have drawn
+
+    logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames)
+    stop, started, first_frames = StopRequest(), time.perf_counter(), frames
+    log.info("%d frames to train, at tote height %d of %d", cfg.total_frames - frames, curriculum.level, curriculum.end)
+
+    def save(name: str) -> None:
+        state = {
+            "policy": policy.state_dict(),
+            "critic": critic.state_dict(),
+            "optimizer": optimizer.state_dict()["state"],
+            "collector": collector.state_dict(),
+            "rng": torch.get_rng_state(),
+        }
+        facts = {
+            **dict(zip(COUNTERS, (frames, iteration, best, latest), strict=True)),
+            "curriculum": curriculum.state_dict(),
+            "config": OmegaConf.to_container(cfg, resolve=False),
+            "versions": versions(),
+            "commit": commit(),
+        }
+        checkpoint.write(run_dir / "checkpoints" / name, state, facts)
+
+    try:
+        batches = iter(collector)
+        while frames < cfg.total_frames and not stop.requested:
+            # Collect a batch, [num_envs, rollout_length].
+            collector.update_policy_weights_(TensorDict.from_module(acting).data)
+            began = time.perf_counter()
+            batch = next(batches)
+            collected = time.perf_counter()
+            before, frames, iteration = frames, frames + batch.numel(), iteration + 1
+            metrics = episode_metrics(batch)
+
+            # Finished episodes move the curriculum.
+            done = batch["next", "done"][..., 0]
+            heights, occupancy = (batch["next", key][done][:, 0] for key in ("tote_height", "occupancy"))
+            level = curriculum.level
+            metrics |= curriculum.update(heights, occupancy, frames)
+            if curriculum.level != level:
+                push_level(collector, curriculum.level)
+                log.info("%s frames: tote height %d -> %d", f"{frames:,}", level, curriculum.level)
+
+            # Learn: advantages once, then epochs of shuffled minibatches.
+            batch["next", "reward"] = batch["next", "reward"] * algo.reward_scale
+            with torch.no_grad():
+                advantage(batch)
+            for group in optimizer.param_groups:
+                group["lr"] = learning_rate(algo, frames, cfg.total_frames)
+            data = batch.select(*learned).reshape(-1)
+            metrics |= update(loss, optimizer, data, algo)
+            metrics["train/lr"] = optimizer.param_groups[0]["lr"]
+            metrics["time/collect_ms"] = (collected - began) * 1e3
+            metrics["time/update_ms"] = (time.perf_counter() - collected) * 1e3
+            metrics["time/fps"] = batch.numel() / (time.perf_counter() - began)
+
+            # On intervals: validate, save, tell.
+            finished = frames >= cfg.total_frames
+            if finished or crossed(before, frames, cfg.evaluation_interval):
+                latest = validate(cfg, build_env, rules, policy)
+                metrics |= {f"eval/{key}": value for key, value in latest.items()}
+                log.info("%s frames: validation occupancy %.4f", f"{frames:,}", latest["occupancy"])
+                if latest["occupancy"] > best:
+                    best = latest["occupancy"]
+                    save("best")
+            logger.log(metrics, frames)
+            if finished or stop.requested or crossed(before, frames, cfg.checkpoint_interval):
+                save("last")
+            if crossed(before, frames, cfg.progress_interval):
+                speed = (frames - first_frames) / (time.perf_counter() - started)
+                log.info(progress_line(frames, cfg.total_frames, speed, curriculum, metrics))
+    finally:
+        logger.close()
+        collector.shutdown()
+        stop.restore()
+
+    if stop.requested:
+        log.info("stopped at %s frames; continue with: python -m pickplace.train resume=%s", f"{frames:,}", run_dir)
+    if (run_dir / "metrics.csv").is_file():
+        learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
+    log.info("run folder: %s", run_dir)
+    return float(latest.get("occupancy", float("nan")))
+
+
+#: What a checkpoint counts, and how a run begins: frames, iterations, best validation occupancy, latest validation.
+COUNTERS = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
+
+
+def check_settings(cfg: DictConfig) -> None:
+    """Refuse numbers that make no sense before anything is built.
+
+    Raises:
+        ValueError: naming the key, its value, and what was expected.
+    """
+    at_least = {
+        "total_frames": 1, "evaluation_interval": 1, "checkpoint_interval": 1, "progress_interval": 1,
+        "env.num_envs": 1, "algo.rollout_length": 1, "algo.epochs": 1, "algo.minibatch_size": 1,
+        "evaluation.episodes": 1, "evaluation.batch_size": 1, "seed": 0,
+    }  # fmt: skip
+    for key, least in at_least.items():
+        value = OmegaConf.select(cfg, key)
+        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            raise ValueError(f"{key}={value}: expected a whole number >= {least}.")
+    ranges = {
+        "algo.gamma": (0, 1), "algo.lmbda": (0, 1), "algo.lr": (0, None), "algo.clip_epsilon": (0, None),
+        "algo.entropy_coeff": (0, None), "algo.critic_coeff": (0, None), "algo.max_grad_norm": (0, None),
+        "algo.reward_scale": (0, None),
+    }  # fmt: skip
+    for key, (low, high) in ranges.items():
+        value = OmegaConf.select(cfg, key)
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not number or not value >= low or (high is not None and value > high):
+            raise ValueError(f"{key}={value}: expected a number >= {low}{'' if high is None else f' and <= {high}'}.")
+
+
+def training_env(env_config, items, device, masks, total_envs, curriculum, first_episode, num_envs) -> TransformedEnv:
+    """The environment of one collector process: slots ``first_episode ..`` of ``total_envs``, under the curriculum."""
+    env = config.instantiate(
+        OmegaConf.create(env_config),
+        items=items,
+        device=device,
+        masks=masks,
+        num_envs=num_envs,
+        first_episode=first_episode,
+        episode_stride=total_envs,
+    )
+    return TransformedEnv(env, Compose(curriculum.transform()))
+
+
+def learning_rate(algo: DictConfig, frames: int, total_frames: int) -> float:
+    """``algo.lr``, falling linearly to 0 over the last part of the run if ``algo.lr_decay_start`` is set."""
+    if algo.lr_decay_start is None:
+        return algo.lr
+    left = (1 - frames / total_frames) / max(1 - algo.lr_decay_start, 1e-9)
+    return algo.lr * min(max(left, 0.0), 1.0)
+
+
+def update(loss: ClipPPOLoss, optimizer, data: TensorDictBase, algo: DictConfig) -> dict[str, float]:
+    """PPO's epochs over one batch of frames ``[B]``; returns the mean diagnostics."""
+    totals, steps = {}, 0
+    for _ in range(algo.epochs):
+        for index in torch.randperm(len(data), device=data.device).split(algo.minibatch_size):
+            losses = loss(data[index])
+            total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+            optimizer.zero_grad(set_to_none=True)
+            total.backward()
+            norm = torch.nn.utils.clip_grad_norm_(loss.parameters(), algo.max_grad_norm)
+            if not torch.isfinite(norm):
+                raise FloatingPointError(f"the gradient is not finite (loss {total.item()}); the last checkpoint is good.")
+            optimizer.step()
+            steps += 1
+            for name, key in DIAGNOSTICS.items():
+                totals[name] = totals.get(name, 0.0) + losses[key].detach()
+            totals["grad_norm"] = totals.get("grad_norm", 0.0) + norm
+    return {f"train/{name}": float(value) / steps for name, value in totals.items()}
+
+
+DIAGNOSTICS = {
+    "loss_objective": "loss_objective",
+    "loss_critic": "loss_critic",
+    "entropy": "entropy",
+    "approx_kl": "kl_approx",
+    "clip_fraction": "clip_fraction",
+    "explained_variance": "explained_variance",
+}
+
+
+def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
+    """Mean reward, and over the episodes that ended in the batch: occupancy and the mix of reasons."""
+    metrics = {"train/reward": batch["next", "reward"].mean().item()}
+    done = batch["next", "done"]
+    ended = int(done.sum())
+    metrics["train/episodes"] = ended
+    if ended:
+        metrics["train/occupancy"] = batch["next", "occupancy"][done].mean().item()
+        reasons = batch["next", "failure"][done]
+        for failure in Failure:
+            metrics[f"train/failure_{failure.name.lower()}"] = (reasons == failure).float().mean().item()
+    return metrics
+
+
+def validate(cfg: DictConfig, build_env, rules, policy) -> dict[str, float]:
+    """Play the validation stream at full height, by the config's planner."""
+    ev = cfg.evaluation
+
+    def make_env(first, count):
+        return build_env(num_envs=count, masks=(), stream=ev.stream, seed=ev.seed, first_episode=first)
+
+    planner = config.instantiate(cfg.planner, rules=rules, policy=policy)
+    report = summarise(play(make_env, planner, ev.episodes, ev.batch_size))
+    low, high = report["occupancy"]["ci95"]
+    return {"occupancy": report["occupancy"]["mean"], "ci95_low": low, "ci95_high": high}
+
+
+def crossed(before: int, now: int, interval: int) -> bool:
+    """Has a multiple of ``interval`` been passed? Fires whatever the batch size, unlike ``now % interval == 0``."""
+    return before // interval != now // interval
+
+
+def progress_line(frames: int, total: int, speed: float, curriculum: Curriculum, metrics: dict) -> str:
+    """Frames, speed, level, occupancy and time to go."""
+    left = int((total - frames) / speed)
+    occupancy = metrics.get("train/occupancy", float("nan"))
+    return (
+        f"{frames / total:4.0%} {frames:>11,} frames | {speed:6,.0f}/s | tote height {curriculum.level}/{curriculum.end} | "
+        f"occupancy {occupancy:.3f} | {left // 60}:{left % 60:02d} to go"
+    )
+
+
+class StopRequest:
+    """Ctrl-C and SIGTERM ask the loop to finish its batch and save; a second Ctrl-C ends the process at once."""
+
+    def __init__(self):
+        self.requested = False
+        self._previous = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def _ask(self, number, frame):
+        if self.requested:
+            os._exit(130)
+        self.requested = True
+        log.info("stopping after this batch; press Ctrl-C again to stop at once")
+
+    def restore(self) -> None:
+        """Give the signals back."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+
+def resume_run(overrides: list[str]) -> float:
+    """Continue a run in its own folder: ``resume=<run folder>`` and overrides of values on top of its saved config."""
+    place = next(item for item in overrides if item.startswith("resume=")).partition("=")[2]
+    folder = checkpoint.locate(place, prefer="last")
+    run_dir = folder.parent.parent
+    handlers = [logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log")]
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
+    state, facts = checkpoint.read(folder)
+    config.refuse_foreign_targets(facts["config"])
+    rest = [item for item in overrides if not item.startswith("resume=")]
+    cfg = config.apply_overrides(OmegaConf.create(facts["config"]), rest)
+    log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
+    return train(cfg, run_dir, (state, facts))
+
+
+def main() -> None:
+    """Entry point of ``pickplace-train``."""
+    overrides = [item for item in sys.argv[1:] if not item.startswith("-")]
+    if any(item.startswith("resume=") and item not in ("resume=", "resume=null") for item in overrides):
+        try:
+            if len(overrides) < len(sys.argv) - 1:
+                raise ValueError("resume=...: expected only key=value overrides beside it, no flags such as -m.")
+            resume_run(overrides)
+        except (ValueError, OSError) as error:
+            config.fail(error)
+    else:
+        config.command("train", train)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,207 @@
+"""A slow, plain-Python reading of the task's rules, cell by cell: what the environment is compared with.
+
+It shares no code with the package and uses nothing but lists and integers. Sizes are in cells, grids are
+lists of columns (`grid[x][y]`), and a flat action is
+`(((x_bin * D_B + y_bin) * W_T + x_tote) * D_T + y_tote) * R + r`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import product
+
+SUCCESS, PICK_MISS, BIN_COLLISION, TOTE_COLLISION, OVERFLOW, ITEM_COLLISION, UNSTABLE, STUCK = range(8)
+
+Pair = tuple[int, int]
+Triple = tuple[int, int, int]
+Grid = list[list[int]]
+
+
+@dataclass(frozen=True)
+class Rules:
+    """The sizes and options that stay the same from episode to episode."""
+
+    bin_size: Triple = (5, 5, 1)
+    tote_size: Triple = (6, 6, 5)
+    effector_size: Pair = (3, 3)
+    rotations: int = 4
+    pick_rule: str = "contain"
+    min_support: float = 0.5
+    strict_support: bool = False
+
+    @property
+    def num_actions(self) -> int:
+        (bin_w, bin_d, _), (tote_w, tote_d, _) = self.bin_size, self.tote_size
+        return bin_w * bin_d * tote_w * tote_d * self.rotations
+
+    def split(self, action: int) -> tuple[Pair, Pair, int]:
+        """The pick cell, the place cell and the rotation of a flat action."""
+        rest, r = divmod(action, self.rotations)
+        rest, y_tote = divmod(rest, self.tote_size[1])
+        rest, x_tote = divmod(rest, self.tote_size[0])
+        x_bin, y_bin = divmod(rest, self.bin_size[1])
+        return (x_bin, y_bin), (x_tote, y_tote), r
+
+    def join(self, pick: Pair, place: Pair, r: int) -> int:
+        """The flat action of a pick cell, a place cell and a rotation."""
+        (bin_d, tote_w, tote_d) = self.bin_size[1], self.tote_size[0], self.tote_size[1]
+        return (((pick[0] * bin_d + pick[1]) * tote_w + place[0]) * tote_d + place[1]) * self.rotations + r
+
+
+def rotate(r: int, effector: Pair, offset: Pair, size: Pair) -> tuple[Pair, Pair, Pair]:
+    """The table of rotations: effector size, item offset inside it and item size after `r` quarter turns."""
+    (effector_w, effector_d), (ox, oy), (w, d) = effector, offset, size
+    if r == 0:
+        return (effector_w, effector_d), (ox, oy), (w, d)
+    if r == 1:
+        return (effector_d, effector_w), (effector_d - oy - d, ox), (d, w)
+    if r == 2:
+        return (effector_w, effector_d), (effector_w - ox - w, effector_d - oy - d), (w, d)
+    if r == 3:
+        return (effector_d, effector_w), (oy, effector_w - ox - w), (d, w)
+    raise ValueError(f"r is {r}, expected 0 to 3")
+
+
+def corner_for(reference_at: Pair, size: Pair) -> Pair:
+    """Where the corner of an effector of this size is when its reference cell is at `reference_at`."""
+    return reference_at[0] - (size[0] - 1) // 2, reference_at[1] - (size[1] - 1) // 2
+
+
+def cells(corner: Pair, size: Pair) -> list[Pair]:
+    """Every cell of a rectangle, inside a grid or not."""
+    return list(product(range(corner[0], corner[0] + size[0]), range(corner[1], corner[1] + size[1])))
+
+
+def inside(cell: Pair, grid: Grid) -> bool:
+    return 0 <= cell[0] < len(grid) and 0 <= cell[1] < len(grid[0])
+
+
+def flat(size: Iterable[int], height: int = 0) -> Grid:
+    """A grid of the given width and depth, level at `height`."""
+    width, depth, *_ = size
+    return [[height] * depth for _ in range(width)]
+
+
+@dataclass
+class Oracle:
+    """One environment: an episode's tote and the item that waits in the bin.
+
+    `item` is `(w, d, h)` and `position` the bin cell of its corner; `heights` is `[W_T][D_T]`.
+    """
+
+    rules: Rules
+    tote_height: int
+    item: Triple
+    position: Pair
+    heights: Grid = field(default_factory=list)
+    volume: int = 0
+
+    def __post_init__(self):
+        self.heights = self.heights or flat(self.rules.tote_size)
+
+    def bin_depth(self) -> Grid:
+        """Height above the bin's floor, `[W_B][D_B]`."""
+        grid = flat(self.rules.bin_size)
+        for x, y in cells(self.position, self.item[:2]):
+            grid[x][y] = self.item[2]
+        return grid
+
+    def tote_depth(self) -> Grid:
+        """Remaining height, `[W_T][D_T]`."""
+        return [[self.tote_height - height for height in column] for column in self.heights]
+
+    def occupancy(self) -> float:
+        width, depth, _ = self.rules.tote_size
+        return self.volume / (width * depth * self.tote_height)
+
+    def try_action(self, action: int) -> tuple[int, Grid | None]:
+        """The failure code of an action and, on success only, the heights it leaves."""
+        rules, heights = self.rules, self.heights
+        w, d, h = self.item
+        pick, place, r = rules.split(action)
+
+        effector_corner = corner_for(pick, rules.effector_size)
+        effector = cells(effector_corner, rules.effector_size)
+        gripped = [cell in effector for cell in cells(self.position, (w, d))]
+        if not (all(gripped) if rules.pick_rule == "contain" else any(gripped)):
+            return PICK_MISS, None
+
+        grid = self.bin_depth()
+        for x, y in effector:
+            if grid[x][y] > h if inside((x, y), grid) else rules.bin_size[2] > h:
+                return BIN_COLLISION, None
+
+        offset = self.position[0] - effector_corner[0], self.position[1] - effector_corner[1]
+        effector_size, offset, size = rotate(r, rules.effector_size, offset, (w, d))
+        effector_corner = corner_for(place, effector_size)
+        effector = cells(effector_corner, effector_size)
+        footprint = cells((effector_corner[0] + offset[0], effector_corner[1] + offset[1]), size)
+        if not all(inside(cell, heights) for cell in footprint):
+            return TOTE_COLLISION, None
+        z = max(heights[x][y] for x, y in footprint)
+        top = z + h
+        if self.tote_height > top and not all(inside(cell, heights) for cell in effector):
+            return TOTE_COLLISION, None
+
+        if top > self.tote_height:
+            return OVERFLOW, None
+
+        if any(heights[x][y] > top for x, y in effector if inside((x, y), heights)):
+            return ITEM_COLLISION, None
+
+        support = sum(heights[x][y] == z for x, y in footprint) / len(footprint)
+        if support <= rules.min_support if rules.strict_support else support < rules.min_support:
+            return UNSTABLE, None
+
+        after = [column[:] for column in heights]
+        for x, y in footprint:
+            after[x][y] = top
+        return SUCCESS, after
+
+    def full_mask(self) -> list[bool]:
+        """For each of the `N_a` flat actions, whether it would succeed."""
+        return [self.try_action(action)[0] == SUCCESS for action in range(self.rules.num_actions)]
+
+    def has_feasible_action(self, try_first: Iterable[int] = ()) -> bool:
+        """Whether any action succeeds; `try_first` only saves time."""
+        return any(
+            self.try_action(action)[0] == SUCCESS
+            for actions in (try_first, range(self.rules.num_actions))
+            for action in actions
+        )
+
+    def step(
+        self, action: int, next_item: Triple, next_position: Pair, try_first: Iterable[int] = ()
+    ) -> tuple[int, bool, int]:
+        """Takes an action; returns reward, terminated and failure code.
+
+        The next item arrives only after a success, and decides whether the episode is stuck.
+        """
+        failure, after = self.try_action(action)
+        if failure != SUCCESS:
+            return 0, True, failure
+        reward = self.item[0] * self.item[1] * self.item[2]
+        self.heights, self.volume = after, self.volume + reward
+        self.item, self.position = next_item, next_position
+        stuck = not self.has_feasible_action(try_first)
+        return reward, stuck, STUCK if stuck else SUCCESS
+
+
+def can_always_start(rules: Rules, kinds: Iterable[Triple]) -> bool:
+    """Whether every kind has a feasible action on the empty tote from every bin position.
+
+    A bin position is one at which the item is wholly inside the bin; the heights tried are those an
+    episode may have, from the greatest item height to the tote's own.
+    """
+    kinds = list(kinds)
+    (bin_w, bin_d, _), greatest = rules.bin_size, max(h for _, _, h in kinds)
+    tote_heights = range(greatest, rules.tote_size[2] + 1)
+    if not tote_heights or any(w > bin_w or d > bin_d for w, d, _ in kinds):
+        return False
+    return all(
+        Oracle(rules, tote_height, kind, position).has_feasible_action()
+        for tote_height in tote_heights
+        for kind in kinds
+        for position in product(range(bin_w - kind[0] + 1), range(bin_d - kind[1] + 1))
+    )
