@@ -146,6 +146,21 @@ class PickPlaceEnv(EnvBase):
         return self.batch_size[0]
 
     # ------------------------------------------------------------------ EnvBase
+    def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        """As ``EnvBase.reset``; the rows that a partial reset leaves alone come back as they are.
+
+        TorchRL takes those rows from ``tensordict`` and fills in zeros where it has only ``_reset``.
+        """
+        if tensordict is not None and "_reset" in tensordict.keys() and "bin_depth" not in tensordict.keys():
+            running = self._observation()
+            full = torch.full_like(running["tote_height"], self.rules.tote_size[2])
+            running["tote_height"] = torch.where(tensordict["_reset"].reshape(-1, 1), full, running["tote_height"])
+            for key, value in tensordict.items():
+                rows = tensordict["_reset"].reshape(-1, *[1] * (value.ndim - 1))
+                running[key] = torch.where(rows, value, running[key]) if key in running.keys() else value
+            tensordict = running
+        return super().reset(tensordict, **kwargs)
+
     def _set_seed(self, seed: int | None):
         """Start the item stream over: the next reset of slot ``i`` plays episode ``first_episode + i``."""
         self.item_seed.fill_(0 if seed is None else seed)

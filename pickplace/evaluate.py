@@ -10,13 +10,15 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf, open_dict
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from pickplace import checkpoint, config
 from pickplace.env import PickPlaceEnv
 from pickplace.geometry import Failure
+from pickplace.report import evaluation_table, tote_picture
 
 log = logging.getLogger(__name__)
 
@@ -182,3 +184,79 @@ def commit() -> str | None:
         return run("rev-parse", "HEAD").strip() + ("+" if run("status", "--porcelain", "-uno").strip() else "")
     except (OSError, subprocess.CalledProcessError):
         return None
+
+
+def run(cfg: DictConfig, run_dir: Path) -> float:
+    """Evaluate as the config says (``conf/evaluate.yaml``); returns the mean occupancy.
+
+    Writes ``evaluation.json``, a table and a picture of a packed tote into ``run_dir``.
+
+    Raises:
+        ValueError: for settings that make no sense, or a checkpoint that does not fit them.
+    """
+    for key in ("evaluation.episodes", "evaluation.batch_size"):
+        value = OmegaConf.select(cfg, key)
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise ValueError(f"{key}={value}: expected a whole number >= 1.")
+    if cfg.threads:
+        torch.set_num_threads(cfg.threads)
+    facts, policy_state = {"checkpoint": None}, None
+    if cfg.checkpoint is not None:
+        folder = checkpoint.locate(cfg.checkpoint)
+        state, saved = checkpoint.read(folder)
+        policy_state = state["policy"]
+        config.refuse_foreign_targets(saved["config"])
+        groups = {"env": cfg.env, "items": cfg["items"]}
+        ours = [o for o in HydraConfig.get().overrides.task if o.lstrip("+~").split("=")[0].split(".")[0] in TRAINED]
+        trained = config.apply_overrides(OmegaConf.create(saved["config"]), ours, groups)
+        with open_dict(cfg):
+            for group in TRAINED:
+                cfg[group] = trained[group]
+        facts = {
+            "checkpoint": str(folder),
+            "trained": {"frames": saved["frames"], "seed": trained.seed, "commit": saved["commit"]},
+            "mask_in_training": trained.algo.mask_infeasible,
+        }
+
+    ev, items = cfg.evaluation, config.instantiate(cfg["items"])
+
+    def make_env(first, count):
+        return config.instantiate(
+            cfg.env, items=items, device=cfg.device, num_envs=count, masks=(),
+            stream=ev.stream, seed=ev.seed, first_episode=first,
+        )  # fmt: skip
+
+    rules = make_env(0, 1).rules
+    kwargs = {}
+    if cfg.planner._target_ == "pickplace.planners.PolicyPlanner":
+        if policy_state is None:
+            raise ValueError("checkpoint=null: planner=policy needs a checkpoint; expected a run folder.")
+        most = saved["config"]["env"]["rotations"]
+        if rules.rotations > most:
+            raise ValueError(f"env.rotations={rules.rotations}: the checkpoint was trained with {most}; expected no more.")
+        policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=cfg.algo.mask_infeasible)
+        checkpoint.load_module(policy, policy_state, "policy")
+        kwargs["policy"] = policy.to(cfg.device).eval()
+        facts |= {"candidates": cfg.planner.candidates, "mask_at_decision": cfg.planner.candidates == "all"}
+    planner = config.instantiate(cfg.planner, rules=rules, **kwargs)
+    result, episodes = evaluate(cfg, make_env, planner, facts)
+    (run_dir / "evaluation.json").write_text(json.dumps(result, indent=1))
+    tote_picture(episodes, rules, run_dir / "tote.png")
+    table = evaluation_table(result)
+    (run_dir / "evaluation.md").write_text(table)
+    log.info("\n%s", table)
+    log.info("run folder: %s", run_dir)
+    return result["occupancy"]["mean"]
+
+
+#: Config groups that an evaluation takes from the checkpoint.
+TRAINED = ("env", "items", "model", "algo")
+
+
+def main() -> None:
+    """Entry point of ``pickplace-evaluate``."""
+    config.command("evaluate", run)
+
+
+if __name__ == "__main__":
+    main()
