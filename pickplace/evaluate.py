@@ -32,6 +32,7 @@ class Episodes:
     failure: Tensor  # int64 [E], a Failure; NONE where a recorded stream ended
     feasible_share: float  # mean share of the N_a actions that were feasible, over all decisions
     final_heights: Tensor  # int32 [E, W_T, D_T]: the tote when the episode ended
+    tote_height: Tensor  # int64 [E]
     decisions: int  # over all episodes
     seconds: float  # spent in the planner
     placed: list = field(default_factory=list)  # of the first episode: (x, y, z, w, d, h) of each item
@@ -99,9 +100,12 @@ def play(make_env, planner, episodes: int, batch_size: int) -> Episodes:
             observation = step_mdp(observation)
             if done.any() and running.any():  # a finished slot plays on, uncounted, until all have finished
                 observation = env.reset(observation.set("_reset", after["done"]))
-        parts.append((occupancy, placed_items, failure, final))
-    occupancy, placed_items, failure, final = (torch.cat(column).cpu() for column in zip(*parts, strict=True))
-    return Episodes(occupancy, placed_items, failure, feasible / decisions, final, decisions, seconds, placed)
+        parts.append((occupancy, placed_items, failure, final, env.tote_height))
+    columns = [torch.cat(column).cpu() for column in zip(*parts, strict=True)]
+    occupancy, placed_items, failure, final, tote_height = columns
+    return Episodes(
+        occupancy, placed_items, failure, feasible / decisions, final, tote_height, decisions, seconds, placed
+    )
 
 
 @torch.no_grad()

@@ -32,6 +32,11 @@ class Choice(Categorical):
     def __init__(self, logits: Tensor):
         super().__init__(logits=logits, validate_args=False)
 
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The most probable choice."""
+        return self.logits.argmax(-1)
+
     def sample(self, sample_shape=()):
         """Inverse-CDF sampling with one uniform number a row."""
         if sample_shape:

@@ -1,0 +1,47 @@
+# make train and make test do everything on a fresh machine: they create .venv and install into it.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.installed
+RUN ?= outputs/quick_$(shell date +%Y-%m-%d_%H-%M-%S)
+ARGS ?=
+
+.PHONY: help install train test test-slow lint format clean
+
+help:  ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+install: $(STAMP)  ## create .venv and install the package and what the tests need
+
+$(STAMP): pyproject.toml
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+train: RUN_DIR := $(RUN)
+train: $(STAMP)  ## train (experiment=quick; ARGS="key=value ..." adds overrides), evaluate, and show a packed tote
+	$(BIN)/python -m pickplace.train experiment=quick hydra.run.dir=$(RUN_DIR) $(ARGS)
+	$(BIN)/python -m pickplace.evaluate checkpoint=$(RUN_DIR) hydra.run.dir=$(RUN_DIR)/evaluation
+	@printf '\n%s\n' "Run folder $(RUN_DIR):"
+	@printf '  %-32s%s\n' \
+	  checkpoints/best 'the policy, for pickplace-evaluate checkpoint=$(RUN_DIR)' \
+	  metrics.csv 'every metric over frames' \
+	  learning_curve.png 'occupancy and tote height over frames' \
+	  evaluation/evaluation.md 'the table above; evaluation.json has every episode' \
+	  evaluation/tote.png 'a packed tote'
+
+test: $(STAMP)  ## run the test suite (minutes)
+	$(BIN)/python -m pytest -q $(ARGS)
+
+test-slow: $(STAMP)  ## run the long checks (an hour)
+	$(BIN)/python -m pytest -q -m slow --timeout 7200 $(ARGS)
+
+lint: $(STAMP)  ## check style
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: $(STAMP)  ## mend style
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:  ## remove .venv and caches; outputs stay
+	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,123 @@
+"""A run that is killed and resumed equals one that never was, bit for bit, with both collectors."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from pickplace import checkpoint
+from pickplace.metrics import read_csv
+
+ITERATION = 8 * 16  # frames: env.num_envs * algo.rollout_length of experiment=smoke
+SETTINGS = [
+    "experiment=smoke",
+    "env.tote_size=[5,5,3]",
+    "curriculum=mixture",  # its sampler draws, so the generators matter
+    "curriculum.advance.occupancy=0.3",
+    "curriculum.advance.window=10",
+    f"total_frames={24 * ITERATION}",
+    f"checkpoint_interval={3 * ITERATION}",
+    f"evaluation_interval={10 * ITERATION}",
+    "evaluation.episodes=4",
+    "threads=1",
+]
+
+
+def start(*overrides):
+    """A training process of its own."""
+    command = [sys.executable, "-m", "pickplace.train", *overrides]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish(process):
+    """Wait for a process that must succeed; returns what it printed."""
+    out, err = process.communicate(timeout=240)
+    assert process.returncode == 0, err
+    return out
+
+
+def wait_for_rows(process, run_dir, count):
+    """Wait until ``metrics.csv`` has so many rows."""
+    path = run_dir / "metrics.csv"
+    for _ in range(120_000):
+        if path.is_file() and path.read_bytes().count(b"\n") > count:
+            return
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.001)
+    raise AssertionError("no metrics appeared")
+
+
+def outcome(run_dir):
+    """Everything that must be equal: tensors, counters, curriculum, metrics without timings."""
+    state, facts = checkpoint.read(run_dir / "checkpoints" / "last")
+    rows = [{k: v for k, v in row.items() if not k.startswith("time/")} for row in read_csv(run_dir / "metrics.csv")]
+    return checkpoint.flatten(state), {k: facts[k] for k in ("frames", "iteration", "best", "curriculum")}, rows
+
+
+def assert_same(run_a, run_b):
+    (tensors_a, rest_a), facts_a, rows_a = outcome(run_a)
+    (tensors_b, rest_b), facts_b, rows_b = outcome(run_b)
+    assert tensors_a.keys() == tensors_b.keys()
+    for key, value in tensors_a.items():
+        assert torch.equal(value, tensors_b[key]), key
+    assert rest_a == rest_b
+    assert facts_a == facts_b
+    assert rows_a == rows_b
+
+
+@pytest.fixture(scope="module", params=["single", "multi_sync"])
+def reference(request, tmp_path_factory):
+    """A run that nothing disturbed, and its settings."""
+    run_dir = tmp_path_factory.mktemp(request.param) / "reference"
+    settings = [*SETTINGS, f"collector={request.param}"]
+    finish(start(*settings, f"hydra.run.dir={run_dir}"))
+    return run_dir, settings
+
+
+def test_the_reference_really_trains(reference):
+    run_dir, _ = reference
+    rows = read_csv(run_dir / "metrics.csv")
+    assert [row["frames"] for row in rows] == [ITERATION * (i + 1) for i in range(24)]
+    assert rows[0]["curriculum/level"] < rows[-1]["curriculum/level"]
+    assert sum("eval/occupancy" in row for row in rows) == 3  # at 10, 20 and 24 iterations
+
+
+def test_killed_and_resumed_equals_uninterrupted(reference, tmp_path):
+    reference_dir, settings = reference
+    run_dir = tmp_path / "killed"
+    process = start(*settings, f"hydra.run.dir={run_dir}")
+    wait_for_rows(process, run_dir, 5)  # beyond the checkpoint of iteration 3
+    process.kill()
+    process.wait()
+    saved = json.loads((checkpoint.locate(run_dir, "last") / checkpoint.FACTS).read_text())["frames"]
+    assert ITERATION <= saved < 24 * ITERATION
+    finish(start(f"resume={run_dir}"))
+    assert_same(reference_dir, run_dir)
+
+
+def test_sigterm_saves_and_a_resume_goes_on_exactly(reference, tmp_path):
+    reference_dir, settings = reference
+    run_dir = tmp_path / "stopped"
+    process = start(*settings, f"hydra.run.dir={run_dir}")
+    wait_for_rows(process, run_dir, 4)
+    process.send_signal(signal.SIGTERM)
+    out = finish(process)
+    assert f"resume={run_dir}" in out
+    rows = read_csv(run_dir / "metrics.csv")
+    saved = json.loads((run_dir / "checkpoints/last" / checkpoint.FACTS).read_text())["frames"]
+    assert rows[-1]["frames"] == saved < 24 * ITERATION
+    finish(start(f"resume={run_dir}"))
+    assert_same(reference_dir, run_dir)
+
+
+def test_resume_with_a_longer_budget(reference):
+    run_dir, _ = reference
+    finish(start(f"resume={run_dir}", f"total_frames={26 * ITERATION}"))
+    rows = read_csv(run_dir / "metrics.csv")
+    assert [row["frames"] for row in rows] == [ITERATION * (i + 1) for i in range(26)]
