@@ -81,8 +81,7 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: dict[str, D
     for override in OverridesParser.create().parse_overrides(overrides):
         key = override.key_or_group
         if groups and key in groups:
-            with OmegaConf.flag_override(cfg, "struct", False):
-                cfg[key] = groups[key]
+            cfg[key] = groups[key]
         elif "/" in key or isinstance(OmegaConf.select(cfg, key), DictConfig):
             raise ValueError(
                 f"{override.input_line!r}: the checkpoint's config group {key!r} cannot be exchanged; expected overrides "

@@ -51,6 +51,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
     policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=algo.mask_infeasible).to(device)
     for warning in check_sizes(policy, rules):
         log.warning(warning)
+    planner = config.instantiate(cfg.planner, rules=rules, policy=policy)  # the one that validates
     critic = ValueOperator(config.instantiate(cfg.model.critic, rules=rules), ["bin_depth", "tote_depth"]).to(device)
     curriculum: Curriculum = config.instantiate(cfg.curriculum)
     curriculum.setup(probe.min_tote_height, rules.tote_size[2], cfg.total_frames)
@@ -150,7 +151,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
             # On intervals: validate, save, tell.
             finished = frames >= cfg.total_frames
             if finished or crossed(before, frames, cfg.evaluation_interval):
-                latest = validate(cfg, build_env, rules, policy)
+                latest = validate(cfg, build_env, planner)
                 metrics |= {f"eval/{key}": value for key, value in latest.items()}
                 log.info("%s frames: validation occupancy %.4f", f"{frames:,}", latest["occupancy"])
                 if latest["occupancy"] > best:
@@ -272,14 +273,13 @@ def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
     return metrics
 
 
-def validate(cfg: DictConfig, build_env, rules, policy) -> dict[str, float]:
-    """Play the validation stream at full height, by the config's planner."""
+def validate(cfg: DictConfig, build_env, planner) -> dict[str, float]:
+    """Play the validation stream at full height."""
     ev = cfg.evaluation
 
     def make_env(first, count):
         return build_env(num_envs=count, masks=(), stream=ev.stream, seed=ev.seed, first_episode=first)
 
-    planner = config.instantiate(cfg.planner, rules=rules, policy=policy)
     report = summarise(play(make_env, planner, ev.episodes, ev.batch_size))
     low, high = report["occupancy"]["ci95"]
     return {"occupancy": report["occupancy"]["mean"], "ci95_low": low, "ci95_high": high}
@@ -319,6 +319,10 @@ class StopRequest:
             signal.signal(number, handler)
 
 
+#: What the state of running episodes is tied to.
+FIXED = ("seed", "env.bin_size", "env.tote_size", "env.rotations", "env.num_envs", "collector.workers")
+
+
 def resume_run(overrides: list[str]) -> float:
     """Continue a run in its own folder: ``resume=<run folder>`` and overrides of values on top of its saved config."""
     place = next(item for item in overrides if item.startswith("resume=")).partition("=")[2]
@@ -329,7 +333,12 @@ def resume_run(overrides: list[str]) -> float:
     state, facts = checkpoint.read(folder)
     config.refuse_foreign_targets(facts["config"])
     rest = [item for item in overrides if not item.startswith("resume=")]
-    cfg = config.apply_overrides(OmegaConf.create(facts["config"]), rest)
+    saved = OmegaConf.create(facts["config"])
+    cfg = config.apply_overrides(saved, rest)
+    for key in FIXED:
+        was, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
+        if was != now:
+            raise ValueError(f"{key}={now}: the run began with {was}, and a resumed run cannot change it; start a new one.")
     log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
     return train(cfg, run_dir, (state, facts))
 

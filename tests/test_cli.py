@@ -1,0 +1,197 @@
+"""The commands: bad input ends in one sentence, a code other than 0, and leaves nothing behind."""
+
+import json
+import logging
+import os
+import subprocess
+import sys
+
+import pytest
+
+from pickplace import checkpoint, evaluate, train
+
+MAINS = {"train": train.main, "evaluate": evaluate.main}
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path, capsys):
+    """Run a command in this process, in an empty folder; returns exit code, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(command, *arguments):
+        monkeypatch.setattr(sys, "argv", [f"pickplace-{command}", *arguments])
+        code = 0
+        try:
+            MAINS[command]()
+        except SystemExit as exit:
+            code = exit.code or 0
+        finally:
+            logging.root.handlers.clear()  # the files of this run may be gone when the next one logs
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def smoke_run(tmp_path_factory):
+    """A small finished run."""
+    run_dir = tmp_path_factory.mktemp("smoke") / "run"
+    command = [sys.executable, "-m", "pickplace.train", "experiment=smoke", f"hydra.run.dir={run_dir}"]
+    subprocess.run(command, check=True, capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    return run_dir
+
+
+BAD = [
+    ("train", ["algo.gama=0.9"], ["algo.gama", "'gamma'"]),
+    ("train", ["nonsense=1"], ["nonsense", "there is no key"]),
+    ("train", ["curriculum=mien"], ["curriculum/mien", "adaptive"]),
+    ("train", ["experiment=quik"], ["experiment/quik", "quick"]),
+    ("train", ["env.tote_size=[6,6,-5]"], ["tote_size=[6, 6, -5]", "positive whole numbers"]),
+    ("train", ["env.tote_size=[6,6]"], ["tote_size=[6, 6]", "3 positive"]),
+    ("train", ["env.rotations=5"], ["rotations=5", "1, 2, 3 or 4"]),
+    ("train", ["env.pick_rule=contains"], ["pick_rule='contains'", "'overlap'"]),
+    ("train", ["env.bin_size=[1,1,1]"], ["item 2x1x1", "bin_size"]),
+    ("train", ["env.num_envs=0"], ["env.num_envs=0", ">= 1"]),
+    ("train", ["algo.lr=-1"], ["algo.lr=-1", ">= 0"]),
+    ("train", ["algo.gamma=1.5"], ["algo.gamma=1.5", "<= 1"]),
+    ("train", ["total_frames=many"], ["total_frames=many", "whole number"]),
+    ("train", ["items.kinds=[[9,9,1]]"], ["item 9x9x1", "bin_size"]),
+    ("train", ["items.kinds=[[1,1,9]]"], ["item 1x1x9", "tote_size[2]=5"]),
+    ("train", ["items.kinds=[]"], ["items.kinds=[]", "at least one"]),
+    ("train", ["items=recorded", "items.path=nowhere.csv"], ["items.path='nowhere.csv'", "no such file"]),
+    ("train", ["model.actor.receptive_field=4"], ["receptive_field=4", "odd"]),
+    ("train", ["model.actor.compute_dtype=float8"], ["float8", "bfloat16"]),
+    ("train", ["model=fcn4d", "env.tote_size=[4,4,1]"], ["tote_size=[4, 4, 1]", "eq. 3"]),
+    ("train", ["model=fcn4d", "items.kinds=[[4,1,1]]", "env.effector_size=[4,4]"], ["longest side is 4", "eq. 2"]),
+    ("train", ["curriculum.start_height=9"], ["start_height=9"]),
+    ("train", ["collector=multi_sync", "collector.workers=3"], ["collector.workers=3", "divisor"]),
+    ("train", ["planner.candidates=0"], ["candidates=0", "'all'"]),
+    ("train", ["resume=nowhere"], ["'nowhere'", "run folder"]),
+    ("train", ["resume=nowhere", "-m"], ["resume", "flags"]),
+    ("evaluate", [], ["checkpoint=null", "run folder"]),
+    ("evaluate", ["checkpoint=nowhere"], ["'nowhere'", "run folder"]),
+    ("evaluate", ["planner=greedy"], ["planner/greedy", "joint_dbl"]),
+    ("evaluate", ["planner=joint_dbl", "evaluation.episodes=0"], ["evaluation.episodes=0", ">= 1"]),
+    ("evaluate", ["planner=joint_dbl", "evaluation.stream=exam"], ["stream='exam'", "validation"]),
+]
+
+
+@pytest.mark.parametrize(("command", "arguments", "expected"), BAD)
+def test_bad_input_is_one_sentence(run, tmp_path, command, arguments, expected):
+    code, _, err = run(command, *arguments)
+    lines = [line for line in err.splitlines() if line.strip() and "Warning" not in line]
+    assert code not in (0, None)
+    assert len(lines) == 1 and lines[0].startswith("error: "), err
+    for part in expected:
+        assert part in lines[0]
+    leftovers = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert leftovers == []
+
+
+def test_csv_with_a_bad_row(run, tmp_path):
+    (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n1,x,1\n")
+    code, _, err = run("train", "items=recorded", "items.path=items.csv")
+    assert code == 2
+    assert "items.csv, line 3" in err and "'1,x,1'" in err
+
+
+def test_full_error_shows_the_traceback(run, monkeypatch):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(ValueError, match="rotations=5"):
+        run("train", "env.rotations=5")
+
+
+def test_checkpoint_for_fewer_rotations(run, smoke_run, tmp_path):
+    state, facts = checkpoint.read(smoke_run / "checkpoints" / "last")
+    facts["config"]["env"]["rotations"] = 2
+    del facts["schema"], facts["sha256"]
+    checkpoint.write(tmp_path / "two", state, facts)
+    code, _, err = run("evaluate", f"checkpoint={tmp_path / 'two'}", "env.rotations=4")
+    assert code == 2 and "env.rotations=4: the checkpoint was trained with 2" in err
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("env.rotations=1", "env.rotations=1: the run began with 4"),
+        ("env.tote_size=[5,5,1]", "the run began with [4, 4, 1]"),
+        ("env.num_envs=4", "env.num_envs=4: the run began with 8"),
+        ("model.actor.filters=16", "does not fit"),
+        ("curriculum=paper", "cannot be exchanged"),
+    ],
+)
+def test_incompatible_resume_is_refused_and_changes_nothing(run, smoke_run, override, message):
+    files = {path: path.read_bytes() for path in smoke_run.rglob("*") if path.is_file() and path.suffix != ".log"}
+    code, _, err = run("train", f"resume={smoke_run}", override, "total_frames=1024")
+    assert code == 2
+    assert message in err and err.count("\n") == 1
+    assert files == {path: path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize("damage", ["truncate", "flip", "remove", "facts", "schema", "target"])
+def test_damaged_checkpoints_are_refused(run, smoke_run, tmp_path, damage):
+    folder = tmp_path / "copy"
+    folder.mkdir()
+    for name in (checkpoint.TENSORS, checkpoint.FACTS):
+        (folder / name).write_bytes((smoke_run / "checkpoints" / "last" / name).read_bytes())
+    tensors, facts = folder / checkpoint.TENSORS, folder / checkpoint.FACTS
+    if damage == "truncate":
+        tensors.write_bytes(tensors.read_bytes()[:-10])
+    elif damage == "flip":
+        blob = bytearray(tensors.read_bytes())
+        blob[len(blob) // 2] ^= 1
+        tensors.write_bytes(blob)
+    elif damage == "remove":
+        tensors.unlink()
+    elif damage == "facts":
+        facts.write_text(facts.read_text()[:-20])
+    else:
+        content = json.loads(facts.read_text())
+        if damage == "schema":
+            content["schema"] = 99
+        else:
+            content["config"]["model"]["actor"]["_target_"] = "os.system"
+        facts.write_text(json.dumps(content))
+    code, _, err = run("evaluate", f"checkpoint={folder}")
+    assert code == 2 and err.startswith("error: ") and err.count("\n") == 1
+
+
+def test_evaluation_of_a_run(run, smoke_run, tmp_path):
+    arguments = [f"checkpoint={smoke_run}", "evaluation.episodes=6", "env.tote_size=[5,5,2]", "planner.candidates=10"]
+    code, out, err = run("evaluate", *arguments, "hydra.run.dir=result")
+    assert code == 0, err
+    assert "occupancy" in out
+    result = json.loads((tmp_path / "result" / "evaluation.json").read_text())
+    assert set(result) >= {
+        "planner", "env", "episodes", "seed", "occupancy", "items_placed", "failures", "feasible_action_share",
+        "latency_ms", "versions", "commit", "mask_in_training", "mask_at_decision", "candidates",
+    }  # fmt: skip
+    assert set(result["occupancy"]) == {"mean", "ci95", "min", "per_episode"}
+    assert len(result["occupancy"]["per_episode"]) == 6
+    assert result["env"]["tote_size"] == [5, 5, 2] and result["candidates"] == 10
+    assert result["mask_in_training"] is True and result["mask_at_decision"] is False
+    assert {path.name for path in (tmp_path / "result").iterdir()} >= {"tote.png", "evaluation.md"}
+
+
+def test_sweep_and_own_curriculum(run, tmp_path):
+    folder = tmp_path / "mine" / "curriculum"
+    folder.mkdir(parents=True)
+    (folder / "mine.yaml").write_text(
+        "defaults:\n  - advance: threshold\n  - sample: recent\n  - _self_\n"
+        "_target_: pickplace.curriculum.Curriculum\nstart_height: 1\nend_height: null\n"
+        "advance: {occupancy: 0.1, window: 5}\n"
+    )
+    settings = ["experiment=smoke", "curriculum=mine", "env.tote_size=[4,4,2]", "hydra.sweep.dir=sweep"]
+    code, _, err = run("train", "-m", "seed=0,1", *settings, "--config-dir", str(tmp_path / "mine"))
+    assert code == 0, err
+    for job in ("0", "1"):
+        assert (tmp_path / "sweep" / job / "checkpoints" / "last").is_dir()
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+def test_help_from_any_directory(command, tmp_path):
+    arguments = [sys.executable, "-m", f"pickplace.{command}", "--help"]
+    result = subprocess.run(arguments, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "env: deep_bin, paper" in result.stdout
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,156 @@
+"""Every config file composes and instantiates, every preset runs, and overrides on saved configs do what they say."""
+
+import hydra
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from pickplace import PickPlaceEnv, config
+from pickplace.curriculum import Curriculum
+from pickplace.items import ItemDistribution
+from pickplace.metrics import read_csv
+from pickplace.models.critics import Conv4dCritic, OutcomeCritic
+from pickplace.train import train
+
+CONF = config.conf_dir()
+TINY = [
+    "env.num_envs=4", "algo.rollout_length=4", "algo.minibatch_size=8", "algo.epochs=1", "total_frames=32",
+    "evaluation.episodes=2", "evaluation_interval=16", "checkpoint_interval=16", "progress_interval=16",
+    "env.tote_size=[6,6,2]", "model.actor.filters=8", "model.critic.filters=8", "model.critic.hidden=8", "threads=1",
+]  # fmt: skip
+
+
+def options(group):
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+def composed(*overrides, name="train"):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose(name, list(overrides))
+
+
+@pytest.mark.parametrize("name", options("env"))
+def test_every_env(name):
+    cfg = composed(f"env={name}")
+    env = config.instantiate(cfg.env, items=config.instantiate(cfg["items"]), num_envs=2)
+    assert isinstance(env, PickPlaceEnv)
+    assert env.reset()["action_mask"].any(1).all()
+
+
+@pytest.mark.parametrize("name", options("items"))
+def test_every_item_distribution(name, tmp_path):
+    table = tmp_path / "items.csv"
+    table.write_text("w,d,h\n1,1,1\n2,1,1\n")
+    cfg = composed(f"items={name}", *([f"items.path={table}"] if name == "recorded" else []))
+    assert isinstance(config.instantiate(cfg["items"]), ItemDistribution)
+
+
+@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize("name", options("model"))
+def test_every_model(name, masked):
+    cfg, rules = composed(f"model={name}"), PickPlaceEnv(num_envs=1).rules
+    policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=masked)
+    assert policy.mask_infeasible is masked
+    assert isinstance(config.instantiate(cfg.model.critic, rules=rules), Conv4dCritic | OutcomeCritic)
+
+
+@pytest.mark.parametrize("name", options("curriculum"))
+def test_every_curriculum(name):
+    assert isinstance(config.instantiate(composed(f"curriculum={name}").curriculum), Curriculum)
+
+
+@pytest.mark.parametrize("name", options("logger"))
+def test_every_logger(name, tmp_path):
+    logger = config.instantiate(composed(f"logger={name}").logger, folder=tmp_path, frames=0)
+    logger.log({"train/occupancy": 0.5}, 10)
+    logger.close()
+
+
+@pytest.mark.parametrize("name", options("planner"))
+def test_every_planner(name):
+    env = PickPlaceEnv(num_envs=3)
+    cfg, kwargs = composed(f"planner={name}", name="evaluate"), {}
+    if name == "policy":
+        model = composed().model.actor
+        kwargs["policy"] = config.instantiate(model, rules=env.rules, mask_infeasible=True)
+    observation = env.reset()
+    action = config.instantiate(cfg.planner, rules=env.rules, **kwargs).decide(observation)
+    assert observation["action_mask"].gather(1, action[:, None]).all()
+
+
+@pytest.mark.parametrize("group", ["algo", "collector", "evaluation"])
+def test_every_other_group(group):
+    for name in options(group):
+        cfg = composed(f"{group}={name}")
+        for target in [value for key, value in cfg[group].items() if key == "_target_"]:
+            assert callable(hydra.utils.get_object(target))
+
+
+@pytest.mark.parametrize("name", options("experiment"))
+def test_every_preset_runs(name, tmp_path):
+    extra = ["env.tote_size=[4,4,1]"] if name == "smoke" else []
+    occupancy = train(composed(f"experiment={name}", *TINY, *extra), tmp_path)
+    assert 0 <= occupancy <= 1
+    assert [row["frames"] for row in read_csv(tmp_path / "metrics.csv")] == [16, 32]
+    assert {path.name for path in tmp_path.iterdir()} == {"checkpoints", "learning_curve.png", "metrics.csv"}
+
+
+@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize("model", options("model"))
+def test_every_model_trains_with_and_without_a_mask(model, masked, tmp_path):
+    overrides = [f"model={model}", f"algo.mask_infeasible={masked}", "curriculum=none", *TINY, "env.rotations=3"]
+    assert 0 <= train(composed(*overrides), tmp_path) <= 1
+
+
+def test_presets_change_the_training_config():
+    assert composed("experiment=smoke").total_frames == 512
+    assert composed("experiment=quick", "total_frames=7").total_frames == 7
+    paper = composed("experiment=paper")
+    assert (paper.algo.lr, paper.algo.gamma, paper.algo.rollout_length, paper.env.num_envs) == (2.5e-4, 0.99, 32, 16)
+    assert (paper.algo.critic_coeff, paper.algo.entropy_coeff, paper.algo.mask_infeasible) == (0.005, 0.002, False)
+    assert paper.curriculum.advance.frames_per_level == 5_000_000
+
+
+def test_a_preset_combines_with_any_curriculum():
+    for name in options("curriculum"):
+        composed("experiment=quick", "env.tote_size=[6,6,10]", f"curriculum={name}", "algo.gamma=0.97", "seed=3")
+
+
+def test_overrides_on_a_saved_config():
+    saved = composed("experiment=smoke")
+    changed = config.apply_overrides(saved, ["algo.gamma=0.9", "total_frames=99", "env.tote_size=[7,7,2]"])
+    assert (changed.algo.gamma, changed.total_frames, changed.env.tote_size) == (0.9, 99, [7, 7, 2])
+    assert saved.algo.gamma == 0.99
+    other = composed("items=tall")["items"]
+    swapped = config.apply_overrides(saved, ["items=tall", "items.height=[1,2]"], {"items": other})
+    assert swapped["items"].height == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("algo.gama=0.9", "there is no key 'gama' in algo; did you mean 'gamma'?"),
+        ("curriculum=paper", "the checkpoint's config group 'curriculum' cannot be exchanged"),
+        ("curriculum/advance=frames", "cannot be exchanged"),
+        ("nothing.at.all=1", "there is no key 'nothing' in the config"),
+    ],
+)
+def test_refused_overrides_on_a_saved_config(override, message):
+    with pytest.raises(ValueError) as error:
+        config.apply_overrides(composed("experiment=smoke"), [override])
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "target",
+    ["os.system", "pickplace.checkpoint.shutil.rmtree", "pickplace.checkpoint.os.system", "builtins.eval", "pickplace"],
+)
+def test_foreign_targets_are_refused(target):
+    with pytest.raises(ValueError, match="expected a class or function defined in pickplace"):
+        config.refuse_foreign_targets({"model": [{"_target_": target}]})
+
+
+def test_our_own_configs_are_accepted():
+    for name in options("model"):
+        cfg = composed(f"model={name}", "curriculum=mixture", "items=mixed")
+        config.refuse_foreign_targets(OmegaConf.to_container(cfg, resolve=False))
