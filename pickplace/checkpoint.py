@@ -2,7 +2,7 @@
 
 A checkpoint is a folder with ``state.safetensors`` (every tensor, random generators included) and ``state.json``
 (config, counters, and the checksum of the tensors). It is data, not code: nothing in it is unpickled or imported.
-It is written beside its place and renamed into it, so that a reader finds the old one or the new one, never half of one.
+It is written beside its place and renamed into it: a reader finds the old one or the new one, never half of one.
 """
 
 import hashlib

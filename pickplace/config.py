@@ -84,8 +84,8 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: dict[str, D
             cfg[key] = groups[key]
         elif "/" in key or isinstance(OmegaConf.select(cfg, key), DictConfig):
             raise ValueError(
-                f"{override.input_line!r}: the checkpoint's config group {key!r} cannot be exchanged; expected overrides "
-                f"of its values, such as {key.replace('/', '.')}.<key>=<value>."
+                f"{override.input_line!r}: the checkpoint's config group {key!r} cannot be exchanged; expected "
+                f"overrides of its values, such as {key.replace('/', '.')}.<key>=<value>."
             )
         elif override.is_delete():
             raise ValueError(f"{override.input_line!r}: a key of the checkpoint's config cannot be deleted.")
@@ -154,7 +154,7 @@ def command(config_name: str, task) -> None:
         run_dir = Path(HydraConfig.get().runtime.output_dir)
         try:
             return task(cfg, run_dir)
-        except (ValueError, OSError, InstantiationException, OmegaConfBaseException) as error:
+        except (ValueError, OSError, FloatingPointError, InstantiationException, OmegaConfBaseException) as error:
             begun = run_dir.is_dir() and any(entry.is_dir() and entry.name != ".hydra" for entry in run_dir.iterdir())
             if not begun and (run_dir / ".hydra").is_dir():
                 logging.shutdown()

@@ -289,9 +289,7 @@ class Staged(Advance):
         self.stages, least = [], 0
         for stage in stages:
             if not isinstance(stage, Mapping) or set(stage) != {"frames", "height"}:
-                raise ValueError(
-                    f"curriculum.advance.stages: got {stage!r}, expected {{frames: F, height: H}}."
-                )
+                raise ValueError(f"curriculum.advance.stages: got {stage!r}, expected {{frames: F, height: H}}.")
             frames = _whole("curriculum.advance.stages: frames", stage["frames"], least)
             self.stages.append((frames, stage["height"]))
             least = frames + 1
@@ -324,9 +322,7 @@ class Curriculum:
         end_height: the last level, in cells; None is the tote's full height, ``tote_size[2]``.
     """
 
-    def __init__(
-        self, advance: Advance, sample, start_height: int | None = None, end_height: int | None = None
-    ):
+    def __init__(self, advance: Advance, sample, start_height: int | None = None, end_height: int | None = None):
         self.advance, self.sample = advance, sample
         self.start_height, self.end_height = start_height, end_height
 

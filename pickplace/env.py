@@ -81,6 +81,8 @@ class PickPlaceEnv(EnvBase):
         rules = Rules(bin_size, tote_size, effector_size, rotations, pick_rule, min_support, strict_support)
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise ValueError(f"num_envs={num_envs!r}: expected a whole number >= 1.")
+        if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
+            raise ValueError(f"seed={seed!r}: expected a whole number >= 0 and < 2**63.")
         if stream not in STREAMS:
             raise ValueError(f"stream={stream!r}: expected one of {', '.join(STREAMS)}.")
         if not set(masks) <= {"action", "outcome"}:
@@ -151,13 +153,14 @@ class PickPlaceEnv(EnvBase):
 
         TorchRL takes those rows from ``tensordict`` and fills in zeros where it has only ``_reset``.
         """
-        if tensordict is not None and "_reset" in tensordict.keys() and "bin_depth" not in tensordict.keys():
+        given = set() if tensordict is None else set(tensordict.keys())
+        if "_reset" in given and "bin_depth" not in given:
             running = self._observation()
             full = torch.full_like(running["tote_height"], self.rules.tote_size[2])
             running["tote_height"] = torch.where(tensordict["_reset"].reshape(-1, 1), full, running["tote_height"])
             for key, value in tensordict.items():
                 rows = tensordict["_reset"].reshape(-1, *[1] * (value.ndim - 1))
-                running[key] = torch.where(rows, value, running[key]) if key in running.keys() else value
+                running[key] = value if key == "_reset" else torch.where(rows, value, running[key])
             tensordict = running
         return super().reset(tensordict, **kwargs)
 
@@ -175,7 +178,10 @@ class PickPlaceEnv(EnvBase):
             height = tensordict.get("tote_height", None)
         if height is None:
             height = torch.full_like(self.tote_height, self.rules.tote_size[2])
-        height = height.reshape(self.num_envs).to(torch.int64)
+        height = height.reshape(self.num_envs)
+        if height.is_floating_point() and bool((height % 1 != 0).any()):
+            raise ValueError(f"tote_height={height[height % 1 != 0][0].item()}: expected whole cells.")
+        height = height.to(torch.int64)
         low, high = self.min_tote_height, self.rules.tote_size[2]
         if bool((rows & ((height < low) | (height > high))).any()):
             bad = height[rows & ((height < low) | (height > high))][0].item()

@@ -6,7 +6,7 @@ import platform
 import subprocess
 import time
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -16,7 +16,6 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from pickplace import checkpoint, config
-from pickplace.env import PickPlaceEnv
 from pickplace.geometry import Failure
 from pickplace.report import evaluation_table, tote_picture
 
@@ -183,8 +182,12 @@ def commit() -> str | None:
     root = config.PACKAGE.parent
     if not (root / ".git").exists():
         return None
+
+    def run(*arguments):
+        command = ["git", "-C", str(root), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
     try:
-        run = lambda *args: subprocess.run(["git", "-C", root, *args], capture_output=True, text=True, check=True).stdout
         return run("rev-parse", "HEAD").strip() + ("+" if run("status", "--porcelain", "-uno").strip() else "")
     except (OSError, subprocess.CalledProcessError):
         return None
@@ -237,7 +240,9 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
             raise ValueError("checkpoint=null: planner=policy needs a checkpoint; expected a run folder.")
         most = saved["config"]["env"]["rotations"]
         if rules.rotations > most:
-            raise ValueError(f"env.rotations={rules.rotations}: the checkpoint was trained with {most}; expected no more.")
+            raise ValueError(
+                f"env.rotations={rules.rotations}: the checkpoint was trained with {most}; expected no more."
+            )
         policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=cfg.algo.mask_infeasible)
         checkpoint.load_module(policy, policy_state, "policy")
         kwargs["policy"] = policy.to(cfg.device).eval()

@@ -94,7 +94,7 @@ class Rules:
         tote_size: ``(W_T, D_T, H_T)``; an episode's tote height may be lower than ``H_T``.
         effector_size: ``(W_E, D_E)`` of the flat suction rectangle.
         rotations: ``R``, the number of quarter turns to choose from, 1 to 4.
-        pick_rule: ``"contain"`` (the EE covers the item's whole footprint) or ``"overlap"`` (one shared cell is enough).
+        pick_rule: ``"contain"`` (the EE covers the whole footprint) or ``"overlap"`` (one shared cell is enough).
         min_support: least share of the footprint that must rest on the highest cells below it.
         strict_support: require more than ``min_support`` instead of at least.
         longest_side: longest side of any item, where it is known; saves time only.

@@ -35,6 +35,10 @@ def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, cou
     return ((key >> 11) & ((1 << 53) - 1)).double() / float(1 << 53)
 
 
+def _is_whole(value) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and value % 1 == 0
+
+
 class ItemDistribution:
     """What an item distribution offers to the environment.
 
@@ -80,19 +84,20 @@ class Kinds(ItemDistribution):
     """
 
     def __init__(self, kinds, weights=None):
-        kinds = [tuple(kind) for kind in kinds]
+        if not isinstance(kinds, (list, tuple)) or not kinds:
+            raise ValueError(f"items.kinds={kinds!r}: expected a list of at least one (w, d, h).")
         for kind in kinds:
-            if len(kind) != 3 or any(int(v) != v or v < 1 for v in kind):
+            if not isinstance(kind, (list, tuple)) or len(kind) != 3 or not all(_is_whole(v) and v >= 1 for v in kind):
                 raise ValueError(f"items.kinds: got {kind!r}, expected (w, d, h) in positive whole cells.")
-        if not kinds:
-            raise ValueError("items.kinds=[]: expected at least one (w, d, h).")
-        weights = [1.0] * len(kinds) if weights is None else [float(v) for v in weights]
-        if len(weights) != len(kinds):
-            raise ValueError(f"items.weights: got {len(weights)} numbers, expected {len(kinds)}, one for each kind.")
-        if not all(0 <= v < float("inf") for v in weights) or sum(weights) <= 0:
+        if weights is None:
+            weights = [1.0] * len(kinds)
+        if not isinstance(weights, (list, tuple)) or len(weights) != len(kinds):
+            raise ValueError(f"items.weights={weights!r}: expected {len(kinds)} numbers, one for each kind.")
+        numbers = all(isinstance(v, (int, float)) and 0 <= v < float("inf") for v in weights)
+        if not numbers or sum(weights) <= 0:
             raise ValueError(f"items.weights={weights!r}: expected finite numbers >= 0 that are not all 0.")
         used = [i for i, v in enumerate(weights) if v > 0]
-        self.sizes = torch.tensor([kinds[i] for i in used], dtype=torch.int64)
+        self.sizes = torch.tensor([list(kinds[i]) for i in used], dtype=torch.int64)
         share = torch.tensor([weights[i] for i in used], dtype=torch.float64)
         self._edges = (share.cumsum(0) / share.sum())[:-1]
 
@@ -109,9 +114,10 @@ class Uniform(Kinds):
 
     def __init__(self, width=(1, 3), depth=(1, 3), height=(1, 3)):
         ranges = {"width": width, "depth": depth, "height": height}
-        for name, (low, high) in ranges.items():
-            if int(low) != low or int(high) != high or not 1 <= low <= high:
-                raise ValueError(f"items.{name}={[low, high]!r}: expected [least, greatest] with 1 <= least <= greatest.")
+        for name, limits in ranges.items():
+            pair = isinstance(limits, (list, tuple)) and len(limits) == 2 and all(map(_is_whole, limits))
+            if not pair or not 1 <= limits[0] <= limits[1]:
+                raise ValueError(f"items.{name}={limits!r}: expected [least, greatest] with 1 <= least <= greatest.")
         super().__init__(list(product(*(range(low, high + 1) for low, high in ranges.values()))))
 
 

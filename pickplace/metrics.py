@@ -1,4 +1,4 @@
-"""Where metrics go (config group ``logger``). Names are ``train/...``, ``eval/...``, ``curriculum/...``, ``time/...``."""
+"""Where metrics go (config group ``logger``). Names: ``train/...``, ``eval/...``, ``curriculum/...``, ``time/...``."""
 
 import csv
 from pathlib import Path
@@ -62,7 +62,9 @@ class TensorboardLogger:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError as error:
-            raise ValueError("logger=tensorboard: tensorboard is missing; pip install 'pickplace[tensorboard]'.") from error
+            raise ValueError(
+                "logger=tensorboard: tensorboard is missing; pip install 'pickplace[tensorboard]'."
+            ) from error
         # Events after the checkpoint that a run is resumed from are hidden by TensorBoard itself.
         self._writer = SummaryWriter(str(folder), purge_step=frames or None)
 

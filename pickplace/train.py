@@ -35,7 +35,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
         resume: state and facts of the checkpoint to continue from, as :func:`pickplace.checkpoint.read` gives them.
 
     Returns:
-        Mean occupancy of the final policy at full tote height on the validation stream, so that sweepers can optimise it.
+        Mean occupancy of the final policy at full tote height on the validation stream, for sweepers to optimise.
     """
     algo, device = cfg.algo, torch.device(cfg.device)
     check_settings(cfg)
@@ -240,7 +240,9 @@ def update(loss: ClipPPOLoss, optimizer, data: TensorDictBase, algo: DictConfig)
             total.backward()
             norm = torch.nn.utils.clip_grad_norm_(loss.parameters(), algo.max_grad_norm)
             if not torch.isfinite(norm):
-                raise FloatingPointError(f"the gradient is not finite (loss {total.item()}); the last checkpoint is good.")
+                raise FloatingPointError(
+                    f"the gradient is not finite (loss {total.item()}); the last checkpoint is good."
+                )
             optimizer.step()
             steps += 1
             for name, key in DIAGNOSTICS.items():
@@ -295,8 +297,9 @@ def progress_line(frames: int, total: int, speed: float, curriculum: Curriculum,
     left = int((total - frames) / speed)
     occupancy = metrics.get("train/occupancy", float("nan"))
     return (
-        f"{frames / total:4.0%} {frames:>11,} frames | {speed:6,.0f}/s | tote height {curriculum.level}/{curriculum.end} | "
-        f"occupancy {occupancy:.3f} | {left // 60}:{left % 60:02d} to go"
+        f"{frames / total:4.0%} {frames:>11,} frames | {speed:6,.0f}/s | "
+        f"tote height {curriculum.level}/{curriculum.end} | occupancy {occupancy:.3f} | "
+        f"{left // 60}:{left % 60:02d} to go"
     )
 
 
@@ -338,7 +341,9 @@ def resume_run(overrides: list[str]) -> float:
     for key in FIXED:
         was, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
         if was != now:
-            raise ValueError(f"{key}={now}: the run began with {was}, and a resumed run cannot change it; start a new one.")
+            raise ValueError(
+                f"{key}={now}: the run began with {was}, and a resumed run cannot change it; start a new one."
+            )
     log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
     return train(cfg, run_dir, (state, facts))
 

@@ -91,9 +91,7 @@ def test_specs_hold(kwargs):
 
 
 def test_shapes_and_dtypes():
-    env = make_env(
-        [(1, 2, 1)], bin_size=(3, 4, 1), tote_size=(5, 6, 7), effector_size=(1, 2), rotations=2, num_envs=3
-    )
+    env = make_env([(1, 2, 1)], bin_size=(3, 4, 1), tote_size=(5, 6, 7), effector_size=(1, 2), rotations=2, num_envs=3)
     assert env.batch_size == torch.Size([3])
     td = env.rand_step(env.reset())
     expected = {
@@ -356,9 +354,7 @@ def test_the_rotation_table_is_a_group(effector, offset, size):
     assert turned == (effector, offset, size)
 
 
-@pytest.mark.parametrize(
-    ("width", "length", "shift"), [(2, 4, 1), (3, 6, 1), (3, 6, 2), (5, 9, 2), (7, 9, 2)]
-)
+@pytest.mark.parametrize(("width", "length", "shift"), [(2, 4, 1), (3, 6, 1), (3, 6, 2), (5, 9, 2), (7, 9, 2)])
 def test_support_is_compared_exactly_in_float64(width, length, shift):
     share = (width - shift) / width
     up, down = torch.tensor(share, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)

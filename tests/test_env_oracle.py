@@ -25,10 +25,7 @@ def draw_config(rng: Random):
     limit = [min(3, bin_side) for bin_side in bin_sides]
     if pick_rule == "contain" and rng.random() < 0.95:
         limit = [min(side, effector_side) for side, effector_side in zip(limit, effector, strict=True)]
-    kinds = {
-        (rng.randint(1, limit[0]), rng.randint(1, limit[1]), rng.randint(1, 3))
-        for _ in range(rng.randint(1, 5))
-    }
+    kinds = {(rng.randint(1, limit[0]), rng.randint(1, limit[1]), rng.randint(1, 3)) for _ in range(rng.randint(1, 5))}
     greatest = max(h for _, _, h in kinds)
     rules = Rules(
         bin_size=(*bin_sides, rng.randint(1, 3)),

@@ -38,7 +38,13 @@ def test_reference_figures(planner, tote, rotations, items, mean, error):
     def make(first, count):
         kinds = None if items == "paper" else Uniform((1, 3), (1, 3), (1, 3))
         return PickPlaceEnv(
-            tote_size=tote, rotations=rotations, items=kinds, num_envs=count, masks=(), stream="test", first_episode=first
+            tote_size=tote,
+            rotations=rotations,
+            items=kinds,
+            num_envs=count,
+            masks=(),
+            stream="test",
+            first_episode=first,
         )
 
     occupancy = play(make, PLANNERS[planner](make(0, 1).rules), 200, 200).occupancy
@@ -75,7 +81,8 @@ def test_joint_dbl_is_the_least_top_y_x_over_all_actions(settings):
             item = type(env.current_item)(*(part[rows] for part in env.current_item))
             step = rules.apply(env.heights[rows], env.tote_height[rows], item, actions)
             assert not step.failure.any()
-            keys = zip(step.top.tolist(), step.footprint[:, 1].tolist(), step.footprint[:, 0].tolist(), actions.tolist())
+            columns = (step.top, step.footprint[:, 1], step.footprint[:, 0], actions)
+            keys = torch.stack(columns, 1).tolist()
             assert int(chosen[n]) == min(keys)[3]
 
 

@@ -13,8 +13,12 @@ choice. Every policy offers
 """
 
 import torch
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
 from torch import Tensor, nn
 from torch.distributions import Categorical
 from torchrl.envs.utils import ExplorationType, exploration_type
@@ -202,7 +206,7 @@ def fcn_grasp(rules: Rules, mask_infeasible: bool, **network) -> nn.Module:
 
 
 def as_actor(policy: nn.Module) -> ProbabilisticTensorDictSequential:
-    """The policy as TorchRL's PPO loss wants it: observation -> ``logits`` -> a sampled choice and its log-probability."""
+    """The policy as TorchRL's PPO loss wants it: observation -> ``logits`` -> a choice and its log-probability."""
     return ProbabilisticTensorDictSequential(
         TensorDictModule(policy, in_keys=policy.in_keys, out_keys=["logits"]),
         ProbabilisticTensorDictModule(
@@ -239,7 +243,9 @@ def check_sizes(policy: nn.Module, rules: Rules) -> list[str]:
     field, side = policy.network.receptive_field, rules.longest_side or rules.max_side
     broken = []
     if side > field / 2 + 1:
-        broken.append(f"items: the longest side is {side}, expected at most {field / 2 + 1:g} (receptive field {field}, eq. 2).")
+        broken.append(
+            f"items: the longest side is {side}, expected at most {field / 2 + 1:g} (receptive field {field}, eq. 2)."
+        )
     for key, size in (("bin_size", rules.bin_size), ("tote_size", rules.tote_size)):
         if min(size[:2]) < field:
             broken.append(

@@ -137,9 +137,7 @@ class Conv4dPolicy(nn.Module):
         rows = bins.shape[1] - 4
         states_at_once, rows_at_once = self._chunk_sizes(bins, totes)
         out = [
-            torch.cat(
-                [layers(b[:, row : row + rows_at_once + 4], t) for row in range(0, rows, rows_at_once)], dim=1
-            )
+            torch.cat([layers(b[:, row : row + rows_at_once + 4], t) for row in range(0, rows, rows_at_once)], dim=1)
             for b, t in zip(bins.split(states_at_once), totes.split(states_at_once), strict=True)
         ]
         out = torch.cat(out)

@@ -1,4 +1,4 @@
-"""The 2D fully convolutional network behind ``fcn_grasp``: what the tote looks like around each cell, given the item."""
+"""The 2D fully convolutional network behind ``fcn_grasp``: the tote around each cell, given the item."""
 
 import torch
 import torch.nn.functional as F
@@ -20,8 +20,8 @@ class ItemConditionedFcn(nn.Module):
         filters: width of the 3x3 layers.
         receptive_field: side of the square that an output cell sees, odd, at least 3; (side - 1) / 2 layers of 3x3.
         hidden: width of the 1x1 layer before the output.
-        tote_clip: ``H_1_max`` of eq. 4, in whole cells; None does not clip (then depth is limited by ``depth_range``).
-        depth_range: number of one-hot planes: clipped depths from ``tote_clip`` downwards; lower ones count as the last.
+        tote_clip: ``H_1_max`` of eq. 4, in whole cells.
+        depth_range: number of one-hot planes: clipped depths from ``tote_clip`` down; lower ones count as the last.
         item_range: sides and heights from this one on look alike.
         head_std: standard deviation of the last layer's initial weights.
         compute_dtype: ``"float32"`` or ``"bfloat16"`` (autocast of the convolutions).

@@ -1,8 +1,8 @@
 """Planners: everything that decides where to pick, where to place and how to turn, behind one interface.
 
 A planner is made as ``Planner(rules, ...)`` and called as ``decide(observation) -> actions``: ``observation`` is a
-TensorDict of ``batch_size=[N]`` with ``bin_depth``, ``tote_depth`` and ``tote_height`` as the environment emits them, and
-``actions`` is int64 ``[N]``, flat indices.
+TensorDict of ``batch_size=[N]`` with ``bin_depth``, ``tote_depth`` and ``tote_height`` as the environment emits them,
+and ``actions`` is int64 ``[N]``, flat indices.
 """
 
 from pickplace.planners.heuristics import JointDBL, RandomFeasible

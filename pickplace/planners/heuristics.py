@@ -66,6 +66,4 @@ class JointDBL:
 
 
 def _placements(rules: Rules, observation: TensorDictBase):
-    return rules.placements_from_depth(
-        observation["bin_depth"], observation["tote_depth"], observation["tote_height"]
-    )
+    return rules.placements_from_depth(observation["bin_depth"], observation["tote_depth"], observation["tote_height"])

@@ -1,0 +1,103 @@
+"""Checkpoints: what goes in comes out, and a reader never meets half of one."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pickplace import checkpoint
+from pickplace.checkpoint import CheckpointError
+from pickplace.metrics import CsvLogger, read_csv
+
+leaves = st.one_of(
+    st.integers(-(2**40), 2**40),
+    st.floats(allow_nan=False),
+    st.booleans(),
+    st.none(),
+    st.lists(st.floats(-10, 10, width=32), max_size=4).map(lambda x: torch.tensor(x)),
+    st.integers(-9, 9).map(torch.tensor),
+)
+keys = st.one_of(st.integers(0, 99), st.text("abc.xyz", min_size=1, max_size=5))
+trees = st.dictionaries(
+    keys, st.recursive(leaves, lambda c: st.dictionaries(keys, c, min_size=1, max_size=3)), max_size=4
+)
+
+
+def same(a, b):
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, torch.Tensor):
+        return a.dtype == b.dtype and torch.equal(a, b)
+    return type(a) is type(b) and a == b
+
+
+@settings(max_examples=60, deadline=None)
+@given(tree=trees)
+def test_round_trip(tree, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("round") / "last"
+    checkpoint.write(folder, tree, {"frames": 3})
+    state, facts = checkpoint.read(folder)
+    assert same(tree, state)
+    assert facts["frames"] == 3
+
+
+def test_a_kill_between_the_renames_loses_nothing(tmp_path):
+    run = tmp_path / "run"
+    folder = run / "checkpoints" / "last"
+    checkpoint.write(folder, {"x": torch.ones(2)}, {"frames": 1})
+    folder.rename(folder.with_name(".last.old"))  # killed right after this
+    found = checkpoint.locate(run, prefer="last")
+    assert checkpoint.read(found)[1]["frames"] == 1
+    checkpoint.write(folder, {"x": torch.zeros(2)}, {"frames": 2})
+    assert checkpoint.read(checkpoint.locate(run, prefer="last"))[1]["frames"] == 2
+    assert [path.name for path in folder.parent.iterdir()] == ["last"]
+
+
+def test_a_kill_while_writing_leaves_the_old_one(tmp_path, monkeypatch):
+    folder = tmp_path / "last"
+    checkpoint.write(folder, {"x": torch.ones(2)}, {"frames": 1})
+
+    def full(*_):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(checkpoint.os, "fsync", full)
+    with pytest.raises(OSError):
+        checkpoint.write(folder, {"x": torch.zeros(2)}, {"frames": 2})
+    monkeypatch.undo()
+    assert checkpoint.read(folder)[1]["frames"] == 1
+    checkpoint.write(folder, {"x": torch.zeros(2)}, {"frames": 3})
+    assert [path.name for path in tmp_path.iterdir()] == ["last"]
+
+
+def test_locate_knows_runs_and_checkpoints(tmp_path):
+    checkpoint.write(tmp_path / "checkpoints" / "best", {}, {})
+    checkpoint.write(tmp_path / "checkpoints" / "last", {}, {})
+    assert checkpoint.locate(tmp_path).name == "best"
+    assert checkpoint.locate(tmp_path, prefer="last").name == "last"
+    assert checkpoint.locate(tmp_path / "checkpoints" / "last").name == "last"
+    with pytest.raises(CheckpointError, match="no checkpoint there"):
+        checkpoint.locate(tmp_path / "elsewhere")
+
+
+def test_load_module_names_what_does_not_fit():
+    module = torch.nn.Linear(2, 3)
+    with pytest.raises(CheckpointError, match=r"policy does not fit these settings: weight has shape \(4, 2\)"):
+        checkpoint.load_module(module, torch.nn.Linear(2, 4).state_dict() | {"bias": torch.zeros(3)}, "policy")
+    with pytest.raises(CheckpointError, match="bias has shape None"):
+        checkpoint.load_module(module, {"weight": torch.zeros(3, 2)}, "policy")
+
+
+def test_metrics_survive_a_cut_line_and_a_resume(tmp_path):
+    logger = CsvLogger(tmp_path)
+    logger.log({"a": 1.0}, 10)
+    logger.log({"a": 2.0, "b": 5.0}, 20)
+    logger.log({"a": 3.0}, 30)
+    logger.close()
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write("40,4.")
+    assert [row["frames"] for row in read_csv(tmp_path / "metrics.csv")] == [10, 20, 30]
+    logger = CsvLogger(tmp_path, frames=20)
+    logger.log({"a": 7.0}, 30)
+    logger.close()
+    rows = read_csv(tmp_path / "metrics.csv")
+    assert rows == [{"frames": 10, "a": 1.0}, {"frames": 20, "a": 2.0, "b": 5.0}, {"frames": 30, "a": 7.0}]
