@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from pickplace import PickPlaceEnv
 from pickplace.evaluate import play
 from pickplace.items import Uniform
-from pickplace.models.actors import GraspPolicy, OutcomePolicy, as_actor, as_collection_policy
+from pickplace.models.actors import FlatPolicy, GraspPolicy, OutcomePolicy, as_actor, as_collection_policy
 from pickplace.planners import JointDBL, PolicyPlanner, RandomFeasible
 
 # planner, tote, R, items, occupancy and its standard error, from an independent prototype of the rules; where no
@@ -204,3 +204,24 @@ def test_log_prob_of_the_choice_is_what_the_loss_sees(policy_type):
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         again = as_collection_policy(policy)(TensorDict(dict(out.items()), batch_size=[64]))
     assert torch.equal(again[policy.choice_key], as_actor(policy).get_dist(out).logits.argmax(1))
+
+
+@pytest.mark.parametrize("policy_type", [OutcomePolicy, GraspPolicy, FlatPolicy])
+def test_weights_serve_fewer_rotations_and_other_totes(policy_type):
+    """The logits of the actions that remain are those of the policy trained with all four rotations."""
+    torch.manual_seed(0)
+    sizes = {"filters": 8, "head_std": 1.0, "compute_dtype": "float32"}
+    sizes |= {} if policy_type is FlatPolicy else {"hidden": 8}
+    env = PickPlaceEnv(num_envs=2)
+    observation = env.reset()
+    policy = policy_type(env.rules, **sizes)
+    for rotations, tote in ((1, (6, 6, 5)), (3, (6, 6, 5)), (2, (7, 9, 4))):
+        rules = PickPlaceEnv(rotations=rotations, tote_size=tote, num_envs=1).rules
+        fewer = policy_type(rules, **sizes)
+        fewer.load_state_dict(policy.state_dict())
+        depth = torch.full((2, *tote[:2]), float(tote[2]))
+        assert fewer.action_log_probs(observation["bin_depth"], depth).shape == (2, rules.num_actions)
+        if tote == (6, 6, 5) and policy_type is FlatPolicy:
+            every = policy.action_log_probs(observation["bin_depth"], depth).unflatten(1, (-1, 4))[..., :rotations]
+            few = fewer.action_log_probs(observation["bin_depth"], depth)
+            torch.testing.assert_close(few, every.flatten(1).log_softmax(1), rtol=1e-4, atol=1e-4)

@@ -66,10 +66,10 @@ class FlatPolicy(nn.Module):
         self.rules, self.mask_infeasible = rules, mask_infeasible
         self.masks = ("action",) if mask_infeasible else ()
         self.in_keys = ["bin_depth", "tote_depth"] + ["action_mask"] * mask_infeasible
-        self.network = Conv4dPolicy(rules.rotations, **network)
+        self.network = Conv4dPolicy(4, **network)  # of which the first R count: the weights serve fewer rotations too
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        logits = self.network(bin_depth, tote_depth)
+        logits = self.network(bin_depth, tote_depth).unflatten(1, (-1, 4))[..., : self.rules.rotations].flatten(1)
         return logits if action_mask is None else torch.where(action_mask, logits, MASKED)
 
     def to_action(self, choice: Tensor, *_) -> Tensor:
@@ -98,10 +98,13 @@ class OutcomePolicy(nn.Module):
     def __init__(self, rules: Rules, **network):
         super().__init__()
         self.rules = rules
-        self.network = ItemConditionedFcn(rules.parities, **network)
+        self.network = ItemConditionedFcn(2, **network)  # parities; without rotations only the first counts
+
+    def _logits(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
+        return self.network(bin_depth, tote_depth)[:, : self.rules.parities].flatten(1)
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor, outcome_mask: Tensor) -> Tensor:
-        return torch.where(outcome_mask, self.network(bin_depth, tote_depth).flatten(1), MASKED)
+        return torch.where(outcome_mask, self._logits(bin_depth, tote_depth), MASKED)
 
     def to_action(self, choice: Tensor, bin_depth: Tensor, tote_depth: Tensor, tote_height: Tensor) -> Tensor:
         placements = self.rules.placements_from_depth(bin_depth, tote_depth, tote_height)
@@ -113,7 +116,7 @@ class OutcomePolicy(nn.Module):
         outcome = self.rules.action_outcomes(item)  # [N, N_a], -1 where nothing reaches the tote
         ways = outcome.new_zeros(len(outcome), self.rules.num_outcomes + 1)
         ways.scatter_add_(1, outcome + 1, torch.ones_like(outcome))
-        logits = self.network(bin_depth, tote_depth).flatten(1)
+        logits = self._logits(bin_depth, tote_depth)
         logits = torch.where(ways[:, 1:] > 0, logits, MASKED)
         share = logits.log_softmax(-1) - ways[:, 1:].clamp(min=1).log()
         return torch.where(outcome >= 0, share.gather(1, outcome.clamp(min=0)), MASKED)
@@ -138,12 +141,13 @@ class GraspPolicy(nn.Module):
     def __init__(self, rules: Rules, **network):
         super().__init__()
         self.rules = rules
-        self.network = ItemConditionedFcn(rules.parities * rules.num_offsets**2, **network)
+        self.classes = rules.parities * rules.num_offsets**2
+        self.network = ItemConditionedFcn(2 * rules.num_offsets**2, **network)
         self.miss = nn.Parameter(torch.zeros(()))
 
     def _choices(self, bin_depth: Tensor, tote_depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Logit per flat action of each choice, the choice's number of flat actions, and each pick's grasp class."""
-        maps = self.network(bin_depth, tote_depth).flatten(2)  # [N, Q*O*O, W_T*D_T]
+        maps = self.network(bin_depth, tote_depth)[:, : self.classes].flatten(2)  # [N, Q*O*O, W_T*D_T]
         logits = torch.cat([maps.flatten(1), self.miss.expand(len(maps), 1)], 1)
         picks = self._pick_classes(bin_depth)
         missing = (picks < 0).sum((1, 2)) * self.rules.num_places
@@ -164,7 +168,7 @@ class GraspPolicy(nn.Module):
 
     def to_action(self, choice: Tensor, bin_depth: Tensor, *_) -> Tensor:
         rules, places = self.rules, self.rules.num_places
-        missed = choice == rules.parities * rules.num_offsets**2 * places
+        missed = choice == self.classes * places
         wanted = torch.where(missed, -1, choice // places)
         pairs = self._pick_classes(bin_depth).flatten(1) == wanted[:, None]  # [N, P*R]
         pair = pick_one(torch.where(pairs, torch.arange(pairs.shape[1], device=choice.device), -1))
