@@ -90,7 +90,7 @@ def locate(path, prefer: str = "best") -> Path:
     Raises:
         CheckpointError: if there is none.
     """
-    path = Path(path)
+    path = Path(path).absolute()
     for folder in (path / "checkpoints" / prefer, path):
         for candidate in (folder, folder.with_name(f".{folder.name}.old")):
             if (candidate / FACTS).is_file():

@@ -79,7 +79,7 @@ def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, 
 
     Args: as :func:`single`, and ``workers``, the number of processes; it must divide ``num_envs``.
     """
-    if workers < 1 or num_envs % workers:
+    if not isinstance(workers, int) or workers < 1 or num_envs % workers:
         raise ValueError(f"collector.workers={workers}: expected a divisor of env.num_envs={num_envs}.")
     share = num_envs // workers
     collector = MultiSyncCollector(

@@ -9,6 +9,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 import hydra
+import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, InstantiationException
@@ -34,7 +35,28 @@ def instantiate(node: DictConfig, **kwargs):
     except TypeError as error:
         raise ValueError(f"{node.get('_target_')}: {error}.") from error
     except InstantiationException as error:
-        raise error.__cause__ or error from None
+        cause = error.__cause__ or error
+        if isinstance(cause, (TypeError, ImportError)):
+            raise ValueError(f"{error.args[0] if error.args else ''} {cause}".strip()) from error
+        raise cause from None
+
+
+def use_machine(cfg: DictConfig) -> torch.device:
+    """Set the number of threads, and return the device, of a config.
+
+    Raises:
+        ValueError: for a device that this machine lacks, or a bad number of threads.
+    """
+    if cfg.threads is not None:
+        if not isinstance(cfg.threads, int) or isinstance(cfg.threads, bool) or cfg.threads < 1:
+            raise ValueError(f"threads={cfg.threads}: expected a whole number >= 1, or null.")
+        torch.set_num_threads(cfg.threads)
+    try:
+        device = torch.device(cfg.device)
+        torch.empty(0, device=device)
+    except (RuntimeError, TypeError, AssertionError) as error:
+        raise ValueError(f"device={cfg.device}: expected cpu, or cuda on a machine that has it.") from error
+    return device
 
 
 def refuse_foreign_targets(node, path: str = "config") -> None:
@@ -139,7 +161,7 @@ def _check_composition(config_name: str) -> None:
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
         try:
             hydra.compose(config_name, overrides)
-        except (HydraException, OmegaConfBaseException) as error:
+        except (HydraException, OmegaConfBaseException, ValueError) as error:
             fail(error, hydra.compose(config_name))
 
 
@@ -154,7 +176,7 @@ def command(config_name: str, task) -> None:
         run_dir = Path(HydraConfig.get().runtime.output_dir)
         try:
             return task(cfg, run_dir)
-        except (ValueError, OSError, FloatingPointError, InstantiationException, OmegaConfBaseException) as error:
+        except Exception as error:  # HYDRA_FULL_ERROR=1 shows where it came from
             begun = run_dir.is_dir() and any(entry.is_dir() and entry.name != ".hydra" for entry in run_dir.iterdir())
             if not begun and (run_dir / ".hydra").is_dir():
                 logging.shutdown()

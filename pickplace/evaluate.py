@@ -205,8 +205,7 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
         value = OmegaConf.select(cfg, key)
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise ValueError(f"{key}={value}: expected a whole number >= 1.")
-    if cfg.threads:
-        torch.set_num_threads(cfg.threads)
+    config.use_machine(cfg)
     facts, policy_state = {"checkpoint": None}, None
     if cfg.checkpoint is not None:
         folder = checkpoint.locate(cfg.checkpoint)

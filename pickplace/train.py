@@ -37,10 +37,8 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
     Returns:
         Mean occupancy of the final policy at full tote height on the validation stream, for sweepers to optimise.
     """
-    algo, device = cfg.algo, torch.device(cfg.device)
     check_settings(cfg)
-    if cfg.threads:
-        torch.set_num_threads(cfg.threads)
+    algo, device = cfg.algo, config.use_machine(cfg)
     torch.manual_seed(cfg.seed)
 
     # What is trained, and where it acts.
@@ -195,6 +193,15 @@ def check_settings(cfg: DictConfig) -> None:
         value = OmegaConf.select(cfg, key)
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
             raise ValueError(f"{key}={value}: expected a whole number >= {least}.")
+    for key in ("algo.mask_infeasible", "algo.normalize_advantage"):
+        if not isinstance(value := OmegaConf.select(cfg, key), bool):
+            raise ValueError(f"{key}={value}: expected true or false.")
+    if cfg.planner._target_ != "pickplace.planners.PolicyPlanner":
+        raise ValueError(
+            f"planner._target_={cfg.planner._target_}: training validates its policy; expected planner=policy."
+        )
+    if (start := cfg.algo.lr_decay_start) is not None and not (isinstance(start, (int, float)) and 0 <= start <= 1):
+        raise ValueError(f"algo.lr_decay_start={start}: expected a share of total_frames between 0 and 1, or null.")
     ranges = {
         "algo.gamma": (0, 1), "algo.lmbda": (0, 1), "algo.lr": (0, None), "algo.clip_epsilon": (0, None),
         "algo.entropy_coeff": (0, None), "algo.critic_coeff": (0, None), "algo.max_grad_norm": (0, None),

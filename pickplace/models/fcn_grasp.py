@@ -44,10 +44,16 @@ class ItemConditionedFcn(nn.Module):
         compute_dtype: str = "float32",
     ):
         super().__init__()
-        if receptive_field < 3 or receptive_field % 2 == 0:
-            raise ValueError(f"model.receptive_field={receptive_field}: expected an odd number >= 3.")
+        if not isinstance(receptive_field, int) or receptive_field < 3 or receptive_field % 2 == 0:
+            raise ValueError(f"model.receptive_field={receptive_field!r}: expected an odd number >= 3.")
         if compute_dtype not in ("float32", "bfloat16"):
             raise ValueError(f"model.compute_dtype={compute_dtype!r}: expected 'float32' or 'bfloat16'.")
+        sizes = {"filters": filters, "hidden": hidden, "depth_range": depth_range, "item_range": item_range}
+        for key, value in {**sizes, "tote_clip": tote_clip, "out_channels": out_channels}.items():
+            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+                raise ValueError(f"model.{key}={value!r}: expected a whole number >= 1.")
+        if not isinstance(head_std, (int, float)) or head_std < 0:
+            raise ValueError(f"model.head_std={head_std!r}: expected a number >= 0.")
         self.receptive_field = receptive_field
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
         self.compute_dtype = getattr(torch, compute_dtype)
