@@ -161,6 +161,31 @@ def evaluate(cfg: DictConfig, make_env, planner, facts: dict) -> tuple[dict, Epi
     return report, result
 
 
+def paired_difference(result: dict, path: Path) -> dict:
+    """Mean occupancy of a result minus that of another ``evaluation.json``, episode by episode, with its 95% interval.
+
+    Both must have met the same items: pairing removes what one stream is luckier than another.
+
+    Raises:
+        ValueError: if the file cannot be read, or is about other episodes.
+    """
+    try:
+        other = json.loads(path.read_text())
+        theirs = torch.tensor(other["occupancy"]["per_episode"], dtype=torch.float64)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"compare={str(path)!r}: expected an evaluation.json ({error}).") from error
+    for key in ("stream", "seed", "episodes", "items"):
+        if result[key] != other.get(key):
+            raise ValueError(f"compare={str(path)!r}: its {key} is {other.get(key)!r}, expected {result[key]!r}.")
+    for key in ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "min_support", "strict_support"):
+        if result["env"][key] != other["env"].get(key):
+            raise ValueError(
+                f"compare={str(path)!r}: env.{key}={other['env'].get(key)}, expected {result['env'][key]}."
+            )
+    difference = torch.tensor(result["occupancy"]["per_episode"], dtype=torch.float64) - theirs
+    return {"against": other["planner"], "mean": float(difference.mean()), "ci95": list(confidence95(difference))}
+
+
 def versions() -> dict[str, str]:
     """What a result was computed with."""
     import tensordict
@@ -248,6 +273,8 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
         facts |= {"candidates": cfg.planner.candidates, "mask_at_decision": cfg.planner.candidates == "all"}
     planner = config.instantiate(cfg.planner, rules=rules, **kwargs)
     result, episodes = evaluate(cfg, make_env, planner, facts)
+    if cfg.compare is not None:
+        result["paired_difference"] = paired_difference(result, Path(cfg.compare))
     (run_dir / "evaluation.json").write_text(json.dumps(result, indent=1))
     tote_picture(episodes, rules, run_dir / "tote.png")
     table = evaluation_table(result)

@@ -202,6 +202,10 @@ def evaluation_table(result: dict) -> str:
         ("episodes ended by", failures),
         ("feasible actions", f"{result['feasible_action_share']:.2%} of all, mean over decisions"),
     ]
+    if paired := result.get("paired_difference"):
+        low, high = paired["ci95"]
+        text = f"{paired['mean']:+.4f} (95% interval of the paired difference {low:+.4f} to {high:+.4f})"
+        rows.append((f"minus {paired['against']}", text))
     if latency:
         rows.append(("one decision", f"{latency['p50']:.1f} ms (median), {latency['p95']:.1f} ms (95th percentile)"))
     if result.get("checkpoint"):

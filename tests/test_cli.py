@@ -195,3 +195,17 @@ def test_help_from_any_directory(command, tmp_path):
     result = subprocess.run(arguments, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert "env: deep_bin, paper" in result.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+def test_paired_difference(run, tmp_path):
+    settings = ["env.tote_size=[4,4,1]", "evaluation.episodes=20", "evaluation.latency_decisions=0"]
+    assert run("evaluate", "planner=random", *settings, "hydra.run.dir=a")[0] == 0
+    code, out, err = run("evaluate", "planner=joint_dbl", *settings, "hydra.run.dir=b", "compare=a/evaluation.json")
+    assert code == 0, err
+    a, b = (json.loads((tmp_path / name / "evaluation.json").read_text()) for name in "ab")
+    paired = b["paired_difference"]
+    assert paired["against"] == "random" and "minus random" in out
+    assert paired["mean"] == pytest.approx(b["occupancy"]["mean"] - a["occupancy"]["mean"])
+    assert paired["ci95"][0] < paired["mean"] < paired["ci95"][1]
+    code, _, err = run("evaluate", "planner=joint_dbl", *settings, "evaluation.seed=1", "compare=a/evaluation.json")
+    assert code == 2 and "its seed is 0, expected 1" in err
