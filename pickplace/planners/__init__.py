@@ -5,7 +5,7 @@ TensorDict of ``batch_size=[N]`` with ``bin_depth``, ``tote_depth`` and ``tote_h
 and ``actions`` is int64 ``[N]``, flat indices.
 """
 
-from pickplace.planners.heuristics import JointDBL, RandomFeasible
+from pickplace.planners.heuristics import JointDBL, RandomFeasible, UniformRandom
 from pickplace.planners.policy import PolicyPlanner
 
-__all__ = ["JointDBL", "PolicyPlanner", "RandomFeasible"]
+__all__ = ["JointDBL", "PolicyPlanner", "RandomFeasible", "UniformRandom"]

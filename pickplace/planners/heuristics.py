@@ -7,6 +7,26 @@ from torch import Tensor
 from pickplace.geometry import FAR, Rules
 
 
+class UniformRandom:
+    """Uniform over all ``N_a`` flat actions, feasible or not: where a policy that is trained without a mask begins.
+
+    Args:
+        rules: the task's sizes.
+        seed: seed of the planner's own generator.
+    """
+
+    name = "uniform"
+
+    def __init__(self, rules: Rules, seed: int = 0):
+        self.rules, self._generator = rules, torch.Generator().manual_seed(seed)
+
+    def decide(self, observation: TensorDictBase) -> Tensor:
+        """Flat actions, int64 ``[N]``."""
+        depth = observation["bin_depth"]
+        draw = torch.randint(self.rules.num_actions, (len(depth),), generator=self._generator)
+        return draw.to(depth.device)
+
+
 class RandomFeasible:
     """Uniform over the feasible flat actions.
 
