@@ -29,6 +29,7 @@ train: $(STAMP)  ## train (experiment=quick; ARGS="key=value ..." adds overrides
 	  evaluation/evaluation.md 'the table above; evaluation.json has every episode' \
 	  evaluation/tote.png 'a packed tote'
 
+test test-slow: export OMP_NUM_THREADS ?= 2
 test: $(STAMP)  ## run the test suite (minutes)
 	$(BIN)/python -m pytest -q $(ARGS)
 

@@ -3,8 +3,10 @@
 import importlib
 import logging
 import os
+import re
 import shutil
 import sys
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -12,7 +14,15 @@ import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException, InstantiationException
+from hydra.errors import (
+    ConfigCompositionException,
+    HydraException,
+    InstantiationException,
+    MissingConfigException,
+    OverrideParseException,
+)
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -35,10 +45,12 @@ def instantiate(node: DictConfig, **kwargs):
     except TypeError as error:
         raise ValueError(f"{node.get('_target_')}: {error}.") from error
     except InstantiationException as error:
-        cause = error.__cause__ or error
-        if isinstance(cause, (TypeError, ImportError)):
-            raise ValueError(f"{error.args[0] if error.args else ''} {cause}".strip()) from error
-        raise cause from None
+        if isinstance(error.__cause__, (ValueError, OSError)):
+            raise error.__cause__ from None
+        if error.__cause__ is None:
+            raise
+        what = str(error).splitlines()[0].partition(", set env var")[0].rstrip(":")
+        raise ValueError(f"{what}: {error.__cause__}.") from error
 
 
 def use_machine(cfg: DictConfig) -> torch.device:
@@ -92,7 +104,7 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: dict[str, D
 
     Args:
         saved: the config of a checkpoint.
-        overrides: as on Hydra's command line, ``key=value``, ``+key=value``, ``~key``.
+        overrides: as on Hydra's command line, ``key=value``; a leading ``+`` changes nothing.
         groups: for a config group that may be exchanged as a whole, its composed node.
 
     Raises:
@@ -101,87 +113,159 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: dict[str, D
     cfg = saved.copy()
     OmegaConf.set_struct(cfg, True)
     for override in OverridesParser.create().parse_overrides(overrides):
-        key = override.key_or_group
+        key, line = override.key_or_group, override.input_line
         if groups and key in groups:
             cfg[key] = groups[key]
         elif "/" in key or isinstance(OmegaConf.select(cfg, key), DictConfig):
             raise ValueError(
-                f"{override.input_line!r}: the checkpoint's config group {key!r} cannot be exchanged; expected "
-                f"overrides of its values, such as {key.replace('/', '.')}.<key>=<value>."
+                f"{line!r}: the checkpoint's config group {key!r} cannot be exchanged; expected overrides of its "
+                f"values, such as {key.replace('/', '.')}.<key>=<value>."
             )
-        elif override.is_delete():
-            raise ValueError(f"{override.input_line!r}: a key of the checkpoint's config cannot be deleted.")
+        elif override.is_delete() or override.is_sweep_override():
+            raise ValueError(f"{line!r}: expected <key>=<value> with one value, on top of the checkpoint's config.")
         else:
             try:
-                OmegaConf.update(cfg, key, override.value(), force_add=override.is_add())
+                OmegaConf.update(cfg, key, override.value())
             except OmegaConfBaseException as error:
                 raise ValueError(_unknown_key(key, cfg)) from error
     return cfg
 
 
-def _unknown_key(key: str, cfg: DictConfig) -> str:
-    """A sentence on a key that is not in the config, with what is."""
-    parent, _, leaf = key.rpartition(".")
-    node = OmegaConf.select(cfg, parent) if parent else cfg
-    while not isinstance(node, DictConfig):
-        parent, _, leaf = parent.rpartition(".")
-        node = OmegaConf.select(cfg, parent) if parent else cfg
-    known = [str(name) for name in node if name != "_target_" and name != "hydra"]
+def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> None:
+    """Refuse keys that nothing reads: Hydra adds what it finds in a preset, or after a ``+``, misspelt or not.
+
+    Nodes with a ``_target_`` are left alone: what is made from them knows its own arguments.
+
+    Raises:
+        ValueError: naming the key, and the ones that there are.
+    """
+    for key, node in cfg.items():
+        if key not in known:
+            raise ValueError(_unknown_key(f"{path}{key}", known, path))
+        if OmegaConf.is_dict(node) and OmegaConf.is_dict(known[key]) and "_target_" not in node:
+            refuse_unknown_keys(node, known[key], f"{path}{key}.")
+
+
+def _unknown_key(key: str, cfg: DictConfig, prefix: str = "") -> str:
+    """A sentence on a key that is not in the config, with what is; ``cfg`` is the node at ``prefix``."""
+    at, node = prefix, cfg
+    *parents, leaf = key.removeprefix(prefix).split(".")
+    for parent in parents:
+        child = node.get(parent) if parent in node else None
+        if not OmegaConf.is_dict(child):
+            leaf = parent
+            break
+        at, node = f"{at}{parent}.", child
+    known = [str(name) for name in node if name not in ("_target_", "hydra")]
     close = get_close_matches(leaf, known, 1)
-    hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}."
-    return f"{key}: there is no key {leaf!r} in {parent or 'the config'}; {hint}"
+    hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known) or 'none'}."
+    return f"{key}: there is no key {leaf!r} in {at[:-1] or 'the config'}; {hint}"
 
 
-def sentence(error: BaseException, cfg: DictConfig | None = None) -> str:
+def sentence(error: Exception) -> str:
     """What went wrong, in one line for a person."""
-    text = str(error).strip()
-    if isinstance(error, (HydraException, OmegaConfBaseException)):
-        lines = [line.strip() for line in text.splitlines() if line.strip()]
-        if lines and lines[0].startswith("Could not override '") and cfg is not None:
-            return _unknown_key(lines[0].split("'")[1], cfg)
-        lines = [line for line in lines if not line.startswith(("full_key", "object_type", "See https", "To append"))]
-        return " ".join(lines)
-    return " ".join(text.split()) or type(error).__name__
+    if isinstance(error, OverrideParseException):
+        reasons = [line for line in error.message.splitlines() if not line.startswith(("Error parsing", "See https"))]
+        return f"{error.override!r}: expected <key>=<value> ({' '.join(reasons)})."
+    if isinstance(error, MissingConfigException) and error.options:
+        return f"{error.missing_cfg_file}: there is no such config; expected one of {', '.join(error.options)}."
+    if isinstance(error, EXPECTED):
+        noise = ("full_key", "object_type", "See https", "To append", "Config search path", "provider=")
+        lines = [line.strip() for line in str(error).splitlines()]
+        return " ".join(line for line in lines if line and not line.startswith(noise)) or type(error).__name__
+    return f"{type(error).__name__}: {' '.join(str(error).split())} (HYDRA_FULL_ERROR=1 shows where)"
 
 
-def fail(error: BaseException, cfg: DictConfig | None = None):
-    """Print one sentence and exit with code 2; with ``HYDRA_FULL_ERROR=1`` raise the error itself."""
-    if os.environ.get("HYDRA_FULL_ERROR") == "1":
-        raise error
-    sys.stderr.write(f"error: {sentence(error, cfg)}\n")
-    sys.exit(2)
+#: What users cause; anything else may be a fault of the program, and its kind is told too.
+EXPECTED = (ValueError, OSError, FloatingPointError, HydraException, OmegaConfBaseException)
 
 
-def _check_composition(config_name: str) -> None:
-    """Compose once before Hydra does, so that a mistyped override ends in one sentence."""
-    argv = sys.argv[1:]
-    overrides = [arg for arg in argv if not arg.startswith("-")]
-    if len(overrides) < len(argv):  # flags such as --help, --config-dir or -m: Hydra itself deals with them
-        return
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        try:
-            hydra.compose(config_name, overrides)
-        except (HydraException, OmegaConfBaseException, ValueError) as error:
-            fail(error, hydra.compose(config_name))
+@contextmanager
+def one_sentence():
+    """An error ends the command in one sentence and exit code 2; with ``HYDRA_FULL_ERROR=1`` in its traceback."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except Exception as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        sys.stderr.write(f"error: {sentence(error)}\n")
+        sys.exit(2)
 
 
-def command(config_name: str, task) -> None:
+class RememberSweep(Callback):
+    """Lets :func:`command` know the folder of a sweep whose jobs cannot even be composed."""
+
+    def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
+        HydraConfig.instance().set_config(config)
+
+
+def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> None:
     """Run ``task(cfg, run_dir)`` as a Hydra application; what a user did wrong ends in one sentence and exit code 2.
 
-    A run folder that was made for a run that never began is taken away again.
+    A run folder in which nothing was written is taken away again.
+
+    Args:
+        config_name: the file in ``conf/``.
+        task: what to do.
+        from_checkpoint: groups that this command's own config lacks; overrides of them reach ``task`` as they are.
     """
-    _check_composition(config_name)
+    full_error = os.environ.get("HYDRA_FULL_ERROR", "")
+    overrides = sys.argv[1:]
+    opened = tuple(f"{group}." for group in from_checkpoint)
+    sys.argv[1:] = [f"+{word}" if word.startswith(opened) else word for word in overrides]
 
     def app(cfg: DictConfig):
-        run_dir = Path(HydraConfig.get().runtime.output_dir)
-        try:
-            return task(cfg, run_dir)
-        except Exception as error:  # HYDRA_FULL_ERROR=1 shows where it came from
-            begun = run_dir.is_dir() and any(entry.is_dir() and entry.name != ".hydra" for entry in run_dir.iterdir())
-            if not begun and (run_dir / ".hydra").is_dir():
-                logging.shutdown()
-                shutil.rmtree(run_dir, ignore_errors=True)
-            fail(error)
+        os.environ["HYDRA_FULL_ERROR"] = full_error
+        with one_sentence(), _tidy():
+            hydra_cfg = HydraConfig.get()
+            if missing := OmegaConf.missing_keys(cfg):
+                raise ValueError(f"{min(missing)}: no value; expected {min(missing)}=<value>.")
+            known = hydra.compose(hydra_cfg.job.config_name)
+            refuse_unknown_keys(OmegaConf.masked_copy(cfg, [key for key in cfg if key not in from_checkpoint]), known)
+            return task(cfg, Path(hydra_cfg.runtime.output_dir))
 
     app.__module__, app.__qualname__ = "__main__", "app"
-    hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(app)()
+    HydraConfig.instance().cfg = None
+    with one_sentence():
+        # Hydra raises what it would print over many lines.
+        os.environ["HYDRA_FULL_ERROR"] = "1"
+        try:
+            with _tidy():
+                hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(app)()
+        except ConfigCompositionException as error:
+            if not (key := re.match("Could not override '(.*)'", str(error))):
+                raise
+            raise ValueError(_unknown_key(key[1], _composed_without(key[1], config_name, overrides))) from error
+        except ValueError as error:  # Hydra's own, which does not say where
+            raise ValueError(f"{' '.join(overrides)}: {error}.") from error
+        finally:
+            os.environ["HYDRA_FULL_ERROR"] = full_error
+
+
+def _composed_without(key: str, config_name: str, overrides: list[str]) -> DictConfig:
+    """The config without the overrides of a key, or without any if others are wrong too."""
+    rest = [word for word in overrides if not word.startswith("-") and word.partition("=")[0] != key]
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        try:
+            return hydra.compose(config_name, rest)
+        except (HydraException, OmegaConfBaseException, ValueError):
+            return hydra.compose(config_name)
+
+
+@contextmanager
+def _tidy():
+    """Take away the folders of a run or sweep that failed, if nothing but Hydra's own notes is in them."""
+    try:
+        yield
+    except BaseException:
+        if HydraConfig.initialized():
+            cfg = HydraConfig.get()
+            run_dir = None if OmegaConf.is_missing(cfg.runtime, "output_dir") else cfg.runtime.output_dir
+            sweep_dir = cfg.sweep.dir if cfg.mode == RunMode.MULTIRUN else None
+            logging.shutdown()
+            for folder, notes in ((run_dir, {".hydra", f"{cfg.job.name}.log"}), (sweep_dir, {"multirun.yaml"})):
+                if folder and os.path.isdir(folder) and set(os.listdir(folder)) <= notes:
+                    shutil.rmtree(folder, ignore_errors=True)
+        raise

@@ -179,8 +179,8 @@ class PickPlaceEnv(EnvBase):
         if height is None:
             height = torch.full_like(self.tote_height, self.rules.tote_size[2])
         height = height.reshape(self.num_envs)
-        if height.is_floating_point() and bool((height % 1 != 0).any()):
-            raise ValueError(f"tote_height={height[height % 1 != 0][0].item()}: expected whole cells.")
+        if not torch.can_cast(height.dtype, torch.int64):
+            raise ValueError(f"tote_height={height[0].item()} ({height.dtype}): expected whole cells, as integers.")
         height = height.to(torch.int64)
         low, high = self.min_tote_height, self.rules.tote_size[2]
         if bool((rows & ((height < low) | (height > high))).any()):
@@ -274,7 +274,7 @@ def check_items(rules: Rules, items: ItemDistribution) -> None:
     """
     w_b, d_b, _ = rules.bin_size
     height = rules.tote_size[2]
-    problems = []
+    problems = {}  # (x, y, w, d, h) -> the first kind like it: the rows of a long recording repeat themselves
     for kind, (w, d, h) in enumerate(items.sizes.tolist()):
         for (room_w, room_d), what in (((w_b, d_b), "bin_size"), (rules.effector_size, "effector_size")):
             if (w > room_w or d > room_d) and (what == "bin_size" or rules.pick_rule == "contain"):
@@ -284,8 +284,8 @@ def check_items(rules: Rules, items: ItemDistribution) -> None:
         for x, y in items.corners(kind, rules.bin_size):
             if x + w > w_b or y + d > d_b:
                 raise ValueError(f"{items.label(kind)} at x={x}, y={y} leaves the bin: expected it inside {w_b}x{d_b}.")
-            problems.append((x, y, w, d, h, kind))
-    for chunk in torch.tensor(problems).split(1024):
+            problems.setdefault((x, y, w, d, h), kind)
+    for chunk in torch.tensor([(*item, kind) for item, kind in problems.items()]).split(1024):
         item = Item(*chunk[:, :5].unbind(-1))
         empty = torch.zeros(len(chunk), *rules.tote_size[:2], dtype=torch.int32)
         placements = rules.placements(empty, torch.full((len(chunk),), height), item)

@@ -226,14 +226,19 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
     Raises:
         ValueError: for settings that make no sense, or a checkpoint that does not fit them.
     """
-    for key in ("evaluation.episodes", "evaluation.batch_size"):
+    at_least = {"evaluation.episodes": 1, "evaluation.batch_size": 1, "evaluation.latency_decisions": 0}
+    for key, least in at_least.items():
         value = OmegaConf.select(cfg, key)
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise ValueError(f"{key}={value}: expected a whole number >= 1.")
+        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            raise ValueError(f"{key}={value}: expected a whole number >= {least}.")
+    if cfg.evaluation.stream not in ("validation", "test"):
+        raise ValueError(f"evaluation.stream={cfg.evaluation.stream}: expected validation or test.")
+    if "model" in cfg and cfg.checkpoint is None:
+        raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
     config.use_machine(cfg)
     facts, policy_state = {"checkpoint": None}, None
     if cfg.checkpoint is not None:
-        folder = checkpoint.locate(cfg.checkpoint)
+        folder = checkpoint.locate(str(cfg.checkpoint))
         state, saved = checkpoint.read(folder)
         policy_state = state["policy"]
         config.refuse_foreign_targets(saved["config"])
@@ -290,7 +295,7 @@ TRAINED = ("env", "items", "model", "algo")
 
 def main() -> None:
     """Entry point of ``pickplace-evaluate``."""
-    config.command("evaluate", run)
+    config.command("evaluate", run, from_checkpoint=("model",))
 
 
 if __name__ == "__main__":

@@ -35,8 +35,9 @@ def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, cou
     return ((key >> 11) & ((1 << 53) - 1)).double() / float(1 << 53)
 
 
-def _is_whole(value) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and value % 1 == 0
+def _is_length(value) -> bool:
+    """Is it a positive whole number of cells that fits the tensors?"""
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value < 2**31
 
 
 class ItemDistribution:
@@ -87,14 +88,14 @@ class Kinds(ItemDistribution):
         if not isinstance(kinds, (list, tuple)) or not kinds:
             raise ValueError(f"items.kinds={kinds!r}: expected a list of at least one (w, d, h).")
         for kind in kinds:
-            if not isinstance(kind, (list, tuple)) or len(kind) != 3 or not all(_is_whole(v) and v >= 1 for v in kind):
+            if not isinstance(kind, (list, tuple)) or len(kind) != 3 or not all(map(_is_length, kind)):
                 raise ValueError(f"items.kinds: got {kind!r}, expected (w, d, h) in positive whole cells.")
         if weights is None:
             weights = [1.0] * len(kinds)
         if not isinstance(weights, (list, tuple)) or len(weights) != len(kinds):
             raise ValueError(f"items.weights={weights!r}: expected {len(kinds)} numbers, one for each kind.")
         numbers = all(isinstance(v, (int, float)) and 0 <= v < float("inf") for v in weights)
-        if not numbers or sum(weights) <= 0:
+        if not numbers or not 0 < sum(weights) < float("inf"):
             raise ValueError(f"items.weights={weights!r}: expected finite numbers >= 0 that are not all 0.")
         used = [i for i, v in enumerate(weights) if v > 0]
         self.sizes = torch.tensor([list(kinds[i]) for i in used], dtype=torch.int64)
@@ -115,9 +116,11 @@ class Uniform(Kinds):
     def __init__(self, width=(1, 3), depth=(1, 3), height=(1, 3)):
         ranges = {"width": width, "depth": depth, "height": height}
         for name, limits in ranges.items():
-            pair = isinstance(limits, (list, tuple)) and len(limits) == 2 and all(map(_is_whole, limits))
-            if not pair or not 1 <= limits[0] <= limits[1]:
-                raise ValueError(f"items.{name}={limits!r}: expected [least, greatest] with 1 <= least <= greatest.")
+            pair = isinstance(limits, (list, tuple)) and len(limits) == 2 and all(map(_is_length, limits))
+            if not pair or limits[0] > limits[1]:
+                raise ValueError(
+                    f"items.{name}={limits!r}: expected [least, greatest], whole cells with 1 <= least <= greatest."
+                )
         super().__init__(list(product(*(range(low, high + 1) for low, high in ranges.values()))))
 
 
@@ -130,37 +133,40 @@ class Recorded(ItemDistribution):
         loop: after the last row start over, instead of ending (truncating) the episode.
 
     Raises:
-        ValueError: a missing file or column, or a value that is not a whole number, naming the row.
+        ValueError: a missing file or column, or a value that is not a whole number, naming the line.
     """
 
     def __init__(self, path, loop=False):
-        self.path = Path(path)
+        if not isinstance(loop, bool):
+            raise ValueError(f"items.loop={loop!r}: expected true or false.")
+        self.path = Path(str(path))
         if not self.path.is_file():
             raise ValueError(f"items.path={str(path)!r}: no such file; expected a CSV with columns w,d,h (and x,y).")
-        with self.path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            header = [name.strip() for name in reader.fieldnames or []]
-            reader.fieldnames = header
-            if header not in (["w", "d", "h"], ["w", "d", "h", "x", "y"]):
-                raise ValueError(f"{path}: the header is {','.join(header)!r}, expected 'w,d,h' or 'w,d,h,x,y'.")
-            rows = [self._row(reader.line_num, row, header) for row in reader]
+        try:
+            with self.path.open(newline="", encoding="utf-8-sig") as file:
+                reader = csv.reader(file)
+                table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise ValueError(f"{path}: {error}; expected a CSV in UTF-8.") from error
+        header = table[0][1] if table else []
+        if header not in (["w", "d", "h"], ["w", "d", "h", "x", "y"]):
+            raise ValueError(f"{path}: the header is {','.join(header)!r}, expected 'w,d,h' or 'w,d,h,x,y'.")
+        rows = [self._row(line, row, header) for line, row in table[1:] if any(row)]
         if not rows:
             raise ValueError(f"{path}: no items, expected at least one row below the header.")
-        table = torch.tensor(rows, dtype=torch.int64)
-        self.sizes = table[:, :3]
-        self._corner = table[:, 3:] if len(header) == 5 else None
-        self._loop = bool(loop)
+        numbers = torch.tensor(rows, dtype=torch.int64)
+        self.sizes = numbers[:, :3]
+        self._corner = numbers[:, 3:] if len(header) == 5 else None
+        self._lines = [line for line, row in table[1:] if any(row)]
+        self._loop = loop
         self.length = None if loop else len(rows)
 
     def _row(self, line, row, header):
-        try:
-            values = [int(row[name]) for name in header]
-        except (TypeError, ValueError):
-            values = []
-        if not values or None in row or min(values[:3]) < 1 or min(values) < 0:
-            given = ",".join(str(v) for v in row.values())
+        whole = all(field.isdecimal() and len(field) < 10 for field in row)
+        values = [int(field) for field in row] if whole else []
+        if len(values) != len(header) or min(values[:3]) < 1:
             raise ValueError(
-                f"{self.path}, line {line}: got {given!r}, expected {','.join(header)} as whole numbers "
+                f"{self.path}, line {line}: got {','.join(row)!r}, expected {','.join(header)} as whole numbers "
                 "with w, d, h >= 1 and x, y >= 0."
             )
         return values
@@ -184,4 +190,4 @@ class Recorded(ItemDistribution):
         return [tuple(self._corner[kind].tolist())]
 
     def label(self, kind):
-        return f"{self.path}, row {kind + 1}: " + super().label(kind)
+        return f"{self.path}, line {self._lines[kind]}: " + super().label(kind)

@@ -4,14 +4,16 @@ from pathlib import Path
 
 import numpy as np
 
+from pickplace.geometry import Failure
 from pickplace.metrics import read_csv
 
-WALL, INK, POINT = "#9aa3ab", "#263238", "#c2410c"
+WALL, INK, POINT, LINE = "#9aa3ab", "#263238", "#c2410c", "#0072b2"
 # Okabe and Ito's colours, told apart by colour-blind readers too; one for each size of item.
 COLOURS = ["#56b4e9", "#e69f00", "#009e73", "#f0e442", "#cc79a7", "#0072b2", "#d55e00", "#8c8c8c"]
 
 
 def _figure(width: float, height: float):
+    """A figure that needs no display; matplotlib is imported here, so that importing pickplace stays fast."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -21,51 +23,71 @@ def _figure(width: float, height: float):
 
 
 def learning_curve(metrics: Path, path: Path) -> None:
-    """Draw occupancy and the curriculum's level over frames.
+    """Draw occupancy over frames, and below it the tote height that the curriculum had reached.
+
+    Whatever the table lacks is left out: a run that was stopped early has no validation, one batch may end no episode.
 
     Args:
         metrics: a ``metrics.csv``, see :class:`pickplace.metrics.CsvLogger`.
         path: the PNG or SVG to write.
     """
+    from matplotlib.ticker import EngFormatter, MaxNLocator
+
     rows = read_csv(metrics)
-    figure = _figure(8, 5)
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
 
-    def column(key):
-        points = [(row["frames"], row[key]) for row in rows if key in row]
-        return np.array(points, dtype=float).reshape(-1, 2).T
+    def columns(*keys):
+        """Frames and these metrics, of the rows that have them all."""
+        table = [[row[key] for key in ("frames", *keys)] for row in rows if all(key in row for key in keys)]
+        return np.array(table, dtype=float).reshape(-1, 1 + len(keys)).T
 
-    frames, occupancy = column("train/occupancy")
-    window = max(1, len(frames) // 100)
-    kernel = np.ones(window) / window
+    steps, level = columns("curriculum/level")
+    figure = _figure(8, 5 if len(steps) else 4)
+    if len(steps):
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[4, 1])
+    else:
+        upper = lower = figure.subplots()
+
+    frames, occupancy = columns("train/occupancy")
     if len(frames):
-        smooth = np.convolve(occupancy, kernel, mode="valid")
-        label = "training episodes, at the curriculum's height, actions sampled"
-        upper.plot(frames[window - 1 :], smooth, color="#0072b2", label=label)
-    at, mean = column("eval/occupancy")
+        window = max(1, len(frames) // 100)  # a running mean over the latest 1% of the batches
+        smooth = np.convolve(occupancy, np.ones(window) / window, mode="valid")
+        upper.plot(
+            frames[window - 1 :], smooth, ".-" if len(smooth) < 20 else "-", color=LINE,
+            label="training episodes, at the curriculum's height, actions sampled",
+        )  # fmt: skip
+    at, mean = columns("eval/occupancy")
     if len(at):
-        low, high = column("eval/ci95_low")[1], column("eval/ci95_high")[1]
+        upper.plot(at, mean, "o-", color=POINT, label="validation at full height, 95% interval")
+    at, mean, low, high = columns("eval/occupancy", "eval/ci95_low", "eval/ci95_high")
+    if len(at):
         # The mean of few episodes may lie on the edge of its interval by rounding; a bar has no negative length.
         bars = [np.maximum(mean - low, 0), np.maximum(high - mean, 0)]
-        label = "validation at full height, 95% interval"
-        upper.errorbar(at, mean, yerr=bars, fmt="o-", color=POINT, capsize=3, label=label)
-    upper.set_ylabel("occupancy")
+        upper.errorbar(at, mean, yerr=bars, fmt="none", ecolor=POINT, capsize=3)
+    upper.set_title("Learning curve: share of the tote's volume filled when an episode ends")
+    upper.set_ylabel("occupancy (0 to 1)")
     upper.set_ylim(0, 1.02)
     upper.grid(alpha=0.3)
-    upper.legend(loc="lower right")
-    upper.set_title("Share of the tote's volume filled")
-    at, level = column("curriculum/level")
-    lower.step(at, level, where="post", color=INK)
-    lower.set_ylabel("tote height\n(cells)")
-    lower.set_ylim(0, (level.max() if len(level) else 1) + 0.5)
-    lower.yaxis.get_major_locator().set_params(integer=True)
+    if upper.lines:
+        upper.legend(loc="lower right")
+    else:
+        upper.text(0.5, 0.5, "no episode has ended yet", transform=upper.transAxes, ha="center", color=INK)
+
+    if len(steps):
+        for frame in steps[1:][np.diff(level) != 0]:
+            upper.axvline(frame, color=WALL, lw=0.8, ls=":", zorder=0)
+        lower.step(steps, level, ".-" if len(steps) < 20 else "-", where="post", color=INK)
+        lower.set_ylabel("tote height\n(cells)")
+        lower.set_ylim(0, level.max() + 0.5)
+        lower.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+        lower.grid(alpha=0.3)
     lower.set_xlabel("frames (environment steps)")
-    lower.grid(alpha=0.3)
+    lower.set_xlim(0, 1.02 * max([row["frames"] for row in rows], default=100))
+    lower.xaxis.set_major_formatter(EngFormatter(sep=""))
     figure.savefig(path, dpi=120)
 
 
 def tote_picture(episodes, rules, path: Path) -> None:
-    """Draw the packed tote of the first episode in perspective, beside its height map.
+    """Draw the packed tote of the first episode, beside its height map.
 
     Args:
         episodes: an :class:`pickplace.evaluate.Episodes`.
@@ -73,119 +95,160 @@ def tote_picture(episodes, rules, path: Path) -> None:
         path: the PNG or SVG to write.
     """
     figure = _figure(12, 6)
-    solid, plan = figure.subplots(1, 2, width_ratios=[1.15, 1])
-    colours = _colours(episodes.placed)
+    solid, plan = figure.subplots(1, 2, width_ratios=[1.2, 1])
     height = int(episodes.tote_height[0])
-    _draw_boxes(solid, episodes.placed, colours, (*rules.tote_size[:2], height))
+    size = (*rules.tote_size[:2], height)
+    _draw_boxes(solid, episodes.placed, _colours(episodes.placed), size)
     _draw_plan(plan, episodes.final_heights[0].numpy(), height)
-    failure = int(episodes.failure[0])
-    from pickplace.geometry import Failure
-
-    ending = Failure(failure).name.lower().replace("_", " ") if failure else "the item stream ended"
-    size = "x".join(map(str, (*rules.tote_size[:2], height)))
+    failure, full = Failure(int(episodes.failure[0])), bool((episodes.final_heights[0] >= height).all())
+    stuck = "the tote's top is reached everywhere" if full else "stuck, no feasible action left"
+    ending = {Failure.NONE: "the item stream is over", Failure.STUCK: stuck}
     figure.suptitle(
-        f"Tote {size}: occupancy {float(episodes.occupancy[0]):.1%}, {int(episodes.items_placed[0])} items; "
-        f"the episode ended with: {ending}",
+        f"{'x'.join(map(str, size))} tote, {float(episodes.occupancy[0]):.1%} full, "
+        f"{int(episodes.items_placed[0])} items placed; "
+        f"ended: {ending.get(failure, failure.name.lower().replace('_', ' '))}",
         color=INK,
+        fontsize="x-large",
     )
     figure.savefig(path, dpi=120)
 
 
+def _kind(box) -> tuple[int, int, int]:
+    """The size of an item, whichever way it was turned."""
+    *_, w, d, h = box
+    return min(w, d), max(w, d), h
+
+
 def _colours(placed) -> dict:
-    """A colour for each kind of item, whichever way it was turned."""
-    kinds = sorted({(min(w, d), max(w, d), h) for *_, w, d, h in placed})
-    return {kind: COLOURS[i % len(COLOURS)] for i, kind in enumerate(kinds)}
+    """A colour for each kind of item, the small ones first; many kinds share a spectrum."""
+    from matplotlib import colormaps
+
+    kinds = sorted({_kind(box) for box in placed}, key=lambda kind: (np.prod(kind), kind))
+    few = len(kinds) <= len(COLOURS)
+    colours = COLOURS if few else colormaps["Spectral"](np.linspace(0, 1, len(kinds)))
+    return dict(zip(kinds, colours, strict=False))
+
+
+# Faces that the viewer sees, of a unit cube: outward normal, share of the light, corners as a cycle. The cut from the
+# first corner to the third runs along the lattice that the corners of all cubes project onto.
+FACES = [
+    ((0, 0, 1), 1.0, [(0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]),
+    ((1, 0, 0), 0.72, [(1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)]),
+    ((0, 1, 0), 0.86, [(0, 1, 0), (1, 1, 0), (1, 1, 1), (0, 1, 1)]),
+]
+
+
+def visible_triangles(boxes) -> dict:
+    """What is seen of boxes on a unit grid from the direction (1, 1, 1), exactly, with no order of painting.
+
+    In this projection the corners of all cells fall on one triangular lattice, so each of its triangles shows one face
+    of one box, or nothing.
+
+    Args:
+        boxes: ``(x, y, z, w, d, h)`` each, whole numbers, not overlapping.
+
+    Returns:
+        ``{triangle: (box, face)}``: three lattice points ``(x - z, y - z)``; indices into ``boxes`` and ``FACES``.
+    """
+    cells = {}
+    for number, (x, y, z, w, d, h) in enumerate(boxes):
+        cells.update(dict.fromkeys([(x + i, y + j, z + k) for i, j, k in np.ndindex(w, d, h)], number))
+    nearest = {}
+    for (x, y, z), number in cells.items():
+        for face, ((i, j, k), _, corners) in enumerate(FACES):
+            if (x + i, y + j, z + k) in cells:
+                continue  # the next cell covers it
+            points = [(x + a - z - c, y + b - z - c, z + c) for a, b, c in corners]
+            for triangle in (points[:3], [points[0], *points[2:]]):
+                key = tuple(sorted((a, b) for a, b, _ in triangle))
+                depth = sum(c for *_, c in triangle)  # along one line of sight, the higher the nearer
+                if key not in nearest or depth > nearest[key][0]:
+                    nearest[key] = depth, number, face
+    return {key: (number, face) for key, (_, number, face) in nearest.items()}
 
 
 def _draw_boxes(axes, placed, colours, size) -> None:
-    """The items as boxes in an oblique view from the front right, above; exact, since hidden faces are painted over.
-
-    Every face is drawn cell by cell, the cells from far to near: unit cubes have a painter's order, boxes may not.
-    """
-    from matplotlib.collections import PolyCollection
+    """The items as boxes in isometric projection, from the corner with the greatest x and the least y, from above."""
+    from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 
     wide, deep, high = size
-    across, along = np.array([0.87, -0.36]), np.array([0.87, 0.36])  # where the x and y axes point on paper
-    up = np.array([0.0, 1.0])
 
-    def project(x, y, z):
-        return x * across + y * along + z * up
+    def paper(a, b):
+        return (a - b) * 3**0.5 / 2, -(a + b) / 2
 
-    def outline(points, **style):
-        line = np.array([project(*p) for p in points])
-        axes.plot(line[:, 0], line[:, 1], **style)
+    def corner(x, y, z):
+        return paper(x - z, deep - y - z)
 
-    floor = [(0, 0, 0), (wide, 0, 0), (wide, deep, 0), (0, deep, 0), (0, 0, 0)]
-    back = {"color": WALL, "lw": 1.2, "zorder": 1}
-    outline(floor, **back)
-    outline([(0, deep, 0), (0, deep, high)], **back)
-    cells = {}
-    for number, (x, y, z, w, d, h) in enumerate(placed):
-        for cell in np.ndindex(w, d, h):
-            cells[(x + cell[0], y + cell[1], z + cell[2])] = number
-    # The viewer looks from (+x, -y, +z): near cells have a large x, a small y and a large z.
-    order = sorted(cells, key=lambda c: (c[2], c[0] - c[1]))
-    faces, shades, edges = [], [], []
-    for x, y, z in order:
-        number = cells[x, y, z]
-        _, _, _, w, d, h = placed[number]
-        base = np.array(to_rgb(colours[min(w, d), max(w, d), h]))
-        sides = (
-            ((0, 0, 1), [(0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], 1.0),
-            ((1, 0, 0), [(1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)], 0.7),
-            ((0, -1, 0), [(0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)], 0.85),
-        )
-        for normal, corners, light in sides:
-            beyond = (x + normal[0], y + normal[1], z + normal[2])
-            if beyond in cells:
-                continue  # hidden behind the next cell
-            shade = (*np.clip(base * light, 0, 1), 1.0)
-            faces.append([project(x + a, y + b, z + c) for a, b, c in corners])
-            shades.append(shade)
-            # Lines only where an item ends, so that each item reads as one box.
-            for (a, b, c), (e, f, g) in zip(corners, corners[1:] + corners[:1], strict=True):
-                middle = np.array([a + e, b + f, c + g]) / 2 - 0.5
-                step = np.sign(middle - np.array(normal) / 2).astype(int)
-                if cells.get((x + step[0], y + step[1], z + step[2])) != number:
-                    edges.append((len(faces) - 1, [project(x + a, y + b, z + c), project(x + e, y + f, z + g)]))
-    line = 0.8 if wide * deep <= 150 else 0.35
-    # Edges are thin polygons among the faces, so that nearer faces hide them too.
-    drawn, fills, strokes, widths, start = [], [], [], [], 0
-    for index, face in enumerate(faces):
-        drawn.append(face), fills.append(shades[index]), strokes.append(shades[index]), widths.append(0.2)
-        while start < len(edges) and edges[start][0] == index:
-            drawn.append(edges[start][1]), fills.append("none"), strokes.append(INK), widths.append(line)
-            start += 1
+    # The tote: floor and the two far walls, tinted.
+    lo, hi = (0, 0), (wide, deep)
+    floor = [corner(x, y, 0) for x, y in ((0, 0), (wide, 0), (wide, deep), (0, deep))]
+    walls = [
+        [corner(*lo, 0), corner(0, deep, 0), corner(0, deep, high), corner(*lo, high)],
+        [corner(*hi, 0), corner(0, deep, 0), corner(0, deep, high), corner(*hi, high)],
+    ]
     axes.add_collection(
-        PolyCollection(drawn, facecolors=fills, edgecolors=strokes, linewidths=widths, closed=False, zorder=2)
+        PolyCollection([floor, *walls], facecolors=["#e4e8eb", "#f4f6f7", "#eceff1"], edgecolors=WALL, zorder=1)
     )
-    front = {"color": WALL, "lw": 1.2, "zorder": 3}
-    outline([(0, 0, high), (wide, 0, high), (wide, deep, high), (0, deep, high), (0, 0, high)], **front)
-    for x, y in ((0, 0), (wide, 0), (wide, deep)):
-        outline([(x, y, 0), (x, y, high)], **front)
+
+    # The items, y turned around so that the viewer is at (1, 1, 1).
+    seen = visible_triangles([(x, deep - y - d, z, w, d, h) for x, y, z, w, d, h in placed])
+    fills, sides = [], {}
+    for triangle, (number, face) in seen.items():
+        fills.append(np.array(to_rgb(colours[_kind(placed[number])])) * FACES[face][1])
+        for i, j in ((0, 1), (1, 2), (0, 2)):
+            sides.setdefault((triangle[i], triangle[j]), []).append((number, face))
+    triangles = [[paper(*point) for point in triangle] for triangle in seen]
+    # A stroke of the fill's own colour closes the seams between triangles.
+    axes.add_collection(PolyCollection(triangles, facecolors=fills, edgecolors=fills, linewidths=0.6, zorder=2))
+    # Lines where a face ends: both sides of it, or nothing beyond, shown as something else.
+    edges = [[paper(*p), paper(*q)] for (p, q), owners in sides.items() if len(owners) == 1 or owners[0] != owners[1]]
+    width = float(np.clip(10 / (wide + deep), 0.35, 1.1))
+    axes.add_collection(LineCollection(edges, colors=INK, linewidths=width, capstyle="round", zorder=3))
+
+    # The near edges of the tote.
+    rim = [corner(*at, high) for at in (lo, (wide, 0), hi, (0, deep), lo)]
+    posts = [[corner(*at, 0), corner(*at, high)] for at in (lo, (wide, 0), hi)]
+    axes.add_collection(LineCollection([rim, *posts], colors=WALL, linewidths=1.2, zorder=4))
+    gap = 0.05 * (wide + deep)
+    for label, (x, y) in (("x", corner(wide / 2, 0, 0)), ("y", corner(wide, deep / 2, 0))):
+        axes.text(x + (gap if label == "y" else -gap) / 2, y - gap / 2, label, ha="center", va="top", color=INK)
     axes.set_aspect("equal")
     axes.autoscale_view()
     axes.set_axis_off()
-    if len(colours) <= len(COLOURS):
+    if 0 < len(colours) <= 20:
         patches = [Patch(facecolor=c, edgecolor=INK, label="x".join(map(str, kind))) for kind, c in colours.items()]
-        axes.legend(handles=patches, title="item (cells)", loc="upper left", frameon=False)
+        axes.figure.legend(
+            handles=patches, title="items (cells)", loc="outside left upper", frameon=False, alignment="left"
+        )
 
 
 def _draw_plan(axes, heights, limit) -> None:
-    """The height map from above."""
-    image = axes.imshow(heights.T, origin="lower", cmap="viridis", vmin=0, vmax=limit)
+    """The height map ``[W_T, D_T]`` from above, in one colour for each whole height."""
+    from matplotlib import colormaps
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.ticker import MaxNLocator
+
+    colours = ListedColormap(colormaps["YlGnBu"](np.linspace(0, 0.75, limit + 1)))
+    norm = BoundaryNorm(np.arange(limit + 2) - 0.5, colours.N)
+    image = axes.imshow(heights.T, origin="lower", cmap=colours, norm=norm)
     if max(heights.shape) <= 12:
         for (x, y), height in np.ndenumerate(heights):
-            dark = height < 0.6 * limit
+            red, green, blue, _ = colours(norm(height))
+            dark = 0.299 * red + 0.587 * green + 0.114 * blue < 0.55
             axes.text(x, y, str(int(height)), ha="center", va="center", color="white" if dark else INK)
+        axes.set_xticks(np.arange(heights.shape[0] + 1) - 0.5, minor=True)
+        axes.set_yticks(np.arange(heights.shape[1] + 1) - 0.5, minor=True)
+        axes.grid(which="minor", color="white", lw=1)
+        axes.tick_params(which="minor", length=0)
     axes.set_xlabel("x (cells)")
     axes.set_ylabel("y (cells)")
     for axis in (axes.xaxis, axes.yaxis):
-        axis.get_major_locator().set_params(integer=True)
+        axis.set_major_locator(MaxNLocator(12, integer=True, min_n_ticks=1))
     axes.set_title("height map from above")
-    axes.figure.colorbar(image, ax=axes, label="height (cells)", shrink=0.8)
+    every = limit // 12 + 1
+    axes.figure.colorbar(image, ax=axes, label="height (cells)", shrink=0.8, ticks=range(0, limit + 1, every))
 
 
 def evaluation_table(result: dict) -> str:

@@ -191,8 +191,8 @@ def check_settings(cfg: DictConfig) -> None:
     }  # fmt: skip
     for key, least in at_least.items():
         value = OmegaConf.select(cfg, key)
-        if not isinstance(value, int) or isinstance(value, bool) or value < least:
-            raise ValueError(f"{key}={value}: expected a whole number >= {least}.")
+        if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 2**63:
+            raise ValueError(f"{key}={value}: expected a whole number >= {least} and < 2**63.")
     for key in ("algo.mask_infeasible", "algo.normalize_advantage"):
         if not isinstance(value := OmegaConf.select(cfg, key), bool):
             raise ValueError(f"{key}={value}: expected true or false.")
@@ -200,6 +200,8 @@ def check_settings(cfg: DictConfig) -> None:
         raise ValueError(
             f"planner._target_={cfg.planner._target_}: training validates its policy; expected planner=policy."
         )
+    if cfg.evaluation.stream != "validation":
+        raise ValueError(f"evaluation.stream={cfg.evaluation.stream}: training picks its best policy on validation.")
     if (start := cfg.algo.lr_decay_start) is not None and not (isinstance(start, (int, float)) and 0 <= start <= 1):
         raise ValueError(f"algo.lr_decay_start={start}: expected a share of total_frames between 0 and 1, or null.")
     ranges = {
@@ -337,9 +339,9 @@ def resume_run(overrides: list[str]) -> float:
     """Continue a run in its own folder: ``resume=<run folder>`` and overrides of values on top of its saved config."""
     place = next(item for item in overrides if item.startswith("resume=")).partition("=")[2]
     folder = checkpoint.locate(place, prefer="last")
+    if folder.parent.name != "checkpoints":
+        raise ValueError(f"resume={place}: expected a run folder, or its checkpoints/last or checkpoints/best.")
     run_dir = folder.parent.parent
-    handlers = [logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log")]
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
     state, facts = checkpoint.read(folder)
     config.refuse_foreign_targets(facts["config"])
     rest = [item for item in overrides if not item.startswith("resume=")]
@@ -351,6 +353,8 @@ def resume_run(overrides: list[str]) -> float:
             raise ValueError(
                 f"{key}={now}: the run began with {was}, and a resumed run cannot change it; start a new one."
             )
+    handlers = [logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log")]
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
     log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
     return train(cfg, run_dir, (state, facts))
 
@@ -359,12 +363,10 @@ def main() -> None:
     """Entry point of ``pickplace-train``."""
     overrides = [item for item in sys.argv[1:] if not item.startswith("-")]
     if any(item.startswith("resume=") and item not in ("resume=", "resume=null") for item in overrides):
-        try:
+        with config.one_sentence():
             if len(overrides) < len(sys.argv) - 1:
                 raise ValueError("resume=...: expected only key=value overrides beside it, no flags such as -m.")
             resume_run(overrides)
-        except (ValueError, OSError) as error:
-            config.fail(error)
     else:
         config.command("train", train)
 

@@ -5,6 +5,7 @@ import logging
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -44,7 +45,19 @@ def smoke_run(tmp_path_factory):
 
 BAD = [
     ("train", ["algo.gama=0.9"], ["algo.gama", "'gamma'"]),
+    ("train", ["+algo.gama=0.9"], ["algo.gama", "'gamma'"]),
+    ("train", ["+env.foo=1"], ["PickPlaceEnv", "'foo'"]),
+    ("train", ["+curriculum.advance.foo=1"], ["pickplace.curriculum.Threshold", "foo"]),
+    ("train", ["-m", "algo.gama=0.9,1"], ["algo.gama", "'gamma'"]),
+    ("train", ["-m", "env.rotations=5,6"], ["rotations=5", "1, 2, 3 or 4"]),
+    ("train", ["-m", "curriculum=none,mien"], ["curriculum/mien", "adaptive"]),
+    ("train", ["algo.gama=0.9", "--help"], ["algo.gama", "'gamma'"]),
+    ("train", ["--config-dir", "nowhere"], ["nowhere"]),
     ("train", ["nonsense=1"], ["nonsense", "there is no key"]),
+    ("train", ["algo=null"], ["algo=null"]),
+    ("train", ["env.tote_size=[6,6"], ["'env.tote_size=[6,6'", "<key>=<value>"]),
+    ("train", ["env.tote_size"], ["'env.tote_size'", "<key>=<value>"]),
+    ("train", ["seed=1,2"], ["seed=1,2", "--multirun"]),
     ("train", ["curriculum=mien"], ["curriculum/mien", "adaptive"]),
     ("train", ["experiment=quik"], ["experiment/quik", "quick"]),
     ("train", ["env.tote_size=[6,6,-5]"], ["tote_size=[6, 6, -5]", "positive whole numbers"]),
@@ -53,6 +66,15 @@ BAD = [
     ("train", ["env.pick_rule=contains"], ["pick_rule='contains'", "'overlap'"]),
     ("train", ["env.bin_size=[1,1,1]"], ["item 2x1x1", "bin_size"]),
     ("train", ["env.num_envs=0"], ["env.num_envs=0", ">= 1"]),
+    ("train", ["env.min_support=2"], ["min_support=2", "between 0 and 1"]),
+    ("train", ["seed=99999999999999999999"], ["seed=9", "2**63"]),
+    ("train", ["threads=0"], ["threads=0", ">= 1"]),
+    ("train", ["device=tpu"], ["device=tpu", "cpu"]),
+    ("train", ["algo.lr=fast"], ["algo.lr=fast", ">= 0"]),
+    ("train", ["algo.lr_decay_start=2"], ["algo.lr_decay_start=2", "between 0 and 1"]),
+    ("train", ["algo.mask_infeasible=maybe"], ["algo.mask_infeasible=maybe", "true or false"]),
+    ("train", ["evaluation.stream=test"], ["evaluation.stream=test", "validation"]),
+    ("train", ["planner=random"], ["RandomFeasible", "planner=policy"]),
     ("train", ["algo.lr=-1"], ["algo.lr=-1", ">= 0"]),
     ("train", ["algo.gamma=1.5"], ["algo.gamma=1.5", "<= 1"]),
     ("train", ["total_frames=many"], ["total_frames=many", "whole number"]),
@@ -60,6 +82,9 @@ BAD = [
     ("train", ["items.kinds=[[1,1,9]]"], ["item 1x1x9", "tote_size[2]=5"]),
     ("train", ["items.kinds=[]"], ["items.kinds=[]", "at least one"]),
     ("train", ["items=recorded", "items.path=nowhere.csv"], ["items.path='nowhere.csv'", "no such file"]),
+    ("train", ["items=recorded"], ["items.path", "no value"]),
+    ("train", ["model.actor.filters=-4"], ["filters=-4", ">= 1"]),
+    ("train", ["model.actor._target_=os.system"], ["os.system"]),
     ("train", ["model.actor.receptive_field=4"], ["receptive_field=4", "odd"]),
     ("train", ["model.actor.compute_dtype=float8"], ["float8", "bfloat16"]),
     ("train", ["model=fcn4d", "env.tote_size=[4,4,1]"], ["tote_size=[4, 4, 1]", "eq. 3"]),
@@ -67,13 +92,17 @@ BAD = [
     ("train", ["curriculum.start_height=9"], ["start_height=9"]),
     ("train", ["collector=multi_sync", "collector.workers=3"], ["collector.workers=3", "divisor"]),
     ("train", ["planner.candidates=0"], ["candidates=0", "'all'"]),
-    ("train", ["resume=nowhere"], ["'nowhere'", "run folder"]),
+    ("train", ["resume=nowhere"], ["nowhere'", "run folder"]),
     ("train", ["resume=nowhere", "-m"], ["resume", "flags"]),
     ("evaluate", [], ["checkpoint=null", "run folder"]),
-    ("evaluate", ["checkpoint=nowhere"], ["'nowhere'", "run folder"]),
+    ("evaluate", ["checkpoint=nowhere"], ["nowhere'", "run folder"]),
+    ("evaluate", ["planner=joint_dbl", "model.actor.filters=8"], ["model", "checkpoint=<run folder>"]),
+    ("evaluate", ["planner=joint_dbl", "planner.seed=1"], ["planner.seed", "no key"]),
+    ("evaluate", ["planner=random", "planner.seed=one"], ["planner.seed='one'", "whole number"]),
+    ("evaluate", ["planner=joint_dbl", "evaluation.latency_decisions=x"], ["latency_decisions=x", ">= 0"]),
     ("evaluate", ["planner=greedy"], ["planner/greedy", "joint_dbl"]),
     ("evaluate", ["planner=joint_dbl", "evaluation.episodes=0"], ["evaluation.episodes=0", ">= 1"]),
-    ("evaluate", ["planner=joint_dbl", "evaluation.stream=exam"], ["stream='exam'", "validation"]),
+    ("evaluate", ["planner=joint_dbl", "evaluation.stream=exam"], ["stream=exam", "validation"]),
 ]
 
 
@@ -85,8 +114,8 @@ def test_bad_input_is_one_sentence(run, tmp_path, command, arguments, expected):
     assert len(lines) == 1 and lines[0].startswith("error: "), err
     for part in expected:
         assert part in lines[0]
-    leftovers = [path for path in tmp_path.rglob("*") if path.is_file()]
-    assert leftovers == []
+    folders = {"outputs", "outputs/train", "outputs/evaluate", "outputs/sweep"}
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} <= folders
 
 
 def test_csv_with_a_bad_row(run, tmp_path):
@@ -94,6 +123,21 @@ def test_csv_with_a_bad_row(run, tmp_path):
     code, _, err = run("train", "items=recorded", "items.path=items.csv")
     assert code == 2
     assert "items.csv, line 3" in err and "'1,x,1'" in err
+
+
+def test_a_preset_with_a_misspelt_key(run, tmp_path):
+    (tmp_path / "mine" / "experiment").mkdir(parents=True)
+    (tmp_path / "mine" / "experiment" / "typo.yaml").write_text("# @package _global_\nalgo: {gama: 0.9}\n")
+    code, _, err = run("train", "--config-dir", "mine", "experiment=typo")
+    assert code == 2
+    assert "algo.gama: there is no key 'gama' in algo; did you mean 'gamma'?" in err
+
+
+def test_a_failure_leaves_earlier_results_in_the_folder(run, tmp_path):
+    (tmp_path / "evaluation.json").write_text("{}")
+    code, _, err = run("evaluate", "planner=joint_dbl", "env.rotations=5", "hydra.run.dir=.")
+    assert code == 2 and "rotations=5" in err
+    assert (tmp_path / "evaluation.json").read_text() == "{}"
 
 
 def test_full_error_shows_the_traceback(run, monkeypatch):
@@ -119,6 +163,10 @@ def test_checkpoint_for_fewer_rotations(run, smoke_run, tmp_path):
         ("env.num_envs=4", "env.num_envs=4: the run began with 8"),
         ("model.actor.filters=16", "does not fit"),
         ("curriculum=paper", "cannot be exchanged"),
+        ("+algo.gama=0.9", "did you mean 'gamma'?"),
+        ("algo.lr=1,2", "one value"),
+        ("algo.lr", "<key>=<value>"),
+        ("~algo.lr", "<key>=<value>"),
     ],
 )
 def test_incompatible_resume_is_refused_and_changes_nothing(run, smoke_run, override, message):
@@ -159,6 +207,7 @@ def test_damaged_checkpoints_are_refused(run, smoke_run, tmp_path, damage):
 
 def test_evaluation_of_a_run(run, smoke_run, tmp_path):
     arguments = [f"checkpoint={smoke_run}", "evaluation.episodes=6", "env.tote_size=[5,5,2]", "planner.candidates=10"]
+    arguments += ["model.actor.compute_dtype=bfloat16"]
     code, out, err = run("evaluate", *arguments, "hydra.run.dir=result")
     assert code == 0, err
     assert "occupancy" in out
@@ -189,10 +238,13 @@ def test_sweep_and_own_curriculum(run, tmp_path):
         assert (tmp_path / "sweep" / job / "checkpoints" / "last").is_dir()
 
 
-@pytest.mark.parametrize("command", ["train", "evaluate"])
+@pytest.mark.parametrize(
+    "command",
+    [[sys.executable, "-m", "pickplace.train"], [str(Path(sys.executable).with_name("pickplace-evaluate"))]],
+    ids=["module", "script"],
+)
 def test_help_from_any_directory(command, tmp_path):
-    arguments = [sys.executable, "-m", f"pickplace.{command}", "--help"]
-    result = subprocess.run(arguments, cwd=tmp_path, capture_output=True, text=True, check=True)
+    result = subprocess.run([*command, "--help"], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert "env: deep_bin, paper" in result.stdout
     assert list(tmp_path.iterdir()) == []
 

@@ -2,6 +2,8 @@
 
 import pytest
 import torch
+from scipy.stats import chisquare
+from tensordict import TensorDict
 
 from pickplace import PickPlaceEnv
 from pickplace.items import STREAMS, Kinds, Recorded, Uniform, hashed_uniform
@@ -13,11 +15,15 @@ def numbers(stream="train", seed=0, episode=0, count=50_000):
 
 
 def test_hashed_numbers_are_uniform():
-    for row in numbers():
+    by_step = numbers()
+    episodes = torch.arange(50_000)
+    by_episode = hashed_uniform("test", torch.tensor(2**63 - 1), episodes, torch.zeros_like(episodes), 3)
+    by_seed = hashed_uniform("validation", episodes, torch.zeros_like(episodes), torch.zeros_like(episodes), 3)
+    for row in (*by_step, *by_episode, *by_seed):
         assert float(row.min()) >= 0 and float(row.max()) < 1
-        count = torch.histc(row.float(), 100, 0, 1)
-        chi2 = float(((count - 500) ** 2 / 500).sum())
-        assert chi2 < 99 + 5 * (2 * 99) ** 0.5
+        assert chisquare(torch.bincount((row * 100).long(), minlength=100)).pvalue > 1e-4
+        pairs = (row[:-1] * 10).long() * 10 + (row[1:] * 10).long()  # one number says nothing about the next
+        assert chisquare(torch.bincount(pairs, minlength=100)).pvalue > 1e-4
 
 
 def test_streams_seeds_episodes_and_numbers_are_unrelated():
@@ -26,6 +32,13 @@ def test_streams_seeds_episodes_and_numbers_are_unrelated():
     correlation = torch.corrcoef(torch.stack(rows))
     off_diagonal = correlation - torch.eye(len(rows))
     assert float(off_diagonal.abs().max()) < 5 / 20_000**0.5
+
+
+def test_no_two_addresses_share_a_number():
+    """Families, seeds, episodes and steps: 10,000 addresses, 10,000 different numbers."""
+    seed, episode, step = (part.flatten() for part in torch.meshgrid(*[torch.arange(15)] * 3, indexing="ij"))
+    rows = torch.cat([hashed_uniform(stream, seed, episode, step, 1)[0] for stream in STREAMS])
+    assert len(rows.unique()) == len(rows) == 3 * 15**3
 
 
 def test_items_do_not_depend_on_the_batch():
@@ -37,17 +50,32 @@ def test_items_do_not_depend_on_the_batch():
         assert [int(part) for part in alone] == [int(part[i]) for part in together]
 
 
+def test_positions_are_uniform_and_independent_of_the_kind():
+    kinds = Kinds([(1, 1, 1), (2, 2, 1)])
+    steps = torch.arange(40_000)
+    item = kinds.sample("train", torch.tensor(0), torch.zeros_like(steps), steps, (4, 3, 1))
+    for side, rooms in ((1, (4, 3)), (2, (3, 2))):
+        of_kind = item.w == side
+        cell = (item.x * rooms[1] + item.y)[of_kind]
+        assert chisquare(torch.bincount(cell, minlength=rooms[0] * rooms[1])).pvalue > 1e-4
+        assert len(cell.unique()) == rooms[0] * rooms[1]
+
+
 def test_weights():
     kinds = Kinds([(1, 1, 1), (2, 1, 1), (1, 2, 1)], weights=[1, 0, 3])
     steps = torch.arange(40_000)
     item = kinds.sample("train", torch.tensor(0), torch.zeros_like(steps), steps, (5, 5, 1))
     assert not (item.w == 2).any()
-    assert float((item.d == 2).double().mean()) == pytest.approx(0.75, abs=0.01)
+    assert chisquare(torch.bincount(item.d)[1:], [10_000, 30_000]).pvalue > 1e-4
+    assert kinds.sizes.tolist() == [[1, 1, 1], [1, 2, 1]]  # what may arrive: a weight of 0 is not checked for a fit
 
 
 def test_uniform_ranges():
-    sizes = Uniform((1, 2), (3, 3), (2, 4)).sizes.tolist()
-    assert sorted(sizes) == [[w, 3, h] for w in (1, 2) for h in (2, 3, 4)]
+    items = Uniform((1, 2), (3, 3), (2, 4))
+    assert sorted(items.sizes.tolist()) == [[w, 3, h] for w in (1, 2) for h in (2, 3, 4)]
+    steps = torch.arange(30_000)
+    item = items.sample("train", torch.tensor(0), torch.zeros_like(steps), steps, (5, 5, 1))
+    assert chisquare(torch.bincount((item.w - 1) * 3 + item.h - 2)).pvalue > 1e-4
 
 
 @pytest.mark.parametrize(
@@ -56,7 +84,9 @@ def test_uniform_ranges():
         (lambda: Kinds(5), "items.kinds=5"),
         (lambda: Kinds([]), r"items.kinds=\[\]"),
         (lambda: Kinds([1, 2]), "items.kinds: got 1"),
-        (lambda: Kinds([("a", 1, 1)]), "items.kinds: got"),
+        (lambda: Kinds([("a", 1, 1)]), "items.kinds: got .'a', 1, 1., expected .w, d, h. in positive whole cells"),
+        (lambda: Kinds([(True, 1, 1)]), "items.kinds: got"),
+        (lambda: Kinds([(10**30, 1, 1)]), "items.kinds: got"),
         (lambda: Kinds([(1, 1)]), "items.kinds: got"),
         (lambda: Kinds([(1, 0, 1)]), "items.kinds: got"),
         (lambda: Kinds([(1, 1.5, 1)]), "items.kinds: got"),
@@ -65,9 +95,17 @@ def test_uniform_ranges():
         (lambda: Kinds([(1, 1, 1)], weights=[1, 2]), "expected 1 numbers"),
         (lambda: Kinds([(1, 1, 1)], weights=[0]), "not all 0"),
         (lambda: Kinds([(1, 1, 1)], weights=[float("nan")]), "not all 0"),
-        (lambda: Uniform(width=3), "items.width=3"),
+        (lambda: Kinds([(1, 1, 1)], weights=["x"]), "items.weights=.*expected finite numbers"),
+        (lambda: Kinds([(1, 1, 1)] * 2, weights=[1e308, 1e308]), "items.weights=.*expected finite numbers"),
+        (lambda: Uniform(width=3), r"items.width=3: expected \[least, greatest\]"),
+        (lambda: Uniform(width=(1, "2")), "items.width"),
+        (lambda: Uniform(width=(1.0, 2.5)), "items.width"),
+        (lambda: Uniform(width=(1, 2, 3)), "items.width"),
         (lambda: Uniform(depth=(2, 1)), "items.depth"),
         (lambda: Uniform(height=(0, 1)), "items.height"),
+        (lambda: Recorded("missing.csv"), "items.path='missing.csv': no such file"),
+        (lambda: Recorded(5), "items.path='5': no such file"),
+        (lambda: Recorded("missing.csv", loop="maybe"), "items.loop='maybe': expected true or false"),
     ],
 )
 def test_bad_arguments(make, key):
@@ -77,7 +115,7 @@ def test_bad_arguments(make, key):
 
 def stream(tmp_path, text, **kwargs):
     path = tmp_path / "items.csv"
-    path.write_text(text)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return Recorded(path, **kwargs)
 
 
@@ -99,6 +137,45 @@ def test_recorded_stream_ends_the_episode(tmp_path):
     assert torch.equal(observation["bin_depth"], expected.expand(2, 5, 5))  # the next episode starts at row 1
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "w,d,h\n1,2,1\n2,1,3",
+        "w,d,h\r\n1,2,1\r\n2,1,3\r\n\r\n",
+        " w, d ,h\n1, 2 ,1\n\n  \n2,1,3\n,,\n",
+        '"w","d","h"\n"1","2","1"\n"2","1","3"',
+    ],
+)
+def test_ways_to_write_the_same_file(tmp_path, text):
+    assert stream(tmp_path, text).sizes.tolist() == [[1, 2, 1], [2, 1, 3]]
+
+
+def test_recorded_positions_are_random_unless_given(tmp_path):
+    items = stream(tmp_path, "w,d,h\n2,1,1\n")
+    episodes = torch.arange(20_000)
+    item = items.sample("train", torch.tensor(0), episodes, torch.zeros_like(episodes), (5, 5, 1))
+    assert chisquare(torch.bincount(item.x * 5 + item.y, minlength=20)).pvalue > 1e-4
+    items = stream(tmp_path, "w,d,h,x,y\n2,1,1,3,4\n")
+    item = items.sample("train", torch.tensor(0), episodes, torch.zeros_like(episodes), (5, 5, 1))
+    assert (item.x == 3).all() and (item.y == 4).all()
+
+
+def test_a_recorded_stream_that_ends_while_others_play_on(tmp_path):
+    """A failed action restarts an episode, so slots are at different rows; each is truncated at its own end."""
+    items = stream(tmp_path, "w,d,h\n1,1,1\n1,1,1\n1,1,1\n")
+    env = PickPlaceEnv(items=items, num_envs=2)
+    observation = env.reset()
+    for number in range(1, 6):
+        action = observation["action_mask"].int().argmax(1)
+        if number == 2:  # slot 1 fails
+            action[1] = observation["action_mask"][1].int().argmin()
+        after, observation = env.step_and_maybe_reset(observation.set("action", action))
+        ends = [number == 3, number == 5]
+        assert after["next", "truncated"][:, 0].tolist() == ends
+        assert after["next", "terminated"][:, 0].tolist() == [False, number == 2]
+        assert after["next", "done"][:, 0].tolist() == [ends[0], ends[1] or number == 2]
+
+
 def test_recorded_stream_may_loop(tmp_path):
     items = stream(tmp_path, "w,d,h\n1,1,1\n2,1,1\n", loop=True)
     env = PickPlaceEnv(items=items, num_envs=1)
@@ -118,8 +195,16 @@ def test_recorded_stream_may_loop(tmp_path):
         ("w,h,d\n1,1,1\n", "the header is 'w,h,d'"),
         ("w,d,h\n", "no items"),
         ("w,d,h\n1,1,1\n1,x,1\n", "line 3: got '1,x,1'"),
-        ("w,d,h\n1,1\n", "line 2"),
-        ("w,d,h\n1,1,1,1\n", "line 2"),
+        ("w,d,h\n1,1\n", "line 2: got '1,1', expected w,d,h as whole numbers"),
+        ("w,d,h\n1,1,1,1\n", "line 2: got '1,1,1,1'"),
+        ("w,d,h\n1,1,1\n\n1,1,1.5\n", "line 4: got '1,1,1.5'"),
+        ("w,d,h\n1_0,1,1\n", "line 2: got '1_0,1,1'"),
+        ("w,d,h\n1,1,99999999999999999999\n", "line 2"),
+        ("w,d,h,x,y\n1,1,1\n", "line 2: got '1,1,1', expected w,d,h,x,y"),
+        ("W;D;H\n1;1;1\n", "the header is 'W;D;H', expected 'w,d,h' or 'w,d,h,x,y'"),
+        ("w,d,h,x\n1,1,1,1\n", "the header is 'w,d,h,x'"),
+        ("1,1,1\n", "the header is '1,1,1'"),
+        (b"w,d,h\n1,1,\xff\n", "expected a CSV in UTF-8"),
         ("w,d,h\n0,1,1\n", "line 2: got '0,1,1'"),
         ("w,d,h,x,y\n1,1,1,-1,0\n", "line 2"),
     ],
@@ -133,10 +218,10 @@ def test_bad_files(tmp_path, text, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("w,d,h\n1,1,1\n6,1,1\n", "row 2: item 6x1x1 does not fit bin_size"),
-        ("w,d,h\n4,1,1\n", "row 1: item 4x1x1 does not fit effector_size"),
-        ("w,d,h\n1,1,6\n", "row 1: item 1x1x6 is higher than the tote"),
-        ("w,d,h,x,y\n2,2,1,4,0\n", "row 1: item 2x2x1 at x=4, y=0 leaves the bin"),
+        ("w,d,h\n1,1,1\n\n6,1,1\n", "line 4: item 6x1x1 does not fit bin_size"),
+        ("w,d,h\n4,1,1\n", "line 2: item 4x1x1 does not fit effector_size"),
+        ("w,d,h\n1,1,6\n", "line 2: item 1x1x6 is higher than the tote"),
+        ("w,d,h,x,y\n1,1,1,0,0\n2,2,1,4,0\n", "line 3: item 2x2x1 at x=4, y=0 leaves the bin"),
     ],
 )
 def test_rows_that_do_not_fit(tmp_path, text, message):
@@ -149,3 +234,10 @@ def test_rows_that_do_not_fit(tmp_path, text, message):
 def test_bad_seeds(seed):
     with pytest.raises(ValueError, match="seed=.*expected a whole number"):
         PickPlaceEnv(seed=seed)
+
+
+@pytest.mark.parametrize("height", [4.5, 4.0, float("nan")])
+def test_a_tote_height_is_an_integer(height):
+    env = PickPlaceEnv(num_envs=2)
+    with pytest.raises(ValueError, match=f"tote_height={height} .*: expected whole cells"):
+        env.reset(TensorDict({"tote_height": torch.full((2, 1), height)}, [2]))

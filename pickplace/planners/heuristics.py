@@ -38,6 +38,8 @@ class RandomFeasible:
     name = "random"
 
     def __init__(self, rules: Rules, seed: int = 0):
+        if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:
+            raise ValueError(f"planner.seed={seed!r}: expected a whole number >= 0 and < 2**63.")
         self.rules, self.seed, self._generator = rules, seed, None
 
     def decide(self, observation: TensorDictBase) -> Tensor:

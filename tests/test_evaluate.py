@@ -1,0 +1,187 @@
+"""Evaluation: what it writes, that it counts every episode, and that nothing but the question changes the answer."""
+
+import json
+import logging
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from pickplace import PickPlaceEnv, evaluate
+from pickplace.geometry import Failure
+from pickplace.items import Recorded
+from pickplace.planners import JointDBL, RandomFeasible
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path, capsys):
+    """Evaluate in this process, in an empty folder; returns exit code, standard error and ``evaluation.json``."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        folder = tmp_path / f"result{len(list(tmp_path.iterdir()))}"
+        monkeypatch.setattr(sys, "argv", ["pickplace-evaluate", *arguments, f"hydra.run.dir={folder}"])
+        code = 0
+        try:
+            evaluate.main()
+        except SystemExit as exit:
+            code = exit.code or 0
+        finally:
+            logging.root.handlers.clear()  # the files of this run may be gone when the next one logs
+        path = folder / "evaluation.json"
+        result = json.loads(path.read_text()) if path.is_file() else None
+        return code, capsys.readouterr().err, result
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def two_rotations(tmp_path_factory):
+    """The folder of a short run with ``R = 2``."""
+    run_dir = tmp_path_factory.mktemp("two") / "run"
+    settings = ["experiment=smoke", "env.rotations=2", "total_frames=256", f"hydra.run.dir={run_dir}"]
+    command = [sys.executable, "-m", "pickplace.train", *settings]
+    subprocess.run(command, check=True, capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    return run_dir
+
+
+def make_env(first, count, **settings):
+    settings = {"tote_size": (4, 4, 2), "stream": "test", "seed": 1, "masks": (), **settings}
+    return PickPlaceEnv(num_envs=count, first_episode=first, **settings)
+
+
+KEYS = {
+    "planner", "env", "items", "stream", "episodes", "seed", "occupancy", "items_placed", "failures",
+    "feasible_action_share", "latency_ms", "versions", "commit",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("planner", ["joint_dbl", "random"])
+def test_evaluation_json(run, planner):
+    settings = ["env.tote_size=[4,5,2]", "evaluation.episodes=5", "evaluation.seed=7", "evaluation.latency_decisions=3"]
+    code, err, result = run(f"planner={planner}", *settings)
+    assert code == 0, err
+    assert set(result) >= KEYS
+    assert (result["planner"], result["episodes"], result["seed"]) == (planner, 5, 7)
+    assert result["env"]["tote_size"] == [4, 5, 2] and result["env"]["rotations"] == 4
+    occupancy = result["occupancy"]
+    assert set(occupancy) == {"mean", "ci95", "min", "per_episode"}
+    assert len(occupancy["per_episode"]) == 5 == sum(result["failures"].values())
+    assert occupancy["min"] == min(occupancy["per_episode"])
+    assert occupancy["mean"] == pytest.approx(sum(occupancy["per_episode"]) / 5)
+    assert occupancy["ci95"][0] <= occupancy["mean"] <= occupancy["ci95"][1]
+    assert set(result["failures"]) <= {failure.name.lower() for failure in Failure}
+    assert 0 < result["feasible_action_share"] < 1
+    assert 0 < result["latency_ms"]["p50"] <= result["latency_ms"]["p95"]
+    assert set(result["versions"]) >= {"pickplace", "torch", "torchrl", "tensordict", "python"}
+
+
+def test_every_episode_is_played_to_its_end_and_counted_once():
+    result = evaluate.play(make_env, RandomFeasible(make_env(0, 1).rules), 7, 3)
+    assert len(result.occupancy) == len(result.items_placed) == len(result.failure) == len(result.final_heights) == 7
+    assert (result.failure == Failure.STUCK).all()  # a planner that knows the feasible actions ends no other way
+    assert (result.items_placed > 0).all()
+    # Each placement is a decision; after the last one the environment itself finds that nothing is feasible.
+    assert result.decisions == int(result.items_placed.sum())
+
+
+def test_placed_items_of_the_first_episode_add_up():
+    result = evaluate.play(make_env, JointDBL(make_env(0, 1).rules), 3, 2)
+    heights, volume = torch.zeros(4, 4, dtype=torch.int32), 0
+    for x, y, z, w, d, h in result.placed:
+        space = heights[x : x + w, y : y + d]
+        assert int(space.max()) == z
+        space.fill_(z + h)
+        volume += w * d * h
+    assert torch.equal(heights, result.final_heights[0])
+    assert len(result.placed) == int(result.items_placed[0])
+    assert volume / (4 * 4 * 2) == pytest.approx(float(result.occupancy[0]))
+
+
+class Fussy(JointDBL):
+    """Fails on purpose at every item of 2x2: its episodes last from one step to many, whatever plays beside them."""
+
+    def decide(self, observation):
+        keys = ("bin_depth", "tote_depth", "tote_height")
+        placements = self.rules.placements_from_depth(*(observation[key] for key in keys))
+        item = self.rules.read_item(observation["bin_depth"])
+        infeasible = self.rules.action_mask(placements).int().argmin(1)
+        return torch.where(item.w * item.d == 4, infeasible, super().decide(observation))
+
+
+@pytest.mark.parametrize("planner", [JointDBL, Fussy])
+@pytest.mark.parametrize("batch_size", [3, 100])
+def test_batch_size_does_not_change_the_episodes(planner, batch_size):
+    rules = make_env(0, 1).rules
+    expected = evaluate.play(make_env, planner(rules), 12, 1)  # one at a time: no slot waits for another
+    result = evaluate.play(make_env, planner(rules), 12, batch_size)
+    if planner is Fussy:  # a slot that ends at once ends again, uncounted, while the longest one plays on
+        assert expected.items_placed.min() == 0 and expected.items_placed.max() > 3
+        assert (expected.failure != Failure.STUCK).any()
+    for name in ("occupancy", "items_placed", "failure", "final_heights", "tote_height"):
+        assert torch.equal(getattr(result, name), getattr(expected, name)), name
+    assert result.placed == expected.placed
+    assert result.decisions == expected.decisions
+    assert result.feasible_share == pytest.approx(expected.feasible_share)
+
+
+def test_streams_and_seeds_are_different_questions():
+    rules = make_env(0, 1).rules
+
+    def occupancy(**settings):
+        return evaluate.play(lambda *a: make_env(*a, **settings), JointDBL(rules), 16, 16).occupancy
+
+    base = occupancy()
+    assert torch.equal(base, occupancy())
+    assert not torch.equal(base, occupancy(seed=2))
+    assert not torch.equal(base, occupancy(stream="validation"))
+
+
+def test_a_recorded_stream_that_ends_is_no_failure(tmp_path):
+    path = tmp_path / "items.csv"
+    path.write_text("w,d,h\n1,1,1\n2,1,1\n")
+
+    def make(first, count):
+        return make_env(first, count, items=Recorded(str(path)))
+
+    result = evaluate.play(make, JointDBL(make(0, 1).rules), 2, 2)
+    assert result.failure.tolist() == [Failure.NONE] * 2
+    assert result.items_placed.tolist() == [2, 2]
+    assert result.occupancy.tolist() == [3 / 32] * 2
+
+
+def test_candidates(run, two_rotations):
+    arguments = [f"checkpoint={two_rotations}", "env.tote_size=[5,5,2]", "evaluation.episodes=8"]
+    arguments += ["evaluation.latency_decisions=0", "evaluation.batch_size=4"]
+    results = {}
+    for candidates in ("1", "all"):
+        code, err, results[candidates] = run(*arguments, f"planner.candidates={candidates}")
+        assert code == 0, err
+    one, best = results["1"], results["all"]
+    assert set(one) >= KEYS | {"checkpoint", "trained", "mask_in_training", "mask_at_decision", "candidates"}
+    assert one["trained"]["frames"] == 256
+    assert (one["candidates"], one["mask_in_training"], one["mask_at_decision"]) == (1, True, False)
+    assert (best["candidates"], best["mask_in_training"], best["mask_at_decision"]) == ("all", True, True)
+    assert best["failures"] == {"stuck": 8}
+    assert set(one["failures"]) != {"stuck"}  # hardly trained, without a mask: some actions fail
+    assert one["occupancy"]["mean"] < best["occupancy"]["mean"]
+    assert one["latency_ms"] is None
+
+
+def test_more_rotations_than_trained_are_refused(run, two_rotations):
+    code, err, result = run(f"checkpoint={two_rotations}", "env.rotations=4")
+    assert code == 2 and result is None
+    assert "env.rotations=4: the checkpoint was trained with 2" in err
+    assert err.startswith("error: ") and err.count("\n") == 1 and "Traceback" not in err
+
+
+def test_confidence_interval_by_hand():
+    # Mean 0.8; deviations -0.1, 0, 0, 0.1: variance 0.02 / 3, standard error sqrt(0.02 / 3 / 4) = 0.0408248;
+    # Student's t with 3 degrees of freedom at 97.5%: 3.182446.
+    low, high = evaluate.confidence95(torch.tensor([0.7, 0.8, 0.8, 0.9], dtype=torch.float64))
+    assert low == pytest.approx(0.8 - 0.129923, abs=1e-6)
+    assert high == pytest.approx(0.8 + 0.129923, abs=1e-6)
+    assert evaluate.confidence95(torch.tensor([0.5] * 5)) == (0.5, 0.5)
+    assert evaluate.confidence95(torch.tensor([0.5])) == (0.0, 1.0)
