@@ -93,7 +93,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
         torch.set_rng_state(state["rng"])  # last: everything above may have drawn
 
     logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames)
-    stop, started, first_frames = StopRequest(), time.perf_counter(), frames
+    stop, started, first_frames, saved = StopRequest(), time.perf_counter(), frames, frames
     log.info("%d frames to train, at tote height %d of %d", cfg.total_frames - frames, curriculum.level, curriculum.end)
 
     def save(name: str) -> None:
@@ -156,11 +156,14 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
                     best = latest["occupancy"]
                     save("best")
             logger.log(metrics, frames)
-            if finished or stop.requested or crossed(before, frames, cfg.checkpoint_interval):
+            if crossed(before, frames, cfg.checkpoint_interval):
                 save("last")
+                saved = frames
             if crossed(before, frames, cfg.progress_interval):
                 speed = (frames - first_frames) / (time.perf_counter() - started)
                 log.info(progress_line(frames, cfg.total_frames, speed, curriculum, metrics))
+        if saved != frames:  # after the loop, so that a stop request is never missed
+            save("last")
     finally:
         logger.close()
         collector.shutdown()
