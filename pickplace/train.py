@@ -94,7 +94,8 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
 
     logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames)
     stop, started, first_frames, saved = StopRequest(), time.perf_counter(), frames, frames
-    log.info("%d frames to train, at tote height %d of %d", cfg.total_frames - frames, curriculum.level, curriculum.end)
+    left = max(cfg.total_frames - frames, 0)
+    log.info("%s frames to train, at tote height %d of %d", f"{left:,}", curriculum.level, curriculum.end)
 
     def save(name: str) -> None:
         state = {
@@ -356,6 +357,10 @@ def resume_run(overrides: list[str]) -> float:
             raise ValueError(
                 f"{key}={now}: the run began with {was}, and a resumed run cannot change it; start a new one."
             )
+    if cfg.total_frames != saved.total_frames and cfg.total_frames < facts["frames"]:
+        raise ValueError(
+            f"total_frames={cfg.total_frames}: the run has trained {facts['frames']} frames already; expected more."
+        )
     handlers = [logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log")]
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
     log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")

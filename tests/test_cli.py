@@ -167,11 +167,12 @@ def test_checkpoint_for_fewer_rotations(run, smoke_run, tmp_path):
         ("algo.lr=1,2", "one value"),
         ("algo.lr", "<key>=<value>"),
         ("~algo.lr", "<key>=<value>"),
+        ("total_frames=100", "total_frames=100: the run has trained 512 frames already; expected more"),
     ],
 )
 def test_incompatible_resume_is_refused_and_changes_nothing(run, smoke_run, override, message):
     files = {path: path.read_bytes() for path in smoke_run.rglob("*") if path.is_file() and path.suffix != ".log"}
-    code, _, err = run("train", f"resume={smoke_run}", override, "total_frames=1024")
+    code, _, err = run("train", f"resume={smoke_run}", "total_frames=1024", override)
     assert code == 2
     assert message in err and err.count("\n") == 1
     assert files == {path: path.read_bytes() for path in files}

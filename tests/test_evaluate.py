@@ -185,3 +185,4 @@ def test_confidence_interval_by_hand():
     assert high == pytest.approx(0.8 + 0.129923, abs=1e-6)
     assert evaluate.confidence95(torch.tensor([0.5] * 5)) == (0.5, 0.5)
     assert evaluate.confidence95(torch.tensor([0.5])) == (0.0, 1.0)
+    assert evaluate.confidence95(torch.tensor([0.5]), least=-1.0) == (-1.0, 1.0)
