@@ -17,6 +17,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 SCHEMA = 1
+PRETRAINED = Path(__file__).resolve().parent / "pretrained"  # weights that the package ships
 TENSORS, FACTS = "state.safetensors", "state.json"
 
 
@@ -85,11 +86,22 @@ def write(folder: Path, state: dict, facts: dict) -> None:
 
 
 def locate(path, prefer: str = "best") -> Path:
-    """The checkpoint folder that a user means: a run folder (then its ``checkpoints/<prefer>``) or a checkpoint.
+    """The checkpoint folder that a user means.
+
+    Args:
+        path: a run folder (then its ``checkpoints/<prefer>``), a checkpoint, or ``pretrained/<name>``: weights that
+            the package ships, unless a folder of that name is here.
+        prefer: ``"best"`` or ``"last"``.
 
     Raises:
         CheckpointError: if there is none.
     """
+    parts = Path(path).parts
+    if len(parts) == 2 and parts[0] == "pretrained" and not Path(path).exists():
+        if not (PRETRAINED / parts[1] / FACTS).is_file():
+            names = ", ".join(f"pretrained/{folder.parent.name}" for folder in sorted(PRETRAINED.glob(f"*/{FACTS}")))
+            raise CheckpointError(f"checkpoint={str(path)!r}: the package ships no such weights; expected {names}.")
+        return PRETRAINED / parts[1]
     path = Path(path).absolute()
     for folder in (path / "checkpoints" / prefer, path):
         for candidate in (folder, folder.with_name(f".{folder.name}.old")):

@@ -17,6 +17,7 @@ from torchrl.envs.utils import step_mdp
 
 from pickplace import checkpoint, config
 from pickplace.geometry import Failure
+from pickplace.planners.policy import restore_policy
 from pickplace.report import evaluation_table, tote_picture
 
 log = logging.getLogger(__name__)
@@ -184,7 +185,11 @@ def paired_difference(result: dict, path: Path) -> dict:
                 f"compare={str(path)!r}: env.{key}={other['env'].get(key)}, expected {result['env'][key]}."
             )
     difference = torch.tensor(result["occupancy"]["per_episode"], dtype=torch.float64) - theirs
-    return {"against": other["planner"], "mean": float(difference.mean()), "ci95": list(confidence95(difference, least=-1.0))}
+    return {
+        "against": other["planner"],
+        "mean": float(difference.mean()),
+        "ci95": list(confidence95(difference, least=-1.0)),
+    }
 
 
 def versions() -> dict[str, str]:
@@ -268,14 +273,8 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
     if cfg.planner._target_ == "pickplace.planners.PolicyPlanner":
         if policy_state is None:
             raise ValueError("checkpoint=null: planner=policy needs a checkpoint; expected a run folder.")
-        most = saved["config"]["env"]["rotations"]
-        if rules.rotations > most:
-            raise ValueError(
-                f"env.rotations={rules.rotations}: the checkpoint was trained with {most}; expected no more."
-            )
-        policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=cfg.algo.mask_infeasible)
-        checkpoint.load_module(policy, policy_state, "policy")
-        kwargs["policy"] = policy.to(cfg.device).eval()
+        policy = restore_policy(cfg, rules, policy_state, saved["config"]["env"]["rotations"])
+        kwargs["policy"] = policy.to(cfg.device)
         facts |= {"candidates": cfg.planner.candidates, "mask_at_decision": cfg.planner.candidates == "all"}
     planner = config.instantiate(cfg.planner, rules=rules, **kwargs)
     result, episodes = evaluate(cfg, make_env, planner, facts)

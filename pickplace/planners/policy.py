@@ -1,10 +1,12 @@
 """The planner that follows a trained policy."""
 
 import torch
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from pickplace import checkpoint, config
 from pickplace.geometry import Rules
 from pickplace.models.actors import MASKED
 
@@ -52,3 +54,24 @@ class PolicyPlanner:
         step = rules.apply(repeat(heights), repeat(tote_height), type(item)(*map(repeat, item)), tried.flatten())
         first = (step.failure.view_as(tried) == 0).int().argmax(1, keepdim=True)  # 0, the most probable, if none
         return tried.gather(1, first)[:, 0]
+
+
+def restore_policy(cfg: DictConfig, rules: Rules, state: dict, trained_rotations: int) -> nn.Module:
+    """The policy of a checkpoint, for these rules; the sizes need not be those that it was trained with.
+
+    Args:
+        cfg: the checkpoint's config, with any overrides on top.
+        rules: the task's sizes.
+        state: the policy's tensors, ``state["policy"]`` of :func:`pickplace.checkpoint.read`.
+        trained_rotations: ``R`` in training, which nothing may exceed.
+
+    Raises:
+        ValueError: for more rotations than were trained, or tensors that do not fit the config.
+    """
+    if rules.rotations > trained_rotations:
+        raise ValueError(
+            f"env.rotations={rules.rotations}: the checkpoint was trained with {trained_rotations}; expected no more."
+        )
+    policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=cfg.algo.mask_infeasible)
+    checkpoint.load_module(policy, state, "policy")
+    return policy.eval()
