@@ -2,6 +2,7 @@
 
 from pickplace.env import PickPlaceEnv
 from pickplace.geometry import Failure, Item, Rules
+from pickplace.robot import Plan, Planner
 
 __version__ = "0.1.0"
-__all__ = ["Failure", "Item", "PickPlaceEnv", "Rules", "__version__"]
+__all__ = ["Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "Rules", "__version__"]

@@ -89,7 +89,7 @@ def answer(planner: Planner, line: bytes, defaults: dict, tell: bool = False) ->
     """The reply to one line: a plan, or ``{"error": ...}`` in one sentence; with the request's ``id`` if it has one."""
     reply = {}
     try:
-        request = json.loads(line, parse_constant=refuse_constant)
+        request = json.loads(line.decode(), parse_constant=refuse_constant)
         if not isinstance(request, dict):
             raise ValueError(f"got {type(request).__name__}, expected an object with bin_depth and tote_depth.")
         if "id" in request:
@@ -100,9 +100,9 @@ def answer(planner: Planner, line: bytes, defaults: dict, tell: bool = False) ->
             if key not in request:
                 raise ValueError(f"{key}: missing; expected a depth map as a list of rows.")
         return {**reply, **timed(planner, tell, **{**defaults, **request})}
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         return {**reply, "error": f"the line is not JSON: {error}."}
-    except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
+    except ValueError as error:
         return {**reply, "error": " ".join(str(error).split())}
 
 
