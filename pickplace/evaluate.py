@@ -16,9 +16,10 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from pickplace import checkpoint, config
-from pickplace.geometry import Failure
+from pickplace.geometry import Failure, Item
 from pickplace.planners.policy import restore_policy
-from pickplace.report import evaluation_table, tote_picture
+from pickplace.replay import Recording, animation, observe, page, picture
+from pickplace.report import evaluation_table
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +36,7 @@ class Episodes:
     tote_height: Tensor  # int64 [E]
     decisions: int  # over all episodes
     seconds: float  # spent in the planner
-    placed: list = field(default_factory=list)  # of the first episode: (x, y, z, w, d, h) of each item
+    recordings: list[Recording] = field(default_factory=list)  # of the first episodes
 
 
 def confidence95(values: Tensor, least: float = 0.0, most: float = 1.0) -> tuple[float, float]:
@@ -54,7 +55,7 @@ def confidence95(values: Tensor, least: float = 0.0, most: float = 1.0) -> tuple
 
 
 @torch.no_grad()
-def play(make_env, planner, episodes: int, batch_size: int) -> Episodes:
+def play(make_env, planner, episodes: int, batch_size: int, record: int = 0) -> Episodes:
     """Play episodes ``0 .. episodes - 1``, each in a slot of its own, all finished and all counted.
 
     Collecting "the first n episodes to finish" would favour short ones, and short ones are the bad ones.
@@ -64,8 +65,9 @@ def play(make_env, planner, episodes: int, batch_size: int) -> Episodes:
         planner: anything with ``decide``, see :mod:`pickplace.planners`.
         batch_size: episodes played side by side. It changes no result, but that of a planner that draws: which numbers
             an episode gets from the planner's one generator depends on the episodes beside it.
+        record: how many episodes, the first ones, to record move by move.
     """
-    parts, placed, feasible, decisions, seconds = [], [], 0.0, 0, 0.0
+    parts, recordings, feasible, decisions, seconds = [], [], 0.0, 0, 0.0
     for first in range(0, episodes, batch_size):
         env = make_env(first, min(batch_size, episodes - first))
         rules, count = env.rules, env.num_envs
@@ -75,6 +77,8 @@ def play(make_env, planner, episodes: int, batch_size: int) -> Episodes:
         placed_items = torch.zeros(count, dtype=torch.int64, device=env.device)
         failure = torch.zeros(count, dtype=torch.int64, device=env.device)
         final = env.heights.clone()
+        recorded = [Recording(first + slot, height) for slot, height in enumerate(env.tote_height.tolist())]
+        recorded = recorded[: max(record - first, 0)]
         while running.any():
             item, heights = env.current_item, env.heights.clone()
             placements = rules.placements(env.heights, env.tote_height, item)
@@ -83,12 +87,12 @@ def play(make_env, planner, episodes: int, batch_size: int) -> Episodes:
             start = time.perf_counter()
             action = planner.decide(observation)
             seconds += time.perf_counter() - start
-            if first == 0 and running[0]:
-                step = rules.apply(heights, env.tote_height, item, action)
-                if step.failure[0] == 0:
-                    x, y, w, d = step.footprint[0].tolist()
-                    h = int(item.h[0])
-                    placed.append((x, y, int(step.top[0]) - h, w, d, h))
+            rows = running[: len(recorded)].nonzero()[:, 0]
+            if len(rows):
+                seen = Item(*(part[rows] for part in item))
+                moves = observe(rules, planner, observation[rows], heights[rows], seen, action[rows])
+                for row, move in zip(rows.tolist(), moves, strict=True):
+                    recorded[row].moves.append(move)
             after = env.step(observation.set("action", action))["next"]
             done = after["done"][:, 0]
             ends = running & done
@@ -97,15 +101,20 @@ def play(make_env, planner, episodes: int, batch_size: int) -> Episodes:
             placed_items = torch.where(ends, env.steps, placed_items)
             failure = torch.where(ends, after["failure"][:, 0], failure)
             final = torch.where(ends[:, None, None], env.heights, final)
+            for row in ends[: len(recorded)].nonzero()[:, 0].tolist():
+                recorded[row].ending, recorded[row].occupancy = Failure(int(failure[row])), float(reached[row])
+                if recorded[row].ending == Failure.STUCK:
+                    recorded[row].waiting = tuple(env.item[row].tolist())
             running = running & ~done
             observation = step_mdp(observation)
             if done.any() and running.any():  # a finished slot plays on, uncounted, until all have finished
                 observation = env.reset(observation.set("_reset", after["done"]))
         parts.append((occupancy, placed_items, failure, final, env.tote_height))
+        recordings += recorded
     columns = [torch.cat(column).cpu() for column in zip(*parts, strict=True)]
     occupancy, placed_items, failure, final, tote_height = columns
     return Episodes(
-        occupancy, placed_items, failure, feasible / decisions, final, tote_height, decisions, seconds, placed
+        occupancy, placed_items, failure, feasible / decisions, final, tote_height, decisions, seconds, recordings
     )
 
 
@@ -146,7 +155,7 @@ def summarise(result: Episodes) -> dict:
 def evaluate(cfg: DictConfig, make_env, planner, facts: dict) -> tuple[dict, Episodes]:
     """Evaluate a planner as the config group ``evaluation`` says: what goes into ``evaluation.json``."""
     ev = cfg.evaluation
-    result = play(make_env, planner, ev.episodes, ev.batch_size)
+    result = play(make_env, planner, ev.episodes, ev.batch_size, record=max(ev.replay, 1))
     report = {
         "planner": planner.name,
         **facts,
@@ -233,10 +242,13 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
         ValueError: for settings that make no sense, or a checkpoint that does not fit them.
     """
     at_least = {"evaluation.episodes": 1, "evaluation.batch_size": 1, "evaluation.latency_decisions": 0}
+    at_least["evaluation.replay"] = 0
     for key, least in at_least.items():
         value = OmegaConf.select(cfg, key)
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
             raise ValueError(f"{key}={value}: expected a whole number >= {least}.")
+    if not isinstance(cfg.evaluation.gif, bool):
+        raise ValueError(f"evaluation.gif={cfg.evaluation.gif}: expected true or false.")
     if cfg.evaluation.stream not in ("validation", "test"):
         raise ValueError(f"evaluation.stream={cfg.evaluation.stream}: expected validation or test.")
     if "model" in cfg and cfg.checkpoint is None:
@@ -281,7 +293,12 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
     if cfg.compare is not None:
         result["paired_difference"] = paired_difference(result, Path(cfg.compare))
     (run_dir / "evaluation.json").write_text(json.dumps(result, indent=1))
-    tote_picture(episodes, rules, run_dir / "tote.png")
+    picture(episodes.recordings[0], rules, run_dir / "tote.png")
+    if ev.replay:
+        title = f"{cfg.checkpoint or planner.name}, {ev.stream} stream, seed {ev.seed}"
+        (run_dir / "replay.html").write_text(page(episodes.recordings, rules, title), encoding="utf-8")
+    if ev.gif:
+        animation(episodes.recordings[0], rules, run_dir / "replay.gif")
     table = evaluation_table(result)
     (run_dir / "evaluation.md").write_text(table)
     log.info("\n%s", table)

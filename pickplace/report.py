@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pickplace.geometry import Failure
 from pickplace.metrics import read_csv
 
 WALL, INK, POINT, LINE = "#9aa3ab", "#263238", "#c2410c", "#0072b2"
@@ -86,31 +85,35 @@ def learning_curve(metrics: Path, path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def tote_picture(episodes, rules, path: Path) -> None:
-    """Draw the packed tote of the first episode, beside its height map.
+def draw_scene(recording, rules, colours, moves: int | None = None):
+    """Draw the tote of a recorded episode, beside its height map.
 
     Args:
-        episodes: an :class:`pickplace.evaluate.Episodes`.
+        recording: a :class:`pickplace.replay.Recording`.
         rules: the task's sizes.
-        path: the PNG or SVG to write.
+        colours: of the kinds of items, see :func:`item_colours`.
+        moves: how many moves have been made; None: all, and the caption says how the episode ended.
+
+    Returns:
+        A matplotlib figure.
     """
+    done = recording.moves if moves is None else recording.moves[:moves]
+    boxes = recording.boxes[: sum(not move.failure for move in done)]
+    heights = np.zeros(rules.tote_size[:2], dtype=int)
+    for x, y, z, w, d, h in boxes:
+        heights[x : x + w, y : y + d] = z + h
+    size = (*rules.tote_size[:2], recording.tote_height)
     figure = _figure(12, 6)
     solid, plan = figure.subplots(1, 2, width_ratios=[1.2, 1])
-    height = int(episodes.tote_height[0])
-    size = (*rules.tote_size[:2], height)
-    _draw_boxes(solid, episodes.placed, _colours(episodes.placed), size)
-    _draw_plan(plan, episodes.final_heights[0].numpy(), height)
-    failure, full = Failure(int(episodes.failure[0])), bool((episodes.final_heights[0] >= height).all())
-    stuck = "the tote's top is reached everywhere" if full else "stuck, no feasible action left"
-    ending = {Failure.NONE: "the item stream is over", Failure.STUCK: stuck}
-    figure.suptitle(
-        f"{'x'.join(map(str, size))} tote, {float(episodes.occupancy[0]):.1%} full, "
-        f"{int(episodes.items_placed[0])} items placed; "
-        f"ended: {ending.get(failure, failure.name.lower().replace('_', ' '))}",
-        color=INK,
-        fontsize="x-large",
-    )
-    figure.savefig(path, dpi=120)
+    _draw_boxes(solid, boxes, colours, size)
+    _draw_plan(plan, heights, recording.tote_height)
+    share = 100 * sum(w * d * h for *_, w, d, h in boxes) / np.prod(size)
+    share = np.floor(10 * share + 1e-9) / 10  # never rounded up: 100% is full
+    caption = f"{'x'.join(map(str, size))} tote, {share:.1f}% full, {len(boxes)} items placed"
+    if len(done) == len(recording.moves):
+        caption += f". {recording.describe_ending(rules.num_places)}"
+    figure.suptitle(caption, color=INK, fontsize="x-large")
+    return figure
 
 
 def _kind(box) -> tuple[int, int, int]:
@@ -119,13 +122,14 @@ def _kind(box) -> tuple[int, int, int]:
     return min(w, d), max(w, d), h
 
 
-def _colours(placed) -> dict:
+def item_colours(boxes) -> dict[tuple[int, int, int], str]:
     """A colour for each kind of item, the small ones first; many kinds share a spectrum."""
     from matplotlib import colormaps
+    from matplotlib.colors import to_hex
 
-    kinds = sorted({_kind(box) for box in placed}, key=lambda kind: (np.prod(kind), kind))
+    kinds = sorted({_kind(box) for box in boxes}, key=lambda kind: (np.prod(kind), kind))
     few = len(kinds) <= len(COLOURS)
-    colours = COLOURS if few else colormaps["Spectral"](np.linspace(0, 1, len(kinds)))
+    colours = COLOURS if few else [to_hex(c) for c in colormaps["Spectral"](np.linspace(0, 1, len(kinds)))]
     return dict(zip(kinds, colours, strict=False))
 
 

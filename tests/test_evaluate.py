@@ -88,15 +88,16 @@ def test_every_episode_is_played_to_its_end_and_counted_once():
 
 
 def test_placed_items_of_the_first_episode_add_up():
-    result = evaluate.play(make_env, JointDBL(make_env(0, 1).rules), 3, 2)
+    result = evaluate.play(make_env, JointDBL(make_env(0, 1).rules), 3, 2, record=1)
+    boxes = result.recordings[0].boxes
     heights, volume = torch.zeros(4, 4, dtype=torch.int32), 0
-    for x, y, z, w, d, h in result.placed:
+    for x, y, z, w, d, h in boxes:
         space = heights[x : x + w, y : y + d]
         assert int(space.max()) == z
         space.fill_(z + h)
         volume += w * d * h
     assert torch.equal(heights, result.final_heights[0])
-    assert len(result.placed) == int(result.items_placed[0])
+    assert len(boxes) == int(result.items_placed[0])
     assert volume / (4 * 4 * 2) == pytest.approx(float(result.occupancy[0]))
 
 
@@ -115,14 +116,14 @@ class Fussy(JointDBL):
 @pytest.mark.parametrize("batch_size", [3, 100])
 def test_batch_size_does_not_change_the_episodes(planner, batch_size):
     rules = make_env(0, 1).rules
-    expected = evaluate.play(make_env, planner(rules), 12, 1)  # one at a time: no slot waits for another
-    result = evaluate.play(make_env, planner(rules), 12, batch_size)
+    expected = evaluate.play(make_env, planner(rules), 12, 1, record=4)  # one at a time: no slot waits
+    result = evaluate.play(make_env, planner(rules), 12, batch_size, record=4)
     if planner is Fussy:  # a slot that ends at once ends again, uncounted, while the longest one plays on
         assert expected.items_placed.min() == 0 and expected.items_placed.max() > 3
         assert (expected.failure != Failure.STUCK).any()
     for name in ("occupancy", "items_placed", "failure", "final_heights", "tote_height"):
         assert torch.equal(getattr(result, name), getattr(expected, name)), name
-    assert result.placed == expected.placed
+    assert result.recordings == expected.recordings and len(result.recordings) == 4
     assert result.decisions == expected.decisions
     assert result.feasible_share == pytest.approx(expected.feasible_share)
 

@@ -2,15 +2,13 @@
 
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
-from pickplace import report
-from pickplace.evaluate import Episodes
-from pickplace.geometry import Failure
+from pickplace import replay, report
+from pickplace.geometry import Failure, Rules
+from pickplace.replay import Move, Recording
 
 
 def random_boxes(rng, size, count):
@@ -55,22 +53,10 @@ def test_a_large_face_hides_what_is_behind():
     assert {number for number, _ in seen.values()} == {1, 2, 3}
 
 
-def episodes_of(boxes, size, failure=Failure.STUCK):
-    heights = torch.zeros(1, *size[:2], dtype=torch.int32)
-    for x, y, z, w, d, h in boxes:
-        heights[0, x : x + w, y : y + d] = z + h
-    volume = sum(w * d * h for *_, w, d, h in boxes)
-    return Episodes(
-        occupancy=torch.tensor([volume / np.prod(size)]),
-        items_placed=torch.tensor([len(boxes)]),
-        failure=torch.tensor([int(failure)]),
-        feasible_share=0.1,
-        final_heights=heights,
-        tote_height=torch.tensor([size[2]]),
-        decisions=len(boxes),
-        seconds=0.1,
-        placed=boxes,
-    )
+def recording_of(boxes, size, failure=Failure.STUCK):
+    """An episode that placed these boxes and ended so."""
+    moves = [Move((0, 0, w, d, h), (0, 0), (0, 0), 0, (x, y, w, d), z, Failure.NONE) for x, y, z, w, d, h in boxes]
+    return Recording(0, size[2], moves, failure)
 
 
 PICTURES = {
@@ -94,28 +80,28 @@ PICTURES = {
 def test_tote_picture(name, tmp_path):
     boxes, size, failure = PICTURES[name]
     path = tmp_path / "tote.png"
-    report.tote_picture(episodes_of(boxes, size, failure), SimpleNamespace(tote_size=size), path)
+    replay.picture(recording_of(boxes, size, failure), Rules(tote_size=size), path)
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(
     ("boxes", "failure", "ending"),
     [
-        ([(0, 0, 0, 2, 1, 1)], Failure.STUCK, "50.0% full, 1 items placed; ended: stuck, no feasible action left"),
-        ([(0, 0, 0, 2, 2, 1)], Failure.STUCK, "100.0% full, 1 items placed; ended: the tote's top is reached"),
-        ([(0, 0, 0, 2, 1, 1)], Failure.ITEM_COLLISION, "ended: item collision"),
-        ([(0, 0, 0, 2, 1, 1)], Failure.NONE, "ended: the item stream is over"),
+        ([(0, 0, 0, 2, 1, 1)], Failure.STUCK, "50.0% full, 1 items placed. This item fits nowhere any more."),
+        ([(0, 0, 0, 2, 2, 1)], Failure.STUCK, "100.0% full, 1 items placed. The tote is full."),
+        ([(0, 0, 0, 2, 1, 1)], Failure.ITEM_COLLISION, "The gripper would hit an item in the tote."),
+        ([(0, 0, 0, 2, 1, 1)], Failure.NONE, "The item stream is over."),
     ],
 )
-def test_caption_of_the_tote_picture(boxes, failure, ending, tmp_path, monkeypatch):
-    figures, make = [], report._figure
-    monkeypatch.setattr(report, "_figure", lambda *size: figures.append(make(*size)) or figures[-1])
-    size = (2, 2, 1)
-    report.tote_picture(episodes_of(boxes, size, failure), SimpleNamespace(tote_size=size), tmp_path / "tote.png")
-    caption = figures[0].get_suptitle()
+def test_caption_of_the_tote_picture(boxes, failure, ending):
+    rules, recording = Rules(tote_size=(2, 2, 1)), recording_of(boxes, (2, 2, 1), failure)
+    figure = report.draw_scene(recording, rules, report.item_colours(boxes))
+    caption = figure.get_suptitle()
     assert caption.startswith("2x2x1 tote") and ending in caption
-    numbers = [text.get_text() for text in figures[0].axes[1].texts]
-    assert sorted(numbers) == sorted(str(int(h)) for h in episodes_of(boxes, size).final_heights.flatten())
+    numbers = [text.get_text() for text in figure.axes[1].texts]
+    assert sorted(numbers) == (["0", "0", "1", "1"] if len(boxes[0]) and boxes[0][4] == 1 else ["1"] * 4)
+    before = report.draw_scene(recording, rules, report.item_colours(boxes), moves=0)
+    assert before.get_suptitle() == "2x2x1 tote, 0.0% full, 0 items placed"
 
 
 CURVES = {

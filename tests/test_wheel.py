@@ -31,6 +31,8 @@ def test_wheel_holds_every_config_file(wheel):
     expected = {f"pickplace/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")}
     assert expected and expected <= inside
     assert {"pickplace/models/conv4d.py", "pickplace/planners/policy.py"} <= inside
+    assert {"pickplace/assets/replay.html", "pickplace/assets/three.min.js"} <= inside
+    assert {f"pickplace/pretrained/r4/{name}" for name in ("card.json", "state.json", "state.safetensors")} <= inside
 
 
 def test_wheel_trains_from_another_directory(wheel, tmp_path):

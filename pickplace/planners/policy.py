@@ -55,6 +55,19 @@ class PolicyPlanner:
         first = (step.failure.view_as(tried) == 0).int().argmax(1, keepdim=True)  # 0, the most probable, if none
         return tried.gather(1, first)[:, 0]
 
+    @torch.no_grad()
+    def heat_map(self, observation: TensorDictBase) -> Tensor:
+        """The policy's greatest probability over picks and rotations for each place cell, ``[N, W_T, D_T]``.
+
+        With ``candidates="all"`` of what is feasible only, as it chooses then.
+        """
+        rules, bin_depth, tote_depth = self.rules, observation["bin_depth"], observation["tote_depth"]
+        score = self.policy.action_log_probs(bin_depth, tote_depth).exp()
+        if self.candidates == "all":
+            placements = rules.placements_from_depth(bin_depth, tote_depth, observation["tote_height"])
+            score = torch.where(rules.action_mask(placements), score, 0.0)
+        return score.view(len(score), rules.num_picks, *rules.tote_size[:2], rules.rotations).amax((1, 4))
+
 
 def restore_policy(cfg: DictConfig, rules: Rules, state: dict, trained_rotations: int) -> nn.Module:
     """The policy of a checkpoint, for these rules; the sizes need not be those that it was trained with.

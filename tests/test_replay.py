@@ -1,0 +1,256 @@
+"""Recorded episodes are what happened, and the page shows them: in a real browser, without any network."""
+
+import base64
+import json
+import re
+import shutil
+import time
+import zlib
+
+import numpy as np
+import pytest
+import torch
+
+from pickplace import Failure, PickPlaceEnv, Rules, evaluate, replay
+from pickplace.items import Kinds, Uniform
+from pickplace.models.actors import fcn_grasp
+from pickplace.planners import JointDBL, PolicyPlanner, UniformRandom
+from pickplace.replay import Move, Recording
+
+CELLS = {
+    "paper": ({}, None),
+    "odd": (
+        {"bin_size": (4, 6, 2), "tote_size": (5, 7, 3), "effector_size": (2, 3), "rotations": 3},
+        Kinds([(1, 2, 2)]),
+    ),
+    "mixed": ({"tote_size": (6, 5, 4), "effector_size": (4, 3)}, Uniform((1, 3), (1, 3), (1, 2))),
+}
+
+
+def record(cell="paper", planner=None, episodes=4):
+    settings, items = CELLS[cell]
+
+    def make_env(first, count):
+        return PickPlaceEnv(**settings, items=items, num_envs=count, stream="test", first_episode=first, masks=())
+
+    rules = make_env(0, 1).rules
+    planner = (planner or JointDBL)(rules)
+    return rules, evaluate.play(make_env, planner, episodes, 2, record=3)
+
+
+def policy_planner(rules, candidates="all"):
+    torch.manual_seed(0)
+    return PolicyPlanner(rules, fcn_grasp(rules, True, filters=8, hidden=8, head_std=1.0).eval(), candidates)
+
+
+@pytest.mark.parametrize("planner", [JointDBL, policy_planner, lambda rules: policy_planner(rules, 5)])
+@pytest.mark.parametrize("cell", CELLS)
+def test_recordings_are_what_happened(cell, planner):
+    rules, result = record(cell, planner)
+    assert [recording.episode for recording in result.recordings] == [0, 1, 2]
+    for number, recording in enumerate(result.recordings):
+        heights = np.zeros(rules.tote_size[:2], dtype=int)
+        for move in recording.moves:
+            x, y, w, d = move.footprint
+            ix, iy, iw, idp, h = move.item
+            if move.failure:
+                assert move is recording.moves[-1] and move.failure == recording.ending
+                continue
+            # The end effector covers the item in the bin, and after the turn in the tote.
+            ee = rules.effector_size
+            turned = ee[::-1] if move.rotation % 2 else ee
+            assert (w, d) == ((idp, iw) if move.rotation % 2 else (iw, idp))
+            for low, high, at, size in (
+                ((ix, iy), (ix + iw, iy + idp), move.pick, ee), ((x, y), (x + w, y + d), move.place, turned)
+            ):  # fmt: skip
+                assert all(a <= b for a, b in zip(at, low, strict=True))
+                assert all(b <= a + s for a, b, s in zip(at, high, size, strict=True))
+            space = heights[x : x + w, y : y + d]
+            assert space.max() == move.z
+            space[:] = move.z + h
+        assert (heights == result.final_heights[number].numpy()).all()
+        volume = sum(w * d * h for *_, w, d, h in recording.boxes)
+        assert volume / heights.size / recording.tote_height == pytest.approx(recording.occupancy)
+        assert recording.occupancy == float(result.occupancy[number])
+        assert (recording.waiting is not None) == (recording.ending == Failure.STUCK)
+        assert len(recording.boxes) == int(result.items_placed[number])
+
+
+@pytest.mark.parametrize("candidates", ["all", 3])
+def test_heat_map_against_a_loop(candidates):
+    rules = Rules(tote_size=(4, 5, 3), rotations=3)
+    planner = policy_planner(rules, candidates)
+    env = PickPlaceEnv(tote_size=(4, 5, 3), rotations=3, num_envs=3)
+    observation = env.rollout(4, break_when_any_done=False)[:, -1]
+    heat = planner.heat_map(observation)
+    score = planner.policy.action_log_probs(observation["bin_depth"], observation["tote_depth"]).exp()
+    for row in range(3):
+        best = torch.zeros(4, 5)
+        for action in range(rules.num_actions):
+            if candidates == "all" and not observation["action_mask"][row, action]:
+                continue
+            place = action // rules.rotations % rules.num_places
+            x, y = divmod(place, 5)
+            best[x, y] = max(best[x, y], score[row, action])
+        assert torch.allclose(heat[row], best)
+    assert heat.max() > 0
+
+
+def unpack(html):
+    packed = re.search(r'id="data">([^<]*)<', html)[1]
+    return json.loads(zlib.decompress(base64.b64decode(packed)))
+
+
+def test_page_is_one_file_that_holds_the_episodes():
+    rules, result = record(planner=policy_planner)
+    html = replay.page(result.recordings, rules, "a <b> & c")
+    data = unpack(html)
+    assert "{{" not in html and "/*{{three}}*/" not in html and "<title>a &lt;b&gt; &amp; c</title>" in html
+    assert not re.search(r'(src|href)="(?!data:)', html) and "import(" not in html.split("<script>")[-1]
+    assert data["tote"] == [6, 6, 5] and data["title"] == "a <b> & c"
+    for source, recording in zip(data["episodes"], result.recordings, strict=True):
+        assert len(source["moves"]) == len(recording.moves) and source["occupancy"] == recording.occupancy
+        heat = np.frombuffer(base64.b64decode(source["heat"]), dtype=np.uint8).reshape(-1, 6, 6)
+        assert all((a == move.heat).all() and a.max() == 255 for a, move in zip(heat, recording.moves, strict=True))
+    kinds = {",".join(map(str, sorted(move[2:4]))) + f",{move[4]}" for e in data["episodes"] for move in e["moves"]}
+    assert kinds <= set(data["colours"])
+
+
+def test_page_of_a_large_tote_is_small():
+    rng = np.random.default_rng(0)
+    moves = []
+    for n in range(4500):  # as many items of two cells as a 30x30x10 tote holds
+        z, cell = divmod(n, 450)
+        x, y = divmod(cell, 15)
+        heat = (rng.random((30, 30)) ** 8 * 255).astype(np.uint8)  # far more detail than a trained policy's
+        moves.append(Move((1, 1, 1, 2, 1), (0, 0), (x, 2 * y), 0, (x, 2 * y, 1, 2), z, Failure.NONE, heat))
+    recordings = [Recording(n, 10, moves, Failure.STUCK, (0, 0, 1, 1, 1), 1.0) for n in range(3)]
+    assert len(replay.page(recordings, Rules(tote_size=(30, 30, 10)), "large")) < 20e6
+
+
+def test_endings_in_words():
+    full = Recording(0, 1, [Move((0, 0, 2, 2, 1), (0, 0), (0, 0), 0, (0, 0, 2, 2), 0, Failure.NONE)], Failure.STUCK)
+    assert full.describe_ending(4) == replay.FULL != full.describe_ending(5)
+    assert set(replay.ENDINGS) == set(Failure)
+
+
+def test_picture_and_animation(tmp_path):
+    from PIL import Image
+
+    rules, result = record(episodes=1)
+    replay.picture(result.recordings[0], rules, tmp_path / "tote.svg", moves=3)
+    assert "3 items placed" in (tmp_path / "tote.svg").read_text() or (tmp_path / "tote.svg").stat().st_size > 10_000
+    replay.animation(result.recordings[0], rules, tmp_path / "replay.gif", seconds=1, frames=6)
+    with Image.open(tmp_path / "replay.gif") as image:
+        assert image.n_frames == 6 and image.info["loop"] == 0
+
+
+# ---------------------------------------------------------------------- in a browser
+@pytest.fixture(scope="module")
+def browser():
+    webdriver = pytest.importorskip("selenium.webdriver")
+    from selenium.webdriver.chrome.service import Service
+
+    driver, chrome = shutil.which("chromedriver"), shutil.which("chromium") or shutil.which("google-chrome")
+    if not driver or not chrome:
+        pytest.skip("needs chromium and chromedriver, such as Debian's packages chromium and chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chrome
+    for argument in (
+        "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1000,700",
+        "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+        "--host-resolver-rules=MAP * ~NOTFOUND",
+    ):  # fmt: skip
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    window = webdriver.Chrome(options=options, service=Service(driver))
+    yield window
+    window.quit()
+
+
+def wait_until(browser, script, seconds=20):
+    """Wait until a script returns something true, and return it."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if value := browser.execute_script(f"return {script}"):
+            return value
+        time.sleep(0.05)
+    raise AssertionError(f"never true: {script}; console: {browser.get_log('browser')}")
+
+
+def open_page(browser, path, fragment=""):
+    browser.get("about:blank")
+    browser.get_log("browser")
+    browser.get(f"file://{path}{fragment}")
+    wait_until(browser, "window.replay && window.replay.ready")
+    return lambda: browser.execute_script("return replay.state()")
+
+
+def colours_on_canvas(browser):
+    """How many different colours the 3D picture has."""
+    return browser.execute_script(
+        "const c = document.querySelector('#stage > canvas'), t = document.createElement('canvas');"
+        "t.width = 200; t.height = 140; const p = t.getContext('2d'); p.drawImage(c, 0, 0, 200, 140);"
+        "const d = p.getImageData(0, 0, 200, 140).data, s = new Set();"
+        "for (let i = 0; i < d.length; i += 4) s.add(d[i] << 16 | d[i + 1] << 8 | d[i + 2]); return s.size"
+    )
+
+
+def test_page_opens_steps_plays_and_changes_episodes(browser, tmp_path):
+    rules, result = record(planner=policy_planner)
+    path = tmp_path / "replay.html"
+    path.write_text(replay.page(result.recordings, rules, "policy"), encoding="utf-8")
+    state = open_page(browser, path, "#episode=0&step=0")
+    moves = result.recordings[0].moves
+    assert state()["moves"] == len(moves) and state()["shown"] == 0 and not state()["playing"]
+    blank = colours_on_canvas(browser)
+    assert blank > 5
+
+    click = {name: browser.find_element("id", name).click for name in ("forward", "back", "play", "heat", "view")}
+    click["forward"]()
+    wait_until(browser, "!replay.state().playing")
+    assert state()["at"] == 1 and state()["shown"] == 1
+    click["back"]()
+    assert state()["at"] == 0
+    browser.execute_script("document.getElementById('speed').value = 350")
+    click["play"]()
+    wait_until(browser, f"replay.state().at === {len(moves)}")
+    end = state()
+    assert end["shown"] == len(moves) and not end["playing"]
+    assert end["ending"] == result.recordings[0].describe_ending(rules.num_places)
+    assert abs(float(end["percent"].rstrip("%")) / 100 - result.recordings[0].occupancy) <= 0.001
+    assert colours_on_canvas(browser) > blank
+    click["heat"]()
+    click["view"]()
+
+    browser.execute_script("const e = document.getElementById('episode'); e.value = 2; e.onchange()")
+    assert state()["episode"] == 2 and state()["at"] == 0 and state()["moves"] == len(result.recordings[2].moves)
+    browser.execute_script("location.hash = '#episode=1&step=2'")
+    wait_until(browser, "replay.state().episode === 1 && replay.state().shown === 2")
+    assert [entry for entry in browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")] == []
+    fetched = browser.execute_script("return performance.getEntriesByType('resource').map(e => e.name)")
+    assert [name for name in fetched if not name.startswith(("data:", "blob:"))] == []
+
+
+def test_page_shows_a_failure_in_place(browser, tmp_path):
+    rules, result = record(planner=lambda rules: policy_planner(rules, 1))
+    failing = next(r for r in result.recordings if r.ending not in (Failure.STUCK, Failure.NONE))
+    path = tmp_path / "replay.html"
+    path.write_text(replay.page([failing], rules, "K=1"), encoding="utf-8")
+    state = open_page(browser, path, "#step=9999")
+    assert state()["ending"] == replay.ENDINGS[failing.ending]
+    assert state()["shown"] == len(failing.boxes) == len(failing.moves) - 1
+    assert browser.find_element("id", "ending").get_attribute("class") == "bad"
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+def test_page_without_a_policy_or_any_success(browser, tmp_path):
+    rules, result = record(planner=UniformRandom)
+    path = tmp_path / "replay.html"
+    path.write_text(replay.page(result.recordings, rules, "uniform"), encoding="utf-8")
+    state = open_page(browser, path)
+    assert not browser.find_element("id", "heat-label").is_displayed()
+    browser.find_element("id", "play").click()
+    wait_until(browser, "replay.state().ending !== ''")
+    assert state()["moves"] == len(result.recordings[0].moves)
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
