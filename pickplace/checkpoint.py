@@ -134,7 +134,14 @@ def read(folder: Path) -> tuple[dict, dict]:
         tensors = load(blob)
     except SafetensorError as error:
         raise CheckpointError(f"{folder}: {TENSORS} cannot be read ({error}).") from error
-    return unflatten(tensors, facts.pop("state")), facts
+    state, frames = facts.pop("state", None), facts.get("frames")
+    whole = isinstance(frames, int) and not isinstance(frames, bool) and frames >= 0
+    if not isinstance(state, dict) or not isinstance(facts.get("config"), dict) or not whole:
+        raise CheckpointError(f"{folder}: {FACTS} lacks its state, config or frames; expected what a training wrote.")
+    state = unflatten(tensors, state)
+    if not isinstance(state.get("policy"), dict):
+        raise CheckpointError(f"{folder}: {TENSORS} has no policy; expected what a training wrote.")
+    return state, facts
 
 
 def load_module(module: torch.nn.Module, state: dict, what: str) -> None:

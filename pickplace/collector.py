@@ -34,21 +34,38 @@ class ResumableCollector(Collector):
             # Without "collector": trajectory numbers are drawn from a pool that all workers share, and never read.
             carried=self._carrier.exclude("collector").clone().to_dict(),
             counters={"frames": torch.tensor(self._frames), "iterations": torch.tensor(self._iter)},
-            rng=torch.get_rng_state(),
+            **rng_state(self.env.device),
         )
 
     def load_state_dict(self, state_dict, **kwargs) -> None:
         self.env.base_env.load_state_dict(state_dict["environment"])
         self.env.transform.load_state_dict(state_dict["transforms"])
-        self._carrier.update(TensorDict(state_dict["carried"], batch_size=self.env.batch_size))
+        # The carrier has no device of its own, so that tensors would stay where they were loaded.
+        carried = TensorDict(state_dict["carried"], batch_size=self.env.batch_size, device=self.env.device)
+        self._carrier.update(carried)
         self._frames = int(state_dict["counters"]["frames"])
         self._iter = int(state_dict["counters"]["iterations"])
-        torch.set_rng_state(state_dict["rng"].cpu())
+        set_rng_state(state_dict, self.env.device)
 
 
-def ignore_interrupt() -> None:
-    """Leave Ctrl-C, which a terminal sends to workers too, to the main process: it finishes the batch and saves."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def rng_state(device: torch.device) -> dict[str, torch.Tensor]:
+    """The state of the global generators that a process on this device draws from."""
+    state = {"rng": torch.get_rng_state()}
+    return state | {"cuda_rng": torch.cuda.get_rng_state(device)} if device.type == "cuda" else state
+
+
+def set_rng_state(state: dict, device: torch.device) -> None:
+    """Restore what :func:`rng_state` returned; one that was saved on another device has the CPU's generator only."""
+    torch.set_rng_state(state["rng"].cpu())
+    if device.type == "cuda" and "cuda_rng" in state:
+        torch.cuda.set_rng_state(state["cuda_rng"].cpu(), device)
+
+
+def ignore_signals() -> None:
+    """Leave Ctrl-C and SIGTERM, which terminals and schedulers send to workers too, to the main process: it finishes
+    the batch, saves, and closes the workers."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def single(make_env, policy, num_envs: int, rollout_length: int, seed: int) -> Collector:
@@ -92,7 +109,7 @@ def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, 
         trust_policy=True,
         use_buffers=True,
         auto_register_policy_transforms=False,
-        init_fn=ignore_interrupt,
+        init_fn=ignore_signals,
     )
     # Each worker draws its own actions; large odd steps keep the generators apart from those of seed + 1.
     collector.map_fn("start", [(seed, seed * 1_000_003 + worker + 1) for worker in range(workers)])

@@ -1,6 +1,5 @@
 """Hydra around the commands: where the config files are, overrides on saved configs, and errors in one sentence."""
 
-import importlib
 import logging
 import os
 import re
@@ -71,32 +70,42 @@ def use_machine(cfg: DictConfig) -> torch.device:
     return device
 
 
-def refuse_foreign_targets(node, path: str = "config") -> None:
-    """Refuse a config that would make anything but pickplace's own objects; a checkpoint's config is not trusted.
+#: What a checkpoint's config may make, and where: by its place in the config, names below ``pickplace``.
+TARGETS = {
+    "env": ("PickPlaceEnv", "env.PickPlaceEnv"),
+    "items": ("items.Kinds", "items.Uniform", "items.Recorded"),
+    "model.actor": ("models.actors.fcn_grasp", "models.actors.fcn4d"),
+    "model.critic": ("models.critics.OutcomeCritic", "models.critics.conv4d_critic"),
+    "curriculum": ("curriculum.Curriculum",),
+    "curriculum.advance": tuple(
+        f"curriculum.{rule}" for rule in ("NoAdvance", "Frames", "Threshold", "Plateau", "Staged")
+    ),
+    "curriculum.sample": ("curriculum.Current", "curriculum.Uniform", "curriculum.Recent"),
+    "collector": ("collector.single", "collector.multi_sync"),
+    "logger": ("metrics.CsvLogger", "metrics.TensorboardLogger", "metrics.NoLogger"),
+    "planner": ("planners.PolicyPlanner",),
+}
+
+
+def refuse_foreign_targets(node, path: str = "") -> None:
+    """Refuse a config that would make anything unexpected; a checkpoint's config is not trusted.
 
     Raises:
-        ValueError: naming the ``_target_``.
+        ValueError: naming the ``_target_`` and its place.
     """
     if isinstance(node, dict):
-        target = node.get("_target_")
-        if target is not None and not _is_ours(target):
-            raise ValueError(f"{path}._target_={target!r}: expected a class or function defined in pickplace.")
+        if "_target_" in node:
+            allowed = [f"pickplace.{name}" for name in TARGETS.get(path, ())]
+            if node["_target_"] not in allowed:
+                expected = f"one of {', '.join(allowed)}" if allowed else "none in this place"
+                raise ValueError(
+                    f"{path}._target_={node['_target_']!r}: the checkpoint is refused; expected {expected}."
+                )
         for key, value in node.items():
-            refuse_foreign_targets(value, f"{path}.{key}")
+            refuse_foreign_targets(value, f"{path}.{key}" if path else str(key))
     elif isinstance(node, list):
         for index, value in enumerate(node):
             refuse_foreign_targets(value, f"{path}[{index}]")
-
-
-def _is_ours(target) -> bool:
-    module, _, name = str(target).rpartition(".")
-    if module.split(".")[0] != "pickplace":
-        return False
-    try:  # of what is importable below pickplace, only what was defined there: not `os` as some module of ours sees it
-        found = getattr(importlib.import_module(module), name, None)
-    except ImportError:
-        return False
-    return getattr(found, "__module__", "").split(".")[0] == "pickplace"
 
 
 def apply_overrides(saved: DictConfig, overrides: list[str], groups: dict[str, DictConfig] | None = None) -> DictConfig:

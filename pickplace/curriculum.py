@@ -154,8 +154,12 @@ class Advance:
         """The level from now on, and what else to log; called after each batch."""
         raise NotImplementedError
 
-    def least_frames(self) -> float:
-        """Frames before which the last height surely is not reached; infinite if it never is."""
+    def least_frames(self, batch: int) -> float:
+        """Frames before which the last height surely is not reached; infinite if it never is.
+
+        Args:
+            batch: frames between two decisions.
+        """
         return 0
 
 
@@ -191,8 +195,8 @@ class Frames(Advance):
         due = self.start + tally.frames // self.share > tally.level
         return min(tally.level + due, self.end), {}
 
-    def least_frames(self):
-        return (self.end - self.start) * self.share
+    def least_frames(self, batch):
+        return (self.end - self.start) * max(self.share, batch)
 
 
 class Threshold(Advance):
@@ -232,8 +236,8 @@ class Threshold(Advance):
             return max(tally.level - 1, self.start), {}
         return tally.level, {}
 
-    def least_frames(self):  # an episode takes at least one frame
-        return (self.end - self.start) * min(self.window, self.max_frames)
+    def least_frames(self, batch):  # an episode takes at least one frame
+        return (self.end - self.start) * max(min(self.window, self.max_frames), batch)
 
 
 class Plateau(Advance):
@@ -273,8 +277,8 @@ class Plateau(Advance):
         self._forget()
         return tally.level + 1, logs
 
-    def least_frames(self):  # an episode takes at least one frame
-        return (self.end - self.start) * self.patience * self.window
+    def least_frames(self, batch):  # an episode takes at least one frame
+        return (self.end - self.start) * self.patience * max(self.window, batch)
 
 
 class Staged(Advance):
@@ -308,7 +312,7 @@ class Staged(Advance):
     def update(self, tally):
         return self._height_at(tally.frames), {}
 
-    def least_frames(self):
+    def least_frames(self, batch):
         return min((f for f in (0, *dict(self.plan)) if self._height_at(f) == self.end), default=math.inf)
 
 
@@ -339,6 +343,7 @@ class Curriculum:
         """
         end = max_height if self.end_height is None else self.end_height
         self.end = _whole("curriculum.end_height", end, min_height, max_height)
+        self.full_height = max_height
         start = min_height if self.start_height is None else self.start_height
         self.start = _whole("curriculum.start_height", start, min_height, self.end)
         first = self.advance.setup(self.start, self.end, _whole("total_frames", total_frames))
@@ -353,9 +358,19 @@ class Curriculum:
         """A transform for one collector process, at the present level."""
         return ToteHeightCurriculum(self.level, self.sample, self.start)
 
-    def check_budget(self, total_frames: int) -> str | None:
-        """A sentence if the last height surely cannot be trained within ``total_frames``, else None."""
-        least = self.advance.least_frames()
+    def check_budget(self, total_frames: int, batch: int = 1) -> str | None:
+        """A sentence if full height surely cannot be trained within ``total_frames``, else None.
+
+        Args:
+            total_frames: the run's budget.
+            batch: frames of a batch, after each of which the level may move.
+        """
+        if self.end < self.full_height:
+            return (
+                f"curriculum.end_height={self.end}: nothing is trained at the full height, {self.full_height}, "
+                "where validation and evaluation play."
+            )
+        least = self.advance.least_frames(batch)
         if least < total_frames:
             return None
         expected = f"more than {least} frames" if least < math.inf else "a stage of that height"

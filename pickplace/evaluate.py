@@ -129,6 +129,8 @@ def decision_latency(make_env, planner, decisions: int) -> dict[str, float] | No
     for _ in range(decisions):
         start = time.perf_counter()
         action = planner.decide(observation)
+        if action.device.type == "cuda":  # where a call returns before its work is done
+            torch.cuda.synchronize(action.device)
         times.append((time.perf_counter() - start) * 1e3)
         _, observation = env.step_and_maybe_reset(observation.set("action", action))
     times = torch.tensor(times, dtype=torch.float64)
@@ -152,6 +154,17 @@ def summarise(result: Episodes) -> dict:
     }
 
 
+def episodes_of(cfg: DictConfig) -> dict:
+    """What says which episodes an evaluation plays."""
+    return {
+        "env": OmegaConf.to_container(cfg.env, resolve=True),
+        "items": OmegaConf.to_container(cfg["items"], resolve=True),
+        "stream": cfg.evaluation.stream,
+        "episodes": cfg.evaluation.episodes,
+        "seed": cfg.evaluation.seed,
+    }
+
+
 def evaluate(cfg: DictConfig, make_env, planner, facts: dict) -> tuple[dict, Episodes]:
     """Evaluate a planner as the config group ``evaluation`` says: what goes into ``evaluation.json``."""
     ev = cfg.evaluation
@@ -159,11 +172,7 @@ def evaluate(cfg: DictConfig, make_env, planner, facts: dict) -> tuple[dict, Epi
     report = {
         "planner": planner.name,
         **facts,
-        "env": OmegaConf.to_container(cfg.env, resolve=True),
-        "items": OmegaConf.to_container(cfg["items"], resolve=True),
-        "stream": ev.stream,
-        "episodes": ev.episodes,
-        "seed": ev.seed,
+        **episodes_of(cfg),
         **summarise(result),
         "latency_ms": decision_latency(make_env, planner, ev.latency_decisions),
         "versions": versions(),
@@ -172,28 +181,39 @@ def evaluate(cfg: DictConfig, make_env, planner, facts: dict) -> tuple[dict, Epi
     return report, result
 
 
-def paired_difference(result: dict, path: Path) -> dict:
-    """Mean occupancy of a result minus that of another ``evaluation.json``, episode by episode, with its 95% interval.
+def read_comparison(path: Path, expected: dict) -> dict:
+    """Another ``evaluation.json`` of the same episodes, for :func:`paired_difference`.
 
-    Both must have met the same items: pairing removes what one stream is luckier than another.
+    Args:
+        path: the file.
+        expected: ``stream``, ``seed``, ``episodes``, ``items`` and ``env`` of the evaluation at hand.
 
     Raises:
         ValueError: if the file cannot be read, or is about other episodes.
     """
     try:
         other = json.loads(path.read_text())
-        theirs = torch.tensor(other["occupancy"]["per_episode"], dtype=torch.float64)
+        torch.tensor(other["occupancy"]["per_episode"], dtype=torch.float64)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"compare={str(path)!r}: expected an evaluation.json ({error}).") from error
     for key in ("stream", "seed", "episodes", "items"):
-        if result[key] != other.get(key):
-            raise ValueError(f"compare={str(path)!r}: its {key} is {other.get(key)!r}, expected {result[key]!r}.")
+        if expected[key] != other.get(key):
+            raise ValueError(f"compare={str(path)!r}: its {key} is {other.get(key)!r}, expected {expected[key]!r}.")
     for key in ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "min_support", "strict_support"):
-        if result["env"][key] != other["env"].get(key):
+        if expected["env"][key] != other["env"].get(key):
             raise ValueError(
-                f"compare={str(path)!r}: env.{key}={other['env'].get(key)}, expected {result['env'][key]}."
+                f"compare={str(path)!r}: env.{key}={other['env'].get(key)}, expected {expected['env'][key]}."
             )
-    difference = torch.tensor(result["occupancy"]["per_episode"], dtype=torch.float64) - theirs
+    return other
+
+
+def paired_difference(result: dict, other: dict) -> dict:
+    """Mean occupancy of a result minus that of another one, episode by episode, with its 95% interval.
+
+    Both have met the same items: pairing removes what one stream is luckier than another.
+    """
+    ours, theirs = (torch.tensor(r["occupancy"]["per_episode"], dtype=torch.float64) for r in (result, other))
+    difference = ours - theirs
     return {
         "against": other["planner"],
         "mean": float(difference.mean()),
@@ -287,11 +307,13 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
             raise ValueError("checkpoint=null: planner=policy needs a checkpoint; expected a run folder.")
         policy = restore_policy(cfg, rules, policy_state, saved["config"]["env"]["rotations"])
         kwargs["policy"] = policy.to(cfg.device)
-        facts |= {"candidates": cfg.planner.candidates, "mask_at_decision": cfg.planner.candidates == "all"}
+        masked = cfg.planner.candidates == "all" or policy.excludes or False
+        facts |= {"candidates": cfg.planner.candidates, "mask_at_decision": masked}
     planner = config.instantiate(cfg.planner, rules=rules, **kwargs)
+    other = None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), episodes_of(cfg))
     result, episodes = evaluate(cfg, make_env, planner, facts)
-    if cfg.compare is not None:
-        result["paired_difference"] = paired_difference(result, Path(cfg.compare))
+    if other:
+        result["paired_difference"] = paired_difference(result, other)
     (run_dir / "evaluation.json").write_text(json.dumps(result, indent=1))
     picture(episodes.recordings[0], rules, run_dir / "tote.png")
     if ev.replay:

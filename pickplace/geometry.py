@@ -80,8 +80,8 @@ def _sizes(name: str, value, count: int) -> tuple[int, ...]:
         exact = all(int(v) == v and not isinstance(v, bool) for v in value)
     except (TypeError, ValueError):
         sizes, exact = (), False
-    if not exact or len(sizes) != count or min(sizes) < 1:
-        raise ValueError(f"{name}={value!r}: expected {count} positive whole numbers of cells.")
+    if not exact or len(sizes) != count or min(sizes) < 1 or max(sizes) >= FAR:
+        raise ValueError(f"{name}={value!r}: expected {count} positive whole numbers of cells, below {FAR}.")
     return sizes
 
 

@@ -66,7 +66,7 @@ class TensorboardLogger:
                 "logger=tensorboard: tensorboard is missing; pip install 'pickplace[tensorboard]'."
             ) from error
         # Events after the checkpoint that a run is resumed from are hidden by TensorBoard itself.
-        self._writer = SummaryWriter(str(folder), purge_step=frames or None)
+        self._writer = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
 
     def log(self, metrics: dict[str, float], frames: int) -> None:
         """Add a point to each metric's curve."""

@@ -279,8 +279,11 @@ def evaluation_table(result: dict) -> str:
         trained = result["trained"]
         rows.append(("checkpoint", f"{result['checkpoint']} ({trained['frames']:,} frames, seed {trained['seed']})"))
     if "candidates" in result:
-        words = {True: "yes", False: "no"}
-        masks = f"in training {words[result['mask_in_training']]}, at decision {words[result['mask_at_decision']]}"
+        in_training, at_decision = (
+            {True: "yes", False: "no"}.get(mask, mask)
+            for mask in (result["mask_in_training"], result["mask_at_decision"])
+        )
+        masks = f"in training {in_training}, at decision {at_decision}"
         rows.append(("mask; candidates K", f"{masks}; {result['candidates']}"))
     width = max(len(name) for name, _ in rows)
     values = max(len(value) for _, value in rows)

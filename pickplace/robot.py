@@ -102,6 +102,9 @@ class Planner:
             raise ValueError(f"{unknown[0]}={sizes[unknown[0]]!r}: expected one of {', '.join(sorted(known))}.")
         trained = {key: value for key, value in OmegaConf.to_container(cfg.env, resolve=True).items() if key in known}
         rules = Rules(**{**trained, **sizes})
+        if rules.pick_rule == "overlap" and rules.longest_side is None:  # then the number of grasps depends on it
+            longest = int(config.instantiate(cfg["items"]).sizes[:, :2].max())
+            rules = replace(rules, longest_side=longest)
         policy = restore_policy(cfg, rules, state["policy"], cfg.env.rotations)
         return cls(rules, policy.to(device), candidates)
 
@@ -148,6 +151,13 @@ class Planner:
         bin_map = _snap("bin_depth", bin_depth, rules.bin_size[:2], unit, tolerance, 2**20)
         tote_map = _snap("tote_depth", tote_depth, rules.tote_size[:2], unit, tolerance, height)
         _refuse_other_than_one_cuboid(bin_map)
+        if (
+            rules.pick_rule == "overlap"
+            and max((bin_map > 0).sum(0).max(), (bin_map > 0).sum(1).max()) > rules.max_side
+        ):
+            raise DepthMapError(
+                f"bin_depth: the item is longer than any in training, expected at most {rules.max_side}."
+            )
 
         device = next(self._planner.policy.parameters()).device
         observation = TensorDict(

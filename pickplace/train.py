@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
@@ -17,6 +19,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from pickplace import checkpoint, config
+from pickplace.collector import rng_state, set_rng_state
 from pickplace.curriculum import Curriculum, push_level
 from pickplace.evaluate import commit, play, summarise, versions
 from pickplace.geometry import Failure
@@ -38,6 +41,8 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
         Mean occupancy of the final policy at full tote height on the validation stream, for sweepers to optimise.
     """
     check_settings(cfg)
+    if cfg.resume is not None and resume is None:
+        raise ValueError(f"resume={cfg.resume}: expected as resume=<run folder> on the command line, without a +.")
     algo, device = cfg.algo, config.use_machine(cfg)
     torch.manual_seed(cfg.seed)
 
@@ -59,7 +64,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
         curriculum.load_state_dict(facts["curriculum"])
         checkpoint.load_module(policy, state["policy"], "policy")
         checkpoint.load_module(critic, state["critic"], "critic")
-    if warning := curriculum.check_budget(cfg.total_frames):
+    if warning := curriculum.check_budget(cfg.total_frames, cfg.env.num_envs * algo.rollout_length):
         log.warning(warning)
 
     # TorchRL's parts: collector, advantage, loss.
@@ -90,7 +95,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
     if resume:
         optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
         collector.load_state_dict(state["collector"])
-        torch.set_rng_state(state["rng"])  # last: everything above may have drawn
+        set_rng_state(state, device)  # last: everything above may have drawn
 
     logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames)
     stop, started, first_frames, saved = StopRequest(), time.perf_counter(), frames, frames
@@ -103,7 +108,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
             "critic": critic.state_dict(),
             "optimizer": optimizer.state_dict()["state"],
             "collector": collector.state_dict(),
-            "rng": torch.get_rng_state(),
+            **rng_state(device),
         }
         facts = {
             **dict(zip(COUNTERS, (frames, iteration, best, latest), strict=True)),
@@ -170,11 +175,13 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
         collector.shutdown()
         stop.restore()
 
-    if stop.requested:
+    if stop.requested:  # a sweep ends here too, instead of going on to its next job
         log.info("stopped at %s frames; continue with: python -m pickplace.train resume=%s", f"{frames:,}", run_dir)
     if (run_dir / "metrics.csv").is_file():
         learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
     log.info("run folder: %s", run_dir)
+    if stop.requested and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
+        raise KeyboardInterrupt
     return float(latest.get("occupancy", float("nan")))
 
 
@@ -216,7 +223,7 @@ def check_settings(cfg: DictConfig) -> None:
     for key, (low, high) in ranges.items():
         value = OmegaConf.select(cfg, key)
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not number or not value >= low or (high is not None and value > high):
+        if not number or not low <= value < float("inf") or (high is not None and value > high):
             raise ValueError(f"{key}={value}: expected a number >= {low}{'' if high is None else f' and <= {high}'}.")
 
 
@@ -336,7 +343,8 @@ class StopRequest:
 
 
 #: What the state of running episodes is tied to.
-FIXED = ("seed", "env.bin_size", "env.tote_size", "env.rotations", "env.num_envs", "collector.workers")
+RULES = ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "min_support", "strict_support")
+FIXED = ("seed", *(f"env.{key}" for key in RULES), "env.num_envs", "items", "algo.mask_infeasible", "collector.workers")
 
 
 def resume_run(overrides: list[str]) -> float:
@@ -347,6 +355,8 @@ def resume_run(overrides: list[str]) -> float:
         raise ValueError(f"resume={place}: expected a run folder, or its checkpoints/last or checkpoints/best.")
     run_dir = folder.parent.parent
     state, facts = checkpoint.read(folder)
+    if missing := [key for key in ("curriculum", *COUNTERS) if key not in facts]:
+        raise ValueError(f"resume={place}: the checkpoint has no {missing[0]!r}; expected one that a training wrote.")
     config.refuse_foreign_targets(facts["config"])
     rest = [item for item in overrides if not item.startswith("resume=")]
     saved = OmegaConf.create(facts["config"])

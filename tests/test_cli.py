@@ -1,5 +1,6 @@
 """The commands: bad input ends in one sentence, a code other than 0, and leaves nothing behind."""
 
+import hashlib
 import json
 import logging
 import os
@@ -8,6 +9,8 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import save
 
 from pickplace import checkpoint, evaluate, train
 
@@ -94,12 +97,21 @@ BAD = [
     ("train", ["planner.candidates=0"], ["candidates=0", "'all'"]),
     ("train", ["resume=nowhere"], ["nowhere'", "run folder"]),
     ("train", ["resume=nowhere", "-m"], ["resume", "flags"]),
+    ("train", ["++resume=nowhere"], ["resume=nowhere", "without a +"]),
+    ("train", ["algo.lr=inf"], ["algo.lr=inf", ">= 0"]),
+    ("train", ["env.tote_size=[5,5,3000000000]"], ["3000000000", "below 1048576"]),
+    ("train", ["model.critic.hidden=-1"], ["model.critic.hidden=-1", ">= 1"]),
+    ("train", ["model=fcn4d", "model.actor.filters=-1"], ["filters=-1", ">= 1"]),
     ("evaluate", [], ["checkpoint=null", "run folder"]),
     ("evaluate", ["checkpoint=nowhere"], ["nowhere'", "run folder"]),
     ("evaluate", ["planner=joint_dbl", "model.actor.filters=8"], ["model", "checkpoint=<run folder>"]),
     ("evaluate", ["planner=joint_dbl", "planner.seed=1"], ["planner.seed", "no key"]),
     ("evaluate", ["planner=random", "planner.seed=one"], ["planner.seed='one'", "whole number"]),
     ("evaluate", ["planner=joint_dbl", "evaluation.latency_decisions=x"], ["latency_decisions=x", ">= 0"]),
+    ("evaluate", ["planner=uniform", "planner.seed=one"], ["planner.seed='one'", "whole number"]),
+    ("evaluate", ["planner=joint_dbl", "compare=nowhere.json"], ["compare='nowhere.json'", "evaluation.json"]),
+    ("evaluate", ["planner=joint_dbl", "evaluation.replay=-1"], ["evaluation.replay=-1", ">= 0"]),
+    ("evaluate", ["planner=joint_dbl", "evaluation.gif=1"], ["evaluation.gif=1", "true or false"]),
     ("evaluate", ["planner=greedy"], ["planner/greedy", "joint_dbl"]),
     ("evaluate", ["planner=joint_dbl", "evaluation.episodes=0"], ["evaluation.episodes=0", ">= 1"]),
     ("evaluate", ["planner=joint_dbl", "evaluation.stream=exam"], ["stream=exam", "validation"]),
@@ -161,6 +173,11 @@ def test_checkpoint_for_fewer_rotations(run, smoke_run, tmp_path):
         ("env.rotations=1", "env.rotations=1: the run began with 4"),
         ("env.tote_size=[5,5,1]", "the run began with [4, 4, 1]"),
         ("env.num_envs=4", "env.num_envs=4: the run began with 8"),
+        ("env.effector_size=[2,3]", "the run began with [3, 3]"),
+        ("env.min_support=1.0", "env.min_support=1.0: the run began with 0.5"),
+        ("env.pick_rule=overlap", "the run began with contain"),
+        ("items.kinds=[[1,1,1]]", "items={"),
+        ("algo.mask_infeasible=false", "the run began with True"),
         ("model.actor.filters=16", "does not fit"),
         ("curriculum=paper", "cannot be exchanged"),
         ("+algo.gama=0.9", "did you mean 'gamma'?"),
@@ -178,7 +195,9 @@ def test_incompatible_resume_is_refused_and_changes_nothing(run, smoke_run, over
     assert files == {path: path.read_bytes() for path in files}
 
 
-@pytest.mark.parametrize("damage", ["truncate", "flip", "remove", "facts", "schema", "target"])
+@pytest.mark.parametrize(
+    "damage", ["truncate", "flip", "remove", "facts", "schema", "target", "state", "config", "frames", "no policy"]
+)
 def test_damaged_checkpoints_are_refused(run, smoke_run, tmp_path, damage):
     folder = tmp_path / "copy"
     folder.mkdir()
@@ -199,6 +218,14 @@ def test_damaged_checkpoints_are_refused(run, smoke_run, tmp_path, damage):
         content = json.loads(facts.read_text())
         if damage == "schema":
             content["schema"] = 99
+        elif damage in ("state", "frames"):
+            del content[damage]
+        elif damage == "config":
+            content["config"] = []
+        elif damage == "no policy":
+            tensors = folder / checkpoint.TENSORS
+            tensors.write_bytes(save({"other": torch.zeros(1)}))
+            content["sha256"] = hashlib.sha256(tensors.read_bytes()).hexdigest()
         else:
             content["config"]["model"]["actor"]["_target_"] = "os.system"
         facts.write_text(json.dumps(content))
@@ -220,7 +247,7 @@ def test_evaluation_of_a_run(run, smoke_run, tmp_path):
     assert set(result["occupancy"]) == {"mean", "ci95", "min", "per_episode"}
     assert len(result["occupancy"]["per_episode"]) == 6
     assert result["env"]["tote_size"] == [5, 5, 2] and result["candidates"] == 10
-    assert result["mask_in_training"] is True and result["mask_at_decision"] is False
+    assert result["mask_in_training"] is True and result["mask_at_decision"].startswith("failed picks")
     assert {path.name for path in (tmp_path / "result").iterdir()} >= {"tote.png", "evaluation.md"}
 
 

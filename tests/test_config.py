@@ -145,14 +145,45 @@ def test_refused_overrides_on_a_saved_config(override, message):
 
 @pytest.mark.parametrize(
     "target",
-    ["os.system", "pickplace.checkpoint.shutil.rmtree", "pickplace.checkpoint.os.system", "builtins.eval", "pickplace"],
+    [
+        "os.system", "pickplace.checkpoint.shutil.rmtree", "builtins.eval", "pickplace", None, 5,
+        "pickplace.export.export", "pickplace.checkpoint.write", "${planner._target_}",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("place", ["env", "model.actor", "curriculum.advance", "collector"])
+def test_foreign_targets_are_refused(target, place):
+    node = {"_target_": target}
+    for key in reversed(place.split(".")):
+        node = {key: node}
+    with pytest.raises(ValueError, match="checkpoint is refused; expected one of pickplace"):
+        config.refuse_foreign_targets(node)
+
+
+@pytest.mark.parametrize(
+    "node",
+    [
+        {"model": {"actor": {"hidden": {"_target_": "pickplace.items.Kinds"}}}},
+        {"items": {"kinds": [[{"_target_": "pickplace.items.Kinds"}]]}},
+        {"_target_": "pickplace.items.Kinds"},
+        {"model": [{"_target_": "pickplace.models.actors.fcn4d"}]},
+    ],
 )
-def test_foreign_targets_are_refused(target):
-    with pytest.raises(ValueError, match="expected a class or function defined in pickplace"):
-        config.refuse_foreign_targets({"model": [{"_target_": target}]})
+def test_targets_in_other_places_are_refused(node):
+    with pytest.raises(ValueError, match="expected none in this place"):
+        config.refuse_foreign_targets(node)
 
 
 def test_our_own_configs_are_accepted():
-    for name in options("model"):
-        cfg = composed(f"model={name}", "curriculum=mixture", "items=mixed")
-        config.refuse_foreign_targets(OmegaConf.to_container(cfg, resolve=False))
+    groups = ("env", "items", "model", "curriculum", "curriculum/advance", "curriculum/sample", "collector", "logger")
+    for group in groups:
+        for name in options(group):
+            cfg = composed(f"{group}={name}")
+            config.refuse_foreign_targets(OmegaConf.to_container(cfg, resolve=False))
+
+
+@pytest.mark.parametrize("part", ["advance", "sample"])
+@pytest.mark.parametrize("composition", options("curriculum"))
+def test_the_parts_of_every_curriculum_can_be_exchanged(composition, part):
+    for name in options(f"curriculum/{part}"):
+        cfg = composed(f"curriculum={composition}", f"curriculum/{part}={name}")
+        config.instantiate(cfg.curriculum).setup(1, 5, 10**9)

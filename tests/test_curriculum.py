@@ -345,6 +345,25 @@ def test_budget_message_is_true():
         assert curriculum.level == 5
 
 
+@pytest.mark.parametrize("batch", [3, 50])
+@pytest.mark.parametrize(
+    ("rule", "occupancy"),
+    [(lambda: Frames(10), []), (lambda: Threshold(0.5, 4), [1.0]), (lambda: Plateau(2, 2), [0.0])],
+)
+def test_budget_message_is_true_of_batches(batch, rule, occupancy):
+    curriculum, frames = make(rule()), 0
+    while curriculum.check_budget(frames + 1, batch):
+        assert curriculum.level < 5
+        frames += batch
+        play(curriculum, frames, occupancy * batch)
+
+
+def test_training_that_ends_below_full_height_says_so():
+    curriculum = Curriculum(NoAdvance(), Current(), end_height=3)
+    curriculum.setup(1, 5, 1000)
+    assert "curriculum.end_height=3: nothing is trained at the full height, 5" in curriculum.check_budget(1000)
+
+
 def test_budget_of_stages_that_never_reach_the_end():
     assert "a stage of that height" in make(Staged([{"frames": 5, "height": 3}])).check_budget(10**9)
 
@@ -573,7 +592,8 @@ def test_every_leaf_instantiates_in_a_composition(group):
         curriculum.setup(1, 5, 1_000_000)
         curriculum.update(torch.tensor([1]), torch.tensor([0.5]), 100)
         assert file.read_text().startswith("# ")
-    assert len(kinds) == len(files) == {"advance": 5, "sample": 3}[group]
+    # Frames twice: evenly divided, and with the paper's 5 million a level.
+    assert len(kinds) == len(files) - (group == "advance") == {"advance": 5, "sample": 3}[group]
 
 
 def test_staged_can_be_given_on_the_command_line():

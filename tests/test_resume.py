@@ -28,11 +28,18 @@ SETTINGS = [
 ]
 
 
-def start(*overrides):
+def start(*overrides, own_group=False):
     """A training process of its own."""
     command = [sys.executable, "-m", "pickplace.train", *overrides]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        process_group=0 if own_group else None,
+    )
 
 
 def finish(process):
@@ -114,6 +121,28 @@ def test_sigterm_saves_and_a_resume_goes_on_exactly(reference, tmp_path):
     assert rows[-1]["frames"] == saved < 24 * ITERATION
     finish(start(f"resume={run_dir}"))
     assert_same(reference_dir, run_dir)
+
+
+def test_a_stop_request_to_the_whole_process_group_saves(reference, tmp_path):
+    """As schedulers and ``timeout`` send it: workers get the signal too, and leave the stopping to the main process."""
+    _, settings = reference
+    run_dir = tmp_path / "group"
+    process = start(*settings, f"hydra.run.dir={run_dir}", own_group=True)
+    wait_for_rows(process, run_dir, 4)
+    os.killpg(process.pid, signal.SIGTERM)
+    assert f"resume={run_dir}" in finish(process)
+    saved = json.loads((run_dir / "checkpoints/last" / checkpoint.FACTS).read_text())["frames"]
+    assert saved == read_csv(run_dir / "metrics.csv")[-1]["frames"] < 24 * ITERATION
+
+
+def test_a_stop_request_ends_a_sweep(tmp_path):
+    sweep = tmp_path / "sweep"
+    process = start("-m", "seed=0,1", *[s for s in SETTINGS if "total_frames" not in s], f"hydra.sweep.dir={sweep}")
+    wait_for_rows(process, sweep / "0", 2)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert (sweep / "0" / "checkpoints" / "last").is_dir() and not (sweep / "1").exists()
 
 
 def test_resume_with_a_longer_budget(reference):

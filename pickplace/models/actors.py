@@ -9,7 +9,8 @@ choice. Every policy offers
 * ``forward(...) -> logits [N, choices]``, float32;
 * ``to_action(choice, bin_depth, tote_depth, tote_height) -> int64 [N]``: a flat action of the class, drawn evenly
   (the lowest one when exploration is off);
-* ``action_log_probs(bin_depth, tote_depth) -> [N, N_a]``: the distribution over flat actions, without any mask.
+* ``action_log_probs(bin_depth, tote_depth) -> [N, N_a]``: the distribution over flat actions, without any mask;
+* ``excludes``: what this distribution gives probability 0 all the same, by construction; None if nothing.
 """
 
 import torch
@@ -60,6 +61,7 @@ class FlatPolicy(nn.Module):
     """
 
     choice_key = "action"
+    excludes = None
 
     def __init__(self, rules: Rules, mask_infeasible: bool = False, **network):
         super().__init__()
@@ -91,6 +93,7 @@ class OutcomePolicy(nn.Module):
     """
 
     choice_key = "outcome"
+    excludes = "failed picks and footprints outside the tote"
     masks = ("outcome",)
     mask_infeasible = True
     in_keys = ["bin_depth", "tote_depth", "outcome_mask"]
@@ -134,6 +137,7 @@ class GraspPolicy(nn.Module):
     """
 
     choice_key = "grasp"
+    excludes = None
     masks = ()
     mask_infeasible = False
     in_keys = ["bin_depth", "tote_depth"]

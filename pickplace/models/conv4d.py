@@ -29,6 +29,12 @@ BIN_PADDING, TOTE_PADDING = -1.0, 0.0
 DTYPES = ("float32", "bfloat16")
 
 
+def _check_width(name: str, value) -> None:
+    """Refuse a layer's width that is none."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise ValueError(f"{name}={value!r}: expected a whole number >= 1.")
+
+
 class Conv4dParameters(nn.Module):
     """Weight ``[out, in, k, k, k, k]`` and bias ``[out]`` of a 4D convolution, drawn as `nn.Conv2d` does.
 
@@ -81,8 +87,9 @@ class Conv4dPolicy(nn.Module):
         chunk_bytes: int = 256 * 2**20,
     ):
         super().__init__()
+        _check_width("filters", filters)
         if compute_dtype not in DTYPES:
-            raise ValueError(f"compute_dtype must be one of {DTYPES}, not {compute_dtype!r}")
+            raise ValueError(f"compute_dtype={compute_dtype!r}: expected one of {', '.join(DTYPES)}.")
         self.rotations = rotations
         self.filters = filters
         self.bin_clip = bin_clip
@@ -218,6 +225,8 @@ class Conv4dCritic(nn.Module):
         depth_scale: float = 5.0,
     ):
         super().__init__()
+        _check_width("filters", filters)
+        _check_width("hidden", hidden)
         self.bin_size = tuple(bin_size)[:2]
         self.tote_size = tuple(tote_size)[:2]
         self.bin_clip = bin_clip

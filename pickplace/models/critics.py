@@ -24,6 +24,8 @@ class OutcomeCritic(nn.Module):
 
     def __init__(self, rules: Rules, channels: int = 16, hidden: int = 128, **network):
         super().__init__()
+        if not isinstance(hidden, int) or isinstance(hidden, bool) or hidden < 1:
+            raise ValueError(f"model.critic.hidden={hidden!r}: expected a whole number >= 1.")
         self.network = ItemConditionedFcn(channels, head_std=0.1, **network)
         extra = 1 + 3 * self.network.item_range
         self.join = nn.Linear(channels * rules.num_places + extra, hidden)

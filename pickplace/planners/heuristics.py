@@ -18,7 +18,7 @@ class UniformRandom:
     name = "uniform"
 
     def __init__(self, rules: Rules, seed: int = 0):
-        self.rules, self._generator = rules, torch.Generator().manual_seed(seed)
+        self.rules, self._generator = rules, torch.Generator().manual_seed(_checked(seed))
 
     def decide(self, observation: TensorDictBase) -> Tensor:
         """Flat actions, int64 ``[N]``."""
@@ -38,9 +38,7 @@ class RandomFeasible:
     name = "random"
 
     def __init__(self, rules: Rules, seed: int = 0):
-        if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:
-            raise ValueError(f"planner.seed={seed!r}: expected a whole number >= 0 and < 2**63.")
-        self.rules, self.seed, self._generator = rules, seed, None
+        self.rules, self.seed, self._generator = rules, _checked(seed), None
 
     def decide(self, observation: TensorDictBase) -> Tensor:
         mask = observation.get("action_mask", None)
@@ -85,6 +83,13 @@ class JointDBL:
             reaching = torch.where((reaching >= 0) & (best[:, parity, None] == least), reaching, highest)
             action = torch.minimum(action, reaching.amin(1, keepdim=True))
         return action[:, 0].clamp(max=highest - 1)
+
+
+def _checked(seed: int) -> int:
+    """A seed that is one."""
+    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:
+        raise ValueError(f"planner.seed={seed!r}: expected a whole number >= 0 and < 2**63.")
+    return seed
 
 
 def _placements(rules: Rules, observation: TensorDictBase):
