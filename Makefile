@@ -5,7 +5,7 @@ STAMP := .venv/.installed
 RUN ?= outputs/quick_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
 
-.PHONY: help install train test test-slow lint format clean
+.PHONY: help install demo train test test-slow lint format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -17,6 +17,10 @@ $(STAMP): pyproject.toml
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev]'
 	@touch $@
 
+demo: $(STAMP)  ## pack totes with the weights that come along, and show it in a browser
+	$(BIN)/python -m pickplace.evaluate checkpoint=pretrained/r4 evaluation.episodes=20 hydra.run.dir=outputs/demo $(ARGS)
+	@$(BIN)/python -m pickplace.show outputs/demo/replay.html
+
 train: RUN_DIR := $(RUN)
 train: $(STAMP)  ## train (experiment=quick; ARGS="key=value ..." adds overrides), evaluate, and show a packed tote
 	$(BIN)/python -m pickplace.train experiment=quick hydra.run.dir=$(RUN_DIR) $(ARGS)
@@ -26,8 +30,10 @@ train: $(STAMP)  ## train (experiment=quick; ARGS="key=value ..." adds overrides
 	  checkpoints/best 'the policy, for pickplace-evaluate checkpoint=$(RUN_DIR)' \
 	  metrics.csv 'every metric over frames' \
 	  learning_curve.png 'occupancy and tote height over frames' \
+	  report.html 'the whole run on one page: curves, tables, best and worst episode' \
 	  evaluation/evaluation.md 'the table above; evaluation.json has every episode' \
-	  evaluation/tote.png 'a packed tote'
+	  evaluation/tote.png 'a packed tote' \
+	  evaluation/replay.html 'how it was packed, in 3D'
 
 test test-slow: export OMP_NUM_THREADS ?= 2
 test: $(STAMP)  ## run the test suite (minutes)

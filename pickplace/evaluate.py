@@ -6,6 +6,7 @@ import platform
 import subprocess
 import time
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -36,7 +37,7 @@ class Episodes:
     tote_height: Tensor  # int64 [E]
     decisions: int  # over all episodes
     seconds: float  # spent in the planner
-    recordings: list[Recording] = field(default_factory=list)  # of the first episodes
+    recordings: list[Recording] = field(default_factory=list)  # of the episodes that were to be recorded
 
 
 def confidence95(values: Tensor, least: float = 0.0, most: float = 1.0) -> tuple[float, float]:
@@ -55,7 +56,7 @@ def confidence95(values: Tensor, least: float = 0.0, most: float = 1.0) -> tuple
 
 
 @torch.no_grad()
-def play(make_env, planner, episodes: int, batch_size: int, record: int = 0) -> Episodes:
+def play(make_env, planner, episodes: int, batch_size: int, record: Collection[int] = ()) -> Episodes:
     """Play episodes ``0 .. episodes - 1``, each in a slot of its own, all finished and all counted.
 
     Collecting "the first n episodes to finish" would favour short ones, and short ones are the bad ones.
@@ -65,7 +66,7 @@ def play(make_env, planner, episodes: int, batch_size: int, record: int = 0) -> 
         planner: anything with ``decide``, see :mod:`pickplace.planners`.
         batch_size: episodes played side by side. It changes no result, but that of a planner that draws: which numbers
             an episode gets from the planner's one generator depends on the episodes beside it.
-        record: how many episodes, the first ones, to record move by move.
+        record: numbers of the episodes to record move by move.
     """
     parts, recordings, feasible, decisions, seconds = [], [], 0.0, 0, 0.0
     for first in range(0, episodes, batch_size):
@@ -77,8 +78,8 @@ def play(make_env, planner, episodes: int, batch_size: int, record: int = 0) -> 
         placed_items = torch.zeros(count, dtype=torch.int64, device=env.device)
         failure = torch.zeros(count, dtype=torch.int64, device=env.device)
         final = env.heights.clone()
-        recorded = [Recording(first + slot, height) for slot, height in enumerate(env.tote_height.tolist())]
-        recorded = recorded[: max(record - first, 0)]
+        totes = enumerate(env.tote_height.tolist())
+        recorded = {slot: Recording(first + slot, height) for slot, height in totes if first + slot in record}
         while running.any():
             item, heights = env.current_item, env.heights.clone()
             placements = rules.placements(env.heights, env.tote_height, item)
@@ -87,11 +88,10 @@ def play(make_env, planner, episodes: int, batch_size: int, record: int = 0) -> 
             start = time.perf_counter()
             action = planner.decide(observation)
             seconds += time.perf_counter() - start
-            rows = running[: len(recorded)].nonzero()[:, 0]
-            if len(rows):
+            if rows := [slot for slot in recorded if running[slot]]:
                 seen = Item(*(part[rows] for part in item))
                 moves = observe(rules, planner, observation[rows], heights[rows], seen, action[rows])
-                for row, move in zip(rows.tolist(), moves, strict=True):
+                for row, move in zip(rows, moves, strict=True):
                     recorded[row].moves.append(move)
             after = env.step(observation.set("action", action))["next"]
             done = after["done"][:, 0]
@@ -101,7 +101,7 @@ def play(make_env, planner, episodes: int, batch_size: int, record: int = 0) -> 
             placed_items = torch.where(ends, env.steps, placed_items)
             failure = torch.where(ends, after["failure"][:, 0], failure)
             final = torch.where(ends[:, None, None], env.heights, final)
-            for row in ends[: len(recorded)].nonzero()[:, 0].tolist():
+            for row in [slot for slot in recorded if ends[slot]]:
                 recorded[row].ending, recorded[row].occupancy = Failure(int(failure[row])), float(reached[row])
                 if recorded[row].ending == Failure.STUCK:
                     recorded[row].waiting = tuple(env.item[row].tolist())
@@ -110,7 +110,7 @@ def play(make_env, planner, episodes: int, batch_size: int, record: int = 0) -> 
             if done.any() and running.any():  # a finished slot plays on, uncounted, until all have finished
                 observation = env.reset(observation.set("_reset", after["done"]))
         parts.append((occupancy, placed_items, failure, final, env.tote_height))
-        recordings += recorded
+        recordings += recorded.values()
     columns = [torch.cat(column).cpu() for column in zip(*parts, strict=True)]
     occupancy, placed_items, failure, final, tote_height = columns
     return Episodes(
@@ -168,7 +168,7 @@ def episodes_of(cfg: DictConfig) -> dict:
 def evaluate(cfg: DictConfig, make_env, planner, facts: dict) -> tuple[dict, Episodes]:
     """Evaluate a planner as the config group ``evaluation`` says: what goes into ``evaluation.json``."""
     ev = cfg.evaluation
-    result = play(make_env, planner, ev.episodes, ev.batch_size, record=max(ev.replay, 1))
+    result = play(make_env, planner, ev.episodes, ev.batch_size, record=range(max(ev.replay, 1)))
     report = {
         "planner": planner.name,
         **facts,

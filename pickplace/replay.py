@@ -1,8 +1,9 @@
-"""Recorded episodes, and the page, pictures and animations that show them."""
+"""Recorded episodes, and the pages, pictures and animations that show them."""
 
 import base64
 import io
 import json
+import re
 import zlib
 from dataclasses import dataclass, field
 from functools import cache
@@ -130,10 +131,8 @@ def page(recordings: list[Recording], rules: Rules, title: str) -> str:
     }
     packed = base64.b64encode(zlib.compress(json.dumps(data, separators=(",", ":")).encode(), 9)).decode()
     html = (ASSETS / "replay.html").read_text(encoding="utf-8")
-    parts = {"{{title}}": escape(title), "{{data}}": packed, "/*{{three}}*/": _three()}
-    for mark, content in parts.items():
-        html = html.replace(mark, content)
-    return html
+    parts = {"title": escape(title), "data": packed, "three": _three()}
+    return re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], html)
 
 
 @cache

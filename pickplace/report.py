@@ -10,6 +10,12 @@ WALL, INK, POINT, LINE = "#9aa3ab", "#263238", "#c2410c", "#0072b2"
 # Okabe and Ito's colours, told apart by colour-blind readers too; one for each size of item.
 COLOURS = ["#56b4e9", "#e69f00", "#009e73", "#f0e442", "#cc79a7", "#0072b2", "#d55e00", "#8c8c8c"]
 
+# Of the reasons for which episodes end, by their names in the metrics; stuck, the good one, is grey.
+FAILURES = {
+    "stuck": "#cfd5da", "none": "#eceff1", "pick_miss": "#d55e00", "bin_collision": "#e69f00",
+    "tote_collision": "#0072b2", "overflow": "#56b4e9", "item_collision": "#009e73", "unstable": "#cc79a7",
+}  # fmt: skip
+
 
 def _figure(width: float, height: float):
     """A figure that needs no display; matplotlib is imported here, so that importing pickplace stays fast."""
@@ -83,6 +89,47 @@ def learning_curve(metrics: Path, path: Path) -> None:
     lower.set_xlim(0, 1.02 * max([row["frames"] for row in rows], default=100))
     lower.xaxis.set_major_formatter(EngFormatter(sep=""))
     figure.savefig(path, dpi=120)
+
+
+def failure_mix(metrics: Path, path) -> None:
+    """Draw the share of training episodes that ended for each reason, over frames.
+
+    Args:
+        metrics: a ``metrics.csv``.
+        path: the PNG or SVG to write, or a file object.
+    """
+    from matplotlib.ticker import EngFormatter, PercentFormatter
+
+    prefix = "train/failure_"
+    rows = [row for row in read_csv(metrics) if any(key.startswith(prefix) for key in row)]
+    names = [name for name in FAILURES if any(row.get(prefix + name, 0) > 0 for row in rows)]
+    figure = _figure(8, 3.2)
+    axes = figure.subplots()
+    if rows:
+        frames = np.array([row["frames"] for row in rows])
+        shares = np.array([[row.get(prefix + name, 0.0) for row in rows] for name in names]).reshape(len(names), -1)
+        weights = np.array([row.get("train/episodes", 1.0) for row in rows])
+        window = max(1, len(rows) // 100)  # as in the learning curve: a running mean over the latest 1%
+
+        def smooth(values):
+            return np.convolve(values, np.ones(window), mode="valid")
+
+        total = np.maximum(smooth(weights), 1e-9)
+        stack = [smooth(share * weights) / total for share in shares]
+        axes.stackplot(
+            frames[window - 1 :], stack, labels=[name.replace("_", " ") for name in names],
+            colors=[FAILURES[name] for name in names],
+        )  # fmt: skip
+        axes.set_xlim(0, 1.02 * frames[-1])
+        axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+    else:
+        axes.text(0.5, 0.5, "no episode has ended yet", transform=axes.transAxes, ha="center", color=INK)
+    axes.set_ylim(0, 1)
+    axes.yaxis.set_major_formatter(PercentFormatter(1))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.set_xlabel("frames (environment steps)")
+    axes.set_ylabel("training episodes")
+    figure.savefig(path, dpi=120, format=None if isinstance(path, Path) else "png")
 
 
 def draw_scene(recording, rules, colours, moves: int | None = None):

@@ -21,10 +21,11 @@ from torchrl.objectives.value import GAE
 from pickplace import checkpoint, config
 from pickplace.collector import rng_state, set_rng_state
 from pickplace.curriculum import Curriculum, push_level
-from pickplace.evaluate import commit, play, summarise, versions
+from pickplace.evaluate import Episodes, commit, confidence95, play, versions
 from pickplace.geometry import Failure
 from pickplace.models.actors import as_actor, as_collection_policy, check_sizes
 from pickplace.report import learning_curve
+from pickplace.training_report import write_report
 
 log = logging.getLogger(__name__)
 
@@ -97,6 +98,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
         collector.load_state_dict(state["collector"])
         set_rng_state(state, device)  # last: everything above may have drawn
 
+    episodes = None  # of the latest validation
     logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames)
     stop, started, first_frames, saved = StopRequest(), time.perf_counter(), frames, frames
     left = max(cfg.total_frames - frames, 0)
@@ -155,7 +157,8 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
             # On intervals: validate, save, tell.
             finished = frames >= cfg.total_frames
             if finished or crossed(before, frames, cfg.evaluation_interval):
-                latest = validate(cfg, build_env, planner)
+                episodes = validate(cfg, build_env, planner)
+                latest = validation_metrics(episodes)
                 metrics |= {f"eval/{key}": value for key, value in latest.items()}
                 log.info("%s frames: validation occupancy %.4f", f"{frames:,}", latest["occupancy"])
                 if latest["occupancy"] > best:
@@ -179,6 +182,11 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
         log.info("stopped at %s frames; continue with: python -m pickplace.train resume=%s", f"{frames:,}", run_dir)
     if (run_dir / "metrics.csv").is_file():
         learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
+        if episodes is not None and frames >= cfg.total_frames:
+            log.info("writing the report")
+            extremes = {int(episodes.occupancy.argmin()), int(episodes.occupancy.argmax())}
+            replayed = validate(cfg, build_env, planner, record=extremes)
+            write_report(run_dir, cfg, replayed, rules, versions() | {"commit": commit()})
     log.info("run folder: %s", run_dir)
     if stop.requested and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise KeyboardInterrupt
@@ -295,16 +303,20 @@ def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
     return metrics
 
 
-def validate(cfg: DictConfig, build_env, planner) -> dict[str, float]:
-    """Play the validation stream at full height."""
+def validate(cfg: DictConfig, build_env, planner, record=()) -> Episodes:
+    """Play the validation stream at full height, and record the episodes of these numbers."""
     ev = cfg.evaluation
 
     def make_env(first, count):
         return build_env(num_envs=count, masks=(), stream=ev.stream, seed=ev.seed, first_episode=first)
 
-    report = summarise(play(make_env, planner, ev.episodes, ev.batch_size))
-    low, high = report["occupancy"]["ci95"]
-    return {"occupancy": report["occupancy"]["mean"], "ci95_low": low, "ci95_high": high}
+    return play(make_env, planner, ev.episodes, ev.batch_size, record)
+
+
+def validation_metrics(episodes: Episodes) -> dict[str, float]:
+    """What is logged of a validation."""
+    low, high = confidence95(episodes.occupancy)
+    return {"occupancy": float(episodes.occupancy.mean()), "ci95_low": low, "ci95_high": high}
 
 
 def crossed(before: int, now: int, interval: int) -> bool:

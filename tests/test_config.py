@@ -94,7 +94,12 @@ def test_every_preset_runs(name, tmp_path):
     occupancy = train(composed(f"experiment={name}", *TINY, *extra), tmp_path)
     assert 0 <= occupancy <= 1
     assert [row["frames"] for row in read_csv(tmp_path / "metrics.csv")] == [16, 32]
-    assert {path.name for path in tmp_path.iterdir()} == {"checkpoints", "learning_curve.png", "metrics.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "checkpoints",
+        "learning_curve.png",
+        "metrics.csv",
+        "report.html",
+    }
 
 
 @pytest.mark.parametrize("masked", [True, False])

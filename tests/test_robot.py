@@ -6,16 +6,18 @@ import sys
 from collections import Counter
 from math import cos, radians, sin
 
+import hydra
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from omegaconf import OmegaConf
 from oracle import Oracle
 from oracle import Rules as OracleRules
 from tensordict import TensorDict
 
-from pickplace import Failure, Planner, Rules, plan
+from pickplace import Failure, Planner, Rules, checkpoint, config, plan
 from pickplace.models.actors import fcn4d, fcn_grasp
 from pickplace.planners import PolicyPlanner
 from pickplace.robot import DepthMapError
@@ -305,3 +307,18 @@ def test_command_answers_json_lines_and_survives_bad_ones(command):
     assert [reply.get("id") for reply in replies] == ["a", None, None, None, None, 7, 8, 9, None, 11, {"b": 1}]
     assert replies[-2]["status"] == "stuck" and sum(replies[-2]["reasons"].values()) == 3600
     assert {**replies[0], "id": 0} == {**replies[-1], "id": 0} and replies[0]["status"] == "ok"
+
+
+def test_load_of_a_policy_whose_grasps_depend_on_the_items(tmp_path):
+    """With ``pick_rule=overlap`` and no mask the number of grasp classes follows from the longest item in training."""
+    overrides = ["experiment=smoke", "env.pick_rule=overlap", "algo.mask_infeasible=false", "env.tote_size=[5,5,2]"]
+    with hydra.initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
+        cfg = hydra.compose("train", overrides)
+    rules = Rules(tote_size=(5, 5, 2), pick_rule="overlap", longest_side=2)
+    policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=False)
+    facts = {"frames": 0, "config": OmegaConf.to_container(cfg), "commit": None}
+    checkpoint.write(tmp_path / "it", {"policy": policy.state_dict()}, facts)
+    loaded = Planner.load(tmp_path / "it")
+    assert loaded.plan(ITEM, np.full((5, 5), 2)).status == "ok"
+    with pytest.raises(DepthMapError, match="the item is longer than any in training, expected at most 2"):
+        loaded.plan(changed(ITEM, (3, 2), 1), np.full((5, 5), 2))
