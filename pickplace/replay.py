@@ -55,7 +55,7 @@ class Recording:
     episode: int  # its number in the stream
     tote_height: int
     moves: list[Move] = field(default_factory=list)
-    ending: Failure = Failure.NONE
+    ending: Failure | None = None  # None while it goes on; NONE when a recorded stream is over
     waiting: tuple[int, ...] | None = None  # the item that arrived last and fits nowhere, as `Move.item`
     occupancy: float = 0.0
 
@@ -66,7 +66,9 @@ class Recording:
         return [(*move.footprint[:2], move.z, *move.footprint[2:], move.item[4]) for move in good]
 
     def describe_ending(self, num_places: int) -> str:
-        """Why the episode ended, in a sentence."""
+        """Why the episode ended, in a sentence; empty while it goes on."""
+        if self.ending is None:
+            return ""
         volume = sum(w * d * h for *_, w, d, h in self.boxes)
         full = self.ending == Failure.STUCK and volume == num_places * self.tote_height
         return FULL if full else ENDINGS[self.ending]

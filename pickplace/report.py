@@ -157,7 +157,7 @@ def draw_scene(recording, rules, colours, moves: int | None = None):
     share = 100 * sum(w * d * h for *_, w, d, h in boxes) / np.prod(size)
     share = np.floor(10 * share + 1e-9) / 10  # never rounded up: 100% is full
     caption = f"{'x'.join(map(str, size))} tote, {share:.1f}% full, {len(boxes)} items placed"
-    if len(done) == len(recording.moves):
+    if len(done) == len(recording.moves) and recording.ending is not None:
         caption += f". {recording.describe_ending(rules.num_places)}"
     figure.suptitle(caption, color=INK, fontsize="x-large")
     return figure
