@@ -173,7 +173,7 @@ class PickPlaceGymEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded("render() before reset().")
         rules, item = self._env.rules, self._env.current_item
         scene = draw_scene(self._recording, rules, item_colours(self._recording.boxes))
-        inset = scene.axes[0].inset_axes([0, 0.02, 0.2, 0.24])
+        inset = scene.add_axes([0.01, 0.04, 0.09, 0.18])
         inset.imshow(rules.bin_depth(item)[0].cpu().numpy().T, origin="lower", cmap="YlOrBr", vmin=0)
         inset.set_title("bin", fontsize="medium")
         inset.set_xticks([])

@@ -1,6 +1,6 @@
 """Train sb3-contrib's MaskablePPO on the Gymnasium environment: python docs/examples/maskable_ppo.py
 
-Needs ``pip install sb3-contrib``. Some two minutes on one CPU core, on a small tote. pickplace's own training is far
+Needs ``pip install sb3-contrib``. Some three minutes on one CPU core, on a small tote. pickplace's own training is far
 faster; this shows that other libraries can learn on the same task.
 """
 
