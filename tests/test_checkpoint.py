@@ -35,37 +35,37 @@ def same(a, b):
 @given(tree=trees)
 def test_round_trip(tree, tmp_path_factory):
     folder = tmp_path_factory.mktemp("round") / "last"
-    checkpoint.write(folder, tree, {"frames": 3})
+    checkpoint.write(folder, {"policy": {}, "tree": tree}, {"frames": 3, "config": {}})
     state, facts = checkpoint.read(folder)
-    assert same(tree, state)
+    assert same({"policy": {}, "tree": tree}, state)
     assert facts["frames"] == 3
 
 
 def test_a_kill_between_the_renames_loses_nothing(tmp_path):
     run = tmp_path / "run"
     folder = run / "checkpoints" / "last"
-    checkpoint.write(folder, {"x": torch.ones(2)}, {"frames": 1})
+    checkpoint.write(folder, {"policy": {}, "x": torch.ones(2)}, {"frames": 1, "config": {}})
     folder.rename(folder.with_name(".last.old"))  # killed right after this
     found = checkpoint.locate(run, prefer="last")
     assert checkpoint.read(found)[1]["frames"] == 1
-    checkpoint.write(folder, {"x": torch.zeros(2)}, {"frames": 2})
+    checkpoint.write(folder, {"policy": {}, "x": torch.zeros(2)}, {"frames": 2, "config": {}})
     assert checkpoint.read(checkpoint.locate(run, prefer="last"))[1]["frames"] == 2
     assert [path.name for path in folder.parent.iterdir()] == ["last"]
 
 
 def test_a_kill_while_writing_leaves_the_old_one(tmp_path, monkeypatch):
     folder = tmp_path / "last"
-    checkpoint.write(folder, {"x": torch.ones(2)}, {"frames": 1})
+    checkpoint.write(folder, {"policy": {}, "x": torch.ones(2)}, {"frames": 1, "config": {}})
 
     def full(*_):
         raise OSError("No space left on device")
 
     monkeypatch.setattr(checkpoint.os, "fsync", full)
     with pytest.raises(OSError):
-        checkpoint.write(folder, {"x": torch.zeros(2)}, {"frames": 2})
+        checkpoint.write(folder, {"policy": {}, "x": torch.zeros(2)}, {"frames": 2, "config": {}})
     monkeypatch.undo()
     assert checkpoint.read(folder)[1]["frames"] == 1
-    checkpoint.write(folder, {"x": torch.zeros(2)}, {"frames": 3})
+    checkpoint.write(folder, {"policy": {}, "x": torch.zeros(2)}, {"frames": 3, "config": {}})
     assert [path.name for path in tmp_path.iterdir()] == ["last"]
 
 

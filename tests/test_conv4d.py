@@ -6,6 +6,8 @@ import math
 import pytest
 import torch
 
+from pickplace.geometry import Rules
+from pickplace.models.actors import MASKED, FlatPolicy
 from pickplace.models.conv4d import Conv4dCritic, Conv4dPolicy
 from pickplace.models.depth import clip_depth, pad_depth
 
@@ -187,3 +189,28 @@ def test_critic_sees_what_clipping_hides_and_refuses_other_sizes():
     assert all(p.grad is not None for p in critic.parameters())
     with pytest.raises(ValueError, match="tote"):
         critic(bins, depths((5, 5), (7, 6))[1])
+
+
+@pytest.mark.parametrize("rotations", [1, 3, 4])
+@pytest.mark.parametrize("empty_row", [False, True])
+def test_masked_policy_computes_only_what_it_needs_and_the_same(rotations, empty_row):
+    """With a mask, pick cells that allow nothing are left out: values and gradients stay as with all of them."""
+    rules = Rules(bin_size=(4, 5, 1), tote_size=(5, 6, 3), rotations=rotations)
+    torch.manual_seed(0)
+    policy = FlatPolicy(rules, True, filters=6, head_std=0.3)
+    bins, totes = torch.randint(0, 2, (7, 4, 5)).float(), torch.randint(0, 4, (7, 5, 6)).float()
+    mask = torch.rand(7, rules.num_actions) < 0.01
+    if empty_row:
+        mask[3] = False
+    weights = torch.rand(7, rules.num_actions)
+
+    def gradients(logits):
+        policy.zero_grad()
+        (torch.where(mask, logits, 0.0) * weights).sum().backward()
+        return [parameter.grad.clone() for parameter in policy.parameters()]
+
+    logits = policy(bins, totes, mask)
+    whole = policy(bins, totes)
+    assert torch.allclose(logits[mask], whole[mask], atol=1e-5) and (logits[~mask] == MASKED).all()
+    for ours, expected in zip(gradients(policy(bins, totes, mask)), gradients(policy(bins, totes)), strict=True):
+        assert torch.allclose(ours, expected, atol=1e-4)

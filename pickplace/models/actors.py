@@ -71,8 +71,16 @@ class FlatPolicy(nn.Module):
         self.network = Conv4dPolicy(4, **network)  # of which the first R count: the weights serve fewer rotations too
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        logits = self.network(bin_depth, tote_depth).unflatten(1, (-1, 4))[..., : self.rules.rotations].flatten(1)
-        return logits if action_mask is None else torch.where(action_mask, logits, MASKED)
+        """Logits ``[N, N_a]``; with a mask only those of the actions that it allows."""
+        rotations = self.rules.rotations
+        if action_mask is None:
+            return self.network(bin_depth, tote_depth).unflatten(1, (-1, 4))[..., :rotations].flatten(1)
+        # Pick cells from which nothing can be picked need no logits: most of them, and most of the arithmetic.
+        by_pick = action_mask.unflatten(1, (self.rules.num_picks, -1))
+        row, pick = by_pick.any(2).nonzero(as_tuple=True)
+        needed = self.network(bin_depth[row], tote_depth[row], pick).unflatten(1, (-1, 4))[..., :rotations].flatten(1)
+        logits = needed.new_full(by_pick.shape, MASKED).index_put((row, pick), needed)
+        return torch.where(action_mask, logits.flatten(1), MASKED)
 
     def to_action(self, choice: Tensor, *_) -> Tensor:
         return choice

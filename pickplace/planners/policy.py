@@ -41,8 +41,11 @@ class PolicyPlanner:
                 outcome = self.policy(bin_depth, tote_depth, mask).argmax(1)
                 with set_exploration_type(ExplorationType.DETERMINISTIC):
                     return self.policy.to_action(outcome, bin_depth, tote_depth, tote_height).clamp(min=0)
+            mask = rules.action_mask(placements)
+            if self.policy.choice_key == "action":  # computes the allowed actions only
+                return self.policy(bin_depth, tote_depth, mask).argmax(1)
             score = self.policy.action_log_probs(bin_depth, tote_depth)
-            return torch.where(rules.action_mask(placements), score, 2 * MASKED).argmax(1)
+            return torch.where(mask, score, 2 * MASKED).argmax(1)
         count = min(self.candidates, rules.num_actions)
         tried = self.policy.action_log_probs(bin_depth, tote_depth).topk(count, dim=1).indices  # [N, K]
         heights = (tote_height[:, None, None] - tote_depth).int()
