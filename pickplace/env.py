@@ -241,12 +241,15 @@ class PickPlaceEnv(EnvBase):
         index = slice(None) if bool(rows.all()) else rows.nonzero()[:, 0]
         item = Item(*self.item[index].unbind(-1))
         placements = rules.placements(self.heights[index], self.tote_height[index], item)
-        outcomes = rules.outcome_mask(placements).flatten(1)
-        self.feasible[index] = outcomes.any(1)
-        if "outcome" in self.masks:
-            self.outcome_mask[index] = outcomes
         if "action" in self.masks:
-            self.action_mask[index] = rules.action_mask(placements)
+            actions = rules.action_mask(placements)
+            self.action_mask[index] = actions
+            self.feasible[index] = _any(actions)
+        if "outcome" in self.masks or not self.masks:
+            outcomes = rules.outcome_mask(placements).flatten(1)
+            self.feasible[index] = _any(outcomes)
+            if self.masks:
+                self.outcome_mask[index] = outcomes
 
     def _observation(self) -> TensorDictBase:
         """What the agent sees, with ``failure`` 0."""
@@ -261,6 +264,11 @@ class PickPlaceEnv(EnvBase):
         for name in self.masks:
             observation[f"{name}_mask"] = getattr(self, f"{name}_mask").clone()
         return TensorDict(observation, batch_size=self.batch_size, device=self.device)
+
+
+def _any(mask: Tensor) -> Tensor:
+    """``mask.any(1)`` of a bool ``[N, M]``; on a CPU the maximum of bytes is vectorised, and far faster."""
+    return mask.view(torch.uint8).amax(1) > 0
 
 
 def check_items(rules: Rules, items: ItemDistribution) -> None:

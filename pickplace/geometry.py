@@ -13,6 +13,10 @@ Two ideas keep the joint feasibility of all ``N_a = P * W_T * D_T * R`` actions 
   pick cells and rotations share one;
 * the end effector (EE) collides if and only if the highest thing under it, the rim counting as a wall of height ``H_T``
   around the tote, is higher than the placed item's top. So one maximum over the EE's rectangle decides.
+
+Maps of many problems are kept with the batch last in memory: what is done to them is shifting, and then every inner
+loop runs over the problems instead of over a row of a few cells. ``K = O * O`` counts the offsets, ``C = Q * K`` the
+grasp classes.
 """
 
 from dataclasses import dataclass
@@ -21,7 +25,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 FAR = 1 << 20  # higher than any wall: what lies outside the tote when only the inside is allowed
@@ -59,9 +62,7 @@ class Placements(NamedTuple):
 
     top: Tensor  # int32 [N, Q, W_T, D_T]: height of the item's top with its footprint's min corner there, or NEVER
     clearance: Tensor  # int32 [N, Q, W_T, D_T]: highest thing under the EE when its reference cell is there
-    pick_failure: Tensor  # int64 [N, P]: 0, PICK_MISS or BIN_COLLISION
-    offset: Tensor  # int64 [N, P, R, 2]: the item's offset in the rotated EE's frame
-    square: Tensor  # bool [N]: the footprint does not change under a quarter turn
+    item: Item  # what is picked
 
 
 class Step(NamedTuple):
@@ -187,7 +188,7 @@ class Rules:
     def bin_depth(self, item: Item) -> Tensor:
         """Height above the bin's floor, float32 ``[N, W_B, D_B]``: the item's height under its footprint, else 0."""
         inside = _rectangle(self.bin_size[:2], item.x, item.y, item.w, item.d)
-        return inside * item.h[:, None, None].float()
+        return (inside * item.h.float()).permute(2, 0, 1).contiguous()
 
     @staticmethod
     def read_item(bin_depth: Tensor) -> Item:
@@ -228,6 +229,33 @@ class Rules:
         offset = torch.stack([torch.stack(pair, -1) for pair in turned[: self.rotations]], 2)
         return failure, offset
 
+    def _offsets(self, item: Item) -> tuple[Tensor, Tensor]:
+        """Which offsets a pick can have, and what they become by turning; offsets are ``(ox, oy)`` row by row.
+
+        Returns:
+            bool ``[K, N]``: some pick cell lifts the item with this offset under the EE before turning (it is the only
+            one); int64 ``[R, K, N]``: the grasp class that this offset becomes by each rotation, clamped into range.
+        """
+        (bin_w, bin_d, wall), (ee_w, ee_d) = self.bin_size, self.effector_size
+        step = torch.arange(self.min_offset, self.min_offset + self.num_offsets, device=item.x.device)[:, None]
+        gripped, leaves = [], []
+        for at, size, ee, room in ((item.x, item.w, ee_w, bin_w), (item.y, item.d, ee_d, bin_d)):
+            corner = at - step  # of the EE, [O, N]
+            cell = corner + (ee - 1) // 2
+            held = (step >= 0) & (step + size <= ee) if self.pick_rule == "contain" else (step < ee) & (step + size > 0)
+            gripped.append(held & (cell >= 0) & (cell < room) & (size > 0))
+            leaves.append((corner < 0) | (corner + ee > room))
+        hits_wall = (leaves[0][:, None] | leaves[1]) & (item.h < wall)
+        available = gripped[0][:, None] & gripped[1] & ~hits_wall  # [O, O, N]
+        ox, oy = step[:, None], step
+        back_x, back_y = ee_w - ox - item.w, ee_d - oy - item.d
+        turned = ((ox, oy), (back_y, ox), (back_x, back_y), (oy, back_x))
+        count, classes = self.num_offsets, []
+        for rotation, (x, y) in enumerate(turned[: self.rotations]):
+            x, y = ((v - self.min_offset).clamp(0, count - 1) for v in (x, y))
+            classes.append(((rotation % 2 * count + x) * count + y).expand_as(available))
+        return available.flatten(0, 1), torch.stack(classes).flatten(1, 2)
+
     # ------------------------------------------------------------------ placing
     def resting_top(self, heights: Tensor, tote_height: Tensor, item: Item) -> Tensor:
         """Height of the item's top for every footprint, int32 ``[N, Q, W_T, D_T]``; NEVER where it cannot rest.
@@ -239,10 +267,10 @@ class Rules:
             tote_height: int64 ``[N]``.
         """
         side, (tote_w, tote_d) = self.max_side, self.tote_size[:2]
-        padded = F.pad(heights, (0, side - 1, 0, side - 1), value=FAR).unsqueeze(1)  # [N, 1, ...]
-        below = [padded[..., i : i + tote_w, j : j + tote_d] for i in range(side) for j in range(side)]
-        w, d = (torch.stack(pair, 1)[:, : self.parities] for pair in ((item.w, item.d), (item.d, item.w)))
-        w, d = w[..., None, None], d[..., None, None]  # [N, Q, 1, 1]
+        padded = _surround(heights.permute(1, 2, 0), (0, side - 1, 0, side - 1), FAR)  # [.., .., N]
+        below = [padded[i : i + tote_w, j : j + tote_d] for i in range(side) for j in range(side)]
+        w, d = (torch.stack(pair)[: self.parities] for pair in ((item.w, item.d), (item.d, item.w)))
+        w, d = w[:, None, None], d[:, None, None]  # [Q, 1, 1, N]
         under = [(i < w) & (j < d) for i in range(side) for j in range(side)]
         # Loops over the S * S cells under an item: the inner loops then run over whole maps, which is fast.
         z = torch.full((), NEVER, dtype=heights.dtype, device=heights.device)
@@ -252,35 +280,29 @@ class Rules:
         for cell, used in zip(below, under, strict=True):
             level += (cell == z) & used
         stable = self._supported(level, w * d)
-        top = z + item.h.to(z.dtype)[:, None, None, None]
-        fits = stable & (top <= tote_height[:, None, None, None]) & (item.h > 0)[:, None, None, None]
-        return torch.where(fits, top, NEVER)
+        top = z + item.h.to(z.dtype)
+        fits = stable & (top <= tote_height) & (item.h > 0)
+        return torch.where(fits, top, NEVER).permute(3, 0, 1, 2)
 
     def clearance(self, heights: Tensor, tote_height: Tensor) -> Tensor:
         """The least top at which the EE hits nothing, per place cell, int32 ``[N, Q, W_T, D_T]``.
 
         That is the highest tote cell under the EE's rectangle; where the rectangle leaves the tote, the rim.
         """
-        maps = []
-        for ee_w, ee_d, ref_x, ref_y in self.effectors:
-            pad = (ref_y, ee_d - 1 - ref_y, ref_x, ee_w - 1 - ref_x)
-            inside = F.pad(heights, pad, value=NEVER)
-            walled = torch.where(inside < 0, tote_height.to(heights.dtype)[:, None, None], inside)
+        tote_w, tote_d, _ = self.tote_size
+        maps = heights.new_empty(self.parities, tote_w, tote_d, len(heights))
+        rim = tote_height.to(heights.dtype)
+        for parity, (ee_w, ee_d, ref_x, ref_y) in enumerate(self.effectors):
+            walled = _surround(heights.permute(1, 2, 0), (ref_x, ee_w - 1 - ref_x, ref_y, ee_d - 1 - ref_y), rim)
             # The maximum over a rectangle is a maximum along one axis, then along the other.
-            walled = walled.unfold(1, ee_w, 1).amax(-1)
-            maps.append(walled.unfold(2, ee_d, 1).amax(-1))
-        return torch.stack(maps, 1)
+            for axis, size, room in ((0, ee_w, tote_w), (1, ee_d, tote_d)):
+                walled = _maximum([walled.narrow(axis, i, room) for i in range(size)])
+            maps[parity] = walled
+        return maps.permute(3, 0, 1, 2)
 
     def placements(self, heights: Tensor, tote_height: Tensor, item: Item) -> Placements:
         """Everything that decides which actions succeed: see :class:`Placements`."""
-        failure, offset = self.grasps(item)
-        return Placements(
-            top=self.resting_top(heights, tote_height, item),
-            clearance=self.clearance(heights, tote_height),
-            pick_failure=failure,
-            offset=offset,
-            square=item.w == item.d,
-        )
+        return Placements(self.resting_top(heights, tote_height, item), self.clearance(heights, tote_height), item)
 
     def placements_from_depth(self, bin_depth: Tensor, tote_depth: Tensor, tote_height: Tensor) -> Placements:
         """:meth:`placements` from what the agent sees: the depth maps and ``tote_height [N, 1]``."""
@@ -299,38 +321,59 @@ class Rules:
         step = (offset - self.min_offset).clamp(0, self.num_offsets - 1)
         return (parity * self.num_offsets + step[..., 0]) * self.num_offsets + step[..., 1]
 
-    def grasp_counts(self, placements: Placements) -> Tensor:
-        """How many (pick cell, rotation) pairs pick the item with each grasp class, int64 ``[N, Q * O * O]``."""
-        picks = (placements.pick_failure == 0)[..., None].expand(-1, -1, self.rotations)
-        counts = picks.new_zeros(len(picks), self.parities * self.num_offsets**2, dtype=torch.int64)
-        return counts.scatter_add_(1, self.grasp_class(placements.offset).flatten(1), picks.flatten(1).long())
-
     def class_mask(self, placements: Placements) -> Tensor:
-        """Does placing succeed, per grasp class and place cell? bool ``[N, Q, O, O, W_T, D_T]``."""
+        """Does placing succeed, per grasp class and place cell? bool ``[C, W_T * D_T, N]``, batch last."""
         low, count = self.min_offset, self.num_offsets
-        maps = []
+        tote_w, tote_d, _ = self.tote_size
+        batch = len(placements.top)
+        mask = placements.top.new_empty(self.parities, count, count, tote_w, tote_d, batch, dtype=torch.bool)
         for parity, (_, _, ref_x, ref_y) in enumerate(self.effectors):
             # With the EE's reference cell at p and the item at offset o, the footprint begins at p - ref + o.
-            pad = (ref_y - low, low + count - 1 - ref_y, ref_x - low, low + count - 1 - ref_x)
-            top = F.pad(placements.top[:, parity], pad, value=NEVER)
-            top = top.unfold(1, count, 1).unfold(2, count, 1).permute(0, 3, 4, 1, 2)  # [N, O, O, W_T, D_T]
-            maps.append(placements.clearance[:, parity, None, None] <= top)
-        return torch.stack(maps, 1)
+            pad = (ref_x - low, low + count - 1 - ref_x, ref_y - low, low + count - 1 - ref_y)
+            top = _surround(placements.top[:, parity].permute(1, 2, 0), pad, NEVER)
+            clear = placements.clearance[:, parity].permute(1, 2, 0)
+            for i in range(count):
+                for j in range(count):
+                    torch.le(clear, top[i : i + tote_w, j : j + tote_d], out=mask[parity, i, j])
+        return mask.flatten(3, 4).flatten(0, 2)
 
     def num_feasible(self, placements: Placements) -> Tensor:
         """How many flat actions succeed, int64 ``[N]``, without listing them."""
-        places = self.class_mask(placements).flatten(1, 3).sum((2, 3))  # [N, Q*O*O]
-        return (places * self.grasp_counts(placements)).sum(1)
+        available, classes = self._offsets(placements.item)
+        places = self.class_mask(placements).sum(1)  # [C, N]
+        return sum((places.gather(0, turned) * available).sum(0) for turned in classes)
 
     def action_mask(self, placements: Placements) -> Tensor:
         """Exactly the flat actions that succeed, bool ``[N, N_a]``."""
-        places = self.class_mask(placements).flatten(1, 3).flatten(2)  # [N, Q*O*O, W_T*D_T]
-        batch, classes = places.shape[:2]
-        row = torch.arange(batch, device=places.device)[:, None, None] * classes + self.grasp_class(placements.offset)
-        mask = places.flatten(0, 1).index_select(0, row.flatten())
-        mask = mask.view(batch, self.num_picks, self.rotations, self.num_places)
-        mask = mask & (placements.pick_failure == 0)[..., None, None]
-        return mask.transpose(2, 3).reshape(batch, self.num_actions)
+        places, batch, rotations = self.num_places, len(placements.top), self.rotations
+        available, classes = self._offsets(placements.item)
+        by_class = self.class_mask(placements).permute(2, 0, 1).reshape(-1, places).view(torch.uint8)  # [N * C, places]
+        # The flags of all rotations side by side in one number, so that a pick cell's whole block is copied at once:
+        # blocks [N * K + 1, places], of which the last, for picks that fail, is empty.
+        packed, slots = {1: (torch.uint8, 1), 2: (torch.int16, 2)}.get(rotations, (torch.int32, 4))
+        flags = torch.eye(slots, dtype=torch.uint8).view(packed)[:, 0].tolist()
+        count = len(available)
+        first = torch.arange(batch, device=by_class.device)
+        blocks = by_class.new_zeros(batch * count + 1, places, dtype=packed)
+        for flag, turned in zip(flags, classes, strict=False):
+            row = (turned + first * (self.parities * count)).t().reshape(-1)
+            blocks[:-1].add_(by_class.index_select(0, row).to(packed), alpha=flag)
+        # Which block each pick cell has.
+        block = self._pick_offsets(placements.item)
+        usable = torch.cat([available.t(), available.new_zeros(batch, 1)], 1)
+        block = torch.where(usable.gather(1, block), block + first[:, None] * count, batch * count)
+        mask = blocks.index_select(0, block.flatten()).view(torch.bool)
+        mask = mask.view(batch, self.num_picks, places, slots)
+        return mask[..., :rotations].reshape(batch, self.num_actions)
+
+    def _pick_offsets(self, item: Item) -> Tensor:
+        """The number of each pick cell's offset, int64 ``[N, P]``; ``K`` where the item is out of reach."""
+        (_, bin_d, _), (ee_w, ee_d), count = self.bin_size, self.effector_size, self.num_offsets
+        cell = torch.arange(self.num_picks, device=item.x.device)
+        x = item.x[:, None] - (cell // bin_d - (ee_w - 1) // 2) - self.min_offset
+        y = item.y[:, None] - (cell % bin_d - (ee_d - 1) // 2) - self.min_offset
+        inside = (x >= 0) & (x < count) & (y >= 0) & (y < count)
+        return torch.where(inside, x * count + y, count * count)
 
     def outcome_mask(self, placements: Placements) -> Tensor:
         """The footprints that some action reaches, bool ``[N, Q, W_T, D_T]`` by ``(parity, min corner)``.
@@ -338,26 +381,31 @@ class Rules:
         A square footprint is the same in both parities; it is listed under parity 0 only, so that distinct entries
         are distinct outcomes.
         """
-        count = self.num_offsets
+        count, batch = self.num_offsets, len(placements.top)
+        tote_w, tote_d, _ = self.tote_size
         high = self.min_offset + count - 1
-        grasped = self.grasp_counts(placements).view(-1, self.parities, count, count) > 0
-        maps = []
+        available, classes = self._offsets(placements.item)
+        # Each class that some pick has; the last row takes what is not available.
+        grasped = available.new_zeros(self.parities * count**2 + 1, batch)
+        grasped.scatter_(0, torch.where(available, classes, len(grasped) - 1).flatten(0, 1), True)
+        grasped = grasped[:-1].view(self.parities, count, count, 1, 1, batch)
+        maps = available.new_empty(self.parities, tote_w, tote_d, batch)
         for parity, (_, _, ref_x, ref_y) in enumerate(self.effectors):
             # The footprint at f is reached with offset o if the EE's reference cell is at f + ref - o.
-            pad = (high - ref_y, ref_y - self.min_offset, high - ref_x, ref_x - self.min_offset)
-            maps.append(F.pad(placements.clearance[:, parity], pad, value=FAR))
-        clear = torch.stack(maps, 1)  # [N, Q, W_T + O - 1, D_T + O - 1], cell f + high - o
-        lowest = torch.full_like(placements.top, FAR)
-        for i in range(count):
-            for j in range(count):
-                cell = clear[..., i : i + self.tote_size[0], j : j + self.tote_size[1]]
-                usable = grasped[:, :, count - 1 - i, count - 1 - j, None, None]
-                lowest = torch.minimum(lowest, torch.where(usable, cell, FAR))
-        reached = lowest <= placements.top
-        if self.parities == 1:
-            return reached
-        square = placements.square[:, None, None]
-        return torch.stack([reached[:, 0] | (square & reached[:, 1]), reached[:, 1] & ~square], 1)
+            pad = (high - ref_x, ref_x - self.min_offset, high - ref_y, ref_y - self.min_offset)
+            clear = _surround(placements.clearance[:, parity].permute(1, 2, 0), pad, FAR)  # cell f + high - o
+            lowest = None
+            for i in range(count):
+                for j in range(count):
+                    cell = clear[i : i + tote_w, j : j + tote_d]
+                    usable = torch.where(grasped[parity, count - 1 - i, count - 1 - j], cell, FAR)
+                    lowest = usable if lowest is None else torch.minimum(lowest, usable, out=lowest)
+            torch.le(lowest, placements.top[:, parity].permute(1, 2, 0), out=maps[parity])
+        if self.parities == 2:
+            square = placements.item.w == placements.item.d
+            maps[0] |= square & maps[1]
+            maps[1] &= ~square
+        return maps.permute(3, 0, 1, 2).contiguous()
 
     def actions_reaching(self, placements: Placements, outcome: Tensor) -> Tensor:
         """All successful flat actions that leave the item in a given footprint.
@@ -370,10 +418,11 @@ class Rules:
         """
         tote_w, tote_d, _ = self.tote_size
         device = outcome.device
+        failure, offset = self.grasps(placements.item)
         parity = torch.arange(self.rotations, device=device) % 2  # [R]
         refs = torch.tensor([e[2:] for e in self.effectors], device=device)[parity]  # [R, 2]
         corner = torch.stack([outcome // tote_d % tote_w, outcome % tote_d], -1)
-        place = corner[:, None, None] + refs - placements.offset  # [N, P, R, 2]
+        place = corner[:, None, None] + refs - offset  # [N, P, R, 2]
         px, py = place.unbind(-1)
         in_grid = (px >= 0) & (px < tote_w) & (py >= 0) & (py < tote_d)
         cell = px.clamp(0, tote_w - 1) * tote_d + py.clamp(0, tote_d - 1)
@@ -381,8 +430,8 @@ class Rules:
         clear = placements.clearance.flatten(1).gather(1, index).view_as(cell)
         top = placements.top.flatten(1).gather(1, outcome[:, None])[..., None]
         turned = (outcome // self.num_places)[:, None, None]
-        same = placements.square[:, None, None] | (parity == turned)
-        good = in_grid & same & (clear <= top) & (placements.pick_failure == 0)[..., None]
+        same = (placements.item.w == placements.item.d)[:, None, None] | (parity == turned)
+        good = in_grid & same & (clear <= top) & (failure == 0)[..., None]
         pick = torch.arange(self.num_picks, device=device)[:, None]
         rotation = torch.arange(self.rotations, device=device)
         action = (pick * self.num_places + cell) * self.rotations + rotation
@@ -435,50 +484,85 @@ class Rules:
             tote_height: int64 ``[N]``.
             action: int64 ``[N]``, the flat index, in ``[0, N_a)``.
         """
-        tote_w, tote_d, _ = self.tote_size
+        (bin_w, bin_d, wall), (tote_w, tote_d, _) = self.bin_size, self.tote_size
         xb, yb, xt, yt, rotation = self.split_action(action)
-        failure, offset = self.grasps(item)
-        rows = torch.arange(len(action), device=action.device)
-        pick = xb * self.bin_size[1] + yb
-        offset = offset[rows, pick, rotation]  # [N, 2]
-        odd = rotation % 2
-        w, d = torch.where(odd == 1, item.d, item.w), torch.where(odd == 1, item.w, item.d)
-        ee_w, ee_d, ref_x, ref_y = torch.tensor(self.effectors, device=action.device)[odd].unbind(-1)
-        left, front = xt - ref_x, yt - ref_y  # the EE's min corner in the tote
-        fx, fy = left + offset[:, 0], front + offset[:, 1]
+        odd = rotation % 2 == 1
 
+        # Picking, as in `grasps`, at one cell.
+        ee_w, ee_d = self.effector_size
+        left, front = xb - (ee_w - 1) // 2, yb - (ee_d - 1) // 2
+        ox, oy = item.x - left, item.y - front
+        back_x, back_y = ee_w - ox - item.w, ee_d - oy - item.d
+        if self.pick_rule == "contain":
+            gripped = torch.minimum(torch.minimum(ox, oy), torch.minimum(back_x, back_y)) >= 0
+        else:
+            gripped = (ox < ee_w) & (oy < ee_d) & (ox + item.w > 0) & (oy + item.d > 0)
+        leaves_bin = (left < 0) | (front < 0) | (left + ee_w > bin_w) | (front + ee_d > bin_d)
+
+        # Turning.
+        w, d = torch.where(odd, item.d, item.w), torch.where(odd, item.w, item.d)
+        turned_x = torch.where(odd, torch.where(rotation == 1, back_y, oy), torch.where(rotation == 0, ox, back_x))
+        turned_y = torch.where(odd, torch.where(rotation == 1, ox, back_x), torch.where(rotation == 0, oy, back_y))
+        ee_w, ee_d = torch.where(odd, ee_d, ee_w), torch.where(odd, ee_w, ee_d)
+        left, front = xt - (ee_w - 1) // 2, yt - (ee_d - 1) // 2  # the EE's min corner in the tote
+        fx, fy = left + turned_x, front + turned_y
+
+        # Placing.
         footprint = _rectangle((tote_w, tote_d), fx, fy, w, d)
-        z = torch.where(footprint, heights, 0).amax((1, 2))
+        by_cell = heights.permute(1, 2, 0).contiguous()  # batch last
+        z = torch.where(footprint, by_cell, 0).flatten(0, 1).amax(0)
         top = z.long() + item.h
-        level = (footprint & (heights == z[:, None, None])).sum((1, 2))
-        under_ee = _rectangle((tote_w, tote_d), left, front, ee_w, ee_d)
+        level = (footprint & (by_cell == z)).flatten(0, 1).sum(0)
+        highest = torch.where(_rectangle((tote_w, tote_d), left, front, ee_w, ee_d), by_cell, 0).flatten(0, 1).amax(0)
         item_outside = (fx < 0) | (fy < 0) | (fx + w > tote_w) | (fy + d > tote_d)
         ee_outside = (left < 0) | (front < 0) | (left + ee_w > tote_w) | (front + ee_d > tote_d)
 
         checks = (  # from the last to the first, so that the first failure has the last word
             (Failure.UNSTABLE, ~self._supported(level, w * d)),
-            (Failure.ITEM_COLLISION, (under_ee & (heights > top[:, None, None])).any(2).any(1)),
+            (Failure.ITEM_COLLISION, highest > top),
             (Failure.OVERFLOW, top > tote_height),
             (Failure.TOTE_COLLISION, item_outside | (ee_outside & (tote_height > top))),
+            # The only thing in a bin is its item, which is never higher than its own top: just the walls can be hit.
+            (Failure.BIN_COLLISION, leaves_bin & (item.h < wall)),
+            (Failure.PICK_MISS, ~gripped | (item.w <= 0)),
         )
         code = torch.zeros_like(action)
         for kind, failed in checks:
             code = torch.where(failed, int(kind), code)
-        picked = failure[rows, pick]
-        code = torch.where(picked > 0, picked, code)
-        placed = footprint & (code == 0)[:, None, None]
-        heights = torch.where(placed, top.to(heights.dtype)[:, None, None], heights)
-        return Step(heights, code, top, torch.stack([fx, fy, w, d], -1))
+        placed = footprint & (code == 0)
+        by_cell = torch.where(placed, top.to(heights.dtype), by_cell)
+        return Step(by_cell.permute(2, 0, 1).contiguous(), code, top, torch.stack([fx, fy, w, d], -1))
 
     def _supported(self, level: Tensor, area: Tensor) -> Tensor:
         share = level.double() / area
         return share > self.min_support if self.strict_support else share >= self.min_support
 
 
+def _surround(maps: Tensor, margins: tuple[int, int, int, int], value) -> Tensor:
+    """Maps ``[W, D, N]`` with margins (before and after along x, then y) of a value, or of one for each problem."""
+    x0, x1, y0, y1 = margins
+    wide, deep, batch = maps.shape
+    out = maps.new_empty(wide + x0 + x1, deep + y0 + y1, batch)
+    if isinstance(value, Tensor):
+        out.copy_(value.expand_as(out))
+    else:
+        out.fill_(value)
+    out[x0 : x0 + wide, y0 : y0 + deep] = maps
+    return out
+
+
+def _maximum(maps: list[Tensor]) -> Tensor:
+    """The elementwise maximum of some maps."""
+    best = maps[0]
+    for other in maps[1:]:
+        best = torch.maximum(best, other)
+    return best
+
+
 def _rectangle(grid: tuple[int, int], x: Tensor, y: Tensor, w: Tensor, d: Tensor) -> Tensor:
-    """Cells of a grid inside the rectangle of size ``(w, d)`` at ``(x, y)``, bool ``[N, *grid]``."""
-    column = torch.arange(grid[0], device=x.device)
-    row = torch.arange(grid[1], device=x.device)
-    in_x = (column >= x[:, None]) & (column < (x + w)[:, None])
-    in_y = (row >= y[:, None]) & (row < (y + d)[:, None])
-    return in_x[:, :, None] & in_y[:, None, :]
+    """Cells of a grid inside the rectangle of size ``(w, d)`` at ``(x, y)``, bool ``[*grid, N]``, batch last."""
+    column = torch.arange(grid[0], device=x.device)[:, None]
+    row = torch.arange(grid[1], device=x.device)[:, None]
+    in_x = (column >= x) & (column < x + w)
+    in_y = (row >= y) & (row < y + d)
+    return in_x[:, None] & in_y

@@ -156,6 +156,9 @@ class Scripted(torch.nn.Module):
     def action_log_probs(self, bin_depth, tote_depth):
         return self.scores.expand(len(bin_depth), -1)
 
+    def forward(self, bin_depth, tote_depth, action_mask):
+        return torch.where(action_mask, self.action_log_probs(bin_depth, tote_depth), -1e9)
+
 
 def test_candidates_are_tried_in_order_without_a_mask():
     env = PickPlaceEnv(num_envs=1)
@@ -184,6 +187,9 @@ class Noise(torch.nn.Module):
 
     def action_log_probs(self, bin_depth, tote_depth):
         return self.scores
+
+    def forward(self, bin_depth, tote_depth, action_mask):
+        return torch.where(action_mask, self.action_log_probs(bin_depth, tote_depth), -1e9)
 
 
 @pytest.mark.parametrize("candidates", [1, 4, 30, "all"])
