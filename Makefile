@@ -5,7 +5,7 @@ STAMP := .venv/.installed
 RUN ?= outputs/quick_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
 
-.PHONY: help install demo train test test-slow lint format clean
+.PHONY: help install demo train test test-slow bench lint format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -41,6 +41,12 @@ test: $(STAMP)  ## run the test suite (minutes)
 
 test-slow: $(STAMP)  ## run the long checks (an hour)
 	$(BIN)/python -m pytest -q -m slow --timeout 7200 $(ARGS)
+
+bench: $(STAMP)  ## run the benchmarks on a quiet machine (minutes), and write docs/performance.md
+	$(BIN)/pip install --quiet --disable-pip-version-check 'jumanji>=1.1,<2' || echo "jumanji: not to be had, its part is skipped"
+	$(BIN)/python benchmarks/environment.py
+	$(BIN)/python benchmarks/conv4d.py
+	$(BIN)/python benchmarks/report.py
 
 lint: $(STAMP)  ## check style
 	$(BIN)/ruff check .

@@ -151,18 +151,17 @@ class PickPlaceEnv(EnvBase):
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         """As ``EnvBase.reset``; the rows that a partial reset leaves alone come back as they are.
 
-        TorchRL takes those rows from ``tensordict`` and fills in zeros where it has only ``_reset``.
+        TorchRL would fill those rows with zeros where ``tensordict`` has only ``_reset``, and copy every mask cell by
+        cell where it has more; but all that an agent sees of them is still here.
         """
-        given = set() if tensordict is None else set(tensordict.keys())
-        if "_reset" in given and "bin_depth" not in given:
-            running = self._observation()
-            full = torch.full_like(running["tote_height"], self.rules.tote_size[2])
-            running["tote_height"] = torch.where(tensordict["_reset"].reshape(-1, 1), full, running["tote_height"])
-            for key, value in tensordict.items():
-                rows = tensordict["_reset"].reshape(-1, *[1] * (value.ndim - 1))
-                running[key] = value if key == "_reset" else torch.where(rows, value, running[key])
-            tensordict = running
-        return super().reset(tensordict, **kwargs)
+        if tensordict is None or "_reset" not in tensordict:
+            return super().reset(tensordict, **kwargs)
+        rows = tensordict["_reset"].reshape(self.num_envs, 1)
+        state = self._reset(tensordict)
+        for key in ("done", "terminated", "truncated", "failure"):
+            if key in tensordict:
+                state[key] = torch.where(rows, state[key], tensordict[key])
+        return tensordict.exclude("_reset").update(state)
 
     def _set_seed(self, seed: int | None):
         """Start the item stream over: the next reset of slot ``i`` plays episode ``first_episode + i``."""
@@ -243,13 +242,19 @@ class PickPlaceEnv(EnvBase):
         placements = rules.placements(self.heights[index], self.tote_height[index], item)
         if "action" in self.masks:
             actions = rules.action_mask(placements)
-            self.action_mask[index] = actions
+            self._store("action_mask", index, actions)
             self.feasible[index] = _any(actions)
         if "outcome" in self.masks or not self.masks:
             outcomes = rules.outcome_mask(placements).flatten(1)
             self.feasible[index] = _any(outcomes)
             if self.masks:
-                self.outcome_mask[index] = outcomes
+                self._store("outcome_mask", index, outcomes)
+
+    def _store(self, name: str, index, values: Tensor):
+        """Keep a mask in a tensor of its own: the last one has been handed out with an observation."""
+        if not isinstance(index, slice):
+            values = getattr(self, name).index_copy(0, index, values)
+        setattr(self, name, values)
 
     def _observation(self) -> TensorDictBase:
         """What the agent sees, with ``failure`` 0."""
@@ -262,7 +267,7 @@ class PickPlaceEnv(EnvBase):
             "failure": torch.zeros_like(self.tote_height)[:, None],
         }
         for name in self.masks:
-            observation[f"{name}_mask"] = getattr(self, f"{name}_mask").clone()
+            observation[f"{name}_mask"] = getattr(self, f"{name}_mask")  # never written to again, see `_store`
         return TensorDict(observation, batch_size=self.batch_size, device=self.device)
 
 

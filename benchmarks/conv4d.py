@@ -1,0 +1,104 @@
+"""The paper's network: forward (and backward) of `fcn4d` against a naive 4D convolution, on one core.
+
+python benchmarks/conv4d.py
+
+Naive: the bin's and the tote's map broadcast to a 4D input of two channels, and each 4D convolution as a sum of
+``conv3d`` over the taps of its first axis, in fp32. Every variant gives the same logits (checked here, and in the
+tests).
+"""
+
+from functools import partial
+
+import torch
+import torch.nn.functional as F
+from common import interleave, save, use_one_core
+
+from pickplace import PickPlaceEnv, Rules
+from pickplace.models.actors import FlatPolicy
+from pickplace.models.depth import clip_depth, pad_depth
+
+CASES = {"5x5 bin, 6x6 tote, batch 64": ((6, 6, 5), 64, 5), "5x5 bin, 30x30 tote, batch 1": ((30, 30, 5), 1, 5)}
+
+
+def conv4d(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+    """A 4D convolution without padding: ``[N, C, A, B, X, Y]`` with ``[O, C, k, k, k, k]``."""
+    kernel, rows = weight.shape[2], x.shape[2] - weight.shape[2] + 1
+    planes = []
+    for row in range(rows):
+        taps = [F.conv3d(x[:, :, row + tap], weight[:, :, tap]) for tap in range(kernel)]
+        planes.append(sum(taps) + bias[:, None, None, None])
+    return torch.stack(planes, 2)
+
+
+def naive(network, bin_depth: torch.Tensor, tote_depth: torch.Tensor) -> torch.Tensor:
+    """All logits ``[N, P * places * 4]``, as the paper writes the network down."""
+    bins = pad_depth(clip_depth(bin_depth, network.bin_clip), 2, -1.0)
+    totes = pad_depth(clip_depth(tote_depth, network.tote_clip), 2, 0.0)
+    size = (len(bins), *bins.shape[1:], *totes.shape[1:])
+    x = torch.stack([bins[:, :, :, None, None].expand(size), totes[:, None, None].expand(size)], 1)
+    for layer in (network.first, network.second):
+        x = F.relu(conv4d(x, layer.weight, layer.bias))
+    return conv4d(x, network.head.weight, network.head.bias).permute(0, 2, 3, 4, 5, 1).flatten(1)
+
+
+def states(tote_size, batch: int):
+    """Observations from the middle of episodes of random feasible actions."""
+    env = PickPlaceEnv(tote_size=tote_size, num_envs=batch)
+    state = env.rollout(12, break_when_any_done=False)[:, -1]["next"]
+    return env.rules, state["bin_depth"], state["tote_depth"], state["action_mask"]
+
+
+def peak(rules: Rules, *inputs) -> dict[str, float]:
+    """MiB held at the worst moment of one forward pass, beyond the inputs and weights."""
+    found = {}
+    network = FlatPolicy(rules).network
+    for name, call in {"naive": lambda: naive(network, *inputs), "ours": lambda: network(*inputs)}.items():
+        with torch.no_grad(), torch.profiler.profile(profile_memory=True) as profile:
+            call()
+        held, most = 0, 0
+        for event in profile.profiler.kineto_results.events():
+            if event.name() == "[memory]":
+                held += event.nbytes()
+                most = max(most, held)
+        found[name] = round(most / 2**20, 1)
+    return found
+
+
+def measure(tote_size, batch: int, repeats: int) -> dict:
+    """Times and memory of one case."""
+    rules, bins, totes, mask = states(tote_size, batch)
+    policies = {dtype: FlatPolicy(rules, True, compute_dtype=dtype) for dtype in ("float32", "bfloat16")}
+    policies["bfloat16"].load_state_dict(policies["float32"].state_dict())
+    network = policies["float32"].network
+    forward = {"naive": lambda: naive(network, bins, totes)}
+    for dtype, policy in policies.items():
+        forward[f"all actions, {dtype}"] = partial(policy, bins, totes)
+        forward[f"masked, {dtype}"] = partial(policy, bins, totes, mask)
+
+    def learn(call):
+        for policy in policies.values():
+            policy.zero_grad(set_to_none=True)
+        call().logsumexp(1).sum().backward()
+
+    with torch.no_grad():
+        assert torch.allclose(forward["naive"](), forward["all actions, float32"](), atol=1e-4)
+        row = {"forward": interleave(forward, repeats, warmup=1)}
+    both = {name: partial(learn, call) for name, call in forward.items() if not name.startswith("all")}
+    row["forward and backward"] = interleave(both, repeats, warmup=1)
+    for figures in row.values():
+        for name in list(figures):
+            figures[name]["ratio"] = figures["naive"]["ms"] / figures[name]["ms"]
+    row["peak MiB, forward"] = peak(rules, bins, totes)
+    picks = mask.unflatten(1, (rules.num_picks, -1)).any(2).sum(1).float().mean()
+    row["pick cells that allow something"] = round(float(picks), 2)
+    return row
+
+
+def main() -> None:
+    use_one_core()
+    torch.manual_seed(0)
+    save("conv4d", {"cases": {title: measure(*case) for title, case in CASES.items()}})
+
+
+if __name__ == "__main__":
+    main()
