@@ -53,7 +53,7 @@ def conv4d(result: dict) -> str:
         held = row["peak MiB, forward"]
         lines.append(
             f"Peak memory of a forward pass over all actions, {title}: naive {held['naive']} MiB, "
-            f"ours {held['ours']} MiB; {row['pick cells that allow something']} pick cells allow something on average.\n"
+            f"ours {held['ours']} MiB; {row['pick cells that allow something']} pick cells allow something (mean).\n"
         )
     return "\n".join([*lines, machine(result)])
 
