@@ -33,6 +33,18 @@ ENDINGS = {
 }
 FULL = "The tote is full."
 
+#: The same in a word or two, for a list of episodes.
+BRIEFLY = {
+    Failure.NONE: "stream over",
+    Failure.PICK_MISS: "missed the item",
+    Failure.BIN_COLLISION: "hit the bin",
+    Failure.TOTE_COLLISION: "hit the tote",
+    Failure.OVERFLOW: "too high",
+    Failure.ITEM_COLLISION: "hit an item",
+    Failure.UNSTABLE: "unstable",
+    Failure.STUCK: "no place left",
+}
+
 
 @dataclass
 class Move:
@@ -150,13 +162,15 @@ def _others(recording: Recording) -> list[tuple[int, ...]]:
 
 
 def _episode(recording: Recording, rules: Rules) -> dict:
-    heat = [move.heat for move in recording.moves]
+    heat, ending = [move.heat for move in recording.moves], recording.describe_ending(rules.num_places)
     return {
         "episode": recording.episode,
         "height": recording.tote_height,
         "occupancy": recording.occupancy,
-        "ending": recording.describe_ending(rules.num_places),
-        "failed": recording.ending not in (Failure.NONE, Failure.STUCK),
+        "ending": ending,
+        "briefly": "full" if ending == FULL else BRIEFLY.get(recording.ending, "goes on"),
+        "failed": recording.ending not in (None, Failure.NONE, Failure.STUCK),
+        "stuck": recording.ending == Failure.STUCK and ending != FULL,
         "waiting": recording.waiting,
         # One flat list a move: 5 of the item, 2 pick, 2 place, rotation, 4 of the footprint, z, failure code.
         "moves": [
@@ -194,7 +208,7 @@ def animation(recording: Recording, rules: Rules, path: Path, seconds: float = 1
     for moves in shown:
         buffer = io.BytesIO()
         draw_scene(recording, rules, colours, moves).savefig(buffer, format="png", dpi=60)
-        images.append(Image.open(buffer).convert("RGB").quantize(128))
+        images.append(Image.open(buffer).convert("RGB").quantize(128, dither=Image.Dither.NONE))
     each = max(20, round(1000 * seconds / len(images)))
     durations = [each] * (len(images) - 1) + [each + 2000]
     images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
