@@ -27,6 +27,13 @@ class ResumableCollector(Collector):
         self.env.set_seed(item_seed)
         self.reset()
 
+    def _setup_compact_obs(self, compact_obs: bool) -> None:
+        """Keep every mask once, where it was acted upon, and not as what came next as well; nobody learns from that."""
+        super()._setup_compact_obs(compact_obs)
+        if not compact_obs:
+            masks = [key for key in self.env.observation_spec.keys() if key.endswith("_mask")]  # noqa: SIM118
+            self._compact_next_keys = tuple(("next", key) for key in masks)
+
     def state_dict(self) -> OrderedDict:
         return OrderedDict(
             environment=dict(self.env.base_env.state_dict()),

@@ -8,9 +8,9 @@ import sys
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hydra
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import (
@@ -24,6 +24,9 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+
+if TYPE_CHECKING:
+    import torch
 
 log = logging.getLogger(__name__)
 
@@ -52,12 +55,14 @@ def instantiate(node: DictConfig, **kwargs):
         raise ValueError(f"{what}: {error.__cause__}.") from error
 
 
-def use_machine(cfg: DictConfig) -> torch.device:
+def use_machine(cfg: DictConfig) -> "torch.device":
     """Set the number of threads, and return the device, of a config.
 
     Raises:
         ValueError: for a device that this machine lacks, or a bad number of threads.
     """
+    import torch  # here, so that --help need not wait for it
+
     if cfg.threads is not None:
         if not isinstance(cfg.threads, int) or isinstance(cfg.threads, bool) or cfg.threads < 1:
             raise ValueError(f"threads={cfg.threads}: expected a whole number >= 1, or null.")
@@ -75,7 +80,7 @@ TARGETS = {
     "env": ("PickPlaceEnv", "env.PickPlaceEnv"),
     "items": ("items.Kinds", "items.Uniform", "items.Recorded"),
     "model.actor": ("models.actors.fcn_grasp", "models.actors.fcn4d"),
-    "model.critic": ("models.critics.OutcomeCritic", "models.critics.conv4d_critic"),
+    "model.critic": ("models.critics.DepthCritic", "models.critics.conv4d_critic"),
     "curriculum": ("curriculum.Curriculum",),
     "curriculum.advance": tuple(
         f"curriculum.{rule}" for rule in ("NoAdvance", "Frames", "Threshold", "Plateau", "Staged")
@@ -196,6 +201,9 @@ def one_sentence():
         yield
     except KeyboardInterrupt:
         sys.exit(130)
+    except BrokenPipeError:  # who reads the output, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
     except Exception as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise

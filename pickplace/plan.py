@@ -4,12 +4,14 @@ import argparse
 import json
 import sys
 import time
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from pickplace.config import one_sentence
-from pickplace.robot import Planner
+
+if TYPE_CHECKING:
+    from pickplace.robot import Planner
 
 #: What a request may hold; ``id`` comes back as it is.
 REQUEST = ("id", "bin_depth", "tote_depth", "tote_height", "cell_size", "tolerance", "alternatives")
@@ -53,6 +55,10 @@ def run(args: argparse.Namespace) -> None:
     Raises:
         ValueError: for arguments, a checkpoint or maps that cannot be used.
     """
+    import torch  # here, so that --help need not wait for it
+
+    from pickplace.robot import Planner
+
     if (args.bin is None) != (args.tote is None):
         missing = "--bin" if args.bin is None else "--tote"
         raise ValueError(f"{missing}: no file; expected both --bin and --tote, or neither to read JSON lines.")
@@ -75,7 +81,7 @@ def run(args: argparse.Namespace) -> None:
             sys.stdout.flush()
 
 
-def timed(planner: Planner, tell: bool, **request) -> dict:
+def timed(planner: "Planner", tell: bool, **request) -> dict:
     """A plan as plain values; its latency goes to standard error if asked for."""
     start = time.perf_counter()
     plan = planner.plan(**request).as_dict()
@@ -85,7 +91,7 @@ def timed(planner: Planner, tell: bool, **request) -> dict:
     return plan
 
 
-def answer(planner: Planner, line: bytes, defaults: dict, tell: bool = False) -> dict:
+def answer(planner: "Planner", line: bytes, defaults: dict, tell: bool = False) -> dict:
     """The reply to one line: a plan, or ``{"error": ...}`` in one sentence; with the request's ``id`` if it has one."""
     reply = {}
     try:

@@ -9,7 +9,7 @@ from pickplace import PickPlaceEnv, config
 from pickplace.curriculum import Curriculum
 from pickplace.items import ItemDistribution
 from pickplace.metrics import read_csv
-from pickplace.models.critics import Conv4dCritic, OutcomeCritic
+from pickplace.models.critics import Conv4dCritic, DepthCritic
 from pickplace.train import train
 
 CONF = config.conf_dir()
@@ -51,7 +51,7 @@ def test_every_model(name, masked):
     cfg, rules = composed(f"model={name}"), PickPlaceEnv(num_envs=1).rules
     policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=masked)
     assert policy.mask_infeasible is masked
-    assert isinstance(config.instantiate(cfg.model.critic, rules=rules), Conv4dCritic | OutcomeCritic)
+    assert isinstance(config.instantiate(cfg.model.critic, rules=rules), Conv4dCritic | DepthCritic)
 
 
 @pytest.mark.parametrize("name", options("curriculum"))

@@ -111,11 +111,14 @@ class OutcomePolicy(nn.Module):
         self.rules = rules
         self.network = ItemConditionedFcn(2, **network)  # parities; without rotations only the first counts
 
-    def _logits(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
-        return self.network(bin_depth, tote_depth)[:, : self.rules.parities].flatten(1)
-
     def forward(self, bin_depth: Tensor, tote_depth: Tensor, outcome_mask: Tensor) -> Tensor:
-        return torch.where(outcome_mask, self._logits(bin_depth, tote_depth), MASKED)
+        """Logits ``[N, Q * W_T * D_T]``; cells where nothing can be put down are not computed."""
+        rules = self.rules
+        by_place = outcome_mask.unflatten(1, (rules.parities, rules.num_places))
+        row, place = by_place.any(1).nonzero(as_tuple=True)
+        needed = self.network.at(bin_depth, tote_depth, row, place)[:, : rules.parities]
+        logits = needed.new_zeros(len(by_place), rules.num_places, rules.parities).index_put((row, place), needed)
+        return torch.where(outcome_mask, logits.transpose(1, 2).flatten(1), MASKED)
 
     def to_action(self, choice: Tensor, bin_depth: Tensor, tote_depth: Tensor, tote_height: Tensor) -> Tensor:
         placements = self.rules.placements_from_depth(bin_depth, tote_depth, tote_height)
@@ -127,7 +130,7 @@ class OutcomePolicy(nn.Module):
         outcome = self.rules.action_outcomes(item)  # [N, N_a], -1 where nothing reaches the tote
         ways = outcome.new_zeros(len(outcome), self.rules.num_outcomes + 1)
         ways.scatter_add_(1, outcome + 1, torch.ones_like(outcome))
-        logits = self._logits(bin_depth, tote_depth)
+        logits = self.network(bin_depth, tote_depth)[:, : self.rules.parities].flatten(1)
         logits = torch.where(ways[:, 1:] > 0, logits, MASKED)
         share = logits.log_softmax(-1) - ways[:, 1:].clamp(min=1).log()
         return torch.where(outcome >= 0, share.gather(1, outcome.clamp(min=0)), MASKED)

@@ -29,7 +29,7 @@ BIN_PADDING, TOTE_PADDING = -1.0, 0.0
 DTYPES = ("float32", "bfloat16")
 
 
-def _check_width(name: str, value) -> None:
+def check_width(name: str, value) -> None:
     """Refuse a layer's width that is none."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 1:
         raise ValueError(f"{name}={value!r}: expected a whole number >= 1.")
@@ -84,10 +84,10 @@ class Conv4dPolicy(nn.Module):
         floor: float | None = None,
         compute_dtype: str = "float32",
         head_std: float | None = 0.01,
-        chunk_bytes: int = 256 * 2**20,
+        chunk_bytes: int = 64 * 2**20,
     ):
         super().__init__()
-        _check_width("filters", filters)
+        check_width("filters", filters)
         if compute_dtype not in DTYPES:
             raise ValueError(f"compute_dtype={compute_dtype!r}: expected one of {', '.join(DTYPES)}.")
         self.rotations = rotations
@@ -225,8 +225,8 @@ class Conv4dCritic(nn.Module):
         depth_scale: float = 5.0,
     ):
         super().__init__()
-        _check_width("filters", filters)
-        _check_width("hidden", hidden)
+        check_width("filters", filters)
+        check_width("hidden", hidden)
         self.bin_size = tuple(bin_size)[:2]
         self.tote_size = tuple(tote_size)[:2]
         self.bin_clip = bin_clip

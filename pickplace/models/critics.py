@@ -1,44 +1,54 @@
 """Value networks. A critic is not needed to act, so it may be tied to the sizes it was trained on."""
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pickplace.geometry import Rules
-from pickplace.models.conv4d import Conv4dCritic
-from pickplace.models.fcn_grasp import ItemConditionedFcn
+from pickplace.models.conv4d import Conv4dCritic, check_width
+from pickplace.models.depth import depth_levels, item_code, one_hot
 
 
-class OutcomeCritic(nn.Module):
-    """The critic beside ``fcn_grasp``: its own convolutions of the same kind, fully connected at the end.
+class DepthCritic(nn.Module):
+    """The critic beside ``fcn_grasp``: fully connected over the one-hot clipped tote and the item's size.
+
+    It shares nothing with the policy, and is tied to the tote's size; acting needs no value.
 
     Args:
-        rules: sizes of the bin and the tote.
-        channels: maps handed to the fully connected part.
-        hidden: width of the fully connected layer.
-        network: arguments of :class:`~pickplace.models.fcn_grasp.ItemConditionedFcn`.
+        rules: sizes of the tote.
+        filters: width of the first layer, which sees the whole tote.
+        hidden: width of the second.
+        tote_clip, depth_range, item_range: as in :class:`ItemConditionedFcn`.
 
     Shapes:
         ``bin_depth [..., W_B, D_B]``, ``tote_depth [..., W_T, D_T]`` -> ``[..., 1]``.
     """
 
-    def __init__(self, rules: Rules, channels: int = 16, hidden: int = 128, **network):
+    def __init__(
+        self,
+        rules: Rules,
+        filters: int = 256,
+        hidden: int = 128,
+        tote_clip: int = 3,
+        depth_range: int = 5,
+        item_range: int = 3,
+    ):
         super().__init__()
-        if not isinstance(hidden, int) or isinstance(hidden, bool) or hidden < 1:
-            raise ValueError(f"model.critic.hidden={hidden!r}: expected a whole number >= 1.")
-        self.network = ItemConditionedFcn(channels, head_std=0.1, **network)
-        extra = 1 + 3 * self.network.item_range
-        self.join = nn.Linear(channels * rules.num_places + extra, hidden)
-        self.value = nn.Linear(hidden, 1)
+        widths = {"filters": filters, "hidden": hidden, "tote_clip": tote_clip}
+        for key, value in {**widths, "depth_range": depth_range, "item_range": item_range}.items():
+            check_width(f"model.critic.{key}", value)
+        self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
+        inputs = depth_range * rules.num_places + 3 * item_range + 1
+        self.layers = nn.Sequential(
+            nn.Linear(inputs, filters), nn.ReLU(), nn.Linear(filters, hidden), nn.ReLU(), nn.Linear(hidden, 1)
+        )
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
         batch = tote_depth.shape[:-2]
         bin_depth, tote_depth = bin_depth.flatten(0, -3), tote_depth.flatten(0, -3)
-        maps = F.relu(self.network(bin_depth, tote_depth)).flatten(1)
-        # Clipping hides how much room is left; the mean depth tells.
-        room = tote_depth.mean((1, 2))[:, None] / 5
-        code = self.network.item_code(bin_depth)
-        return self.value(F.relu(self.join(torch.cat([maps, room, code], 1)))).unflatten(0, batch)
+        planes = one_hot(depth_levels(tote_depth, self.tote_clip, self.depth_range).flatten(1), self.depth_range)
+        room = tote_depth.mean((1, 2))[:, None] / 5  # clipping hides how much room is left
+        x = torch.cat([planes, item_code(bin_depth, self.item_range), room], 1)
+        return self.layers(x).unflatten(0, batch)
 
 
 def conv4d_critic(rules: Rules, **network) -> Conv4dCritic:

@@ -1,0 +1,46 @@
+"""Time of one decision, mask and candidates included, on one core: python benchmarks/decision.py
+
+Batch 1, ``R=4``, states from the middle of episodes; networks as in the configs, with fresh weights.
+"""
+
+import torch
+from common import interleave, save, use_one_core
+
+from pickplace import PickPlaceEnv
+from pickplace.models.actors import fcn4d, fcn_grasp
+from pickplace.planners import PolicyPlanner
+
+TOTES = ((6, 6, 5), (10, 10, 10), (30, 30, 10))
+POLICIES = {"fcn_grasp": (fcn_grasp, {}), "fcn4d": (fcn4d, {"compute_dtype": "bfloat16"})}
+CANDIDATES = (10, "all")
+
+
+def deciders(tote_size) -> dict:
+    """Each policy and number of candidates, as a function that decides once."""
+    env = PickPlaceEnv(tote_size=tote_size, num_envs=1)
+    state = env.rollout(tote_size[0] ** 2 // 2, break_when_any_done=False)[:, -1]["next"]
+    calls = {}
+    for name, (make, network) in POLICIES.items():
+        policy = make(env.rules, True, **network).eval()
+        for candidates in CANDIDATES:
+            planner = PolicyPlanner(env.rules, policy, candidates)
+            calls[f"{name}, K={candidates}"] = lambda planner=planner: planner.decide(state)
+    return calls
+
+
+def main() -> None:
+    use_one_core()
+    torch.manual_seed(0)
+    calls = {"x".join(map(str, tote)): deciders(tote) for tote in TOTES}
+    flat = {(tote, name): call for tote, each in calls.items() for name, call in each.items()}
+    times = interleave(flat, repeats=40)
+    rows = {name: {tote: times[tote, name] for tote in calls} for name in next(iter(calls.values()))}
+    first, last = ("x".join(map(str, tote)) for tote in (TOTES[0], TOTES[-1]))
+    for row in rows.values():
+        row["growth"] = row[last]["ms"] / row[first]["ms"]
+    area = TOTES[-1][0] * TOTES[-1][1] / (TOTES[0][0] * TOTES[0][1])
+    save("decision", {"area grows by": area, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()
