@@ -42,11 +42,12 @@ test: $(STAMP)  ## run the test suite (minutes)
 test-slow: $(STAMP)  ## run the long checks (an hour)
 	$(BIN)/python -m pytest -q -m slow --timeout 7200 $(ARGS)
 
-bench: $(STAMP)  ## run the benchmarks on a quiet machine (minutes), and write docs/performance.md
+bench: $(STAMP)  ## run the benchmarks on a quiet machine (half an hour), and write docs/performance.md
 	$(BIN)/pip install --quiet --disable-pip-version-check 'jumanji>=1.1,<2' || echo "jumanji: not to be had, its part is skipped"
-	$(BIN)/python benchmarks/environment.py
-	$(BIN)/python benchmarks/conv4d.py
-	$(BIN)/python benchmarks/report.py
+	$(BIN)/pip install --quiet --disable-pip-version-check 'sb3-contrib>=2.3,<3' || echo "sb3-contrib: not to be had, its part is skipped"
+	for part in learning training environment collector conv4d decision report; do \
+		$(BIN)/python benchmarks/$$part.py || exit 1; \
+	done
 
 lint: $(STAMP)  ## check style
 	$(BIN)/ruff check .

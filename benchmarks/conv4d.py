@@ -41,6 +41,21 @@ def naive(network, bin_depth: torch.Tensor, tote_depth: torch.Tensor) -> torch.T
     return conv4d(x, network.head.weight, network.head.bias).permute(0, 2, 3, 4, 5, 1).flatten(1)
 
 
+def matrix_product(dtype: torch.dtype, size: int = 2048):
+    """A large square matrix product, the yardstick for what this machine can do, and its arithmetic operations."""
+    a, b = (torch.randn(size, size).to(dtype) for _ in range(2))
+    return lambda: a @ b, 2 * size**3
+
+
+def operations(rules: Rules, filters: int, picks: float) -> float:
+    """Arithmetic operations of one state's logits, the broadcast first layer left out: the second layer and the head.
+
+    Args:
+        picks: how many pick cells are computed.
+    """
+    return 2 * picks * rules.num_places * filters * (filters * 3**4 + 4)
+
+
 def states(tote_size, batch: int):
     """Observations from the middle of episodes of random feasible actions."""
     env = PickPlaceEnv(tote_size=tote_size, num_envs=batch)
@@ -48,11 +63,14 @@ def states(tote_size, batch: int):
     return env.rules, state["bin_depth"], state["tote_depth"], state["action_mask"]
 
 
-def peak(rules: Rules, *inputs) -> dict[str, float]:
+def peak(policies: dict, bins, totes, mask) -> dict[str, float]:
     """MiB held at the worst moment of one forward pass, beyond the inputs and weights."""
     found = {}
-    network = FlatPolicy(rules).network
-    for name, call in {"naive": lambda: naive(network, *inputs), "ours": lambda: network(*inputs)}.items():
+    calls = {"naive": lambda: naive(policies["float32"].network, bins, totes)}
+    for dtype, policy in policies.items():
+        calls[f"all actions, {dtype}"] = partial(policy, bins, totes)
+        calls[f"masked, {dtype}"] = partial(policy, bins, totes, mask)
+    for name, call in calls.items():
         with torch.no_grad(), torch.profiler.profile(profile_memory=True) as profile:
             call()
         held, most = 0, 0
@@ -80,17 +98,26 @@ def measure(tote_size, batch: int, repeats: int) -> dict:
             policy.zero_grad(set_to_none=True)
         call().logsumexp(1).sum().backward()
 
+    products = {dtype: matrix_product(getattr(torch, dtype)) for dtype in policies}
+    forward |= {f"matrix product, {dtype}": call for dtype, (call, _) in products.items()}
     with torch.no_grad():
         assert torch.allclose(forward["naive"](), forward["all actions, float32"](), atol=1e-4)
         row = {"forward": interleave(forward, repeats, warmup=1)}
-    both = {name: partial(learn, call) for name, call in forward.items() if not name.startswith("all")}
+    both = {name: partial(learn, call) for name, call in forward.items() if not name.startswith(("all", "matrix"))}
     row["forward and backward"] = interleave(both, repeats, warmup=1)
-    for figures in row.values():
-        for name in list(figures):
-            figures[name]["ratio"] = figures["naive"]["ms"] / figures[name]["ms"]
-    row["peak MiB, forward"] = peak(rules, bins, totes)
-    picks = mask.unflatten(1, (rules.num_picks, -1)).any(2).sum(1).float().mean()
-    row["pick cells that allow something"] = round(float(picks), 2)
+    for part in ("forward", "forward and backward"):
+        for figures in row[part].values():
+            figures["ratio"] = row[part]["naive"]["ms"] / figures["ms"]
+    picks = float(mask.unflatten(1, (rules.num_picks, -1)).any(2).sum(1).double().mean())
+    for dtype, (_, work) in products.items():
+        reference = work / row["forward"].pop(f"matrix product, {dtype}")["ms"]  # operations a millisecond
+        row[f"GFLOPS of a matrix product, {dtype}"] = reference / 1e6
+        for name, count in (("all actions", rules.num_picks), ("masked", picks)):
+            figures = row["forward"][f"{name}, {dtype}"]
+            done = batch * operations(rules, network.filters, count) / figures["ms"]
+            figures["share of matrix product"] = done / reference
+    row["peak MiB, forward"] = peak(policies, bins, totes, mask)
+    row["pick cells that allow something"] = round(picks, 2)
     return row
 
 

@@ -8,13 +8,14 @@ from common import RESULTS
 HEAD = """# Performance
 
 Made by `make bench` from the JSON in `benchmarks/results/`; each figure is a median, with the 10th and 90th percentile
-in brackets. Peers run in the same process, turn by turn with ours. One core, one thread.
+in brackets. Peers run turn by turn with ours. One core and one thread unless it says otherwise; a
+machine that does nothing else.
 """
 
 
 def machine(result: dict) -> str:
     m = result["machine"]
-    return f"*{m['cpu']}, torch {m['torch']}, Python {m['python']}, {m['threads']} thread.*\n"
+    return f"*{m['cpu']}, torch {m['torch']}, Python {m['python']}, {m['threads']} thread{'s' * (m['threads'] > 1)}.*\n"
 
 
 def time(figures: dict) -> str:
@@ -37,33 +38,110 @@ def environment(result: dict) -> str:
     return "\n".join([*lines, "", machine(result)])
 
 
+def collector(result: dict) -> str:
+    lines = [
+        "## What the collector adds\n",
+        "A vector step with a random choice among feasible actions: a raw loop over `step_and_maybe_reset`, and the"
+        " `Collector`, which also keeps all frames and masks for the learner. `fcn_grasp` trains on outcome masks (72"
+        " entries), `fcn4d` with a mask on action masks (3,600 entries).\n",
+        "| batch, mask | raw loop | collector | added |",
+        "|---|---|---|---|",
+    ]
+    for name, row in result["rows"].items():
+        lines.append(f"| {name} | {time(row['raw loop'])} | {time(row['collector'])} | {row['added ms']:.2f} ms |")
+    return "\n".join([*lines, "", machine(result)])
+
+
 def conv4d(result: dict) -> str:
     lines = [
         "## `fcn4d` against a naive 4D convolution\n",
-        "64 filters. *Masked* computes the logits of the pick cells that allow something, and no others.\n",
-        "| case | what | variant | time | ratio |",
-        "|---|---|---|---|---|",
+        "64 filters. *Masked* computes the logits of the pick cells that allow something, and no others. *Of peak*: "
+        "arithmetic operations a second, as a share of those of a 2048 x 2048 matrix product of the same type in the "
+        "same run.\n",
+        "| case | what | variant | time | ratio | of peak |",
+        "|---|---|---|---|---|---|",
     ]
     for title, row in result["cases"].items():
         for what in ("forward", "forward and backward"):
             for name, figures in row[what].items():
-                lines.append(f"| {title} | {what} | {name} | {time(figures)} | {figures['ratio']:.1f} |")
+                share = figures.get("share of matrix product")
+                share = "" if share is None else f"{share:.0%}"
+                lines.append(f"| {title} | {what} | {name} | {time(figures)} | {figures['ratio']:.1f} | {share} |")
+    lines += [
+        "",
+        "Peak memory of a forward pass, beyond inputs and weights:\n",
+        "| case | variant | MiB |",
+        "|---|---|---|",
+    ]
+    for title, row in result["cases"].items():
+        lines += [f"| {title} | {name} | {held} |" for name, held in row["peak MiB, forward"].items()]
     lines.append("")
     for title, row in result["cases"].items():
-        held = row["peak MiB, forward"]
+        speed = ", ".join(
+            f"{dtype} {row[f'GFLOPS of a matrix product, {dtype}']:,.0f}" for dtype in ("float32", "bfloat16")
+        )
         lines.append(
-            f"Peak memory of a forward pass over all actions, {title}: naive {held['naive']} MiB, "
-            f"ours {held['ours']} MiB; {row['pick cells that allow something']} pick cells allow something (mean).\n"
+            f"{title}: {row['pick cells that allow something']} of the pick cells allow something (mean); "
+            f"GFLOPS of the matrix product: {speed}.\n"
         )
     return "\n".join([*lines, machine(result)])
 
 
+def decision(result: dict) -> str:
+    totes = [name for name in next(iter(result["rows"].values())) if name != "growth"]
+    lines = [
+        "## One decision\n",
+        "Batch 1, `R=4`, feasibility and candidates included. The last column says how the time grows from the first "
+        f"to the last tote, whose area grows by {result['area grows by']:.0f}.\n",
+        f"| policy | {' | '.join(totes)} | grows by |",
+        f"|---|{'---|' * len(totes)}---|",
+    ]
+    for name, row in result["rows"].items():
+        lines.append(f"| {name} | {' | '.join(time(row[tote]) for tote in totes)} | {row['growth']:.1f} |")
+    return "\n".join([*lines, "", machine(result)])
+
+
+def learning(result: dict) -> str:
+    lines = [
+        "## Wall-clock until the tote is packed well\n",
+        "`experiment=quick`, all cores, one run after the other, from the start of the process; validated every 25,000 "
+        "frames on 128 episodes at `6x6x5`, `R=4`. See `benchmarks/learning.py` for the peer's settings.\n",
+        "| who | until 0.95 | until 0.975 | last validation |",
+        "|---|---|---|---|",
+    ]
+    runs = [(f"pickplace, seed {run['seed']}", run) for run in result["ours"]]
+    if result["peer"]:
+        runs.append((result["peer"]["name"], result["peer"]))
+    for name, run in runs:
+        cells = [f"{value:.0f} s" if value else "never" for value in run["reached"].values()]
+        seconds, frames, occupancy = run["curve"][-1]
+        cells.append(f"{occupancy:.3f} after {seconds:.0f} s, {frames:,} frames")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    medians = []
+    for mark in ("0.95", "0.975"):
+        values = sorted(run["reached"][mark] or float("inf") for run in result["ours"])
+        medians.append(f"{values[len(values) // 2]:.0f} s until {mark}")
+    lines += ["", f"Median of our seeds: {', '.join(medians)}."]
+    return "\n".join([*lines, "", machine(result)])
+
+
+def training(result: dict) -> str:
+    speed, parts = result["frames per second"], result["share"]
+    share = ", ".join(f"{part} {value:.0%}" for part, value in parts.items())
+    return (
+        "## Where training time goes\n\n"
+        f"`experiment=quick`, {result['frames']:,} frames: {speed['median']:,.0f} frames/s in the median batch. "
+        f"{share}.\n\n" + machine(result)
+    )
+
+
 def main() -> None:
     parts = [HEAD]
-    for write in (environment, conv4d):
+    for write in (learning, training, environment, collector, conv4d, decision):
         path = RESULTS / f"{write.__name__}.json"
         if path.is_file():
             parts.append(write(json.loads(path.read_text())))
+    parts.append((Path(__file__).parent / "profiles.md").read_text())
     target = Path(__file__).parent.parent / "docs" / "performance.md"
     target.write_text("\n".join(parts))
 

@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 from pickplace.geometry import Failure, Item, Rules
 from pickplace.items import STREAMS, ItemDistribution, Kinds
 
+STARTS_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes
 PAPER_KINDS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1))
 
 
@@ -113,6 +114,7 @@ class PickPlaceEnv(EnvBase):
         sizes = {"action": rules.num_actions, "outcome": rules.num_outcomes}
         for name in self.masks:
             self.register_buffer(f"{name}_mask", zeros(sizes[name], dtype=torch.bool))
+        self._starts: dict[tuple, tuple[Tensor, ...]] = {}  # the masks of empty totes, see `_masks_of_empty_totes`
         self.set_seed(seed)
 
     def _make_specs(self):
@@ -192,7 +194,7 @@ class PickPlaceEnv(EnvBase):
         self.episode.add_(rows * self.episode_stride)
         item = torch.stack(self._arriving(), -1)
         self.item.copy_(torch.where(rows[:, None], item, self.item))
-        self._update_masks(rows)
+        self._update_masks(rows, empty=True)
         done = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         return self._observation().update({"done": done, "terminated": done.clone(), "truncated": done.clone()})
 
@@ -234,21 +236,43 @@ class PickPlaceEnv(EnvBase):
         seed = self.item_seed.expand_as(self.episode)
         return self.items.sample(self.stream, seed, self.episode, self.steps, self.rules.bin_size)
 
-    def _update_masks(self, rows: Tensor):
-        """Recompute the masks of the problems in ``rows``, bool ``[N]``; the others' states did not change."""
+    def _update_masks(self, rows: Tensor, empty: bool = False):
+        """Recompute the masks of the problems in ``rows``, bool ``[N]``; the others' states did not change.
+
+        Args:
+            empty: the totes of these problems are empty.
+        """
+        index = rows.nonzero()[:, 0]
+        if len(index) == 0:
+            return
+        if len(index) == len(rows):
+            index = slice(None)
+        make = self._masks_of_empty_totes if empty and self.device.type == "cpu" else self._masks_of
+        masks = make(self.heights[index], self.tote_height[index], self.item[index])
+        self.feasible[index] = _any(next(iter(masks.values())))
+        for name in self.masks:
+            self._store(f"{name}_mask", index, masks[name])
+
+    def _masks_of(self, heights: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
+        """The masks that are emitted, or ``outcome``, bool ``[M, ...]``, of problems ``[M, ...]``."""
         rules = self.rules
-        index = slice(None) if bool(rows.all()) else rows.nonzero()[:, 0]
-        item = Item(*self.item[index].unbind(-1))
-        placements = rules.placements(self.heights[index], self.tote_height[index], item)
-        if "action" in self.masks:
-            actions = rules.action_mask(placements)
-            self._store("action_mask", index, actions)
-            self.feasible[index] = _any(actions)
-        if "outcome" in self.masks or not self.masks:
-            outcomes = rules.outcome_mask(placements).flatten(1)
-            self.feasible[index] = _any(outcomes)
-            if self.masks:
-                self._store("outcome_mask", index, outcomes)
+        placements = rules.placements(heights, tote_height, Item(*item.unbind(-1)))
+        make = {"action": rules.action_mask, "outcome": lambda p: rules.outcome_mask(p).flatten(1)}
+        return {name: make[name](placements) for name in self.masks or ("outcome",)}
+
+    def _masks_of_empty_totes(self, heights: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
+        """As :meth:`_masks_of`; episodes begin in few ways, so what was computed is kept."""
+        keys = [tuple(key) for key in torch.cat([item, tote_height[:, None]], 1).tolist()]
+        if unseen := {key: row for row, key in enumerate(keys) if key not in self._starts}:
+            rows = torch.tensor(list(unseen.values()))
+            masks = self._masks_of(heights[rows], tote_height[rows], item[rows])
+            if len(self._starts) * sum(mask.shape[1] for mask in masks.values()) > STARTS_BYTES:
+                self._starts = {key: self._starts[key] for key in keys if key in self._starts}
+            # Copies, since a view would keep all of its batch in memory.
+            parts = zip(*([row.clone() for row in mask] for mask in masks.values()), strict=True)
+            self._starts.update(zip(unseen, parts, strict=True))
+        columns = zip(*(self._starts[key] for key in keys), strict=True)
+        return dict(zip(self.masks or ("outcome",), map(torch.stack, columns), strict=True))
 
     def _store(self, name: str, index, values: Tensor):
         """Keep a mask in a tensor of its own: the last one has been handed out with an observation."""

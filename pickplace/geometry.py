@@ -236,25 +236,27 @@ class Rules:
             bool ``[K, N]``: some pick cell lifts the item with this offset under the EE before turning (it is the only
             one); int64 ``[R, K, N]``: the grasp class that this offset becomes by each rotation, clamped into range.
         """
-        (bin_w, bin_d, wall), (ee_w, ee_d) = self.bin_size, self.effector_size
-        step = torch.arange(self.min_offset, self.min_offset + self.num_offsets, device=item.x.device)[:, None]
-        gripped, leaves = [], []
+        (bin_w, bin_d, wall), (ee_w, ee_d), count = self.bin_size, self.effector_size, self.num_offsets
+        step = torch.arange(self.min_offset, self.min_offset + count, device=item.x.device)[:, None]
+        gripped, leaves, backs = [], [], []
         for at, size, ee, room in ((item.x, item.w, ee_w, bin_w), (item.y, item.d, ee_d, bin_d)):
-            corner = at - step  # of the EE, [O, N]
+            corner, back = at - step, ee - size - step  # of the EE; from the item's far end to the EE's; [O, N]
+            held = (torch.minimum(step, back) >= 0) if self.pick_rule == "contain" else (step < ee) & (step + size > 0)
             cell = corner + (ee - 1) // 2
-            held = (step >= 0) & (step + size <= ee) if self.pick_rule == "contain" else (step < ee) & (step + size > 0)
-            gripped.append(held & (cell >= 0) & (cell < room) & (size > 0))
-            leaves.append((corner < 0) | (corner + ee > room))
+            gripped.append(held & (cell >= 0) & (cell < room))
+            leaves.append((corner < 0) | (corner > room - ee))
+            backs.append((back - self.min_offset).clamp_(0, count - 1))
         hits_wall = (leaves[0][:, None] | leaves[1]) & (item.h < wall)
-        available = gripped[0][:, None] & gripped[1] & ~hits_wall  # [O, O, N]
-        ox, oy = step[:, None], step
-        back_x, back_y = ee_w - ox - item.w, ee_d - oy - item.d
-        turned = ((ox, oy), (back_y, ox), (back_x, back_y), (oy, back_x))
-        count, classes = self.num_offsets, []
-        for rotation, (x, y) in enumerate(turned[: self.rotations]):
-            x, y = ((v - self.min_offset).clamp(0, count - 1) for v in (x, y))
-            classes.append(((rotation % 2 * count + x) * count + y).expand_as(available))
-        return available.flatten(0, 1), torch.stack(classes).flatten(1, 2)
+        available = gripped[0][:, None] & gripped[1] & ~hits_wall & (item.w > 0)  # [O, O, N]
+        here, (back_x, back_y) = torch.arange(count, device=item.x.device)[:, None], backs
+        # An offset (x, y) is (along, across) the EE's width after turning; its class counts (parity, x, y) up.
+        turned = (
+            (here[:, None] * count + here).expand_as(available),
+            here[:, None] + (back_y + count) * count,
+            back_x[:, None] * count + back_y,
+            here * count + back_x[:, None] + count * count,
+        )
+        return available.flatten(0, 1), torch.stack(turned[: self.rotations]).flatten(1, 2)
 
     # ------------------------------------------------------------------ placing
     def resting_top(self, heights: Tensor, tote_height: Tensor, item: Item) -> Tensor:
@@ -266,9 +268,9 @@ class Rules:
             heights: int32 ``[N, W_T, D_T]``.
             tote_height: int64 ``[N]``.
         """
-        side, (tote_w, tote_d) = self.max_side, self.tote_size[:2]
+        side = self.max_side
         padded = _surround(heights.permute(1, 2, 0), (0, side - 1, 0, side - 1), FAR)  # [.., .., N]
-        below = [padded[i : i + tote_w, j : j + tote_d] for i in range(side) for j in range(side)]
+        below = _windows(padded, side).flatten(0, 1).unbind(0)
         w, d = (torch.stack(pair)[: self.parities] for pair in ((item.w, item.d), (item.d, item.w)))
         w, d = w[:, None, None], d[:, None, None]  # [Q, 1, 1, N]
         under = [(i < w) & (j < d) for i in range(side) for j in range(side)]
@@ -332,9 +334,7 @@ class Rules:
             pad = (ref_x - low, low + count - 1 - ref_x, ref_y - low, low + count - 1 - ref_y)
             top = _surround(placements.top[:, parity].permute(1, 2, 0), pad, NEVER)
             clear = placements.clearance[:, parity].permute(1, 2, 0)
-            for i in range(count):
-                for j in range(count):
-                    torch.le(clear, top[i : i + tote_w, j : j + tote_d], out=mask[parity, i, j])
+            torch.le(clear, _windows(top, count), out=mask[parity])
         return mask.flatten(3, 4).flatten(0, 2)
 
     def num_feasible(self, placements: Placements) -> Tensor:
@@ -549,6 +549,12 @@ def _surround(maps: Tensor, margins: tuple[int, int, int, int], value) -> Tensor
         out.fill_(value)
     out[x0 : x0 + wide, y0 : y0 + deep] = maps
     return out
+
+
+def _windows(maps: Tensor, count: int) -> Tensor:
+    """All shifts of maps ``[W + count - 1, D + count - 1, N]`` by up to ``count - 1`` cells, a view
+    ``[count, count, W, D, N]``."""
+    return maps.unfold(0, count, 1).unfold(1, count, 1).permute(3, 4, 0, 1, 2)
 
 
 def _maximum(maps: list[Tensor]) -> Tensor:

@@ -453,3 +453,28 @@ def test_the_oracle_by_hand():
     assert oracle.try_action(rules.join((0, 0), (1, 1), 0))[0] == 0
     deep = Oracle(Rules(bin_size=(5, 5, 2)), 5, (2, 1, 1), (0, 0))
     assert deep.try_action(rules.join((0, 0), (1, 1), 0))[0] == 2
+
+
+@pytest.mark.parametrize("kept", [0, 5000, 2**26])
+@pytest.mark.parametrize("masks", [("action",), ("outcome", "action"), ()])
+def test_masks_of_empty_totes_are_kept_and_are_the_same(kept, masks, monkeypatch):
+    monkeypatch.setattr("pickplace.env.STARTS_BYTES", kept)
+    kinds = [(1, 1, 1), (2, 1, 2), (1, 3, 1)]
+    env = make_env(kinds, tote_size=(4, 4, 4), num_envs=12, masks=masks)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(12):
+        rows = torch.rand(12, 1, generator=generator) < 0.5
+        heights = torch.randint(2, 5, (12, 1), generator=generator)
+        td = env.reset(TensorDict({"_reset": rows, "tote_height": heights}, [12]))
+        placements = env.rules.placements(env.heights, env.tote_height, env.current_item)
+        expected = {
+            "action": env.rules.action_mask(placements),
+            "outcome": env.rules.outcome_mask(placements).flatten(1),
+        }
+        torch.testing.assert_close(env.feasible, expected["outcome"].any(1))
+        for name in masks:
+            assert torch.equal(td[f"{name}_mask"], expected[name])
+        size = env.rules.num_actions * ("action" in masks) + env.rules.num_outcomes * (
+            "action" not in masks or "outcome" in masks
+        )
+        assert len(env._starts) * size <= kept + 12 * size

@@ -174,8 +174,10 @@ class Conv4dPolicy(nn.Module):
         tote_kernel = self.first.weight[:, 1].sum((1, 2))
         from_bin = F.conv2d(bins[:, None], bin_kernel[:, None])
         from_tote = F.conv2d(totes[:, None], tote_kernel[:, None], self.first.bias)
-        from_bin = from_bin.permute(2, 0, 3, 1).to(dtype).contiguous()  # [W_B + 2, N, D_B + 2, filters]
         from_tote = from_tote.permute(0, 2, 3, 1).to(dtype).contiguous()  # [N, W_T + 2, D_T + 2, filters]
+        if bins.shape[1:] == (5, 5):
+            return self._at_one_pick(from_bin.permute(0, 2, 3, 1).to(dtype), from_tote)
+        from_bin = from_bin.permute(2, 0, 3, 1).to(dtype).contiguous()  # [W_B + 2, N, D_B + 2, filters]
         hidden = (from_bin[:, :, :, None, None] + from_tote[None, :, None]).relu_()
 
         rows, weight, out = len(hidden) - 2, self.second.weight.to(dtype), None
@@ -185,6 +187,18 @@ class Conv4dPolicy(nn.Module):
             part = F.conv3d(volume, kernel, self.second.bias.to(dtype) if tap == 0 else None)
             out = part if out is None else out.add_(part)
         return out.relu_().permute(0, 2, 3, 4, 1).unflatten(0, (rows, len(bins)))
+
+    def _at_one_pick(self, from_bin: Tensor, from_tote: Tensor) -> Tensor:
+        """The second layer where there is one pick cell: one 2D convolution, the pick's taps being more channels.
+
+        Args:
+            from_bin, from_tote: the first layer's parts, ``[N, 3, 3, filters]``, ``[N, W_T + 2, D_T + 2, filters]``.
+        """
+        hidden = (from_bin.flatten(1, 2)[:, None, None] + from_tote[:, :, :, None]).relu_().flatten(3)
+        kernel = self.second.weight.to(hidden.dtype).permute(0, 2, 3, 1, 4, 5).flatten(1, 3)
+        kernel = kernel.contiguous(memory_format=torch.channels_last)
+        out = F.conv2d(hidden.permute(0, 3, 1, 2), kernel, self.second.bias.to(hidden.dtype))
+        return out.relu_().permute(0, 2, 3, 1)[None, :, None]
 
     def _features(self, bins: Tensor, totes: Tensor) -> Tensor:
         return self._hidden(bins, totes).transpose(0, 1).to(bins.dtype)
