@@ -6,6 +6,7 @@ and ``actions`` is int64 ``[N]``, flat indices.
 """
 
 from pickplace.planners.heuristics import JointDBL, RandomFeasible, UniformRandom
+from pickplace.planners.individual import IndividualHeuristic
 from pickplace.planners.policy import PolicyPlanner
 
-__all__ = ["JointDBL", "PolicyPlanner", "RandomFeasible", "UniformRandom"]
+__all__ = ["IndividualHeuristic", "JointDBL", "PolicyPlanner", "RandomFeasible", "UniformRandom"]

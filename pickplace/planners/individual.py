@@ -1,0 +1,132 @@
+"""Individual planning, what the paper compares with: where to pick is decided first, and without the tote."""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from pickplace.geometry import FAR, Item, Rules
+
+CANDIDATES = ("corners", "cells")
+
+
+def heuristic_pick(rules: Rules, item: Item) -> Tensor:
+    """The pick cell that puts the item at the least offset under the end effector, int64 ``[N]``.
+
+    Least ``ox + oy``, then ``oy``, among the picks that succeed: the end effector's corner where possible.
+    """
+    failure, offset = rules.grasps(item)
+    ox, oy = offset[:, :, 0].unbind(-1)  # before turning, [N, P]
+    order = (ox + oy) * FAR + oy
+    return torch.where(failure == 0, order, FAR**2).argmin(1)
+
+
+class IndividualHeuristic:
+    """Heuristic pick, then deepest-bottom-left over the corners of the tote's free rectangles.
+
+    A candidate is a footprint in a corner of a maximal rectangle (MaxRects, Jylanki 2010) of the cells that are not
+    higher than the level on which the item would rest; the first in the order (top, footprint y, footprint x) that
+    succeeds in a forward simulation is played, ties by the lowest flat index. If none does, the first is played, and
+    fails.
+
+    Args:
+        rules: the task's sizes.
+        candidates: ``"corners"``, or ``"cells"`` for every footprint.
+    """
+
+    name = "individual_heuristic"
+
+    def __init__(self, rules: Rules, candidates: str = "corners"):
+        if candidates not in CANDIDATES:
+            raise ValueError(f"planner.candidates={candidates!r}: expected 'corners' or 'cells'.")
+        self.rules, self.candidates = rules, candidates
+
+    def decide(self, observation: TensorDictBase) -> Tensor:
+        rules, tote_height = self.rules, observation["tote_height"].reshape(-1)
+        placements = rules.placements_from_depth(observation["bin_depth"], observation["tote_depth"], tote_height)
+        item, rows = placements.item, torch.arange(len(tote_height), device=tote_height.device)
+        pick = heuristic_pick(rules, item)
+
+        def at_pick(actions: Tensor) -> Tensor:
+            """``[N, N_a]`` to ``[N, places * R]``."""
+            return actions.unflatten(1, (rules.num_picks, -1))[rows, pick]
+
+        outcome = at_pick(rules.action_outcomes(item))
+        succeeds = at_pick(rules.action_mask(placements))
+        allowed = outcome >= 0
+        if self.candidates == "corners":
+            heights = (tote_height[:, None, None] - observation["tote_depth"]).int()
+            corners = corner_footprints(rules, heights, placements.top, item).flatten(1)
+            allowed &= corners.gather(1, outcome.clamp(min=0))
+        tote_w, tote_d, _ = rules.tote_size
+        top = placements.top.flatten(1).gather(1, outcome.clamp(min=0)).long()
+        x, y = outcome // tote_d % tote_w, outcome % tote_d
+        order = (top * tote_d + y) * tote_w + x
+        # Those that succeed, in order; then those that fail, in order; ties by the lowest flat index.
+        order = torch.where(allowed, order + FAR * ~(succeeds & allowed) * tote_w * tote_d, FAR**2)
+        return pick * outcome.shape[1] + order.argmin(1)
+
+
+def corner_footprints(rules: Rules, heights: Tensor, top: Tensor, item: Item) -> Tensor:
+    """Which footprints lie in a corner of a maximal free rectangle of their level, bool ``[N, Q, W_T, D_T]``.
+
+    Free on a level are the cells that are not higher than it; a footprint's level is that of what it rests on.
+
+    Args:
+        heights: int32 ``[N, W_T, D_T]``.
+        top: of :class:`~pickplace.geometry.Placements`; footprints that cannot rest are in no corner.
+        item: what is placed.
+    """
+    found = torch.zeros_like(top, dtype=torch.bool)
+    level = top - item.h[:, None, None, None]
+    sizes = ((item.w, item.d), (item.d, item.w))[: rules.parities]
+    for z in level[top >= 0].unique().tolist():
+        free = heights <= z
+        for parity, (w, d) in enumerate(sizes):
+            corners = torch.zeros_like(free)
+            for axes in ((), (1,), (2,), (1, 2)):
+                # The corner at which both coordinates are least, after flipping the tote.
+                corner = _least_corners(free.flip(axes), w, d).flip(axes)
+                for axis, size in ((1, w), (2, d)):
+                    if axis in axes:  # from the footprint's last cell to its first
+                        corner = _shift(corner, axis, size - 1)
+                corners |= corner
+            found[:, parity] |= corners & (level[:, parity] == z) & (top[:, parity] >= 0)
+    return found
+
+
+def _least_corners(free: Tensor, w: Tensor, d: Tensor) -> Tensor:
+    """Cells at which some maximal rectangle of free cells, at least ``w x d``, begins, bool ``[N, W, D]``."""
+    tote_w, tote_d = free.shape[1:]
+    # How many cells are free from each one on along x.
+    run = torch.zeros_like(free, dtype=torch.int64)
+    count = torch.zeros_like(run[:, 0])
+    for x in reversed(range(tote_w)):
+        count = torch.where(free[:, x], count + 1, 0)
+        run[:, x] = count
+    blocked_left = torch.ones_like(free)  # is the cell before this one, along x, not free?
+    blocked_left[:, 1:] = ~free[:, :-1]
+    # How many cells are free from each one on along x in the row before, where the tote begins: none.
+    before = torch.zeros_like(run)
+    before[:, :, 1:] = run[:, :, :-1]
+    corner = torch.zeros_like(free)
+    # Of the rectangles that begin at a cell, the widest of every depth; each is maximal if no side can move outwards.
+    width, closed = run.clone(), blocked_left.clone()
+    for depth in range(1, tote_d + 1):
+        last = torch.zeros_like(run)  # the width that one row more would leave
+        if depth < tote_d:
+            last[:, :, : tote_d - depth] = run[:, :, depth:]
+        longer = torch.minimum(width, last)
+        fits = (width >= w[:, None, None]) & (d[:, None, None] <= depth)
+        corner |= fits & closed & (before < width) & (longer < width) & (width > 0)
+        if depth < tote_d:
+            closed[:, :, : tote_d - depth] |= blocked_left[:, :, depth:]
+        width = longer
+    return corner
+
+
+def _shift(maps: Tensor, axis: int, by: Tensor) -> Tensor:
+    """Move what is in maps ``[N, W, D]`` towards 0 along an axis, by a number of cells for each; zeros come in."""
+    size = maps.shape[axis]
+    cell = torch.arange(size, device=maps.device).view(*[-1 if a == axis else 1 for a in range(3)])
+    source = (cell + by[:, None, None]).expand_as(maps)
+    return maps.gather(axis, source.clamp(max=size - 1)) & (source < size)

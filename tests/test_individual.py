@@ -1,0 +1,79 @@
+"""Individual planning against brute force and the reference's figures."""
+
+import itertools
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pickplace import Item, PickPlaceEnv, Rules
+from pickplace.evaluate import play
+from pickplace.planners import IndividualHeuristic
+from pickplace.planners.individual import corner_footprints, heuristic_pick
+
+
+def maximal_rectangles(free):
+    """All ``(x, y, width, depth)`` of free cells that no side of which can move outwards, by trying every one."""
+    wide, deep = len(free), len(free[0])
+
+    def is_free(x, y, w, d):
+        inside = x >= 0 and y >= 0 and x + w <= wide and y + d <= deep
+        return inside and all(free[i][j] for i in range(x, x + w) for j in range(y, y + d))
+
+    for x, y in itertools.product(range(wide), range(deep)):
+        for w, d in itertools.product(range(1, wide - x + 1), range(1, deep - y + 1)):
+            larger = ((x - 1, y, w + 1, d), (x, y - 1, w, d + 1), (x, y, w + 1, d), (x, y, w, d + 1))
+            if is_free(x, y, w, d) and not any(is_free(*each) for each in larger):
+                yield x, y, w, d
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6), wide=st.integers(2, 6), deep=st.integers(2, 6), steps=st.integers(1, 4))
+def test_corners_of_maximal_rectangles(seed, wide, deep, steps):
+    generator = torch.Generator().manual_seed(seed)
+    rules = Rules(tote_size=(wide, deep, 6), rotations=4)
+    heights = torch.randint(steps, (3, wide, deep), generator=generator).int()
+    w, d, h = (torch.randint(1, 3, (3,), generator=generator) for _ in range(3))
+    item = Item(torch.zeros_like(w), torch.zeros_like(w), w, d, h)
+    top = rules.resting_top(heights, torch.full((3,), 6), item)
+    found = corner_footprints(rules, heights, top, item)
+    for n, parity in itertools.product(range(3), range(2)):
+        size = (int(w[n]), int(d[n])) if parity == 0 else (int(d[n]), int(w[n]))
+        expected = torch.zeros(wide, deep, dtype=torch.bool)
+        for z in range(steps):
+            for x, y, a, b in maximal_rectangles((heights[n] <= z).tolist()):
+                if a >= size[0] and b >= size[1]:
+                    for i, j in itertools.product((x, x + a - size[0]), (y, y + b - size[1])):
+                        expected[i, j] |= int(top[n, parity, i, j]) == z + int(h[n])
+        assert torch.equal(found[n, parity], expected)
+
+
+@pytest.mark.parametrize("wall", [1, 2])
+def test_the_pick_is_the_corner_of_the_effector_where_it_can_be(wall):
+    rules = Rules(bin_size=(5, 5, wall))
+    x, y = torch.arange(25) // 5, torch.arange(25) % 5
+    one = torch.ones(25, dtype=torch.int64)
+    # The reference cell is the middle of the 3x3 effector; it must be a cell of the bin, and under walls that are
+    # higher than the item the whole effector must stay inside.
+    most = 4 if wall == 1 else 3
+    expected = (x + 1).clamp(max=most) * 5 + (y + 1).clamp(max=most)
+    assert torch.equal(heuristic_pick(rules, Item(x, y, one, one, one)), expected)
+
+
+@pytest.mark.parametrize(("rotations", "reference"), [(1, 0.569), (3, 0.922)])
+def test_every_cell_meets_the_reference(rotations, reference):
+    rules = PickPlaceEnv(rotations=rotations, num_envs=1).rules
+    planner = IndividualHeuristic(rules, "cells")
+
+    def make_env(first, count):
+        return PickPlaceEnv(rotations=rotations, num_envs=count, masks=(), stream="test", seed=5, first_episode=first)
+
+    occupancy = play(make_env, planner, 500, 250).occupancy
+    error = float(occupancy.std() / len(occupancy) ** 0.5)
+    assert abs(float(occupancy.mean()) - reference) < 3 * error + 0.0005
+
+
+def test_bad_candidates():
+    with pytest.raises(ValueError, match=r"planner.candidates='all': expected 'corners' or 'cells'"):
+        IndividualHeuristic(Rules(), "all")
