@@ -79,7 +79,7 @@ def use_machine(cfg: DictConfig) -> "torch.device":
 TARGETS = {
     "env": ("PickPlaceEnv", "env.PickPlaceEnv"),
     "items": ("items.Kinds", "items.Uniform", "items.Recorded"),
-    "model.actor": ("models.actors.fcn_grasp", "models.actors.fcn4d"),
+    "model.actor": ("models.actors.fcn_grasp", "models.actors.fcn4d", "models.actors.typical"),
     "model.critic": ("models.critics.DepthCritic", "models.critics.conv4d_critic"),
     "curriculum": ("curriculum.Curriculum",),
     "curriculum.advance": tuple(

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.modules import ValueOperator
-from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives import A2CLoss, ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from pickplace import checkpoint, config
@@ -80,17 +80,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
         rollout_length=algo.rollout_length,
         seed=cfg.seed,
     )
-    advantage = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=critic, average_gae=False, deactivate_vmap=True)
-    loss = ClipPPOLoss(
-        as_actor(policy),
-        critic,
-        clip_epsilon=algo.clip_epsilon,
-        entropy_coeff=algo.entropy_coeff,
-        critic_coeff=algo.critic_coeff,
-        loss_critic_type="l2",
-        normalize_advantage=algo.normalize_advantage,
-    )
-    loss.set_keys(action=policy.choice_key, sample_log_prob="log_prob")
+    advantage, loss = make_losses(algo, policy, critic)
     learned = [*policy.in_keys, policy.choice_key, "log_prob", "advantage", "value_target"]
     optimizer = torch.optim.Adam(loss.parameters(), lr=algo.lr, eps=1e-5)
     if resume:
@@ -212,6 +202,8 @@ def check_settings(cfg: DictConfig) -> None:
         value = OmegaConf.select(cfg, key)
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 2**63:
             raise ValueError(f"{key}={value}: expected a whole number >= {least} and < 2**63.")
+    if cfg.algo.loss not in ("a2c", "ppo"):
+        raise ValueError(f"algo.loss={cfg.algo.loss}: expected ppo or a2c.")
     for key in ("algo.mask_infeasible", "algo.normalize_advantage"):
         if not isinstance(value := OmegaConf.select(cfg, key), bool):
             raise ValueError(f"{key}={value}: expected true or false.")
@@ -233,6 +225,21 @@ def check_settings(cfg: DictConfig) -> None:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not number or not low <= value < float("inf") or (high is not None and value > high):
             raise ValueError(f"{key}={value}: expected a number >= {low}{'' if high is None else f' and <= {high}'}.")
+
+
+def make_losses(algo: DictConfig, policy: torch.nn.Module, critic: ValueOperator) -> tuple[GAE, A2CLoss | ClipPPOLoss]:
+    """The advantage estimator and the loss that ``algo.loss`` names."""
+    common = {"entropy_coeff": algo.entropy_coeff, "critic_coeff": algo.critic_coeff, "loss_critic_type": "l2"}
+    if algo.loss == "ppo":
+        clip = {"clip_epsilon": algo.clip_epsilon, "normalize_advantage": algo.normalize_advantage}
+        loss = ClipPPOLoss(as_actor(policy), critic, **clip, **common)
+    else:
+        loss = A2CLoss(as_actor(policy), critic, **common)
+    loss.set_keys(action=policy.choice_key, sample_log_prob="log_prob")
+    # A2CLoss has no normalisation of its own.
+    average = algo.loss == "a2c" and algo.normalize_advantage
+    advantage = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=critic, average_gae=average, deactivate_vmap=True)
+    return advantage, loss
 
 
 def training_env(env_config, items, device, masks, total_envs, curriculum, first_episode, num_envs) -> TransformedEnv:
@@ -257,8 +264,8 @@ def learning_rate(algo: DictConfig, frames: int, total_frames: int) -> float:
     return algo.lr * min(max(left, 0.0), 1.0)
 
 
-def update(loss: ClipPPOLoss, optimizer, data: TensorDictBase, algo: DictConfig) -> dict[str, float]:
-    """PPO's epochs over one batch of frames ``[B]``; returns the mean diagnostics."""
+def update(loss: A2CLoss | ClipPPOLoss, optimizer, data: TensorDictBase, algo: DictConfig) -> dict[str, float]:
+    """The epochs over one batch of frames ``[B]``; returns the mean diagnostics."""
     totals, steps = {}, 0
     for _ in range(algo.epochs):
         for index in torch.randperm(len(data), device=data.device).split(algo.minibatch_size):
@@ -274,6 +281,8 @@ def update(loss: ClipPPOLoss, optimizer, data: TensorDictBase, algo: DictConfig)
             optimizer.step()
             steps += 1
             for name, key in DIAGNOSTICS.items():
+                if key not in losses.keys():  # noqa: SIM118
+                    continue
                 totals[name] = totals.get(name, 0.0) + losses[key].detach()
             totals["grad_norm"] = totals.get("grad_norm", 0.0) + norm
     return {f"train/{name}": float(value) / steps for name, value in totals.items()}

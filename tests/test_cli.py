@@ -78,6 +78,7 @@ BAD = [
     ("train", ["algo.mask_infeasible=maybe"], ["algo.mask_infeasible=maybe", "true or false"]),
     ("train", ["evaluation.stream=test"], ["evaluation.stream=test", "validation"]),
     ("train", ["planner=random"], ["RandomFeasible", "planner=policy"]),
+    ("train", ["algo.loss=dqn"], ["algo.loss=dqn", "ppo or a2c"]),
     ("train", ["algo.lr=-1"], ["algo.lr=-1", ">= 0"]),
     ("train", ["algo.gamma=1.5"], ["algo.gamma=1.5", "<= 1"]),
     ("train", ["total_frames=many"], ["total_frames=many", "whole number"]),

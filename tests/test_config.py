@@ -2,15 +2,18 @@
 
 import hydra
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from torchrl.modules import ValueOperator
 
 from pickplace import PickPlaceEnv, config
 from pickplace.curriculum import Curriculum
 from pickplace.items import ItemDistribution
 from pickplace.metrics import read_csv
+from pickplace.models.actors import as_collection_policy, fcn_grasp
 from pickplace.models.critics import Conv4dCritic, DepthCritic
-from pickplace.train import train
+from pickplace.train import make_losses, train
 
 CONF = config.conf_dir()
 TINY = [
@@ -76,7 +79,7 @@ def test_every_planner(name):
     observation = env.reset()
     action = config.instantiate(cfg.planner, rules=env.rules, **kwargs).decide(observation)
     assert ((action >= 0) & (action < env.rules.num_actions)).all()
-    if name != "uniform":
+    if name not in ("uniform", "individual_heuristic"):
         assert observation["action_mask"].gather(1, action[:, None]).all()
 
 
@@ -107,6 +110,34 @@ def test_every_preset_runs(name, tmp_path):
 def test_every_model_trains_with_and_without_a_mask(model, masked, tmp_path):
     overrides = [f"model={model}", f"algo.mask_infeasible={masked}", "curriculum=none", *TINY, "env.rotations=3"]
     assert 0 <= train(composed(*overrides), tmp_path) <= 1
+
+
+def test_a2c_trains_through_the_same_loop(tmp_path):
+    cfg = composed("algo=a2c", "model=fcn_grasp", "curriculum=none", *TINY)
+    assert 0 <= train(cfg, tmp_path) <= 1
+    assert (cfg.algo.loss, cfg.algo.gamma) == ("a2c", composed().algo.gamma)
+
+
+def test_ppo_begins_where_a2c_is():
+    """At the policy that collected the data the ratio is 1, and the clipped objective has the gradient of A2C's."""
+    env = PickPlaceEnv(num_envs=16, masks=("outcome",))
+    policy = fcn_grasp(env.rules, True, head_std=1.0)
+    critic = ValueOperator(DepthCritic(env.rules), ["bin_depth", "tote_depth"])
+    with torch.no_grad():
+        data = env.rollout(4, as_collection_policy(policy), break_when_any_done=False).reshape(-1)
+    gradients = {}
+    for algo in ("ppo", "a2c"):
+        cfg = composed(f"algo={algo}", "algo.normalize_advantage=false").algo
+        advantage, loss = make_losses(cfg, policy, critic)
+        with torch.no_grad():
+            advantage(data)
+        policy.zero_grad()
+        loss(data)["loss_objective"].backward()
+        gradients[algo] = torch.cat(
+            [parameter.grad.flatten() for parameter in loss.parameters() if parameter.grad is not None]
+        )
+    assert gradients["ppo"].abs().max() > 0
+    torch.testing.assert_close(gradients["ppo"], gradients["a2c"])
 
 
 def test_presets_change_the_training_config():

@@ -89,6 +89,25 @@ class FlatPolicy(nn.Module):
         return self(bin_depth, tote_depth).log_softmax(-1)
 
 
+class TypicalPolicy(FlatPolicy):
+    """The "typical" network that the paper compares with: ``fcn4d``, then one fully connected layer over all logits.
+
+    The layer is a square of side ``N_a``, so that it is tied to the sizes that it is trained at, and its memory grows
+    with the fourth power of the tote's side: 50 MB at ``6x6``, 400 MB at ``10x10``, 32 GB at ``30x30`` with ``R=4``.
+
+    Args: as :class:`FlatPolicy`.
+    """
+
+    def __init__(self, rules: Rules, mask_infeasible: bool = False, **network):
+        super().__init__(rules, mask_infeasible, **network)
+        self.join = nn.Linear(rules.num_actions, rules.num_actions)
+
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Logits ``[N, N_a]``."""
+        logits = self.join(super().forward(bin_depth, tote_depth))
+        return logits if action_mask is None else torch.where(action_mask, logits, MASKED)
+
+
 class OutcomePolicy(nn.Module):
     """``fcn_grasp`` with masking: chooses among the distinct footprints that some action reaches.
 
@@ -217,6 +236,11 @@ def pick_one(candidates: Tensor) -> Tensor:
 def fcn4d(rules: Rules, mask_infeasible: bool, **network) -> FlatPolicy:
     """The paper's policy (config ``model=fcn4d``)."""
     return FlatPolicy(rules, mask_infeasible, **network)
+
+
+def typical(rules: Rules, mask_infeasible: bool, **network) -> TypicalPolicy:
+    """The paper's comparison with a fully connected layer (config ``model=typical``)."""
+    return TypicalPolicy(rules, mask_infeasible, **network)
 
 
 def fcn_grasp(rules: Rules, mask_infeasible: bool, **network) -> nn.Module:
