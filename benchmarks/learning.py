@@ -28,21 +28,31 @@ EPISODES = 128
 SLOTS = 128
 
 
-def ours(seed: int) -> dict:
-    """One run of ``experiment=quick``: its validations and how its time was spent."""
+def ours(seed: int, whole: bool) -> dict:
+    """One run of ``experiment=quick``, to its end or to the last mark: its validations, how its time was spent."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "pickplace.train", "experiment=quick", f"seed={seed}"]
-        command += ["evaluation_interval=25_000", f"hydra.run.dir={folder}"]
+        command += ["evaluation_interval=50_000", f"hydra.run.dir={folder}"]
         started, curve = time.perf_counter(), []
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             for line in process.stdout:
                 if found := re.search(r"([\d,]+) frames: validation occupancy ([\d.]+)", line):
                     frames, occupancy = int(found[1].replace(",", "")), float(found[2])
                     curve.append([time.perf_counter() - started, frames, occupancy])
+                    if not whole and None not in reached(curve).values():
+                        process.terminate()  # it finishes its batch and saves
+        seconds = time.perf_counter() - started
         rows = [line.split(",") for line in (Path(folder) / "metrics.csv").read_text().splitlines()]
     columns = {name: [float(row[i]) for row in rows[1:]] for i, name in enumerate(rows[0]) if name.startswith("time/")}
     spent = {name.removeprefix("time/"): float(np.median(values)) for name, values in columns.items()}
-    return {"seed": seed, "curve": curve, "reached": reached(curve), "median batch": spent}
+    return {
+        "seed": seed,
+        "seconds": seconds,
+        "whole": whole,
+        "curve": curve,
+        "reached": reached(curve),
+        "median batch": spent,
+    }
 
 
 def reached(curve: list) -> dict:
@@ -177,7 +187,7 @@ def peer(seconds: float) -> dict | None:
 
 def main() -> None:
     seeds = [int(seed) for seed in sys.argv[1:]] or [0, 1, 2]
-    runs = [ours(seed) for seed in seeds]
+    runs = [ours(seed, whole=seed == seeds[0]) for seed in seeds]
     needed = sorted(run["reached"]["0.95"] or float("inf") for run in runs)[len(runs) // 2]
     torch.manual_seed(0)
     save("learning", {"ours": runs, "peer": peer(10 * needed)})

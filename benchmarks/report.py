@@ -104,7 +104,7 @@ def decision(result: dict) -> str:
 def learning(result: dict) -> str:
     lines = [
         "## Wall-clock until the tote is packed well\n",
-        "`experiment=quick`, all cores, one run after the other, from the start of the process; validated every 25,000 "
+        "`experiment=quick`, all cores, one run after the other, from the start of the process; validated every 50,000 "
         "frames on 128 episodes at `6x6x5`, `R=4`. See `benchmarks/learning.py` for the peer's settings.\n",
         "| who | until 0.95 | until 0.975 | last validation |",
         "|---|---|---|---|",
