@@ -18,7 +18,7 @@ from torchrl.envs.utils import step_mdp
 
 from pickplace import checkpoint, config
 from pickplace.geometry import Failure, Item
-from pickplace.planners.policy import restore_policy
+from pickplace.planners.policy import restore_critic, restore_policy
 from pickplace.replay import Recording, animation, observe, page, picture
 from pickplace.report import evaluation_table
 
@@ -174,6 +174,7 @@ def evaluate(cfg: DictConfig, make_env, planner, facts: dict) -> tuple[dict, Epi
         **facts,
         **episodes_of(cfg),
         **summarise(result),
+        **(planner.statistics() if hasattr(planner, "statistics") else {}),
         "latency_ms": decision_latency(make_env, planner, ev.latency_decisions),
         "versions": versions(),
         "commit": commit(),
@@ -253,6 +254,13 @@ def commit() -> str | None:
         return None
 
 
+#: Planners that are made from a checkpoint's policy.
+NEEDS_POLICY = {"pickplace.planners.PolicyPlanner": "policy", "pickplace.planners.Lookahead": "lookahead"}
+
+#: Planners that imagine items.
+NEEDS_ITEMS = ("pickplace.planners.Lookahead", "pickplace.planners.MCTS")
+
+
 def run(cfg: DictConfig, run_dir: Path) -> float:
     """Evaluate as the config says (``conf/evaluate.yaml``); returns the mean occupancy.
 
@@ -274,7 +282,8 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
     if "model" in cfg and cfg.checkpoint is None:
         raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
     config.use_machine(cfg)
-    facts, policy_state = {"checkpoint": None}, None
+    settings = {key: value for key, value in cfg.planner.items() if key != "_target_"}
+    facts, policy_state = {"planner_settings": settings, "checkpoint": None}, None
     if cfg.checkpoint is not None:
         folder = checkpoint.locate(str(cfg.checkpoint))
         state, saved = checkpoint.read(folder)
@@ -286,7 +295,7 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
         with open_dict(cfg):
             for group in TRAINED:
                 cfg[group] = trained[group]
-        facts = {
+        facts |= {
             "checkpoint": str(folder),
             "trained": {"frames": saved["frames"], "seed": trained.seed, "commit": saved["commit"]},
             "mask_in_training": trained.algo.mask_infeasible,
@@ -302,13 +311,20 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
 
     rules = make_env(0, 1).rules
     kwargs = {}
-    if cfg.planner._target_ == "pickplace.planners.PolicyPlanner":
+    if cfg.planner._target_ in NEEDS_POLICY:
         if policy_state is None:
-            raise ValueError("checkpoint=null: planner=policy needs a checkpoint; expected a run folder.")
+            name = NEEDS_POLICY[cfg.planner._target_]
+            raise ValueError(f"checkpoint=null: planner={name} needs a checkpoint; expected a run folder.")
         policy = restore_policy(cfg, rules, policy_state, saved["config"]["env"]["rotations"])
         kwargs["policy"] = policy.to(cfg.device)
-        masked = cfg.planner.candidates == "all" or policy.excludes or False
-        facts |= {"candidates": cfg.planner.candidates, "mask_at_decision": masked}
+        if cfg.planner._target_ == "pickplace.planners.Lookahead":
+            kwargs |= {"critic": restore_critic(cfg, rules, state, saved["config"]["env"]["tote_size"])}
+            facts |= {"candidates": "all", "mask_at_decision": True}
+        else:
+            masked = cfg.planner.candidates == "all" or policy.excludes or False
+            facts |= {"candidates": cfg.planner.candidates, "mask_at_decision": masked}
+    if cfg.planner._target_ in NEEDS_ITEMS:
+        kwargs["items"] = items
     planner = config.instantiate(cfg.planner, rules=rules, **kwargs)
     other = None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), episodes_of(cfg))
     result, episodes = evaluate(cfg, make_env, planner, facts)

@@ -64,6 +64,10 @@ class Placements(NamedTuple):
     clearance: Tensor  # int32 [N, Q, W_T, D_T]: highest thing under the EE when its reference cell is there
     item: Item  # what is picked
 
+    def rows(self, index: Tensor) -> "Placements":
+        """Those of some problems, by their numbers, which may come up more than once."""
+        return Placements(self.top[index], self.clearance[index], Item(*(part[index] for part in self.item)))
+
 
 class Step(NamedTuple):
     """The effect of one action; made by :meth:`Rules.apply`."""
@@ -532,6 +536,20 @@ class Rules:
         placed = footprint & (code == 0)
         by_cell = torch.where(placed, top.to(heights.dtype), by_cell)
         return Step(by_cell.permute(2, 0, 1).contiguous(), code, top, torch.stack([fx, fy, w, d], -1))
+
+    def put_down(self, heights: Tensor, placements: Placements, outcome: Tensor) -> Tensor:
+        """The tote after a success that leaves the item in a given footprint, int32 ``[N, W_T, D_T]``.
+
+        Args:
+            heights: int32 ``[N, W_T, D_T]``, of which ``placements`` were made.
+            outcome: int64 ``[N]``, index ``(parity * W_T + x) * D_T + y``, one of :meth:`outcome_mask`.
+        """
+        tote_w, tote_d, _ = self.tote_size
+        odd, item = outcome >= self.num_places, placements.item
+        w, d = torch.where(odd, item.d, item.w), torch.where(odd, item.w, item.d)
+        footprint = _rectangle((tote_w, tote_d), outcome // tote_d % tote_w, outcome % tote_d, w, d)
+        top = placements.top.flatten(1).gather(1, outcome[:, None])[:, 0]
+        return torch.where(footprint, top, heights.permute(1, 2, 0)).permute(2, 0, 1).contiguous()
 
     def _supported(self, level: Tensor, area: Tensor) -> Tensor:
         share = level.double() / area

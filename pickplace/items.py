@@ -191,3 +191,8 @@ class Recorded(ItemDistribution):
 
     def label(self, kind):
         return f"{self.path}, line {self._lines[kind]}: " + super().label(kind)
+
+
+def imagined(items: ItemDistribution) -> ItemDistribution:
+    """What a search samples items from: of a recorded stream, which it must not look up, its sizes, equally likely."""
+    return Kinds(items.sizes.tolist()) if isinstance(items, Recorded) else items

@@ -72,14 +72,17 @@ def test_every_logger(name, tmp_path):
 @pytest.mark.parametrize("name", options("planner"))
 def test_every_planner(name):
     env = PickPlaceEnv(num_envs=3)
-    cfg, kwargs = composed(f"planner={name}", name="evaluate"), {}
-    if name == "policy":
+    quick = {"mcts": ["planner.simulations=20"], "lookahead": ["planner.samples=2", "planner.rounds=1"]}
+    cfg, kwargs = composed(f"planner={name}", *quick.get(name, []), name="evaluate"), {}
+    if name in ("mcts", "lookahead"):
+        kwargs["items"] = env.items
+    if name in ("policy", "lookahead"):
         model = composed().model.actor
         kwargs["policy"] = config.instantiate(model, rules=env.rules, mask_infeasible=True)
     observation = env.reset()
     action = config.instantiate(cfg.planner, rules=env.rules, **kwargs).decide(observation)
     assert ((action >= 0) & (action < env.rules.num_actions)).all()
-    if name not in ("uniform", "individual_heuristic"):
+    if name not in ("uniform", "individual_heuristic", "mcts"):
         assert observation["action_mask"].gather(1, action[:, None]).all()
 
 

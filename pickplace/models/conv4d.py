@@ -176,7 +176,7 @@ class Conv4dPolicy(nn.Module):
         from_tote = F.conv2d(totes[:, None], tote_kernel[:, None], self.first.bias)
         from_tote = from_tote.permute(0, 2, 3, 1).to(dtype).contiguous()  # [N, W_T + 2, D_T + 2, filters]
         if bins.shape[1:] == (5, 5):
-            return self._at_one_pick(from_bin.permute(0, 2, 3, 1).to(dtype), from_tote)
+            return self._at_one_pick(from_bin.permute(0, 2, 3, 1).to(dtype).contiguous(), from_tote)
         from_bin = from_bin.permute(2, 0, 3, 1).to(dtype).contiguous()  # [W_B + 2, N, D_B + 2, filters]
         hidden = (from_bin[:, :, :, None, None] + from_tote[None, :, None]).relu_()
 

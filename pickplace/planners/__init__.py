@@ -7,6 +7,8 @@ and ``actions`` is int64 ``[N]``, flat indices.
 
 from pickplace.planners.heuristics import JointDBL, RandomFeasible, UniformRandom
 from pickplace.planners.individual import IndividualHeuristic
+from pickplace.planners.lookahead import Lookahead
+from pickplace.planners.mcts import MCTS
 from pickplace.planners.policy import PolicyPlanner
 
-__all__ = ["IndividualHeuristic", "JointDBL", "PolicyPlanner", "RandomFeasible", "UniformRandom"]
+__all__ = ["MCTS", "IndividualHeuristic", "JointDBL", "Lookahead", "PolicyPlanner", "RandomFeasible", "UniformRandom"]

@@ -5,6 +5,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import ValueOperator
 
 from pickplace import checkpoint, config
 from pickplace.geometry import Rules
@@ -91,3 +92,20 @@ def restore_policy(cfg: DictConfig, rules: Rules, state: dict, trained_rotations
     policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=cfg.algo.mask_infeasible)
     checkpoint.load_module(policy, state, "policy")
     return policy.eval()
+
+
+def restore_critic(cfg: DictConfig, rules: Rules, state: dict, trained_tote: list[int]):
+    """The critic of a checkpoint as a function to values in cells, or None if it does not serve this tote.
+
+    Args:
+        cfg: the checkpoint's config.
+        rules: the task's sizes.
+        state: as of :func:`pickplace.checkpoint.read`, with or without ``state["critic"]``.
+        trained_tote: ``tote_size`` in training.
+    """
+    if "critic" not in state or tuple(trained_tote[:2]) != rules.tote_size[:2]:
+        return None
+    critic = ValueOperator(config.instantiate(cfg.model.critic, rules=rules), ["bin_depth", "tote_depth"])
+    checkpoint.load_module(critic, state["critic"], "critic")
+    critic = critic.module.to(cfg.device).eval()
+    return lambda bin_depth, tote_depth: critic(bin_depth, tote_depth) / cfg.algo.reward_scale

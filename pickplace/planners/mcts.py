@@ -1,0 +1,224 @@
+"""Monte-Carlo tree search, which the paper compares with."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from pickplace.geometry import Item, Rules
+from pickplace.items import ItemDistribution, imagined
+
+
+@dataclass(eq=False)
+class _Node:
+    """A tote and the item that has arrived."""
+
+    heights: Tensor  # int32 [W_T, D_T]
+    item: Tensor  # int64 [5]
+    untried: list[int] | None  # actions in random order, of which the last comes first; None: all N_a flat actions
+    edges: dict[int, "_Edge"] = field(default_factory=dict)
+
+
+@dataclass(eq=False)
+class _Edge:
+    """An action at a node, and the bins that were sampled to come after it."""
+
+    node: _Node
+    action: int
+    visits: int = 0
+    total: float = 0.0  # of the returns
+    volume: int = 0  # that the action places
+    heights: Tensor | None = None  # what it leaves; None until it is simulated, and where it fails
+    failed: bool = False
+    bins: list[_Node] = field(default_factory=list)
+
+
+class MCTS:
+    """UCT with decision nodes and sampled bin nodes, and uniform rollouts; the most visited action is played.
+
+    Each simulation walks down by UCB1, tries one action that has not been tried, samples the bin that arrives, and
+    plays uniformly at random to the end. An action's bins are sampled from the item distribution, ``visits **
+    widening`` of them at most, so that the tree grows deeper than one step; the stream that is played is never looked
+    up. Simulations advance together on the environment's rules; those of one wave see each other's visits, but not yet
+    their returns.
+
+    Args:
+        rules: the task's sizes.
+        items: the item distribution; of a recorded stream, its sizes, equally likely.
+        simulations: for each decision.
+        mask: search among the distinct footprints that some action reaches; False: among all ``N_a`` flat actions,
+            as in the paper, in the tree and in the rollouts.
+        exploration: weight of UCB1's second term; returns are shares of the tote's volume.
+        widening: exponent of the number of bins sampled after an action.
+        wave: simulations that advance together, over all problems.
+        seed: of the search.
+    """
+
+    name = "mcts"
+
+    def __init__(
+        self,
+        rules: Rules,
+        items: ItemDistribution,
+        simulations: int = 5000,
+        mask: bool = False,
+        exploration: float = 0.5,
+        widening: float = 0.5,
+        wave: int = 256,
+        seed: int = 0,
+    ):
+        for key, value, least in (("simulations", simulations, 1), ("wave", wave, 1), ("seed", seed, 0)):
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise ValueError(f"planner.{key}={value!r}: expected a whole number >= {least}.")
+        for key, value, most in (("exploration", exploration, math.inf), ("widening", widening, 1)):
+            if not isinstance(value, (int, float)) or isinstance(value, bool) or not 0 <= value <= most:
+                raise ValueError(f"planner.{key}={value!r}: expected a number >= 0{' and <= 1' if most == 1 else ''}.")
+        if not isinstance(mask, bool):
+            raise ValueError(f"planner.mask={mask!r}: expected true or false.")
+        self.rules, self.items, self.simulations, self.mask = rules, imagined(items), simulations, mask
+        self.exploration, self.widening, self.wave, self.seed = exploration, widening, wave, seed
+        self._random = np.random.default_rng(seed)
+        self._sampled, self._depths, self._walks = 0, 0, 0
+
+    def decide(self, observation: TensorDictBase) -> Tensor:
+        """Flat actions, int64 ``[N]``."""
+        rules, device = self.rules, observation["tote_depth"].device
+        tote_height = observation["tote_height"].reshape(-1).cpu()
+        heights = (tote_height[:, None, None] - observation["tote_depth"].cpu()).int()
+        item = rules.read_item(observation["bin_depth"].cpu())
+        roots = self._nodes(heights, tote_height, item)
+        each = max(1, self.wave // len(roots))
+        for done in range(0, self.simulations, each):
+            walks = [
+                (problem, *self._walk_down(root))
+                for problem, root in enumerate(roots)
+                for _ in range(min(each, self.simulations - done))
+            ]
+            self._simulate(walks, tote_height)
+        best = [max(root.edges.values(), key=lambda edge: (edge.visits, edge.total), default=None) for root in roots]
+        chosen = torch.tensor([0 if edge is None else edge.action for edge in best])
+        if self.mask:
+            reaching = rules.actions_reaching(rules.placements(heights, tote_height, item), chosen)
+            chosen = torch.where(reaching >= 0, reaching, rules.num_actions).amin(1).clamp(max=rules.num_actions - 1)
+        return chosen.to(device)
+
+    def statistics(self) -> dict[str, float]:
+        """The mean number of actions on a walk down the tree, over all searches so far."""
+        return {"mean_tree_depth": self._depths / max(self._walks, 1)}
+
+    def _walk_down(self, root: _Node) -> tuple[list[_Edge], bool]:
+        """The edges from the root on, each of which counts the visit; and whether the last bin's item fits nowhere.
+
+        If it does not, the walk ends with an action whose outcome, or whose next bin, must be found out.
+        """
+        node, path = root, []
+        while (edge := self._choose(node)) is not None:
+            edge.visits += 1
+            path.append(edge)
+            if edge.heights is None or len(edge.bins) < edge.visits**self.widening:
+                break
+            node = edge.bins[self._random.integers(len(edge.bins))]
+        self._walks += 1
+        self._depths += len(path)
+        return path, edge is None
+
+    def _choose(self, node: _Node) -> _Edge | None:
+        """An action that was not tried, if there is one, else the most promising by UCB1; None if there is none."""
+        action = None
+        if node.untried:
+            action = node.untried.pop()
+        elif node.untried is None and len(node.edges) < self.rules.num_actions:
+            while (action := int(self._random.integers(self.rules.num_actions))) in node.edges:
+                pass
+        if action is not None:
+            return node.edges.setdefault(action, _Edge(node, action))
+        if not node.edges:
+            return None
+        edges = list(node.edges.values())
+        visits, total = (np.array([getattr(edge, name) for edge in edges]) for name in ("visits", "total"))
+        bonus = self.exploration * np.sqrt(np.log(visits.sum()) / visits)
+        return edges[int((total / visits + bonus).argmax())]
+
+    def _simulate(self, walks: list[tuple[int, list[_Edge], bool]], tote_height: Tensor) -> None:
+        """Carry out the last actions, sample the bins after them, play out, and add the returns to the edges.
+
+        Args:
+            walks: which problem, and what :meth:`_walk_down` found.
+            tote_height: int64 ``[N]``, of the problems.
+        """
+        walks = [walk for walk in walks if walk[1]]
+        last = [(problem, path[-1]) for problem, path, over in walks if not over and not path[-1].failed]
+        self._carry_out([(problem, edge) for problem, edge in last if edge.heights is None], tote_height)
+        going = [number for number, (_, path, over) in enumerate(walks) if not over and not path[-1].failed]
+        returns = torch.zeros(len(walks), dtype=torch.float64)
+        if going:
+            height = tote_height[[walks[number][0] for number in going]]
+            heights = torch.stack([walks[number][1][-1].heights for number in going])
+            nodes = self._nodes(heights, height, self._arriving(len(going)))
+            for number, node in zip(going, nodes, strict=True):
+                walks[number][1][-1].bins.append(node)
+            items = Item(*torch.stack([node.item for node in nodes]).unbind(1))
+            returns[going] = self._play_out(heights, height, items)
+        for (problem, path, _), volume in zip(walks, returns.tolist(), strict=True):
+            for edge in reversed(path):
+                volume += edge.volume
+                edge.total += volume / float(tote_height[problem] * self.rules.num_places)
+
+    def _carry_out(self, tried: list[tuple[int, _Edge]], tote_height: Tensor) -> None:
+        """Find out what actions leave in the tote."""
+        if not tried:
+            return
+        rules, height = self.rules, tote_height[[problem for problem, _ in tried]]
+        heights = torch.stack([edge.node.heights for _, edge in tried])
+        item = Item(*torch.stack([edge.node.item for _, edge in tried]).unbind(1))
+        action = torch.tensor([edge.action for _, edge in tried])
+        if self.mask:
+            after = rules.put_down(heights, rules.placements(heights, height, item), action)
+            failed = [False] * len(tried)
+        else:
+            step = rules.apply(heights, height, item, action)
+            after, failed = step.heights, (step.failure > 0).tolist()
+        for (_, edge), left, bad, volume in zip(tried, after, failed, (item.w * item.d * item.h).tolist(), strict=True):
+            edge.failed = bad
+            if not bad:
+                edge.heights, edge.volume = left, volume
+
+    def _nodes(self, heights: Tensor, tote_height: Tensor, item: Item) -> list[_Node]:
+        """New nodes, with the actions to try."""
+        untried = [None] * len(heights)
+        if self.mask:
+            rules = self.rules
+            mask = rules.outcome_mask(rules.placements(heights, tote_height, item)).flatten(1).numpy()
+            untried = [self._random.permutation(row.nonzero()[0]).tolist() for row in mask]
+        return [_Node(*parts) for parts in zip(heights, torch.stack(item, 1), untried, strict=True)]
+
+    def _arriving(self, count: int) -> Item:
+        """Bins from the item distribution, each drawn once."""
+        number = torch.arange(self._sampled, self._sampled + count)
+        self._sampled += count
+        seed = torch.full_like(number, self.seed)
+        return self.items.sample("train", seed, number, torch.zeros_like(number), self.rules.bin_size)
+
+    def _play_out(self, heights: Tensor, tote_height: Tensor, item: Item) -> Tensor:
+        """Volume placed by uniformly random actions until one fails or nothing can be done, float64 ``[M]``."""
+        rules, volume, row = self.rules, torch.zeros(len(heights), dtype=torch.float64), torch.arange(len(heights))
+        while True:
+            if self.mask:
+                placements = rules.placements(heights, tote_height, item)
+                mask = rules.outcome_mask(placements).flatten(1)
+                draw = torch.from_numpy(self._random.random(mask.shape, dtype=np.float32))
+                going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]
+                outcome = torch.where(mask, draw, -1.0).argmax(1)
+                heights = rules.put_down(heights, placements, outcome)
+            else:
+                action = torch.from_numpy(self._random.integers(rules.num_actions, size=len(heights)))
+                step = rules.apply(heights, tote_height, item, action)
+                heights, going = step.heights, (step.failure == 0).nonzero()[:, 0]
+            row, heights, tote_height = row[going], heights[going], tote_height[going]
+            volume[row] += (item.w * item.d * item.h)[going].double()
+            if len(row) == 0:
+                return volume
+            item = self._arriving(len(row))

@@ -1,0 +1,103 @@
+"""Tree search: it approaches the exact optimum, it is a tree, and it never looks at the real stream."""
+
+import pytest
+import torch
+
+from pickplace import PickPlaceEnv
+from pickplace.evaluate import play
+from pickplace.items import Kinds, Recorded
+from pickplace.planners import MCTS
+
+OPTIMUM = 0.9456  # 4x4x1, R=4, see tests/test_optimum.py
+
+
+def make_env(first, count, **settings):
+    return PickPlaceEnv(
+        num_envs=count, first_episode=first, stream="validation", masks=(), **{"tote_size": (4, 4, 1), **settings}
+    )
+
+
+def planner(simulations, **settings):
+    env = make_env(0, 1)
+    return MCTS(env.rules, env.items, simulations, **{"mask": True, "wave": 512, **settings})
+
+
+def test_more_simulations_come_closer_to_the_optimum():
+    few, many = planner(16), planner(300)
+    worse, better = (play(make_env, each, 48, 48).occupancy for each in (few, many))
+    noise = float(better.std() / 48**0.5)
+    assert worse.mean() < better.mean() - 0.02
+    assert OPTIMUM - 0.02 - 2 * noise < better.mean() < OPTIMUM + 3 * noise
+    assert many.statistics()["mean_tree_depth"] > 1.5 > few.statistics()["mean_tree_depth"] >= 1
+
+
+@pytest.mark.parametrize("mask", [True, False])
+def test_visits_and_returns_add_up(mask):
+    env = make_env(0, 1, tote_size=(4, 4, 2))
+    search = MCTS(env.rules, env.items, 300, mask=mask, wave=7)
+    roots = []
+    make = search._nodes
+    search._nodes = lambda *args: roots.append(make(*args)) or roots[-1]
+    search.decide(env.reset())
+    root = roots[0][0]
+    assert sum(edge.visits for edge in root.edges.values()) == 300
+    stack, seen = [root], 0
+    while stack:
+        node = stack.pop()
+        for edge in node.edges.values():
+            seen += 1
+            assert 0 <= edge.total <= edge.visits
+            assert len(edge.bins) <= edge.visits and (edge.failed <= (edge.total == 0))
+            inside = sum(child.visits for bin_ in edge.bins for child in bin_.edges.values())
+            assert inside <= edge.visits - len(edge.bins) or edge.failed  # the first visit to a bin plays it out
+            stack += edge.bins
+    assert seen > 10
+
+
+def test_without_a_mask_it_tries_what_fails():
+    env = make_env(0, 2)
+    observation = env.reset()
+    search = MCTS(env.rules, env.items, 200, mask=False)
+    action = search.decide(observation)
+    assert ((action >= 0) & (action < env.rules.num_actions)).all()
+    # With far fewer simulations than actions nothing is tried twice: the paper's setting is nearly a random choice.
+    assert search.statistics()["mean_tree_depth"] == 1
+
+
+def test_the_same_seed_is_the_same_search():
+    observation = make_env(0, 3).reset()
+    actions = [planner(50, seed=seed).decide(observation).tolist() for seed in (1, 1, 2)]
+    assert actions[0] == actions[1]
+
+
+def test_a_recorded_stream_is_not_looked_up(tmp_path):
+    table = tmp_path / "items.csv"
+    table.write_text("w,d,h\n1,1,1\n2,1,1\n")
+    env = make_env(0, 1, items=Recorded(table))
+    search = MCTS(env.rules, env.items, 20, mask=True)
+    assert isinstance(search.items, Kinds) and search.items.length is None
+    search.decide(env.reset())
+
+
+def test_a_full_tote_has_nothing_to_search():
+    env = make_env(0, 1)
+    observation = env.reset()
+    observation["tote_depth"] = torch.zeros_like(observation["tote_depth"])
+    assert planner(20).decide(observation).tolist()[0] in range(env.rules.num_actions)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"simulations": 0}, "planner.simulations=0: expected a whole number >= 1"),
+        ({"wave": 1.5}, "planner.wave=1.5"),
+        ({"seed": -1}, "planner.seed=-1"),
+        ({"exploration": -1}, "planner.exploration=-1: expected a number >= 0"),
+        ({"widening": 2}, "planner.widening=2: expected a number >= 0 and <= 1"),
+        ({"mask": 1}, "planner.mask=1: expected true or false"),
+    ],
+)
+def test_bad_settings_are_refused(settings, words):
+    env = make_env(0, 1)
+    with pytest.raises(ValueError, match=words):
+        MCTS(env.rules, env.items, **settings)
