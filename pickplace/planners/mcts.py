@@ -118,7 +118,7 @@ class MCTS:
         while (edge := self._choose(node)) is not None:
             edge.visits += 1
             path.append(edge)
-            if edge.heights is None or len(edge.bins) < edge.visits**self.widening:
+            if edge.heights is None or len(edge.bins) < int(edge.visits**self.widening):
                 break
             node = edge.bins[self._random.integers(len(edge.bins))]
         self._walks += 1
