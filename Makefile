@@ -45,7 +45,7 @@ test-slow: $(STAMP)  ## run the long checks (an hour)
 bench: $(STAMP)  ## run the benchmarks on a quiet machine (half an hour), and write docs/performance.md
 	$(BIN)/pip install --quiet --disable-pip-version-check 'jumanji>=1.1,<2' || echo "jumanji: not to be had, its part is skipped"
 	$(BIN)/pip install --quiet --disable-pip-version-check 'sb3-contrib>=2.3,<3' || echo "sb3-contrib: not to be had, its part is skipped"
-	for part in learning training environment collector conv4d decision report; do \
+	for part in learning training environment collector conv4d decision startup report; do \
 		$(BIN)/python benchmarks/$$part.py || exit 1; \
 	done
 

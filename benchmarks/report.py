@@ -22,60 +22,68 @@ def time(figures: dict) -> str:
     return f"{figures['ms']:.1f} ms ({figures['low']:.1f} to {figures['high']:.1f})"
 
 
+def table(head: str, rows) -> list[str]:
+    """Lines of a table: the head's columns, split by ``|``, and the cells of each row."""
+    columns = [column.strip() for column in head.split("|")]
+    lines = [f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}"]
+    return [*lines, *(f"| {' | '.join(map(str, row))} |" for row in rows), ""]
+
+
 def environment(result: dict) -> str:
+    rows = []
+    for batch, row in result["batches"].items():
+        ours, peer = row["pickplace"], row.get("jumanji")
+        cells = [batch, time(ours), f"{ours['steps_per_second']:,}"]
+        rows.append(
+            cells + ([time(peer), f"{peer['steps_per_second']:,}", f"{row['ratio']:.1f}"] if peer else ["", "", ""])
+        )
     lines = [
         "## Environment, the full joint mask included\n",
         f"Paper's sizes, 3,600 actions, `step_and_maybe_reset`, random feasible actions; {result['steps']} steps each. "
         f"Peer: {result['peer'] or 'not installed'}, `BinPack-v2`, another task (see `benchmarks/environment.py`).\n",
-        "| batch | a step | steps/s | peer, a step | peer, steps/s | ratio |",
-        "|---|---|---|---|---|---|",
+        *table("batch | a step | steps/s | peer, a step | peer, steps/s | ratio", rows),
     ]
-    for batch, row in result["batches"].items():
-        ours, peer = row["pickplace"], row.get("jumanji")
-        cells = [batch, time(ours), f"{ours['steps_per_second']:,}"]
-        cells += [time(peer), f"{peer['steps_per_second']:,}", f"{row['ratio']:.1f}"] if peer else ["", "", ""]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join([*lines, "", machine(result)])
+    return "\n".join([*lines, machine(result)])
 
 
 def collector(result: dict) -> str:
+    rows = (
+        (name, time(row["raw loop"]), time(row["collector"]), f"{row['added ms']:.2f} ms")
+        for name, row in result["rows"].items()
+    )
     lines = [
         "## What the collector adds\n",
         "A vector step with a random choice among feasible actions: a raw loop over `step_and_maybe_reset`, and the"
         " `Collector`, which also keeps all frames and masks for the learner. `fcn_grasp` trains on outcome masks (72"
         " entries), `fcn4d` with a mask on action masks (3,600 entries).\n",
-        "| batch, mask | raw loop | collector | added |",
-        "|---|---|---|---|",
+        *table("batch, mask | raw loop | collector | added", rows),
     ]
-    for name, row in result["rows"].items():
-        lines.append(f"| {name} | {time(row['raw loop'])} | {time(row['collector'])} | {row['added ms']:.2f} ms |")
-    return "\n".join([*lines, "", machine(result)])
+    return "\n".join([*lines, machine(result)])
+
+
+def startup(result: dict) -> str:
+    rows = ((f"`{name}`", time(figures)) for name, figures in result["rows"].items())
+    return "\n".join(["## Starting up\n", *table("what | time, from the start of the process", rows), machine(result)])
 
 
 def conv4d(result: dict) -> str:
-    lines = [
-        "## `fcn4d` against a naive 4D convolution\n",
-        "64 filters. *Masked* computes the logits of the pick cells that allow something, and no others. *Of peak*: "
-        "arithmetic operations a second, as a share of those of a 2048 x 2048 matrix product of the same type in the "
-        "same run.\n",
-        "| case | what | variant | time | ratio | of peak |",
-        "|---|---|---|---|---|---|",
-    ]
+    times, peaks = [], []
     for title, row in result["cases"].items():
         for what in ("forward", "forward and backward"):
             for name, figures in row[what].items():
                 share = figures.get("share of matrix product")
                 share = "" if share is None else f"{share:.0%}"
-                lines.append(f"| {title} | {what} | {name} | {time(figures)} | {figures['ratio']:.1f} | {share} |")
-    lines += [
-        "",
+                times.append((title, what, name, time(figures), f"{figures['ratio']:.1f}", share))
+        peaks += [(title, name, held) for name, held in row["peak MiB, forward"].items()]
+    lines = [
+        "## `fcn4d` against a naive 4D convolution\n",
+        "64 filters. *Masked* computes the logits of the pick cells that allow something, and no others. *Of peak*: "
+        "arithmetic operations a second, as a share of those of a 2048 x 2048 matrix product of the same type in the "
+        "same run.\n",
+        *table("case | what | variant | time | ratio | of peak", times),
         "Peak memory of a forward pass, beyond inputs and weights:\n",
-        "| case | variant | MiB |",
-        "|---|---|---|",
+        *table("case | variant | MiB", peaks),
     ]
-    for title, row in result["cases"].items():
-        lines += [f"| {title} | {name} | {held} |" for name, held in row["peak MiB, forward"].items()]
-    lines.append("")
     for title, row in result["cases"].items():
         speed = ", ".join(
             f"{dtype} {row[f'GFLOPS of a matrix product, {dtype}']:,.0f}" for dtype in ("float32", "bfloat16")
@@ -89,26 +97,20 @@ def conv4d(result: dict) -> str:
 
 def decision(result: dict) -> str:
     totes = [name for name in next(iter(result["rows"].values())) if name != "growth"]
+    rows = (
+        (name, *(time(row[tote]) for tote in totes), f"{row['growth']:.1f}") for name, row in result["rows"].items()
+    )
     lines = [
         "## One decision\n",
         "Batch 1, `R=4`, feasibility and candidates included. The last column says how the time grows from the first "
         f"to the last tote, whose area grows by {result['area grows by']:.0f}.\n",
-        f"| policy | {' | '.join(totes)} | grows by |",
-        f"|---|{'---|' * len(totes)}---|",
+        *table(f"policy | {' | '.join(totes)} | grows by", rows),
     ]
-    for name, row in result["rows"].items():
-        lines.append(f"| {name} | {' | '.join(time(row[tote]) for tote in totes)} | {row['growth']:.1f} |")
-    return "\n".join([*lines, "", machine(result)])
+    return "\n".join([*lines, machine(result)])
 
 
 def learning(result: dict) -> str:
-    lines = [
-        "## Wall-clock until the tote is packed well\n",
-        "`experiment=quick`, all cores, one run after the other, from the start of the process; validated every 50,000 "
-        "frames on 128 episodes at `6x6x5`, `R=4`. See `benchmarks/learning.py` for the peer's settings.\n",
-        "| who | until 0.95 | until 0.975 | last validation |",
-        "|---|---|---|---|",
-    ]
+    rows, medians = [], []
     runs = [(f"pickplace, seed {run['seed']}", run) for run in result["ours"]]
     if result["peer"]:
         runs.append((result["peer"]["name"], result["peer"]))
@@ -116,13 +118,19 @@ def learning(result: dict) -> str:
         cells = [f"{value:.0f} s" if value else "never" for value in run["reached"].values()]
         seconds, frames, occupancy = run["curve"][-1]
         cells.append(f"{occupancy:.3f} after {seconds:.0f} s, {frames:,} frames")
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    medians = []
+        rows.append([name, *cells])
     for mark in ("0.95", "0.975"):
         values = sorted(run["reached"][mark] or float("inf") for run in result["ours"])
         medians.append(f"{values[len(values) // 2]:.0f} s until {mark}")
-    lines += ["", f"Median of our seeds: {', '.join(medians)}."]
-    return "\n".join([*lines, "", machine(result)])
+    lines = [
+        "## Wall-clock until the tote is packed well\n",
+        "`experiment=quick`, all cores, one run after the other, from the start of the process; validated every 50,000 "
+        "frames on 128 episodes at `6x6x5`, `R=4`. See `benchmarks/learning.py` for the peer's settings.\n",
+        *table("who | until 0.95 | until 0.975 | last validation", rows),
+        f"Median of our seeds: {', '.join(medians)}.",
+        "",
+    ]
+    return "\n".join([*lines, machine(result)])
 
 
 def training(result: dict) -> str:
@@ -137,7 +145,7 @@ def training(result: dict) -> str:
 
 def main() -> None:
     parts = [HEAD]
-    for write in (learning, training, environment, collector, conv4d, decision):
+    for write in (learning, training, environment, collector, conv4d, decision, startup):
         path = RESULTS / f"{write.__name__}.json"
         if path.is_file():
             parts.append(write(json.loads(path.read_text())))

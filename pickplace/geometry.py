@@ -21,7 +21,7 @@ grasp classes.
 
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import torch
@@ -302,7 +302,7 @@ class Rules:
             walled = _surround(heights.permute(1, 2, 0), (ref_x, ee_w - 1 - ref_x, ref_y, ee_d - 1 - ref_y), rim)
             # The maximum over a rectangle is a maximum along one axis, then along the other.
             for axis, size, room in ((0, ee_w, tote_w), (1, ee_d, tote_d)):
-                walled = _maximum([walled.narrow(axis, i, room) for i in range(size)])
+                walled = reduce(torch.maximum, [walled.narrow(axis, i, room) for i in range(size)])
             maps[parity] = walled
         return maps.permute(3, 0, 1, 2)
 
@@ -573,14 +573,6 @@ def _windows(maps: Tensor, count: int) -> Tensor:
     """All shifts of maps ``[W + count - 1, D + count - 1, N]`` by up to ``count - 1`` cells, a view
     ``[count, count, W, D, N]``."""
     return maps.unfold(0, count, 1).unfold(1, count, 1).permute(3, 4, 0, 1, 2)
-
-
-def _maximum(maps: list[Tensor]) -> Tensor:
-    """The elementwise maximum of some maps."""
-    best = maps[0]
-    for other in maps[1:]:
-        best = torch.maximum(best, other)
-    return best
 
 
 def _rectangle(grid: tuple[int, int], x: Tensor, y: Tensor, w: Tensor, d: Tensor) -> Tensor:

@@ -234,6 +234,20 @@ def test_damaged_checkpoints_are_refused(run, smoke_run, tmp_path, damage):
     assert code == 2 and err.startswith("error: ") and err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    "search", [["lookahead", "planner.samples=2", "planner.rounds=1"], ["mcts", "planner.simulations=8"]]
+)
+def test_evaluation_of_a_search(search, run, smoke_run, tmp_path):
+    arguments = [f"planner={search[0]}", *search[1:], f"checkpoint={smoke_run}", "evaluation.episodes=2"]
+    code, _, err = run("evaluate", *arguments, "evaluation.latency_decisions=0", "hydra.run.dir=result")
+    assert code == 0, err
+    result = json.loads((tmp_path / "result" / "evaluation.json").read_text())
+    assert result["planner"] == search[0] and 0 < result["occupancy"]["mean"] <= 1
+    wanted = dict(word.removeprefix("planner.").split("=") for word in search[1:])
+    assert {key: str(result["planner_settings"][key]) for key in wanted} == wanted
+    assert ("mean_tree_depth" in result) == (search[0] == "mcts")
+
+
 def test_evaluation_of_a_run(run, smoke_run, tmp_path):
     arguments = [f"checkpoint={smoke_run}", "evaluation.episodes=6", "env.tote_size=[5,5,2]", "planner.candidates=10"]
     arguments += ["model.actor.compute_dtype=bfloat16"]

@@ -66,7 +66,7 @@ def test_without_a_mask_it_tries_what_fails():
 
 def test_the_same_seed_is_the_same_search():
     observation = make_env(0, 3).reset()
-    actions = [planner(50, seed=seed).decide(observation).tolist() for seed in (1, 1, 2)]
+    actions = [planner(50, seed=seed).decide(observation).tolist() for seed in (1, 1)]
     assert actions[0] == actions[1]
 
 
