@@ -18,9 +18,10 @@ from torchrl.envs.utils import step_mdp
 
 from pickplace import checkpoint, config
 from pickplace.geometry import Failure, Item
-from pickplace.planners.policy import restore_critic, restore_policy
+from pickplace.planners.policy import PolicyPlanner, planner_parts
 from pickplace.replay import Recording, animation, observe, page, picture
 from pickplace.report import evaluation_table
+from pickplace.warm_start import taught_by
 
 log = logging.getLogger(__name__)
 
@@ -254,13 +255,6 @@ def commit() -> str | None:
         return None
 
 
-#: Planners that are made from a checkpoint's policy.
-NEEDS_POLICY = {"pickplace.planners.PolicyPlanner": "policy", "pickplace.planners.Lookahead": "lookahead"}
-
-#: Planners that imagine items.
-NEEDS_ITEMS = ("pickplace.planners.Lookahead", "pickplace.planners.MCTS")
-
-
 def run(cfg: DictConfig, run_dir: Path) -> float:
     """Evaluate as the config says (``conf/evaluate.yaml``); returns the mean occupancy.
 
@@ -283,22 +277,23 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
         raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
     config.use_machine(cfg)
     settings = {key: value for key, value in cfg.planner.items() if key != "_target_"}
-    facts, policy_state = {"planner_settings": settings, "checkpoint": None}, None
+    facts, trained = {"planner_settings": settings, "checkpoint": None}, None
     if cfg.checkpoint is not None:
         folder = checkpoint.locate(str(cfg.checkpoint))
         state, saved = checkpoint.read(folder)
-        policy_state = state["policy"]
         config.refuse_foreign_targets(saved["config"])
         groups = {"env": cfg.env, "items": cfg["items"]}
         ours = [o for o in HydraConfig.get().overrides.task if o.lstrip("+~").split("=")[0].split(".")[0] in TRAINED]
-        trained = config.apply_overrides(OmegaConf.create(saved["config"]), ours, groups)
+        merged = config.apply_overrides(OmegaConf.create(saved["config"]), ours, groups)
         with open_dict(cfg):
             for group in TRAINED:
-                cfg[group] = trained[group]
+                cfg[group] = merged[group]
+        trained = (cfg, state, saved["config"]["env"])
         facts |= {
             "checkpoint": str(folder),
-            "trained": {"frames": saved["frames"], "seed": trained.seed, "commit": saved["commit"]},
-            "mask_in_training": trained.algo.mask_infeasible,
+            "trained": {"frames": saved["frames"], "seed": merged.seed, "commit": saved["commit"]},
+            "mask_in_training": merged.algo.mask_infeasible,
+            "warm_start": taught_by(saved["config"]),
         }
 
     ev, items = cfg.evaluation, config.instantiate(cfg["items"])
@@ -310,22 +305,13 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
         )  # fmt: skip
 
     rules = make_env(0, 1).rules
-    kwargs = {}
-    if cfg.planner._target_ in NEEDS_POLICY:
-        if policy_state is None:
-            name = NEEDS_POLICY[cfg.planner._target_]
-            raise ValueError(f"checkpoint=null: planner={name} needs a checkpoint; expected a run folder.")
-        policy = restore_policy(cfg, rules, policy_state, saved["config"]["env"]["rotations"])
-        kwargs["policy"] = policy.to(cfg.device)
-        if cfg.planner._target_ == "pickplace.planners.Lookahead":
-            kwargs |= {"critic": restore_critic(cfg, rules, state, saved["config"]["env"]["tote_size"])}
-            facts |= {"candidates": "all", "mask_at_decision": True}
-        else:
-            masked = cfg.planner.candidates == "all" or policy.excludes or False
-            facts |= {"candidates": cfg.planner.candidates, "mask_at_decision": masked}
-    if cfg.planner._target_ in NEEDS_ITEMS:
-        kwargs["items"] = items
-    planner = config.instantiate(cfg.planner, rules=rules, **kwargs)
+    parts = planner_parts(cfg.planner, rules, items, trained)
+    planner = config.instantiate(cfg.planner, **parts)
+    if isinstance(planner, PolicyPlanner):
+        masked = planner.candidates == "all" or planner.policy.excludes or False
+        facts |= {"candidates": planner.candidates, "mask_at_decision": masked}
+    elif "policy" in parts:
+        facts |= {"candidates": "all", "mask_at_decision": True}
     other = None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), episodes_of(cfg))
     result, episodes = evaluate(cfg, make_env, planner, facts)
     if other:

@@ -26,6 +26,7 @@ from pickplace.geometry import Failure
 from pickplace.models.actors import as_actor, as_collection_policy, check_sizes
 from pickplace.report import learning_curve
 from pickplace.training_report import write_report
+from pickplace.warm_start import Phase, WarmStart, imitation_loss
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +57,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
     for warning in check_sizes(policy, rules):
         log.warning(warning)
     planner = config.instantiate(cfg.planner, rules=rules, policy=policy)  # the one that validates
+    warm_start = WarmStart(cfg.warm_start, policy, rules, items, cfg.seed)
     critic = ValueOperator(config.instantiate(cfg.model.critic, rules=rules), ["bin_depth", "tote_depth"]).to(device)
     curriculum: Curriculum = config.instantiate(cfg.curriculum)
     curriculum.setup(probe.min_tote_height, rules.tote_size[2], cfg.total_frames)
@@ -119,6 +121,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
             began = time.perf_counter()
             batch = next(batches)
             collected = time.perf_counter()
+            phase = warm_start.phase(frames)
             before, frames, iteration = frames, frames + batch.numel(), iteration + 1
             metrics = episode_metrics(batch)
 
@@ -131,14 +134,16 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
                 push_level(collector, curriculum.level)
                 log.info("%s frames: tote height %d -> %d", f"{frames:,}", level, curriculum.level)
 
-            # Learn: advantages once, then epochs of shuffled minibatches.
+            # Learn: advantages (and what the teacher would do) once, then epochs of shuffled minibatches.
             batch["next", "reward"] = batch["next", "reward"] * algo.reward_scale
             with torch.no_grad():
                 advantage(batch)
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate(algo, frames, cfg.total_frames)
             data = batch.select(*learned).reshape(-1)
-            metrics |= update(loss, optimizer, data, algo)
+            if phase == Phase.IMITATION:
+                data["taught"] = warm_start.ask(batch.reshape(-1), iteration)
+            metrics |= update(loss, optimizer, data, algo, policy, phase)
             metrics["train/lr"] = optimizer.param_groups[0]["lr"]
             metrics["time/collect_ms"] = (collected - began) * 1e3
             metrics["time/update_ms"] = (time.perf_counter() - collected) * 1e3
@@ -264,13 +269,22 @@ def learning_rate(algo: DictConfig, frames: int, total_frames: int) -> float:
     return algo.lr * min(max(left, 0.0), 1.0)
 
 
-def update(loss: A2CLoss | ClipPPOLoss, optimizer, data: TensorDictBase, algo: DictConfig) -> dict[str, float]:
-    """The epochs over one batch of frames ``[B]``; returns the mean diagnostics."""
+def update(loss, optimizer, data: TensorDictBase, algo: DictConfig, policy, phase=Phase.REWARD) -> dict[str, float]:
+    """The epochs over one batch of frames ``[B]``; returns the mean diagnostics.
+
+    The loss is TorchRL's in phase ``REWARD``; its critic's part alone, with or without imitation, before.
+    """
     totals, steps = {}, 0
     for _ in range(algo.epochs):
         for index in torch.randperm(len(data), device=data.device).split(algo.minibatch_size):
-            losses = loss(data[index])
-            total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+            part = data[index]
+            losses = loss(part)
+            total = losses["loss_critic"]
+            if phase == Phase.REWARD:
+                total = losses["loss_objective"] + total + losses["loss_entropy"]
+            elif phase == Phase.IMITATION:
+                losses["loss_imitation"], losses["agreement"] = imitation_loss(policy, part)
+                total = total + losses["loss_imitation"]
             optimizer.zero_grad(set_to_none=True)
             total.backward()
             norm = torch.nn.utils.clip_grad_norm_(loss.parameters(), algo.max_grad_norm)
@@ -295,6 +309,8 @@ DIAGNOSTICS = {
     "approx_kl": "kl_approx",
     "clip_fraction": "clip_fraction",
     "explained_variance": "explained_variance",
+    "loss_imitation": "loss_imitation",
+    "agreement": "agreement",
 }
 
 

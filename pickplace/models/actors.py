@@ -9,6 +9,7 @@ choice. Every policy offers
 * ``forward(...) -> logits [N, choices]``, float32;
 * ``to_action(choice, bin_depth, tote_depth, tote_height) -> int64 [N]``: a flat action of the class, drawn evenly
   (the lowest one when exploration is off);
+* ``to_choice(action, bin_depth, tote_depth, tote_height) -> int64 [N]``: the class of a flat action that succeeds;
 * ``action_log_probs(bin_depth, tote_depth) -> [N, N_a]``: the distribution over flat actions, without any mask;
 * ``excludes``: what this distribution gives probability 0 all the same, by construction; None if nothing.
 """
@@ -85,6 +86,9 @@ class FlatPolicy(nn.Module):
     def to_action(self, choice: Tensor, *_) -> Tensor:
         return choice
 
+    def to_choice(self, action: Tensor, *_) -> Tensor:
+        return action
+
     def action_log_probs(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
         return self(bin_depth, tote_depth).log_softmax(-1)
 
@@ -142,6 +146,13 @@ class OutcomePolicy(nn.Module):
     def to_action(self, choice: Tensor, bin_depth: Tensor, tote_depth: Tensor, tote_height: Tensor) -> Tensor:
         placements = self.rules.placements_from_depth(bin_depth, tote_depth, tote_height)
         return pick_one(self.rules.actions_reaching(placements, choice))
+
+    def to_choice(self, action: Tensor, bin_depth: Tensor, tote_depth: Tensor, tote_height: Tensor) -> Tensor:
+        (tote_w, tote_d, _), item = self.rules.tote_size, self.rules.read_item(bin_depth)
+        heights = (tote_height[:, None, None] - tote_depth).int()
+        x, y, w, _ = self.rules.apply(heights, tote_height, item, action).footprint.unbind(-1)
+        turned = (w != item.w).long()  # a square item is the same either way
+        return (turned * tote_w + x) * tote_d + y
 
     def action_log_probs(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
         """Without a mask: an action whose pick misses, or that leaves the tote, has no outcome, so probability 0."""
@@ -211,6 +222,16 @@ class GraspPolicy(nn.Module):
             anywhere = torch.randint(places, choice.shape, device=choice.device)
         place = torch.where(missed, anywhere, choice % places)
         return (pair // rules.rotations * places + place) * rules.rotations + pair % rules.rotations
+
+    def to_choice(self, action: Tensor, bin_depth: Tensor, *_) -> Tensor:
+        rules, places = self.rules, self.rules.num_places
+        pick, place, rotation = (
+            action // (places * rules.rotations),
+            action // rules.rotations % places,
+            action % rules.rotations,
+        )
+        grasp = self._pick_classes(bin_depth)[torch.arange(len(action), device=action.device), pick, rotation]
+        return torch.where(grasp < 0, self.classes * places, grasp * places + place)
 
     def action_log_probs(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
         logits, ways, picks = self._choices(bin_depth, tote_depth)

@@ -9,6 +9,7 @@ from torchrl.modules import ValueOperator
 
 from pickplace import checkpoint, config
 from pickplace.geometry import Rules
+from pickplace.items import ItemDistribution
 from pickplace.models.actors import MASKED
 
 
@@ -71,6 +72,40 @@ class PolicyPlanner:
             placements = rules.placements_from_depth(bin_depth, tote_depth, observation["tote_height"])
             score = torch.where(rules.action_mask(placements), score, 0.0)
         return score.view(len(score), rules.num_picks, *rules.tote_size[:2], rules.rotations).amax((1, 4))
+
+
+#: Planners that follow a checkpoint's policy, by their names.
+NEEDS_POLICY = {"pickplace.planners.PolicyPlanner": "policy", "pickplace.planners.Lookahead": "lookahead"}
+
+#: Planners that imagine items.
+NEEDS_ITEMS = ("pickplace.planners.Lookahead", "pickplace.planners.MCTS")
+
+
+def planner_parts(planner: DictConfig, rules: Rules, items: ItemDistribution, trained: tuple | None = None) -> dict:
+    """What the planner of a config is made of beside its settings, as arguments.
+
+    Args:
+        planner: a config of the group ``planner``.
+        rules: the task's sizes.
+        items: for a search to imagine.
+        trained: for a planner that follows a policy: the checkpoint's config with any overrides on top, its tensors,
+            and the ``env`` that it was trained in; None: there is no checkpoint.
+
+    Raises:
+        ValueError: for a planner that needs a checkpoint without one, or with one that does not serve these sizes.
+    """
+    parts = {"rules": rules}
+    if planner._target_ in NEEDS_ITEMS:
+        parts["items"] = items
+    if planner._target_ in NEEDS_POLICY:
+        if trained is None:
+            name = NEEDS_POLICY[planner._target_]
+            raise ValueError(f"checkpoint=null: planner={name} needs a checkpoint; expected a run folder.")
+        cfg, state, env = trained
+        parts["policy"] = restore_policy(cfg, rules, state["policy"], env["rotations"]).to(cfg.device)
+        if NEEDS_POLICY[planner._target_] == "lookahead":
+            parts["critic"] = restore_critic(cfg, rules, state, env["tote_size"])
+    return parts
 
 
 def restore_policy(cfg: DictConfig, rules: Rules, state: dict, trained_rotations: int) -> nn.Module:
