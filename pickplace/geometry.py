@@ -233,6 +233,16 @@ class Rules:
         offset = torch.stack([torch.stack(pair, -1) for pair in turned[: self.rotations]], 2)
         return failure, offset
 
+    def heuristic_pick(self, item: Item) -> Tensor:
+        """The pick cell of individual planning, which does not look at the tote, int64 ``[N]``.
+
+        The one with the least offset ``ox + oy``, then ``oy``, among those that succeed: the item lies in the end
+        effector's corner where possible.
+        """
+        failure, offset = self.grasps(item)
+        ox, oy = offset[:, :, 0].unbind(-1)  # before turning, [N, P]
+        return torch.where(failure == 0, (ox + oy) * FAR + oy, FAR**2).argmin(1)
+
     def _offsets(self, item: Item) -> tuple[Tensor, Tensor]:
         """Which offsets a pick can have, and what they become by turning; offsets are ``(ox, oy)`` row by row.
 

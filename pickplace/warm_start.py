@@ -68,7 +68,7 @@ class WarmStart:
 
     @torch.no_grad()
     def ask(self, data: TensorDictBase, iteration: int) -> Tensor:
-        """The teacher's choices, int64 ``[B]``; -1 where what it wants fails.
+        """The teacher's choices, int64 ``[B]``; -1 where what it wants fails, or cannot be done by this policy.
 
         Args:
             data: observations ``[B]``.
@@ -79,9 +79,15 @@ class WarmStart:
         action = teacher.decide(data)
         bin_depth, tote_depth, tote_height = data["bin_depth"], data["tote_depth"], data["tote_height"][:, 0]
         heights = (tote_height[:, None, None] - tote_depth).int()
-        step = self.rules.apply(heights, tote_height, self.rules.read_item(bin_depth), action)
+        item = self.rules.read_item(bin_depth)
+        wanted = self.rules.apply(heights, tote_height, item, action)
         choice = self.policy.to_choice(action, bin_depth, tote_depth, tote_height)
-        return torch.where(step.failure == 0, choice, -1)
+        choice = torch.where(wanted.failure == 0, choice, 0)  # any that there is
+        # A policy with a pick of its own may not reach the same footprint.
+        action = self.policy.to_action(choice, bin_depth, tote_depth, tote_height).clamp(min=0)
+        reached = self.rules.apply(heights, tote_height, item, action)
+        same = (reached.footprint == wanted.footprint).all(1) & (reached.failure == 0) & (wanted.failure == 0)
+        return torch.where(same, choice, -1)
 
 
 def imitation_loss(policy: nn.Module, data: TensorDictBase) -> tuple[Tensor, Tensor]:

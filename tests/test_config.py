@@ -115,6 +115,21 @@ def test_every_model_trains_with_and_without_a_mask(model, masked, tmp_path):
     assert 0 <= train(composed(*overrides), tmp_path) <= 1
 
 
+@pytest.mark.parametrize("name", [*options("planner"), "none"])
+def test_any_planner_can_be_imitated(name, tmp_path):
+    settings = {
+        "mcts": ["warm_start.teacher.simulations=20"],
+        "lookahead": ["warm_start.teacher.samples=2", "warm_start.teacher.rounds=1"],
+    }
+    follows = ["warm_start.checkpoint=pretrained/r4"] if name in ("policy", "lookahead") else []
+    phases = [f"warm_start.{key}=16" for key in ("frames", "critic_frames")] if name != "none" else []
+    overrides = [f"warm_start={name}", *settings.get(name, []), *follows, *phases, *TINY]
+    cfg = composed("curriculum=none", *overrides, "total_frames=48")
+    assert 0 <= train(cfg, tmp_path) <= 1
+    rows = read_csv(tmp_path / "metrics.csv")
+    assert ["train/agreement" in row for row in rows] == [name != "none", False, False]
+
+
 def test_a2c_trains_through_the_same_loop(tmp_path):
     cfg = composed("algo=a2c", "model=fcn_grasp", "curriculum=none", *TINY)
     assert 0 <= train(cfg, tmp_path) <= 1

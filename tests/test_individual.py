@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from pickplace import Item, PickPlaceEnv, Rules
 from pickplace.evaluate import play
-from pickplace.planners import IndividualHeuristic
-from pickplace.planners.individual import corner_footprints, heuristic_pick
+from pickplace.models.actors import fcn4d, individual_rl
+from pickplace.planners import IndividualHeuristic, PolicyPlanner, RandomFeasible
+from pickplace.planners.individual import corner_footprints
 
 
 def maximal_rectangles(free):
@@ -58,7 +59,7 @@ def test_the_pick_is_the_corner_of_the_effector_where_it_can_be(wall):
     # higher than the item the whole effector must stay inside.
     most = 4 if wall == 1 else 3
     expected = (x + 1).clamp(max=most) * 5 + (y + 1).clamp(max=most)
-    assert torch.equal(heuristic_pick(rules, Item(x, y, one, one, one)), expected)
+    assert torch.equal(rules.heuristic_pick(Item(x, y, one, one, one)), expected)
 
 
 @pytest.mark.parametrize(("rotations", "reference"), [(1, 0.569), (3, 0.922)])
@@ -72,6 +73,58 @@ def test_every_cell_meets_the_reference(rotations, reference):
     occupancy = play(make_env, planner, 500, 250).occupancy
     error = float(occupancy.std() / len(occupancy) ** 0.5)
     assert abs(float(occupancy.mean()) - reference) < 3 * error + 0.0005
+
+
+def random_states(rules, count, seed, steps=8):
+    """Bins and totes in the middle of a random episode."""
+    env = PickPlaceEnv(rotations=rules.rotations, num_envs=count, masks=("action",), seed=seed)
+    planner = RandomFeasible(rules, seed)
+    td = env.reset()
+    for _ in range(steps):
+        _, td = env.step_and_maybe_reset(td.set("action", planner.decide(td)))
+    return td
+
+
+@pytest.mark.parametrize("rotations", [1, 3, 4])
+def test_individual_rl_is_fcn4d_at_the_heuristic_pick(rotations):
+    rules = PickPlaceEnv(rotations=rotations, num_envs=1).rules
+    td = random_states(rules, 32, rotations)
+    policy = individual_rl(rules, mask_infeasible=False, filters=6, head_std=1.0)
+    whole = fcn4d(rules, mask_infeasible=False, filters=6)
+    whole.load_state_dict(policy.state_dict())
+    pick = rules.heuristic_pick(rules.read_item(td["bin_depth"]))
+    logits = whole(td["bin_depth"], td["tote_depth"]).unflatten(1, (rules.num_picks, -1))
+    assert torch.allclose(policy(td["bin_depth"], td["tote_depth"]), logits[torch.arange(32), pick], atol=1e-5)
+    # Over the flat actions it is the same distribution, with nothing at any other pick.
+    over_actions = policy.action_log_probs(td["bin_depth"], td["tote_depth"]).exp().unflatten(1, (rules.num_picks, -1))
+    assert torch.allclose(over_actions.sum((1, 2)), torch.ones(32))
+    assert torch.allclose(over_actions[torch.arange(32), pick].sum(1), torch.ones(32))
+
+
+@pytest.mark.parametrize("candidates", [1, 200, "all"])
+def test_individual_rl_never_picks_elsewhere(candidates):
+    rules = PickPlaceEnv(rotations=1, num_envs=1).rules
+    td = random_states(rules, 512, 0, steps=12)
+    policy = individual_rl(rules, mask_infeasible=False, filters=6, head_std=1.0)
+    action = PolicyPlanner(rules, policy, candidates).decide(td)
+    pick = rules.heuristic_pick(rules.read_item(td["bin_depth"]))
+    assert torch.equal(action // (rules.num_places * rules.rotations), pick)
+    # Without turning, some items cannot be put down from this pick though they could be from another.
+    at_pick = td["action_mask"].unflatten(1, (rules.num_picks, -1))[torch.arange(512), pick].any(1)
+    assert td["action_mask"].any(1).all() and not at_pick.all()
+    if candidates != 1:
+        assert torch.equal(td["action_mask"].gather(1, action[:, None])[:, 0], at_pick)
+
+
+def test_individual_rl_under_a_mask_fails_where_it_must():
+    rules = PickPlaceEnv(rotations=1, num_envs=1).rules
+    td = random_states(rules, 512, 0, steps=12)
+    policy = individual_rl(rules, mask_infeasible=True, filters=6, head_std=1.0)
+    choice = policy(td["bin_depth"], td["tote_depth"], td["action_mask"]).argmax(1)
+    action = policy.to_action(choice, td["bin_depth"])
+    pick = rules.heuristic_pick(rules.read_item(td["bin_depth"]))
+    possible = td["action_mask"].unflatten(1, (rules.num_picks, -1))[torch.arange(512), pick].any(1)
+    assert torch.equal(td["action_mask"].gather(1, action[:, None])[:, 0], possible)
 
 
 def test_bad_candidates():

@@ -93,6 +93,51 @@ class FlatPolicy(nn.Module):
         return self(bin_depth, tote_depth).log_softmax(-1)
 
 
+class IndividualPolicy(FlatPolicy):
+    """``individual_rl``, what the paper compares with: the pick is heuristic, only place and rotation are learnt.
+
+    The network is that of ``fcn4d``; its features after the last ``3x3x3x3`` convolution are selected at the pick cell,
+    so that nothing else of them is computed. With a mask, a state in which nothing can be placed with the heuristic
+    pick is left unmasked: the policy fails then, as it must.
+
+    Args: as :class:`FlatPolicy`.
+    """
+
+    choice_key = "placement"
+    excludes = "every pick but the heuristic one"
+
+    def _at_pick(self, actions: Tensor, pick: Tensor) -> Tensor:
+        """The part of ``[N, N_a]`` that belongs to a pick cell ``[N]``: ``[N, W_T * D_T * R]``."""
+        return actions.unflatten(1, (self.rules.num_picks, -1))[torch.arange(len(pick), device=pick.device), pick]
+
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Logits ``[N, W_T * D_T * R]``."""
+        pick = self.rules.heuristic_pick(self.rules.read_item(bin_depth))
+        logits = self.network(bin_depth, tote_depth, pick).unflatten(1, (-1, 4))
+        logits = logits[..., : self.rules.rotations].flatten(1)
+        if action_mask is None:
+            return logits
+        allowed = self._at_pick(action_mask, pick)
+        return torch.where(allowed | ~allowed.any(1, keepdim=True), logits, MASKED)
+
+    def to_action(self, choice: Tensor, bin_depth: Tensor, *_) -> Tensor:
+        rules = self.rules
+        pick = rules.heuristic_pick(rules.read_item(bin_depth))
+        return pick * rules.num_places * rules.rotations + choice
+
+    def to_choice(self, action: Tensor, *_) -> Tensor:
+        """Place and rotation, whatever the pick."""
+        return action % (self.rules.num_places * self.rules.rotations)
+
+    def action_log_probs(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
+        """Minus infinity for every pick but the heuristic one."""
+        choice = torch.arange(self.rules.num_places * self.rules.rotations, device=bin_depth.device)
+        pick = self.rules.heuristic_pick(self.rules.read_item(bin_depth))
+        score = self(bin_depth, tote_depth).log_softmax(-1)
+        out = score.new_full((len(score), self.rules.num_actions), -torch.inf)
+        return out.scatter_(1, pick[:, None] * len(choice) + choice, score)
+
+
 class TypicalPolicy(FlatPolicy):
     """The "typical" network that the paper compares with: ``fcn4d``, then one fully connected layer over all logits.
 
@@ -257,6 +302,11 @@ def pick_one(candidates: Tensor) -> Tensor:
 def fcn4d(rules: Rules, mask_infeasible: bool, **network) -> FlatPolicy:
     """The paper's policy (config ``model=fcn4d``)."""
     return FlatPolicy(rules, mask_infeasible, **network)
+
+
+def individual_rl(rules: Rules, mask_infeasible: bool, **network) -> IndividualPolicy:
+    """The paper's individual planning by reinforcement learning (config ``model=individual_rl``)."""
+    return IndividualPolicy(rules, mask_infeasible, **network)
 
 
 def typical(rules: Rules, mask_infeasible: bool, **network) -> TypicalPolicy:

@@ -9,17 +9,6 @@ from pickplace.geometry import FAR, Item, Rules
 CANDIDATES = ("corners", "cells")
 
 
-def heuristic_pick(rules: Rules, item: Item) -> Tensor:
-    """The pick cell that puts the item at the least offset under the end effector, int64 ``[N]``.
-
-    Least ``ox + oy``, then ``oy``, among the picks that succeed: the end effector's corner where possible.
-    """
-    failure, offset = rules.grasps(item)
-    ox, oy = offset[:, :, 0].unbind(-1)  # before turning, [N, P]
-    order = (ox + oy) * FAR + oy
-    return torch.where(failure == 0, order, FAR**2).argmin(1)
-
-
 class IndividualHeuristic:
     """Heuristic pick, then deepest-bottom-left over the corners of the tote's free rectangles.
 
@@ -44,7 +33,7 @@ class IndividualHeuristic:
         rules, tote_height = self.rules, observation["tote_height"].reshape(-1)
         placements = rules.placements_from_depth(observation["bin_depth"], observation["tote_depth"], tote_height)
         item, rows = placements.item, torch.arange(len(tote_height), device=tote_height.device)
-        pick = heuristic_pick(rules, item)
+        pick = rules.heuristic_pick(item)
 
         def at_pick(actions: Tensor) -> Tensor:
             """``[N, N_a]`` to ``[N, places * R]``."""

@@ -8,9 +8,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ValueOperator
 
 from pickplace import checkpoint, config
-from pickplace.geometry import Rules
+from pickplace.geometry import FAR, Rules
 from pickplace.items import ItemDistribution
-from pickplace.models.actors import MASKED
 
 
 class PolicyPlanner:
@@ -47,9 +46,10 @@ class PolicyPlanner:
             if self.policy.choice_key == "action":  # computes the allowed actions only
                 return self.policy(bin_depth, tote_depth, mask).argmax(1)
             score = self.policy.action_log_probs(bin_depth, tote_depth)
-            return torch.where(mask, score, 2 * MASKED).argmax(1)
+            # If none is feasible of those that a policy with a pick of its own chooses among: its most probable one.
+            return torch.where(mask, score, score - FAR).argmax(1)
         count = min(self.candidates, rules.num_actions)
-        tried = self.policy.action_log_probs(bin_depth, tote_depth).topk(count, dim=1).indices  # [N, K]
+        score, tried = self.policy.action_log_probs(bin_depth, tote_depth).topk(count, dim=1)  # [N, K]
         heights = (tote_height[:, None, None] - tote_depth).int()
         item = rules.read_item(bin_depth)
 
@@ -57,7 +57,8 @@ class PolicyPlanner:
             return x.repeat_interleave(count, 0)
 
         step = rules.apply(repeat(heights), repeat(tote_height), type(item)(*map(repeat, item)), tried.flatten())
-        first = (step.failure.view_as(tried) == 0).int().argmax(1, keepdim=True)  # 0, the most probable, if none
+        succeeds = (step.failure.view_as(tried) == 0) & (score > -torch.inf)
+        first = succeeds.int().argmax(1, keepdim=True)  # 0, the most probable, if none
         return tried.gather(1, first)[:, 0]
 
     @torch.no_grad()
