@@ -5,7 +5,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pickplace.models.conv4d import check_width
-from pickplace.models.depth import depth_levels, item_code, one_hot
+from pickplace.models.depth import depth_levels, item_code, plane_numbers
+
+PADDED_ROWS = 512  # what bf16 products are rounded up to: one is prepared for each number of rows, which takes time
 
 
 class ItemConditionedFcn(nn.Module):
@@ -73,14 +75,15 @@ class ItemConditionedFcn(nn.Module):
             row: int64 ``[M]``, which problem.
             place: int64 ``[M]``, which place cell ``x * D_T + y`` of it.
         """
-        code = item_code(bin_depth, self.item_range)[row]
-        x = torch.cat([self._patches(tote_depth, row, place), code], 1).to(self.compute_dtype)
-        lower = self.compute_dtype != torch.float32
+        lower, count = self.compute_dtype != torch.float32, len(row)
+        if lower and count > 8 * PADDED_ROWS:
+            row, place = (F.pad(index, (0, -count % PADDED_ROWS)) for index in (row, place))
+        x = self._inputs(bin_depth, tote_depth, row, place)
         with torch.autocast(tote_depth.device.type, self.compute_dtype, enabled=lower):
-            return self.head(F.relu(self.hidden(F.relu(self.patch(x))))).float()
+            return self.head(F.relu(self.hidden(F.relu(self.patch(x))))).float()[:count]
 
-    def _patches(self, tote_depth: Tensor, row: Tensor, place: Tensor) -> Tensor:
-        """The tote around cells as one-hot planes, bool ``[M, depth_range * receptive_field**2]``, deepest first."""
+    def _inputs(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, place: Tensor) -> Tensor:
+        """The tote around cells as one-hot planes, deepest first, and the item's code, ``[M, inputs]``."""
         side, deep = self.receptive_field, tote_depth.shape[2]
         levels = depth_levels(tote_depth, self.tote_clip, self.depth_range)
         levels = F.pad(levels, (side // 2,) * 4, value=self.depth_range)  # outside: no plane
@@ -88,4 +91,9 @@ class ItemConditionedFcn(nn.Module):
         corner = (row * wide + place // deep) * long + place % deep
         tap = torch.arange(side, device=row.device)
         around = levels.flatten()[corner[:, None] + (tap[:, None] * long + tap).flatten()]
-        return one_hot(around, self.depth_range)
+        x = torch.empty(len(row), self.patch.in_features, dtype=self.compute_dtype, device=row.device)
+        planes, code = x.split([self.depth_range * side**2, 3 * self.item_range], 1)
+        planes = planes.unflatten(1, (self.depth_range, side**2))
+        torch.eq(around[:, None], plane_numbers(self.depth_range, row.device), out=planes)
+        code.copy_(item_code(bin_depth, self.item_range)[row])
+        return x
