@@ -14,7 +14,7 @@ CARD = "card.json"
 
 
 def export(source, folder: Path, evaluations: list[Path]) -> None:
-    """Write the policy of a checkpoint, without what only training needs, and its card.
+    """Write the networks of a checkpoint, without what only training needs, and its card.
 
     Args:
         source: a run folder or a checkpoint.
@@ -37,7 +37,7 @@ def export(source, folder: Path, evaluations: list[Path]) -> None:
             raise ValueError(f"{path}: it evaluates a policy of {theirs}, expected {trained}.")
         results.append({**result, "checkpoint": f"pretrained/{folder.name}"})
     kept = {key: facts[key] for key in ("frames", "config", "versions", "commit")}
-    checkpoint.write(folder, {"policy": state["policy"]}, kept)
+    checkpoint.write(folder, {key: state[key] for key in ("policy", "critic")}, kept)  # lookahead asks the critic
     card = {"name": f"pretrained/{folder.name}", "trained": trained, "versions": facts["versions"]}
     card |= {"config": facts["config"], "evaluations": results}
     (folder / CARD).write_text(json.dumps(card, indent=1) + "\n")
