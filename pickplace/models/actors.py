@@ -27,7 +27,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from pickplace.geometry import Rules
 from pickplace.models.conv4d import Conv4dPolicy
-from pickplace.models.fcn_grasp import ItemConditionedFcn
+from pickplace.models.fcn_grasp import FootprintFcn
 
 MASKED = -1e9  # the logit of what must not be chosen: its probability is exactly 0 in float32
 
@@ -165,7 +165,7 @@ class OutcomePolicy(nn.Module):
 
     Args:
         rules: the task's sizes.
-        network: arguments of :class:`~pickplace.models.fcn_grasp.ItemConditionedFcn`.
+        network: arguments of :class:`~pickplace.models.fcn_grasp.FootprintFcn`.
     """
 
     choice_key = "outcome"
@@ -177,16 +177,13 @@ class OutcomePolicy(nn.Module):
     def __init__(self, rules: Rules, **network):
         super().__init__()
         self.rules = rules
-        self.network = ItemConditionedFcn(2, **network)  # parities; without rotations only the first counts
+        self.network = FootprintFcn(**network)
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor, outcome_mask: Tensor) -> Tensor:
-        """Logits ``[N, Q * W_T * D_T]``; cells where nothing can be put down are not computed."""
-        rules = self.rules
-        by_place = outcome_mask.unflatten(1, (rules.parities, rules.num_places))
-        row, place = by_place.any(1).nonzero(as_tuple=True)
-        needed = self.network.at(bin_depth, tote_depth, row, place)[:, : rules.parities]
-        logits = needed.new_zeros(len(by_place), rules.num_places, rules.parities).index_put((row, place), needed)
-        return torch.where(outcome_mask, logits.transpose(1, 2).flatten(1), MASKED)
+        """Logits ``[N, Q * W_T * D_T]``; footprints that the mask rules out are not computed."""
+        row, outcome = outcome_mask.nonzero(as_tuple=True)
+        scores = self.network.at(bin_depth, tote_depth, row, outcome)
+        return scores.new_full(outcome_mask.shape, MASKED).index_put((row, outcome), scores[:, 0])
 
     def to_action(self, choice: Tensor, bin_depth: Tensor, tote_depth: Tensor, tote_height: Tensor) -> Tensor:
         placements = self.rules.placements_from_depth(bin_depth, tote_depth, tote_height)
@@ -205,7 +202,7 @@ class OutcomePolicy(nn.Module):
         outcome = self.rules.action_outcomes(item)  # [N, N_a], -1 where nothing reaches the tote
         ways = outcome.new_zeros(len(outcome), self.rules.num_outcomes + 1)
         ways.scatter_add_(1, outcome + 1, torch.ones_like(outcome))
-        logits = self.network(bin_depth, tote_depth)[:, : self.rules.parities].flatten(1)
+        logits = self.network(bin_depth, tote_depth, self.rules.parities).flatten(1)
         logits = torch.where(ways[:, 1:] > 0, logits, MASKED)
         share = logits.log_softmax(-1) - ways[:, 1:].clamp(min=1).log()
         return torch.where(outcome >= 0, share.gather(1, outcome.clamp(min=0)), MASKED)
@@ -219,7 +216,8 @@ class GraspPolicy(nn.Module):
 
     Args:
         rules: the task's sizes.
-        network: arguments of :class:`~pickplace.models.fcn_grasp.ItemConditionedFcn`.
+        network: arguments of :class:`~pickplace.models.fcn_grasp.FootprintFcn`, which scores each footprint once for
+            every offset of the item under the end effector.
     """
 
     choice_key = "grasp"
@@ -232,12 +230,15 @@ class GraspPolicy(nn.Module):
         super().__init__()
         self.rules = rules
         self.classes = rules.parities * rules.num_offsets**2
-        self.network = ItemConditionedFcn(2 * rules.num_offsets**2, **network)
-        self.miss = nn.Parameter(torch.zeros(()))
+        self.network = FootprintFcn(rules.num_offsets**2, **network)
+        self.miss, self.outside = (nn.Parameter(torch.zeros(())) for _ in range(2))
+        self.register_buffer("scored", self._scored(), persistent=False)
 
     def _choices(self, bin_depth: Tensor, tote_depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Logit per flat action of each choice, the choice's number of flat actions, and each pick's grasp class."""
-        maps = self.network(bin_depth, tote_depth)[:, : self.classes].flatten(2)  # [N, Q*O*O, W_T*D_T]
+        scores = self.network(bin_depth, tote_depth, self.rules.parities).flatten(1)
+        scores = torch.cat([scores, self.outside.expand(len(scores), 1)], 1)
+        maps = scores[:, self.scored]  # [N, Q*O*O, W_T*D_T]
         logits = torch.cat([maps.flatten(1), self.miss.expand(len(maps), 1)], 1)
         picks = self._pick_classes(bin_depth)
         missing = (picks < 0).sum((1, 2)) * self.rules.num_places
@@ -246,6 +247,26 @@ class GraspPolicy(nn.Module):
         )
         ways = torch.cat([counts[:, 1:].repeat_interleave(self.rules.num_places, 1), missing[:, None]], 1)
         return logits, ways, picks
+
+    def _scored(self) -> Tensor:
+        """Where among the network's scores each (grasp class, place cell) is found, int64 ``[Q*O*O, W_T*D_T]``.
+
+        The last score is that of every footprint whose corner is not in the tote.
+        """
+        (tote_w, tote_d, _), offsets = self.rules.tote_size, self.rules.num_offsets
+        step, x, y = torch.arange(offsets), torch.arange(tote_w), torch.arange(tote_d)
+        found = []
+        for parity, (_, _, ref_x, ref_y) in enumerate(self.rules.effectors):
+            left = x[:, None] + (step[:, None, None, None] + self.rules.min_offset - ref_x)  # [O, 1, W_T, 1]
+            front = y + (step[:, None, None] + self.rules.min_offset - ref_y)  # [O, 1, D_T]
+            # The network sees a turned footprint along the item's own axes.
+            channel = step[:, None] * offsets + step if parity == 0 else step * offsets + step[:, None]
+            inside = (left >= 0) & (left < tote_w) & (front >= 0) & (front < tote_d)
+            corner = (parity * tote_w + left) * tote_d + front
+            index = corner * offsets**2 + channel[:, :, None, None]
+            last = self.rules.num_outcomes * offsets**2
+            found.append(torch.where(inside, index, last).flatten(2).flatten(0, 1))
+        return torch.cat(found)
 
     def _pick_classes(self, bin_depth: Tensor) -> Tensor:
         """The grasp class of every pick cell and rotation, int64 ``[N, P, R]``, -1 if the pick fails."""

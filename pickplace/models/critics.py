@@ -17,7 +17,7 @@ class DepthCritic(nn.Module):
         rules: sizes of the tote.
         filters: width of the first layer, which sees the whole tote.
         hidden: width of the second.
-        tote_clip, depth_range, item_range: as in :class:`ItemConditionedFcn`.
+        tote_clip, depth_range, item_range: as in :class:`FootprintFcn`.
 
     Shapes:
         ``bin_depth [..., W_B, D_B]``, ``tote_depth [..., W_T, D_T]`` -> ``[..., 1]``.

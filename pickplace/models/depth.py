@@ -43,12 +43,8 @@ def depth_levels(tote_depth: Tensor, tote_clip: int, depth_range: int) -> Tensor
 
 def one_hot(levels: Tensor, count: int) -> Tensor:
     """Planes of uint8 levels, bool ``[N, M]`` to ``[N, count * M]``, plane by plane; other levels are in no plane."""
-    return (levels[:, None] == plane_numbers(count, levels.device)).flatten(1)
-
-
-def plane_numbers(count: int, device: torch.device) -> Tensor:
-    """What a level is compared with to tell its plane, uint8 ``[count, 1]``."""
-    return torch.arange(count, dtype=torch.uint8, device=device)[:, None]
+    plane = torch.arange(count, dtype=torch.uint8, device=levels.device)
+    return (levels[:, None] == plane[:, None]).flatten(1)
 
 
 def item_code(bin_depth: Tensor, item_range: int) -> Tensor:

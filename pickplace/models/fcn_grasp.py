@@ -1,99 +1,148 @@
-"""The fully convolutional network behind ``fcn_grasp``: the tote around each cell, given the item."""
+"""The fully convolutional network behind ``fcn_grasp``: the tote around a footprint, seen from what would lie there."""
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pickplace.geometry import Rules
 from pickplace.models.conv4d import check_width
-from pickplace.models.depth import depth_levels, item_code, plane_numbers
 
 PADDED_ROWS = 512  # what bf16 products are rounded up to: one is prepared for each number of rows, which takes time
 
 
-class ItemConditionedFcn(nn.Module):
-    """Maps the clipped tote depth and the item's size to maps of the tote's size.
+class FootprintFcn(nn.Module):
+    """Scores footprints by what surrounds them, as heights relative to the item that would lie there.
 
-    A convolution of ``receptive_field x receptive_field``, then two of ``1x1``, so that one set of weights serves any
-    tote. It is computed as matrix products over the patches around the cells that are asked for: a masked policy needs
-    few of them. The depth is clipped as in eq. 4 of the paper, floored, and given as one-hot planes (a cell outside the
-    tote is 0 in every plane, so walls need no input of their own), followed by the one-hot size of the item.
+    A convolution of ``receptive_field x receptive_field`` and two of ``1x1``, one set of weights for any tote, computed
+    as matrix products over the patches around the footprints that are asked for. A patch is centred on its footprint
+    and turned with it, so that an item that is turned is seen as one that is not. Its cells are one-hot: around the
+    footprint, the height above the top that the item would have; under it, the depth of the hole that it would close;
+    nothing outside the tote. After the patch come the item's width, depth and height, the room above its top, and how
+    far above the deepest place of the tote it rests (the clipped depth of eq. 4), one-hot each.
 
     Args:
-        out_channels: number of maps.
+        out_channels: scores of each footprint.
         filters: width of the convolution.
-        receptive_field: side of the square that an output cell sees, odd, at least 3; cells.
+        receptive_field: side of the square that is seen, odd, at least 3; cells.
         hidden: width of the 1x1 layer before the output.
         tote_clip: ``H_1_max`` of eq. 4, in whole cells.
-        depth_range: number of one-hot planes: clipped depths from ``tote_clip`` down; lower ones count as the last.
+        depth_range: number of clipped depths told apart, and of rooms above the top.
+        reach: heights around a footprint are told apart up to so many cells above and below the item's top.
         item_range: sides and heights from this one on look alike.
         head_std: standard deviation of the last layer's initial weights.
-        compute_dtype: ``"float32"`` or ``"bfloat16"`` (autocast of the matrix products).
+        compute_dtype: ``"float32"``, ``"bfloat16"`` (autocast of the matrix products), or ``"auto"``: bfloat16 where
+            the processor has units for it.
     """
 
     def __init__(
         self,
-        out_channels: int,
+        out_channels: int = 1,
         filters: int = 96,
         receptive_field: int = 5,
         hidden: int = 64,
         tote_clip: int = 3,
         depth_range: int = 5,
+        reach: int = 3,
         item_range: int = 3,
         head_std: float = 0.01,
-        compute_dtype: str = "float32",
+        compute_dtype: str = "auto",
     ):
         super().__init__()
         if not isinstance(receptive_field, int) or receptive_field < 3 or receptive_field % 2 == 0:
             raise ValueError(f"model.receptive_field={receptive_field!r}: expected an odd number >= 3.")
-        if compute_dtype not in ("float32", "bfloat16"):
-            raise ValueError(f"model.compute_dtype={compute_dtype!r}: expected 'float32' or 'bfloat16'.")
+        if compute_dtype not in ("auto", "float32", "bfloat16"):
+            raise ValueError(f"model.compute_dtype={compute_dtype!r}: expected 'auto', 'float32' or 'bfloat16'.")
         sizes = {"filters": filters, "hidden": hidden, "depth_range": depth_range, "item_range": item_range}
-        for key, value in {**sizes, "tote_clip": tote_clip, "out_channels": out_channels}.items():
+        for key, value in {**sizes, "tote_clip": tote_clip, "reach": reach, "out_channels": out_channels}.items():
             check_width(f"model.{key}", value)
         if not isinstance(head_std, (int, float)) or head_std < 0:
             raise ValueError(f"model.head_std={head_std!r}: expected a number >= 0.")
-        self.receptive_field = receptive_field
+        self.receptive_field, self.reach = receptive_field, reach
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
-        self.compute_dtype = getattr(torch, compute_dtype)
-        self.patch = nn.Linear(depth_range * receptive_field**2 + 3 * item_range, filters)
+        self.compute_dtype = fast_dtype() if compute_dtype == "auto" else getattr(torch, compute_dtype)
+        self.planes = max(3 * reach + 2, depth_range, item_range)  # around: -reach .. reach; under: holes 0 .. reach
+        self.patch = nn.Linear(self.planes * (receptive_field**2 + 5), filters)
         self.hidden = nn.Linear(filters, hidden)
         self.head = nn.Linear(hidden, out_channels)
         nn.init.normal_(self.head.weight, std=head_std)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
-        """Bin ``[N, W_B, D_B]`` and tote ``[N, W_T, D_T]`` depth to maps ``[N, out_channels, W_T, D_T]``, float32."""
-        places = tote_depth[0].numel()
-        cell = torch.arange(len(tote_depth) * places, device=tote_depth.device)
-        out = self.at(bin_depth, tote_depth, cell // places, cell % places)
-        return out.view(*tote_depth.shape, -1).permute(0, 3, 1, 2)
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor, parities: int) -> Tensor:
+        """Scores of all footprints, float32 ``[N, parities, W_T, D_T, out_channels]``, be they in the tote or not.
 
-    def at(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, place: Tensor) -> Tensor:
-        """The maps' values at some cells only, float32 ``[M, out_channels]``.
+        Args:
+            bin_depth, tote_depth: ``[N, W_B, D_B]``, ``[N, W_T, D_T]``.
+            parities: 1, or 2 to turn the footprints too.
+        """
+        count = parities * tote_depth[0].numel()
+        index = torch.arange(len(tote_depth) * count, device=tote_depth.device)
+        out = self.at(bin_depth, tote_depth, index // count, index % count)
+        return out.view(len(tote_depth), parities, *tote_depth.shape[1:], -1)
+
+    def at(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, outcome: Tensor) -> Tensor:
+        """The scores of some footprints only, float32 ``[M, out_channels]``.
 
         Args:
             row: int64 ``[M]``, which problem.
-            place: int64 ``[M]``, which place cell ``x * D_T + y`` of it.
+            outcome: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
         """
         lower, count = self.compute_dtype != torch.float32, len(row)
         if lower and count > 8 * PADDED_ROWS:
-            row, place = (F.pad(index, (0, -count % PADDED_ROWS)) for index in (row, place))
-        x = self._inputs(bin_depth, tote_depth, row, place)
+            row, outcome = (F.pad(index, (0, -count % PADDED_ROWS)) for index in (row, outcome))
+        x = self._inputs(bin_depth, tote_depth, row, outcome)
         with torch.autocast(tote_depth.device.type, self.compute_dtype, enabled=lower):
             return self.head(F.relu(self.hidden(F.relu(self.patch(x))))).float()[:count]
 
-    def _inputs(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, place: Tensor) -> Tensor:
-        """The tote around cells as one-hot planes, deepest first, and the item's code, ``[M, inputs]``."""
-        side, deep = self.receptive_field, tote_depth.shape[2]
-        levels = depth_levels(tote_depth, self.tote_clip, self.depth_range)
-        levels = F.pad(levels, (side // 2,) * 4, value=self.depth_range)  # outside: no plane
-        _, wide, long = levels.shape
-        corner = (row * wide + place // deep) * long + place % deep
+    def _inputs(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, outcome: Tensor) -> Tensor:
+        """What the first layer sees of some footprints, ``[M, inputs]``: one-hot, cell by cell, then the five codes."""
+        side, reach = self.receptive_field, self.reach
+        _, wide, long = tote_depth.shape
+        item = Rules.read_item(bin_depth)
+        turned = outcome >= wide * long
+        # Patches begin some cells before their footprint along the item's own axes, to have it in their middle.
+        before_w, before_d = (side // 2 - (size - 1) // 2 for size in (item.w[row], item.d[row]))
+        margin = side + max(bin_depth.shape[1:])
+        stride = long + 2 * margin
+        x = outcome // long % wide + margin - torch.where(turned, before_d, before_w)
+        y = outcome % long + margin - torch.where(turned, before_w, before_d)
         tap = torch.arange(side, device=row.device)
-        around = levels.flatten()[corner[:, None] + (tap[:, None] * long + tap).flatten()]
-        x = torch.empty(len(row), self.patch.in_features, dtype=self.compute_dtype, device=row.device)
-        planes, code = x.split([self.depth_range * side**2, 3 * self.item_range], 1)
-        planes = planes.unflatten(1, (self.depth_range, side**2))
-        torch.eq(around[:, None], plane_numbers(self.depth_range, row.device), out=planes)
-        code.copy_(item_code(bin_depth, self.item_range)[row])
-        return x
+        steps = torch.stack([tap[:, None] * stride + tap, tap[:, None] + tap * stride]).flatten(1)
+        # Depths as small whole numbers: comparing a row of them is what takes the time.
+        depth = F.pad(tote_depth.to(torch.int16), (margin,) * 4, value=OUTSIDE)
+        corner = (row * (wide + 2 * margin) + x) * stride + y
+        seen = depth.flatten()[steps[turned.long()] + corner[:, None]]  # [M, side * side]
+        under = self._under(bin_depth.shape[1:], row.device)[item.w[row], item.d[row]]
+        rest = torch.where(under, seen, FAR_DOWN).amin(1)  # depth of what the item rests on
+        room = rest - item.h[row].to(torch.int16)  # above its top
+        around = (room[:, None] - seen).clamp_(-reach, reach).add_(reach)
+        hole = (seen - rest[:, None]).clamp_(0, reach).add_(2 * reach + 1)
+        level = torch.where(under, hole, around).masked_fill_(seen == OUTSIDE, self.planes)
+
+        deepest = tote_depth.amax((1, 2)).to(torch.int16).clamp(min=self.tote_clip)[row]
+        sizes = [(size - 1).clamp(0, self.item_range - 1)[row].to(torch.int16) for size in (item.w, item.d, item.h)]
+        depths = [depth.clamp(0, self.depth_range - 1) for depth in (room, deepest - rest)]
+        level = torch.cat([level, torch.stack([*sizes, *depths], 1)], 1)
+        planes = torch.eye(self.planes + 1, self.planes, dtype=self.compute_dtype, device=row.device)
+        return F.embedding(level.int(), planes).flatten(1)
+
+    def _under(self, bin_size, device: torch.device) -> Tensor:
+        """Which cells of a patch lie under an item of ``w x d``, bool ``[W_B + 1, D_B + 1, side * side]``."""
+        side, maps = self.receptive_field, []
+        tap = torch.arange(side, device=device)
+        for longest in bin_size:
+            size = torch.arange(longest + 1, device=device)[:, None]
+            begin = side // 2 - (size - 1) // 2
+            maps.append((tap >= begin) & (tap < begin + size))
+        return (maps[0][:, None, :, None] & maps[1][None, :, None]).flatten(2)
+
+
+def fast_dtype() -> torch.dtype:
+    """bfloat16 where the processor multiplies matrices of it, several times faster than float32; else float32."""
+    if torch.cuda.is_available():
+        return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
+    able = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+    return torch.bfloat16 if any(able.get(key) for key in ("amx_bf16", "avx512_bf16", "bf16")) else torch.float32
+
+
+OUTSIDE = -1000  # the depth of a cell that is not in the tote
+FAR_DOWN = 10_000  # deeper than any tote
