@@ -80,7 +80,7 @@ TARGETS = {
     "env": ("PickPlaceEnv", "env.PickPlaceEnv"),
     "items": ("items.Kinds", "items.Uniform", "items.Recorded"),
     "model.actor": ("models.actors.fcn_grasp", "models.actors.fcn4d", "models.actors.typical"),
-    "model.critic": ("models.critics.DepthCritic", "models.critics.conv4d_critic"),
+    "model.critic": ("models.critics.pooled_critic", "models.critics.conv4d_critic"),
     "curriculum": ("curriculum.Curriculum",),
     "curriculum.advance": tuple(
         f"curriculum.{rule}" for rule in ("NoAdvance", "Frames", "Threshold", "Plateau", "Staged")

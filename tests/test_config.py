@@ -12,7 +12,7 @@ from pickplace.curriculum import Curriculum
 from pickplace.items import ItemDistribution
 from pickplace.metrics import read_csv
 from pickplace.models.actors import as_collection_policy, fcn_grasp
-from pickplace.models.critics import Conv4dCritic, DepthCritic
+from pickplace.models.critics import Conv4dCritic, PooledCritic
 from pickplace.train import make_losses, train
 
 CONF = config.conf_dir()
@@ -54,7 +54,7 @@ def test_every_model(name, masked):
     cfg, rules = composed(f"model={name}"), PickPlaceEnv(num_envs=1).rules
     policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=masked)
     assert policy.mask_infeasible is masked
-    assert isinstance(config.instantiate(cfg.model.critic, rules=rules), Conv4dCritic | DepthCritic)
+    assert isinstance(config.instantiate(cfg.model.critic, rules=rules), Conv4dCritic | PooledCritic)
 
 
 @pytest.mark.parametrize("name", options("curriculum"))
@@ -140,7 +140,7 @@ def test_ppo_begins_where_a2c_is():
     """At the policy that collected the data the ratio is 1, and the clipped objective has the gradient of A2C's."""
     env = PickPlaceEnv(num_envs=16, masks=("outcome",))
     policy = fcn_grasp(env.rules, True, head_std=1.0)
-    critic = ValueOperator(DepthCritic(env.rules), ["bin_depth", "tote_depth"])
+    critic = ValueOperator(PooledCritic(env.rules), ["bin_depth", "tote_depth"])
     with torch.no_grad():
         data = env.rollout(4, as_collection_policy(policy), break_when_any_done=False).reshape(-1)
     gradients = {}

@@ -50,8 +50,6 @@ class FootprintFcn(nn.Module):
         super().__init__()
         if not isinstance(receptive_field, int) or receptive_field < 3 or receptive_field % 2 == 0:
             raise ValueError(f"model.receptive_field={receptive_field!r}: expected an odd number >= 3.")
-        if compute_dtype not in ("auto", "float32", "bfloat16"):
-            raise ValueError(f"model.compute_dtype={compute_dtype!r}: expected 'auto', 'float32' or 'bfloat16'.")
         sizes = {"filters": filters, "hidden": hidden, "depth_range": depth_range, "item_range": item_range}
         for key, value in {**sizes, "tote_clip": tote_clip, "reach": reach, "out_channels": out_channels}.items():
             check_width(f"model.{key}", value)
@@ -59,7 +57,7 @@ class FootprintFcn(nn.Module):
             raise ValueError(f"model.head_std={head_std!r}: expected a number >= 0.")
         self.receptive_field, self.reach = receptive_field, reach
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
-        self.compute_dtype = fast_dtype() if compute_dtype == "auto" else getattr(torch, compute_dtype)
+        self.compute_dtype = matrix_dtype("model.compute_dtype", compute_dtype)
         self.planes = max(3 * reach + 2, depth_range, item_range)  # around: -reach .. reach; under: holes 0 .. reach
         self.patch = nn.Linear(self.planes * (receptive_field**2 + 5), filters)
         self.hidden = nn.Linear(filters, hidden)
@@ -91,7 +89,8 @@ class FootprintFcn(nn.Module):
             row, outcome = (F.pad(index, (0, -count % PADDED_ROWS)) for index in (row, outcome))
         x = self._inputs(bin_depth, tote_depth, row, outcome)
         with torch.autocast(tote_depth.device.type, self.compute_dtype, enabled=lower):
-            return self.head(F.relu(self.hidden(F.relu(self.patch(x))))).float()[:count]
+            x = F.relu(self.hidden(F.relu(self.patch(x))))
+        return self.head(x.float())[:count]  # in full: scores that differ a little must not be rounded to a tie
 
     def _inputs(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, outcome: Tensor) -> Tensor:
         """What the first layer sees of some footprints, ``[M, inputs]``: one-hot, cell by cell, then the five codes."""
@@ -136,8 +135,16 @@ class FootprintFcn(nn.Module):
         return (maps[0][:, None, :, None] & maps[1][None, :, None]).flatten(2)
 
 
-def fast_dtype() -> torch.dtype:
-    """bfloat16 where the processor multiplies matrices of it, several times faster than float32; else float32."""
+def matrix_dtype(key: str, name: str) -> torch.dtype:
+    """What matrix products are computed in: ``"float32"``, ``"bfloat16"``, or what is fastest here for ``"auto"``.
+
+    Raises:
+        ValueError: for another name, naming the key.
+    """
+    if name not in ("auto", "float32", "bfloat16"):
+        raise ValueError(f"{key}={name!r}: expected 'auto', 'float32' or 'bfloat16'.")
+    if name != "auto":
+        return getattr(torch, name)
     if torch.cuda.is_available():
         return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
     able = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}

@@ -139,9 +139,11 @@ def restore_critic(cfg: DictConfig, rules: Rules, state: dict, trained_tote: lis
         state: as of :func:`pickplace.checkpoint.read`, with or without ``state["critic"]``.
         trained_tote: ``tote_size`` in training.
     """
-    if "critic" not in state or tuple(trained_tote[:2]) != rules.tote_size[:2]:
+    if "critic" not in state:
         return None
     critic = ValueOperator(config.instantiate(cfg.model.critic, rules=rules), ["bin_depth", "tote_depth"])
+    if tuple(trained_tote[:2]) != rules.tote_size[:2] and not getattr(critic.module, "any_size", False):
+        return None
     checkpoint.load_module(critic, state["critic"], "critic")
     critic = critic.module.to(cfg.device).eval()
     return lambda bin_depth, tote_depth: critic(bin_depth, tote_depth) / cfg.algo.reward_scale
