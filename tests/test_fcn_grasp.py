@@ -56,7 +56,7 @@ def by_hand(network, bin_depth, tote_depth, parity, x, y):
     shift = max(int(tote_depth.max()) - network.tote_clip, 0)
     clipped = network.tote_clip - (rest - shift)
     ones += [min(size, network.item_range) - 1 for size in (w, d, h)]
-    ones += [max(0, min(v, network.depth_range - 1)) for v in (rest - h, clipped)]
+    ones += [max(0, min(v, network.depth_range - 1)) for v in (rest - h + 1, clipped)]
     weight, out = network.patch.weight.unflatten(1, (-1, network.planes)), network.patch.bias
     for position, plane in enumerate(ones):
         if plane is not None:

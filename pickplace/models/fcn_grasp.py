@@ -17,8 +17,9 @@ class FootprintFcn(nn.Module):
     as matrix products over the patches around the footprints that are asked for. A patch is centred on its footprint
     and turned with it, so that an item that is turned is seen as one that is not. Its cells are one-hot: around the
     footprint, the height above the top that the item would have; under it, the depth of the hole that it would close;
-    nothing outside the tote. After the patch come the item's width, depth and height, the room above its top, and how
-    far above the deepest place of the tote it rests (the clipped depth of eq. 4), one-hot each.
+    nothing outside the tote. After the patch come the item's width, depth and height, the room above its top (too
+    little, none, or how much), and how far above the deepest place of the tote it rests (the clipped depth of
+    eq. 4), one-hot each.
 
     Args:
         out_channels: scores of each footprint.
@@ -119,7 +120,7 @@ class FootprintFcn(nn.Module):
 
         deepest = tote_depth.amax((1, 2)).to(torch.int16).clamp(min=self.tote_clip)[row]
         sizes = [(size - 1).clamp(0, self.item_range - 1)[row].to(torch.int16) for size in (item.w, item.d, item.h)]
-        depths = [depth.clamp(0, self.depth_range - 1) for depth in (room, deepest - rest)]
+        depths = [depth.clamp(0, self.depth_range - 1) for depth in (room + 1, deepest - rest)]
         level = torch.cat([level, torch.stack([*sizes, *depths], 1)], 1)
         planes = torch.eye(self.planes + 1, self.planes, dtype=self.compute_dtype, device=row.device)
         return F.embedding(level.int(), planes).flatten(1)

@@ -69,7 +69,10 @@ class Lookahead:
         heights = (tote_height[:, None, None] - tote_depth).int()
         placements = rules.placements(heights, tote_height, rules.read_item(bin_depth))
         logits = policy(bin_depth, tote_depth, rules.outcome_mask(placements).flatten(1))
-        value, choice = logits.topk(min(self.candidates, logits.shape[1]), 1)
+        value, choice = torch.sort(
+            logits, dim=1, descending=True, stable=True
+        )  # of equals the first, as the policy itself plays
+        value, choice = value[:, : self.candidates], choice[:, : self.candidates]
         best = self._best(heights, tote_height, placements, choice, value > MASKED / 2)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             outcome = choice.gather(1, best[:, None])[:, 0]
