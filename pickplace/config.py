@@ -75,11 +75,22 @@ def use_machine(cfg: DictConfig) -> "torch.device":
     return device
 
 
+#: Every planner, by its class.
+PLANNERS = (
+    "IndividualHeuristic",
+    "JointDBL",
+    "Lookahead",
+    "MCTS",
+    "PolicyPlanner",
+    "RandomFeasible",
+    "UniformRandom",
+)
+
 #: What a checkpoint's config may make, and where: by its place in the config, names below ``pickplace``.
 TARGETS = {
     "env": ("PickPlaceEnv", "env.PickPlaceEnv"),
     "items": ("items.Kinds", "items.Uniform", "items.Recorded"),
-    "model.actor": ("models.actors.fcn_grasp", "models.actors.fcn4d", "models.actors.typical"),
+    "model.actor": tuple(f"models.actors.{name}" for name in ("fcn_grasp", "fcn4d", "typical", "individual_rl")),
     "model.critic": ("models.critics.pooled_critic", "models.critics.conv4d_critic"),
     "curriculum": ("curriculum.Curriculum",),
     "curriculum.advance": tuple(
@@ -89,6 +100,7 @@ TARGETS = {
     "collector": ("collector.single", "collector.multi_sync"),
     "logger": ("metrics.CsvLogger", "metrics.TensorboardLogger", "metrics.NoLogger"),
     "planner": ("planners.PolicyPlanner",),
+    "warm_start.teacher": tuple(f"planners.{name}" for name in PLANNERS),
 }
 
 

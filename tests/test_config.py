@@ -229,7 +229,7 @@ def test_targets_in_other_places_are_refused(node):
 
 def test_our_own_configs_are_accepted():
     groups = ("env", "items", "model", "curriculum", "curriculum/advance", "curriculum/sample", "collector", "logger")
-    for group in groups:
+    for group in (*groups, "warm_start"):
         for name in options(group):
             cfg = composed(f"{group}={name}")
             config.refuse_foreign_targets(OmegaConf.to_container(cfg, resolve=False))
