@@ -96,7 +96,7 @@ def test_every_other_group(group):
 
 @pytest.mark.parametrize("name", options("experiment"))
 def test_every_preset_runs(name, tmp_path):
-    extra = ["env.tote_size=[4,4,1]"] if name == "smoke" else []
+    extra = {"smoke": ["env.tote_size=[4,4,1]"], "mixed": ["env.tote_size=[7,7,3]"]}.get(name, [])
     occupancy = train(composed(f"experiment={name}", *TINY, *extra), tmp_path)
     assert 0 <= occupancy <= 1
     assert [row["frames"] for row in read_csv(tmp_path / "metrics.csv")] == [16, 32]
