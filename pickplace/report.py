@@ -325,6 +325,8 @@ def evaluation_table(result: dict) -> str:
     if result.get("checkpoint"):
         trained = result["trained"]
         rows.append(("checkpoint", f"{result['checkpoint']} ({trained['frames']:,} frames, seed {trained['seed']})"))
+        if result.get("warm_start"):
+            rows.append(("warm start", f"imitated {result['warm_start']}"))
     if "candidates" in result:
         in_training, at_decision = (
             {True: "yes", False: "no"}.get(mask, mask)

@@ -112,6 +112,16 @@ def test_only_differences_count_far_from_the_rim():
     torch.testing.assert_close(network(bins, totes, 2)[inside], network(bins, totes + 2, 2)[inside])
 
 
+def test_very_deep_totes():
+    """Depths are kept in 16 bits, whatever the tote."""
+    generator = torch.Generator().manual_seed(2)
+    network = FootprintFcn(1, 8, 5, head_std=1.0, compute_dtype="float32")
+    bins, totes = random_state(generator, 4, (5, 5), (6, 6))
+    totes = totes.clamp(min=0) + 100
+    inside = (slice(None), slice(None), slice(0, 4), slice(0, 4))
+    torch.testing.assert_close(network(bins, totes, 2)[inside], network(bins, totes + 900_000, 2)[inside])
+
+
 @pytest.mark.parametrize("rotations", [1, 2, 4])
 def test_only_what_the_mask_allows_is_computed_and_it_is_the_same(rotations, monkeypatch):
     env = PickPlaceEnv(tote_size=(7, 5, 3), rotations=rotations, num_envs=12, masks=("action", "outcome"))

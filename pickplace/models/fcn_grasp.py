@@ -6,6 +6,7 @@ from torch import Tensor, nn
 
 from pickplace.geometry import Rules
 from pickplace.models.conv4d import check_width
+from pickplace.models.depth import clip_depth
 
 PADDED_ROWS = 512  # what bf16 products are rounded up to: one is prepared for each number of rows, which takes time
 
@@ -108,7 +109,9 @@ class FootprintFcn(nn.Module):
         tap = torch.arange(side, device=row.device)
         steps = torch.stack([tap[:, None] * stride + tap, tap[:, None] + tap * stride]).flatten(1)
         # Depths as small whole numbers: comparing a row of them is what takes the time.
-        depth = F.pad(tote_depth.to(torch.int16), (margin,) * 4, value=OUTSIDE)
+        depth = clip_depth(tote_depth, 8_000, floor=-900).to(torch.int16)
+        deepest = depth.amax((1, 2)).clamp(min=self.tote_clip)[row]
+        depth = F.pad(depth, (margin,) * 4, value=OUTSIDE)
         corner = (row * (wide + 2 * margin) + x) * stride + y
         seen = depth.flatten()[steps[turned.long()] + corner[:, None]]  # [M, side * side]
         under = self._under(bin_depth.shape[1:], row.device)[item.w[row], item.d[row]]
@@ -118,7 +121,6 @@ class FootprintFcn(nn.Module):
         hole = (seen - rest[:, None]).clamp_(0, reach).add_(2 * reach + 1)
         level = torch.where(under, hole, around).masked_fill_(seen == OUTSIDE, self.planes)
 
-        deepest = tote_depth.amax((1, 2)).to(torch.int16).clamp(min=self.tote_clip)[row]
         sizes = [(size - 1).clamp(0, self.item_range - 1)[row].to(torch.int16) for size in (item.w, item.d, item.h)]
         depths = [depth.clamp(0, self.depth_range - 1) for depth in (room + 1, deepest - rest)]
         level = torch.cat([level, torch.stack([*sizes, *depths], 1)], 1)
