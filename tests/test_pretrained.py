@@ -42,7 +42,7 @@ def test_card_tells_what_the_weights_are(path):
     assert card["trained"] == {key: facts.get(key, facts["config"].get(key)) for key in ("frames", "seed", "commit")}
     assert not card["trained"]["commit"].endswith("+")  # trained from a clean checkout
     with safe_open(path.parent / checkpoint.TENSORS, "pt") as tensors:
-        assert {key.split("|")[0] for key in tensors.keys()} == {"policy"} == set(state)  # noqa: SIM118
+        assert {key.split("|")[0] for key in tensors.keys()} == {"critic", "policy"} == set(state)  # noqa: SIM118
 
 
 def test_export_refuses_an_evaluation_of_something_else(tmp_path):

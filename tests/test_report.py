@@ -168,11 +168,14 @@ def test_evaluation_table_of_a_policy():
         "mask_at_decision": False,
         "candidates": 10,
         "latency_ms": None,
+        "warm_start": "JointDBL",
     }
     rows = table(RESULT | facts)
     assert rows["mask; candidates K"] == "in training yes, at decision no; 10"
     assert rows["checkpoint"] == "run/checkpoints/best (1,200,000 frames, seed 3)"
+    assert rows["warm start"] == "imitated JointDBL"
     assert "one decision" not in rows
+    assert "warm start" not in table(RESULT | facts | {"warm_start": None})
 
 
 def test_importing_the_package_does_not_import_matplotlib():

@@ -40,10 +40,10 @@ class Lookahead:
         policy: torch.nn.Module,
         items: ItemDistribution,
         critic=None,
-        horizon: int | None = 8,
+        horizon: int | None = 2,
         candidates: int = 4,
         samples: int = 32,
-        rounds: int = 3,
+        rounds: int = 2,
         confidence: float = 2.0,
         seed: int = 0,
     ):
