@@ -56,7 +56,7 @@ def by_hand(network, bin_depth, tote_depth, parity, x, y):
     shift = max(int(tote_depth.max()) - network.tote_clip, 0)
     clipped = network.tote_clip - (rest - shift)
     ones += [min(size, network.item_range) - 1 for size in (w, d, h)]
-    ones += [max(0, min(v, network.depth_range - 1)) for v in (rest - h + 1, clipped)]
+    ones += [max(0, min(v, most - 1)) for v, most in ((rest - h + 1, network.rooms), (clipped, network.depth_range))]
     weight, out = network.patch.weight.unflatten(1, (-1, network.planes)), network.patch.bias
     for position, plane in enumerate(ones):
         if plane is not None:
@@ -70,11 +70,13 @@ def by_hand(network, bin_depth, tote_depth, parity, x, y):
     field=st.sampled_from([3, 5, 7]),
     tote=st.tuples(st.integers(3, 7), st.integers(3, 7)),
     sizes=st.tuples(st.integers(1, 4), st.integers(1, 6), st.integers(1, 3), st.integers(1, 4)),
+    rooms=st.sampled_from([None, 1, 3, 12]),
 )
-def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes):
+def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes, rooms):
     generator = torch.Generator().manual_seed(seed)
     clip, levels, reach, items = sizes
-    network = FootprintFcn(3, 8, field, 6, clip, levels, reach, items, head_std=1.0, compute_dtype="float32")
+    options = {"head_std": 1.0, "compute_dtype": "float32", "rooms": rooms}
+    network = FootprintFcn(3, 8, field, 6, clip, levels, reach, items, **options)
     bins, totes = random_state(generator, 2, (4, 6), tote)
     totes = totes.clamp(min=0)
     scores = network(bins, totes, 2)

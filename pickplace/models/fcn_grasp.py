@@ -28,7 +28,9 @@ class FootprintFcn(nn.Module):
         receptive_field: side of the square that is seen, odd, at least 3; cells.
         hidden: width of the 1x1 layer before the output.
         tote_clip: ``H_1_max`` of eq. 4, in whole cells.
-        depth_range: number of clipped depths told apart, and of rooms above the top.
+        depth_range: number of clipped depths told apart.
+        rooms: number of rooms above the top told apart: too little, none, 1, 2, ... cells; None: ``depth_range``. Few
+            serve totes that are higher than those in training.
         reach: heights around a footprint are told apart up to so many cells above and below the item's top.
         item_range: sides and heights from this one on look alike.
         head_std: standard deviation of the last layer's initial weights.
@@ -48,19 +50,24 @@ class FootprintFcn(nn.Module):
         item_range: int = 3,
         head_std: float = 0.01,
         compute_dtype: str = "auto",
+        rooms: int | None = None,
     ):
         super().__init__()
         if not isinstance(receptive_field, int) or receptive_field < 3 or receptive_field % 2 == 0:
             raise ValueError(f"model.receptive_field={receptive_field!r}: expected an odd number >= 3.")
         sizes = {"filters": filters, "hidden": hidden, "depth_range": depth_range, "item_range": item_range}
+        sizes["rooms"] = rooms = depth_range if rooms is None else rooms
         for key, value in {**sizes, "tote_clip": tote_clip, "reach": reach, "out_channels": out_channels}.items():
             check_width(f"model.{key}", value)
         if not isinstance(head_std, (int, float)) or head_std < 0:
             raise ValueError(f"model.head_std={head_std!r}: expected a number >= 0.")
         self.receptive_field, self.reach = receptive_field, reach
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
+        self.rooms = rooms
         self.compute_dtype = matrix_dtype("model.compute_dtype", compute_dtype)
-        self.planes = max(3 * reach + 2, depth_range, item_range)  # around: -reach .. reach; under: holes 0 .. reach
+        self.planes = max(
+            3 * reach + 2, depth_range, item_range, rooms
+        )  # around: -reach .. reach; under: holes 0 .. reach
         self.patch = nn.Linear(self.planes * (receptive_field**2 + 5), filters)
         self.hidden = nn.Linear(filters, hidden)
         self.head = nn.Linear(hidden, out_channels)
@@ -122,8 +129,8 @@ class FootprintFcn(nn.Module):
         level = torch.where(under, hole, around).masked_fill_(seen == OUTSIDE, self.planes)
 
         sizes = [(size - 1).clamp(0, self.item_range - 1)[row].to(torch.int16) for size in (item.w, item.d, item.h)]
-        depths = [depth.clamp(0, self.depth_range - 1) for depth in (room + 1, deepest - rest)]
-        level = torch.cat([level, torch.stack([*sizes, *depths], 1)], 1)
+        codes = [*sizes, (room + 1).clamp(0, self.rooms - 1), (deepest - rest).clamp(0, self.depth_range - 1)]
+        level = torch.cat([level, torch.stack(codes, 1)], 1)
         planes = torch.eye(self.planes + 1, self.planes, dtype=self.compute_dtype, device=row.device)
         return F.embedding(level.int(), planes).flatten(1)
 
