@@ -140,7 +140,7 @@ def test_ppo_begins_where_a2c_is():
     """At the policy that collected the data the ratio is 1, and the clipped objective has the gradient of A2C's."""
     env = PickPlaceEnv(num_envs=16, masks=("outcome",))
     policy = fcn_grasp(env.rules, True, head_std=1.0)
-    critic = ValueOperator(PooledCritic(env.rules), ["bin_depth", "tote_depth"])
+    critic = ValueOperator(PooledCritic(), ["bin_depth", "tote_depth"])
     with torch.no_grad():
         data = env.rollout(4, as_collection_policy(policy), break_when_any_done=False).reshape(-1)
     gradients = {}
