@@ -57,7 +57,9 @@ def confidence95(values: Tensor, least: float = 0.0, most: float = 1.0) -> tuple
 
 
 @torch.no_grad()
-def play(make_env, planner, episodes: int, batch_size: int, record: Collection[int] = ()) -> Episodes:
+def play(
+    make_env, planner, episodes: int, batch_size: int, record: Collection[int] = (), until: float | None = None
+) -> Episodes:
     """Play episodes ``0 .. episodes - 1``, each in a slot of its own, all finished and all counted.
 
     Collecting "the first n episodes to finish" would favour short ones, and short ones are the bad ones.
@@ -68,9 +70,12 @@ def play(make_env, planner, episodes: int, batch_size: int, record: Collection[i
         batch_size: episodes played side by side. It changes no result, but that of a planner that draws: which numbers
             an episode gets from the planner's one generator depends on the episodes beside it.
         record: numbers of the episodes to record move by move.
+        until: a time of ``time.monotonic()`` after which no further batch is begun; None: all episodes are played.
     """
     parts, recordings, feasible, decisions, seconds = [], [], 0.0, 0, 0.0
     for first in range(0, episodes, batch_size):
+        if parts and until is not None and time.monotonic() > until:
+            break
         env = make_env(first, min(batch_size, episodes - first))
         rules, count = env.rules, env.num_envs
         observation = env.reset()
@@ -166,14 +171,20 @@ def episodes_of(cfg: DictConfig) -> dict:
     }
 
 
-def evaluate(cfg: DictConfig, make_env, planner, facts: dict) -> tuple[dict, Episodes]:
-    """Evaluate a planner as the config group ``evaluation`` says: what goes into ``evaluation.json``."""
+def evaluate(cfg: DictConfig, make_env, planner, facts: dict, record=(), until=None) -> tuple[dict, Episodes]:
+    """Evaluate a planner as the config group ``evaluation`` says: what goes into ``evaluation.json``.
+
+    Args:
+        facts: more to put into it.
+        record, until: as of :func:`play`.
+    """
     ev = cfg.evaluation
-    result = play(make_env, planner, ev.episodes, ev.batch_size, record=range(max(ev.replay, 1)))
+    result = play(make_env, planner, ev.episodes, ev.batch_size, record, until)
     report = {
         "planner": planner.name,
         **facts,
         **episodes_of(cfg),
+        "episodes": len(result.occupancy),
         **summarise(result),
         **(planner.statistics() if hasattr(planner, "statistics") else {}),
         "latency_ms": decision_latency(make_env, planner, ev.latency_decisions),
@@ -255,22 +266,19 @@ def commit() -> str | None:
         return None
 
 
-def run(cfg: DictConfig, run_dir: Path) -> float:
-    """Evaluate as the config says (``conf/evaluate.yaml``); returns the mean occupancy.
+def prepare(cfg: DictConfig) -> tuple:
+    """What a config evaluates (``conf/evaluate.yaml``): ``make_env(first_episode, num_envs)``, the planner, and facts.
 
-    Writes ``evaluation.json``, a table and a picture of a packed tote into ``run_dir``.
+    The groups that a checkpoint brings are put into ``cfg``.
 
     Raises:
         ValueError: for settings that make no sense, or a checkpoint that does not fit them.
     """
     at_least = {"evaluation.episodes": 1, "evaluation.batch_size": 1, "evaluation.latency_decisions": 0}
-    at_least["evaluation.replay"] = 0
     for key, least in at_least.items():
         value = OmegaConf.select(cfg, key)
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
             raise ValueError(f"{key}={value}: expected a whole number >= {least}.")
-    if not isinstance(cfg.evaluation.gif, bool):
-        raise ValueError(f"evaluation.gif={cfg.evaluation.gif}: expected true or false.")
     if cfg.evaluation.stream not in ("validation", "test"):
         raise ValueError(f"evaluation.stream={cfg.evaluation.stream}: expected validation or test.")
     if "model" in cfg and cfg.checkpoint is None:
@@ -304,24 +312,42 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
             stream=ev.stream, seed=ev.seed, first_episode=first,
         )  # fmt: skip
 
-    rules = make_env(0, 1).rules
-    parts = planner_parts(cfg.planner, rules, items, trained)
+    parts = planner_parts(cfg.planner, make_env(0, 1).rules, items, trained)
     planner = config.instantiate(cfg.planner, **parts)
     if isinstance(planner, PolicyPlanner):
         masked = planner.candidates == "all" or planner.policy.excludes or False
         facts |= {"candidates": planner.candidates, "mask_at_decision": masked}
     elif "policy" in parts:
         facts |= {"candidates": "all", "mask_at_decision": True}
+    return make_env, planner, facts
+
+
+def run(cfg: DictConfig, run_dir: Path) -> float:
+    """Evaluate as the config says (``conf/evaluate.yaml``); returns the mean occupancy.
+
+    Writes ``evaluation.json``, a table, a picture of a packed tote and a replay into ``run_dir``.
+
+    Raises:
+        ValueError: for settings that make no sense, or a checkpoint that does not fit them.
+    """
+    ev = cfg.evaluation
+    replay, gif = ev.get("replay", 0), ev.get("gif", False)  # evaluation=validation has neither
+    if not isinstance(replay, int) or isinstance(replay, bool) or replay < 0:
+        raise ValueError(f"evaluation.replay={replay}: expected a whole number >= 0.")
+    if not isinstance(gif, bool):
+        raise ValueError(f"evaluation.gif={gif}: expected true or false.")
+    make_env, planner, facts = prepare(cfg)
+    rules = make_env(0, 1).rules
     other = None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), episodes_of(cfg))
-    result, episodes = evaluate(cfg, make_env, planner, facts)
+    result, episodes = evaluate(cfg, make_env, planner, facts, record=range(max(replay, 1)))
     if other:
         result["paired_difference"] = paired_difference(result, other)
     (run_dir / "evaluation.json").write_text(json.dumps(result, indent=1))
     picture(episodes.recordings[0], rules, run_dir / "tote.png")
-    if ev.replay:
+    if replay:
         title = f"{cfg.checkpoint or planner.name}, {ev.stream} stream, seed {ev.seed}"
         (run_dir / "replay.html").write_text(page(episodes.recordings, rules, title), encoding="utf-8")
-    if ev.gif:
+    if gif:
         animation(episodes.recordings[0], rules, run_dir / "replay.gif")
     table = evaluation_table(result)
     (run_dir / "evaluation.md").write_text(table)

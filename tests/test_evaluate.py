@@ -189,3 +189,11 @@ def test_confidence_interval_by_hand():
     assert evaluate.confidence95(torch.tensor([0.5] * 5)) == (0.5, 0.5)
     assert evaluate.confidence95(torch.tensor([0.5])) == (0.0, 1.0)
     assert evaluate.confidence95(torch.tensor([0.5]), least=-1.0) == (-1.0, 1.0)
+
+
+def test_the_validation_group_serves_an_evaluation_too(run):
+    """It is training's, and has nothing to say about replays."""
+    code, error, result = run(
+        "planner=joint_dbl", "env.tote_size=[4,4,1]", "evaluation=validation", "evaluation.episodes=4"
+    )
+    assert (code, error, result["stream"]) == (0, "", "validation")

@@ -1,0 +1,45 @@
+"""Evaluates one cell in a process of its own: python benchmarks/reproduce/cell.py MINUTES override ...
+
+As ``pickplace.evaluate``, but within a budget. Where the time of a decision says that all episodes fit, they are played
+side by side; else one after the other until the time is up; where one alone would take twice the budget, none, and that
+time is the result.
+"""
+
+import json
+import logging
+import sys
+import time
+
+from omegaconf import DictConfig
+
+from pickplace import config
+from pickplace.evaluate import decision_latency, evaluate, prepare
+
+log = logging.getLogger(__name__)
+
+
+def main() -> None:
+    seconds = 60 * float(sys.argv.pop(1))
+
+    def task(cfg: DictConfig, run_dir):
+        until = time.monotonic() + seconds
+        make_env, planner, facts = prepare(cfg)
+        latency = decision_latency(make_env, planner, 3)
+        rules, items = make_env(0, 1).rules, config.instantiate(cfg["items"])
+        moves = rules.num_places * rules.tote_size[2] / float(items.sizes.prod(1).double().mean())
+        episode = latency["p50"] / 1e3 * moves  # if the tote is filled
+        pilot = {"latency_ms": latency, "seconds_a_filled_episode": episode}
+        (run_dir / "pilot.json").write_text(json.dumps(pilot))
+        if episode > 2 * seconds:
+            log.info("attempted only: to fill one tote would take %.1f hours", episode / 3600)
+            return
+        if episode * cfg.evaluation.episodes > seconds:
+            cfg.evaluation.batch_size = 1
+        result, _ = evaluate(cfg, make_env, planner, facts, until=until)
+        (run_dir / "evaluation.json").write_text(json.dumps(result))
+
+    config.command("evaluate", task, from_checkpoint=("model",))
+
+
+if __name__ == "__main__":
+    main()

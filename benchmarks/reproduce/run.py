@@ -1,0 +1,282 @@
+"""Computes the cells of the comparison that are not there yet, and writes docs/results/: make reproduce.
+
+    python benchmarks/reproduce/run.py [--figure NAME ...] [--match TEXT] [--minutes 60] [--jobs 1] [--list]
+
+Each cell runs in a process of its own, in one thread. What stops early is taken up again: a training goes on from its
+last checkpoint, an evaluation begins anew. A finished cell is one JSON file, with its command.
+"""
+
+import argparse
+import json
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cells as definitions
+from cells import Cell
+
+from pickplace.evaluate import commit, versions
+from pickplace.metrics import read_csv
+
+ROOT = Path(__file__).parents[2]
+RESULTS, OUTPUTS = ROOT / "docs" / "results", ROOT / "outputs" / "reproduce"
+MEMORY = 20 * 2**30  # bytes that a cell may reserve: what asks for more is told so, and takes nothing from others
+
+
+def result_of(cell: Cell) -> Path:
+    """Where a cell's result stands."""
+    return RESULTS / ("trainings" if cell.kind == "train" else "cells") / f"{cell.name}.json"
+
+
+def run_dir_of(cell: Cell) -> Path:
+    """Where a cell works."""
+    return OUTPUTS / cell.kind / cell.name
+
+
+class Child:
+    """A command in one thread, its output in a file, its peak memory and its time measured."""
+
+    running: set["Child"] = set()
+
+    def __init__(self, command: list[str], log: Path):
+        def limits():
+            resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        log.parent.mkdir(parents=True, exist_ok=True)
+        self.log, self.started = log, time.monotonic()
+        with log.open("ab") as out:
+            self.process = subprocess.Popen(
+                command, stdout=out, stderr=out, cwd=ROOT, env={**os.environ, **threads}, preexec_fn=limits,
+                start_new_session=True,
+            )  # fmt: skip
+        Child.running.add(self)
+
+    def wait(self, minutes: float) -> dict:
+        """``{"rc", "seconds", "peak_mib", "out_of_time"}``; told to end when its time is up, and killed if it won't."""
+        timers = [
+            threading.Timer(60 * minutes, self.process.send_signal, [signal.SIGTERM]),
+            threading.Timer(60 * minutes + 300, self.process.kill),
+        ]
+        for timer in timers:
+            timer.start()
+        _, status, usage = os.wait4(self.process.pid, 0)
+        self.process.returncode = os.waitstatus_to_exitcode(status)
+        for timer in timers:
+            timer.cancel()
+        Child.running.discard(self)
+        seconds = time.monotonic() - self.started
+        return {
+            "rc": self.process.returncode,
+            "seconds": round(seconds, 1),
+            "peak_mib": usage.ru_maxrss // 1024,
+            "out_of_time": seconds > 60 * minutes,
+        }
+
+    def last_words(self) -> str:
+        """The last line of its output."""
+        lines = self.log.read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else ""
+
+
+def train(cell: Cell, minutes: float) -> dict:
+    """Train, or go on training, for at most so many minutes in all; the curve and what it cost."""
+    folder = run_dir_of(cell)
+    command = [sys.executable, "-m", "pickplace.train"]
+    spent = trained_seconds(folder) / 60
+    if (folder / "checkpoints" / "last").is_dir():
+        action = [f"resume={folder}"]
+    else:
+        action = [*cell.overrides, "threads=1", f"hydra.run.dir={folder}"]
+    child = Child([*command, *action], OUTPUTS / "logs" / f"{cell.name}.log")
+    cost = child.wait(max(minutes - spent, 0.1))
+    finished = (folder / "checkpoints" / "last").is_dir() and cost["rc"] == 0
+    if not finished:
+        return {"attempted": child.last_words(), **cost}
+    rows = read_csv(folder / "metrics.csv")
+    facts = json.loads((folder / "checkpoints" / "last" / "state.json").read_text())
+    seconds = trained_seconds(folder)
+    return {
+        "frames": facts["frames"],
+        "frames_asked": facts["config"]["total_frames"],
+        "training_seconds": round(seconds, 1),
+        "frames_a_second": round(facts["frames"] / seconds, 1),
+        "peak_mib": cost["peak_mib"],
+        "warm_start": (facts["config"].get("warm_start") or {}).get("frames", 0),
+        "mask_in_training": facts["config"]["algo"]["mask_infeasible"],
+        "trained_with": {"commit": facts["commit"], "versions": facts["versions"]},
+        "curve": curve(rows),
+    }
+
+
+def trained_seconds(folder: Path) -> float:
+    """Time that a run has spent on collecting and learning so far."""
+    path = folder / "metrics.csv"
+    rows = read_csv(path) if path.is_file() else []
+    return sum(row["time/collect_ms"] + row["time/update_ms"] for row in rows) / 1e3
+
+
+def curve(rows: list[dict], points: int = 100) -> dict:
+    """Training occupancy and tote height in some hundred means, and every validation."""
+    size = max(1, len(rows) // points)
+    parts = [rows[first : first + size] for first in range(0, len(rows), size)]
+    parts = [[row for row in part if "train/occupancy" in row] for part in parts]
+    parts = [part for part in parts if part]
+    tested = [row for row in rows if "eval/occupancy" in row]
+
+    def mean(part, key):
+        return round(sum(row[key] for row in part) / len(part), 5)
+
+    return {
+        "frames": [int(part[-1]["frames"]) for part in parts],
+        "training_occupancy": [mean(part, "train/occupancy") for part in parts],
+        "level": [int(part[-1]["curriculum/level"]) for part in parts],
+        "validation_frames": [int(row["frames"]) for row in tested],
+        "validation_occupancy": [round(row["eval/occupancy"], 5) for row in tested],
+    }
+
+
+def evaluate(cell: Cell, minutes: float) -> dict:
+    """Play the test stream within the budget."""
+    folder = run_dir_of(cell)
+    for name in ("evaluation.json", "pilot.json"):
+        (folder / name).unlink(missing_ok=True)
+    action = [*cell.overrides, "threads=1", f"hydra.run.dir={folder}"]
+    if cell.training is not None:
+        action.append(f"checkpoint={OUTPUTS / 'train' / cell.training}")
+    command = [sys.executable, str(Path(__file__).parent / "cell.py"), str(minutes), *action]
+    child = Child(command, OUTPUTS / "logs" / f"{cell.name}.log")
+    cost = child.wait(3 * minutes)
+    pilot = json.loads((folder / "pilot.json").read_text()) if (folder / "pilot.json").is_file() else {}
+    if not (folder / "evaluation.json").is_file():
+        reason = "no episode fits into the budget" if cost["rc"] in (0, -15, -9) else child.last_words()
+        return {"attempted": reason, **pilot, **cost}
+    result = json.loads((folder / "evaluation.json").read_text())
+    result["occupancy"]["per_episode"] = [round(value, 6) for value in result["occupancy"]["per_episode"]]
+    if result["checkpoint"]:
+        result["checkpoint"] = cell.training or next(o for o in cell.overrides if o.startswith("checkpoint="))[11:]
+    return {**result, "peak_mib": cost["peak_mib"], "seconds": cost["seconds"]}
+
+
+def placement_only(cell: Cell, minutes: float) -> dict:
+    """Replay the packings of a placement-only packer, see ``placement_only.py``."""
+    folder = run_dir_of(cell)
+    folder.mkdir(parents=True, exist_ok=True)
+    script = Path(__file__).parent / "placement_only.py"
+    child = Child(
+        [sys.executable, str(script), str(folder / "result.json"), *cell.overrides],
+        OUTPUTS / "logs" / f"{cell.name}.log",
+    )
+    cost = child.wait(minutes)
+    if cost["rc"]:
+        return {"attempted": child.last_words(), **cost}
+    return {**json.loads((folder / "result.json").read_text()), **cost}
+
+
+def compute(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> str:
+    """Compute a cell and write its result; a word on how it went."""
+    if cell.training is not None:
+        trained = json.loads(result_of(trainings[cell.training]).read_text())
+        if "attempted" in trained:
+            result = {"attempted": f"its training, {cell.training}: {trained['attempted']}"}
+            return write(cell, minutes, result)
+        if not (OUTPUTS / "train" / cell.training / "checkpoints").is_dir():
+            return f"left: the run folder of {cell.training} is not here; delete its result to train again"
+    return write(cell, minutes, {"train": train, "evaluate": evaluate, "placement_only": placement_only}[cell.kind](
+        cell, minutes
+    ))  # fmt: skip
+
+
+def write(cell: Cell, minutes: float, result: dict) -> str:
+    """Write a result, unless the user stopped it; a word on what it says."""
+    if stopped.is_set():
+        return "stopped"
+    head = {
+        "cell": cell.name,
+        "kind": cell.kind,
+        "method": cell.method,
+        "axes": dict(cell.axes),
+        "training": cell.training,
+        "command": command_of(cell),
+        "budget_minutes": minutes,
+    }
+    facts = {"commit": commit(), "versions": versions()} if cell.kind == "train" or "attempted" in result else {}
+    path = result_of(cell)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({**head, **facts, **result}, indent=1)
+    text = re.sub(
+        r"\[\s+((?:[-\d.e]+,?\s*)+)\]", lambda m: "[" + " ".join(m[1].split()) + "]", text
+    )  # lists of numbers
+    path.with_suffix(".part").write_text(text + "\n")
+    path.with_suffix(".part").replace(path)
+    if "attempted" in result:
+        return f"attempted: {result['attempted']}"
+    if cell.kind == "train":
+        return f"{result['frames']:,} frames in {result['training_seconds']:.0f} s"
+    return f"{result['occupancy']['mean']:.4f}, {result['episodes']} episodes" if "occupancy" in result else "done"
+
+
+def command_of(cell: Cell) -> str:
+    """The command that a user would type for the same."""
+    if cell.kind == "placement_only":
+        return " ".join(["python benchmarks/reproduce/placement_only.py result.json", *cell.overrides])
+    where = [f"checkpoint=outputs/reproduce/train/{cell.training}"] if cell.training else []
+    return " ".join([f"python -m pickplace.{cell.kind}", *cell.overrides, *where, "threads=1"])
+
+
+stopped = threading.Event()
+
+
+def stop(*_) -> None:
+    """Let trainings save, and end."""
+    stopped.set()
+    for child in list(Child.running):
+        child.process.send_signal(signal.SIGTERM)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--figure", action="append", help="only the cells of this figure; may be repeated")
+    parser.add_argument("--match", default="", help="only cells in whose name this regular expression is found")
+    parser.add_argument("--minutes", type=float, default=60, help="budget of a cell")
+    parser.add_argument("--jobs", type=int, default=1, help="cells that run side by side, one core each")
+    parser.add_argument("--list", action="store_true", help="tell what is done and what is not, and end")
+    arguments = parser.parse_args()
+    trainings, figures = definitions.read()
+    if unknown := set(arguments.figure or ()) - set(figures):
+        parser.error(f"--figure {sorted(unknown)[0]}: expected one of {', '.join(figures)}.")
+    chosen = [cell for name in arguments.figure or figures for cell in figures[name]]
+    chosen = list({cell.name: cell for cell in chosen if re.search(arguments.match, cell.name)}.values())
+    first = list({cell.training: trainings[cell.training] for cell in chosen if cell.training}.values())
+    missing = [[cell for cell in part if not result_of(cell).is_file()] for part in (first, chosen)]
+    say(f"{len(first) + len(chosen)} cells, {sum(map(len, missing))} to compute")
+    if arguments.list:
+        for cell in missing[0] + missing[1]:
+            say(f"  {cell.kind} {cell.name}: {command_of(cell)}")
+        return
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
+
+    def work(cell: Cell) -> None:
+        if not stopped.is_set():
+            say(f"{cell.kind} {cell.name}: {compute(cell, arguments.minutes, trainings)}")
+
+    for part in missing:  # what evaluations need comes before them
+        with ThreadPoolExecutor(arguments.jobs) as pool:
+            list(pool.map(work, part))
+
+
+def say(text: str) -> None:
+    sys.stdout.write(f"{time.strftime('%H:%M:%S')} {text}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
