@@ -5,7 +5,7 @@ STAMP := .venv/.installed
 RUN ?= outputs/quick_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
 
-.PHONY: help install demo train test test-slow bench lint format clean
+.PHONY: help install demo train test test-slow bench reproduce results lint format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -48,6 +48,14 @@ bench: $(STAMP)  ## run the benchmarks on a quiet machine (half an hour), and wr
 	for part in learning training environment collector conv4d decision startup report; do \
 		$(BIN)/python benchmarks/$$part.py || exit 1; \
 	done
+
+reproduce: $(STAMP)  ## compute what is missing of the paper's comparison (days; ARGS="--figure candidates --jobs 2")
+	$(BIN)/pip install --quiet --disable-pip-version-check 'py3dbp>=1.1,<2' 'rectpack>=0.2,<1' || echo "placement-only packers: not to be had"
+	$(BIN)/python benchmarks/reproduce/run.py $(ARGS)
+	$(BIN)/python benchmarks/reproduce/results.py
+
+results: $(STAMP)  ## draw the comparison's figures, and write docs/results.md
+	$(BIN)/python benchmarks/reproduce/results.py
 
 lint: $(STAMP)  ## check style
 	$(BIN)/ruff check .

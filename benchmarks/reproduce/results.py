@@ -1,0 +1,129 @@
+"""Draws the figures of the comparison and writes docs/results.md from the JSON in docs/results/: make results."""
+
+import json
+import sys
+from pathlib import Path
+
+import cells as definitions
+import claims
+import figures
+from run import RESULTS
+
+ROOT = RESULTS.parents[1]
+INDICATIVE = 20  # episodes below which a figure only indicates
+
+HEAD = """# The paper's comparison, run again
+
+Made by `make results` from the JSON in [`results/`](results), which `make reproduce` computes cell by cell; each JSON
+holds the command of its cell. All methods meet the same episodes of the test stream, seed 0. Brackets are 95%
+confidence intervals of the mean over episodes; ° marks fewer than {indicative} episodes: indicative. *Budget* is what
+the method was trained with: frames and minutes on one core, each cell having an hour at most; a policy that does not
+beat `random` is called *not trained*, whatever else it does. *Attempted* cells could not be done within their hour, or
+within 20 GiB, and tell how far off they were.
+
+{done} of {total} cells are done.
+"""
+
+
+def load() -> dict[str, dict]:
+    """Every result that there is, by the name of its cell."""
+    paths = [*(RESULTS / "cells").glob("*.json"), *(RESULTS / "trainings").glob("*.json")]
+    return {path.stem: json.loads(path.read_text()) for path in sorted(paths)}
+
+
+def table(cells, results) -> list[str]:
+    """One row for each cell, done or not."""
+    lines = ["| method | cell | occupancy | episodes | a decision | budget |", "|---|---|---|---|---|---|"]
+    for cell in cells:
+        labels = " ".join(definitions.AXES[axis][0].format(value) for axis, value in cell.axes)
+        result = results.get(cell.name)
+        lines.append(
+            f"| {figures.label(cell.method)} | {labels} | {occupancy(result)} | {episodes(result)} | "
+            f"{decision(result)} | {budget(cell, results)} |"
+        )
+    return lines
+
+
+def occupancy(result) -> str:
+    if result is None:
+        return "not yet"
+    if "attempted" in result:
+        return f"attempted: {result['attempted']}"
+    low, high = result["occupancy"]["ci95"]
+    return f"{result['occupancy']['mean']:.4f} ({low:.4f} to {high:.4f})"
+
+
+def episodes(result) -> str:
+    if result is None or "occupancy" not in result:
+        return ""
+    return f"{result['episodes']}{'°' if result['episodes'] < INDICATIVE else ''}"
+
+
+def decision(result) -> str:
+    latency = (result or {}).get("latency_ms")
+    if not latency:
+        return ""
+    return f"{latency['p50'] / 1e3:.1f} s" if latency["p50"] >= 1e3 else f"{latency['p50']:.1f} ms"
+
+
+def budget(cell, results) -> str:
+    """What was spent on the policy that the cell evaluates."""
+    if cell.training is None:
+        return next((f"`{o[11:]}`" for o in cell.overrides if o.startswith("checkpoint=")), "none")
+    trained = results.get(cell.training)
+    if trained is None:
+        return "not yet"
+    if "attempted" in trained:
+        return f"attempted, {trained['seconds'] / 60:.0f} min, {trained['peak_mib'] / 1024:.1f} GiB"
+    words = [f"{trained['frames']:,} frames", f"{trained['training_seconds'] / 60:.0f} min"]
+    if trained["frames"] < trained["frames_asked"]:
+        words[0] += f" of {trained['frames_asked']:,}"
+    if trained["peak_mib"] > 4096:
+        words.append(f"{trained['peak_mib'] / 1024:.1f} GiB")
+    if trained["warm_start"]:
+        words.append("warm start")
+    if not beats_random(cell.training, results):
+        words.append("**not trained**")
+    return ", ".join(words)
+
+
+def beats_random(training: str, results) -> bool:
+    """Does its best figure at the size that it was trained at lie beyond ``random``'s?"""
+    trained = results[training]
+    tote = trained["axes"].get("tote", "6x6x5")
+    random = results.get(f"random-R{trained['axes'].get('R', 4)}-{tote}")
+    if random is None:
+        return True
+    mean = max(trained["curve"]["validation_occupancy"], default=0.0)
+    return mean > random["occupancy"]["ci95"][1]
+
+
+def main() -> None:
+    _, parts = definitions.read()
+    results = load()
+    every = {cell.name for cells in parts.values() for cell in cells}
+    every |= {cell.training for cells in parts.values() for cell in cells if cell.training}
+    done = sum(name in results for name in every)
+    text = [HEAD.format(indicative=INDICATIVE, done=done, total=len(every))]
+    text += ["## What the paper claims, and what we find\n", *claims.table(results), ""]
+    for name, (title, draw) in figures.FIGURES.items():
+        text.append(f"## {title}\n")
+        if draw(results, RESULTS / "figures" / name):
+            text.append(f"![{title}](results/figures/{name}.png)\n")
+            text.append(f"[SVG](results/figures/{name}.svg); behind it: `benchmarks/reproduce/{name}.yaml`.\n")
+        if name == "placement_only":
+            text += figures.placement_table(parts[name], results)
+        else:
+            text += [
+                "<details><summary>Every cell</summary>\n",
+                *table(parts[name], results, trainings),
+                "\n</details>",
+            ]
+        text.append("")
+    path = Path(RESULTS.parent / "results.md")
+    path.write_text("\n".join(text))
+    sys.stdout.write(f"{path.relative_to(ROOT)}: {done} of {len(every)} cells\n")
+
+
+if __name__ == "__main__":
+    main()
