@@ -116,7 +116,7 @@ def main() -> None:
         else:
             text += [
                 "<details><summary>Every cell</summary>\n",
-                *table(parts[name], results, trainings),
+                *table(parts[name], results),
                 "\n</details>",
             ]
         text.append("")
