@@ -1,0 +1,134 @@
+"""The comparison: its cells are commands that exist, and what it writes follows from the results."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from pickplace import config
+
+FOLDER = Path(__file__).parents[1] / "benchmarks" / "reproduce"
+sys.path.insert(0, str(FOLDER))
+
+import cells  # noqa: E402
+import claims  # noqa: E402
+import figures  # noqa: E402
+import placement_only  # noqa: E402
+import results  # noqa: E402
+
+TRAININGS, PARTS = cells.read()
+
+
+def test_every_training_composes_and_every_evaluation_too():
+    evaluations = {cell.name: cell for part in PARTS.values() for cell in part if cell.kind == "evaluate"}
+    with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
+        for cell in TRAININGS.values():
+            assert compose("train", list(cell.overrides)).total_frames >= 400_000 or "warm" in cell.name
+        for overrides in {cell.method: cell.overrides for cell in evaluations.values()}.values():
+            assert compose("evaluate", list(overrides)).evaluation.stream == "test"
+
+
+def test_an_entry_stands_for_every_combination_of_its_grid():
+    entry = {"method": "m", "set": "a=1 b=2", "training": "t-R{R}-s{seed}", "grid": {"R": [1, 4], "seed": [0, 1]}}
+    made = cells.expand(entry, "evaluate")
+    assert [cell.name for cell in made] == ["m-R1-s0", "m-R1-s1", "m-R4-s0", "m-R4-s1"]
+    assert made[1].overrides == ("a=1", "b=2", "env.rotations=1")  # the seed is the training's
+    assert made[1].training == "t-R1-s1"
+    assert cells.expand({"method": "m", "grid": {"seed": [3], "tote": ["6x6x10"]}}, "train")[0].overrides == (
+        "seed=3",
+        "env.tote_size=[6,6,10]",
+    )
+
+
+@pytest.mark.parametrize("entry", [{"method": "m", "gird": {}}, {"method": "m", "grid": {"Q": [1]}}])
+def test_an_entry_with_a_misspelt_key(entry):
+    with pytest.raises(ValueError, match="gird|grid.Q"):
+        cells.expand(entry, "train")
+
+
+def result(mean, **more):
+    occupancy = {"mean": mean, "ci95": [mean - 0.01, mean + 0.01]}
+    return {"occupancy": occupancy, "episodes": 100, "latency_ms": {"p50": 2.0}, **more}
+
+
+def test_claims_follow_the_figures():
+    found = {f"fcn4d-R3-s0-6x6x5-K{k}": result(mean) for k, mean in ((1, 0.8), (10, 0.9), (50, 0.905))}
+    assert claims.k_settles(found)[0] is True
+    found["fcn4d-R3-s0-6x6x5-K50"] = result(0.95)
+    assert claims.k_settles(found)[0] is False
+    assert claims.k_settles({})[0] is None
+    curve = {"validation_occupancy": [0.3, 0.2], "validation_frames": [1, 2]}
+    found = {"typical-6x6x5-s0": {"curve": curve}, "fcn4d-R4-s0": {"curve": {**curve, "validation_occupancy": [0.7]}}}
+    assert claims.typical_learns_poorly(found)[0] is True
+
+
+def test_tables_say_what_is_missing_attempted_and_not_trained():
+    cell = next(cell for cell in PARTS["rl_methods"] if cell.name == "typical-R4-s0-6x6x5-K1")
+    trained = {
+        "axes": {"tote": "6x6x5", "seed": 0},
+        "frames": 1000,
+        "frames_asked": 2000,
+        "training_seconds": 60,
+        "peak_mib": 900,
+        "warm_start": 0,
+        "curve": {"validation_occupancy": [0.2]},
+    }
+    found = {cell.training: trained, "random-R4-6x6x5": result(0.26)}
+    assert "not yet" in results.table([cell], found)[-1]
+    found[cell.name] = result(0.21, episodes=100) | {"episodes": 5}
+    row = results.table([cell], found)[-1]
+    assert "0.2100 (0.2000 to 0.2200) | 5° | 2.0 ms | 1,000 frames of 2,000, 1 min, **not trained**" in row
+    found[cell.training] = {"attempted": "no memory", "seconds": 120, "peak_mib": 20480}
+    found[cell.name] = {"attempted": "its training"}
+    assert "attempted: its training |  |  | attempted, 2 min, 20.0 GiB" in results.table([cell], found)[-1]
+
+
+def test_every_figure_is_drawn_from_few_results_and_from_none(tmp_path):
+    found = {}
+    for name, part in PARTS.items():
+        assert figures.FIGURES[name][1]({}, tmp_path / name) is False
+        found |= {cell.name: result(0.5 + 0.001 * number) for number, cell in enumerate(part[::2])}
+    curve = {"validation_occupancy": [0.3, 0.5], "validation_frames": [100, 200]}
+    found |= {name: {"curve": curve} for name in TRAININGS}
+    shares = {key: {"mean": 0.5, "ci95": [0.4, 0.6]} for key in ("occupancy_planned", "occupancy")}
+    found["py3dbp-R1-6x6x5"] = {"kind": "placement_only", "placements": {"executed": 3, "unstable": 1}, **shares}
+    for name, (_, draw) in figures.FIGURES.items():
+        assert draw(found, tmp_path / name) is True
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+        assert (tmp_path / f"{name}.svg").read_text().startswith("<?xml")
+
+
+def test_a_plan_of_single_cells_can_be_executed_but_where_the_effector_collides():
+    """A 4x4x2 tote, items 1x1x1 in reading order: the plan fills the first layer; walls are in the way of none."""
+    from pickplace import PickPlaceEnv
+    from pickplace.items import Kinds
+
+    env = PickPlaceEnv(tote_size=(4, 4, 2), items=Kinds([(1, 1, 1)]), num_envs=1, stream="test")
+
+    def packer(size, turns):
+        places = iter([(x, y, z) for z in (0, 1) for x in range(4) for y in range(4)])
+        return lambda w, d, h: (*place, 1, 1) if (place := next(places, None)) else None
+
+    outcomes, planned, executed = placement_only.replay(env, packer)
+    assert (len(outcomes), planned, executed, set(outcomes)) == (32, 1.0, 1.0, {"executed"})
+
+    def towers(size, turns):
+        places = iter([(x, y, z) for x in range(4) for y in range(4) for z in (0, 1)])
+        return lambda w, d, h: (*place, 1, 1) if (place := next(places, None)) else None
+
+    outcomes, planned, executed = placement_only.replay(env, towers)
+    assert planned == 1.0
+    assert executed < 1.0
+    assert set(outcomes) == {"executed", "effector_collides"}
+
+    def floating(size, turns):
+        return lambda w, d, h: (0, 0, 1, 1, 1)
+
+    assert placement_only.replay(env, floating)[0][0] == "rests_elsewhere"
+
+
+def test_results_are_written_as_json_that_can_be_read_again():
+    for path in (FOLDER.parents[1] / "docs" / "results").rglob("*.json"):
+        assert json.loads(path.read_text())["cell"] == path.stem
