@@ -37,10 +37,17 @@ def export(source, folder: Path, evaluations: list[Path]) -> None:
             raise ValueError(f"{path}: it evaluates a policy of {theirs}, expected {trained}.")
         results.append({**result, "checkpoint": f"pretrained/{folder.name}"})
     kept = {key: facts[key] for key in ("frames", "config", "versions", "commit")}
-    checkpoint.write(folder, {key: state[key] for key in ("policy", "critic")}, kept)  # lookahead asks the critic
+    # What lookahead may ask is kept; fcn4d's critic is tied to one tote, and larger than the policy.
+    networks = ("policy", "critic") if asks_critic(facts["config"]) else ("policy",)
+    checkpoint.write(folder, {key: state[key] for key in networks}, kept)
     card = {"name": f"pretrained/{folder.name}", "trained": trained, "versions": facts["versions"]}
     card |= {"config": facts["config"], "evaluations": results}
     (folder / CARD).write_text(json.dumps(card, indent=1) + "\n")
+
+
+def asks_critic(cfg: dict) -> bool:
+    """Does ``planner=lookahead`` serve the policy of a checkpoint with this config?"""
+    return cfg["model"]["actor"]["_target_"].endswith(".fcn_grasp")
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pickplace.geometry import Rules
-from pickplace.models.actors import MASKED, FlatPolicy
+from pickplace.models.actors import MASKED, FlatPolicy, typical
 from pickplace.models.conv4d import Conv4dCritic, Conv4dPolicy
 from pickplace.models.depth import clip_depth, pad_depth
 
@@ -214,3 +214,21 @@ def test_masked_policy_computes_only_what_it_needs_and_the_same(rotations, empty
     assert torch.allclose(logits[mask], whole[mask], atol=1e-5) and (logits[~mask] == MASKED).all()
     for ours, expected in zip(gradients(policy(bins, totes, mask)), gradients(policy(bins, totes)), strict=True):
         assert torch.allclose(ours, expected, atol=1e-4)
+
+
+def test_typical_is_fcn4d_and_one_fully_connected_layer():
+    rules = Rules(bin_size=(3, 3, 1), tote_size=(4, 4, 2))
+    policy = typical(rules, mask_infeasible=False, filters=8)
+    maps = torch.randint(0, 2, (5, 3, 3)).float(), torch.randint(0, 3, (5, 4, 4)).float()
+    before = policy.network(*maps)
+    wanted = before @ policy.join.weight.T + policy.join.bias
+    torch.testing.assert_close(policy(*maps), wanted)
+
+
+def test_a_typical_network_that_memory_does_not_hold(monkeypatch):
+    def refuse(*_):
+        raise RuntimeError("can't allocate memory")
+
+    monkeypatch.setattr(torch.nn, "Linear", refuse)
+    with pytest.raises(ValueError, match=r"90,000\^2 weights, 32.4 GB.* smaller env.tote_size"):
+        typical(Rules(tote_size=(30, 30, 5)), mask_infeasible=False, filters=8)

@@ -145,11 +145,21 @@ class TypicalPolicy(FlatPolicy):
     with the fourth power of the tote's side: 50 MB at ``6x6``, 400 MB at ``10x10``, 32 GB at ``30x30`` with ``R=4``.
 
     Args: as :class:`FlatPolicy`.
+
+    Raises:
+        ValueError: for a layer that memory does not hold.
     """
 
     def __init__(self, rules: Rules, mask_infeasible: bool = False, **network):
         super().__init__(rules, mask_infeasible, **network)
-        self.join = nn.Linear(rules.num_actions, rules.num_actions)
+        try:
+            self.join = nn.Linear(rules.num_actions, rules.num_actions)
+        except RuntimeError as error:  # torch's way to say that there is no memory
+            size = 4 * rules.num_actions**2 / 1e9
+            raise ValueError(
+                f"model=typical: its last layer has {rules.num_actions:,}^2 weights, {size:.1f} GB, for which there "
+                "is no memory; expected a smaller env.tote_size or env.bin_size."
+            ) from error
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Logits ``[N, N_a]``."""
