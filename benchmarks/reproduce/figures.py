@@ -17,6 +17,7 @@ METHODS = {
     "typical": ("typical", "#009e73", "v"),
     "individual_rl": ("individual, RL", "#e69f00", "D"),
     "individual_heuristic": ("individual, heuristic", "#cc79a7", "D"),
+    "individual_heuristic_cells": ("individual, heuristic, every cell", "#7a3b69", "d"),
     "joint_dbl": ("joint DBL", "#000000", "P"),
     "mcts": ("MCTS", "#009e73", "X"),
     "random": ("random, feasible", "#8c8c8c", "x"),
@@ -130,6 +131,7 @@ def individual(results, path) -> bool:
             ("fcn4d", "fcn4d-R{}-s0-{}-K10"),
             ("individual_rl", "individual_rl-R{}-s0-{}-K10"),
             ("individual_heuristic", "individual_heuristic-R{}-{}"),
+            ("individual_heuristic_cells", "individual_heuristic_cells-R{}-{}"),
             ("joint_dbl", "joint_dbl-R{}-{}"),
             ("random", "random-R{}-{}"),
         ):
