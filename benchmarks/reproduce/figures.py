@@ -138,11 +138,14 @@ def individual(results, path) -> bool:
             points(part, rotations, [results.get(name.format(r, tote)) for r in rotations], method)
         part.set_title(tote, fontsize=10)
         part.set_xticks(rotations)
+        part.set_xlim(0.7, 4.3)
         part.set_ylim(0, 1.05)
     if not any(part.lines for part in axes):
         return False
-    figure.supxlabel("R, rotations that the robot may choose from")
-    figure.supylabel("occupancy")
+    for part in axes[3:]:
+        part.set_xlabel("R, rotations to choose from")
+    for part in axes[::3]:
+        part.set_ylabel("occupancy")
     legend(figure, axes, ncols=4)
     return save(figure, path)
 
@@ -233,7 +236,8 @@ def learning_curves(results, path) -> bool:
         part.xaxis.set_major_formatter(EngFormatter(sep=""))
         if part.lines:
             part.legend(fontsize=8, frameon=False, loc="lower right")
-    figure.supxlabel("frames")
+    for part in axes[4:]:
+        part.set_xlabel("frames")
     figure.supylabel("occupancy at 6x6x5, R=4, validation stream (band: least and greatest seed)")
     return save(figure, path)
 
