@@ -205,7 +205,7 @@ def learning_curves(results, path) -> bool:
     ):  # fmt: skip
         band(axes[0], results, [name.format(seed) for seed in seeds], method)
     panels = [
-        (1, "fcn4d: curriculum", {"fcn4d": "adaptive", "fcn4d_paper": "paper, 80,000 a level", "fcn4d_none": "none"}),
+        (1, "fcn4d: curriculum", {"fcn4d": "adaptive", "fcn4d_paper": "paper, 60,000 a level", "fcn4d_none": "none"}),
         (2, "fcn4d: masking", {"fcn4d": "no mask", "fcn4d_masked": "mask", "fcn4d_warm": "mask, warm start"}),
     ]
     for number, title, rows in panels:
