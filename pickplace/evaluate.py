@@ -70,11 +70,11 @@ def play(
         batch_size: episodes played side by side. It changes no result, but that of a planner that draws: which numbers
             an episode gets from the planner's one generator depends on the episodes beside it.
         record: numbers of the episodes to record move by move.
-        until: a time of ``time.monotonic()`` after which no further batch is begun; None: all episodes are played.
+        until: CPU time of this process (``time.process_time()``) after which no further batch is begun; None: never.
     """
     parts, recordings, feasible, decisions, seconds = [], [], 0.0, 0, 0.0
     for first in range(0, episodes, batch_size):
-        if parts and until is not None and time.monotonic() > until:
+        if parts and until is not None and time.process_time() > until:
             break
         env = make_env(first, min(batch_size, episodes - first))
         rules, count = env.rules, env.num_envs

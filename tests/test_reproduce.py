@@ -1,6 +1,7 @@
 """The comparison: its cells are commands that exist, and what it writes follows from the results."""
 
 import json
+import signal
 import sys
 from pathlib import Path
 
@@ -17,6 +18,7 @@ import claims  # noqa: E402
 import figures  # noqa: E402
 import placement_only  # noqa: E402
 import results  # noqa: E402
+import run  # noqa: E402
 
 TRAININGS, PARTS = cells.read()
 
@@ -70,7 +72,7 @@ def test_tables_say_what_is_missing_attempted_and_not_trained():
         "axes": {"tote": "6x6x5", "seed": 0},
         "frames": 1000,
         "frames_asked": 2000,
-        "training_seconds": 60,
+        "cpu_seconds": 60,
         "peak_mib": 900,
         "warm_start": 0,
         "curve": {"validation_occupancy": [0.2]},
@@ -80,7 +82,7 @@ def test_tables_say_what_is_missing_attempted_and_not_trained():
     found[cell.name] = result(0.21, episodes=100) | {"episodes": 5}
     row = results.table([cell], found)[-1]
     assert "0.2100 (0.2000 to 0.2200) | 5° | 2.0 ms | 1,000 frames of 2,000, 1 min, **not trained**" in row
-    found[cell.training] = {"attempted": "no memory", "seconds": 120, "peak_mib": 20480}
+    found[cell.training] = {"attempted": "no memory", "cpu_seconds": 120, "peak_mib": 20480}
     found[cell.name] = {"attempted": "its training"}
     assert "attempted: its training |  |  | attempted, 2 min, 20.0 GiB" in results.table([cell], found)[-1]
 
@@ -132,3 +134,21 @@ def test_a_plan_of_single_cells_can_be_executed_but_where_the_effector_collides(
 def test_results_are_written_as_json_that_can_be_read_again():
     for path in (FOLDER.parents[1] / "docs" / "results").rglob("*.json"):
         assert json.loads(path.read_text())["cell"] == path.stem
+
+
+def test_a_command_that_uses_up_its_budget_is_told_to_end(tmp_path):
+    child = run.Child([sys.executable, "-c", "print('busy', flush=True)\nwhile True: pass"], tmp_path / "log")
+    cost = child.wait(0.01)
+    assert (cost["rc"], child.last_words()) == (-signal.SIGTERM, "busy")
+    assert 0.6 <= cost["cpu_seconds"] < 30 and cost["peak_mib"] > 1
+
+
+def test_a_training_is_taken_up_where_its_budget_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "OUTPUTS", tmp_path)
+    overrides = ("experiment=smoke", "total_frames=2_000_000", "checkpoint_interval=2_000_000")
+    cell = cells.Cell("tiny", "train", overrides, "tiny", ())
+    first = run.train(cell, 0.15)
+    assert first["frames"] < first["frames_asked"] == 2_000_000
+    again = run.train(cell, 0.4)
+    assert again["frames"] > first["frames"] and again["cpu_seconds"] > first["cpu_seconds"]
+    assert again["curve"]["frames"][-1] == again["frames"]

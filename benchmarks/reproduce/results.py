@@ -74,8 +74,8 @@ def budget(cell, results) -> str:
     if trained is None:
         return "not yet"
     if "attempted" in trained:
-        return f"attempted, {trained['seconds'] / 60:.0f} min, {trained['peak_mib'] / 1024:.1f} GiB"
-    words = [f"{trained['frames']:,} frames", f"{trained['training_seconds'] / 60:.0f} min"]
+        return f"attempted, {trained['cpu_seconds'] / 60:.0f} min, {trained['peak_mib'] / 1024:.1f} GiB"
+    words = [f"{trained['frames']:,} frames", f"{trained['cpu_seconds'] / 60:.0f} min"]
     if trained["frames"] < trained["frames_asked"]:
         words[0] += f" of {trained['frames_asked']:,}"
     if trained["peak_mib"] > 4096:
