@@ -19,6 +19,7 @@ from torch import Tensor
 SCHEMA = 1
 PRETRAINED = Path(__file__).resolve().parent / "pretrained"  # weights that the package ships
 TENSORS, FACTS = "state.safetensors", "state.json"
+PREVIOUS = "previous"  # beside checkpoints/last, the one before it
 
 
 class CheckpointError(ValueError):
@@ -57,31 +58,45 @@ def unflatten(tensors: dict[str, Tensor], facts: dict) -> dict:
     return tree
 
 
-def write(folder: Path, state: dict, facts: dict) -> None:
+def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> None:
     """Write a checkpoint folder, replacing an older one as a whole.
 
     Args:
         folder: where the checkpoint shall be.
         state: nested dicts of tensors and plain values.
         facts: what to keep beside it as readable JSON: config, counters, metrics.
+        keep: the name under which the older one stays beside it; None: it is taken away.
+
+    Raises:
+        CheckpointError: if it cannot be written; the older one is whole, and nothing half-written stays.
     """
     folder = Path(folder)
     fresh, old = folder.with_name(f".{folder.name}.new"), folder.with_name(f".{folder.name}.old")
     tensors, rest = flatten(state)
-    shutil.rmtree(fresh, ignore_errors=True)
-    fresh.mkdir(parents=True)
     blob = save(tensors)
     digest = hashlib.sha256(blob).hexdigest()
     text = json.dumps({"schema": SCHEMA, "sha256": digest, **facts, "state": rest}, indent=1)
-    for name, content in ((TENSORS, blob), (FACTS, text.encode())):
-        with open(fresh / name, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)  # if we are killed right here, locate() finds the old one
-    fresh.rename(folder)
+    shutil.rmtree(fresh, ignore_errors=True)
+    try:
+        fresh.mkdir(parents=True)
+        for name, content in ((TENSORS, blob), (FACTS, text.encode())):
+            with open(fresh / name, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        if old.exists() and not folder.exists():  # a kill between the renames below left it so
+            old.rename(folder)
+        shutil.rmtree(old, ignore_errors=True)
+        if folder.exists():
+            folder.rename(old)  # if we are killed right here, locate() finds the old one
+        fresh.rename(folder)
+    except OSError as error:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise CheckpointError(f"{folder}: the checkpoint cannot be written ({error}).") from error
+    if keep is not None and old.exists():
+        kept = folder.with_name(keep)
+        shutil.rmtree(kept, ignore_errors=True)
+        old.rename(kept)
     shutil.rmtree(old, ignore_errors=True)
 
 
@@ -117,8 +132,25 @@ def read(folder: Path) -> tuple[dict, dict]:
     """Read a checkpoint folder: the state as written, and its facts.
 
     Raises:
-        CheckpointError: if a file is missing, truncated or altered, or of another schema.
+        CheckpointError: if a file is missing, truncated or altered, or of another schema; the sentence offers the
+            newest whole checkpoint beside it, if there is one.
     """
+    try:
+        return _read(folder)
+    except CheckpointError as error:
+        others = []
+        for other in [PREVIOUS, "last", "best"] if Path(folder).parent.name == "checkpoints" else []:
+            try:
+                others.append((_read(Path(folder).with_name(other))[1]["frames"], Path(folder).with_name(other)))
+            except CheckpointError:
+                continue
+        if not others:
+            raise
+        frames, other = max(others)
+        raise CheckpointError(f"{error} {other}, at {frames:,} frames, is whole.") from error
+
+
+def _read(folder: Path) -> tuple[dict, dict]:
     folder = Path(folder)
     try:
         facts = json.loads((folder / FACTS).read_bytes())

@@ -2,6 +2,7 @@
 
 import signal
 from collections import OrderedDict
+from contextlib import contextmanager
 from functools import partial
 
 import torch
@@ -73,6 +74,44 @@ def ignore_signals() -> None:
     the batch, saves, and closes the workers."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+
+
+@contextmanager
+def watched(collector):
+    """While inside, a worker process that dies raises an error in the main thread at once, whatever it waits for.
+
+    TorchRL 0.14.1 looks after its workers between waits only, and then ends them by a signal that ours ignore.
+
+    Raises:
+        ChildProcessError: saying which worker died, and how; the other ones are killed.
+    """
+    workers = getattr(collector, "procs", [])
+
+    def look(*_):
+        dead = [number for number, worker in enumerate(workers) if not worker.is_alive()]
+        if dead:  # first of all one that was killed: others may have ended because of it
+            number = min(dead, key=lambda number: workers[number].exitcode == 0)
+            code = workers[number].exitcode
+            raise ChildProcessError(f"collector worker {number} of {len(workers)} has died (exit code {code}).")
+
+    previous = signal.signal(signal.SIGCHLD, look)
+    try:
+        look()
+        yield
+    except (OSError, EOFError, RuntimeError) as error:
+        signal.signal(signal.SIGCHLD, previous)
+        for worker in workers:  # a broken pipe may tell of a death before the signal does
+            worker.join(0.5)
+        try:
+            look()
+        except ChildProcessError as death:
+            for worker in workers:
+                worker.kill()
+                worker.join()
+            raise death from error
+        raise
+    finally:
+        signal.signal(signal.SIGCHLD, previous)
 
 
 def single(make_env, policy, num_envs: int, rollout_length: int, seed: int) -> Collector:

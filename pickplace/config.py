@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 PACKAGE = Path(__file__).resolve().parent
+LOCK = ".lock"  # in a run folder, held by the process that trains there
 
 
 def conf_dir() -> Path:
@@ -294,7 +295,7 @@ def _tidy():
             run_dir = None if OmegaConf.is_missing(cfg.runtime, "output_dir") else cfg.runtime.output_dir
             sweep_dir = cfg.sweep.dir if cfg.mode == RunMode.MULTIRUN else None
             logging.shutdown()
-            for folder, notes in ((run_dir, {".hydra", f"{cfg.job.name}.log"}), (sweep_dir, {"multirun.yaml"})):
+            for folder, notes in ((run_dir, {".hydra", LOCK, f"{cfg.job.name}.log"}), (sweep_dir, {"multirun.yaml"})):
                 if folder and os.path.isdir(folder) and set(os.listdir(folder)) <= notes:
                     shutil.rmtree(folder, ignore_errors=True)
         raise

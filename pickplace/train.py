@@ -5,10 +5,12 @@ import os
 import signal
 import sys
 import time
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
 import torch
+from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -19,7 +21,7 @@ from torchrl.objectives import A2CLoss, ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from pickplace import checkpoint, config
-from pickplace.collector import rng_state, set_rng_state
+from pickplace.collector import rng_state, set_rng_state, watched
 from pickplace.curriculum import Curriculum, push_level
 from pickplace.evaluate import Episodes, commit, confidence95, play, versions
 from pickplace.geometry import Failure
@@ -45,6 +47,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
     check_settings(cfg)
     if cfg.resume is not None and resume is None:
         raise ValueError(f"resume={cfg.resume}: expected as resume=<run folder> on the command line, without a +.")
+    lock = claim(run_dir) if resume is None else None
     algo, device = cfg.algo, config.use_machine(cfg)
     torch.manual_seed(cfg.seed)
 
@@ -111,9 +114,16 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
             "versions": versions(),
             "commit": commit(),
         }
-        checkpoint.write(run_dir / "checkpoints" / name, state, facts)
+        keep = checkpoint.PREVIOUS if name == "last" else None
+        checkpoint.write(run_dir / "checkpoints" / name, state, facts, keep)
 
-    try:
+    with ExitStack() as cleanup:
+        cleanup.callback(lock.release if lock else lambda: None)
+        cleanup.callback(stop.restore)
+        cleanup.callback(collector.shutdown)
+        cleanup.callback(logger.close)
+        cleanup.enter_context(saying_what_is_safe(run_dir, lambda: saved))
+        cleanup.enter_context(watched(collector))
         batches = iter(collector)
         while frames < cfg.total_frames and not stop.requested:
             # Collect a batch, [num_envs, rollout_length].
@@ -168,10 +178,6 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
                 log.info(progress_line(frames, cfg.total_frames, speed, curriculum, metrics))
         if saved != frames:  # after the loop, so that a stop request is never missed
             save("last")
-    finally:
-        logger.close()
-        collector.shutdown()
-        stop.restore()
 
     if stop.requested:  # a sweep ends here too, instead of going on to its next job
         log.info("stopped at %s frames; continue with: python -m pickplace.train resume=%s", f"{frames:,}", run_dir)
@@ -288,10 +294,9 @@ def update(loss, optimizer, data: TensorDictBase, algo: DictConfig, policy, phas
             optimizer.zero_grad(set_to_none=True)
             total.backward()
             norm = torch.nn.utils.clip_grad_norm_(loss.parameters(), algo.max_grad_norm)
-            if not torch.isfinite(norm):
-                raise FloatingPointError(
-                    f"the gradient is not finite (loss {total.item()}); the last checkpoint is good."
-                )
+            if not torch.isfinite(norm + total.detach()):
+                parts = {key: value.detach() for key, value in losses.items() if key.startswith("loss_")}
+                raise FloatingPointError(f"the loss or its gradient is not finite: {extremes({**parts, **part})}.")
             optimizer.step()
             steps += 1
             for name, key in DIAGNOSTICS.items():
@@ -300,6 +305,18 @@ def update(loss, optimizer, data: TensorDictBase, algo: DictConfig, policy, phas
                 totals[name] = totals.get(name, 0.0) + losses[key].detach()
             totals["grad_norm"] = totals.get("grad_norm", 0.0) + norm
     return {f"train/{name}": float(value) / steps for name, value in totals.items()}
+
+
+def extremes(values) -> str:
+    """Least and greatest of each floating-point tensor, and how much of it is not finite, for a message."""
+    words = []
+    for name, value in values.items():
+        if value.is_floating_point():
+            finite = value[value.isfinite()]
+            text = f"{finite.min():.3g} to {finite.max():.3g}" if len(finite) else "no number"
+            bad = value.numel() - len(finite)
+            words.append(f"{name} {text}" + f" ({bad} of {value.numel()} not finite)" * bool(bad))
+    return "; ".join(words)
 
 
 DIAGNOSTICS = {
@@ -379,6 +396,34 @@ class StopRequest:
             signal.signal(number, handler)
 
 
+def claim(run_dir: Path) -> FileLock:
+    """Hold a run folder for this process, until it is released or the process is gone, however it went.
+
+    Raises:
+        ValueError: if another process holds it.
+    """
+    lock = FileLock(Path(run_dir) / config.LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ValueError(
+            f"{run_dir}: another process is training there; expected another run folder, or to wait for it."
+        ) from None
+    return lock
+
+
+@contextmanager
+def saying_what_is_safe(run_dir: Path, saved):
+    """Add to what ends a training where it can be taken up: ``saved()`` is the number of frames of the last save."""
+    try:
+        yield
+    except (FloatingPointError, ChildProcessError, checkpoint.CheckpointError) as error:
+        safe = "Nothing had been saved before."
+        if saved():
+            safe = f"What was saved at {saved():,} frames is whole: python -m pickplace.train resume={run_dir}"
+        raise type(error)(f"{error} {safe}") from error
+
+
 #: What the state of running episodes is tied to.
 RULES = ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "min_support", "strict_support")
 FIXED = ("seed", *(f"env.{key}" for key in RULES), "env.num_envs", "items", "algo.mask_infeasible", "collector.workers")
@@ -391,6 +436,7 @@ def resume_run(overrides: list[str]) -> float:
     if folder.parent.name != "checkpoints":
         raise ValueError(f"resume={place}: expected a run folder, or its checkpoints/last or checkpoints/best.")
     run_dir = folder.parent.parent
+    lock = claim(run_dir)  # before reading what another process may be writing
     state, facts = checkpoint.read(folder)
     if missing := [key for key in ("curriculum", *COUNTERS) if key not in facts]:
         raise ValueError(f"resume={place}: the checkpoint has no {missing[0]!r}; expected one that a training wrote.")
@@ -411,7 +457,8 @@ def resume_run(overrides: list[str]) -> float:
     handlers = [logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log")]
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
     log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
-    return train(cfg, run_dir, (state, facts))
+    with lock:
+        return train(cfg, run_dir, (state, facts))
 
 
 def main() -> None:

@@ -61,8 +61,9 @@ def test_a_kill_while_writing_leaves_the_old_one(tmp_path, monkeypatch):
         raise OSError("No space left on device")
 
     monkeypatch.setattr(checkpoint.os, "fsync", full)
-    with pytest.raises(OSError):
+    with pytest.raises(CheckpointError, match="cannot be written .No space left on device"):
         checkpoint.write(folder, {"policy": {}, "x": torch.zeros(2)}, {"frames": 2, "config": {}})
+    assert [path.name for path in tmp_path.iterdir()] == ["last"]
     monkeypatch.undo()
     assert checkpoint.read(folder)[1]["frames"] == 1
     checkpoint.write(folder, {"policy": {}, "x": torch.zeros(2)}, {"frames": 3, "config": {}})

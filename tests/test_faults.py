@@ -1,0 +1,114 @@
+"""What goes wrong on shared machines overnight: nothing is lost, and one sentence says what to do."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from hydra import compose, initialize_config_dir
+from test_resume import start, wait_for_rows
+
+from pickplace import checkpoint, config
+from pickplace.train import claim, train
+
+ENDLESS = ["experiment=smoke", "total_frames=10_000_000", "threads=1"]
+
+
+def test_a_dead_worker_ends_the_run_in_one_sentence(tmp_path):
+    run_dir = tmp_path / "run"
+    process = start(*ENDLESS, "collector=multi_sync", f"hydra.run.dir={run_dir}")
+    wait_for_rows(process, run_dir, 4)
+    children = subprocess.run(["pgrep", "-f", "-P", str(process.pid), "spawn_main"], capture_output=True, text=True)
+    os.kill(int(children.stdout.split()[-1]), signal.SIGKILL)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 2
+    sentence = error.strip().splitlines()[-1]
+    assert sentence.startswith("error: collector worker 1 of 2 has died (exit code -9). What was saved at ")
+    assert sentence.endswith(f"frames is whole: python -m pickplace.train resume={run_dir}")
+    assert checkpoint.read(run_dir / "checkpoints" / "last")
+
+
+def test_a_second_process_in_the_same_run_folder_is_refused(tmp_path):
+    run_dir = tmp_path / "run"
+    first = start(*ENDLESS, f"hydra.run.dir={run_dir}")
+    try:
+        wait_for_rows(first, run_dir, 4)
+        for second in (start(f"resume={run_dir}"), start(*ENDLESS, f"hydra.run.dir={run_dir}")):
+            _, error = second.communicate(timeout=120)
+            assert second.returncode == 2
+            assert error.strip().splitlines()[-1] == (
+                f"error: {run_dir}: another process is training there; expected another run folder, or to wait for it."
+            )
+        assert first.poll() is None
+    finally:
+        first.kill()
+        first.wait()
+    claim(run_dir).release()  # a killed process holds nothing
+
+
+@pytest.fixture
+def smoke():
+    """Trains experiment=smoke in this process."""
+
+    def run(run_dir, *overrides):
+        with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
+            cfg = compose("train", ["experiment=smoke", "threads=1", *overrides])
+        run_dir.mkdir(exist_ok=True)
+        return train(cfg, run_dir)
+
+    return run
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_with_a_summary(smoke, tmp_path):
+    with pytest.raises(FloatingPointError) as caught:
+        smoke(tmp_path / "run", "algo.reward_scale=1e38")
+    message = str(caught.value)
+    assert message.startswith("the loss or its gradient is not finite: loss_")
+    assert "advantage" in message and "not finite)" in message
+    assert message.endswith("Nothing had been saved before.")
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_a_full_disk_ends_the_run_and_the_checkpoint_before_is_whole(smoke, tmp_path, monkeypatch):
+    run_dir, synced, fsync = tmp_path / "run", [], os.fsync
+
+    def full(number):
+        synced.append(number)
+        if len(synced) > 4:  # the third save: best and last of the first 256 frames went well
+            raise OSError(28, "No space left on device")
+        fsync(number)
+
+    monkeypatch.setattr(checkpoint.os, "fsync", full)
+    with pytest.raises(checkpoint.CheckpointError, match="cannot be written .*No space left.* at 256 frames is whole"):
+        smoke(run_dir, "total_frames=2048")
+    monkeypatch.undo()
+    assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 256
+    assert not [path for path in (run_dir / "checkpoints").iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "remove"])
+def test_a_damaged_checkpoint_is_refused_and_the_one_before_is_offered(smoke, tmp_path, damage):
+    run_dir = tmp_path / "run"
+    smoke(run_dir, "total_frames=1024", "evaluation_interval=1024")
+    names = sorted(path.name for path in (run_dir / "checkpoints").iterdir())
+    assert names == ["best", "last", "previous"]
+    tensors = run_dir / "checkpoints" / "last" / checkpoint.TENSORS
+    blob = bytearray(tensors.read_bytes())
+    blob[len(blob) // 2] ^= 1
+    if damage == "remove":
+        tensors.unlink()
+    else:
+        tensors.write_bytes(blob if damage == "flip" else blob[:-1])
+    result = subprocess.run(
+        [sys.executable, "-m", "pickplace.train", f"resume={run_dir}", "total_frames=2048"],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert result.returncode == 2
+    assert f"{run_dir}/checkpoints/best, at 1,024 frames, is whole." in result.stderr
+    resumed = subprocess.run(
+        [sys.executable, "-m", "pickplace.train", f"resume={run_dir}/checkpoints/previous", "total_frames=2048"],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert resumed.returncode == 0, resumed.stderr
+    assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 2048
