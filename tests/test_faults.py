@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -112,3 +113,13 @@ def test_a_damaged_checkpoint_is_refused_and_the_one_before_is_offered(smoke, tm
     )  # fmt: skip
     assert resumed.returncode == 0, resumed.stderr
     assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 2048
+
+
+def test_chaos_in_short(tmp_path):
+    """``make chaos`` kills it a hundred times, with either collector."""
+    result = subprocess.run(
+        [sys.executable, str(Path(__file__).parent / "chaos.py"), "4"],
+        env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert "killed 4 times" in result.stdout
