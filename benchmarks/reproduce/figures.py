@@ -236,6 +236,9 @@ def learning_curves(results, path) -> bool:
         part.xaxis.set_major_formatter(EngFormatter(sep=""))
         if part.lines:
             part.legend(fontsize=8, frameon=False, loc="lower right")
+        else:
+            part.set_xticks([])
+            part.text(0.5, 0.5, "not computed yet", transform=part.transAxes, ha="center", color="#8c8c8c")
     for part in axes[4:]:
         part.set_xlabel("frames")
     figure.supylabel("occupancy at 6x6x5, R=4, validation stream (band: least and greatest seed)")
@@ -318,8 +321,8 @@ def presets(results, path) -> bool:
 
 OUTCOMES = {
     "executed": ("executed", "#0072b2"),
-    "effector_collides": ("the effector would collide, or no grasp reaches it", "#d55e00"),
-    "rests_elsewhere": ("the item would rest elsewhere", "#e69f00"),
+    "effector_collides": ("out of the effector's reach", "#d55e00"),
+    "rests_elsewhere": ("rests elsewhere", "#e69f00"),
     "unstable": ("unstable", "#cc79a7"),
 }
 
@@ -327,6 +330,8 @@ OUTCOMES = {
 def placement_only(results, path) -> bool:
     rows = {name: result for name, result in results.items() if result.get("kind") == "placement_only"}
     rows = {name: result for name, result in rows.items() if "placements" in result}
+    place = {f"-{tote}": number for number, tote in enumerate(TOTES)}
+    rows = dict(sorted(rows.items(), key=lambda row: (*row[0].split("-")[:2], place[row[0][row[0].rindex("-") :]])))
     if not rows:
         return False
     figure, (left, right) = canvas(10, 0.32 * len(rows) + 1.8, 1, 2, sharey=True)
@@ -336,11 +341,12 @@ def placement_only(results, path) -> bool:
         share = np.array([r["placements"].get(key, 0) / sum(r["placements"].values()) for r in rows.values()])
         left.barh(names, share, left=start, color=colour, label=text)
         start += share
+    left.set_xlim(0, 1)
     left.set_xlabel("share of the plan's placements")
     left.invert_yaxis()
     for key, text, marker, colour in (
         ("occupancy_planned", "planned", "o", "#8c8c8c"),
-        ("occupancy", "when the first placement cannot be executed", "s", "#0072b2"),
+        ("occupancy", "when the first placement fails", "s", "#0072b2"),
     ):
         mean = np.array([r[key]["mean"] for r in rows.values()])
         low, high = np.array([r[key]["ci95"] for r in rows.values()]).T
