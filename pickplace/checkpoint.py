@@ -152,6 +152,9 @@ def read(folder: Path) -> tuple[dict, dict]:
 
 def _read(folder: Path) -> tuple[dict, dict]:
     folder = Path(folder)
+    for name in (FACTS, TENSORS):
+        if (folder / name).is_symlink():
+            raise CheckpointError(f"{folder}: {name} is a link; expected a file of the checkpoint itself.")
     try:
         facts = json.loads((folder / FACTS).read_bytes())
         blob = (folder / TENSORS).read_bytes()
@@ -176,18 +179,23 @@ def _read(folder: Path) -> tuple[dict, dict]:
     return state, facts
 
 
-def load_module(module: torch.nn.Module, state: dict, what: str) -> None:
-    """Load parameters into a module.
+def restore(make, state: dict, what: str) -> torch.nn.Module:
+    """The module that ``make()`` makes, with a checkpoint's tensors.
+
+    Sizes are compared before any memory is taken: a config that asks for more than there is cannot fit the tensors.
 
     Raises:
-        CheckpointError: naming the first parameter that is missing, unexpected or of another shape.
+        CheckpointError: naming the first tensor that is missing, unexpected or of another shape.
     """
-    own = module.state_dict()
+    with torch.device("meta"):
+        own = make().state_dict()
     for key in sorted({*own, *state}):
         mine = tuple(own[key].shape) if key in own else None
-        theirs = tuple(state[key].shape) if key in state else None
+        theirs = tuple(state[key].shape) if isinstance(state.get(key), Tensor) else None
         if mine != theirs:
             raise CheckpointError(
                 f"The checkpoint's {what} does not fit these settings: {key} has shape {theirs}, expected {mine}."
             )
+    module = make()
     module.load_state_dict(state)
+    return module

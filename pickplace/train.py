@@ -56,20 +56,24 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
     build_env = partial(config.instantiate, cfg.env, items=items, device=cfg.device)
     probe = build_env(num_envs=1, masks=())
     rules = probe.rules
-    policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=algo.mask_infeasible).to(device)
+    state, facts = resume or ({}, {})
+
+    def build(what: str, make) -> torch.nn.Module:
+        return (checkpoint.restore(make, state[what], what) if resume else make()).to(device)
+
+    make_policy = partial(config.instantiate, cfg.model.actor, rules=rules, mask_infeasible=algo.mask_infeasible)
+    policy = build("policy", make_policy)
     for warning in check_sizes(policy, rules):
         log.warning(warning)
     planner = config.instantiate(cfg.planner, rules=rules, policy=policy)  # the one that validates
     warm_start = WarmStart(cfg.warm_start, policy, rules, items, cfg.seed)
-    critic = ValueOperator(config.instantiate(cfg.model.critic, rules=rules), ["bin_depth", "tote_depth"]).to(device)
+    make_critic = partial(config.instantiate, cfg.model.critic, rules=rules)
+    critic = build("critic", lambda: ValueOperator(make_critic(), ["bin_depth", "tote_depth"]))
     curriculum: Curriculum = config.instantiate(cfg.curriculum)
     curriculum.setup(probe.min_tote_height, rules.tote_size[2], cfg.total_frames)
-    state, facts = resume or ({}, {})
     frames, iteration, best, latest = (facts.get(k, d) for k, d in COUNTERS.items())
     if resume:
         curriculum.load_state_dict(facts["curriculum"])
-        checkpoint.load_module(policy, state["policy"], "policy")
-        checkpoint.load_module(critic, state["critic"], "critic")
     if warning := curriculum.check_budget(cfg.total_frames, cfg.env.num_envs * algo.rollout_length):
         log.warning(warning)
 

@@ -1,5 +1,10 @@
 """Checkpoints: what goes in comes out, and a reader never meets half of one."""
 
+import hashlib
+import json
+import pickle
+import shutil
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -80,12 +85,67 @@ def test_locate_knows_runs_and_checkpoints(tmp_path):
         checkpoint.locate(tmp_path / "elsewhere")
 
 
-def test_load_module_names_what_does_not_fit():
-    module = torch.nn.Linear(2, 3)
+def test_restore_names_what_does_not_fit():
+    def make():
+        return torch.nn.Linear(2, 3)
+
+    state = torch.nn.Linear(2, 3).state_dict()
+    assert torch.equal(checkpoint.restore(make, state, "policy").weight, state["weight"])
     with pytest.raises(CheckpointError, match=r"policy does not fit these settings: weight has shape \(4, 2\)"):
-        checkpoint.load_module(module, torch.nn.Linear(2, 4).state_dict() | {"bias": torch.zeros(3)}, "policy")
+        checkpoint.restore(make, torch.nn.Linear(2, 4).state_dict() | {"bias": torch.zeros(3)}, "policy")
     with pytest.raises(CheckpointError, match="bias has shape None"):
-        checkpoint.load_module(module, {"weight": torch.zeros(3, 2)}, "policy")
+        checkpoint.restore(make, {"weight": torch.zeros(3, 2)}, "policy")
+    with pytest.raises(CheckpointError, match="bias has shape None"):
+        checkpoint.restore(make, {"weight": torch.zeros(3, 2), "bias": 3}, "policy")
+
+
+def test_a_config_that_asks_for_more_memory_than_there_is_takes_none():
+    with pytest.raises(CheckpointError, match="bias has shape .3,., expected .10000000000,."):
+        checkpoint.restore(lambda: torch.nn.Linear(2, 10**10), torch.nn.Linear(2, 3).state_dict(), "policy")
+
+
+@pytest.mark.parametrize("name", [checkpoint.FACTS, checkpoint.TENSORS])
+def test_links_are_refused(tmp_path, name):
+    folder = tmp_path / "last"
+    checkpoint.write(folder, {"policy": {}}, {"frames": 1, "config": {}})
+    (folder / name).rename(tmp_path / name)
+    (folder / name).symlink_to(tmp_path / name)
+    with pytest.raises(CheckpointError, match=f"{name} is a link"):
+        checkpoint.read(folder)
+
+
+class Evil:
+    """Unpickling it makes a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+@pytest.mark.parametrize("name", [checkpoint.TENSORS, checkpoint.FACTS, "state.pt", "checkpoint.pkl", ""])
+def test_a_pickle_is_never_run_whatever_its_name(tmp_path, name):
+    folder, made = tmp_path / "run" / "checkpoints" / "last", tmp_path / "made"
+    checkpoint.write(folder, {"policy": {}}, {"frames": 1, "config": {}})
+    blob = pickle.dumps(Evil(made))
+    assert pickle.loads(blob) and made.unlink() is None  # it would
+    if name == checkpoint.TENSORS:  # with the right checksum
+        facts = json.loads((folder / checkpoint.FACTS).read_text())
+        facts["sha256"] = hashlib.sha256(blob).hexdigest()
+        (folder / checkpoint.FACTS).write_text(json.dumps(facts))
+    if name:
+        (folder / name).write_bytes(blob)
+    else:
+        shutil.rmtree(folder)
+        folder.write_bytes(blob)
+    if name in (checkpoint.TENSORS, checkpoint.FACTS, ""):
+        with pytest.raises(CheckpointError) as caught:
+            checkpoint.read(checkpoint.locate(folder))
+        assert "\n" not in str(caught.value)
+    else:
+        checkpoint.read(checkpoint.locate(folder))
+    assert not made.exists()
 
 
 def test_metrics_survive_a_cut_line_and_a_resume(tmp_path):

@@ -1,5 +1,7 @@
 """The planner that follows a trained policy."""
 
+from functools import partial
+
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -125,9 +127,8 @@ def restore_policy(cfg: DictConfig, rules: Rules, state: dict, trained_rotations
         raise ValueError(
             f"env.rotations={rules.rotations}: the checkpoint was trained with {trained_rotations}; expected no more."
         )
-    policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=cfg.algo.mask_infeasible)
-    checkpoint.load_module(policy, state, "policy")
-    return policy.eval()
+    make = partial(config.instantiate, cfg.model.actor, rules=rules, mask_infeasible=cfg.algo.mask_infeasible)
+    return checkpoint.restore(make, state, "policy").eval()
 
 
 def restore_critic(cfg: DictConfig, rules: Rules, state: dict, trained_tote: list[int]):
@@ -141,9 +142,13 @@ def restore_critic(cfg: DictConfig, rules: Rules, state: dict, trained_tote: lis
     """
     if "critic" not in state:
         return None
-    critic = ValueOperator(config.instantiate(cfg.model.critic, rules=rules), ["bin_depth", "tote_depth"])
-    if tuple(trained_tote[:2]) != rules.tote_size[:2] and not getattr(critic.module, "any_size", False):
+
+    def make():
+        return ValueOperator(config.instantiate(cfg.model.critic, rules=rules), ["bin_depth", "tote_depth"])
+
+    with torch.device("meta"):
+        any_size = getattr(make().module, "any_size", False)
+    if tuple(trained_tote[:2]) != rules.tote_size[:2] and not any_size:
         return None
-    checkpoint.load_module(critic, state["critic"], "critic")
-    critic = critic.module.to(cfg.device).eval()
+    critic = checkpoint.restore(make, state["critic"], "critic").module.to(cfg.device).eval()
     return lambda bin_depth, tote_depth: critic(bin_depth, tote_depth) / cfg.algo.reward_scale
