@@ -90,13 +90,13 @@ def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> No
         if folder.exists():
             folder.rename(old)  # if we are killed right here, locate() finds the old one
         fresh.rename(folder)
+        if keep is not None and old.exists():
+            kept = folder.with_name(keep)
+            shutil.rmtree(kept, ignore_errors=True)
+            old.rename(kept)
     except OSError as error:
         shutil.rmtree(fresh, ignore_errors=True)
         raise CheckpointError(f"{folder}: the checkpoint cannot be written ({error}).") from error
-    if keep is not None and old.exists():
-        kept = folder.with_name(keep)
-        shutil.rmtree(kept, ignore_errors=True)
-        old.rename(kept)
     shutil.rmtree(old, ignore_errors=True)
 
 
@@ -123,8 +123,8 @@ def locate(path, prefer: str = "best") -> Path:
             if (candidate / FACTS).is_file():
                 return candidate
     raise CheckpointError(
-        f"checkpoint={str(path)!r}: no checkpoint there; expected a run folder, or its checkpoints/last or "
-        "checkpoints/best."
+        f"checkpoint={str(path)!r}: no checkpoint there; expected a run folder, or one of its checkpoints: best, last "
+        "or previous."
     )
 
 

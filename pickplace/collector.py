@@ -9,6 +9,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
 
+from pickplace.config import WorkerDied
+
 
 class ResumableCollector(Collector):
     """A ``Collector`` whose ``state_dict`` also holds the base environment, the carried TensorDict and the process's
@@ -83,7 +85,7 @@ def watched(collector):
     TorchRL 0.14.1 looks after its workers between waits only, and then ends them by a signal that ours ignore.
 
     Raises:
-        ChildProcessError: saying which worker died, and how; the other ones are killed.
+        WorkerDied: saying which worker died, and how; the other ones are killed.
     """
     workers = getattr(collector, "procs", [])
 
@@ -92,23 +94,23 @@ def watched(collector):
         if dead:  # first of all one that was killed: others may have ended because of it
             number = min(dead, key=lambda number: workers[number].exitcode == 0)
             code = workers[number].exitcode
-            raise ChildProcessError(f"collector worker {number} of {len(workers)} has died (exit code {code}).")
+            raise WorkerDied(f"collector worker {number + 1} of {len(workers)} has died (exit code {code}).")
 
     previous = signal.signal(signal.SIGCHLD, look)
     try:
-        look()
-        yield
-    except (OSError, EOFError, RuntimeError) as error:
-        signal.signal(signal.SIGCHLD, previous)
-        for worker in workers:  # a broken pipe may tell of a death before the signal does
-            worker.join(0.5)
         try:
             look()
-        except ChildProcessError as death:
-            for worker in workers:
-                worker.kill()
-                worker.join()
-            raise death from error
+            yield
+        except (OSError, EOFError, RuntimeError):
+            for worker in workers:  # a broken pipe may tell of a death before the signal does
+                worker.join(0.5)
+            look()
+            raise
+    except WorkerDied:
+        signal.signal(signal.SIGCHLD, previous)
+        for worker in workers:
+            worker.kill()
+            worker.join()
         raise
     finally:
         signal.signal(signal.SIGCHLD, previous)

@@ -5,7 +5,7 @@ import os
 import re
 import shutil
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -203,8 +203,12 @@ def sentence(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())} (HYDRA_FULL_ERROR=1 shows where)"
 
 
-#: What users cause; anything else may be a fault of the program, and its kind is told too.
-EXPECTED = (ValueError, OSError, FloatingPointError, HydraException, OmegaConfBaseException)
+class WorkerDied(Exception):
+    """A collector worker process is gone. Not an OSError: much code around signals takes those for its own."""
+
+
+#: What users or their machines cause; anything else may be a fault of the program, and its kind is told too.
+EXPECTED = (ValueError, OSError, FloatingPointError, WorkerDied, HydraException, OmegaConfBaseException)
 
 
 @contextmanager
@@ -284,6 +288,18 @@ def _composed_without(key: str, config_name: str, overrides: list[str]) -> DictC
             return hydra.compose(config_name)
 
 
+def _claimed(folder: str) -> bool:
+    """Does another process train in a run folder?"""
+    from filelock import FileLock, Timeout
+
+    path = Path(folder) / LOCK
+    try:
+        with FileLock(path, timeout=0) if path.exists() else nullcontext():
+            return False
+    except Timeout:
+        return True
+
+
 @contextmanager
 def _tidy():
     """Take away the folders of a run or sweep that failed, if nothing but Hydra's own notes is in them."""
@@ -296,6 +312,6 @@ def _tidy():
             sweep_dir = cfg.sweep.dir if cfg.mode == RunMode.MULTIRUN else None
             logging.shutdown()
             for folder, notes in ((run_dir, {".hydra", LOCK, f"{cfg.job.name}.log"}), (sweep_dir, {"multirun.yaml"})):
-                if folder and os.path.isdir(folder) and set(os.listdir(folder)) <= notes:
+                if folder and os.path.isdir(folder) and set(os.listdir(folder)) <= notes and not _claimed(folder):
                     shutil.rmtree(folder, ignore_errors=True)
         raise

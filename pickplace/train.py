@@ -33,21 +33,34 @@ from pickplace.warm_start import Phase, WarmStart, imitation_loss
 log = logging.getLogger(__name__)
 
 
-def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = None) -> float:
-    """Train a policy as the config says.
+def train(cfg: DictConfig, run_dir: Path) -> float:
+    """Train a policy as the config says, in a run folder that no other process trains in.
 
     Args:
         cfg: the composed config, see ``conf/train.yaml``.
         run_dir: where checkpoints, metrics and figures go.
-        resume: state and facts of the checkpoint to continue from, as :func:`pickplace.checkpoint.read` gives them.
 
     Returns:
         Mean occupancy of the final policy at full tote height on the validation stream, for sweepers to optimise.
     """
-    check_settings(cfg)
-    if cfg.resume is not None and resume is None:
+    if cfg.resume is not None:
         raise ValueError(f"resume={cfg.resume}: expected as resume=<run folder> on the command line, without a +.")
-    lock = claim(run_dir) if resume is None else None
+    with claim(run_dir):
+        return run(cfg, run_dir)
+
+
+def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None = None) -> float:
+    """The training itself, from its beginning or from a checkpoint.
+
+    Args:
+        cfg, run_dir: as of :func:`train`.
+        resume: state and facts of the checkpoint to continue from, as :func:`pickplace.checkpoint.read` gives them,
+            and its folder.
+
+    Returns:
+        As :func:`train`.
+    """
+    check_settings(cfg)
     algo, device = cfg.algo, config.use_machine(cfg)
     torch.manual_seed(cfg.seed)
 
@@ -56,7 +69,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
     build_env = partial(config.instantiate, cfg.env, items=items, device=cfg.device)
     probe = build_env(num_envs=1, masks=())
     rules = probe.rules
-    state, facts = resume or ({}, {})
+    state, facts, safe = resume or ({}, {}, None)  # safe: the checkpoint that was read or written last
 
     def build(what: str, make) -> torch.nn.Module:
         return (checkpoint.restore(make, state[what], what) if resume else make()).to(device)
@@ -104,6 +117,7 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
     log.info("%s frames to train, at tote height %d of %d", f"{left:,}", curriculum.level, curriculum.end)
 
     def save(name: str) -> None:
+        nonlocal safe
         state = {
             "policy": policy.state_dict(),
             "critic": critic.state_dict(),
@@ -120,13 +134,13 @@ def train(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict] | None = Non
         }
         keep = checkpoint.PREVIOUS if name == "last" else None
         checkpoint.write(run_dir / "checkpoints" / name, state, facts, keep)
+        safe = run_dir / "checkpoints" / name
 
     with ExitStack() as cleanup:
-        cleanup.callback(lock.release if lock else lambda: None)
         cleanup.callback(stop.restore)
         cleanup.callback(collector.shutdown)
         cleanup.callback(logger.close)
-        cleanup.enter_context(saying_what_is_safe(run_dir, lambda: saved))
+        cleanup.enter_context(saying_what_is_safe(lambda: safe))
         cleanup.enter_context(watched(collector))
         batches = iter(collector)
         while frames < cfg.total_frames and not stop.requested:
@@ -400,8 +414,9 @@ class StopRequest:
             signal.signal(number, handler)
 
 
-def claim(run_dir: Path) -> FileLock:
-    """Hold a run folder for this process, until it is released or the process is gone, however it went.
+@contextmanager
+def claim(run_dir: Path):
+    """Hold a run folder for this process, until the end of the block or of the process, however it ends.
 
     Raises:
         ValueError: if another process holds it.
@@ -413,19 +428,24 @@ def claim(run_dir: Path) -> FileLock:
         raise ValueError(
             f"{run_dir}: another process is training there; expected another run folder, or to wait for it."
         ) from None
-    return lock
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 @contextmanager
-def saying_what_is_safe(run_dir: Path, saved):
-    """Add to what ends a training where it can be taken up: ``saved()`` is the number of frames of the last save."""
+def saying_what_is_safe(safe):
+    """Add to what ends a training the checkpoint, ``safe()``, from which it can be taken up."""
     try:
         yield
-    except (FloatingPointError, ChildProcessError, checkpoint.CheckpointError) as error:
-        safe = "Nothing had been saved before."
-        if saved():
-            safe = f"What was saved at {saved():,} frames is whole: python -m pickplace.train resume={run_dir}"
-        raise type(error)(f"{error} {safe}") from error
+    except (FloatingPointError, config.WorkerDied, checkpoint.CheckpointError) as error:
+        hint = "Nothing had been saved before."
+        if folder := safe():
+            # The same batch would lead to the same numbers.
+            other = " algo.lr=<a smaller one>" if isinstance(error, FloatingPointError) else ""
+            hint = f"What was saved before is whole: python -m pickplace.train resume={folder}{other}"
+        raise type(error)(f"{error} {hint}") from error
 
 
 #: What the state of running episodes is tied to.
@@ -438,16 +458,28 @@ def resume_run(overrides: list[str]) -> float:
     place = next(item for item in overrides if item.startswith("resume=")).partition("=")[2]
     folder = checkpoint.locate(place, prefer="last")
     if folder.parent.name != "checkpoints":
-        raise ValueError(f"resume={place}: expected a run folder, or its checkpoints/last or checkpoints/best.")
+        raise ValueError(f"resume={place}: expected a run folder, or one of its checkpoints: last, best or previous.")
     run_dir = folder.parent.parent
-    lock = claim(run_dir)  # before reading what another process may be writing
-    state, facts = checkpoint.read(folder)
+    with claim(run_dir):  # before reading what another process may be writing
+        state, facts = checkpoint.read(folder)
+        cfg = resumed_config(place, facts, [item for item in overrides if not item.startswith("resume=")])
+        handlers = [logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log")]
+        logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
+        log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
+        return run(cfg, run_dir, (state, facts, folder))
+
+
+def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
+    """A checkpoint's config with overrides of values on top.
+
+    Raises:
+        ValueError: for a checkpoint that no training wrote, or a change that a resumed run cannot follow.
+    """
     if missing := [key for key in ("curriculum", *COUNTERS) if key not in facts]:
         raise ValueError(f"resume={place}: the checkpoint has no {missing[0]!r}; expected one that a training wrote.")
     config.refuse_foreign_targets(facts["config"])
-    rest = [item for item in overrides if not item.startswith("resume=")]
     saved = OmegaConf.create(facts["config"])
-    cfg = config.apply_overrides(saved, rest)
+    cfg = config.apply_overrides(saved, overrides)
     for key in FIXED:
         was, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
         if was != now:
@@ -458,11 +490,7 @@ def resume_run(overrides: list[str]) -> float:
         raise ValueError(
             f"total_frames={cfg.total_frames}: the run has trained {facts['frames']} frames already; expected more."
         )
-    handlers = [logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log")]
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
-    log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
-    with lock:
-        return train(cfg, run_dir, (state, facts))
+    return cfg
 
 
 def main() -> None:

@@ -1,9 +1,11 @@
 """What goes wrong on shared machines overnight: nothing is lost, and one sentence says what to do."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,7 @@ from hydra import compose, initialize_config_dir
 from test_resume import start, wait_for_rows
 
 from pickplace import checkpoint, config
-from pickplace.train import claim, train
+from pickplace.train import claim, resume_run, train
 
 ENDLESS = ["experiment=smoke", "total_frames=10_000_000", "threads=1"]
 
@@ -25,8 +27,8 @@ def test_a_dead_worker_ends_the_run_in_one_sentence(tmp_path):
     _, error = process.communicate(timeout=60)
     assert process.returncode == 2
     sentence = error.strip().splitlines()[-1]
-    assert sentence.startswith("error: collector worker 1 of 2 has died (exit code -9). What was saved at ")
-    assert sentence.endswith(f"frames is whole: python -m pickplace.train resume={run_dir}")
+    assert sentence.startswith("error: collector worker 2 of 2 has died (exit code -9). What was saved before")
+    assert f" is whole: python -m pickplace.train resume={run_dir}/checkpoints/" in sentence
     assert checkpoint.read(run_dir / "checkpoints" / "last")
 
 
@@ -34,6 +36,10 @@ def test_a_second_process_in_the_same_run_folder_is_refused(tmp_path):
     run_dir = tmp_path / "run"
     first = start(*ENDLESS, f"hydra.run.dir={run_dir}")
     try:
+        while not (run_dir / config.LOCK).exists():  # so early that nothing else is there
+            time.sleep(0.01)
+        early = start(*ENDLESS, f"hydra.run.dir={run_dir}")
+        assert "another process" in early.communicate(timeout=120)[1]
         wait_for_rows(first, run_dir, 4)
         for second in (start(f"resume={run_dir}"), start(*ENDLESS, f"hydra.run.dir={run_dir}")):
             _, error = second.communicate(timeout=120)
@@ -45,7 +51,8 @@ def test_a_second_process_in_the_same_run_folder_is_refused(tmp_path):
     finally:
         first.kill()
         first.wait()
-    claim(run_dir).release()  # a killed process holds nothing
+    with claim(run_dir):  # a killed process holds nothing
+        pass
 
 
 @pytest.fixture
@@ -81,19 +88,30 @@ def test_a_full_disk_ends_the_run_and_the_checkpoint_before_is_whole(smoke, tmp_
         fsync(number)
 
     monkeypatch.setattr(checkpoint.os, "fsync", full)
-    with pytest.raises(checkpoint.CheckpointError, match="cannot be written .*No space left.* at 256 frames is whole"):
+    with pytest.raises(checkpoint.CheckpointError, match="cannot be written .*No space left.*resume=.*last$"):
         smoke(run_dir, "total_frames=2048")
     monkeypatch.undo()
     assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 256
     assert not [path for path in (run_dir / "checkpoints").iterdir() if path.name.startswith(".")]
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run with a checkpoint that is whole under each name."""
+    run_dir = tmp_path_factory.mktemp("finished") / "run"
+    overrides = ["experiment=smoke", "threads=1", "total_frames=1024", "evaluation_interval=1024"]
+    with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
+        cfg = compose("train", overrides)
+    run_dir.mkdir()
+    train(cfg, run_dir)
+    assert sorted(path.name for path in (run_dir / "checkpoints").iterdir()) == ["best", "last", "previous"]
+    return run_dir
+
+
 @pytest.mark.parametrize("damage", ["flip", "cut", "remove"])
-def test_a_damaged_checkpoint_is_refused_and_the_one_before_is_offered(smoke, tmp_path, damage):
+def test_a_damaged_checkpoint_is_refused_and_a_whole_one_is_offered(finished, tmp_path, damage):
     run_dir = tmp_path / "run"
-    smoke(run_dir, "total_frames=1024", "evaluation_interval=1024")
-    names = sorted(path.name for path in (run_dir / "checkpoints").iterdir())
-    assert names == ["best", "last", "previous"]
+    shutil.copytree(finished, run_dir)
     tensors = run_dir / "checkpoints" / "last" / checkpoint.TENSORS
     blob = bytearray(tensors.read_bytes())
     blob[len(blob) // 2] ^= 1
@@ -101,18 +119,13 @@ def test_a_damaged_checkpoint_is_refused_and_the_one_before_is_offered(smoke, tm
         tensors.unlink()
     else:
         tensors.write_bytes(blob if damage == "flip" else blob[:-1])
-    result = subprocess.run(
-        [sys.executable, "-m", "pickplace.train", f"resume={run_dir}", "total_frames=2048"],
-        capture_output=True, text=True,
-    )  # fmt: skip
-    assert result.returncode == 2
-    assert f"{run_dir}/checkpoints/best, at 1,024 frames, is whole." in result.stderr
-    resumed = subprocess.run(
-        [sys.executable, "-m", "pickplace.train", f"resume={run_dir}/checkpoints/previous", "total_frames=2048"],
-        capture_output=True, text=True,
-    )  # fmt: skip
-    assert resumed.returncode == 0, resumed.stderr
-    assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 2048
+    with pytest.raises(checkpoint.CheckpointError, match=f"{run_dir}/checkpoints/best, at 1,024 frames, is whole.$"):
+        resume_run([f"resume={run_dir}"])
+    (run_dir / "checkpoints" / "best" / checkpoint.FACTS).unlink()
+    with pytest.raises(checkpoint.CheckpointError, match=f"{run_dir}/checkpoints/previous, at 768 frames, is whole.$"):
+        resume_run([f"resume={run_dir}"])
+    resume_run([f"resume={run_dir}/checkpoints/previous", "total_frames=1280"])
+    assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 1280
 
 
 def test_chaos_in_short(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -28,7 +29,9 @@ def test_every_training_composes_and_every_evaluation_too():
     with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
         for cell in TRAININGS.values():
             assert compose("train", list(cell.overrides)).total_frames >= 300_000
-        for overrides in {cell.method: cell.overrides for cell in evaluations.values()}.values():
+        for overrides in {
+            (cell.method, *sorted(dict(cell.axes))): cell.overrides for cell in evaluations.values()
+        }.values():
             assert compose("evaluate", list(overrides)).evaluation.stream == "test"
 
 
@@ -51,7 +54,9 @@ def test_an_entry_with_a_misspelt_key(entry):
 
 
 def result(mean, **more):
-    occupancy = {"mean": mean, "ci95": [mean - 0.01, mean + 0.01]}
+    """Ten episodes, of which every other one is a little better."""
+    episodes = [mean + 0.001 * (number % 2) for number in range(10)]
+    occupancy = {"mean": mean, "ci95": [mean - 0.01, mean + 0.01], "per_episode": episodes}
     return {"occupancy": occupancy, "episodes": 100, "latency_ms": {"p50": 2.0}, **more}
 
 
@@ -60,16 +65,28 @@ def test_claims_follow_the_figures():
     assert claims.k_settles(found)[0] is True
     found["fcn4d-R3-s0-6x6x5-K50"] = result(0.95)
     assert claims.k_settles(found)[0] is False
-    assert claims.k_settles({})[0] is None
+    assert claims.k_settles({}) == (None, "")
+    tree = {"mcts-R4-6x6x5-mask_false": result(0.3)}
+    assert claims.mcts_far_behind(tree) == (None, "")  # behind what?
+    assert claims.mcts_far_behind(tree | {"fcn4d-R4-s0-6x6x5-K1": result(0.5)})[0] is True
+    assert claims.mcts_far_behind(tree | {"fcn4d-R4-s0-6x6x5-K1": result(0.35)})[0] is False
     curve = {"validation_occupancy": [0.3, 0.2], "validation_frames": [1, 2]}
     found = {"typical-6x6x5-s0": {"curve": curve}, "fcn4d-R4-s0": {"curve": {**curve, "validation_occupancy": [0.7]}}}
     assert claims.typical_learns_poorly(found)[0] is True
 
 
-def test_tables_say_what_is_missing_attempted_and_not_trained():
+def test_a_difference_within_the_noise_decides_nothing():
+    ours, theirs = result(0.5), result(0.5)
+    theirs["occupancy"]["per_episode"] = ours["occupancy"]["per_episode"][1:] + [0.5]
+    assert claims.gap({"a": ours, "b": theirs}, "a", "b")[0] is None
+    assert claims.gap({"a": result(0.6), "b": theirs}, "a", "b")[0] is True
+    assert claims.gap({"a": ours}, "a", "b") is None
+
+
+def test_tables_say_what_is_missing_attempted_and_no_better_than_random():
     cell = next(cell for cell in PARTS["rl_methods"] if cell.name == "typical-R4-s0-6x6x5-K1")
+    setting = {"env": {"tote_size": [6, 6, 5], "num_envs": 16}, "items": {"kinds": []}}
     trained = {
-        "axes": {"tote": "6x6x5", "seed": 0},
         "frames": 1000,
         "frames_asked": 2000,
         "cpu_seconds": 60,
@@ -77,11 +94,15 @@ def test_tables_say_what_is_missing_attempted_and_not_trained():
         "warm_start": 0,
         "curve": {"validation_occupancy": [0.2]},
     }
-    found = {cell.training: trained, "random-R4-6x6x5": result(0.26)}
+    chance = result(0.26, planner="random", **{**setting, "env": {"tote_size": [6, 6, 5], "num_envs": 256}})
+    elsewhere = result(0.1, planner="random", env={"tote_size": [6, 6, 9]}, items=setting["items"])
+    found = {cell.training: trained, "random-R4-6x6x5": chance, "random-R4-6x6x9": elsewhere}
     assert "not yet" in results.table([cell], found)[-1]
-    found[cell.name] = result(0.21, episodes=100) | {"episodes": 5}
+    found[cell.name] = result(0.21, checkpoint="typical/best", **setting) | {"episodes": 5}
     row = results.table([cell], found)[-1]
-    assert "0.2100 (0.2000 to 0.2200) | 5° | 2.0 ms | 1,000 frames of 2,000, 1 min, **not trained**" in row
+    assert "0.2100 (0.2000 to 0.2200) | 5° | 2.0 ms | 1,000 frames of 2,000, 1 min, **no better than random**" in row
+    found[cell.name] = result(0.31, checkpoint="typical/best", **setting)
+    assert "random" not in results.table([cell], found)[-1]
     found[cell.training] = {"attempted": "no memory", "cpu_seconds": 120, "peak_mib": 20480}
     found[cell.name] = {"attempted": "its training"}
     assert "attempted: its training |  |  | attempted, 2 min, 20.0 GiB" in results.table([cell], found)[-1]
@@ -93,6 +114,7 @@ def test_every_figure_is_drawn_from_few_results_and_from_none(tmp_path):
         assert figures.FIGURES[name][1]({}, tmp_path / name) is False
         found |= {cell.name: result(0.5 + 0.001 * number) for number, cell in enumerate(part[::2])}
     curve = {"validation_occupancy": [0.3, 0.5], "validation_frames": [100, 200]}
+    assert not set(found) & set(TRAININGS)
     found |= {name: {"curve": curve} for name in TRAININGS}
     shares = {key: {"mean": 0.5, "ci95": [0.4, 0.6]} for key in ("occupancy_planned", "occupancy")}
     found["py3dbp-R1-6x6x5"] = {"kind": "placement_only", "placements": {"executed": 3, "unstable": 1}, **shares}
@@ -131,24 +153,56 @@ def test_a_plan_of_single_cells_can_be_executed_but_where_the_effector_collides(
     assert placement_only.replay(env, floating)[0][0] == "rests_elsewhere"
 
 
-def test_results_are_written_as_json_that_can_be_read_again():
-    for path in (FOLDER.parents[1] / "docs" / "results").rglob("*.json"):
-        assert json.loads(path.read_text())["cell"] == path.stem
+@pytest.mark.parametrize("path", sorted((FOLDER.parents[1] / "docs" / "results").rglob("*.json")), ids=lambda p: p.stem)
+def test_a_result_that_is_kept_belongs_to_a_cell_of_today(path):
+    found = json.loads(path.read_text())
+    every = {cell.name: cell for part in PARTS.values() for cell in part} | TRAININGS
+    assert found["cell"] == path.stem and path.stem in every
+    assert all(word in found["command"] for word in every[path.stem].overrides if "evaluation." not in word)
+    assert "attempted" in found or "curve" in found or 0 <= found["occupancy"]["mean"] <= 1
+    assert "/tmp" not in path.read_text() and "/home" not in path.read_text()
 
 
 def test_a_command_that_uses_up_its_budget_is_told_to_end(tmp_path):
     child = run.Child([sys.executable, "-c", "print('busy', flush=True)\nwhile True: pass"], tmp_path / "log")
     cost = child.wait(0.01)
     assert (cost["rc"], child.last_words()) == (-signal.SIGTERM, "busy")
-    assert 0.6 <= cost["cpu_seconds"] < 30 and cost["peak_mib"] > 1
+    assert 0.6 <= cost["cpu_seconds"] < 30 and cost["peak_mib"] > 1 and cost["ended_by"] == "budget"
 
 
 def test_a_training_is_taken_up_where_its_budget_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "OUTPUTS", tmp_path)
-    overrides = ("experiment=smoke", "total_frames=2_000_000", "checkpoint_interval=2_000_000")
+    overrides = ("experiment=smoke", "total_frames=2_000_000", "evaluation_interval=2_000_000")
     cell = cells.Cell("tiny", "train", overrides, "tiny", ())
-    first = run.train(cell, 0.15)
+    first = run.train(cell, 0.4)
     assert first["frames"] < first["frames_asked"] == 2_000_000
-    again = run.train(cell, 0.4)
+    assert run.train(cell, 0.4)["frames"] == first["frames"]  # its budget is spent: nothing runs
+    again = run.train(cell, 0.6)
     assert again["frames"] > first["frames"] and again["cpu_seconds"] > first["cpu_seconds"]
     assert again["curve"]["frames"][-1] == again["frames"]
+    assert run.checkpoint_of("tiny").name == "last"  # it was never validated
+
+
+def test_a_failure_that_may_pass_leaves_no_result(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "OUTPUTS", tmp_path / "outputs")
+    monkeypatch.setattr(run, "RESULTS", tmp_path / "results")
+    cell = cells.Cell("wrong", "evaluate", ("planner=nobody",), "wrong", ())
+    with pytest.raises(run.Failed, match="exit code 2: error: planner/nobody"):
+        run.compute(cell, 1, {})
+    with pytest.raises(run.Failed, match="its training, wrong, is not done"):
+        run.compute(cells.Cell("e", "evaluate", (), "e", (), "wrong"), 1, {"wrong": cell})
+    assert not (tmp_path / "results").exists()
+
+
+def test_an_evaluation_leaves_the_command_that_gives_the_same(tmp_path, monkeypatch):
+    """A planner that draws: neither the pilot nor the budget may change what it draws."""
+    monkeypatch.setattr(run, "OUTPUTS", tmp_path / "outputs")
+    monkeypatch.setattr(run, "RESULTS", tmp_path / "results")
+    overrides = ("planner=random", "evaluation.episodes=20", "env.tote_size=[4,4,1]")
+    run.compute(cells.Cell("drawn", "evaluate", overrides, "drawn", ()), 10, {})
+    found = json.loads((tmp_path / "results" / "cells" / "drawn.json").read_text())
+    command = found["command"].split()[1:]
+    assert "evaluation.batch_size=128" in command
+    subprocess.run([sys.executable, *command, f"hydra.run.dir={tmp_path / 'again'}"], check=True, capture_output=True)
+    again = json.loads((tmp_path / "again" / "evaluation.json").read_text())
+    assert again["occupancy"]["mean"] == found["occupancy"]["mean"]

@@ -83,7 +83,8 @@ def read() -> tuple[dict[str, Cell], dict[str, list[Cell]]]:
     """Trainings by name, and for each figure, by the name of its file, its evaluations.
 
     Raises:
-        ValueError: for two cells of one name that are not the same, or an evaluation of a training that there is not.
+        ValueError: for two cells of one name that are not the same, an evaluation of a training that there is not, or a
+            training that nobody needs.
     """
     trainings = {}
     for entry in yaml.safe_load((HERE / "trainings.yaml").read_text()):
@@ -101,4 +102,9 @@ def read() -> tuple[dict[str, Cell], dict[str, list[Cell]]]:
                 raise ValueError(f"{path.name}: {cell.name} is another cell elsewhere; rename its method.")
             if cell.training is not None and cell.training not in trainings:
                 raise ValueError(f"{path.name}: {cell.name} needs {cell.training}, which trainings.yaml lacks.")
+    needed = {cell.training for part in figures.values() for cell in part}
+    if idle := sorted(set(trainings) - needed):
+        raise ValueError(f"trainings.yaml: {idle[0]} is needed by no figure.")
+    if both := sorted(set(trainings) & set(seen)):
+        raise ValueError(f"{both[0]}: a training and an evaluation have this name; rename one.")
     return trainings, figures

@@ -1,6 +1,9 @@
 """The paper's claims, each held against our figures: borne out, not, or not known yet."""
 
+import torch
 from figures import TOTES
+
+from pickplace.evaluate import confidence95
 
 
 def mean(results, name) -> float | None:
@@ -8,71 +11,98 @@ def mean(results, name) -> float | None:
     return results[name]["occupancy"]["mean"] if "occupancy" in results.get(name, {}) else None
 
 
-def known(*values) -> bool:
-    return all(value is not None for value in values)
+def difference(ours: dict, theirs: dict) -> tuple[float, float, float] | None:
+    """Mean occupancy of one result minus another's and its 95% interval, over the episodes that both have played."""
+    pairs = zip(ours["occupancy"]["per_episode"], theirs["occupancy"]["per_episode"], strict=False)
+    gaps = torch.tensor([a - b for a, b in pairs], dtype=torch.float64)
+    return (float(gaps.mean()), *confidence95(gaps, least=-1.0)) if len(gaps) > 1 else None
+
+
+def gap(results, ours: str, theirs: str, margin: float = 0.0) -> tuple[bool | None, str] | None:
+    """Is one cell above another by more than a margin? None in the pair: not to be told apart. And the difference.
+
+    Returns:
+        None where one of them is not there.
+    """
+    if mean(results, ours) is None or mean(results, theirs) is None:
+        return None
+    centre, low, high = difference(results[ours], results[theirs])
+    verdict = True if low > margin else False if high < margin else None
+    return verdict, f"{centre:+.3f} ({low:+.3f} to {high:+.3f})"
+
+
+def judged(comparisons: list) -> tuple[bool | None, str]:
+    """All of them: yes if each is, no if one is surely not; and what was found. ``(text, gap(...))`` each."""
+    found = [(text, pair) for text, pair in comparisons if pair is not None]
+    verdicts = [pair[0] for _, pair in found]
+    words = "; ".join(f"{text} {pair[1]}" for text, pair in found)
+    if not found:
+        return None, ""
+    return False if False in verdicts else None if None in verdicts else True, words
+
+
+JOINT = ("fcn4d", "fcn_grasp_unmasked")
+ALONE = ("individual_rl-R3-s0-{}-K10", "individual_heuristic-R3-{}", "individual_heuristic_cells-R3-{}")
 
 
 def joint_beats_individual(results):
-    """R=3, K=10: the paper's two networks, and ours, against the best individual method."""
-    gaps, words = {}, []
+    """R=3, K=10, each joint network against the best individual method there is."""
+    comparisons = []
     for tote in TOTES:
-        joint = [mean(results, f"{name}-R3-s0-{tote}-K10") for name in ("fcn4d", "fcn_grasp_unmasked")]
-        names = (f"individual_rl-R3-s0-{tote}-K10", *(f"individual_heuristic{end}-R3-{tote}" for end in ("", "_cells")))
-        alone = [mean(results, name) for name in names]
-        if known(*joint, *alone):
-            gaps[tote] = joint[1] - max(alone)
-            words.append(f"{tote}: fcn4d {joint[0] - max(alone):+.3f}, fcn_grasp {gaps[tote]:+.3f}")
-    if "6x6x5" not in gaps:
-        return None, ""
-    ours = min(gaps.values()) > 0
-    return ours, "against the best individual method, R=3, K=10. " + "; ".join(words)
+        names = [name.format(tote) for name in ALONE]
+        values = {name: mean(results, name) for name in names}
+        if None in values.values():
+            continue
+        best = max(values, key=values.get)
+        for joint in JOINT:
+            pair = gap(results, f"{joint}-R3-s0-{tote}-K10", best)
+            comparisons.append((f"{tote}, {joint} minus {best.partition('-')[0]}", pair))
+    return judged(comparisons)
 
 
 def most_on_small_totes(results):
     gaps = {}
     for tote in TOTES:
-        names = (f"{name}-R3-{tote}" for name in ("individual_heuristic", "individual_heuristic_cells"))
-        values = mean(results, f"fcn_grasp_unmasked-R3-s0-{tote}-K10"), *(mean(results, name) for name in names)
-        if known(*values):
-            gaps[tote] = values[0] - max(values[1:])
+        values = [mean(results, name.format(tote)) for name in ALONE[1:]]
+        ours = mean(results, f"fcn_grasp_unmasked-R3-s0-{tote}-K10")
+        if ours is not None and None not in values:
+            gaps[tote] = ours - max(values)
     if not {"6x6x5", "10x10x5"} <= set(gaps):
         return None, ""
-    words = ", ".join(f"{tote} {gap:+.3f}" for tote, gap in gaps.items())
-    return max(gaps, key=gaps.get) in (
-        "6x6x5",
-        "6x6x10",
-    ), f"fcn_grasp minus the better individual heuristic, R=3: {words}"
+    words = ", ".join(f"{tote} {value:+.3f}" for tote, value in gaps.items())
+    small = max(gaps, key=gaps.get) in ("6x6x5", "6x6x10")
+    return small, f"fcn_grasp minus the better individual heuristic, R=3: {words}"
 
 
 def k_settles(results):
-    texts, verdicts = [], []
-    for method in ("fcn4d", "fcn_grasp_unmasked"):
-        at = {k: mean(results, f"{method}-R3-s0-6x6x5-K{k}") for k in (1, 10, 50)}
-        if known(*at.values()):
-            verdicts.append(abs(at[50] - at[10]) < 0.01)
-            texts.append(f"{method}: K=1 {at[1]:.3f}, 10 {at[10]:.3f}, 50 {at[50]:.3f}")
-    return (all(verdicts) if verdicts else None), "; ".join(texts)
+    """From K=10 to K=50 less than a hundredth is gained."""
+    comparisons = []
+    for joint in JOINT:
+        pair = gap(results, f"{joint}-R3-s0-6x6x5-K50", f"{joint}-R3-s0-6x6x5-K10", margin=0.01)
+        less = pair and ({True: False, False: True, None: None}[pair[0]], pair[1])
+        comparisons.append((f"{joint}, K=50 minus K=10", less))
+    return judged(comparisons)
+
+
+SIZES = (("fcn4d", 10), ("fcn_grasp_unmasked", 10), ("fcn_grasp", "all"))
 
 
 def no_loss_with_size(results):
-    texts, verdicts = [], []
-    for method, k in (("fcn4d", 10), ("fcn_grasp_unmasked", 10), ("fcn_grasp", "all")):
-        at = {tote: mean(results, f"{method}-R4-s0-{tote}-K{k}") for tote in TOTES}
-        at = {tote: value for tote, value in at.items() if value is not None}
-        if {"6x6x5", "10x10x5"} <= set(at):
-            verdicts.append(all(value >= at["6x6x5"] - 0.01 for tote, value in at.items() if tote != "6x6x10"))
-            texts.append(f"{method}: " + ", ".join(f"{tote} {value:.3f}" for tote, value in at.items()))
-    return (all(verdicts) if verdicts else None), "; ".join(texts)
+    """No tote but 6x6x10 is packed worse than 6x6x5 by more than a hundredth."""
+    comparisons = []
+    for method, k in SIZES:
+        for tote in TOTES[2:]:
+            pair = gap(results, f"{method}-R4-s0-{tote}-K{k}", f"{method}-R4-s0-6x6x5-K{k}", margin=-0.01)
+            comparisons.append((f"{method}, {tote} minus 6x6x5", pair))
+    return judged(comparisons)
 
 
 def high_tote_is_harder(results):
-    texts, verdicts = [], []
-    for method, k in (("fcn4d", 10), ("fcn_grasp_unmasked", 10), ("fcn_grasp", "all")):
-        pair = [mean(results, f"{method}-R4-s0-{tote}-K{k}") for tote in ("6x6x5", "6x6x10")]
-        if known(*pair):
-            verdicts.append(pair[1] < pair[0])
-            texts.append(f"{method}: {pair[0]:.3f} and {pair[1]:.3f}")
-    return (any(verdicts) if verdicts else None), "; ".join(texts)
+    comparisons = []
+    for method, k in SIZES:
+        pair = gap(results, f"{method}-R4-s0-6x6x5-K{k}", f"{method}-R4-s0-6x6x10-K{k}")
+        comparisons.append((f"{method}, 6x6x5 minus 6x6x10", pair))
+    return judged(comparisons)
 
 
 def final(results, names) -> list[float]:
@@ -82,6 +112,7 @@ def final(results, names) -> list[float]:
 
 
 def typical_learns_poorly(results):
+    """Every seed of it ends below every seed of fcn4d."""
     typical = final(results, [f"typical-6x6x5-s{seed}" for seed in range(3)])
     paper = final(results, [f"fcn4d-R4-s{seed}" for seed in range(3)])
     if not typical or not paper:
@@ -90,12 +121,13 @@ def typical_learns_poorly(results):
 
 
 def clipping_helps(results):
+    """Every clipped seed ends above every one that is not."""
     without = final(results, [f"fcn4d_noclip-6x6x5-s{seed}" for seed in range(3)])
     clipped = final(results, [f"fcn4d-R4-s{seed}" for seed in range(3)])
     if not without or not clipped:
         return None, ""
-    better = sum(clipped) / len(clipped) > sum(without) / len(without)
-    return better, f"last validation at 6x6x5, each seed: clipped {show(clipped)}; not clipped {show(without)}"
+    verdict = True if min(clipped) > max(without) else False if max(clipped) < min(without) else None
+    return verdict, f"last validation at 6x6x5, each seed: clipped {show(clipped)}; not clipped {show(without)}"
 
 
 def show(values) -> str:
@@ -103,25 +135,22 @@ def show(values) -> str:
 
 
 def mcts_far_behind(results):
-    texts, verdicts = [], []
+    """By more than a tenth of the tote, behind fcn4d and fcn_grasp without a mask."""
+    comparisons = []
     for tote in TOTES:
-        tree, policy = mean(results, f"mcts-R4-{tote}-mask_false"), mean(results, f"fcn4d-R4-s0-{tote}-K1")
-        masked = mean(results, f"mcts-R4-{tote}-mask_true")
-        if known(tree):
-            verdicts.append(
-                tree < (policy if policy is not None else mean(results, f"fcn_grasp-R4-s0-{tote}-Kall") or 1)
-            )
-            beside = "" if policy is None else f", fcn4d {policy:.3f}"
-            texts.append(f"{tote}: {tree:.3f}{'' if masked is None else f' (over outcomes {masked:.3f})'}{beside}")
-    return (all(verdicts) if verdicts else None), "; ".join(texts)
+        for joint in JOINT:
+            pair = gap(results, f"{joint}-R4-s0-{tote}-K1", f"mcts-R4-{tote}-mask_false", margin=0.1)
+            comparisons.append((f"{tote}, {joint} minus mcts", pair))
+    return judged(comparisons)
 
 
 def large_totes_work(results):
+    """At least 0.8 of a 30x30 tote."""
     texts, verdicts = [], []
     for tote in ("30x30x5", "30x30x10"):
         for method, k in (("fcn4d", 10), ("fcn_grasp", "all")):
             value = mean(results, f"{method}-R4-s0-{tote}-K{k}")
-            if known(value):
+            if value is not None:
                 verdicts.append(value > 0.8)
                 texts.append(f"{method} {tote} {value:.3f}")
     return (all(verdicts) if verdicts else None), ", ".join(texts)
@@ -151,7 +180,7 @@ def table(results) -> list[str]:
     lines = ["| the paper's claim | our figures bear it out | figures |", "|---|---|---|"]
     for claim, check, why in CLAIMS:
         verdict, evidence = check(results)
-        word = {None: "not known yet", True: "yes", False: "no"}[verdict]
+        word = {None: "undecided" if evidence else "not known yet", True: "yes", False: "no"}[verdict]
         if verdict is False and why:
             word += f": {why}"
         lines.append(f"| {claim} | {word} | {evidence} |")

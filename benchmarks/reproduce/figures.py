@@ -20,10 +20,10 @@ METHODS = {
     "individual_heuristic_cells": ("individual, heuristic, every cell", "#7a3b69", "d"),
     "joint_dbl": ("joint DBL", "#000000", "P"),
     "mcts": ("MCTS", "#009e73", "X"),
+    "mcts_outcomes": ("MCTS over outcomes", "#44aa99", "X"),
     "random": ("random, feasible", "#8c8c8c", "x"),
     "uniform": ("uniform, all actions", "#b0b0b0", "+"),
     "lookahead": ("lookahead", "#d55e00", "o"),
-    "policy": ("fcn_grasp, mask", "#0072b2", "o"),
     "py3dbp": ("py3dbp", "#d55e00", "s"),
     "rectpack": ("rectpack", "#009e73", "s"),
 }
@@ -159,8 +159,8 @@ def rl_methods(results, path) -> bool:
         ("fcn4d", "fcn4d-R4-s0-{}-K1", {}),
         ("fcn4d_noclip", "fcn4d_noclip-R4-s0-{}-K1", {}),
         ("typical", "typical-R4-s0-{}-K1", {}),
-        ("mcts", "mcts-R4-{}-mask_true", {"label": "MCTS over outcomes", "color": "#44aa99"}),
-        ("mcts", "mcts-R4-{}-mask_false", {"label": "MCTS, 5,000 simulations"}),
+        ("mcts_outcomes", "mcts-R4-{}-mask_true", {}),
+        ("mcts", "mcts-R4-{}-mask_false", {}),
         ("random", "random-R4-{}", {}),
         ("uniform", "uniform-R4-{}", {}),
     ]
@@ -258,8 +258,7 @@ def optimum(results, path) -> bool:
     for number, method in enumerate(methods):
         found = [results.get(f"{method}_small-{tote}-R{r}") for tote, r in OPTIMA]
         xs = np.arange(len(OPTIMA)) + 0.12 * (number - 2)
-        more = {"label": "MCTS over outcomes", "color": "#44aa99"} if method == "mcts" else {}
-        points(axes, xs, found, method, line="", **more)
+        points(axes, xs, found, "mcts_outcomes" if method == "mcts" else method, line="")
     if not axes.lines:
         return False
     for x, value in enumerate(OPTIMA.values()):
@@ -273,10 +272,10 @@ def optimum(results, path) -> bool:
 def latency(results, path) -> bool:
     figure, (axes,) = canvas(6.5, 4.2)
     series = [
-        ("policy", ["policy-6x6x5"], {}),
+        ("fcn_grasp", ["fcn_grasp_mixed-6x6x5"], {}),
         ("lookahead", [f"lookahead-6x6x5-{n}samples" for n in (8, 32, 128)], {}),
-        ("mcts", [f"mcts_mixed-6x6x5-{n}sim" for n in (100, 500, 2000, 5000)], {"label": "MCTS over outcomes"}),
-        ("joint_dbl", ["joint_dbl_mixed-6x6x5"], {}),
+        ("mcts_outcomes", [f"mcts_mixed-6x6x5-{n}sim" for n in (100, 500, 2000, 5000)], {}),
+        ("joint_dbl", ["joint_dbl-mixed-6x6x5"], {}),
     ]
     for method, names, more in series:
         found = [results[name] for name in names if "occupancy" in results.get(name, {})]
@@ -304,7 +303,7 @@ def presets(results, path) -> bool:
         ("joint_dbl", lambda kind, tote: f"joint_dbl-{kind}-{tote}"),
         ("individual_heuristic", lambda kind, tote: f"individual_heuristic-{kind}-{tote}"),
         ("fcn4d", lambda kind, tote: f"fcn4d_{kind}-{tote}-K10"),
-        ("mcts", lambda kind, tote: f"mcts-{kind}-{tote}"),
+        ("mcts_outcomes", lambda kind, tote: f"mcts-{kind}-{tote}-mask_true"),
         ("random", lambda kind, tote: f"random-{kind}-{tote}"),
     ]
     for number, (method, name) in enumerate(rows):

@@ -43,43 +43,45 @@ def run_dir_of(cell: Cell) -> Path:
 
 
 class Child:
-    """A command in one thread, its output in a file, its peak memory and its time measured."""
-
-    running: set["Child"] = set()
+    """A command in one thread, its output in a file; its memory is limited, its peak and its CPU time are measured."""
 
     def __init__(self, command: list[str], log: Path):
-        def limits():
-            resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-
         threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
         log.parent.mkdir(parents=True, exist_ok=True)
         self.log, self.started = log, time.monotonic()
         with log.open("ab") as out:
             self.process = subprocess.Popen(
-                command, stdout=out, stderr=out, cwd=ROOT, env={**os.environ, **threads}, preexec_fn=limits,
-                start_new_session=True,
-            )  # fmt: skip
-        Child.running.add(self)
+                command, stdout=out, stderr=out, cwd=ROOT, env={**os.environ, **threads}, start_new_session=True
+            )
+        if hasattr(resource, "prlimit"):  # Linux
+            _, hard = resource.prlimit(self.process.pid, resource.RLIMIT_AS)
+            limit = MEMORY if hard == resource.RLIM_INFINITY else min(MEMORY, hard)
+            resource.prlimit(self.process.pid, resource.RLIMIT_AS, (limit, hard))
 
     def wait(self, minutes: float) -> dict:
-        """``{"rc", "cpu_seconds", "peak_mib"}``; told to end when it has used its time, and killed if it will not."""
-        told = None
+        """``{"rc", "cpu_seconds", "peak_mib", "ended_by"}``, the last one ``itself``, ``budget`` or ``user``.
+
+        A command that has used its time, or that the user stops, is told so once, and killed ten minutes of CPU time
+        later if it has not ended.
+        """
+        ended_by, limit = "itself", None
         while True:
             pid, status, usage = os.wait4(self.process.pid, os.WNOHANG)
             if pid:
                 break
-            if told is None and self.used() > 60 * minutes:
-                self.process.terminate()
-                told = time.monotonic()
-            elif told is not None and time.monotonic() > told + 600:
-                self.process.kill()
+            if limit is None and (stopped.is_set() or self.used() > 60 * minutes):
+                ended_by = "user" if stopped.is_set() else "budget"
+                limit = self.used() + 600
+                os.kill(self.process.pid, signal.SIGTERM)
+            elif limit is not None and self.used() > limit:
+                os.kill(self.process.pid, signal.SIGKILL)
             time.sleep(0.5)
-        self.process.returncode = os.waitstatus_to_exitcode(status)
-        Child.running.discard(self)
+        self.process.returncode = os.waitstatus_to_exitcode(status)  # or Popen would wait for it again
         return {
             "rc": self.process.returncode,
             "cpu_seconds": round(usage.ru_utime + usage.ru_stime, 1),
-            "peak_mib": usage.ru_maxrss // 1024,
+            "peak_mib": usage.ru_maxrss // (2**20 if sys.platform == "darwin" else 1024),
+            "ended_by": ended_by,
         }
 
     def used(self) -> float:
@@ -91,40 +93,55 @@ class Child:
             return time.monotonic() - self.started
 
     def last_words(self) -> str:
-        """The last line of its output."""
+        """The last line of its output, fit for a table."""
         lines = self.log.read_text(errors="replace").strip().splitlines()
-        return lines[-1] if lines else ""
+        return lines[-1].replace(f"{ROOT}/", "").replace("|", ";") if lines else ""
+
+
+class Failed(Exception):
+    """A cell that may well succeed the next time: nothing is written about it."""
+
+
+def attempted(child: Child, cost: dict, reason: str) -> dict:
+    """What to write about a cell that cannot be done within its budget or in memory.
+
+    Raises:
+        Failed: if neither was the reason.
+    """
+    words = child.last_words()
+    if cost["ended_by"] == "budget":
+        return {"attempted": reason, **cost}
+    if "memory" in words:
+        return {"attempted": words.removeprefix("error: "), **cost}
+    raise Failed(f"exit code {cost['rc']}: {words}")
 
 
 def train(cell: Cell, minutes: float) -> dict:
     """Train, or go on training, for at most so many minutes in all; the curve and what it cost."""
     folder = run_dir_of(cell)
-    command = [sys.executable, "-m", "pickplace.train"]
-    spent = cpu_seconds(folder)
-    if (folder / "checkpoints" / "last").is_dir():
-        action = [f"resume={folder}"]
-    else:
-        action = [*cell.overrides, "threads=1", f"hydra.run.dir={folder}"]
-    child = Child([*command, *action], OUTPUTS / "logs" / f"{cell.name}.log")
-    cost = child.wait(max(minutes - spent / 60, 0.1))
-    if folder.is_dir():
-        (folder / SPENT).write_text(str(spent + cost["cpu_seconds"]))
-    finished = (folder / "checkpoints" / "last").is_dir() and cost["rc"] == 0
-    if not finished:
-        return {"attempted": child.last_words(), **cost}
-    rows = read_csv(folder / "metrics.csv")
-    facts = json.loads((folder / "checkpoints" / "last" / "state.json").read_text())
+    last, spent, peak = folder / "checkpoints" / "last", cpu_seconds(folder), None
+    if not (last.is_dir() and spent >= 60 * minutes):
+        action = [f"resume={folder}"] if last.is_dir() else [*cell.overrides, "threads=1", f"hydra.run.dir={folder}"]
+        child = Child([sys.executable, "-m", "pickplace.train", *action], OUTPUTS / "logs" / f"{cell.name}.log")
+        cost = child.wait(minutes - spent / 60)
+        cost["cpu_seconds"] += spent
+        peak = cost["peak_mib"]
+        if folder.is_dir():
+            (folder / SPENT).write_text(str(cost["cpu_seconds"]))
+        if not last.is_dir() or (cost["rc"] and cost["ended_by"] == "itself"):
+            return attempted(child, cost, "no batch was finished within the budget")
+    facts = json.loads((last / "state.json").read_text())
     seconds = cpu_seconds(folder)
     return {
         "frames": facts["frames"],
         "frames_asked": facts["config"]["total_frames"],
         "cpu_seconds": round(seconds, 1),
         "frames_a_second": round(facts["frames"] / seconds, 1),
-        "peak_mib": cost["peak_mib"],
+        "peak_mib": peak,
         "warm_start": (facts["config"].get("warm_start") or {}).get("frames", 0),
         "mask_in_training": facts["config"]["algo"]["mask_infeasible"],
         "trained_with": {"commit": facts["commit"], "versions": facts["versions"]},
-        "curve": curve(rows),
+        "curve": curve([row for row in read_csv(folder / "metrics.csv") if row["frames"] <= facts["frames"]]),
     }
 
 
@@ -160,19 +177,31 @@ def evaluate(cell: Cell, minutes: float) -> dict:
         (folder / name).unlink(missing_ok=True)
     action = [*cell.overrides, "threads=1", f"hydra.run.dir={folder}"]
     if cell.training is not None:
-        action.append(f"checkpoint={OUTPUTS / 'train' / cell.training}")
+        action.append(f"checkpoint={checkpoint_of(cell.training)}")
     command = [sys.executable, str(Path(__file__).parent / "cell.py"), str(minutes), *action]
     child = Child(command, OUTPUTS / "logs" / f"{cell.name}.log")
     cost = child.wait(3 * minutes)
     pilot = json.loads((folder / "pilot.json").read_text()) if (folder / "pilot.json").is_file() else {}
     if not (folder / "evaluation.json").is_file():
-        reason = "no episode fits into the budget" if cost["rc"] in (0, -15, -9) else child.last_words()
-        return {"attempted": reason, **pilot, **cost}
+        if cost["rc"] == 0:
+            return {
+                "attempted": f"one episode would take {pilot['seconds_a_filled_episode'] / 3600:.1f} hours",
+                **pilot,
+            }
+        return {**pilot, **attempted(child, cost, "no episode was finished within three times the budget")}
     result = json.loads((folder / "evaluation.json").read_text())
     result["occupancy"]["per_episode"] = [round(value, 6) for value in result["occupancy"]["per_episode"]]
     if result["checkpoint"]:
-        result["checkpoint"] = cell.training or next(o for o in cell.overrides if o.startswith("checkpoint="))[11:]
+        which = Path(result["checkpoint"]).name if cell.training else None  # best, or last
+        given = next((word[11:] for word in cell.overrides if word.startswith("checkpoint=")), None)
+        result["checkpoint"] = f"{cell.training}/{which}" if cell.training else given
     return {**result, "peak_mib": cost["peak_mib"], "cpu_seconds": cost["cpu_seconds"]}
+
+
+def checkpoint_of(training: str) -> Path:
+    """The best checkpoint of a training, or the last one where the budget ended before the first validation."""
+    folder = OUTPUTS / "train" / training / "checkpoints"
+    return folder / ("best" if (folder / "best").is_dir() else "last")
 
 
 def placement_only(cell: Cell, minutes: float) -> dict:
@@ -186,35 +215,43 @@ def placement_only(cell: Cell, minutes: float) -> dict:
     )
     cost = child.wait(minutes)
     if cost["rc"]:
-        return {"attempted": child.last_words(), **cost}
+        return attempted(child, cost, "it did not finish within the budget")
     return {**json.loads((folder / "result.json").read_text()), **cost}
 
 
+COMPUTE = {"train": train, "evaluate": evaluate, "placement_only": placement_only}
+
+
 def compute(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> str:
-    """Compute a cell and write its result; a word on how it went."""
+    """Compute a cell and write its result; a word on how it went.
+
+    Raises:
+        Failed: if there is no result, and why.
+    """
     if cell.training is not None:
-        trained = json.loads(result_of(trainings[cell.training]).read_text())
+        path = result_of(trainings[cell.training])
+        if not path.is_file():
+            raise Failed(f"its training, {cell.training}, is not done")
+        trained = json.loads(path.read_text())
         if "attempted" in trained:
-            result = {"attempted": f"its training, {cell.training}: {trained['attempted']}"}
-            return write(cell, minutes, result)
+            return write(cell, minutes, {"attempted": f"its training: {trained['attempted']}"})
         if not (OUTPUTS / "train" / cell.training / "checkpoints").is_dir():
-            return f"left: the run folder of {cell.training} is not here; delete its result to train again"
-    return write(cell, minutes, {"train": train, "evaluate": evaluate, "placement_only": placement_only}[cell.kind](
-        cell, minutes
-    ))  # fmt: skip
+            raise Failed(f"the run folder of {cell.training} is not here; delete its result to train it again")
+    result = COMPUTE[cell.kind](cell, minutes)
+    if stopped.is_set():
+        raise Failed("stopped")
+    return write(cell, minutes, result)
 
 
 def write(cell: Cell, minutes: float, result: dict) -> str:
-    """Write a result, unless the user stopped it; a word on what it says."""
-    if stopped.is_set():
-        return "stopped"
+    """Write a result; a word on what it says."""
     head = {
         "cell": cell.name,
         "kind": cell.kind,
         "method": cell.method,
         "axes": dict(cell.axes),
         "training": cell.training,
-        "command": command_of(cell),
+        "command": command_of(cell, result),
         "budget_minutes": minutes,
     }
     facts = {"commit": commit(), "versions": versions()} if cell.kind == "train" or "attempted" in result else {}
@@ -233,22 +270,19 @@ def write(cell: Cell, minutes: float, result: dict) -> str:
     return f"{result['occupancy']['mean']:.4f}, {result['episodes']} episodes" if "occupancy" in result else "done"
 
 
-def command_of(cell: Cell) -> str:
+def command_of(cell: Cell, result: dict | None = None) -> str:
     """The command that a user would type for the same."""
     if cell.kind == "placement_only":
         return " ".join(["python benchmarks/reproduce/placement_only.py result.json", *cell.overrides])
-    where = [f"checkpoint=outputs/reproduce/train/{cell.training}"] if cell.training else []
-    return " ".join([f"python -m pickplace.{cell.kind}", *cell.overrides, *where, "threads=1"])
+    where = [f"checkpoint={checkpoint_of(cell.training).relative_to(ROOT)}"] if cell.training else []
+    played = []
+    if result and "batch_size" in result:  # planners that draw depend on it
+        played = [f"evaluation.episodes={result['episodes']}", f"evaluation.batch_size={result['batch_size']}"]
+    overrides = [word for word in cell.overrides if not (played and word.startswith("evaluation."))]
+    return " ".join([f"python -m pickplace.{cell.kind}", *overrides, *where, *played, "threads=1"])
 
 
-stopped = threading.Event()
-
-
-def stop(*_) -> None:
-    """Let trainings save, and end."""
-    stopped.set()
-    for child in list(Child.running):
-        child.process.send_signal(signal.SIGTERM)
+stopped = threading.Event()  # by the user: trainings save, and all end
 
 
 def main() -> None:
@@ -271,12 +305,17 @@ def main() -> None:
         for cell in missing[0] + missing[1]:
             say(f"  {cell.kind} {cell.name}: {command_of(cell)}")
         return
-    signal.signal(signal.SIGINT, stop)
-    signal.signal(signal.SIGTERM, stop)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopped.set())
 
     def work(cell: Cell) -> None:
-        if not stopped.is_set():
-            say(f"{cell.kind} {cell.name}: {compute(cell, arguments.minutes, trainings)}")
+        if stopped.is_set():
+            return
+        try:
+            word = compute(cell, arguments.minutes, trainings)
+        except Exception as error:  # of a run of days, one cell
+            word = f"failed, {error}" if isinstance(error, Failed) else f"failed, {type(error).__name__}: {error}"
+        say(f"{cell.kind} {cell.name}: {word}")
 
     for part in missing:  # what evaluations need comes before them
         with ThreadPoolExecutor(arguments.jobs) as pool:
