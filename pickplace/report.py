@@ -73,7 +73,7 @@ def learning_curve(metrics: Path, path: Path) -> None:
     upper.set_ylim(0, 1.02)
     upper.grid(alpha=0.3)
     if upper.lines:
-        upper.legend(loc="lower right")
+        upper.legend(loc="best")
     else:
         upper.text(0.5, 0.5, "no episode has ended yet", transform=upper.transAxes, ha="center", color=INK)
 
