@@ -261,7 +261,8 @@ def test_command_plans_from_files(command, tmp_path):
         (["nowhere"], "nowhere"),
         (
             ["pretrained/none"],
-            "expected pretrained/mixed, pretrained/r1, pretrained/r3, pretrained/r4, pretrained/unmasked",
+            "expected pretrained/fcn4d, pretrained/mixed, pretrained/r1, pretrained/r3, pretrained/r4, "
+            "pretrained/unmasked",
         ),
         (["pretrained/r4", "--bin", "bin.npy"], "--tote: no file"),
         (["pretrained/r4", "--bin", "bin.npy", "--tote", "missing.npy"], "missing.npy: cannot be read"),
