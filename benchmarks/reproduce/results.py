@@ -20,7 +20,8 @@ holds the command of its cell. All methods meet the same episodes of the test st
 confidence intervals of the mean over episodes; ° marks fewer than {indicative} episodes: indicative. *Budget* is what
 the method was trained with: frames, and minutes of one core; a cell has an hour at most, or what its JSON says.
 What is *no better than random* feasible choices on the same episodes is not a trained policy, whatever else it does.
-*Attempted* cells could not be done within their budget, or within 20 GiB, and tell how far off they were.
+*Attempted* cells could not be done within their budget, or within 20 GiB, and tell how far off they were. The time of a
+decision is that of one tote, one thread, on a machine that did other work beside.
 
 {done} of {total} cells are done.
 """
@@ -79,7 +80,7 @@ def budget(cell, results) -> str:
     words = [f"{trained['frames']:,} frames", f"{trained['cpu_seconds'] / 60:.0f} min"]
     if trained["frames"] < trained["frames_asked"]:
         words[0] += f" of {trained['frames_asked']:,}"
-    if trained["peak_mib"] > 4096:
+    if (trained["peak_mib"] or 0) > 4096:
         words.append(f"{trained['peak_mib'] / 1024:.1f} GiB")
     if trained["warm_start"]:
         words.append("warm start")

@@ -28,7 +28,7 @@ from pickplace.metrics import read_csv
 
 ROOT = Path(__file__).parents[2]
 RESULTS, OUTPUTS = ROOT / "docs" / "results", ROOT / "outputs" / "reproduce"
-SPENT = "cpu_seconds"  # a file in the folder of a training
+SPENT = "cost.json"  # in the folder of a training
 MEMORY = 20 * 2**30  # bytes that a cell may reserve: what asks for more is told so, and takes nothing from others
 
 
@@ -119,25 +119,25 @@ def attempted(child: Child, cost: dict, reason: str) -> dict:
 def train(cell: Cell, minutes: float) -> dict:
     """Train, or go on training, for at most so many minutes in all; the curve and what it cost."""
     folder = run_dir_of(cell)
-    last, spent, peak = folder / "checkpoints" / "last", cpu_seconds(folder), None
-    if not (last.is_dir() and spent >= 60 * minutes):
+    last, before = folder / "checkpoints" / "last", spent(folder)
+    if not (last.is_dir() and before["cpu_seconds"] >= 60 * minutes):
         action = [f"resume={folder}"] if last.is_dir() else [*cell.overrides, "threads=1", f"hydra.run.dir={folder}"]
         child = Child([sys.executable, "-m", "pickplace.train", *action], OUTPUTS / "logs" / f"{cell.name}.log")
-        cost = child.wait(minutes - spent / 60)
-        cost["cpu_seconds"] += spent
-        peak = cost["peak_mib"]
+        cost = child.wait(minutes - before["cpu_seconds"] / 60)
+        cost["cpu_seconds"] += before["cpu_seconds"]
+        cost["peak_mib"] = max(cost["peak_mib"], before["peak_mib"])
         if folder.is_dir():
-            (folder / SPENT).write_text(str(cost["cpu_seconds"]))
+            (folder / SPENT).write_text(json.dumps({key: cost[key] for key in ("cpu_seconds", "peak_mib")}))
         if not last.is_dir() or (cost["rc"] and cost["ended_by"] == "itself"):
             return attempted(child, cost, "no batch was finished within the budget")
     facts = json.loads((last / "state.json").read_text())
-    seconds = cpu_seconds(folder)
+    cost = spent(folder)
     return {
         "frames": facts["frames"],
         "frames_asked": facts["config"]["total_frames"],
-        "cpu_seconds": round(seconds, 1),
-        "frames_a_second": round(facts["frames"] / seconds, 1),
-        "peak_mib": peak,
+        "cpu_seconds": round(cost["cpu_seconds"], 1),
+        "frames_a_second": round(facts["frames"] / cost["cpu_seconds"], 1),
+        "peak_mib": cost["peak_mib"],
         "warm_start": (facts["config"].get("warm_start") or {}).get("frames", 0),
         "mask_in_training": facts["config"]["algo"]["mask_infeasible"],
         "trained_with": {"commit": facts["commit"], "versions": facts["versions"]},
@@ -145,9 +145,10 @@ def train(cell: Cell, minutes: float) -> dict:
     }
 
 
-def cpu_seconds(folder: Path) -> float:
-    """CPU time that a training has used so far, over all its resumptions."""
-    return float((folder / SPENT).read_text()) if (folder / SPENT).is_file() else 0.0
+def spent(folder: Path) -> dict:
+    """CPU time and peak memory of a training so far, over all its resumptions."""
+    path = folder / SPENT
+    return json.loads(path.read_text()) if path.is_file() else {"cpu_seconds": 0.0, "peak_mib": 0}
 
 
 def curve(rows: list[dict], points: int = 100) -> dict:
