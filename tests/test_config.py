@@ -101,6 +101,7 @@ def test_every_preset_runs(name, tmp_path):
     assert 0 <= occupancy <= 1
     assert [row["frames"] for row in read_csv(tmp_path / "metrics.csv")] == [16, 32]
     assert {path.name for path in tmp_path.iterdir()} == {
+        ".lock",
         "checkpoints",
         "learning_curve.png",
         "metrics.csv",

@@ -56,8 +56,8 @@ def test_fcn_grasp_trained_there_comes_within_2_percent(tmp_path):
     state, _ = checkpoint.read(tmp_path / "checkpoints" / "last")
     make = make_env(4)
     rules = make(0, 1).rules
-    make = partial(config.instantiate, cfg.model.actor, rules=rules, mask_infeasible=True)
-    policy = checkpoint.restore(make, state["policy"], "policy")
+    build = partial(config.instantiate, cfg.model.actor, rules=rules, mask_infeasible=True)
+    policy = checkpoint.restore(build, state["policy"], "policy")
     occupancy = play(make, PolicyPlanner(rules, policy), 2000, 1000).occupancy
     noise = occupancy.std() / len(occupancy) ** 0.5
     assert occupancy.mean() < OPTIMA[4, 4, 4] + 3 * noise

@@ -174,10 +174,10 @@ def test_a_training_is_taken_up_where_its_budget_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "OUTPUTS", tmp_path)
     overrides = ("experiment=smoke", "total_frames=2_000_000", "evaluation_interval=2_000_000")
     cell = cells.Cell("tiny", "train", overrides, "tiny", ())
-    first = run.train(cell, 0.4)
+    first = run.train(cell, 0.25)
     assert first["frames"] < first["frames_asked"] == 2_000_000
-    assert run.train(cell, 0.4)["frames"] == first["frames"]  # its budget is spent: nothing runs
-    again = run.train(cell, 0.6)
+    assert run.train(cell, 0.25)["frames"] == first["frames"]  # its budget is spent: nothing runs
+    again = run.train(cell, 0.4)
     assert again["frames"] > first["frames"] and again["cpu_seconds"] > first["cpu_seconds"]
     assert again["curve"]["frames"][-1] == again["frames"]
     assert run.checkpoint_of("tiny").name == "last"  # it was never validated
