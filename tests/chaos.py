@@ -114,18 +114,14 @@ def chaos(folder: Path, kills: int, collector: str, seed: int) -> dict[str, int]
 
 
 def main() -> None:
-    kills, collector, seed = _arguments()
+    given = sys.argv[1:]
+    kills, collector, seed = given + ["100", "single", "0"][len(given) :]
     with tempfile.TemporaryDirectory() as folder:
         moments = chaos(Path(folder), int(kills), collector, int(seed))
     told = ", ".join(f"{count} while {moment}" for moment, count in moments.items())
     sys.stdout.write(
         f"collector={collector}: killed {kills} times ({told}); it ended as an undisturbed run, bit for bit\n"
     )
-
-
-def _arguments() -> list[str]:
-    given = sys.argv[1:]
-    return given + ["100", "single", "0"][len(given) :]
 
 
 if __name__ == "__main__":

@@ -6,20 +6,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cells
+import claims
+import figures
+import placement_only
 import pytest
+import results
+import run
 from hydra import compose, initialize_config_dir
 
 from pickplace import config
 
 FOLDER = Path(__file__).parents[1] / "benchmarks" / "reproduce"
-sys.path.insert(0, str(FOLDER))
-
-import cells  # noqa: E402
-import claims  # noqa: E402
-import figures  # noqa: E402
-import placement_only  # noqa: E402
-import results  # noqa: E402
-import run  # noqa: E402
 
 TRAININGS, PARTS = cells.read()
 

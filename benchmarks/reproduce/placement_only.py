@@ -15,6 +15,7 @@ import torch
 
 from pickplace import PickPlaceEnv
 from pickplace.evaluate import confidence95
+from pickplace.geometry import NEVER
 
 STREAM, SEED = "test", 0
 
@@ -86,7 +87,7 @@ def replay(env: PickPlaceEnv, packer) -> tuple[list[str], float, float]:
         reachable = bool(rules.outcome_mask(placements)[0, turned, x, y])
         if rest != z:
             outcome = "rests_elsewhere"
-        elif float((under == rest).double().mean()) < rules.min_support:
+        elif placements.top[0, turned, x, y] == NEVER:  # it fits, so its support is too small
             outcome = "unstable"
         else:
             outcome = "executed" if reachable else "effector_collides"

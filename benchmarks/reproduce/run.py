@@ -193,8 +193,8 @@ def evaluate(cell: Cell, minutes: float) -> dict:
     result = json.loads((folder / "evaluation.json").read_text())
     result["occupancy"]["per_episode"] = [round(value, 6) for value in result["occupancy"]["per_episode"]]
     if result["checkpoint"]:
-        which = Path(result["checkpoint"]).name if cell.training else None  # best, or last
         given = next((word[11:] for word in cell.overrides if word.startswith("checkpoint=")), None)
+        which = Path(result["checkpoint"]).name  # best, or last
         result["checkpoint"] = f"{cell.training}/{which}" if cell.training else given
     return {**result, "peak_mib": cost["peak_mib"], "cpu_seconds": cost["cpu_seconds"]}
 
@@ -259,9 +259,9 @@ def write(cell: Cell, minutes: float, result: dict) -> str:
     path = result_of(cell)
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps({**head, **facts, **result}, indent=1)
-    text = re.sub(
-        r"\[\s+((?:[-\d.e]+,?\s*)+)\]", lambda m: "[" + " ".join(m[1].split()) + "]", text
-    )  # lists of numbers
+    # Lists of numbers on one line each; the pattern must not backtrack on long ones that hold something else.
+    numbers = re.compile(r"\[\s+(-?[\d.e+-]+(?:,\s+-?[\d.e+-]+)*)\s+\]")
+    text = numbers.sub(lambda found: f"[{' '.join(found[1].split())}]", text)
     path.with_suffix(".part").write_text(text + "\n")
     path.with_suffix(".part").replace(path)
     if "attempted" in result:
