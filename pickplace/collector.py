@@ -1,6 +1,7 @@
 """Collectors whose state can be saved and restored exactly. The one place that touches private names of TorchRL."""
 
 import signal
+import threading
 from collections import OrderedDict
 from contextlib import contextmanager
 from functools import partial
@@ -94,6 +95,10 @@ def watched(collector):
         if dead:  # first of all one that was killed: others may have ended because of it
             number = min(dead, key=lambda number: workers[number].exitcode == 0)
             code = workers[number].exitcode
+            # Loggers and finalizers swallow what is raised while they run, so it is said again until we have left.
+            again = threading.Timer(0.5, signal.pthread_kill, (threading.main_thread().ident, signal.SIGCHLD))
+            again.daemon = True
+            again.start()
             raise WorkerDied(f"collector worker {number + 1} of {len(workers)} has died (exit code {code}).")
 
     previous = signal.signal(signal.SIGCHLD, look)

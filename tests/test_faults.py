@@ -1,18 +1,23 @@
 """What goes wrong on shared machines overnight: nothing is lost, and one sentence says what to do."""
 
+import multiprocessing
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hydra import compose, initialize_config_dir
 from test_resume import start, wait_for_rows
 
 from pickplace import checkpoint, config
+from pickplace.collector import watched
+from pickplace.config import WorkerDied
 from pickplace.train import claim, resume_run, train
 
 ENDLESS = ["experiment=smoke", "total_frames=10_000_000", "threads=1"]
@@ -30,6 +35,18 @@ def test_a_dead_worker_ends_the_run_in_one_sentence(tmp_path):
     assert sentence.startswith("error: collector worker 2 of 2 has died (exit code -9). What was saved before")
     assert f" is whole: python -m pickplace.train resume={run_dir}/checkpoints/" in sentence
     assert checkpoint.read(run_dir / "checkpoints" / "last")
+
+
+def test_a_worker_s_death_is_told_until_it_is_heard():
+    """A logger or a finalizer swallows what is raised while it runs."""
+    worker = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600,))
+    worker.start()
+    with pytest.raises(WorkerDied, match="1 of 1 has died"), watched(SimpleNamespace(procs=[worker])):
+        worker.kill()
+        with suppress(WorkerDied):
+            time.sleep(60)
+        time.sleep(60)
+    time.sleep(0.6)  # and not once we have left
 
 
 def test_a_second_process_in_the_same_run_folder_is_refused(tmp_path):
