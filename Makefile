@@ -35,10 +35,11 @@ train: $(STAMP)  ## train (experiment=quick; ARGS="key=value ..." adds overrides
 	  evaluation/tote.png 'a packed tote' \
 	  evaluation/replay.html 'how it was packed, in 3D'
 
-test test-slow: export OMP_NUM_THREADS ?= 2
-test: $(STAMP)  ## run the test suite (minutes)
-	$(BIN)/python -m pytest -q $(ARGS)
+test: export OMP_NUM_THREADS ?= 1
+test: $(STAMP)  ## run the test suite (minutes), in as many processes as there are cores, at most 4
+	$(BIN)/python -m pytest -q -n logical --maxprocesses 4 --dist worksteal $(ARGS)
 
+test-slow: export OMP_NUM_THREADS ?= 2
 test-slow: $(STAMP)  ## run the long checks (an hour)
 	$(BIN)/python -m pytest -q -m slow --timeout 7200 $(ARGS)
 

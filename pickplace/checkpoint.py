@@ -47,13 +47,19 @@ def flatten(tree, prefix: str = "") -> tuple[dict[str, Tensor], dict]:
 
 
 def unflatten(tensors: dict[str, Tensor], facts: dict) -> dict:
-    """The inverse of :func:`flatten`; lists come back as dicts with whole-number keys."""
+    """The inverse of :func:`flatten`; lists come back as dicts with whole-number keys.
+
+    Raises:
+        ValueError: for a path that goes on below another one's leaf.
+    """
     tree = {}
     for path, value in [*tensors.items(), *facts.items()]:
         node = tree
         *parents, leaf = (int(part) if part.isdecimal() else part for part in path.split("|"))
         for parent in parents:
-            node = node.setdefault(parent, {})
+            node = node.setdefault(parent, {}) if isinstance(node, dict) else None
+        if not isinstance(node, dict) or leaf in node:
+            raise ValueError(f"{path!r} stands where something else stands")
         node[leaf] = value
     return tree
 
@@ -158,7 +164,7 @@ def _read(folder: Path) -> tuple[dict, dict]:
     try:
         facts = json.loads((folder / FACTS).read_bytes())
         blob = (folder / TENSORS).read_bytes()
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # the last one from JSON that is nested without end
         raise CheckpointError(f"{folder}: the checkpoint cannot be read ({error}).") from error
     if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
         found = facts.get("schema") if isinstance(facts, dict) else None
@@ -173,7 +179,10 @@ def _read(folder: Path) -> tuple[dict, dict]:
     whole = isinstance(frames, int) and not isinstance(frames, bool) and frames >= 0
     if not isinstance(state, dict) or not isinstance(facts.get("config"), dict) or not whole:
         raise CheckpointError(f"{folder}: {FACTS} lacks its state, config or frames; expected what a training wrote.")
-    state = unflatten(tensors, state)
+    try:
+        state = unflatten(tensors, state)
+    except ValueError as error:
+        raise CheckpointError(f"{folder}: {FACTS} and {TENSORS} do not fit each other ({error}).") from error
     if not isinstance(state.get("policy"), dict):
         raise CheckpointError(f"{folder}: {TENSORS} has no policy; expected what a training wrote.")
     return state, facts

@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors.torch import save
 
 from pickplace import checkpoint
 from pickplace.checkpoint import CheckpointError
@@ -146,6 +147,55 @@ def test_a_pickle_is_never_run_whatever_its_name(tmp_path, name):
     else:
         checkpoint.read(checkpoint.locate(folder))
     assert not made.exists()
+
+
+paths = st.one_of(
+    st.sampled_from(["policy", "policy|x", "policy|0", "policy|0|y", "|", "../x"]), st.text("a|0/.", max_size=5)
+)
+plain = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(-(2**70), 2**70), st.floats(), st.text(max_size=6)),
+    lambda c: st.one_of(st.lists(c, max_size=3), st.dictionaries(paths, c, max_size=4)),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.dictionaries(st.sampled_from(["state", "config", "frames", "schema", "policy", "best"]), plain),
+    st.dictionaries(paths, st.builds(torch.zeros, st.just(2)), max_size=4),
+    st.binary(max_size=3),
+    st.integers(0, 400),
+)
+def test_whatever_a_checkpoint_holds_it_is_read_or_refused(tmp_path_factory, facts, tensors, noise, at):
+    """With the right checksum, so that what is refused is refused for what it is."""
+    folder = tmp_path_factory.mktemp("any") / "checkpoints" / "last"
+    folder.mkdir(parents=True)
+    blob = save(tensors)
+    blob = blob[:at] + noise + blob[at + len(noise) :]
+    digest = hashlib.sha256(blob).hexdigest()
+    content = {"schema": 1, "frames": 0, "config": {}, "state": {"policy|x": 1}, "sha256": digest, **facts}
+    (folder / checkpoint.TENSORS).write_bytes(blob)
+    (folder / checkpoint.FACTS).write_text(json.dumps(content))
+    try:
+        state, facts = checkpoint.read(checkpoint.locate(folder))
+        assert isinstance(state["policy"], dict) and isinstance(facts["config"], dict) and facts["frames"] >= 0
+    except CheckpointError as error:
+        assert "\n" not in str(error)
+    assert {path.name for path in folder.parent.parent.rglob("*")} == {
+        "checkpoints",
+        "last",
+        checkpoint.FACTS,
+        checkpoint.TENSORS,
+    }
+
+
+@pytest.mark.parametrize("text", ["[" * 200_000, '{"a":' * 200_000, '{"frames": ' + "9" * 10_000 + "}", "\xff", ""])
+def test_facts_that_are_no_facts(tmp_path, text):
+    folder = tmp_path / "last"
+    checkpoint.write(folder, {"policy": {}}, {"frames": 1, "config": {}})
+    (folder / checkpoint.FACTS).write_bytes(text.encode("latin-1"))
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        checkpoint.read(folder)
 
 
 def test_metrics_survive_a_cut_line_and_a_resume(tmp_path):
