@@ -188,23 +188,50 @@ def _read(folder: Path) -> tuple[dict, dict]:
     return state, facts
 
 
+def fitting(theirs, mine: dict, what: str, path: str = "") -> dict:
+    """The part of a checkpoint's state that is shaped like ``mine``, nested dicts of tensors and plain values.
+
+    Raises:
+        CheckpointError: naming the first value that is missing, of another type or shape, or not finite.
+    """
+    found = {}
+    for key, own in mine.items():
+        other, name = theirs.get(key) if isinstance(theirs, dict) else None, f"{path}{key}"
+        if key == "cuda_rng" and other is None:  # saved without a GPU
+            continue
+        if isinstance(own, dict):
+            found[key] = fitting(other, own, what, f"{name}|")
+            continue
+        if _kind(other) != _kind(own):
+            raise CheckpointError(
+                f"The checkpoint's {what} does not fit these settings: {name} is {_kind(other)}, expected {_kind(own)}."
+            )
+        if isinstance(other, Tensor) and not other.isfinite().all():
+            raise CheckpointError(f"The checkpoint's {what} is of no use: {name} holds values that are not finite.")
+        found[key] = other
+    return found
+
+
+def _kind(value) -> str:
+    """A value's type, for comparing and for messages."""
+    if isinstance(value, Tensor):
+        return f"{str(value.dtype).removeprefix('torch.')} of shape {tuple(value.shape)}"
+    return "missing" if value is None else type(value).__name__
+
+
 def restore(make, state: dict, what: str) -> torch.nn.Module:
     """The module that ``make()`` makes, with a checkpoint's tensors.
 
     Sizes are compared before any memory is taken: a config that asks for more than there is cannot fit the tensors.
 
     Raises:
-        CheckpointError: naming the first tensor that is missing, unexpected or of another shape.
+        CheckpointError: as :func:`fitting`, and for a tensor that the module does not have.
     """
     with torch.device("meta"):
         own = make().state_dict()
-    for key in sorted({*own, *state}):
-        mine = tuple(own[key].shape) if key in own else None
-        theirs = tuple(state[key].shape) if isinstance(state.get(key), Tensor) else None
-        if mine != theirs:
-            raise CheckpointError(
-                f"The checkpoint's {what} does not fit these settings: {key} has shape {theirs}, expected {mine}."
-            )
+    weights = fitting(state, own, what)
+    if unknown := sorted(map(str, set(state) - set(own))):
+        raise CheckpointError(f"The checkpoint's {what} does not fit these settings: {unknown[0]} is not expected.")
     module = make()
-    module.load_state_dict(state)
+    module.load_state_dict(weights)
     return module

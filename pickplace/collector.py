@@ -42,8 +42,8 @@ class ResumableCollector(Collector):
         return OrderedDict(
             environment=dict(self.env.base_env.state_dict()),
             transforms=dict(self.env.transform.state_dict()),
-            # Without "collector": trajectory numbers are drawn from a pool that all workers share, and never read.
-            carried=self._carrier.exclude("collector").clone().to_dict(),
+            # What the next step reads. Trajectory numbers, in "collector", are drawn from a pool that workers share.
+            carried=self._carrier.select(*self.env.observation_spec.keys(), *self.env.done_keys).clone().to_dict(),
             counters={"frames": torch.tensor(self._frames), "iterations": torch.tensor(self._iter)},
             **rng_state(self.env.device),
         )

@@ -417,15 +417,24 @@ class Curriculum:
         """Continue where :meth:`state_dict` was taken; call after :meth:`setup`.
 
         Raises:
-            ValueError: the state of another advance rule, or a level outside the configured heights.
+            ValueError: the state of another advance rule, a level outside the configured heights, or no such state.
         """
-        state, rule = dict(state), state["advance"]
+        rule = state.get("advance") if isinstance(state, dict) else None
+        if not isinstance(rule, dict) or set(state) != {*vars(self.tally), "advance"}:
+            raise ValueError(f"The checkpoint's curriculum is {state!r}; expected what a training wrote.")
         if set(rule) != set(self.advance.remembers):
             raise ValueError(
                 f"curriculum.advance={type(self.advance).__name__}: the checkpoint has the state "
                 f"{sorted(rule)}, expected {sorted(self.advance.remembers)}; resume with the run's own rule."
             )
-        del state["advance"]
-        _whole("curriculum level of the checkpoint", state["level"], self.start, self.end)
-        self.tally = Tally(**state | {"window": deque(state["window"], self.advance.window)})
+        key = "curriculum {} of the checkpoint".format
+        level = _whole(key("level"), state["level"], self.start, self.end)
+        counts = {name: _whole(key(name), state[name], 0) for name in ("frames", "began", "episodes")}
+        if not isinstance(state["window"], list):
+            raise ValueError(f"{key('window')}={state['window']!r}: expected a list of numbers between 0 and 1.")
+        window = deque((_fraction(key("window"), share) for share in state["window"]), self.advance.window)
+        for name, value in rule.items():
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < math.inf:
+                raise ValueError(f"{key(name)}={value!r}: expected a number.")
+        self.tally = Tally(level, window, **counts)
         vars(self.advance).update(rule)

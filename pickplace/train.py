@@ -72,7 +72,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     state, facts, safe = resume or ({}, {}, None)  # safe: the checkpoint that was read or written last
 
     def build(what: str, make) -> torch.nn.Module:
-        return (checkpoint.restore(make, state[what], what) if resume else make()).to(device)
+        return (checkpoint.restore(make, state.get(what), what) if resume else make()).to(device)
 
     make_policy = partial(config.instantiate, cfg.model.actor, rules=rules, mask_infeasible=algo.mask_infeasible)
     policy = build("policy", make_policy)
@@ -105,16 +105,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     advantage, loss = make_losses(algo, policy, critic)
     learned = [*policy.in_keys, policy.choice_key, "log_prob", "advantage", "value_target"]
     optimizer = torch.optim.Adam(loss.parameters(), lr=algo.lr, eps=1e-5)
-    if resume:
-        optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
-        collector.load_state_dict(state["collector"])
-        set_rng_state(state, device)  # last: everything above may have drawn
-
     episodes = None  # of the latest validation
-    logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames)
-    stop, started, first_frames, saved = StopRequest(), time.perf_counter(), frames, frames
-    left = max(cfg.total_frames - frames, 0)
-    log.info("%s frames to train, at tote height %d of %d", f"{left:,}", curriculum.level, curriculum.end)
 
     def save(name: str) -> None:
         nonlocal safe
@@ -137,9 +128,18 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         safe = run_dir / "checkpoints" / name
 
     with ExitStack() as cleanup:
-        cleanup.callback(stop.restore)
         cleanup.callback(collector.shutdown)
+        if resume:
+            load_optimizer(optimizer, state.get("optimizer"))
+            collector.load_state_dict(checkpoint.fitting(state.get("collector"), collector.state_dict(), "collector"))
+            # Last: everything above may have drawn.
+            set_rng_state(checkpoint.fitting(state, rng_state(device), "random generator"), device)
+        logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames)
         cleanup.callback(logger.close)
+        stop, started, first_frames, saved = StopRequest(), time.perf_counter(), frames, frames
+        cleanup.callback(stop.restore)
+        left = max(cfg.total_frames - frames, 0)
+        log.info("%s frames to train, at tote height %d of %d", f"{left:,}", curriculum.level, curriculum.end)
         cleanup.enter_context(saying_what_is_safe(lambda: safe))
         cleanup.enter_context(watched(collector))
         batches = iter(collector)
@@ -269,6 +269,20 @@ def make_losses(algo: DictConfig, policy: torch.nn.Module, critic: ValueOperator
     average = algo.loss == "a2c" and algo.normalize_advantage
     advantage = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=critic, average_gae=average, deactivate_vmap=True)
     return advantage, loss
+
+
+def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
+    """Give Adam the moments of a checkpoint; parameters without a gradient so far have none.
+
+    Raises:
+        CheckpointError: if they do not fit the parameters.
+    """
+    if not state or not isinstance(state, dict):
+        raise checkpoint.CheckpointError("The checkpoint has no optimizer; expected one that a training wrote.")
+    parameters = enumerate(optimizer.param_groups[0]["params"])
+    mine = {n: {"step": torch.tensor(0.0), "exp_avg": p, "exp_avg_sq": p} for n, p in parameters if n in state}
+    moments = checkpoint.fitting(state, mine, "optimizer")
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
 
 
 def training_env(env_config, items, device, masks, total_envs, curriculum, first_episode, num_envs) -> TransformedEnv:
@@ -477,6 +491,12 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     """
     if missing := [key for key in ("curriculum", *COUNTERS) if key not in facts]:
         raise ValueError(f"resume={place}: the checkpoint has no {missing[0]!r}; expected one that a training wrote.")
+    for key in ("iteration", "best"):
+        value = facts[key]
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not -1 <= value < 2**63:
+            raise ValueError(f"resume={place}: the checkpoint's {key} is {value!r}; expected a number >= -1.")
+    if not isinstance(facts["latest"], dict):
+        raise ValueError(f"resume={place}: the checkpoint's latest is {facts['latest']!r}; expected a validation.")
     config.refuse_foreign_targets(facts["config"])
     saved = OmegaConf.create(facts["config"])
     cfg = config.apply_overrides(saved, overrides)

@@ -92,16 +92,20 @@ def test_restore_names_what_does_not_fit():
 
     state = torch.nn.Linear(2, 3).state_dict()
     assert torch.equal(checkpoint.restore(make, state, "policy").weight, state["weight"])
-    with pytest.raises(CheckpointError, match=r"policy does not fit these settings: weight has shape \(4, 2\)"):
+    with pytest.raises(CheckpointError, match=r"policy does not fit .* weight is float32 of shape \(4, 2\)"):
         checkpoint.restore(make, torch.nn.Linear(2, 4).state_dict() | {"bias": torch.zeros(3)}, "policy")
-    with pytest.raises(CheckpointError, match="bias has shape None"):
+    with pytest.raises(CheckpointError, match="bias is missing"):
         checkpoint.restore(make, {"weight": torch.zeros(3, 2)}, "policy")
-    with pytest.raises(CheckpointError, match="bias has shape None"):
+    with pytest.raises(CheckpointError, match="bias is int, expected float32"):
         checkpoint.restore(make, {"weight": torch.zeros(3, 2), "bias": 3}, "policy")
+    with pytest.raises(CheckpointError, match="more is not expected"):
+        checkpoint.restore(make, {**state, "more": torch.zeros(1)}, "policy")
+    with pytest.raises(CheckpointError, match="policy is of no use: bias holds values.* not finite"):
+        checkpoint.restore(make, {**state, "bias": torch.full((3,), float("nan"))}, "policy")
 
 
 def test_a_config_that_asks_for_more_memory_than_there_is_takes_none():
-    with pytest.raises(CheckpointError, match="bias has shape .3,., expected .10000000000,."):
+    with pytest.raises(CheckpointError, match="weight is .* of shape .3, 2., expected .* of shape .10000000000, 2."):
         checkpoint.restore(lambda: torch.nn.Linear(2, 10**10), torch.nn.Linear(2, 3).state_dict(), "policy")
 
 

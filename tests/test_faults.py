@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from test_resume import start, wait_for_rows
 
@@ -143,6 +144,63 @@ def test_a_damaged_checkpoint_is_refused_and_a_whole_one_is_offered(finished, tm
         resume_run([f"resume={run_dir}"])
     resume_run([f"resume={run_dir}/checkpoints/previous", "total_frames=1280"])
     assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 1280
+
+
+NUMBERS = [None, "x", [], {}, float("nan"), 10**30]
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "words"),
+    [
+        *(("iteration", value, "iteration is") for value in NUMBERS),
+        *(("best", value, "best is") for value in NUMBERS),
+        ("latest", 3, "latest is 3; expected a validation"),
+        *(("curriculum", value, "curriculum is") for value in NUMBERS),
+        ("curriculum|level", 2.5, "level of the checkpoint=2.5: expected a whole number"),
+        ("curriculum|frames", -1, "frames of the checkpoint=-1: expected a whole number"),
+        ("curriculum|window", "abc", "window of the checkpoint='abc': expected a list"),
+        ("curriculum|window", [0.5, 7], "window of the checkpoint=7: expected a number between 0 and 1"),
+        ("rng", torch.zeros(5056), "rng is float32 of shape (5056,), expected uint8 of shape (5056,)"),
+        ("rng", None, "rng is missing, expected uint8"),
+        ("optimizer", None, "has no optimizer"),
+        ("optimizer|0|step", torch.tensor(float("inf")), "optimizer is of no use: 0|step holds values"),
+        ("optimizer|0|exp_avg", torch.zeros(3), "0|exp_avg is float32 of shape (3,), expected"),
+        ("critic", None, "critic does not fit"),
+        ("collector", None, "environment|heights is missing"),
+        ("collector|rng", torch.zeros(3), "rng is float32"),
+        ("collector|carried|outcome_mask", None, "carried|outcome_mask is missing, expected bool"),
+        ("collector|carried|tote_depth", torch.zeros(8, 4, 9), "tote_depth is float32 of shape (8, 4, 9)"),
+        (
+            "collector|environment|heights",
+            torch.zeros(8, 4, 4),
+            "of shape (8, 4, 4), expected int32",
+        ),
+        ("collector|counters|frames", None, "counters|frames is missing"),
+        ("policy", torch.zeros(3), "no policy"),
+    ],
+)
+def test_a_checkpoint_that_no_training_wrote_is_not_resumed(finished, tmp_path, part, value, words):
+    """With the right checksum; what was there before stays as it was."""
+    run_dir = tmp_path / "run"
+    shutil.copytree(finished, run_dir)
+    folder = run_dir / "checkpoints" / "last"
+    state, facts = checkpoint.read(folder)
+    *parents, leaf = (int(word) if word.isdecimal() else word for word in part.split("|"))
+    for node in (facts, state):
+        for parent in parents:
+            node = node.get(parent, {})
+        if leaf in node:
+            node[leaf] = value
+            if value is None and node is not facts:
+                del node[leaf]
+    del facts["schema"], facts["sha256"]
+    checkpoint.write(folder, state, facts)
+    before = {path: path.read_bytes() for path in run_dir.rglob("*") if path.is_file() and path.suffix != ".log"}
+    with pytest.raises(ValueError) as caught:
+        resume_run([f"resume={run_dir}", "total_frames=1280"])
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert before == {path: path.read_bytes() for path in before}
 
 
 def test_chaos_in_short(tmp_path):
