@@ -1,5 +1,6 @@
 """Hydra around the commands: where the config files are, overrides on saved configs, and errors in one sentence."""
 
+import errno
 import logging
 import os
 import re
@@ -196,6 +197,8 @@ def sentence(error: Exception) -> str:
         return f"{error.override!r}: expected <key>=<value> ({' '.join(reasons)})."
     if isinstance(error, MissingConfigException) and error.options:
         return f"{error.missing_cfg_file}: there is no such config; expected one of {', '.join(error.options)}."
+    if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"{error.filename}: {error.strerror}; expected a place where you may read and write."
     if isinstance(error, EXPECTED):
         noise = ("full_key", "object_type", "See https", "To append", "Config search path", "provider=")
         lines = [line.strip() for line in str(error).splitlines()]
@@ -273,6 +276,8 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
                 raise
             raise ValueError(_unknown_key(key[1], _composed_without(key[1], config_name, overrides))) from error
         except ValueError as error:  # Hydra's own, which does not say where
+            if isinstance(error.__cause__, OSError):  # such as a log file that cannot be opened
+                raise error.__cause__ from None
             raise ValueError(f"{' '.join(overrides)}: {error}.") from error
         finally:
             os.environ["HYDRA_FULL_ERROR"] = full_error

@@ -95,13 +95,13 @@ def answer(planner: "Planner", line: bytes, defaults: dict, tell: bool = False) 
     """The reply to one line: a plan, or ``{"error": ...}`` in one sentence; with the request's ``id`` if it has one."""
     reply = {}
     try:
-        request = json.loads(line.decode(), parse_constant=refuse_constant)
+        request = json.loads(line.decode(), parse_constant=refuse_constant, parse_float=finite)
         if not isinstance(request, dict):
             raise ValueError(f"got {type(request).__name__}, expected an object with bin_depth and tote_depth.")
         if "id" in request:
             reply["id"] = request.pop("id")
         if unknown := sorted(set(request) - set(REQUEST)):
-            raise ValueError(f"{unknown[0]}: there is no such key; expected any of {', '.join(REQUEST)}.")
+            raise ValueError(f"{unknown[0][:40]}: there is no such key; expected any of {', '.join(REQUEST)}.")
         for key in ("bin_depth", "tote_depth"):
             if key not in request:
                 raise ValueError(f"{key}: missing; expected a depth map as a list of rows.")
@@ -112,9 +112,15 @@ def answer(planner: "Planner", line: bytes, defaults: dict, tell: bool = False) 
         return {**reply, "error": " ".join(str(error).split())}
 
 
+def finite(text: str) -> float:
+    """JSON takes 1e999, which Python reads as infinity and would write as such."""
+    number = float(text)
+    return number if abs(number) < float("inf") else refuse_constant(text)
+
+
 def refuse_constant(name: str):
     """Python's parser takes NaN and Infinity, which JSON does not have."""
-    raise ValueError(f"the line is not JSON: got {name}, expected a finite number.")
+    raise ValueError(f"the line is not JSON: got {name[:20]}, expected a finite number.")
 
 
 def read_map(path: str) -> np.ndarray:

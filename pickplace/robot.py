@@ -6,6 +6,7 @@ cell ``(0, 0)`` on the inner floor; x runs along the first axis of the depth map
 seen from above.
 """
 
+import reprlib
 from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
@@ -135,19 +136,19 @@ class Planner:
         """
         rules, unit = self.rules, 1.0
         if cell_size is not None:
-            unit = _number("cell_size", cell_size, "a length in metres > 0", lambda v: v > 0)
+            unit = _number("cell_size", cell_size, "a length in metres, 1e-6 to 1e6", lambda v: 1e-6 <= v <= 1e6)
         tolerance = _number("tolerance", tolerance, "a number of cells >= 0 and < 0.5", lambda v: 0 <= v < 0.5)
         if isinstance(alternatives, bool) or not isinstance(alternatives, int) or alternatives < 0:
-            raise DepthMapError(f"alternatives={alternatives!r}: expected a whole number >= 0.")
+            raise DepthMapError(f"alternatives={reprlib.repr(alternatives)}: expected a whole number >= 0.")
         height = rules.tote_size[2]
         if tote_height is not None:
             wanted = f"a whole number of cells >= 1, within {tolerance:g}" + (", in metres" if cell_size else "")
-            measured = _number(
-                "tote_height", tote_height, wanted, lambda v: abs(v / unit - round(v / unit)) <= tolerance
-            )
-            height = round(measured / unit)
-            if not 1 <= height < 2**20:
-                raise DepthMapError(f"tote_height={tote_height!r}: expected {wanted}.")
+
+            def good(length):  # the range first: far beyond it nothing can be rounded
+                cells = length / unit
+                return 0.5 < cells < 2**20 - 0.5 and abs(cells - round(cells)) <= tolerance
+
+            height = round(_number("tote_height", tote_height, wanted, good) / unit)
         bin_map = _snap("bin_depth", bin_depth, rules.bin_size[:2], unit, tolerance, 2**20)
         tote_map = _snap("tote_depth", tote_depth, rules.tote_size[:2], unit, tolerance, height)
         _refuse_other_than_one_cuboid(bin_map)
@@ -293,7 +294,7 @@ def _number(name: str, value, wanted: str, good) -> float:
     except (TypeError, ValueError, OverflowError):
         number = float("nan")
     if isinstance(value, (bool, str)) or not abs(number) < float("inf") or not good(number):
-        raise DepthMapError(f"{name}={value!r}: expected {wanted}.")
+        raise DepthMapError(f"{name}={reprlib.repr(value)}: expected {wanted}.")
     return number
 
 

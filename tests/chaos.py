@@ -79,7 +79,7 @@ def torment(run_dir: Path, settings: list[str], kills: int, draw: random.Random)
             ended, status = os.waitpid(child, os.WNOHANG)
             if ended:
                 raise RuntimeError(f"it ended by itself, {status}: {run_dir.with_suffix('.log').read_text()[-800:]}")
-            if aim != "saving":
+            if aim != "saving" or rows(run_dir) < before + patience:
                 time.sleep(0.002)
         time.sleep(draw.uniform(0, 0.004 if aim == "saving" else 0.2))
         os.kill(child, signal.SIGKILL)

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -16,10 +17,12 @@ import torch
 from hydra import compose, initialize_config_dir
 from test_resume import start, wait_for_rows
 
-from pickplace import checkpoint, config
+from pickplace import Planner, checkpoint, config
 from pickplace.collector import watched
 from pickplace.config import WorkerDied
+from pickplace.evaluate import main as evaluate_main
 from pickplace.train import claim, resume_run, train
+from pickplace.train import main as train_main
 
 ENDLESS = ["experiment=smoke", "total_frames=10_000_000", "threads=1"]
 
@@ -144,6 +147,49 @@ def test_a_damaged_checkpoint_is_refused_and_a_whole_one_is_offered(finished, tm
         resume_run([f"resume={run_dir}"])
     resume_run([f"resume={run_dir}/checkpoints/previous", "total_frames=1280"])
     assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 1280
+
+
+@pytest.fixture
+def read_only(finished):
+    """A finished run in a folder where nothing can be written, not even by root."""
+    with tempfile.TemporaryDirectory() as base:  # pytest's own folders are closed to other users
+        run_dir = Path(base) / "run"
+        shutil.copytree(finished, run_dir)
+        for path in (Path(base), run_dir, *run_dir.rglob("*")):
+            path.chmod(0o555 if path.is_dir() else 0o444)
+        user = os.geteuid()
+        if user == 0:
+            os.seteuid(65534)
+        try:
+            yield run_dir
+        finally:
+            os.seteuid(user)
+            for path in (Path(base), run_dir, *run_dir.rglob("*")):
+                path.chmod(0o755)
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments", "name"),
+    [
+        (train_main, ["resume={}", "total_frames=1280"], ".lock"),
+        (train_main, ["experiment=smoke", "hydra.run.dir={}"], "train.log"),
+        (train_main, ["experiment=smoke", "hydra.run.dir={}/below"], "below"),
+        (evaluate_main, ["planner=random", "hydra.run.dir={}"], "evaluate.log"),
+    ],
+)
+def test_a_read_only_run_folder_is_named(read_only, monkeypatch, capsys, main, arguments, name):
+    monkeypatch.setattr(sys, "argv", ["pickplace", *(word.format(read_only) for word in arguments)])
+    before = {path: path.read_bytes() for path in read_only.rglob("*") if path.is_file()}
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    expected = f"error: {read_only}/{name}: Permission denied; expected a place where you may read and write.\n"
+    assert capsys.readouterr().err == expected
+    assert before == {path: path.read_bytes() for path in read_only.rglob("*") if path.is_file()}
+
+
+def test_a_read_only_run_can_be_evaluated_from_elsewhere(read_only):
+    Planner.load(read_only)
 
 
 NUMBERS = [None, "x", [], {}, float("nan"), 10**30]

@@ -186,7 +186,7 @@ BAD = [
     ({"tote_depth": changed(EMPTY, (3, 1), -1)}, "tote_depth[3, 1]: got -1 cells"),
     ({"tote_depth": EMPTY * 0.05 + 0.02, "bin_depth": ITEM * 0.05, "cell_size": 0.05},
      "tote_depth[0, 0]: got 5.4 cells (0.27 m), expected a whole number of cells, within 0.25"),
-    ({"cell_size": 0}, "cell_size=0: expected a length in metres > 0"),
+    ({"cell_size": 0}, "cell_size=0: expected a length in metres, 1e-6 to 1e6"),
     ({"cell_size": "5cm"}, "cell_size='5cm': expected a length"),
     ({"cell_size": float("nan")}, "cell_size=nan"),
     ({"cell_size": 1e-320}, "bin_depth[1, 2]: got inf cells"),
