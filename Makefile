@@ -5,7 +5,7 @@ STAMP := .venv/.installed
 RUN ?= outputs/quick_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
 
-.PHONY: help install demo train test test-slow chaos bench reproduce results lint format clean
+.PHONY: help install demo train test test-slow chaos fuzz memory bench reproduce results lint format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -46,6 +46,12 @@ test-slow: $(STAMP)  ## run the long checks (an hour)
 chaos: $(STAMP)  ## kill trainings a hundred times with either collector, and compare how they end (half an hour)
 	$(BIN)/python tests/chaos.py 100 single
 	$(BIN)/python tests/chaos.py 100 multi_sync
+
+fuzz: $(STAMP)  ## feed the planner with damaged requests (an hour)
+	$(BIN)/python tests/fuzz.py 60
+
+memory: $(STAMP)  ## watch the memory of a planner and of two trainings (an hour and a half)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/memory.py
 
 bench: $(STAMP)  ## run the benchmarks on a quiet machine (half an hour), and write docs/performance.md
 	$(BIN)/pip install --quiet --disable-pip-version-check 'jumanji>=1.1,<2' || echo "jumanji: not to be had, its part is skipped"
