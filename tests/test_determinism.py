@@ -1,0 +1,56 @@
+"""docs/determinism.md, held to its word."""
+
+import json
+import sys
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from test_resume import assert_same
+
+from pickplace import Planner, config, evaluate
+from pickplace.train import train
+
+PAPER = [(1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1)]
+
+
+@pytest.mark.parametrize(
+    "settings", [["curriculum=mixture"], ["algo=a2c", "warm_start=random", "warm_start.frames=256"]], ids=" ".join
+)
+def test_the_same_training_twice(tmp_path, settings):
+    for name in "ab":
+        with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
+            cfg = compose("train", ["experiment=smoke", "threads=1", "total_frames=768", "seed=3", *settings])
+        (tmp_path / name).mkdir()
+        train(cfg, tmp_path / name)
+    assert_same(tmp_path / "a", tmp_path / "b")
+
+
+@pytest.mark.parametrize("planner", ["joint_dbl", "random", "mcts", "lookahead", "policy"])
+def test_the_same_evaluation_twice(tmp_path, monkeypatch, planner):
+    results = []
+    more = {"mcts": ["planner.simulations=20"], "lookahead": ["planner.samples=2"]}.get(planner, [])
+    if planner in ("lookahead", "policy"):
+        more = [*more, "checkpoint=pretrained/r4"]
+    for name in "ab":
+        settings = ["env.tote_size=[4,4,2]", "evaluation.episodes=6", "threads=1", f"hydra.run.dir={tmp_path / name}"]
+        monkeypatch.setattr(sys, "argv", ["pickplace-evaluate", f"planner={planner}", *settings, *more])
+        evaluate.main()
+        results.append(json.loads((tmp_path / name / "evaluation.json").read_text()))
+        del results[-1]["latency_ms"]
+    assert results[0] == results[1]
+
+
+def test_a_plan_depends_on_its_own_maps_alone():
+    def maps(seed):
+        generator = torch.Generator().manual_seed(seed)
+        w, d, h = PAPER[seed % len(PAPER)]
+        item = torch.zeros(5, 5)
+        item[1 : 1 + w, 2 : 2 + d] = h
+        return item, torch.randint(0, 6, (6, 6), generator=generator)
+
+    planner = Planner.load("pretrained/r4")
+    forwards = [planner.plan(*maps(seed)) for seed in range(12)]
+    torch.manual_seed(99)
+    backwards = [planner.plan(*maps(seed)) for seed in reversed(range(12))]
+    assert forwards == backwards[::-1]
