@@ -5,16 +5,16 @@ STAMP := .venv/.installed
 RUN ?= outputs/quick_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
 
-.PHONY: help install demo train test test-slow chaos fuzz memory bench reproduce results lint format clean
+.PHONY: help install demo train test test-slow coverage chaos fuzz memory bench reproduce results lock audit lint format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-install: $(STAMP)  ## create .venv and install the package and what the tests need
+install: $(STAMP)  ## create .venv and install the package and what the tests need (LOCK=.ci/requirements.lock: these versions)
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check $(if $(LOCK),-c $(LOCK)) -e '.[dev]'
 	@touch $@
 
 demo: $(STAMP)  ## pack totes with the weights that come along, and show it in a browser
@@ -43,6 +43,9 @@ test-slow: export OMP_NUM_THREADS ?= 2
 test-slow: $(STAMP)  ## run the long checks (an hour)
 	$(BIN)/python -m pytest -q -m slow --timeout 7200 $(ARGS)
 
+coverage: $(STAMP)  ## run the test suite, and tell which lines it never reaches
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --maxprocesses 4 --dist worksteal --cov --cov-report=term
+
 chaos: $(STAMP)  ## kill trainings a hundred times with either collector, and compare how they end (half an hour)
 	$(BIN)/python tests/chaos.py 100 single
 	$(BIN)/python tests/chaos.py 100 multi_sync
@@ -67,6 +70,13 @@ reproduce: $(STAMP)  ## compute what is missing of the paper's comparison (days;
 
 results: $(STAMP)  ## draw the comparison's figures, and write docs/results.md
 	$(BIN)/python benchmarks/reproduce/results.py
+
+lock: $(STAMP)  ## write down the versions that are installed, for make install LOCK=.ci/requirements.lock
+	$(BIN)/pip freeze --exclude-editable | sed 's/+cpu//' > .ci/requirements.lock
+
+audit: $(STAMP)  ## look the locked versions up in the database of known vulnerabilities (needs the internet)
+	$(BIN)/pip install --quiet --disable-pip-version-check 'pip-audit>=2.7,<3'
+	$(BIN)/pip-audit --requirement .ci/requirements.lock --no-deps
 
 lint: $(STAMP)  ## check style
 	$(BIN)/ruff check .
