@@ -37,7 +37,7 @@ def same(a, b):
     return type(a) is type(b) and a == b
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(tree=trees)
 def test_round_trip(tree, tmp_path_factory):
     folder = tmp_path_factory.mktemp("round") / "last"
@@ -163,7 +163,7 @@ plain = st.recursive(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.dictionaries(st.sampled_from(["state", "config", "frames", "schema", "policy", "best"]), plain),
     st.dictionaries(paths, st.builds(torch.zeros, st.just(2)), max_size=4),

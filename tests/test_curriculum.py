@@ -243,7 +243,7 @@ def run(curriculum, batches, frames=0):
 
 
 @pytest.mark.parametrize("rule", RULES)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(batches=BATCHES, low=st.integers(1, 2), high=st.integers(5, 7))
 def test_level_stays_in_range_and_moves_by_one(rule, batches, low, high):
     curriculum = make(RULES[rule](), low=low, high=high)
@@ -254,7 +254,7 @@ def test_level_stays_in_range_and_moves_by_one(rule, batches, low, high):
 
 
 @pytest.mark.parametrize("rule", RULES)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(batches=BATCHES, more=BATCHES)
 def test_state_through_json_continues_exactly(rule, batches, more):
     straight = make(RULES[rule]())

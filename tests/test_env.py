@@ -400,7 +400,7 @@ def test_overflow_leaves_tote_bin_and_mask_as_they_were():
 SIDES = st.integers(1, 3)
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow])
 @given(
     kinds=st.lists(st.tuples(SIDES, SIDES, SIDES), min_size=1, max_size=4, unique=True),
     bin_walls=st.integers(1, 2),

@@ -64,7 +64,7 @@ def by_hand(network, bin_depth, tote_depth, parity, x, y):
     return network.head(F.relu(network.hidden(F.relu(out))))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 10**6),
     field=st.sampled_from([3, 5, 7]),
@@ -186,7 +186,7 @@ def test_nothing_allowed_anywhere_gives_no_logit():
     assert (logits == MASKED).all()
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     seed=st.integers(0, 10**6), field=st.sampled_from([1, 3, 5]), tote=st.tuples(st.integers(1, 6), st.integers(1, 6))
 )

@@ -41,7 +41,7 @@ def outcomes(rules, rim, heights, item):
     return step.failure.reshape(grid).numpy(), step.heights.reshape(*grid, *rules.tote_size[:2]).numpy()
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(problems())
 def test_a_success_adds_the_item_and_a_failure_nothing(problem):
     rules, rim, heights, item = problem
@@ -60,7 +60,7 @@ def test_a_success_adds_the_item_and_a_failure_nothing(problem):
     assert ((failure == 0).ravel() == mask[0].numpy()).all()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(problems(), st.integers(1, 1000))
 def test_raising_the_floor_and_the_rim_changes_nothing(problem, by):
     rules, rim, heights, item = problem
@@ -69,7 +69,7 @@ def test_raising_the_floor_and_the_rim_changes_nothing(problem, by):
     assert (failure == raised).all() and (after + by == above).all()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(problems(effector_sides=ODD, rotations=(1, 4)))
 def test_a_mirrored_problem_has_the_mirrored_outcomes(problem):
     """The mirror turns clockwise into counter-clockwise. Odd effectors: an even one's reference is off its centre."""
@@ -92,7 +92,7 @@ def quarter(problem):
     return turned, rim, np.rot90(heights), (bin_d - y - d, x, d, w, h)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(problems(effector_sides=ODD))
 def test_a_turned_problem_has_the_turned_outcomes_and_four_turns_are_none(problem):
     failure, after = outcomes(*problem)

@@ -54,7 +54,7 @@ def test_stable_baselines_checker():
         checker.check_env(make().unwrapped)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 2**31), st.integers(1, 3), st.sampled_from([1, 2]))
 def test_single_against_the_batched_environment(seed, slots, height):
     """Episode ``e`` of a seed is slot ``e`` of the environment underneath, in all that an agent gets."""

@@ -65,7 +65,7 @@ def oracle_of(rules, bin_depth, tote_depth, tote_height):
     return Oracle(own, tote_height, (w, d, int(bin_depth.max())), (x, y), heights)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(cells_and_states(), st.sampled_from(["all", 1, 7]), st.booleans(), st.integers(0, 5))
 def test_plans_agree_with_the_oracle_and_with_plane_geometry(cell, candidates, mask, seed):
     rules, bin_depth, tote_depth = cell

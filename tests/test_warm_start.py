@@ -44,7 +44,7 @@ def heights_after(env, td, action):
     return step.heights, step.failure
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     model=st.sampled_from(["outcome", "grasp", "flat"]),
     rotations=st.integers(1, 4),
