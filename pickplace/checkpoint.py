@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import shutil
+import stat
 from pathlib import Path
 
 import torch
@@ -158,10 +159,12 @@ def read(folder: Path) -> tuple[dict, dict]:
 
 def _read(folder: Path) -> tuple[dict, dict]:
     folder = Path(folder)
-    for name in (FACTS, TENSORS):
-        if (folder / name).is_symlink():
-            raise CheckpointError(f"{folder}: {name} is a link; expected a file of the checkpoint itself.")
     try:
+        for name in (FACTS, TENSORS):
+            if not stat.S_ISREG((folder / name).lstat().st_mode):  # a pipe would be waited for
+                raise CheckpointError(
+                    f"{folder}: {name} is a link or no file; expected a file of the checkpoint itself."
+                )
         facts = json.loads((folder / FACTS).read_bytes())
         blob = (folder / TENSORS).read_bytes()
     except (OSError, ValueError, RecursionError) as error:  # the last one from JSON that is nested without end
@@ -173,10 +176,11 @@ def _read(folder: Path) -> tuple[dict, dict]:
         raise CheckpointError(f"{folder}: {TENSORS} is truncated or altered, its checksum does not match {FACTS}.")
     try:
         tensors = load(blob)
-    except SafetensorError as error:
-        raise CheckpointError(f"{folder}: {TENSORS} cannot be read ({error}).") from error
+    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:  # types and sizes there are not
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"{folder}: {TENSORS} cannot be read ({reason}).") from error
     state, frames = facts.pop("state", None), facts.get("frames")
-    whole = isinstance(frames, int) and not isinstance(frames, bool) and frames >= 0
+    whole = isinstance(frames, int) and not isinstance(frames, bool) and 0 <= frames < 2**63
     if not isinstance(state, dict) or not isinstance(facts.get("config"), dict) or not whole:
         raise CheckpointError(f"{folder}: {FACTS} lacks its state, config or frames; expected what a training wrote.")
     try:

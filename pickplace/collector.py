@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
 
+from pickplace.checkpoint import CheckpointError
 from pickplace.config import WorkerDied
 
 
@@ -66,10 +67,17 @@ def rng_state(device: torch.device) -> dict[str, torch.Tensor]:
 
 
 def set_rng_state(state: dict, device: torch.device) -> None:
-    """Restore what :func:`rng_state` returned; one that was saved on another device has the CPU's generator only."""
-    torch.set_rng_state(state["rng"].cpu())
-    if device.type == "cuda" and "cuda_rng" in state:
-        torch.cuda.set_rng_state(state["cuda_rng"].cpu(), device)
+    """Restore what :func:`rng_state` returned; one that was saved on another device has the CPU's generator only.
+
+    Raises:
+        CheckpointError: if no generator is ever in that state.
+    """
+    try:
+        torch.set_rng_state(state["rng"].cpu())
+        if device.type == "cuda" and "cuda_rng" in state:
+            torch.cuda.set_rng_state(state["cuda_rng"].cpu(), device)
+    except RuntimeError as error:
+        raise CheckpointError("The checkpoint's random generator is of no use: it is in no valid state.") from error
 
 
 def ignore_signals() -> None:

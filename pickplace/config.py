@@ -66,14 +66,27 @@ def use_machine(cfg: DictConfig) -> "torch.device":
     import torch  # here, so that --help need not wait for it
 
     if cfg.threads is not None:
-        if not isinstance(cfg.threads, int) or isinstance(cfg.threads, bool) or cfg.threads < 1:
-            raise ValueError(f"threads={cfg.threads}: expected a whole number >= 1, or null.")
+        if not isinstance(cfg.threads, int) or isinstance(cfg.threads, bool) or not 1 <= cfg.threads <= 1024:
+            raise ValueError(f"threads={cfg.threads}: expected a whole number >= 1 and <= 1024, or null.")
         torch.set_num_threads(cfg.threads)
+    return usable_device(cfg.device)
+
+
+def usable_device(name: str) -> "torch.device":
+    """The device of that name.
+
+    Raises:
+        ValueError: if this machine lacks it.
+    """
+    import torch
+
     try:
-        device = torch.device(cfg.device)
+        device = torch.device(name)
         torch.empty(0, device=device)
     except (RuntimeError, TypeError, AssertionError) as error:
-        raise ValueError(f"device={cfg.device}: expected cpu, or cuda on a machine that has it.") from error
+        raise ValueError(f"device={name}: expected cpu, or cuda on a machine that has it.") from error
+    if device.type not in ("cpu", "cuda"):
+        raise ValueError(f"device={name}: expected cpu, or cuda on a machine that has it.")
     return device
 
 
@@ -125,6 +138,38 @@ def refuse_foreign_targets(node, path: str = "") -> None:
     elif isinstance(node, list):
         for index, value in enumerate(node):
             refuse_foreign_targets(value, f"{path}[{index}]")
+    elif isinstance(node, str) and re.search(r"\$\{[^}]*:", node):  # such as one that reads environment variables
+        raise ValueError(f"{path}={node!r}: the checkpoint is refused; expected no resolver in its config.")
+
+
+#: What every config of a training has.
+TRAINED_WITH = (
+    "env._target_",
+    "env.rotations",
+    "env.tote_size",
+    "items._target_",
+    "model.actor._target_",
+    "algo.mask_infeasible",
+)
+
+
+def trusted(content: dict) -> DictConfig:
+    """A checkpoint's config, once it is known to be one of a training and to make nothing unexpected.
+
+    Raises:
+        ValueError: naming what is missing, or what it would make.
+    """
+    try:
+        refuse_foreign_targets(content)
+        cfg = OmegaConf.create(content)
+        OmegaConf.to_container(cfg, resolve=True)
+        missing = [key for key in TRAINED_WITH if OmegaConf.select(cfg, key) is None]
+    except (OmegaConfBaseException, RecursionError, AttributeError, TypeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"The checkpoint's config cannot be read ({reason}).") from error
+    if missing:
+        raise ValueError(f"The checkpoint's config has no {missing[0]}; expected one that a training wrote.")
+    return cfg
 
 
 def apply_overrides(saved: DictConfig, overrides: list[str], groups: dict[str, DictConfig] | None = None) -> DictConfig:
@@ -197,7 +242,7 @@ def sentence(error: Exception) -> str:
         return f"{error.override!r}: expected <key>=<value> ({' '.join(reasons)})."
     if isinstance(error, MissingConfigException) and error.options:
         return f"{error.missing_cfg_file}: there is no such config; expected one of {', '.join(error.options)}."
-    if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+    if isinstance(error, OSError) and error.filename and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"{error.filename}: {error.strerror}; expected a place where you may read and write."
     if isinstance(error, EXPECTED):
         noise = ("full_key", "object_type", "See https", "To append", "Config search path", "provider=")

@@ -7,6 +7,7 @@ level there.
 """
 
 import math
+import reprlib
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -421,7 +422,7 @@ class Curriculum:
         """
         rule = state.get("advance") if isinstance(state, dict) else None
         if not isinstance(rule, dict) or set(state) != {*vars(self.tally), "advance"}:
-            raise ValueError(f"The checkpoint's curriculum is {state!r}; expected what a training wrote.")
+            raise ValueError(f"The checkpoint's curriculum is {reprlib.repr(state)}; expected what a training wrote.")
         if set(rule) != set(self.advance.remembers):
             raise ValueError(
                 f"curriculum.advance={type(self.advance).__name__}: the checkpoint has the state "
@@ -431,7 +432,9 @@ class Curriculum:
         level = _whole(key("level"), state["level"], self.start, self.end)
         counts = {name: _whole(key(name), state[name], 0) for name in ("frames", "began", "episodes")}
         if not isinstance(state["window"], list):
-            raise ValueError(f"{key('window')}={state['window']!r}: expected a list of numbers between 0 and 1.")
+            raise ValueError(
+                f"{key('window')}={reprlib.repr(state['window'])}: expected a list of numbers between 0 and 1."
+            )
         window = deque((_fraction(key("window"), share) for share in state["window"]), self.advance.window)
         for name, value in rule.items():
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < math.inf:

@@ -289,10 +289,10 @@ def prepare(cfg: DictConfig) -> tuple:
     if cfg.checkpoint is not None:
         folder = checkpoint.locate(str(cfg.checkpoint))
         state, saved = checkpoint.read(folder)
-        config.refuse_foreign_targets(saved["config"])
+        theirs = config.trusted(saved["config"])
         groups = {"env": cfg.env, "items": cfg["items"]}
         ours = [o for o in HydraConfig.get().overrides.task if o.lstrip("+~").split("=")[0].split(".")[0] in TRAINED]
-        merged = config.apply_overrides(OmegaConf.create(saved["config"]), ours, groups)
+        merged = config.apply_overrides(theirs, ours, groups)
         with open_dict(cfg):
             for group in TRAINED:
                 cfg[group] = merged[group]

@@ -1,6 +1,7 @@
 """Where metrics go (config group ``logger``). Names: ``train/...``, ``eval/...``, ``curriculum/...``, ``time/...``."""
 
 import csv
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -17,42 +18,44 @@ class CsvLogger:
 
     def __init__(self, folder, frames: int = 0):
         self.path = Path(folder) / "metrics.csv"
-        self._columns, self._rows = ["frames"], []
-        if frames and self.path.is_file():
-            for row in read_csv(self.path):
-                if row["frames"] <= frames:
-                    self._rows.append(row)
-                    self._columns += [key for key in row if key not in self._columns]
-        self._file = None
-        self._rewrite()
+        self._columns, self._file = ["frames"], None
+        earlier = read_csv(self.path) if frames and self.path.is_file() else []
+        self._rewrite([row for row in earlier if row["frames"] <= frames])
 
-    def _rewrite(self):
-        if self._file:
-            self._file.close()
+    def _rewrite(self, rows):
+        """Begin the file anew, with columns for all that these rows hold."""
+        self.close()
+        self._columns += [key for key in dict.fromkeys(key for row in rows for key in row) if key not in self._columns]
         fresh = self.path.with_name(".metrics.csv.new")
         with fresh.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
-            writer.writerows(self._rows)
+            writer.writerows(rows)
         fresh.replace(self.path)
         self._file = self.path.open("a", newline="")
         self._writer = csv.DictWriter(self._file, self._columns)
 
     def log(self, metrics: dict[str, float], frames: int) -> None:
-        """Add a row."""
+        """Add a row.
+
+        Raises:
+            OSError: naming the file, if it cannot be written.
+        """
         row = {"frames": frames, **metrics}
-        self._rows.append(row)
-        new = [key for key in row if key not in self._columns]
-        if new:
-            self._columns += new
-            self._rewrite()
-        else:
-            self._writer.writerow(row)
-            self._file.flush()
+        try:
+            if set(row) <= set(self._columns):
+                self._writer.writerow(row)
+                self._file.flush()
+            else:
+                self._rewrite([*read_csv(self.path), row])
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Close the file; what a full disk did not take is lost."""
+        if self._file:
+            with suppress(OSError):
+                self._file.close()
 
 
 class TensorboardLogger:

@@ -96,8 +96,7 @@ class Planner:
             ValueError: for a checkpoint that cannot be used, or bad sizes.
         """
         state, facts = checkpoint.read(checkpoint.locate(path))
-        config.refuse_foreign_targets(facts["config"])
-        cfg = OmegaConf.create(facts["config"])
+        cfg = config.trusted(facts["config"])
         known = {field.name for field in fields(Rules)}
         if unknown := sorted(set(sizes) - known):
             raise ValueError(f"{unknown[0]}={sizes[unknown[0]]!r}: expected one of {', '.join(sorted(known))}.")
@@ -107,7 +106,7 @@ class Planner:
             longest = int(config.instantiate(cfg["items"]).sizes[:, :2].max())
             rules = replace(rules, longest_side=longest)
         policy = restore_policy(cfg, rules, state["policy"], cfg.env.rotations)
-        return cls(rules, policy.to(device), candidates)
+        return cls(rules, policy.to(config.usable_device(device)), candidates)
 
     @torch.inference_mode()
     def plan(
@@ -138,11 +137,11 @@ class Planner:
         if cell_size is not None:
             unit = _number("cell_size", cell_size, "a length in metres, 1e-6 to 1e6", lambda v: 1e-6 <= v <= 1e6)
         tolerance = _number("tolerance", tolerance, "a number of cells >= 0 and < 0.5", lambda v: 0 <= v < 0.5)
-        if isinstance(alternatives, bool) or not isinstance(alternatives, int) or alternatives < 0:
+        if isinstance(alternatives, bool) or not isinstance(alternatives, (int, np.integer)) or alternatives < 0:
             raise DepthMapError(f"alternatives={reprlib.repr(alternatives)}: expected a whole number >= 0.")
         height = rules.tote_size[2]
         if tote_height is not None:
-            wanted = f"a whole number of cells >= 1, within {tolerance:g}" + (", in metres" if cell_size else "")
+            wanted = f"a whole number of cells, 1 to {2**20 - 1}, within {tolerance:g}" + ", in metres" * (unit != 1.0)
 
             def good(length):  # the range first: far beyond it nothing can be rounded
                 cells = length / unit

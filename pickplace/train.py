@@ -2,6 +2,7 @@
 
 import logging
 import os
+import reprlib
 import signal
 import sys
 import time
@@ -131,13 +132,16 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         cleanup.callback(collector.shutdown)
         if resume:
             load_optimizer(optimizer, state.get("optimizer"))
-            collector.load_state_dict(checkpoint.fitting(state.get("collector"), collector.state_dict(), "collector"))
+            with watched(collector):
+                mine = collector.state_dict()
+                collector.load_state_dict(checkpoint.fitting(state.get("collector"), mine, "collector"))
+                push_level(collector, curriculum.level)
             # Last: everything above may have drawn.
             set_rng_state(checkpoint.fitting(state, rng_state(device), "random generator"), device)
         logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames)
-        cleanup.callback(logger.close)
         stop, started, first_frames, saved = StopRequest(), time.perf_counter(), frames, frames
         cleanup.callback(stop.restore)
+        cleanup.callback(logger.close)
         left = max(cfg.total_frames - frames, 0)
         log.info("%s frames to train, at tote height %d of %d", f"{left:,}", curriculum.level, curriculum.end)
         cleanup.enter_context(saying_what_is_safe(lambda: safe))
@@ -279,8 +283,12 @@ def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
     """
     if not state or not isinstance(state, dict):
         raise checkpoint.CheckpointError("The checkpoint has no optimizer; expected one that a training wrote.")
-    parameters = enumerate(optimizer.param_groups[0]["params"])
-    mine = {n: {"step": torch.tensor(0.0), "exp_avg": p, "exp_avg_sq": p} for n, p in parameters if n in state}
+    parameters = dict(enumerate(optimizer.param_groups[0]["params"]))
+    if unknown := [key for key in state if key not in parameters]:
+        raise checkpoint.CheckpointError(
+            f"The checkpoint's optimizer has {reprlib.repr(unknown[0])}; expected numbers below {len(parameters)}."
+        )
+    mine = {n: {"step": torch.tensor(0.0), "exp_avg": p, "exp_avg_sq": p} for n, p in parameters.items() if n in state}
     moments = checkpoint.fitting(state, mine, "optimizer")
     optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
 
@@ -453,13 +461,14 @@ def saying_what_is_safe(safe):
     """Add to what ends a training the checkpoint, ``safe()``, from which it can be taken up."""
     try:
         yield
-    except (FloatingPointError, config.WorkerDied, checkpoint.CheckpointError) as error:
+    except (OSError, FloatingPointError, config.WorkerDied, checkpoint.CheckpointError) as error:
         hint = "Nothing had been saved before."
         if folder := safe():
             # The same batch would lead to the same numbers.
             other = " algo.lr=<a smaller one>" if isinstance(error, FloatingPointError) else ""
             hint = f"What was saved before is whole: python -m pickplace.train resume={folder}{other}"
-        raise type(error)(f"{error} {hint}") from error
+        kind = ValueError if isinstance(error, OSError) else type(error)
+        raise kind(f"{config.sentence(error).rstrip('.')}. {hint}") from error
 
 
 #: What the state of running episodes is tied to.
@@ -491,14 +500,14 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     """
     if missing := [key for key in ("curriculum", *COUNTERS) if key not in facts]:
         raise ValueError(f"resume={place}: the checkpoint has no {missing[0]!r}; expected one that a training wrote.")
-    for key in ("iteration", "best"):
-        value = facts[key]
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not -1 <= value < 2**63:
-            raise ValueError(f"resume={place}: the checkpoint's {key} is {value!r}; expected a number >= -1.")
+    told = f"resume={place}: the checkpoint's {{}} is {{}}; expected {{}} that a training wrote.".format
     if not isinstance(facts["latest"], dict):
-        raise ValueError(f"resume={place}: the checkpoint's latest is {facts['latest']!r}; expected a validation.")
-    config.refuse_foreign_targets(facts["config"])
-    saved = OmegaConf.create(facts["config"])
+        raise ValueError(told("latest", reprlib.repr(facts["latest"]), "a validation"))
+    for key, value in {"iteration": facts["iteration"], "best": facts["best"], **facts["latest"]}.items():
+        kind = int if key == "iteration" else (int, float)
+        if isinstance(value, bool) or not isinstance(value, kind) or not -(2**63) < value < 2**63:
+            raise ValueError(told(reprlib.repr(key)[1:-1], reprlib.repr(value), "a number"))
+    saved = config.trusted(facts["config"])
     cfg = config.apply_overrides(saved, overrides)
     for key in FIXED:
         was, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)

@@ -53,8 +53,7 @@ class WarmStart:
             trained = None
             if cfg.checkpoint is not None:
                 state, saved = checkpoint.read(checkpoint.locate(str(cfg.checkpoint)))
-                config.refuse_foreign_targets(saved["config"])
-                trained = (OmegaConf.create(saved["config"]), state, saved["config"]["env"])
+                trained = (config.trusted(saved["config"]), state, saved["config"]["env"])
             try:
                 self._parts = planner_parts(cfg.teacher, rules, items, trained)
             except ValueError as error:

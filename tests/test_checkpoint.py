@@ -2,8 +2,10 @@
 
 import hashlib
 import json
+import os
 import pickle
 import shutil
+import struct
 
 import pytest
 import torch
@@ -117,6 +119,39 @@ def test_links_are_refused(tmp_path, name):
     (folder / name).symlink_to(tmp_path / name)
     with pytest.raises(CheckpointError, match=f"{name} is a link"):
         checkpoint.read(folder)
+
+
+@pytest.mark.parametrize("name", [checkpoint.FACTS, checkpoint.TENSORS])
+def test_a_pipe_is_not_waited_for(tmp_path, name):
+    folder = tmp_path / "last"
+    checkpoint.write(folder, {"policy": {}}, {"frames": 1, "config": {}})
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    with pytest.raises(CheckpointError, match=f"{name} is a link or no file"):
+        checkpoint.read(folder)
+
+
+@pytest.mark.parametrize(
+    "tensor",
+    [
+        {"dtype": "F4", "shape": [2], "data_offsets": [0, 1]},
+        {"dtype": "F8_E8M0", "shape": [1], "data_offsets": [0, 1]},
+        {"dtype": "F32", "shape": [0, 2**63], "data_offsets": [0, 0]},
+        {"dtype": "F32", "shape": [2**62, 2**62], "data_offsets": [0, 8]},
+        {"dtype": "F32", "shape": [2], "data_offsets": [0, 2**40]},
+    ],
+)
+def test_tensors_of_absurd_types_and_sizes(tmp_path, tensor):
+    folder = tmp_path / "last"
+    checkpoint.write(folder, {"policy": {}}, {"frames": 1, "config": {}})
+    header = json.dumps({"policy|x": tensor}).encode()
+    blob = struct.pack("<Q", len(header)) + header + bytes(tensor["data_offsets"][1] % 64)
+    facts = json.loads((folder / checkpoint.FACTS).read_text())
+    (folder / checkpoint.TENSORS).write_bytes(blob)
+    (folder / checkpoint.FACTS).write_text(json.dumps({**facts, "sha256": hashlib.sha256(blob).hexdigest()}))
+    with pytest.raises(CheckpointError, match="cannot be read") as caught:
+        checkpoint.read(folder)
+    assert "\n" not in str(caught.value)
 
 
 class Evil:

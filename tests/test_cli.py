@@ -73,6 +73,8 @@ BAD = [
     ("train", ["seed=99999999999999999999"], ["seed=9", "2**63"]),
     ("train", ["threads=0"], ["threads=0", ">= 1"]),
     ("train", ["device=tpu"], ["device=tpu", "cpu"]),
+    ("train", ["device=meta"], ["device=meta", "cpu"]),
+    ("train", ["threads=10000000000"], ["threads=10000000000", "<= 1024"]),
     ("train", ["algo.lr=fast"], ["algo.lr=fast", ">= 0"]),
     ("train", ["algo.lr_decay_start=2"], ["algo.lr_decay_start=2", "between 0 and 1"]),
     ("train", ["algo.mask_infeasible=maybe"], ["algo.mask_infeasible=maybe", "true or false"]),
