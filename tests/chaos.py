@@ -47,9 +47,13 @@ def rows(run_dir: Path) -> int:
     return len(read_csv(path)) if path.is_file() else 0
 
 
-def saving(run_dir: Path) -> bool:
-    """Is a checkpoint half written?"""
-    return any((run_dir / "checkpoints" / name).exists() for name in UNFINISHED)
+def unfinished(run_dir: Path) -> set[tuple[str, int]]:
+    """Checkpoints that are half written, each by its name and its number on the disk."""
+    found = set()
+    for name in UNFINISHED:
+        with contextlib.suppress(FileNotFoundError):
+            found.add((name, (run_dir / "checkpoints" / name).stat().st_ino))
+    return found
 
 
 def command(run_dir: Path, settings: list[str]) -> list[str]:
@@ -67,13 +71,17 @@ def torment(run_dir: Path, settings: list[str], kills: int, draw: random.Random)
     moments = {"starting": 0, "learning": 0, "saving": 0}
     for _ in range(kills):
         aim, before = draw.choice(("starting", "learning", "saving", "saving")), rows(run_dir)
+        leftover = unfinished(run_dir)  # of the life before: whoever is killed next does not save because of it
         child, began = life(run_dir, command(run_dir, settings)), time.monotonic()
         patience, lives = draw.randint(1, 2), draw.uniform(0, 2)
 
-        def due(aim=aim, before=before, began=began, patience=patience, lives=lives) -> bool:
+        def saving(leftover=leftover) -> bool:
+            return bool(unfinished(run_dir) - leftover)
+
+        def due(aim=aim, before=before, began=began, patience=patience, lives=lives, saving=saving) -> bool:
             if aim == "starting":
                 return time.monotonic() > began + lives
-            return rows(run_dir) >= before + patience and (aim == "learning" or saving(run_dir))
+            return rows(run_dir) >= before + patience and (aim == "learning" or saving())
 
         while not due():
             ended, status = os.waitpid(child, os.WNOHANG)
@@ -84,7 +92,7 @@ def torment(run_dir: Path, settings: list[str], kills: int, draw: random.Random)
         time.sleep(draw.uniform(0, 0.004 if aim == "saving" else 0.2))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-        moments["saving" if saving(run_dir) else "starting" if aim == "starting" else "learning"] += 1
+        moments["saving" if saving() else "starting" if aim == "starting" else "learning"] += 1
     child = life(run_dir, command(run_dir, settings))
     if status := os.waitpid(child, 0)[1]:
         raise RuntimeError(f"it could not finish, {status}: {run_dir.with_suffix('.log').read_text()[-800:]}")

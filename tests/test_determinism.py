@@ -41,6 +41,19 @@ def test_the_same_evaluation_twice(tmp_path, monkeypatch, planner):
     assert results[0] == results[1]
 
 
+def test_the_batch_does_not_change_what_a_policy_does(tmp_path, monkeypatch):
+    occupancy = []
+    for batch in (1, 5, 12):
+        settings = ["env.tote_size=[4,4,2]", "evaluation.episodes=12", f"evaluation.batch_size={batch}", "threads=1"]
+        run_dir = tmp_path / str(batch)
+        monkeypatch.setattr(
+            sys, "argv", ["pickplace-evaluate", "checkpoint=pretrained/r4", *settings, f"hydra.run.dir={run_dir}"]
+        )
+        evaluate.main()
+        occupancy.append(json.loads((run_dir / "evaluation.json").read_text())["occupancy"])
+    assert occupancy[0] == occupancy[1] == occupancy[2]
+
+
 def test_a_plan_depends_on_its_own_maps_alone():
     def maps(seed):
         generator = torch.Generator().manual_seed(seed)
