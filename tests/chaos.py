@@ -48,11 +48,11 @@ def rows(run_dir: Path) -> int:
 
 
 def unfinished(run_dir: Path) -> set[tuple[str, int]]:
-    """Checkpoints that are half written, each by its name and its number on the disk."""
+    """Checkpoints that are half written, each by its name and when it was last written to."""
     found = set()
     for name in UNFINISHED:
         with contextlib.suppress(FileNotFoundError):
-            found.add((name, (run_dir / "checkpoints" / name).stat().st_ino))
+            found.add((name, (run_dir / "checkpoints" / name).stat().st_mtime_ns))
     return found
 
 
