@@ -57,6 +57,11 @@ def instantiate(node: DictConfig, **kwargs):
         raise ValueError(f"{what}: {error.__cause__}.") from error
 
 
+def missing_extra(group: str, extra: str) -> ValueError:
+    """The error of a choice in a config group whose optional extra is not installed."""
+    return ValueError(f"{group}={extra}: {extra} is missing; pip install 'pickplace[{extra}]'.")
+
+
 def use_machine(cfg: DictConfig) -> "torch.device":
     """Set the number of threads, and return the device, of a config.
 
@@ -100,7 +105,7 @@ TARGETS = {
     ),
     "curriculum.sample": ("curriculum.Current", "curriculum.Uniform", "curriculum.Recent"),
     "collector": ("collector.single", "collector.multi_sync"),
-    "logger": ("metrics.CsvLogger", "metrics.TensorboardLogger", "metrics.NoLogger"),
+    "logger": tuple(f"metrics.{name}Logger" for name in ("Csv", "Tensorboard", "Wandb", "Mlflow", "No")),
     "planner": ("planners.PolicyPlanner",),
     "warm_start.teacher": tuple(f"planners.{name}" for name in PLANNERS),
 }

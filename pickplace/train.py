@@ -134,7 +134,8 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             collector.load_state_dict(checkpoint.fitting(state.get("collector"), collector.state_dict(), "collector"))
             # Last: everything above may have drawn.
             set_rng_state(checkpoint.fitting(state, rng_state(device), "random generator"), device)
-        logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames)
+        settings = OmegaConf.to_container(cfg, resolve=True)
+        logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames, settings=settings)
         cleanup.callback(logger.close)
         stop, started, first_frames, saved = StopRequest(), time.perf_counter(), frames, frames
         cleanup.callback(stop.restore)
