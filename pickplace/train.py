@@ -480,6 +480,7 @@ def resume_run(overrides: list[str]) -> float:
         cfg = resumed_config(place, facts, [item for item in overrides if not item.startswith("resume=")])
         handlers = [logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log")]
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
+        (run_dir / config.FAILURE).unlink(missing_ok=True)  # of the sweep that it was part of
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
         return run(cfg, run_dir, (state, facts, folder))
 
@@ -527,4 +528,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    # The module by its own name: what launchers and collectors send to other processes is found there.
+    from pickplace.train import main
+
     main()
