@@ -1,6 +1,7 @@
 """Collectors whose state can be saved and restored exactly. The one place that touches private names of TorchRL."""
 
 import signal
+import sys
 import threading
 from collections import OrderedDict
 from contextlib import contextmanager
@@ -9,8 +10,9 @@ from functools import partial
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors.distributed import RayCollector
 
-from pickplace.config import WorkerDied
+from pickplace.config import WorkerDied, missing_extra
 
 
 class ResumableCollector(Collector):
@@ -57,6 +59,51 @@ class ResumableCollector(Collector):
         self._frames = int(state_dict["counters"]["frames"])
         self._iter = int(state_dict["counters"]["iterations"])
         set_rng_state(state_dict, self.env.device)
+
+
+class ResumableRayCollector(RayCollector):
+    """A ``RayCollector`` of `ResumableCollector` actors: their state by worker, as a multi-process collector gives it,
+    one batch ``[num_envs, rollout_length]``, and an error in one sentence when an actor is gone."""
+
+    def iterator(self):
+        with self._watched():
+            for batch in super().iterator():
+                yield batch.flatten(0, 1)  # TorchRL 0.14.1 stacks: [workers, share, rollout_length]
+
+    def update_policy_weights_(self, *args, **kwargs) -> None:
+        with self._watched():
+            super().update_policy_weights_(*args, **kwargs)
+
+    def map_fn(self, *args, **kwargs) -> list:
+        with self._watched():
+            return super().map_fn(*args, **kwargs)
+
+    def state_dict(self) -> OrderedDict:
+        with self._watched():
+            return OrderedDict((f"worker{worker}", state) for worker, state in enumerate(super().state_dict()))
+
+    def load_state_dict(self, state_dict, **kwargs) -> None:
+        with self._watched():
+            super().load_state_dict([state_dict[f"worker{worker}"] for worker in range(self.num_collectors)])
+
+    @contextmanager
+    def _watched(self):
+        import ray
+        from ray.exceptions import RayActorError
+
+        try:
+            yield
+        except (RayActorError, RuntimeError) as error:
+            if not isinstance(error, RayActorError):  # such as a connection that broke while weights went over it
+                try:
+                    ray.get([worker.__ray_ready__.remote() for worker in self.remote_collectors], timeout=5)
+                except RayActorError:
+                    pass
+                except ray.exceptions.GetTimeoutError:
+                    raise error from None
+                else:
+                    raise
+            raise WorkerDied("a Ray worker of the collector has died.") from error
 
 
 def rng_state(device: torch.device) -> dict[str, torch.Tensor]:
@@ -149,9 +196,7 @@ def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, 
 
     Args: as :func:`single`, and ``workers``, the number of processes; it must divide ``num_envs``.
     """
-    if not isinstance(workers, int) or workers < 1 or num_envs % workers:
-        raise ValueError(f"collector.workers={workers}: expected a divisor of env.num_envs={num_envs}.")
-    share = num_envs // workers
+    share = _share(num_envs, workers)
     collector = MultiSyncCollector(
         [partial(make_env, worker * share, share) for worker in range(workers)],
         policy,
@@ -164,6 +209,59 @@ def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, 
         auto_register_policy_transforms=False,
         init_fn=ignore_signals,
     )
-    # Each worker draws its own actions; large odd steps keep the generators apart from those of seed + 1.
-    collector.map_fn("start", [(seed, seed * 1_000_003 + worker + 1) for worker in range(workers)])
+    collector.map_fn("start", _seeds(seed, workers))
     return collector
+
+
+def ray(
+    make_env, policy, num_envs: int, rollout_length: int, seed: int, workers: int = 2, address: str = "local"
+) -> ResumableRayCollector:
+    """Worker processes of a Ray cluster, each with its share of the slots (config ``collector=ray``); needs the extra
+    ``pickplace[ray]``.
+
+    Args: as :func:`multi_sync`, and ``address``: ``local`` starts a Ray of this run's own, ``auto`` or ``host:port``
+        joins a cluster.
+
+    Raises:
+        ValueError: without the extra, with a policy on a GPU, or workers that do not divide the slots.
+    """
+    try:
+        import ray  # noqa: F401
+    except ImportError as error:
+        raise missing_extra("collector", "ray") from error
+    if any(parameter.is_cuda for parameter in policy.parameters()):
+        raise ValueError("collector=ray: its workers have no GPU; expected device=cpu, or collector=single.")
+    share = _share(num_envs, workers)
+    # A Ray of our own has room for the workers, however few cores there are; a cluster knows what it has.
+    room = {"num_cpus": workers} if address == "local" else {}
+    collector = ResumableRayCollector(
+        [partial(make_env, worker * share, share) for worker in range(workers)],
+        policy,
+        frames_per_batch=num_envs * rollout_length,
+        total_frames=sys.maxsize,  # -1 would end it before its first batch
+        sync=True,
+        collector_class=ResumableCollector,
+        collector_kwargs=[
+            {"track_traj_ids": False, "auto_register_policy_transforms": False} for _ in range(workers)
+        ],
+        trust_policy=True,
+        remote_configs={"num_cpus": 1, "num_gpus": 0},
+        ray_init_config={
+            "address": address, "include_dashboard": False, "logging_level": "warning", "log_to_driver": False, **room
+        },
+    )  # fmt: skip
+    collector.map_fn("start", _seeds(seed, workers))
+    return collector
+
+
+def _share(num_envs: int, workers: int) -> int:
+    """How many of the slots each worker has."""
+    if not isinstance(workers, int) or workers < 1 or num_envs % workers:
+        raise ValueError(f"collector.workers={workers}: expected a divisor of env.num_envs={num_envs}.")
+    return num_envs // workers
+
+
+def _seeds(seed: int, workers: int) -> list[tuple[int, int]]:
+    """Each worker's item stream and generator: all draw the same items, and actions of their own; large odd steps keep
+    the generators apart from those of ``seed + 1``."""
+    return [(seed, seed * 1_000_003 + worker + 1) for worker in range(workers)]

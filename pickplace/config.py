@@ -105,7 +105,7 @@ TARGETS = {
         f"curriculum.{rule}" for rule in ("NoAdvance", "Frames", "Threshold", "Plateau", "Staged")
     ),
     "curriculum.sample": ("curriculum.Current", "curriculum.Uniform", "curriculum.Recent"),
-    "collector": ("collector.single", "collector.multi_sync"),
+    "collector": ("collector.single", "collector.multi_sync", "collector.ray"),
     "logger": tuple(f"metrics.{name}Logger" for name in ("Csv", "Tensorboard", "Wandb", "Mlflow", "No")),
     "planner": ("planners.PolicyPlanner",),
     "warm_start.teacher": tuple(f"planners.{name}" for name in PLANNERS),
