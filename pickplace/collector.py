@@ -70,9 +70,13 @@ class ResumableRayCollector(RayCollector):
             for batch in super().iterator():
                 yield batch.flatten(0, 1)  # TorchRL 0.14.1 stacks: [workers, share, rollout_length]
 
-    def update_policy_weights_(self, *args, **kwargs) -> None:
-        with self._watched():
-            super().update_policy_weights_(*args, **kwargs)
+    def update_policy_weights_(self, weights: TensorDict) -> None:
+        # Through Ray's own store, to each worker's `Collector`. TorchRL's weight synchronisation opens connections
+        # of its own, for which one more process has to start within 60 s: more than a busy machine gives.
+        import ray
+
+        reference = ray.put(weights)
+        self.map_fn("update_policy_weights_", [(reference,)] * self.num_collectors)
 
     def map_fn(self, *args, **kwargs) -> list:
         with self._watched():
@@ -88,21 +92,11 @@ class ResumableRayCollector(RayCollector):
 
     @contextmanager
     def _watched(self):
-        import ray
         from ray.exceptions import RayActorError
 
         try:
             yield
-        except (RayActorError, RuntimeError) as error:
-            if not isinstance(error, RayActorError):  # such as a connection that broke while weights went over it
-                try:
-                    ray.get([worker.__ray_ready__.remote() for worker in self.remote_collectors], timeout=5)
-                except RayActorError:
-                    pass
-                except ray.exceptions.GetTimeoutError:
-                    raise error from None
-                else:
-                    raise
+        except RayActorError as error:
             raise WorkerDied("a Ray worker of the collector has died.") from error
 
 
@@ -245,11 +239,13 @@ def ray(
             {"track_traj_ids": False, "auto_register_policy_transforms": False} for _ in range(workers)
         ],
         trust_policy=True,
+        weight_sync_schemes={},
         remote_configs={"num_cpus": 1, "num_gpus": 0},
         ray_init_config={
             "address": address, "include_dashboard": False, "logging_level": "warning", "log_to_driver": False, **room
         },
     )  # fmt: skip
+    collector._weight_sync_initialized = True  # silences a warning on the scheme that there is none of
     collector.map_fn("start", _seeds(seed, workers))
     return collector
 
