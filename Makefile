@@ -5,7 +5,7 @@ STAMP := .venv/.installed
 RUN ?= outputs/quick_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
 
-.PHONY: help install demo train test test-slow coverage chaos fuzz memory bench reproduce results lock audit lint format clean
+.PHONY: help install demo train test test-slow test-extras coverage chaos fuzz memory bench reproduce results lock audit lint format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -38,6 +38,11 @@ train: $(STAMP)  ## train (experiment=quick; ARGS="key=value ..." adds overrides
 test: export OMP_NUM_THREADS ?= 1
 test: $(STAMP)  ## run the test suite (minutes), in as many processes as there are cores, at most 4
 	$(BIN)/python -m pytest -q -n logical --maxprocesses 4 --dist worksteal $(ARGS)
+
+test-extras: export OMP_NUM_THREADS ?= 1
+test-extras: $(STAMP)  ## install every optional extra (a gigabyte), and run the tests that need them
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,wandb,mlflow,optuna,joblib,submitit,ray]'
+	$(BIN)/python -m pytest -q tests/test_scale.py $(ARGS)
 
 test-slow: export OMP_NUM_THREADS ?= 2
 test-slow: $(STAMP)  ## run the long checks (an hour)

@@ -1,6 +1,7 @@
 """Collectors whose state can be saved and restored exactly. The one place that touches private names of TorchRL."""
 
 import signal
+import sys
 import threading
 from collections import OrderedDict
 from contextlib import contextmanager
@@ -9,9 +10,10 @@ from functools import partial
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors.distributed import RayCollector
 
 from pickplace.checkpoint import CheckpointError
-from pickplace.config import WorkerDied
+from pickplace.config import WorkerDied, missing_extra
 
 
 class ResumableCollector(Collector):
@@ -58,6 +60,45 @@ class ResumableCollector(Collector):
         self._frames = int(state_dict["counters"]["frames"])
         self._iter = int(state_dict["counters"]["iterations"])
         set_rng_state(state_dict, self.env.device)
+
+
+class ResumableRayCollector(RayCollector):
+    """A ``RayCollector`` of `ResumableCollector` actors: their state by worker, as a multi-process collector gives it,
+    one batch ``[num_envs, rollout_length]``, and an error in one sentence when an actor is gone."""
+
+    def iterator(self):
+        with self._watched():
+            for batch in super().iterator():
+                yield batch.flatten(0, 1)  # TorchRL 0.14.1 stacks: [workers, share, rollout_length]
+
+    def update_policy_weights_(self, weights: TensorDict) -> None:
+        # Through Ray's own store, to each worker's `Collector`. TorchRL's weight synchronisation opens connections
+        # of its own, for which one more process has to start within 60 s: more than a busy machine gives.
+        import ray
+
+        reference = ray.put(weights)
+        self.map_fn("update_policy_weights_", [(reference,)] * self.num_collectors)
+
+    def map_fn(self, *args, **kwargs) -> list:
+        with self._watched():
+            return super().map_fn(*args, **kwargs)
+
+    def state_dict(self) -> OrderedDict:
+        with self._watched():
+            return OrderedDict((f"worker{worker}", state) for worker, state in enumerate(super().state_dict()))
+
+    def load_state_dict(self, state_dict, **kwargs) -> None:
+        with self._watched():
+            super().load_state_dict([state_dict[f"worker{worker}"] for worker in range(self.num_collectors)])
+
+    @contextmanager
+    def _watched(self):
+        from ray.exceptions import RayActorError
+
+        try:
+            yield
+        except RayActorError as error:
+            raise WorkerDied("a Ray worker of the collector has died.") from error
 
 
 def rng_state(device: torch.device) -> dict[str, torch.Tensor]:
@@ -157,9 +198,7 @@ def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, 
 
     Args: as :func:`single`, and ``workers``, the number of processes; it must divide ``num_envs``.
     """
-    if not isinstance(workers, int) or workers < 1 or num_envs % workers:
-        raise ValueError(f"collector.workers={workers}: expected a divisor of env.num_envs={num_envs}.")
-    share = num_envs // workers
+    share = _share(num_envs, workers)
     collector = MultiSyncCollector(
         [partial(make_env, worker * share, share) for worker in range(workers)],
         policy,
@@ -172,6 +211,61 @@ def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, 
         auto_register_policy_transforms=False,
         init_fn=ignore_signals,
     )
-    # Each worker draws its own actions; large odd steps keep the generators apart from those of seed + 1.
-    collector.map_fn("start", [(seed, seed * 1_000_003 + worker + 1) for worker in range(workers)])
+    collector.map_fn("start", _seeds(seed, workers))
     return collector
+
+
+def ray(
+    make_env, policy, num_envs: int, rollout_length: int, seed: int, workers: int = 2, address: str = "local"
+) -> ResumableRayCollector:
+    """Worker processes of a Ray cluster, each with its share of the slots (config ``collector=ray``); needs the extra
+    ``pickplace[ray]``.
+
+    Args: as :func:`multi_sync`, and ``address``: ``local`` starts a Ray of this run's own, ``auto`` or ``host:port``
+        joins a cluster.
+
+    Raises:
+        ValueError: without the extra, with a policy on a GPU, or workers that do not divide the slots.
+    """
+    try:
+        import ray  # noqa: F401
+    except ImportError as error:
+        raise missing_extra("collector", "ray") from error
+    if any(parameter.is_cuda for parameter in policy.parameters()):
+        raise ValueError("collector=ray: its workers have no GPU; expected device=cpu, or collector=single.")
+    share = _share(num_envs, workers)
+    # A Ray of our own has room for the workers, however few cores there are; a cluster knows what it has.
+    room = {"num_cpus": workers} if address == "local" else {}
+    collector = ResumableRayCollector(
+        [partial(make_env, worker * share, share) for worker in range(workers)],
+        policy,
+        frames_per_batch=num_envs * rollout_length,
+        total_frames=sys.maxsize,  # -1 would end it before its first batch
+        sync=True,
+        collector_class=ResumableCollector,
+        collector_kwargs=[
+            {"track_traj_ids": False, "auto_register_policy_transforms": False} for _ in range(workers)
+        ],
+        trust_policy=True,
+        weight_sync_schemes={},
+        remote_configs={"num_cpus": 1, "num_gpus": 0},
+        ray_init_config={
+            "address": address, "include_dashboard": False, "logging_level": "warning", "log_to_driver": False, **room
+        },
+    )  # fmt: skip
+    collector._weight_sync_initialized = True  # silences a warning on the scheme that there is none of
+    collector.map_fn("start", _seeds(seed, workers))
+    return collector
+
+
+def _share(num_envs: int, workers: int) -> int:
+    """How many of the slots each worker has."""
+    if not isinstance(workers, int) or workers < 1 or num_envs % workers:
+        raise ValueError(f"collector.workers={workers}: expected a divisor of env.num_envs={num_envs}.")
+    return num_envs // workers
+
+
+def _seeds(seed: int, workers: int) -> list[tuple[int, int]]:
+    """Each worker's item stream and generator: all draw the same items, and actions of their own; large odd steps keep
+    the generators apart from those of ``seed + 1``."""
+    return [(seed, seed * 1_000_003 + worker + 1) for worker in range(workers)]

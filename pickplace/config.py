@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import sys
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,6 +33,7 @@ log = logging.getLogger(__name__)
 
 PACKAGE = Path(__file__).resolve().parent
 LOCK = ".lock"  # in a run folder, held by the process that trains there
+FAILURE = "failure.txt"  # in a sweep's run folder, why the run failed
 
 
 def conf_dir() -> Path:
@@ -55,6 +56,11 @@ def instantiate(node: DictConfig, **kwargs):
             raise
         what = str(error).splitlines()[0].partition(", set env var")[0].rstrip(":")
         raise ValueError(f"{what}: {error.__cause__}.") from error
+
+
+def missing_extra(group: str, extra: str) -> ValueError:
+    """The error of a choice in a config group whose optional extra is not installed."""
+    return ValueError(f"{group}={extra}: {extra} is missing; pip install 'pickplace[{extra}]'.")
 
 
 def use_machine(cfg: DictConfig) -> "torch.device":
@@ -112,8 +118,8 @@ TARGETS = {
         f"curriculum.{rule}" for rule in ("NoAdvance", "Frames", "Threshold", "Plateau", "Staged")
     ),
     "curriculum.sample": ("curriculum.Current", "curriculum.Uniform", "curriculum.Recent"),
-    "collector": ("collector.single", "collector.multi_sync"),
-    "logger": ("metrics.CsvLogger", "metrics.TensorboardLogger", "metrics.NoLogger"),
+    "collector": ("collector.single", "collector.multi_sync", "collector.ray"),
+    "logger": tuple(f"metrics.{name}Logger" for name in ("Csv", "Tensorboard", "Wandb", "Mlflow", "No")),
     "planner": ("planners.PolicyPlanner",),
     "warm_start.teacher": tuple(f"planners.{name}" for name in PLANNERS),
 }
@@ -240,6 +246,10 @@ def sentence(error: Exception) -> str:
     if isinstance(error, OverrideParseException):
         reasons = [line for line in error.message.splitlines() if not line.startswith(("Error parsing", "See https"))]
         return f"{error.override!r}: expected <key>=<value> ({' '.join(reasons)})."
+    if isinstance(error, MissingConfigException):
+        for start, extra in EXTRAS.items():
+            if error.missing_cfg_file.startswith(start):
+                return f"{error.missing_cfg_file}: {extra} is missing; pip install 'pickplace[{extra}]'."
     if isinstance(error, MissingConfigException) and error.options:
         return f"{error.missing_cfg_file}: there is no such config; expected one of {', '.join(error.options)}."
     if isinstance(error, OSError) and error.filename and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
@@ -251,12 +261,20 @@ def sentence(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())} (HYDRA_FULL_ERROR=1 shows where)"
 
 
+#: Config files that come with an optional extra.
+EXTRAS = {"hydra/sweeper/optuna": "optuna", "hydra/launcher/joblib": "joblib", "hydra/launcher/submitit": "submitit"}
+
+
+class JobFailed(Exception):
+    """A run of a sweep that failed; the message is one sentence. It crosses processes, as the error itself may not."""
+
+
 class WorkerDied(Exception):
     """A collector worker process is gone. Not an OSError: much code around signals takes those for its own."""
 
 
 #: What users or their machines cause; anything else may be a fault of the program, and its kind is told too.
-EXPECTED = (ValueError, OSError, FloatingPointError, WorkerDied, HydraException, OmegaConfBaseException)
+EXPECTED = (ValueError, OSError, FloatingPointError, JobFailed, WorkerDied, HydraException, OmegaConfBaseException)
 
 
 @contextmanager
@@ -276,8 +294,9 @@ def one_sentence():
         sys.exit(2)
 
 
-class RememberSweep(Callback):
-    """Lets :func:`command` know the folder of a sweep whose jobs cannot even be composed."""
+class SweepCallback(Callback):
+    """Lets :func:`command` know the folder of a sweep whose jobs cannot even be composed; the end of a sweep is told to
+    it even where Hydra does not, since a job failed or was stopped."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
         HydraConfig.instance().set_config(config)
@@ -299,9 +318,9 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
     sys.argv[1:] = [f"+{word}" if word.startswith(opened) else word for word in overrides]
 
     def app(cfg: DictConfig):
+        hydra_cfg = HydraConfig.get()
         os.environ["HYDRA_FULL_ERROR"] = full_error
-        with one_sentence(), _tidy():
-            hydra_cfg = HydraConfig.get()
+        with _job() if hydra_cfg.mode == RunMode.MULTIRUN else _run():
             if missing := OmegaConf.missing_keys(cfg):
                 raise ValueError(f"{min(missing)}: no value; expected {min(missing)}=<value>.")
             known = hydra.compose(hydra_cfg.job.config_name)
@@ -314,7 +333,7 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
         # Hydra raises what it would print over many lines.
         os.environ["HYDRA_FULL_ERROR"] = "1"
         try:
-            with _tidy():
+            with _sweep_end(), _tidy():
                 hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(app)()
         except ConfigCompositionException as error:
             if not (key := re.match("Could not override '(.*)'", str(error))):
@@ -338,7 +357,45 @@ def _composed_without(key: str, config_name: str, overrides: list[str]) -> DictC
             return hydra.compose(config_name)
 
 
-def _claimed(folder: str) -> bool:
+@contextmanager
+def _job():
+    """What goes wrong in a run of a sweep is noted in its folder, and leaves the other runs alone."""
+    try:
+        yield
+    except Exception as error:
+        folder = Path(HydraConfig.get().runtime.output_dir)
+        with suppress(OSError):  # the disk may be what is wrong
+            (folder / FAILURE).write_text(f"{sentence(error)}\n")
+        log.error("run %s failed: %s", folder.name, sentence(error))
+        raise JobFailed(f"run {folder.name}: {sentence(error)}") from error
+    finally:
+        os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra goes on in this process
+
+
+@contextmanager
+def _run():
+    """What goes wrong in a run that is no part of a sweep."""
+    with one_sentence(), _tidy():
+        yield
+
+
+@contextmanager
+def _sweep_end():
+    """Tell the callbacks that a sweep has ended where Hydra does not: when a job failed or was stopped."""
+    try:
+        yield
+    except BaseException:
+        cfg = HydraConfig.get() if HydraConfig.initialized() else None
+        if cfg and cfg.mode == RunMode.MULTIRUN and os.path.isdir(cfg.sweep.dir):
+            for callback in cfg.callbacks.values():
+                try:
+                    hydra.utils.instantiate(callback).on_multirun_end(HydraConfig.instance().cfg)
+                except Exception as error:  # what ended the sweep matters more
+                    log.error(sentence(error))
+        raise
+
+
+def claimed(folder: str | Path) -> bool:
     """Does another process train in a run folder?"""
     from filelock import FileLock, Timeout
 
@@ -359,9 +416,16 @@ def _tidy():
         if HydraConfig.initialized():
             cfg = HydraConfig.get()
             run_dir = None if OmegaConf.is_missing(cfg.runtime, "output_dir") else cfg.runtime.output_dir
-            sweep_dir = cfg.sweep.dir if cfg.mode == RunMode.MULTIRUN else None
+            notes = {".hydra", LOCK, FAILURE, f"{cfg.job.name}.log"}
             logging.shutdown()
-            for folder, notes in ((run_dir, {".hydra", LOCK, f"{cfg.job.name}.log"}), (sweep_dir, {"multirun.yaml"})):
-                if folder and os.path.isdir(folder) and set(os.listdir(folder)) <= notes and not _claimed(folder):
-                    shutil.rmtree(folder, ignore_errors=True)
+
+            def nothing(folder: str) -> bool:
+                return os.path.isdir(folder) and set(os.listdir(folder)) <= notes and not claimed(folder)
+
+            if run_dir and nothing(run_dir):
+                shutil.rmtree(run_dir, ignore_errors=True)
+            if cfg.mode == RunMode.MULTIRUN and os.path.isdir(cfg.sweep.dir):
+                names = set(os.listdir(cfg.sweep.dir)) - {"multirun.yaml"}
+                if all(nothing(os.path.join(cfg.sweep.dir, name)) for name in names):
+                    shutil.rmtree(cfg.sweep.dir, ignore_errors=True)
         raise

@@ -103,7 +103,7 @@ class ToteHeightCurriculum(Transform):
 
 
 def push_level(collector, level: int) -> None:
-    """Set the level in every process of a ``Collector`` or ``MultiSyncCollector``, between two batches.
+    """Set the level in every process of any of our collectors, between two batches.
 
     ``map_fn(path, list_of_args)`` calls a method by its path: on a direct collector once for each entry of
     the list, on a multi-process one once in each worker, where the list must have ``num_workers`` entries.

@@ -1,8 +1,14 @@
-"""Where metrics go (config group ``logger``). Names: ``train/...``, ``eval/...``, ``curriculum/...``, ``time/...``."""
+"""Where metrics go (config group ``logger``). Names: ``train/...``, ``eval/...``, ``curriculum/...``, ``time/...``.
+
+Whatever is chosen, ``metrics.csv`` is written: reports, figures and sweeps read it.
+"""
 
 import csv
+import os
 from contextlib import suppress
 from pathlib import Path
+
+from pickplace.config import missing_extra
 
 
 class CsvLogger:
@@ -14,9 +20,10 @@ class CsvLogger:
     Args:
         folder: the run folder.
         frames: frames already trained; 0 for a new run.
+        settings: the run's config, for backends that show it beside the curves.
     """
 
-    def __init__(self, folder, frames: int = 0):
+    def __init__(self, folder, frames: int = 0, settings: dict | None = None):
         self.path = Path(folder) / "metrics.csv"
         self._columns, self._file = ["frames"], None
         earlier = read_csv(self.path) if frames and self.path.is_file() else []
@@ -58,33 +65,141 @@ class CsvLogger:
                 self._file.close()
 
 
-class TensorboardLogger:
+class TensorboardLogger(CsvLogger):
     """TensorBoard event files in the run folder; needs the extra ``pickplace[tensorboard]``. Args as `CsvLogger`."""
 
-    def __init__(self, folder, frames: int = 0):
+    def __init__(self, folder, frames: int = 0, settings: dict | None = None):
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError as error:
-            raise ValueError(
-                "logger=tensorboard: tensorboard is missing; pip install 'pickplace[tensorboard]'."
-            ) from error
+            raise missing_extra("logger", "tensorboard") from error
+        super().__init__(folder, frames)
         # Events after the checkpoint that a run is resumed from are hidden by TensorBoard itself.
-        self._writer = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
+        self._events = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
 
     def log(self, metrics: dict[str, float], frames: int) -> None:
         """Add a point to each metric's curve."""
+        super().log(metrics, frames)
         for key, value in metrics.items():
-            self._writer.add_scalar(key, value, frames)
+            self._events.add_scalar(key, value, frames)
 
     def close(self) -> None:
         """Flush and close the event file."""
-        self._writer.close()
+        super().close()
+        self._events.close()
+
+
+class WandbLogger(CsvLogger):
+    """Weights & Biases, through TorchRL's logger; needs the extra ``pickplace[wandb]``.
+
+    The run's id is kept in the run folder, ``wandb_run_id``, so that a resumed run goes on under it.
+
+    Args:
+        folder, frames, settings: as of `CsvLogger`.
+        project: the project to which the run belongs.
+        offline: keep everything in the run folder; ``wandb sync`` sends it later.
+    """
+
+    def __init__(
+        self,
+        folder,
+        frames: int = 0,
+        settings: dict | None = None,
+        project: str = "pickplace",
+        offline: bool = True,
+    ):
+        try:
+            import wandb  # noqa: F401
+        except ImportError as error:
+            raise missing_extra("logger", "wandb") from error
+        from torchrl.record.loggers.wandb import WandbLogger as Backend
+
+        super().__init__(folder, frames)
+        place = Path(folder) / "wandb_run_id"
+        self._backend = Backend(
+            Path(folder).name,
+            offline=offline,
+            save_dir=str(folder),
+            id=_run_id(place, frames),
+            project=project,
+            log_env_packages=False,  # they hold paths of this machine; a checkpoint tells the versions that matter
+            settings={"silent": offline, "console": "off"},
+        )
+        place.write_text(self._backend.experiment.id)
+        if settings:
+            self._backend.log_hparams(settings)
+
+    def log(self, metrics: dict[str, float], frames: int) -> None:
+        """Add a point to each metric's curve."""
+        super().log(metrics, frames)
+        self._backend.log_metrics(metrics, step=frames)
+
+    def close(self) -> None:
+        """Finish the run."""
+        super().close()
+        self._backend.experiment.finish()
+
+
+class MlflowLogger(CsvLogger):
+    """MLflow, through TorchRL's logger; needs the extra ``pickplace[mlflow]``.
+
+    The run's id is kept in the run folder, ``mlflow_run_id``, so that a resumed run goes on under it.
+
+    Args:
+        folder, frames, settings: as of `CsvLogger`.
+        experiment: the experiment to which the run belongs.
+        uri: where MLflow keeps it, a database or a server; None: ``mlflow.db`` in the run folder.
+    """
+
+    def __init__(
+        self,
+        folder,
+        frames: int = 0,
+        settings: dict | None = None,
+        experiment: str = "pickplace",
+        uri: str | None = None,
+    ):
+        try:
+            import mlflow
+        except ImportError as error:
+            raise missing_extra("logger", "mlflow") from error
+        from torchrl.record.loggers.mlflow import MLFlowLogger as Backend
+
+        super().__init__(folder, frames)
+        folder = Path(folder).absolute()
+        place = folder / "mlflow_run_id"
+        local = {} if uri else {"artifact_location": (folder / "mlflow_artifacts").as_uri()}
+        before = os.environ.pop("MLFLOW_RUN_ID", None)
+        if run_id := _run_id(place, frames):
+            os.environ["MLFLOW_RUN_ID"] = run_id  # TorchRL's logger hands no id on; MLflow itself looks here
+        try:
+            self._backend = Backend(experiment, uri or f"sqlite:///{folder / 'mlflow.db'}", **local)
+        finally:
+            os.environ.pop("MLFLOW_RUN_ID", None)
+            if before is not None:
+                os.environ["MLFLOW_RUN_ID"] = before
+        place.write_text(self._backend.experiment.info.run_id)
+        self._end_run = mlflow.end_run
+        if not run_id:
+            mlflow.set_tag("mlflow.runName", folder.name)
+            if settings:  # MLflow refuses other values later, and a resumed run may have some
+                self._backend.log_hparams(settings)
+
+    def log(self, metrics: dict[str, float], frames: int) -> None:
+        """Add a point to each metric's curve."""
+        super().log(metrics, frames)
+        self._backend.log_metrics(metrics, step=frames)
+
+    def close(self) -> None:
+        """End the run."""
+        super().close()
+        self._end_run()
 
 
 class NoLogger:
     """Keeps nothing. Args as `CsvLogger`."""
 
-    def __init__(self, folder=None, frames: int = 0):
+    def __init__(self, folder=None, frames: int = 0, settings: dict | None = None):
         pass
 
     def log(self, metrics: dict[str, float], frames: int) -> None:
@@ -92,6 +207,11 @@ class NoLogger:
 
     def close(self) -> None:
         """Nothing to close."""
+
+
+def _run_id(place: Path, frames: int) -> str | None:
+    """The id under which a resumed run goes on, if there is one."""
+    return place.read_text() if frames and place.is_file() else None
 
 
 def read_csv(path) -> list[dict[str, float]]:

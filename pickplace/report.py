@@ -17,7 +17,7 @@ FAILURES = {
 }  # fmt: skip
 
 
-def _figure(width: float, height: float):
+def figure_of(width: float, height: float):
     """A figure that needs no display; matplotlib is imported here, so that importing pickplace stays fast."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -46,7 +46,7 @@ def learning_curve(metrics: Path, path: Path) -> None:
         return np.array(table, dtype=float).reshape(-1, 1 + len(keys)).T
 
     steps, level = columns("curriculum/level")
-    figure = _figure(8, 5 if len(steps) else 4)
+    figure = figure_of(8, 5 if len(steps) else 4)
     if len(steps):
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[4, 1])
     else:
@@ -103,7 +103,7 @@ def failure_mix(metrics: Path, path) -> None:
     prefix = "train/failure_"
     rows = [row for row in read_csv(metrics) if any(key.startswith(prefix) for key in row)]
     names = [name for name in FAILURES if any(row.get(prefix + name, 0) > 0 for row in rows)]
-    figure = _figure(8, 3.2)
+    figure = figure_of(8, 3.2)
     axes = figure.subplots()
     if rows:
         frames = np.array([row["frames"] for row in rows])
@@ -150,7 +150,7 @@ def draw_scene(recording, rules, colours, moves: int | None = None):
     for x, y, z, w, d, h in boxes:
         heights[x : x + w, y : y + d] = z + h
     size = (*rules.tote_size[:2], recording.tote_height)
-    figure = _figure(12, 6)
+    figure = figure_of(12, 6)
     solid, plan = figure.subplots(1, 2, width_ratios=[1.2, 1])
     _draw_boxes(solid, boxes, colours, size)
     _draw_plan(plan, heights, recording.tote_height)

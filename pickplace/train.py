@@ -138,7 +138,8 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
                 push_level(collector, curriculum.level)
             # Last: everything above may have drawn.
             set_rng_state(checkpoint.fitting(state, rng_state(device), "random generator"), device)
-        logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames)
+        settings = OmegaConf.to_container(cfg, resolve=True)
+        logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames, settings=settings)
         stop, started, first_frames, saved = StopRequest(), time.perf_counter(), frames, frames
         cleanup.callback(stop.restore)
         cleanup.callback(logger.close)
@@ -488,6 +489,7 @@ def resume_run(overrides: list[str]) -> float:
         cfg = resumed_config(place, facts, [item for item in overrides if not item.startswith("resume=")])
         handlers = [logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log")]
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
+        (run_dir / config.FAILURE).unlink(missing_ok=True)  # of the sweep that it was part of
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
         return run(cfg, run_dir, (state, facts, folder))
 
@@ -535,4 +537,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    # The module by its own name: what launchers and collectors send to other processes is found there.
+    from pickplace.train import main
+
     main()

@@ -64,9 +64,13 @@ def test_every_curriculum(name):
 
 @pytest.mark.parametrize("name", options("logger"))
 def test_every_logger(name, tmp_path):
+    if name not in ("csv", "none"):
+        pytest.importorskip(name)
     logger = config.instantiate(composed(f"logger={name}").logger, folder=tmp_path, frames=0)
     logger.log({"train/occupancy": 0.5}, 10)
     logger.close()
+    kept = read_csv(tmp_path / "metrics.csv") if name != "none" else []
+    assert kept == [{"frames": 10, "train/occupancy": 0.5}][: name != "none"]
 
 
 @pytest.mark.parametrize("name", options("planner"))

@@ -1,0 +1,261 @@
+"""Sweeps, loggers and collectors for more than one machine; what an optional extra brings is skipped without it."""
+
+import csv
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from test_cli import run  # noqa: F401
+from test_curriculum import make_env
+
+from pickplace import checkpoint, config
+from pickplace import collector as collectors
+from pickplace.config import WorkerDied
+from pickplace.curriculum import push_level
+from pickplace.metrics import read_csv
+from pickplace.sweep import labels, read_run, summarize
+from pickplace.train import resume_run, train
+
+SMOKE = ["experiment=smoke", "threads=1"]
+
+
+def smoke(run_dir, *overrides):
+    """Train experiment=smoke in this process."""
+    with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
+        cfg = compose("train", [*SMOKE, *overrides])
+    run_dir.mkdir(exist_ok=True)
+    return train(cfg, run_dir)
+
+
+def table(folder):
+    with (folder / "sweep.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def is_png(path):
+    return path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 10_000
+
+
+# ---------------------------------------------------------------- sweeps
+
+
+def made_up(folder, name, overrides, occupancies, total=1000, failure=None):
+    """A run folder as a job of a sweep leaves it, validated every 100 frames."""
+    run_dir = folder / name
+    (run_dir / ".hydra").mkdir(parents=True)
+    OmegaConf.save(overrides, run_dir / ".hydra" / "overrides.yaml")
+    OmegaConf.save({"total_frames": total}, run_dir / ".hydra" / "config.yaml")
+    rows = [f"{100 * (i + 1)},{mean},{mean - 0.01},{mean + 0.01}" for i, mean in enumerate(occupancies)]
+    (run_dir / "metrics.csv").write_text("\n".join(["frames,eval/occupancy,eval/ci95_low,eval/ci95_high", *rows, ""]))
+    if failure:
+        (run_dir / config.FAILURE).write_text(failure)
+
+
+def test_a_sweep_s_table_tells_how_every_run_ended(tmp_path):
+    made_up(tmp_path, "0", ["algo.lr=0.00123456", "seed=1"], [0.2, 0.9, 0.8], total=300)
+    made_up(tmp_path, "2", ["algo.lr=0.01", "seed=1"], [0.5])
+    made_up(tmp_path, "10", ["algo.lr=1", "seed=1"], [], failure="the loss is not finite.\n")
+    runs = summarize(tmp_path)
+    assert [(each.name, each.status, each.frames) for each in runs] == [
+        ("0", "finished", 300), ("2", "stopped", 100), ("10", "failed", 0)
+    ]  # fmt: skip
+    assert (runs[0].best, runs[0].final, runs[2].best) == (0.9, 0.8, None)
+    assert labels(runs) == {"0": "lr=0.00123", "2": "lr=0.01", "10": "lr=1"}
+    first, _, last = table(tmp_path)
+    assert (first["algo.lr"], first["best_occupancy"], first["final_ci95_low"]) == ("0.00123456", "0.9", "0.79")
+    assert (last["status"], last["best_occupancy"], last["error"]) == ("failed", "", "the loss is not finite.")
+    assert is_png(tmp_path / "sweep.png")
+
+
+def test_a_sweep_of_many_runs_and_one_of_none(tmp_path):
+    for number in range(50):
+        made_up(tmp_path, str(number), [f"seed={number}"], [number / 50])
+    assert len(summarize(tmp_path)) == 50 and is_png(tmp_path / "sweep.png")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileNotFoundError, match="empty: no run in it"):
+        summarize(tmp_path / "empty")
+
+
+def test_a_run_that_fails_leaves_the_others_alone(run, tmp_path):  # noqa: F811
+    code, _, err = run("train", "-m", *SMOKE, "algo.reward_scale=1e38,1", "hydra.sweep.dir=sweep")
+    assert code == 2 and "error: run 0: the loss or its gradient is not finite" in err
+    failed, finished = table(tmp_path / "sweep")
+    assert failed["status"] == "failed" and failed["error"].startswith("the loss or its gradient is not finite")
+    assert (finished["status"], finished["frames"]) == ("finished", "512")
+    assert 0 <= float(finished["final_occupancy"]) <= float(finished["best_occupancy"]) <= 1
+
+
+def test_a_run_without_metrics_is_known_by_its_checkpoint(tmp_path):
+    made_up(tmp_path, "0", ["seed=1"], [], total=512)
+    (tmp_path / "0" / "metrics.csv").unlink()
+    occupancy = smoke(tmp_path / "0", "logger=none")
+    found = read_run(tmp_path / "0")
+    assert (found.status, found.frames, found.final) == ("finished", 512, pytest.approx(occupancy))
+
+
+@pytest.mark.parametrize(
+    ("choice", "extra"),
+    [
+        ("hydra/sweeper=optuna", "optuna"),
+        ("hydra/launcher=joblib", "joblib"),
+        ("hydra/launcher=submitit_slurm", "submitit"),
+    ],
+)
+def test_a_missing_plugin_is_one_sentence(choice, extra, run):  # noqa: F811
+    if any(
+        path.name.startswith(f"hydra_{extra}") for place in sys.path for path in Path(place).glob("hydra_plugins/*")
+    ):
+        pytest.skip("it is installed")
+    code, _, err = run("train", "-m", *SMOKE, choice)
+    assert code == 2 and err.strip().endswith(f"{extra} is missing; pip install 'pickplace[{extra}]'.")
+
+
+def test_optuna_maximises_the_occupancy(run, tmp_path):  # noqa: F811
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    settings = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "hydra.sweep.dir=sweep", "total_frames=256"]
+    code, out, err = run("train", "-m", *SMOKE, *settings, "algo.lr=interval(0.0001,0.01)")
+    assert code == 0, err
+    assert "Directions: ['maximize']" in out
+    rows = table(tmp_path / "sweep")
+    best = OmegaConf.load(tmp_path / "sweep" / "optimization_results.yaml")
+    assert len(rows) == 2 and len({row["algo.lr"] for row in rows}) == 2
+    assert best.best_value == pytest.approx(max(float(row["final_occupancy"]) for row in rows))
+    assert is_png(tmp_path / "sweep" / "sweep.png")
+
+
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_launchers_in_other_processes(launcher, run, tmp_path):  # noqa: F811
+    extra = launcher.partition("_")[0]
+    pytest.importorskip(f"hydra_plugins.hydra_{extra}_launcher")
+    settings = ["total_frames=256", "evaluation.episodes=2", "hydra.sweep.dir=sweep", f"hydra/launcher={launcher}"]
+    own = "hydra.launcher.n_jobs=2" if extra == "joblib" else "hydra.launcher.timeout_min=5"
+    code, _, err = run("train", "-m", *SMOKE, *settings, own, "algo.reward_scale=1")
+    assert code == 0, err
+    (row,) = table(tmp_path / "sweep")
+    assert (row["status"], row["frames"], row["algo.reward_scale"]) == ("finished", "256", "1")
+
+
+# ---------------------------------------------------------------- loggers
+
+
+@pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])
+def test_a_missing_extra_is_one_sentence(name, tmp_path, monkeypatch):
+    for module in ("tensorboard", "wandb", "mlflow", "torch.utils.tensorboard"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ValueError, match=rf"^logger={name}: {name} is missing; pip install 'pickplace\[{name}\]'\.$"):
+        smoke(tmp_path / "run", f"logger={name}")
+    assert not (tmp_path / "run" / "metrics.csv").exists()
+
+
+@pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])
+def test_a_logger_goes_on_after_a_resume_beside_metrics_csv(name, tmp_path):
+    pytest.importorskip(name)
+    run_dir = tmp_path / "run"
+    smoke(run_dir, f"logger={name}", "total_frames=256")
+    ids = [(run_dir / f"{name}_run_id").read_text()] if name != "tensorboard" else []
+    resume_run([f"resume={run_dir}", "total_frames=512"])
+    rows = read_csv(run_dir / "metrics.csv")
+    assert [row["frames"] for row in rows] == [128, 256, 384, 512]
+    assert (run_dir / "report.html").is_file()
+    if ids:
+        assert (run_dir / f"{name}_run_id").read_text() == ids[0]
+    if name == "wandb":
+        folders = list((run_dir / "wandb").glob(f"offline-run-*-{ids[0]}"))
+        assert all((folder / f"run-{ids[0]}.wandb").stat().st_size > 1000 for folder in folders) and folders
+    if name == "mlflow":
+        import mlflow
+
+        history = mlflow.MlflowClient(f"sqlite:///{run_dir / 'mlflow.db'}").get_metric_history(ids[0], "train/reward")
+        assert [point.step for point in history] == [128, 256, 384, 512]
+        assert [point.value for point in history] == pytest.approx([row["train/reward"] for row in rows])
+
+
+# ---------------------------------------------------------------- collectors
+
+
+@pytest.fixture(scope="module")
+def local_ray():
+    """A Ray of this machine, which the collectors find and leave running."""
+    ray = pytest.importorskip("ray")
+    path = {"env_vars": {"PYTHONPATH": str(Path(__file__).parent)}}  # the workers import from the tests, too
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="warning", runtime_env=path)
+    yield ray
+    ray.shutdown()
+
+
+def drawing_policy():
+    """Draws among the feasible actions, by the generator of its process; takes the first once its weight is 1."""
+
+    class Draw(torch.nn.Module):  # in here, so that workers get the class itself
+        def __init__(self):
+            super().__init__()
+            self.first = torch.nn.Parameter(torch.zeros(1))
+
+        def forward(self, mask):
+            drawn = torch.multinomial(mask.float(), 1)[:, 0]
+            return torch.where(self.first > 0, mask.int().argmax(-1), drawn)
+
+    return TensorDictModule(Draw(), ["action_mask"], ["action"])
+
+
+def ray_collector():
+    def build(first_episode, num_envs):
+        return make_env(num_envs=num_envs)
+
+    return collectors.ray(build, drawing_policy(), num_envs=4, rollout_length=6, seed=0)
+
+
+def test_ray_workers_follow_the_curriculum_go_on_exactly_and_are_missed(local_ray):
+    collector = ray_collector()
+    batches = iter(collector)
+    first = next(batches)
+    assert first.shape == (4, 6) and set(first["tote_height"].flatten().tolist()) == {3}
+    assert not torch.equal(first["action"][:2], first["action"][2:])  # each worker draws its own
+    push_level(collector, 5)
+    saved = checkpoint.unflatten(*checkpoint.flatten(collector.state_dict()))
+    batch = next(batches)
+    assert set(batch["tote_height"].flatten().tolist()) == {3, 5}  # episodes that had begun keep their height
+    weights = TensorDict.from_module(collector.policy).data.clone()
+    collector.update_policy_weights_(weights.apply(torch.ones_like))
+    latest = next(batches)
+    assert torch.equal(latest["action"], latest["action_mask"].int().argmax(-1))
+    local_ray.kill(collector.remote_collectors[0])
+    with pytest.raises(WorkerDied, match="a Ray worker of the collector has died"):
+        next(batches)
+    collector.shutdown()
+
+    collector = ray_collector()
+    collector.load_state_dict(checkpoint.fitting(saved, collector.state_dict(), "collector"))
+    again = next(iter(collector))
+    collector.shutdown()
+    for key in ("action", "tote_height", ("next", "reward"), ("next", "done")):
+        assert torch.equal(batch[key], again[key]), key
+
+
+def test_a_training_collects_with_ray(local_ray, tmp_path):
+    overrides = ["env.tote_size=[5,5,3]", "curriculum=mixture", "curriculum.advance.occupancy=0.3"]
+    smoke(tmp_path / "run", "collector=ray", "total_frames=512", "curriculum.advance.window=10", *overrides)
+    rows = read_csv(tmp_path / "run" / "metrics.csv")
+    assert [row["frames"] for row in rows] == [128, 256, 384, 512]
+    assert rows[0]["curriculum/level"] < rows[-1]["curriculum/level"]
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"workers": 3}, "collector.workers=3: expected a divisor of env.num_envs=4"),
+        ({}, "ray is missing; pip install"),
+    ],
+)
+def test_ray_s_errors_name_what_is_wrong(kwargs, message, monkeypatch):
+    if kwargs:
+        pytest.importorskip("ray")
+    else:
+        monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ValueError, match=message):
+        collectors.ray(None, torch.nn.Linear(1, 1), num_envs=4, rollout_length=1, seed=0, **kwargs)
