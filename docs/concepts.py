@@ -73,7 +73,9 @@ def draw_cut(axes, rules, number, title):
     axes.plot([0, 0, 6, 6], [HEIGHT, 0, 0, HEIGHT], color=INK, lw=2.5)
     if failure:
         axes.plot(3.45, top + 0.14, "X", color=BAD, ms=17, mec="white", mew=1.5, zorder=6)
-    verdict = f"{failure.name.lower()}: reward 0, the episode ends" if failure else "succeeds: reward = the item's volume"
+    verdict = (
+        f"{failure.name.lower()}: reward 0, the episode ends" if failure else "succeeds: reward = the item's volume"
+    )
     axes.text(0, HEIGHT + 1.45, verdict, color=colour, va="center")
     axes.annotate("place cell", (place[0] + 0.5, -0.05), (place[0] + 0.5, -0.9), ha="center", color=colour,
                   arrowprops={"arrowstyle": "-|>", "color": colour})  # fmt: skip
@@ -132,7 +134,9 @@ def draw_levels(axes):
         axes.add_patch(Rectangle((x, 0), 1.6, level * fill, fc=PLACED, ec="none"))
         axes.plot([x, x, x + 1.6, x + 1.6], [level, 0, 0, level], color=INK, lw=2)
         if level < 5:
-            axes.annotate("", (x + 2.25, 0.5), (x + 1.67, 0.5), arrowprops={"arrowstyle": "-|>", "color": GOOD, "lw": 2})
+            axes.annotate(
+                "", (x + 2.25, 0.5), (x + 1.67, 0.5), arrowprops={"arrowstyle": "-|>", "color": GOOD, "lw": 2}
+            )
     axes.text(0, -0.3, "The tote is low at first and grows when the policy packs it well:\neach height is a level.",
               va="top", fontsize=9.5)  # fmt: skip
 

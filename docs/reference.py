@@ -54,7 +54,10 @@ def read(path: Path) -> ConfigFile:
     bases, parts = [], {}
     for entry in (yaml.safe_load(source) or {}).get("defaults", []):
         if isinstance(entry, dict):
-            parts |= {key.removeprefix("override ").split("@")[0]: "null" if option is None else option for key, option in entry.items()}
+            parts |= {
+                key.removeprefix("override ").split("@")[0]: "null" if option is None else option
+                for key, option in entry.items()
+            }
         elif entry != "_self_":
             bases.append(entry)
     top = [f"`{line}`." if line.startswith("python -m") else line for line in top]
