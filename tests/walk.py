@@ -201,7 +201,7 @@ def borrow(walk: Walk, folder: Path, python: str) -> None:
     for script in (folder / "bin").iterdir():
         if not (walk.clone / ".venv/bin" / script.name).exists() and "pickplace" not in script.name:
             (walk.clone / ".venv/bin" / script.name).symlink_to(script)
-    walk.run("pip install --quiet --no-deps --no-build-isolation -e . && touch .venv/.installed")
+    walk.run("pip install --quiet --no-deps -e . && touch .venv/.installed")
 
 
 def main() -> int:
