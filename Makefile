@@ -75,7 +75,7 @@ docs: $(STAMP)  ## write docs/reference.md, and build the site of docs/ in outpu
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[docs]'
 	$(BIN)/python docs/reference.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --config-file .ci/mkdocs.yml
-	@echo "Open outputs/site/index.html"
+	@echo "Open outputs/site/index.html; with its search: $(BIN)/python -m http.server --directory outputs/site"
 
 walk:  ## follow README and docs in a fresh clone and a fresh virtual environment, as a newcomer would (half an hour)
 	$(PYTHON) tests/walk.py $(ARGS)

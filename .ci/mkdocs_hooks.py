@@ -4,10 +4,13 @@ import os
 import re
 from pathlib import Path
 
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {"README.md": "overview.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+STYLE = ".md-typeset td code {word-break: normal}\n"  # keys are not broken in two
+FETCHED = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
 
 
@@ -15,6 +18,7 @@ def on_files(files, config):
     """Add the pages that lie beside docs/."""
     for source, name in PAGES.items():
         files.append(File.generated(config, name, abs_src_path=str(ROOT / source)))
+    files.append(File.generated(config, "site.css", content=STYLE))
     return files
 
 
@@ -44,3 +48,9 @@ def on_page_markdown(markdown, page, config, files):
 def on_page_content(html, **kwargs):
     """Docstrings name things as ``:class:`Name```."""
     return re.sub(r":(?:class|func|meth|mod|attr):<code>~?([\w.]+)</code>", r"<code>\1</code>", html)
+
+
+def on_post_page(output, page, config):
+    """A reader without the internet sees the same."""
+    if found := FETCHED.search(output):
+        raise PluginError(f"{page.file.src_uri}: expected nothing from elsewhere, got {found[0]}")

@@ -4,7 +4,9 @@ import contextlib
 import importlib.util
 import json
 import logging
+import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -127,6 +129,21 @@ def test_every_command_composes(page, monkeypatch):
         plain = [word.split(",")[0] if "[" not in word and "," in word else word for word in overrides]
         with initialize_config_dir(str(folder), version_base="1.3"):
             compose(command, plain)
+
+
+def test_the_site_builds(tmp_path):
+    """Strictly, where its tools are installed: a broken link fails, and so does anything fetched from elsewhere."""
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("mkdocstrings_handlers.python")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--config-file", ".ci/mkdocs.yml"]
+    command += ["--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(
+        command, cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    html = (tmp_path / "site" / "api.html").read_text()
+    assert "Observation space" in html and ":class:<code>" not in html
+    assert (tmp_path / "site" / "overview.html").is_file() and (tmp_path / "site" / "concepts.svg").is_file()
 
 
 # ---------------------------------------------------------------------- reference and drawings
