@@ -5,7 +5,7 @@ STAMP := .venv/.installed
 RUN ?= outputs/quick_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
 
-.PHONY: help install demo train test test-slow test-extras coverage chaos fuzz memory bench reproduce results lock audit lint format clean
+.PHONY: help install demo train test test-slow test-extras coverage chaos fuzz memory bench reproduce results docs walk release lock audit lint format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -75,6 +75,25 @@ reproduce: $(STAMP)  ## compute what is missing of the paper's comparison (days;
 
 results: $(STAMP)  ## draw the comparison's figures, and write docs/results.md
 	$(BIN)/python benchmarks/reproduce/results.py
+
+docs: $(STAMP)  ## write docs/reference.md, and build the site of docs/ in outputs/site
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[docs]'
+	$(BIN)/python docs/reference.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --config-file .ci/mkdocs.yml
+	@echo "Open outputs/site/index.html; with its search: $(BIN)/python -m http.server --directory outputs/site"
+
+walk:  ## follow README and docs in a fresh clone and a fresh virtual environment, as a newcomer would (half an hour)
+	$(PYTHON) tests/walk.py $(ARGS)
+
+release: $(STAMP)  ## build wheel and sdist, check them, and try the wheel in an environment of its own; uploads nothing
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/twine check --strict dist/*
+	$(PYTHON) -m venv --clear dist/.venv
+	dist/.venv/bin/pip install --quiet --disable-pip-version-check dist/*.whl
+	cd dist && .venv/bin/pickplace-plan --help >/dev/null && .venv/bin/pickplace-evaluate planner=joint_dbl evaluation.episodes=2 threads=1 hydra.run.dir=tried
+	rm -rf dist/.venv dist/tried
+	@ls -l dist
 
 lock: $(STAMP)  ## write down the versions that are installed, for make install LOCK=.ci/requirements.lock
 	$(BIN)/pip freeze --exclude-editable | sed 's/+cpu//' > .ci/requirements.lock

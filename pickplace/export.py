@@ -52,7 +52,11 @@ def asks_critic(cfg: dict) -> bool:
 
 def main() -> None:
     """Entry point of ``python -m pickplace.export``."""
-    options = argparse.ArgumentParser(prog="python -m pickplace.export", description=__doc__.splitlines()[0])
+    options = argparse.ArgumentParser(
+        prog="python -m pickplace.export",
+        description="Turns a training checkpoint into weights that the package ships, with a card that says how they "
+        "were trained and what they reach: card.json, from each evaluation.json. What only training needs is left out.",
+    )
     options.add_argument("checkpoint", help="a run folder or a checkpoint")
     options.add_argument("folder", type=Path, help="where the weights go, pickplace/pretrained/<name>")
     options.add_argument("evaluations", type=Path, nargs="+", help="evaluation.json files of this checkpoint")

@@ -30,20 +30,35 @@ def parser() -> argparse.ArgumentParser:
         description="Where to pick, where to place and how to turn. With --bin and --tote: one plan, as JSON. Without: "
         'reads a request a line from standard input, {"bin_depth": [[...]], "tote_depth": [[...]]}, and answers each '
         "with a plan in one line; a bad line is answered with an error, and the process goes on.",
+        epilog="Maps, frames of reference and errors: docs/robot.md",
     )
     options.add_argument("checkpoint", help="a run folder, a checkpoint, or pretrained/<name>")
     options.add_argument("--bin", metavar="NPY", help="depth map [W_B, D_B]: height above the bin's floor")
     options.add_argument("--tote", metavar="NPY", help="depth map [W_T, D_T]: remaining height, from surface to rim")
-    options.add_argument("--tote-height", type=float, help="height of the tote's rim; default: that of --tote-size")
-    options.add_argument("--cell-size", type=float, help="side of a cell in metres, if the maps are in metres")
-    options.add_argument("--tolerance", type=float, default=0.25, help="of heights, in cells (default %(default)s)")
-    options.add_argument("--candidates", default="all", help="K most probable actions tried, or all (the default)")
-    options.add_argument("--alternatives", type=int, default=10, help="choices reported (default %(default)s)")
+    options.add_argument(
+        "--tote-height", type=float, metavar="H", help="height of the tote's rim; default: that of --tote-size"
+    )
+    options.add_argument(
+        "--cell-size", type=float, metavar="M", help="side of a cell in metres, if the maps are in metres"
+    )
+    options.add_argument(
+        "--tolerance",
+        type=float,
+        metavar="T",
+        default=0.25,
+        help="heights are off by at most so many cells (default %(default)s)",
+    )
+    options.add_argument(
+        "--candidates", metavar="K", default="all", help="K most probable actions are tried, or all (the default)"
+    )
+    options.add_argument(
+        "--alternatives", type=int, metavar="N", default=10, help="best choices that are reported (default %(default)s)"
+    )
     options.add_argument("--bin-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
     options.add_argument("--tote-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
     options.add_argument("--effector-size", type=int, nargs=2, metavar=("W", "D"), help="cells; default: as trained")
-    options.add_argument("--rotations", type=int, help="quarter turns to choose from; default: as trained")
-    options.add_argument("--threads", type=int, help="CPU threads; default: torch's")
+    options.add_argument("--rotations", type=int, metavar="R", help="quarter turns to choose from; default: as trained")
+    options.add_argument("--threads", type=int, metavar="N", help="CPU threads; default: torch's")
     options.add_argument("--device", default="cpu", help="cpu (the default) or cuda")
     options.add_argument("--time", action="store_true", help="print the latency of each plan on standard error")
     return options

@@ -1,5 +1,6 @@
 """Shows a page in a browser, or says where it is: ``python -m pickplace.show outputs/demo/replay.html``."""
 
+import argparse
 import os
 import sys
 import webbrowser
@@ -26,6 +27,17 @@ def show(page: Path) -> str:
     return f"Open this file in a browser: {page.resolve()}"
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Entry point of ``python -m pickplace.show``."""
+    options = argparse.ArgumentParser(
+        prog="python -m pickplace.show",
+        description="Opens a page in a browser, or says which file to open where there is none.",
+    )
+    options.add_argument("page", type=Path, help="such as replay.html of an evaluation, or report.html of a training")
+    args = options.parse_args()
     with one_sentence():
-        sys.stdout.write(f"\n{show(Path(sys.argv[1]))}\n")
+        sys.stdout.write(f"\n{show(args.page)}\n")
+
+
+if __name__ == "__main__":
+    main()

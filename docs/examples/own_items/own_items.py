@@ -1,0 +1,45 @@
+"""An item distribution of one's own: items arrive in batches of the same kind."""
+
+from omegaconf import OmegaConf
+
+from pickplace import Item, checkpoint
+from pickplace.items import Kinds, hashed_uniform
+from pickplace.planners import PolicyPlanner
+from pickplace.planners.policy import restore_policy
+
+
+class Batches(Kinds):
+    """Kinds of which ``run`` items come in a row, each at a position of its own.
+
+    Args:
+        kinds: ``(w, d, h)`` triples, in cells.
+        run: how many items of the same kind come in a row.
+        weights: a relative frequency for each kind; None means equally likely.
+    """
+
+    def __init__(self, kinds, run: int, weights=None):
+        super().__init__(kinds, weights)  # keeps `sizes`, int64 [K, 3]: all that may arrive
+        if not isinstance(run, int) or run < 1:
+            raise ValueError(f"items.run={run!r}: expected a whole number >= 1.")
+        self.run = run
+
+    def sample(self, stream, seed, episode, step, bin_size):
+        """The ``step``-th item of each episode, int64 ``[N]``: a function of its arguments, so nothing is stored."""
+        (kind,) = hashed_uniform(stream, seed, episode, step // self.run, 1)
+        w, d, h = self.sizes.to(step.device)[self._index(kind, step)].unbind(-1)
+        _, across, along = hashed_uniform(stream, seed, episode, step, 3)
+        x = (across * (bin_size[0] - w + 1)).long()
+        y = (along * (bin_size[1] - d + 1)).long()
+        return Item(x, y, w, d, h)
+
+
+class OwnRun:
+    """The planner that follows the policy of a run whose config you trust: it says which classes are made."""
+
+    name = "own_run"
+
+    def __init__(self, rules, run):
+        state, facts = checkpoint.read(checkpoint.locate(run))
+        cfg = OmegaConf.create(facts["config"])
+        policy = restore_policy(cfg, rules, state["policy"], cfg.env.rotations)
+        self.decide = PolicyPlanner(rules, policy).decide
