@@ -121,13 +121,12 @@ def typical_learns_poorly(results):
 
 
 def clipping_helps(results):
-    """Every clipped seed ends above every one that is not."""
-    without = final(results, [f"fcn4d_noclip-6x6x5-s{seed}" for seed in range(3)])
-    clipped = final(results, [f"fcn4d-R4-s{seed}" for seed in range(3)])
-    if not without or not clipped:
-        return None, ""
-    verdict = True if min(clipped) > max(without) else False if max(clipped) < min(without) else None
-    return verdict, f"last validation at 6x6x5, each seed: clipped {show(clipped)}; not clipped {show(without)}"
+    """Where the tote is higher than the clip: trained low with it, against trained at the size itself without."""
+    comparisons = []
+    for tote in ("6x6x10", "10x10x10", "30x30x10"):
+        pair = gap(results, f"fcn4d-R4-s0-{tote}-K1", f"fcn4d_noclip-R4-s0-{tote}-K1")
+        comparisons.append((f"{tote}, clipped minus not clipped", pair))
+    return judged(comparisons)
 
 
 def show(values) -> str:

@@ -214,7 +214,7 @@ def learning_curves(results, path) -> bool:
         axes[number].set_title(title, fontsize=10)
     band(axes[3], results, [f"fcn4d-R4-s{seed}" for seed in seeds], "fcn4d", label="depth clipped (eq. 4)")
     band(axes[3], results, [f"fcn4d_noclip-6x6x5-s{seed}" for seed in seeds], "fcn4d_noclip", label="not clipped")
-    axes[3].set_title("fcn4d: clipping", fontsize=10)
+    axes[3].set_title("fcn4d: clipping (at 5, which takes nothing here)", fontsize=10)
     band(axes[4], results, [f"fcn_grasp-R4-s{seed}" for seed in seeds], "fcn_grasp", label="adaptive")
     for method, text, colour in (
         ("fcn_grasp_paper", "paper, 60,000 a level", "#009e73"),
