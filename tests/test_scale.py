@@ -242,7 +242,8 @@ def test_a_training_collects_with_ray(local_ray, tmp_path):
     smoke(tmp_path / "run", "collector=ray", "total_frames=512", "curriculum.advance.window=10", *overrides)
     rows = read_csv(tmp_path / "run" / "metrics.csv")
     assert [row["frames"] for row in rows] == [128, 256, 384, 512]
-    assert rows[0]["curriculum/level"] < rows[-1]["curriculum/level"]
+    assert rows[0]["curriculum/level"] == 1 < rows[-1]["curriculum/level"]
+    assert "curriculum/occupancy_at_2" in rows[-1]  # the workers have followed
 
 
 @pytest.mark.parametrize(
