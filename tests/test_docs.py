@@ -117,6 +117,7 @@ def test_every_command_composes(page, monkeypatch):
     for command, words in commands_of(page):
         folder = config.conf_dir()
         overrides = [word for word in words if word != "-m"]
+        assert "--config-dir" not in overrides[1:], "Hydra takes its flags before the settings, or after all of them"
         if "--config-dir" in overrides:
             at = overrides.index("--config-dir")
             folder_of_user = ROOT / overrides[at + 1]
