@@ -31,7 +31,8 @@ class CsvLogger:
 
     def _rewrite(self, rows):
         """Begin the file anew, with columns for all that these rows hold."""
-        self.close()
+        if self._file:
+            self._file.close()
         self._columns += [key for key in dict.fromkeys(key for row in rows for key in row) if key not in self._columns]
         fresh = self.path.with_name(".metrics.csv.new")
         with fresh.open("w", newline="") as file:
