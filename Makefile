@@ -102,13 +102,14 @@ audit: $(STAMP)  ## look the locked versions up in the database of known vulnera
 	$(BIN)/pip install --quiet --disable-pip-version-check 'pip-audit>=2.7,<3'
 	$(BIN)/pip-audit --requirement .ci/requirements.lock --no-deps
 
-lint: $(STAMP)  ## check style
+lint: $(STAMP)  ## check style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
 
 format: $(STAMP)  ## mend style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 clean:  ## remove .venv and caches; outputs stay
-	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

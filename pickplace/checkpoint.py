@@ -10,7 +10,9 @@ import json
 import os
 import shutil
 import stat
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from safetensors import SafetensorError
@@ -21,6 +23,8 @@ SCHEMA = 1
 PRETRAINED = Path(__file__).resolve().parent / "pretrained"  # weights that the package ships
 TENSORS, FACTS = "state.safetensors", "state.json"
 PREVIOUS = "previous"  # beside checkpoints/last, the one before it
+
+Module = TypeVar("Module", bound=torch.nn.Module)
 
 
 class CheckpointError(ValueError):
@@ -53,7 +57,7 @@ def unflatten(tensors: dict[str, Tensor], facts: dict) -> dict:
     Raises:
         ValueError: for a path that goes on below another one's leaf.
     """
-    tree = {}
+    tree: dict = {}
     for path, value in [*tensors.items(), *facts.items()]:
         node = tree
         *parents, leaf = (int(part) if part.isdecimal() else part for part in path.split("|"))
@@ -146,9 +150,9 @@ def read(folder: Path) -> tuple[dict, dict]:
         return _read(folder)
     except CheckpointError as error:
         others = []
-        for other in [PREVIOUS, "last", "best"] if Path(folder).parent.name == "checkpoints" else []:
+        for name in [PREVIOUS, "last", "best"] if Path(folder).parent.name == "checkpoints" else []:
             try:
-                others.append((_read(Path(folder).with_name(other))[1]["frames"], Path(folder).with_name(other)))
+                others.append((_read(Path(folder).with_name(name))[1]["frames"], Path(folder).with_name(name)))
             except CheckpointError:
                 continue
         if not others:
@@ -198,7 +202,7 @@ def fitting(theirs, mine: dict, what: str, path: str = "") -> dict:
     Raises:
         CheckpointError: naming the first value that is missing, of another type or shape, or not finite.
     """
-    found = {}
+    found: dict = {}
     for key, own in mine.items():
         other, name = theirs.get(key) if isinstance(theirs, dict) else None, f"{path}{key}"
         if key == "cuda_rng" and other is None:  # saved without a GPU
@@ -223,7 +227,7 @@ def _kind(value) -> str:
     return "missing" if value is None else type(value).__name__
 
 
-def restore(make, state: dict, what: str) -> torch.nn.Module:
+def restore(make: Callable[[], Module], state: dict, what: str) -> Module:
     """The module that ``make()`` makes, with a checkpoint's tensors.
 
     Sizes are compared before any memory is taken: a config that asks for more than there is cannot fit the tensors.

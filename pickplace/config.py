@@ -219,10 +219,11 @@ def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> N
         ValueError: naming the key, and the ones that there are.
     """
     for key, node in cfg.items():
+        name = path + str(key)
         if key not in known:
-            raise ValueError(_unknown_key(f"{path}{key}", known, path))
+            raise ValueError(_unknown_key(name, known, path))
         if OmegaConf.is_dict(node) and OmegaConf.is_dict(known[key]) and "_target_" not in node:
-            refuse_unknown_keys(node, known[key], f"{path}{key}.")
+            refuse_unknown_keys(node, known[key], f"{name}.")
 
 
 def _unknown_key(key: str, cfg: DictConfig, prefix: str = "") -> str:
@@ -231,7 +232,7 @@ def _unknown_key(key: str, cfg: DictConfig, prefix: str = "") -> str:
     *parents, leaf = key.removeprefix(prefix).split(".")
     for parent in parents:
         child = node.get(parent) if parent in node else None
-        if not OmegaConf.is_dict(child):
+        if not isinstance(child, DictConfig):
             leaf = parent
             break
         at, node = f"{at}{parent}.", child
@@ -246,7 +247,7 @@ def sentence(error: Exception) -> str:
     if isinstance(error, OverrideParseException):
         reasons = [line for line in error.message.splitlines() if not line.startswith(("Error parsing", "See https"))]
         return f"{error.override!r}: expected <key>=<value> ({' '.join(reasons)})."
-    if isinstance(error, MissingConfigException):
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         for start, extra in EXTRAS.items():
             if error.missing_cfg_file.startswith(start):
                 return f"{error.missing_cfg_file}: {extra} is missing; pip install 'pickplace[{extra}]'."
@@ -324,7 +325,8 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
             if missing := OmegaConf.missing_keys(cfg):
                 raise ValueError(f"{min(missing)}: no value; expected {min(missing)}=<value>.")
             known = hydra.compose(hydra_cfg.job.config_name)
-            refuse_unknown_keys(OmegaConf.masked_copy(cfg, [key for key in cfg if key not in from_checkpoint]), known)
+            own = [str(key) for key in cfg if key not in from_checkpoint]
+            refuse_unknown_keys(OmegaConf.masked_copy(cfg, own), known)
             return task(cfg, Path(hydra_cfg.runtime.output_dir))
 
     app.__module__, app.__qualname__ = "__main__", "app"

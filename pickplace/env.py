@@ -242,11 +242,10 @@ class PickPlaceEnv(EnvBase):
         Args:
             empty: the totes of these problems are empty.
         """
-        index = rows.nonzero()[:, 0]
-        if len(index) == 0:
+        numbers = rows.nonzero()[:, 0]
+        if len(numbers) == 0:
             return
-        if len(index) == len(rows):
-            index = slice(None)
+        index = slice(None) if len(numbers) == len(rows) else numbers
         make = self._masks_of_empty_totes if empty and self.device.type == "cpu" else self._masks_of
         masks = make(self.heights[index], self.tote_height[index], self.item[index])
         self.feasible[index] = _any(next(iter(masks.values())))
@@ -274,7 +273,7 @@ class PickPlaceEnv(EnvBase):
         columns = zip(*(self._starts[key] for key in keys), strict=True)
         return dict(zip(self.masks or ("outcome",), map(torch.stack, columns), strict=True))
 
-    def _store(self, name: str, index, values: Tensor):
+    def _store(self, name: str, index: Tensor | slice, values: Tensor):
         """Keep a mask in a tensor of its own: the last one has been handed out with an observation."""
         if not isinstance(index, slice):
             values = getattr(self, name).index_copy(0, index, values)
@@ -311,7 +310,8 @@ def check_items(rules: Rules, items: ItemDistribution) -> None:
     """
     w_b, d_b, _ = rules.bin_size
     height = rules.tote_size[2]
-    problems = {}  # (x, y, w, d, h) -> the first kind like it: the rows of a long recording repeat themselves
+    # (x, y, w, d, h) -> the first kind like it: the rows of a long recording repeat themselves
+    problems: dict[tuple[int, ...], int] = {}
     for kind, (w, d, h) in enumerate(items.sizes.tolist()):
         for (room_w, room_d), what in (((w_b, d_b), "bin_size"), (rules.effector_size, "effector_size")):
             if (w > room_w or d > room_d) and (what == "bin_size" or rules.pick_rule == "contain"):

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -72,7 +73,9 @@ def play(
         record: numbers of the episodes to record move by move.
         until: CPU time of this process (``time.process_time()``) after which no further batch is begun; None: never.
     """
-    parts, recordings, feasible, decisions, seconds = [], [], 0.0, 0, 0.0
+    feasible, decisions, seconds = 0.0, 0, 0.0
+    parts: list[tuple[Tensor, ...]] = []
+    recordings: list[Recording] = []
     for first in range(0, episodes, batch_size):
         if parts and until is not None and time.process_time() > until:
             break
@@ -139,8 +142,8 @@ def decision_latency(make_env, planner, decisions: int) -> dict[str, float] | No
             torch.cuda.synchronize(action.device)
         times.append((time.perf_counter() - start) * 1e3)
         _, observation = env.step_and_maybe_reset(observation.set("action", action))
-    times = torch.tensor(times, dtype=torch.float64)
-    return {"p50": float(times.quantile(0.5)), "p95": float(times.quantile(0.95))}
+    sample = torch.tensor(times, dtype=torch.float64)
+    return {"p50": float(sample.quantile(0.5)), "p95": float(sample.quantile(0.95))}
 
 
 def summarise(result: Episodes) -> dict:
@@ -285,7 +288,8 @@ def prepare(cfg: DictConfig) -> tuple:
         raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
     config.use_machine(cfg)
     settings = {key: value for key, value in cfg.planner.items() if key != "_target_"}
-    facts, trained = {"planner_settings": settings, "checkpoint": None}, None
+    facts: dict[str, Any] = {"planner_settings": settings, "checkpoint": None}
+    trained = None
     if cfg.checkpoint is not None:
         folder = checkpoint.locate(str(cfg.checkpoint))
         state, saved = checkpoint.read(folder)

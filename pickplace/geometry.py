@@ -355,7 +355,7 @@ class Rules:
         """How many flat actions succeed, int64 ``[N]``, without listing them."""
         available, classes = self._offsets(placements.item)
         places = self.class_mask(placements).sum(1)  # [C, N]
-        return sum((places.gather(0, turned) * available).sum(0) for turned in classes)
+        return reduce(torch.add, [(places.gather(0, turned) * available).sum(0) for turned in classes])
 
     def action_mask(self, placements: Placements) -> Tensor:
         """Exactly the flat actions that succeed, bool ``[N, N_a]``."""
@@ -408,13 +408,12 @@ class Rules:
             # The footprint at f is reached with offset o if the EE's reference cell is at f + ref - o.
             pad = (high - ref_x, ref_x - self.min_offset, high - ref_y, ref_y - self.min_offset)
             clear = _surround(placements.clearance[:, parity].permute(1, 2, 0), pad, FAR)  # cell f + high - o
-            lowest = None
-            for i in range(count):
-                for j in range(count):
-                    cell = clear[i : i + tote_w, j : j + tote_d]
-                    usable = torch.where(grasped[parity, count - 1 - i, count - 1 - j], cell, FAR)
-                    lowest = usable if lowest is None else torch.minimum(lowest, usable, out=lowest)
-            torch.le(lowest, placements.top[:, parity].permute(1, 2, 0), out=maps[parity])
+            usable = (
+                torch.where(grasped[parity, count - 1 - i, count - 1 - j], clear[i : i + tote_w, j : j + tote_d], FAR)
+                for i in range(count)
+                for j in range(count)
+            )
+            torch.le(reduce(torch.minimum, usable), placements.top[:, parity].permute(1, 2, 0), out=maps[parity])
         if self.parities == 2:
             square = placements.item.w == placements.item.d
             maps[0] |= square & maps[1]
@@ -517,8 +516,8 @@ class Rules:
         w, d = torch.where(odd, item.d, item.w), torch.where(odd, item.w, item.d)
         turned_x = torch.where(odd, torch.where(rotation == 1, back_y, oy), torch.where(rotation == 0, ox, back_x))
         turned_y = torch.where(odd, torch.where(rotation == 1, ox, back_x), torch.where(rotation == 0, oy, back_y))
-        ee_w, ee_d = torch.where(odd, ee_d, ee_w), torch.where(odd, ee_w, ee_d)
-        left, front = xt - (ee_w - 1) // 2, yt - (ee_d - 1) // 2  # the EE's min corner in the tote
+        wide, deep = torch.where(odd, ee_d, ee_w), torch.where(odd, ee_w, ee_d)  # the turned EE
+        left, front = xt - (wide - 1) // 2, yt - (deep - 1) // 2  # its min corner in the tote
         fx, fy = left + turned_x, front + turned_y
 
         # Placing.
@@ -527,9 +526,9 @@ class Rules:
         z = torch.where(footprint, by_cell, 0).flatten(0, 1).amax(0)
         top = z.long() + item.h
         level = (footprint & (by_cell == z)).flatten(0, 1).sum(0)
-        highest = torch.where(_rectangle((tote_w, tote_d), left, front, ee_w, ee_d), by_cell, 0).flatten(0, 1).amax(0)
+        highest = torch.where(_rectangle((tote_w, tote_d), left, front, wide, deep), by_cell, 0).flatten(0, 1).amax(0)
         item_outside = (fx < 0) | (fy < 0) | (fx + w > tote_w) | (fy + d > tote_d)
-        ee_outside = (left < 0) | (front < 0) | (left + ee_w > tote_w) | (front + ee_d > tote_d)
+        ee_outside = (left < 0) | (front < 0) | (left + wide > tote_w) | (front + deep > tote_d)
 
         checks = (  # from the last to the first, so that the first failure has the last word
             (Failure.UNSTABLE, ~self._supported(level, w * d)),

@@ -31,7 +31,8 @@ def _make_env(num_envs: int, items, settings: dict) -> PickPlaceEnv:
 
 def _spaces(env: PickPlaceEnv) -> tuple[spaces.Dict, spaces.Discrete]:
     """Observation and action space of one problem."""
-    spec, boxes = env.observation_spec, {}
+    spec = env.observation_spec
+    boxes: dict[str, spaces.Space] = {}
     for key in KEYS:
         space, shape = spec[key].space, tuple(spec[key].shape[1:])
         dtype = np.int64 if key == "tote_height" else np.float32
@@ -112,13 +113,15 @@ class PickPlaceGymEnv(gymnasium.Env):
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 4}
+    action_space: spaces.Discrete
 
     def __init__(self, items=None, render_mode: str | None = None, **settings):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode={render_mode!r}: expected 'rgb_array', 'human' or None.")
         self._env, self.render_mode = _make_env(1, items, settings), render_mode
         self.observation_space, self.action_space = _spaces(self._env)
-        self._window = self._recording = None
+        self._recording: Recording | None = None  # of the running episode, for rendering
+        self._window: tuple | None = None  # the figure and the image in it
         self._started = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
@@ -139,12 +142,12 @@ class PickPlaceGymEnv(gymnasium.Env):
         if not self.action_space.contains(action):
             raise ValueError(f"action={action!r}: expected a whole number in [0, {self.action_space.n}).")
         actions = torch.as_tensor([int(action)], device=self._env.device)
-        if self.render_mode:
+        if self._recording is not None:
             before = TensorDict({"tote_height": self._env.tote_height[:, None].clone()}, [1], device=self._env.device)
             move = observe(self._env.rules, None, before, self._env.heights, self._env.current_item, actions)[0]
             self._recording.moves.append(move)
         state = self._env.step(TensorDict({"action": actions}, [1], device=self._env.device))["next"]
-        if self.render_mode and bool(state["done"]):
+        if self._recording is not None and bool(state["done"]):
             self._recording.ending = Failure(int(state["failure"]))
         self._show()
         flags = bool(state["terminated"]), bool(state["truncated"])
@@ -173,7 +176,7 @@ class PickPlaceGymEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded("render() before reset().")
         rules, item = self._env.rules, self._env.current_item
         scene = draw_scene(self._recording, rules, item_colours(self._recording.boxes))
-        inset = scene.add_axes([0.01, 0.04, 0.09, 0.18])
+        inset = scene.add_axes((0.01, 0.04, 0.09, 0.18))
         inset.imshow(rules.bin_depth(item)[0].cpu().numpy().T, origin="lower", cmap="YlOrBr", vmin=0)
         inset.set_title("bin", fontsize="medium")
         inset.set_xticks([])
@@ -194,7 +197,7 @@ class PickPlaceGymEnv(gymnasium.Env):
 
         if self._window is None:
             figure = pyplot.figure("pickplace", figsize=(12, 6))
-            axes = figure.add_axes([0, 0, 1, 1])
+            axes = figure.add_axes((0, 0, 1, 1))
             axes.set_axis_off()
             self._window = figure, axes.imshow(self._picture())
         self._window[1].set_data(self._picture())
@@ -221,6 +224,8 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         autoreset_mode: Gymnasium's ``"NextStep"`` (the default), ``"SameStep"`` or ``"Disabled"``.
         **settings: as of :class:`PickPlaceGymEnv`; there is no rendering.
     """
+
+    single_action_space: spaces.Discrete
 
     def __init__(
         self,
@@ -284,7 +289,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
             state[key][:, 0].cpu().numpy().copy() for key in ("reward", "terminated", "truncated")
         )
         reward = reward.astype(np.float64)
-        infos = {}
+        infos: dict[str, Any] = {}
         if waiting.any():  # their action did not count: this step is their reset
             self._reset_rows(waiting)
             reward[waiting], terminated[waiting], truncated[waiting] = 0, False, False

@@ -25,14 +25,12 @@ class CsvLogger:
 
     def __init__(self, folder, frames: int = 0, settings: dict | None = None):
         self.path = Path(folder) / "metrics.csv"
-        self._columns, self._file = ["frames"], None
+        self._columns = ["frames"]
         earlier = read_csv(self.path) if frames and self.path.is_file() else []
         self._rewrite([row for row in earlier if row["frames"] <= frames])
 
     def _rewrite(self, rows):
         """Begin the file anew, with columns for all that these rows hold."""
-        if self._file:
-            self._file.close()
         self._columns += [key for key in dict.fromkeys(key for row in rows for key in row) if key not in self._columns]
         fresh = self.path.with_name(".metrics.csv.new")
         with fresh.open("w", newline="") as file:
@@ -55,15 +53,15 @@ class CsvLogger:
                 self._writer.writerow(row)
                 self._file.flush()
             else:
+                self._file.close()
                 self._rewrite([*read_csv(self.path), row])
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def close(self) -> None:
         """Close the file; what a full disk did not take is lost."""
-        if self._file:
-            with suppress(OSError):
-                self._file.close()
+        with suppress(OSError):
+            self._file.close()
 
 
 class TensorboardLogger(CsvLogger):

@@ -35,6 +35,7 @@ FULL = "The tote is full."
 
 #: The same in a word or two, for a list of episodes.
 BRIEFLY = {
+    None: "goes on",
     Failure.NONE: "stream over",
     Failure.PICK_MISS: "missed the item",
     Failure.BIN_COLLISION: "hit the bin",
@@ -162,13 +163,14 @@ def _others(recording: Recording) -> list[tuple[int, ...]]:
 
 
 def _episode(recording: Recording, rules: Rules) -> dict:
-    heat, ending = [move.heat for move in recording.moves], recording.describe_ending(rules.num_places)
+    heat = [move.heat for move in recording.moves if move.heat is not None]
+    ending = recording.describe_ending(rules.num_places)
     return {
         "episode": recording.episode,
         "height": recording.tote_height,
         "occupancy": recording.occupancy,
         "ending": ending,
-        "briefly": "full" if ending == FULL else BRIEFLY.get(recording.ending, "goes on"),
+        "briefly": "full" if ending == FULL else BRIEFLY[recording.ending],
         "failed": recording.ending not in (None, Failure.NONE, Failure.STUCK),
         "stuck": recording.ending == Failure.STUCK and ending != FULL,
         "waiting": recording.waiting,
@@ -177,7 +179,7 @@ def _episode(recording: Recording, rules: Rules) -> dict:
             [*move.item, *move.pick, *move.place, move.rotation, *move.footprint, move.z, int(move.failure)]
             for move in recording.moves
         ],
-        "heat": base64.b64encode(np.stack(heat).tobytes()).decode() if heat and heat[0] is not None else None,
+        "heat": base64.b64encode(np.stack(heat).tobytes()).decode() if heat else None,
     }
 
 

@@ -204,7 +204,7 @@ def visible_triangles(boxes) -> dict:
     cells = {}
     for number, (x, y, z, w, d, h) in enumerate(boxes):
         cells.update(dict.fromkeys([(x + i, y + j, z + k) for i, j, k in np.ndindex(w, d, h)], number))
-    nearest = {}
+    nearest: dict[tuple, tuple[int, int, int]] = {}  # triangle -> depth, box, face
     for (x, y, z), number in cells.items():
         for face, ((i, j, k), _, corners) in enumerate(FACES):
             if (x + i, y + j, z + k) in cells:
@@ -245,7 +245,8 @@ def _draw_boxes(axes, placed, colours, size) -> None:
 
     # The items, y turned around so that the viewer is at (1, 1, 1).
     seen = visible_triangles([(x, deep - y - d, z, w, d, h) for x, y, z, w, d, h in placed])
-    fills, sides = [], {}
+    fills = []
+    sides: dict[tuple, list[tuple[int, int]]] = {}  # of triangles -> box and face at each
     for triangle, (number, face) in seen.items():
         fills.append(np.array(to_rgb(colours[_kind(placed[number])])) * FACES[face][1])
         for i, j in ((0, 1), (1, 2), (0, 2)):
@@ -259,8 +260,8 @@ def _draw_boxes(axes, placed, colours, size) -> None:
     axes.add_collection(LineCollection(edges, colors=INK, linewidths=width, capstyle="round", zorder=3))
 
     # The near edges of the tote.
-    rim = [corner(*at, high) for at in (lo, (wide, 0), hi, (0, deep), lo)]
-    posts = [[corner(*at, 0), corner(*at, high)] for at in (lo, (wide, 0), hi)]
+    rim = [corner(x, y, high) for x, y in (lo, (wide, 0), hi, (0, deep), lo)]
+    posts = [[corner(x, y, 0), corner(x, y, high)] for x, y in (lo, (wide, 0), hi)]
     axes.add_collection(LineCollection([rim, *posts], colors=WALL, linewidths=1.2, zorder=4))
     gap = 0.05 * (wide + deep)
     for label, (x, y) in (("x", corner(wide / 2, 0, 0)), ("y", corner(wide, deep / 2, 0))):

@@ -8,6 +8,7 @@ seen from above.
 
 import reprlib
 from dataclasses import asdict, dataclass, fields, replace
+from typing import Literal, cast
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from pickplace import checkpoint, config
 from pickplace.geometry import Failure, Item, Rules
+from pickplace.models.actors import Policy
 from pickplace.planners.policy import PolicyPlanner, restore_policy
 
 
@@ -78,11 +80,11 @@ class Planner:
         candidates: as in :class:`~pickplace.planners.PolicyPlanner`: ``"all"``, or ``K``.
     """
 
-    def __init__(self, rules: Rules, policy: torch.nn.Module, candidates: int | str = "all"):
+    def __init__(self, rules: Rules, policy: Policy, candidates: int | Literal["all"] = "all"):
         self.rules, self._planner = rules, PolicyPlanner(rules, policy, candidates)
 
     @classmethod
-    def load(cls, path, candidates: int | str = "all", device: str = "cpu", **sizes) -> "Planner":
+    def load(cls, path, candidates: int | Literal["all"] = "all", device: str = "cpu", **sizes) -> "Planner":
         """A planner from a checkpoint.
 
         Args:
@@ -100,7 +102,8 @@ class Planner:
         known = {field.name for field in fields(Rules)}
         if unknown := sorted(set(sizes) - known):
             raise ValueError(f"{unknown[0]}={sizes[unknown[0]]!r}: expected one of {', '.join(sorted(known))}.")
-        trained = {key: value for key, value in OmegaConf.to_container(cfg.env, resolve=True).items() if key in known}
+        env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
+        trained = {key: value for key, value in env.items() if key in known}
         rules = Rules(**{**trained, **sizes})
         if rules.pick_rule == "overlap" and rules.longest_side is None:  # then the number of grasps depends on it
             longest = int(config.instantiate(cfg["items"]).sizes[:, :2].max())
@@ -173,15 +176,17 @@ class Planner:
         item = rules.read_item(observation["bin_depth"])
         at = torch.tensor([height], device=device)
         feasible = bool(rules.outcome_mask(rules.placements(heights, at, item)).any())
-        action = self._planner.decide(observation) if feasible else None
-        step = rules.apply(heights, at, item, action) if feasible else None
-        done = feasible and int(step.failure[0]) == 0
+        action = None  # one that succeeds
+        if feasible:
+            decided = self._planner.decide(observation)
+            step = rules.apply(heights, at, item, decided)
+            action = decided if int(step.failure[0]) == 0 else None
 
         capacity = height * rules.num_places
         before = int(heights.sum()) / capacity
         volume = int(item.w * item.d * item.h)
         plan = Plan(
-            status="ok" if done else "rejected" if feasible else "stuck",
+            status="ok" if action is not None else "rejected" if feasible else "stuck",
             item={key: int(value) for key, value in item._asdict().items()},
             pick=None,
             place=None,
@@ -189,30 +194,30 @@ class Planner:
             drop_height=None,
             action=None,
             occupancy_before=before,
-            occupancy_after=before + volume / capacity if done else before,
-            alternatives=self._alternatives(observation, heights, at, item, action if done else None, alternatives),
+            occupancy_after=before if action is None else before + volume / capacity,
+            alternatives=self._alternatives(observation, heights, at, item, action, alternatives),
             reasons=None if feasible else self._reasons(heights, at, item),
         )
-        if not done:
+        if action is None:
             return plan
         x_bin, y_bin, x_tote, y_tote, rotation = (int(part) for part in rules.split_action(action))
         ee_w, ee_d = rules.effector_size
         turned_w, turned_d, ref_x, ref_y = rules.effectors[rotation % 2]
         top = int(step.top[0])
+
+        def length(cells: float) -> float:
+            return round(cells * unit, 9)  # without the tail of binary fractions
+
         # The centre comes from the rectangle, not from the reference cell, which is off by half a cell on even sides.
         left, front = x_bin - (ee_w - 1) // 2, y_bin - (ee_d - 1) // 2
-        pick = (left + ee_w / 2, front + ee_d / 2, plan.item["h"])
-        place = (x_tote - ref_x + turned_w / 2, y_tote - ref_y + turned_d / 2, top)
-
-        def lengths(cells) -> tuple[float, ...]:
-            return tuple(round(value * unit, 9) for value in cells)  # without the tail of binary fractions
-
+        pick = length(left + ee_w / 2), length(front + ee_d / 2), length(plan.item["h"])
+        place = length(x_tote - ref_x + turned_w / 2), length(y_tote - ref_y + turned_d / 2), length(top)
         return replace(
             plan,
-            pick=Pose((x_bin, y_bin), lengths(pick)),
-            place=Pose((x_tote, y_tote), lengths(place)),
+            pick=Pose((x_bin, y_bin), pick),
+            place=Pose((x_tote, y_tote), place),
             rotation_degrees=90 * rotation,
-            drop_height=lengths([top - plan.item["h"]])[0],
+            drop_height=length(top - plan.item["h"]),
             action=int(action),
         )
 

@@ -78,7 +78,7 @@ def read_run(folder: Path) -> Run:
     run = Run(folder.name, dict(word.lstrip("+").partition("=")[::2] for word in words))
     if (folder / "metrics.csv").is_file():
         rows = read_csv(folder / "metrics.csv")
-        run.frames = rows[-1]["frames"] if rows else 0
+        run.frames = int(rows[-1]["frames"]) if rows else 0
         run.validations = [row for row in rows if "eval/occupancy" in row]
     else:  # logger=none
         try:
@@ -117,8 +117,8 @@ def summarize(folder: Path) -> list[Run]:
     runs = [read_run(path) for path in found]
     write_table(runs, folder / TABLE)
     draw(runs, folder / FIGURE)
-    best = max((run for run in runs if run.validations), key=lambda run: run.best, default=None)
-    if best:
+    best = max(runs, key=lambda run: -1.0 if run.best is None else run.best)
+    if best.best is not None:
         log.info("best validation occupancy: %.4f, %s (%s)", best.best, folder / best.name, labels(runs)[best.name])
     log.info("the sweep's table and figure: %s, %s", folder / TABLE, folder / FIGURE)
     return runs
@@ -171,7 +171,7 @@ def draw(runs: list[Run], path: Path) -> None:
     named, names = ranked[:SHOWN], labels(runs)
     distinct = [colour for colour in COLOURS if colour != YELLOW]
     if len(runs) <= len(distinct):
-        colours = {run.name: colour for run, colour in zip(runs, distinct, strict=False)}
+        colours: dict[str, str | tuple] = {run.name: colour for run, colour in zip(runs, distinct, strict=False)}
     else:  # from the best to the last
         scale = matplotlib.colormaps["viridis"]
         colours = {run.name: scale(0.9 * rank / len(ranked)) for rank, run in enumerate(ranked)}
@@ -189,7 +189,7 @@ def draw(runs: list[Run], path: Path) -> None:
 
     for place, run in enumerate(named):
         note = {"finished": None, "stopped": f"stopped at {run.frames:,} frames"}.get(run.status, run.status)
-        if run.validations:
+        if run.final is not None:
             last, colour = run.validations[-1], colours[run.name]
             low, high = (last.get(f"eval/ci95_{side}", run.final) for side in ("low", "high"))
             # The mean of few episodes may lie on the edge of its interval by rounding; a bar has no negative length.

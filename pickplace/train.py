@@ -26,7 +26,7 @@ from pickplace.collector import rng_state, set_rng_state, watched
 from pickplace.curriculum import Curriculum, push_level
 from pickplace.evaluate import Episodes, commit, confidence95, play, versions
 from pickplace.geometry import Failure
-from pickplace.models.actors import as_actor, as_collection_policy, check_sizes
+from pickplace.models.actors import Policy, as_actor, as_collection_policy, check_sizes
 from pickplace.report import learning_curve
 from pickplace.training_report import write_report
 from pickplace.warm_start import Phase, WarmStart, imitation_loss
@@ -72,11 +72,11 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     rules = probe.rules
     state, facts, safe = resume or ({}, {}, None)  # safe: the checkpoint that was read or written last
 
-    def build(what: str, make) -> torch.nn.Module:
-        return (checkpoint.restore(make, state.get(what), what) if resume else make()).to(device)
+    def build(what: str, make):
+        return (checkpoint.restore(make, state.get(what, {}), what) if resume else make()).to(device)
 
     make_policy = partial(config.instantiate, cfg.model.actor, rules=rules, mask_infeasible=algo.mask_infeasible)
-    policy = build("policy", make_policy)
+    policy: Policy = build("policy", make_policy)
     for warning in check_sizes(policy, rules):
         log.warning(warning)
     planner = config.instantiate(cfg.planner, rules=rules, policy=policy)  # the one that validates
@@ -88,8 +88,8 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     frames, iteration, best, latest = (facts.get(k, d) for k, d in COUNTERS.items())
     if resume:
         curriculum.load_state_dict(facts["curriculum"])
-    if warning := curriculum.check_budget(cfg.total_frames, cfg.env.num_envs * algo.rollout_length):
-        log.warning(warning)
+    if shortage := curriculum.check_budget(cfg.total_frames, cfg.env.num_envs * algo.rollout_length):
+        log.warning(shortage)
 
     # TorchRL's parts: collector, advantage, loss.
     env_config = OmegaConf.to_container(cfg.env, resolve=True)
@@ -131,7 +131,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     with ExitStack() as cleanup:
         cleanup.callback(collector.shutdown)
         if resume:
-            load_optimizer(optimizer, state.get("optimizer"))
+            load_optimizer(optimizer, state.get("optimizer", {}))
             with watched(collector):
                 mine = collector.state_dict()
                 collector.load_state_dict(checkpoint.fitting(state.get("collector"), mine, "collector"))
@@ -261,7 +261,7 @@ def check_settings(cfg: DictConfig) -> None:
             raise ValueError(f"{key}={value}: expected a number >= {low}{'' if high is None else f' and <= {high}'}.")
 
 
-def make_losses(algo: DictConfig, policy: torch.nn.Module, critic: ValueOperator) -> tuple[GAE, A2CLoss | ClipPPOLoss]:
+def make_losses(algo: DictConfig, policy: Policy, critic: ValueOperator) -> tuple[GAE, A2CLoss | ClipPPOLoss]:
     """The advantage estimator and the loss that ``algo.loss`` names."""
     common = {"entropy_coeff": algo.entropy_coeff, "critic_coeff": algo.critic_coeff, "loss_critic_type": "l2"}
     if algo.loss == "ppo":
@@ -321,7 +321,8 @@ def update(loss, optimizer, data: TensorDictBase, algo: DictConfig, policy, phas
 
     The loss is TorchRL's in phase ``REWARD``; its critic's part alone, with or without imitation, before.
     """
-    totals, steps = {}, 0
+    totals: dict[str, torch.Tensor | float] = {}
+    steps = 0
     for _ in range(algo.epochs):
         for index in torch.randperm(len(data), device=data.device).split(algo.minibatch_size):
             part = data[index]
@@ -487,7 +488,8 @@ def resume_run(overrides: list[str]) -> float:
     with claim(run_dir):  # before reading what another process may be writing
         state, facts = checkpoint.read(folder)
         cfg = resumed_config(place, facts, [item for item in overrides if not item.startswith("resume=")])
-        handlers = [logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log")]
+        log_file = run_dir / "train.log"
+        handlers: list[logging.Handler] = [logging.StreamHandler(sys.stdout), logging.FileHandler(log_file)]
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
         (run_dir / config.FAILURE).unlink(missing_ok=True)  # of the sweep that it was part of
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")

@@ -4,13 +4,14 @@ from enum import Enum
 
 import torch
 import torch.nn.functional as F
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from pickplace import checkpoint, config
 from pickplace.geometry import Rules
 from pickplace.items import ItemDistribution
+from pickplace.models.actors import Policy
 from pickplace.planners.policy import planner_parts
 
 
@@ -40,7 +41,7 @@ class WarmStart:
         ValueError: naming the key, for numbers that make no sense and for a teacher that lacks its checkpoint.
     """
 
-    def __init__(self, cfg: DictConfig, policy: nn.Module, rules: Rules, items: ItemDistribution, seed: int):
+    def __init__(self, cfg: DictConfig, policy: Policy, rules: Rules, items: ItemDistribution, seed: int):
         for key in ("frames", "critic_frames"):
             if not isinstance(cfg[key], int) or isinstance(cfg[key], bool) or cfg[key] < 0:
                 raise ValueError(f"warm_start.{key}={cfg[key]}: expected a whole number >= 0.")
@@ -48,7 +49,7 @@ class WarmStart:
             raise ValueError(f"warm_start.frames={cfg.frames}: nobody to imitate; expected warm_start=<planner>.")
         self.policy, self.rules, self.seed = policy, rules, seed
         self.teacher, self.frames, self.critic_frames = cfg.teacher, cfg.frames, cfg.critic_frames
-        self._parts = None
+        self._parts: dict = {}  # of the teacher
         if self.frames:
             trained = None
             if cfg.checkpoint is not None:
@@ -74,7 +75,7 @@ class WarmStart:
             iteration: of the run. A teacher that draws begins anew with each, so that a resumed run is the same.
         """
         draws = {"seed": self.seed + iteration} if "seed" in self.teacher else {}
-        teacher = config.instantiate(OmegaConf.merge(self.teacher, draws), **self._parts)
+        teacher = config.instantiate(self.teacher, **self._parts, **draws)
         action = teacher.decide(data)
         bin_depth, tote_depth, tote_height = data["bin_depth"], data["tote_depth"], data["tote_height"][:, 0]
         heights = (tote_height[:, None, None] - tote_depth).int()
@@ -89,7 +90,7 @@ class WarmStart:
         return torch.where(same, choice, -1)
 
 
-def imitation_loss(policy: nn.Module, data: TensorDictBase) -> tuple[Tensor, Tensor]:
+def imitation_loss(policy: Policy, data: TensorDictBase) -> tuple[Tensor, Tensor]:
     """Mean cross-entropy against the teacher's ``taught`` choices, and the share of them that is the likeliest."""
     taught = data["taught"]
     logits = policy(*(data[key] for key in policy.in_keys))

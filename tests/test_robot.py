@@ -189,7 +189,7 @@ BAD = [
     ({"cell_size": 0}, "cell_size=0: expected a length in metres, 1e-6 to 1e6"),
     ({"cell_size": "5cm"}, "cell_size='5cm': expected a length"),
     ({"cell_size": float("nan")}, "cell_size=nan"),
-    ({"cell_size": 1e-320}, "bin_depth[1, 2]: got inf cells"),
+    ({"cell_size": 1e-320}, "cell_size=1e-320: expected a length in metres, 1e-6 to 1e6"),
     ({"tote_height": 0}, "tote_height=0: expected a whole number of cells, 1 to 1048575"),
     ({"tote_height": 4.5}, "tote_height=4.5"),
     ({"tote_height": 10**400}, "tote_height=1000"),

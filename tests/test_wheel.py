@@ -30,7 +30,7 @@ def test_wheel_holds_every_config_file(wheel):
     inside = set(zipfile.ZipFile(wheel).namelist())
     expected = {f"pickplace/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")}
     assert expected and expected <= inside
-    assert {"pickplace/models/conv4d.py", "pickplace/planners/policy.py"} <= inside
+    assert {"pickplace/py.typed", "pickplace/models/conv4d.py", "pickplace/planners/policy.py"} <= inside
     assert {"pickplace/assets/replay.html", "pickplace/assets/three.min.js"} <= inside
     assert {f"pickplace/pretrained/r4/{name}" for name in ("card.json", "state.json", "state.safetensors")} <= inside
 

@@ -62,7 +62,7 @@ class FlatPolicy(nn.Module):
     """
 
     choice_key = "action"
-    excludes = None
+    excludes: str | None = None
 
     def __init__(self, rules: Rules, mask_infeasible: bool = False, **network):
         super().__init__()
@@ -235,6 +235,7 @@ class GraspPolicy(nn.Module):
     masks = ()
     mask_infeasible = False
     in_keys = ["bin_depth", "tote_depth"]
+    scored: Tensor  # see `_scored`
 
     def __init__(self, rules: Rules, **network):
         super().__init__()
@@ -319,6 +320,9 @@ class GraspPolicy(nn.Module):
         return rows[batch, picks + 1].transpose(2, 3).flatten(1)  # [N, P, R, places] -> [N, N_a]
 
 
+Policy = FlatPolicy | OutcomePolicy | GraspPolicy
+
+
 def pick_one(candidates: Tensor) -> Tensor:
     """One entry >= 0 of each row of int64 ``[N, M]``: drawn evenly when exploring, else the lowest; -1 if none."""
     if exploration_type() == ExplorationType.RANDOM:
@@ -345,12 +349,12 @@ def typical(rules: Rules, mask_infeasible: bool, **network) -> TypicalPolicy:
     return TypicalPolicy(rules, mask_infeasible, **network)
 
 
-def fcn_grasp(rules: Rules, mask_infeasible: bool, **network) -> nn.Module:
+def fcn_grasp(rules: Rules, mask_infeasible: bool, **network) -> OutcomePolicy | GraspPolicy:
     """The default policy (config ``model=fcn_grasp``): by outcomes with masking, by grasps without."""
     return (OutcomePolicy if mask_infeasible else GraspPolicy)(rules, **network)
 
 
-def as_actor(policy: nn.Module) -> ProbabilisticTensorDictSequential:
+def as_actor(policy: Policy) -> ProbabilisticTensorDictSequential:
     """The policy as TorchRL's PPO loss wants it: observation -> ``logits`` -> a choice and its log-probability."""
     return ProbabilisticTensorDictSequential(
         TensorDictModule(policy, in_keys=policy.in_keys, out_keys=["logits"]),
@@ -365,7 +369,7 @@ def as_actor(policy: nn.Module) -> ProbabilisticTensorDictSequential:
     )
 
 
-def as_collection_policy(policy: nn.Module) -> TensorDictSequential:
+def as_collection_policy(policy: Policy) -> TensorDictSequential:
     """The policy as the collector runs it: a choice, its log-probability, and a flat action; no logits are kept."""
     choose = as_actor(policy)
     if policy.choice_key == "action":
@@ -376,7 +380,7 @@ def as_collection_policy(policy: nn.Module) -> TensorDictSequential:
     return TensorDictSequential(choose, decide, selected_out_keys=[policy.choice_key, "log_prob", "action"])
 
 
-def check_sizes(policy: nn.Module, rules: Rules) -> list[str]:
+def check_sizes(policy: Policy, rules: Rules) -> list[str]:
     """The paper's conditions on sizes in training: eq. 2 on the items, eq. 3 on the bin and the tote.
 
     Returns:

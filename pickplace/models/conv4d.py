@@ -143,11 +143,11 @@ class Conv4dPolicy(nn.Module):
             bins = windows[torch.arange(len(bins), device=bins.device), pick.flatten()]
         rows = bins.shape[1] - 4
         states_at_once, rows_at_once = self._chunk_sizes(bins, totes)
-        out = [
+        parts = [
             torch.cat([layers(b[:, row : row + rows_at_once + 4], t) for row in range(0, rows, rows_at_once)], dim=1)
             for b, t in zip(bins.split(states_at_once), totes.split(states_at_once), strict=True)
         ]
-        out = torch.cat(out)
+        out = torch.cat(parts)
         return out.reshape(*batch, *out.shape[1:])
 
     def _prepare(self, depth: Tensor, limit: float | None, padding: float) -> Tensor:
@@ -183,12 +183,14 @@ class Conv4dPolicy(nn.Module):
         from_tote = from_tote[None].expand(len(from_bin), -1, -1, -1, -1, -1)
         hidden = (from_bin[:, :, :, None, None] + from_tote).relu_()
 
-        rows, weight, out = len(hidden) - 2, self.second.weight.to(dtype), None
-        for tap in range(3):
+        rows, weight = len(hidden) - 2, self.second.weight.to(dtype)
+
+        def convolve(tap: int, bias: Tensor | None = None) -> Tensor:
             volume = hidden[tap : tap + rows].flatten(0, 1).permute(0, 4, 1, 2, 3)  # a channels-last view
             kernel = weight[:, :, tap].contiguous(memory_format=torch.channels_last_3d)
-            part = F.conv3d(volume, kernel, self.second.bias.to(dtype) if tap == 0 else None)
-            out = part if out is None else out.add_(part)
+            return F.conv3d(volume, kernel, bias)
+
+        out = convolve(0, self.second.bias.to(dtype)).add_(convolve(1)).add_(convolve(2))
         return out.relu_().permute(0, 2, 3, 4, 1).unflatten(0, (rows, len(bins)))
 
     def _at_one_pick(self, from_bin: Tensor, from_tote: Tensor) -> Tensor:
@@ -266,7 +268,7 @@ class Conv4dCritic(nn.Module):
             got = tuple(depth.shape[-2:])
             if got != size:
                 raise ValueError(f"this critic was built for a {name} of {size}, not {got}")
-        batch, dtype = tote_depth.shape[:-2], self.value[0].weight.dtype
+        batch, dtype = tote_depth.shape[:-2], next(self.parameters()).dtype
         bins = bin_depth.to(dtype).reshape(-1, 1, *self.bin_size)
         totes = tote_depth.to(dtype).reshape(-1, 1, *self.tote_size)
         left = torch.stack((totes.mean((1, 2, 3)), totes.amax((1, 2, 3))), dim=-1) / self.depth_scale

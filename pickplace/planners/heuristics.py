@@ -38,7 +38,8 @@ class RandomFeasible:
     name = "random"
 
     def __init__(self, rules: Rules, seed: int = 0):
-        self.rules, self.seed, self._generator = rules, _checked(seed), None
+        self.rules, self.seed = rules, _checked(seed)
+        self._generator: torch.Generator | None = None
 
     def decide(self, observation: TensorDictBase) -> Tensor:
         mask = observation.get("action_mask", None)

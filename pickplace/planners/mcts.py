@@ -73,9 +73,9 @@ class MCTS:
         for key, value, least in (("simulations", simulations, 1), ("wave", wave, 1), ("seed", seed, 0)):
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise ValueError(f"planner.{key}={value!r}: expected a whole number >= {least}.")
-        for key, value, most in (("exploration", exploration, math.inf), ("widening", widening, 1)):
-            if not isinstance(value, (int, float)) or isinstance(value, bool) or not 0 <= value <= most:
-                raise ValueError(f"planner.{key}={value!r}: expected a number >= 0{' and <= 1' if most == 1 else ''}.")
+        for key, number, most in (("exploration", exploration, math.inf), ("widening", widening, 1)):
+            if not isinstance(number, (int, float)) or isinstance(number, bool) or not 0 <= number <= most:
+                raise ValueError(f"planner.{key}={number!r}: expected a number >= 0{' and <= 1' if most == 1 else ''}.")
         if not isinstance(mask, bool):
             raise ValueError(f"planner.mask={mask!r}: expected true or false.")
         self.rules, self.items, self.simulations, self.mask = rules, imagined(items), simulations, mask
@@ -152,16 +152,20 @@ class MCTS:
         walks = [walk for walk in walks if walk[1]]
         last = [(problem, path[-1]) for problem, path, over in walks if not over and not path[-1].failed]
         self._carry_out([(problem, edge) for problem, edge in last if edge.heights is None], tote_height)
-        going = [number for number, (_, path, over) in enumerate(walks) if not over and not path[-1].failed]
+        going = {  # the walks that go on, and what they leave in the tote
+            number: path[-1].heights
+            for number, (_, path, over) in enumerate(walks)
+            if not over and path[-1].heights is not None
+        }
         returns = torch.zeros(len(walks), dtype=torch.float64)
         if going:
             height = tote_height[[walks[number][0] for number in going]]
-            heights = torch.stack([walks[number][1][-1].heights for number in going])
+            heights = torch.stack(list(going.values()))
             nodes = self._nodes(heights, height, self._arriving(len(going)))
             for number, node in zip(going, nodes, strict=True):
                 walks[number][1][-1].bins.append(node)
             items = Item(*torch.stack([node.item for node in nodes]).unbind(1))
-            returns[going] = self._play_out(heights, height, items)
+            returns[list(going)] = self._play_out(heights, height, items)
         for (problem, path, _), volume in zip(walks, returns.tolist(), strict=True):
             for edge in reversed(path):
                 volume += edge.volume

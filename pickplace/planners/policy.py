@@ -1,17 +1,19 @@
 """The planner that follows a trained policy."""
 
 from functools import partial
+from typing import Any, Literal
 
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ValueOperator
 
 from pickplace import checkpoint, config
 from pickplace.geometry import FAR, Rules
 from pickplace.items import ItemDistribution
+from pickplace.models.actors import Policy
 
 
 class PolicyPlanner:
@@ -26,7 +28,7 @@ class PolicyPlanner:
 
     name = "policy"
 
-    def __init__(self, rules: Rules, policy: nn.Module, candidates: int | str = "all"):
+    def __init__(self, rules: Rules, policy: Policy, candidates: int | Literal["all"] = "all"):
         whole = isinstance(candidates, int) and not isinstance(candidates, bool)
         if candidates != "all" and not (whole and candidates >= 1):
             raise ValueError(f"planner.candidates={candidates!r}: expected 'all' or a whole number >= 1.")
@@ -97,7 +99,7 @@ def planner_parts(planner: DictConfig, rules: Rules, items: ItemDistribution, tr
     Raises:
         ValueError: for a planner that needs a checkpoint without one, or with one that does not serve these sizes.
     """
-    parts = {"rules": rules}
+    parts: dict[str, Any] = {"rules": rules}
     if planner._target_ in NEEDS_ITEMS:
         parts["items"] = items
     if planner._target_ in NEEDS_POLICY:
@@ -111,7 +113,7 @@ def planner_parts(planner: DictConfig, rules: Rules, items: ItemDistribution, tr
     return parts
 
 
-def restore_policy(cfg: DictConfig, rules: Rules, state: dict, trained_rotations: int) -> nn.Module:
+def restore_policy(cfg: DictConfig, rules: Rules, state: dict, trained_rotations: int) -> Policy:
     """The policy of a checkpoint, for these rules; the sizes need not be those that it was trained with.
 
     Args:
