@@ -102,8 +102,9 @@ lint: $(STAMP)  ## check style
 	$(BIN)/ruff format --check .
 
 format: $(STAMP)  ## mend style
-	$(BIN)/ruff check --fix .
+	$(BIN)/ruff check --fix --exit-zero --quiet .
 	$(BIN)/ruff format .
+	$(BIN)/ruff check .
 
 clean:  ## remove .venv and caches; outputs stay
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
