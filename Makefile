@@ -108,8 +108,9 @@ lint: $(STAMP)  ## check style and types
 	$(BIN)/mypy
 
 format: $(STAMP)  ## mend style
-	$(BIN)/ruff check --fix .
+	$(BIN)/ruff check --fix --exit-zero --quiet .
 	$(BIN)/ruff format .
+	$(BIN)/ruff check .
 
 clean:  ## remove .venv and caches; outputs stay
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
