@@ -12,7 +12,7 @@ help:  ## list the targets
 
 install: $(STAMP)  ## create .venv and install the package and what the tests need (LOCK=.ci/requirements.lock: these versions)
 
-$(STAMP): pyproject.toml
+$(STAMP): pyproject.toml $(LOCK)
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check $(if $(LOCK),-c $(LOCK)) -e '.[dev]'
 	@touch $@
