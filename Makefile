@@ -4,6 +4,7 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 RUN ?= outputs/quick_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
+PYTEST := $(BIN)/python -m pytest -q -n logical --maxprocesses 4 --dist worksteal
 
 .PHONY: help install demo train test test-slow test-extras coverage chaos fuzz memory bench reproduce results docs walk release lock audit lint format clean
 
@@ -37,7 +38,7 @@ train: $(STAMP)  ## train (experiment=quick; ARGS="key=value ..." adds overrides
 
 test: export OMP_NUM_THREADS ?= 1
 test: $(STAMP)  ## run the test suite (minutes), in as many processes as there are cores, at most 4
-	$(BIN)/python -m pytest -q -n logical --maxprocesses 4 --dist worksteal $(ARGS)
+	$(PYTEST) $(ARGS)
 
 test-extras: export OMP_NUM_THREADS ?= 1
 test-extras: $(STAMP)  ## install every optional extra (a gigabyte), and run the tests that need them
@@ -49,7 +50,7 @@ test-slow: $(STAMP)  ## run the long checks (an hour)
 	$(BIN)/python -m pytest -q -m slow --timeout 7200 $(ARGS)
 
 coverage: $(STAMP)  ## run the test suite, and tell which lines it never reaches
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --maxprocesses 4 --dist worksteal --cov --cov-report=term
+	OMP_NUM_THREADS=1 $(PYTEST) --cov --cov-report=term
 
 chaos: $(STAMP)  ## kill trainings a hundred times with either collector, and compare how they end (half an hour)
 	$(BIN)/python tests/chaos.py 100 single

@@ -22,6 +22,7 @@ from pickplace.geometry import Failure, Item
 from pickplace.planners.policy import PolicyPlanner, planner_parts
 from pickplace.replay import Recording, animation, observe, page, picture
 from pickplace.report import evaluation_table
+from pickplace.trust import trusted
 from pickplace.warm_start import taught_by
 
 log = logging.getLogger(__name__)
@@ -293,7 +294,7 @@ def prepare(cfg: DictConfig) -> tuple:
     if cfg.checkpoint is not None:
         folder = checkpoint.locate(str(cfg.checkpoint))
         state, saved = checkpoint.read(folder)
-        theirs = config.trusted(saved["config"])
+        theirs = trusted(saved["config"])
         groups = {"env": cfg.env, "items": cfg["items"]}
         ours = [o for o in HydraConfig.get().overrides.task if o.lstrip("+~").split("=")[0].split(".")[0] in TRAINED]
         merged = config.apply_overrides(theirs, ours, groups)

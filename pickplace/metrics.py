@@ -7,8 +7,12 @@ import csv
 import os
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pickplace.config import missing_extra
+
+if TYPE_CHECKING:
+    from torchrl.record.loggers.common import Logger
 
 
 class CsvLogger:
@@ -88,7 +92,18 @@ class TensorboardLogger(CsvLogger):
         self._events.close()
 
 
-class WandbLogger(CsvLogger):
+class BackendLogger(CsvLogger):
+    """A logger of TorchRL's, made by subclasses as ``_backend``, beside the table. Args as `CsvLogger`."""
+
+    _backend: "Logger"
+
+    def log(self, metrics: dict[str, float], frames: int) -> None:
+        """Add a point to each metric's curve."""
+        super().log(metrics, frames)
+        self._backend.log_metrics(metrics, step=frames)
+
+
+class WandbLogger(BackendLogger):
     """Weights & Biases, through TorchRL's logger; needs the extra ``pickplace[wandb]``.
 
     The run's id is kept in the run folder, ``wandb_run_id``, so that a resumed run goes on under it.
@@ -128,18 +143,13 @@ class WandbLogger(CsvLogger):
         if settings:
             self._backend.log_hparams(settings)
 
-    def log(self, metrics: dict[str, float], frames: int) -> None:
-        """Add a point to each metric's curve."""
-        super().log(metrics, frames)
-        self._backend.log_metrics(metrics, step=frames)
-
     def close(self) -> None:
         """Finish the run."""
         super().close()
         self._backend.experiment.finish()
 
 
-class MlflowLogger(CsvLogger):
+class MlflowLogger(BackendLogger):
     """MLflow, through TorchRL's logger; needs the extra ``pickplace[mlflow]``.
 
     The run's id is kept in the run folder, ``mlflow_run_id``, so that a resumed run goes on under it.
@@ -183,11 +193,6 @@ class MlflowLogger(CsvLogger):
             mlflow.set_tag("mlflow.runName", folder.name)
             if settings:  # MLflow refuses other values later, and a resumed run may have some
                 self._backend.log_hparams(settings)
-
-    def log(self, metrics: dict[str, float], frames: int) -> None:
-        """Add a point to each metric's curve."""
-        super().log(metrics, frames)
-        self._backend.log_metrics(metrics, step=frames)
 
     def close(self) -> None:
         """End the run."""

@@ -330,8 +330,8 @@ def evaluation_table(result: dict) -> str:
             rows.append(("warm start", f"imitated {result['warm_start']}"))
     if "candidates" in result:
         in_training, at_decision = (
-            {True: "yes", False: "no"}.get(mask, mask)
-            for mask in (result["mask_in_training"], result["mask_at_decision"])
+            {True: "yes", False: "no", None: "unknown"}.get(mask, mask)
+            for mask in (result.get("mask_in_training"), result["mask_at_decision"])
         )
         masks = f"in training {in_training}, at decision {at_decision}"
         rows.append(("mask; candidates K", f"{masks}; {result['candidates']}"))

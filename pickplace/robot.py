@@ -20,6 +20,7 @@ from pickplace import checkpoint, config
 from pickplace.geometry import Failure, Item, Rules
 from pickplace.models.actors import Policy
 from pickplace.planners.policy import PolicyPlanner, restore_policy
+from pickplace.trust import trusted
 
 
 class DepthMapError(ValueError):
@@ -98,7 +99,7 @@ class Planner:
             ValueError: for a checkpoint that cannot be used, or bad sizes.
         """
         state, facts = checkpoint.read(checkpoint.locate(path))
-        cfg = config.trusted(facts["config"])
+        cfg = trusted(facts["config"])
         known = {field.name for field in fields(Rules)}
         if unknown := sorted(set(sizes) - known):
             raise ValueError(f"{unknown[0]}={sizes[unknown[0]]!r}: expected one of {', '.join(sorted(known))}.")

@@ -13,6 +13,7 @@ from pickplace.geometry import Rules
 from pickplace.items import ItemDistribution
 from pickplace.models.actors import Policy
 from pickplace.planners.policy import planner_parts
+from pickplace.trust import trusted
 
 
 class Phase(Enum):
@@ -54,7 +55,7 @@ class WarmStart:
             trained = None
             if cfg.checkpoint is not None:
                 state, saved = checkpoint.read(checkpoint.locate(str(cfg.checkpoint)))
-                trained = (config.trusted(saved["config"]), state, saved["config"]["env"])
+                trained = (trusted(saved["config"]), state, saved["config"]["env"])
             try:
                 self._parts = planner_parts(cfg.teacher, rules, items, trained)
             except ValueError as error:

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import logging
 import os
 import subprocess
 import sys
@@ -12,29 +11,7 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from pickplace import checkpoint, evaluate, train
-
-MAINS = {"train": train.main, "evaluate": evaluate.main}
-
-
-@pytest.fixture
-def run(monkeypatch, tmp_path, capsys):
-    """Run a command in this process, in an empty folder; returns exit code, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(command, *arguments):
-        monkeypatch.setattr(sys, "argv", [f"pickplace-{command}", *arguments])
-        code = 0
-        try:
-            MAINS[command]()
-        except SystemExit as exit:
-            code = exit.code or 0
-        finally:
-            logging.root.handlers.clear()  # the files of this run may be gone when the next one logs
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
+from pickplace import checkpoint
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from pickplace.metrics import read_csv
 from pickplace.models.actors import as_collection_policy, fcn_grasp
 from pickplace.models.critics import Conv4dCritic, PooledCritic
 from pickplace.train import make_losses, train
+from pickplace.trust import refuse_foreign_targets
 
 CONF = config.conf_dir()
 TINY = [
@@ -215,7 +216,7 @@ def test_foreign_targets_are_refused(target, place):
     for key in reversed(place.split(".")):
         node = {key: node}
     with pytest.raises(ValueError, match="checkpoint is refused; expected one of pickplace"):
-        config.refuse_foreign_targets(node)
+        refuse_foreign_targets(node)
 
 
 @pytest.mark.parametrize(
@@ -229,7 +230,7 @@ def test_foreign_targets_are_refused(target, place):
 )
 def test_targets_in_other_places_are_refused(node):
     with pytest.raises(ValueError, match="expected none in this place"):
-        config.refuse_foreign_targets(node)
+        refuse_foreign_targets(node)
 
 
 def test_our_own_configs_are_accepted():
@@ -237,7 +238,7 @@ def test_our_own_configs_are_accepted():
     for group in (*groups, "warm_start"):
         for name in options(group):
             cfg = composed(f"{group}={name}")
-            config.refuse_foreign_targets(OmegaConf.to_container(cfg, resolve=False))
+            refuse_foreign_targets(OmegaConf.to_container(cfg, resolve=False))
 
 
 @pytest.mark.parametrize("part", ["advance", "sample"])

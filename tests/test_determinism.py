@@ -5,11 +5,9 @@ import sys
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from test_resume import assert_same
 
-from pickplace import Planner, config, evaluate
-from pickplace.train import train
+from pickplace import Planner, evaluate
 
 PAPER = [(1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1)]
 
@@ -17,12 +15,9 @@ PAPER = [(1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1)]
 @pytest.mark.parametrize(
     "settings", [["curriculum=mixture"], ["algo=a2c", "warm_start=random", "warm_start.frames=256"]], ids=" ".join
 )
-def test_the_same_training_twice(tmp_path, settings):
+def test_the_same_training_twice(smoke, tmp_path, settings):
     for name in "ab":
-        with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
-            cfg = compose("train", ["experiment=smoke", "threads=1", "total_frames=768", "seed=3", *settings])
-        (tmp_path / name).mkdir()
-        train(cfg, tmp_path / name)
+        smoke(tmp_path / name, "total_frames=768", "seed=3", *settings)
     assert_same(tmp_path / "a", tmp_path / "b")
 
 

@@ -15,15 +15,15 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from test_resume import start, wait_for_rows
 
 from pickplace import Planner, checkpoint, config
 from pickplace.collector import watched
 from pickplace.config import WorkerDied
 from pickplace.evaluate import main as evaluate_main
-from pickplace.train import claim, resume_run, train
+from pickplace.resume import claim
 from pickplace.train import main as train_main
+from pickplace.train import resume_run
 
 ENDLESS = ["experiment=smoke", "total_frames=10_000_000", "threads=1"]
 
@@ -82,19 +82,6 @@ def test_a_second_process_in_the_same_run_folder_is_refused(tmp_path):
         pass
 
 
-@pytest.fixture
-def smoke():
-    """Trains experiment=smoke in this process."""
-
-    def run(run_dir, *overrides):
-        with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
-            cfg = compose("train", ["experiment=smoke", "threads=1", *overrides])
-        run_dir.mkdir(exist_ok=True)
-        return train(cfg, run_dir)
-
-    return run
-
-
 def test_a_loss_that_is_not_finite_stops_the_run_with_a_summary(smoke, tmp_path):
     with pytest.raises(FloatingPointError) as caught:
         smoke(tmp_path / "run", "algo.reward_scale=1e38")
@@ -138,14 +125,10 @@ def test_a_full_disk_at_the_metrics_names_the_file_and_the_checkpoint(smoke, tmp
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(smoke, tmp_path_factory):
     """A run with a checkpoint that is whole under each name."""
     run_dir = tmp_path_factory.mktemp("finished") / "run"
-    overrides = ["experiment=smoke", "threads=1", "total_frames=1024", "evaluation_interval=1024"]
-    with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
-        cfg = compose("train", overrides)
-    run_dir.mkdir()
-    train(cfg, run_dir)
+    smoke(run_dir, "total_frames=1024", "evaluation_interval=1024")
     assert sorted(path.name for path in (run_dir / "checkpoints").iterdir()) == ["best", "last", "previous"]
     return run_dir
 

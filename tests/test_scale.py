@@ -6,11 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from test_cli import run  # noqa: F401
 from test_curriculum import make_env
 
 from pickplace import checkpoint, config
@@ -19,17 +17,9 @@ from pickplace.config import WorkerDied
 from pickplace.curriculum import push_level
 from pickplace.metrics import read_csv
 from pickplace.sweep import labels, read_run, summarize
-from pickplace.train import resume_run, train
+from pickplace.train import resume_run
 
 SMOKE = ["experiment=smoke", "threads=1"]
-
-
-def smoke(run_dir, *overrides):
-    """Train experiment=smoke in this process."""
-    with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
-        cfg = compose("train", [*SMOKE, *overrides])
-    run_dir.mkdir(exist_ok=True)
-    return train(cfg, run_dir)
 
 
 def table(folder):
@@ -81,7 +71,7 @@ def test_a_sweep_of_many_runs_and_one_of_none(tmp_path):
         summarize(tmp_path / "empty")
 
 
-def test_a_run_that_fails_leaves_the_others_alone(run, tmp_path):  # noqa: F811
+def test_a_run_that_fails_leaves_the_others_alone(run, tmp_path):
     code, _, err = run("train", "-m", *SMOKE, "algo.reward_scale=1e38,1", "hydra.sweep.dir=sweep")
     assert code == 2 and "error: run 0: the loss or its gradient is not finite" in err
     failed, finished = table(tmp_path / "sweep")
@@ -90,7 +80,7 @@ def test_a_run_that_fails_leaves_the_others_alone(run, tmp_path):  # noqa: F811
     assert 0 <= float(finished["final_occupancy"]) <= float(finished["best_occupancy"]) <= 1
 
 
-def test_a_run_without_metrics_is_known_by_its_checkpoint(tmp_path):
+def test_a_run_without_metrics_is_known_by_its_checkpoint(smoke, tmp_path):
     made_up(tmp_path, "0", ["seed=1"], [], total=512)
     (tmp_path / "0" / "metrics.csv").unlink()
     occupancy = smoke(tmp_path / "0", "logger=none")
@@ -106,7 +96,7 @@ def test_a_run_without_metrics_is_known_by_its_checkpoint(tmp_path):
         ("hydra/launcher=submitit_slurm", "submitit"),
     ],
 )
-def test_a_missing_plugin_is_one_sentence(choice, extra, run):  # noqa: F811
+def test_a_missing_plugin_is_one_sentence(choice, extra, run):
     if any(
         path.name.startswith(f"hydra_{extra}") for place in sys.path for path in Path(place).glob("hydra_plugins/*")
     ):
@@ -115,7 +105,7 @@ def test_a_missing_plugin_is_one_sentence(choice, extra, run):  # noqa: F811
     assert code == 2 and err.strip().endswith(f"{extra} is missing; pip install 'pickplace[{extra}]'.")
 
 
-def test_optuna_maximises_the_occupancy(run, tmp_path):  # noqa: F811
+def test_optuna_maximises_the_occupancy(run, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
     settings = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "hydra.sweep.dir=sweep", "total_frames=256"]
     code, out, err = run("train", "-m", *SMOKE, *settings, "algo.lr=interval(0.0001,0.01)")
@@ -129,7 +119,7 @@ def test_optuna_maximises_the_occupancy(run, tmp_path):  # noqa: F811
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
-def test_launchers_in_other_processes(launcher, run, tmp_path):  # noqa: F811
+def test_launchers_in_other_processes(launcher, run, tmp_path):
     extra = launcher.partition("_")[0]
     pytest.importorskip(f"hydra_plugins.hydra_{extra}_launcher")
     settings = ["total_frames=256", "evaluation.episodes=2", "hydra.sweep.dir=sweep", f"hydra/launcher={launcher}"]
@@ -144,7 +134,7 @@ def test_launchers_in_other_processes(launcher, run, tmp_path):  # noqa: F811
 
 
 @pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])
-def test_a_missing_extra_is_one_sentence(name, tmp_path, monkeypatch):
+def test_a_missing_extra_is_one_sentence(smoke, name, tmp_path, monkeypatch):
     for module in ("tensorboard", "wandb", "mlflow", "torch.utils.tensorboard"):
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ValueError, match=rf"^logger={name}: {name} is missing; pip install 'pickplace\[{name}\]'\.$"):
@@ -153,7 +143,7 @@ def test_a_missing_extra_is_one_sentence(name, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])
-def test_a_logger_goes_on_after_a_resume_beside_metrics_csv(name, tmp_path):
+def test_a_logger_goes_on_after_a_resume_beside_metrics_csv(smoke, name, tmp_path):
     pytest.importorskip(name)
     run_dir = tmp_path / "run"
     smoke(run_dir, f"logger={name}", "total_frames=256")
@@ -237,7 +227,7 @@ def test_ray_workers_follow_the_curriculum_go_on_exactly_and_are_missed(local_ra
         assert torch.equal(batch[key], again[key]), key
 
 
-def test_a_training_collects_with_ray(local_ray, tmp_path):
+def test_a_training_collects_with_ray(smoke, local_ray, tmp_path):
     overrides = ["env.tote_size=[5,5,3]", "curriculum=mixture", "curriculum.advance.occupancy=0.3"]
     smoke(tmp_path / "run", "collector=ray", "total_frames=512", "curriculum.advance.window=10", *overrides)
     rows = read_csv(tmp_path / "run" / "metrics.csv")

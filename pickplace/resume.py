@@ -1,0 +1,127 @@
+"""How a training is stopped and taken up again: signals, the run folder's lock, what a resumed run may change."""
+
+import logging
+import os
+import reprlib
+import signal
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from filelock import FileLock, Timeout
+from omegaconf import DictConfig, OmegaConf
+
+from pickplace import checkpoint, config
+from pickplace.trust import trusted
+
+log = logging.getLogger(__name__)
+
+#: What a checkpoint counts, and how a run begins: frames, iterations, best validation occupancy, latest validation.
+COUNTERS = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
+
+
+#: What the state of running episodes is tied to.
+RULES = ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "min_support", "strict_support")
+FIXED = ("seed", *(f"env.{key}" for key in RULES), "env.num_envs", "items", "algo.mask_infeasible", "collector.workers")
+
+
+def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
+    """A checkpoint's config with overrides of values on top.
+
+    Raises:
+        ValueError: for a checkpoint that no training wrote, or a change that a resumed run cannot follow.
+    """
+    if missing := [key for key in ("curriculum", *COUNTERS) if key not in facts]:
+        raise ValueError(f"resume={place}: the checkpoint has no {missing[0]!r}; expected one that a training wrote.")
+    told = f"resume={place}: the checkpoint's {{}} is {{}}; expected {{}} that a training wrote.".format
+    if not isinstance(facts["latest"], dict):
+        raise ValueError(told("latest", reprlib.repr(facts["latest"]), "a validation"))
+    for key, value in {"iteration": facts["iteration"], "best": facts["best"], **facts["latest"]}.items():
+        kind = int if key == "iteration" else (int, float)
+        if isinstance(value, bool) or not isinstance(value, kind) or not -(2**63) < value < 2**63:
+            raise ValueError(told(reprlib.repr(key)[1:-1], reprlib.repr(value), "a number"))
+    saved = trusted(facts["config"])
+    cfg = config.apply_overrides(saved, overrides)
+    for key in FIXED:
+        was, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
+        if was != now:
+            raise ValueError(
+                f"{key}={now}: the run began with {was}, and a resumed run cannot change it; start a new one."
+            )
+    if cfg.total_frames != saved.total_frames and cfg.total_frames < facts["frames"]:
+        raise ValueError(
+            f"total_frames={cfg.total_frames}: the run has trained {facts['frames']} frames already; expected more."
+        )
+    return cfg
+
+
+def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
+    """Give Adam the moments of a checkpoint; parameters without a gradient so far have none.
+
+    Raises:
+        CheckpointError: if they do not fit the parameters.
+    """
+    if not state or not isinstance(state, dict):
+        raise checkpoint.CheckpointError("The checkpoint has no optimizer; expected one that a training wrote.")
+    parameters = dict(enumerate(optimizer.param_groups[0]["params"]))
+    if unknown := [key for key in state if key not in parameters]:
+        raise checkpoint.CheckpointError(
+            f"The checkpoint's optimizer has {reprlib.repr(unknown[0])}; expected numbers below {len(parameters)}."
+        )
+    mine = {n: {"step": torch.tensor(0.0), "exp_avg": p, "exp_avg_sq": p} for n, p in parameters.items() if n in state}
+    moments = checkpoint.fitting(state, mine, "optimizer")
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
+
+
+class StopRequest:
+    """Ctrl-C and SIGTERM ask the loop to finish its batch and save; a second Ctrl-C ends the process at once."""
+
+    def __init__(self):
+        self.requested = False
+        self._previous = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def _ask(self, number, frame):
+        if self.requested:
+            os._exit(130)
+        self.requested = True
+        log.info("stopping after this batch; press Ctrl-C again to stop at once")
+
+    def restore(self) -> None:
+        """Give the signals back."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def claim(run_dir: Path):
+    """Hold a run folder for this process, until the end of the block or of the process, however it ends.
+
+    Raises:
+        ValueError: if another process holds it.
+    """
+    lock = FileLock(Path(run_dir) / config.LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ValueError(
+            f"{run_dir}: another process is training there; expected another run folder, or to wait for it."
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextmanager
+def saying_what_is_safe(safe):
+    """Add to what ends a training the checkpoint, ``safe()``, from which it can be taken up."""
+    try:
+        yield
+    except (OSError, FloatingPointError, config.WorkerDied, checkpoint.CheckpointError) as error:
+        hint = "Nothing had been saved before."
+        if folder := safe():
+            # The same batch would lead to the same numbers.
+            other = " algo.lr=<a smaller one>" if isinstance(error, FloatingPointError) else ""
+            hint = f"What was saved before is whole: python -m pickplace.train resume={folder}{other}"
+        kind = ValueError if isinstance(error, OSError) else type(error)
+        raise kind(f"{config.sentence(error).rstrip('.')}. {hint}") from error
