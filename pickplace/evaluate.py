@@ -22,7 +22,7 @@ from pickplace.geometry import Failure, Item
 from pickplace.planners.policy import PolicyPlanner, planner_parts
 from pickplace.replay import Recording, animation, observe, page, picture
 from pickplace.report import evaluation_table
-from pickplace.trust import trusted
+from pickplace.trust import modules, trusted
 from pickplace.warm_start import taught_by
 
 log = logging.getLogger(__name__)
@@ -287,6 +287,7 @@ def prepare(cfg: DictConfig) -> tuple:
         raise ValueError(f"evaluation.stream={cfg.evaluation.stream}: expected validation or test.")
     if "model" in cfg and cfg.checkpoint is None:
         raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
+    modules(cfg.trust)
     config.use_machine(cfg)
     settings = {key: value for key, value in cfg.planner.items() if key != "_target_"}
     facts: dict[str, Any] = {"planner_settings": settings, "checkpoint": None}
@@ -294,7 +295,7 @@ def prepare(cfg: DictConfig) -> tuple:
     if cfg.checkpoint is not None:
         folder = checkpoint.locate(str(cfg.checkpoint))
         state, saved = checkpoint.read(folder)
-        theirs = trusted(saved["config"])
+        theirs = trusted(saved["config"], cfg.trust)
         groups = {"env": cfg.env, "items": cfg["items"]}
         ours = [o for o in HydraConfig.get().overrides.task if o.lstrip("+~").split("=")[0].split(".")[0] in TRAINED]
         merged = config.apply_overrides(theirs, ours, groups)

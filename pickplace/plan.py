@@ -58,6 +58,13 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--tote-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
     options.add_argument("--effector-size", type=int, nargs=2, metavar=("W", "D"), help="cells; default: as trained")
     options.add_argument("--rotations", type=int, metavar="R", help="quarter turns to choose from; default: as trained")
+    options.add_argument(
+        "--trust",
+        action="append",
+        metavar="MODULE",
+        default=[],
+        help="a module of yours that the checkpoint's config may name",
+    )
     options.add_argument("--threads", type=int, metavar="N", help="CPU threads; default: torch's")
     options.add_argument("--device", default="cpu", help="cpu (the default) or cuda")
     options.add_argument("--time", action="store_true", help="print the latency of each plan on standard error")
@@ -84,7 +91,7 @@ def run(args: argparse.Namespace) -> None:
     sizes = {key: getattr(args, key) for key in ("bin_size", "tote_size", "effector_size", "rotations")}
     sizes = {key: value for key, value in sizes.items() if value is not None}
     candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates
-    planner = Planner.load(args.checkpoint, candidates=candidates, device=args.device, **sizes)
+    planner = Planner.load(args.checkpoint, candidates=candidates, device=args.device, trust=args.trust, **sizes)
     defaults = {key: getattr(args, key) for key in ("tote_height", "cell_size", "tolerance", "alternatives")}
     if args.bin is not None:
         result = timed(planner, args.time, bin_depth=read_map(args.bin), tote_depth=read_map(args.tote), **defaults)

@@ -40,8 +40,12 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
         kind = int if key == "iteration" else (int, float)
         if isinstance(value, bool) or not isinstance(value, kind) or not -(2**63) < value < 2**63:
             raise ValueError(told(reprlib.repr(key)[1:-1], reprlib.repr(value), "a number"))
-    saved = trusted(facts["config"])
-    cfg = config.apply_overrides(saved, overrides)
+    # Only who resumes a run says what to trust, never the checkpoint.
+    said = [word for word in overrides if word.lstrip("+").partition("=")[0] == "trust"]
+    trust = config.apply_overrides(OmegaConf.create({"trust": []}), said).trust
+    saved = trusted(facts["config"], trust)
+    saved["trust"] = trust
+    cfg = config.apply_overrides(saved, [word for word in overrides if word not in said])
     for key in FIXED:
         was, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
         if was != now:

@@ -7,6 +7,7 @@ seen from above.
 """
 
 import reprlib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Literal, cast
 
@@ -85,13 +86,16 @@ class Planner:
         self.rules, self._planner = rules, PolicyPlanner(rules, policy, candidates)
 
     @classmethod
-    def load(cls, path, candidates: int | Literal["all"] = "all", device: str = "cpu", **sizes) -> "Planner":
+    def load(
+        cls, path, candidates: int | Literal["all"] = "all", device: str = "cpu", trust: Sequence[str] = (), **sizes
+    ) -> "Planner":
         """A planner from a checkpoint.
 
         Args:
             path: a run folder, a checkpoint, or ``pretrained/<name>``.
             candidates: ``"all"``, or ``K``: how many of the most probable actions are tried.
             device: where to compute, ``"cpu"`` or ``"cuda"``.
+            trust: modules of your own whose classes the checkpoint's config may make; it may make pickplace's only.
             **sizes: what differs from the training's settings, such as ``tote_size=(30, 30, 10)``; see
                 :class:`~pickplace.geometry.Rules`. The policy serves any bin and tote.
 
@@ -99,7 +103,7 @@ class Planner:
             ValueError: for a checkpoint that cannot be used, or bad sizes.
         """
         state, facts = checkpoint.read(checkpoint.locate(path))
-        cfg = trusted(facts["config"])
+        cfg = trusted(facts["config"], trust)
         known = {field.name for field in fields(Rules)}
         if unknown := sorted(set(sizes) - known):
             raise ValueError(f"{unknown[0]}={sizes[unknown[0]]!r}: expected one of {', '.join(sorted(known))}.")

@@ -26,6 +26,7 @@ from pickplace.models.actors import Policy, as_actor, as_collection_policy, chec
 from pickplace.report import learning_curve
 from pickplace.resume import COUNTERS, StopRequest, claim, load_optimizer, resumed_config, saying_what_is_safe
 from pickplace.training_report import write_report
+from pickplace.trust import modules
 from pickplace.warm_start import Phase, WarmStart, imitation_loss
 
 log = logging.getLogger(__name__)
@@ -77,7 +78,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     for warning in check_sizes(policy, rules):
         log.warning(warning)
     planner = config.instantiate(cfg.planner, rules=rules, policy=policy)  # the one that validates
-    warm_start = WarmStart(cfg.warm_start, policy, rules, items, cfg.seed)
+    warm_start = WarmStart(cfg.warm_start, policy, rules, items, cfg.seed, cfg.trust)
     make_critic = partial(config.instantiate, cfg.model.critic, rules=rules)
     critic = build("critic", lambda: ValueOperator(make_critic(), ["bin_depth", "tote_depth"]))
     curriculum: Curriculum = config.instantiate(cfg.curriculum)
@@ -229,6 +230,7 @@ def check_settings(cfg: DictConfig) -> None:
         value = OmegaConf.select(cfg, key)
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 2**63:
             raise ValueError(f"{key}={value}: expected a whole number >= {least} and < 2**63.")
+    modules(cfg.trust)
     if cfg.algo.loss not in ("a2c", "ppo"):
         raise ValueError(f"algo.loss={cfg.algo.loss}: expected ppo or a2c.")
     for key in ("algo.mask_infeasible", "algo.normalize_advantage"):

@@ -37,12 +37,13 @@ class WarmStart:
         rules: the task's sizes.
         items: for a teacher that imagines some.
         seed: of a teacher that draws.
+        trust: modules beside pickplace's own whose classes the config of a teacher's checkpoint may make.
 
     Raises:
         ValueError: naming the key, for numbers that make no sense and for a teacher that lacks its checkpoint.
     """
 
-    def __init__(self, cfg: DictConfig, policy: Policy, rules: Rules, items: ItemDistribution, seed: int):
+    def __init__(self, cfg: DictConfig, policy: Policy, rules: Rules, items: ItemDistribution, seed: int, trust=()):
         for key in ("frames", "critic_frames"):
             if not isinstance(cfg[key], int) or isinstance(cfg[key], bool) or cfg[key] < 0:
                 raise ValueError(f"warm_start.{key}={cfg[key]}: expected a whole number >= 0.")
@@ -55,7 +56,7 @@ class WarmStart:
             trained = None
             if cfg.checkpoint is not None:
                 state, saved = checkpoint.read(checkpoint.locate(str(cfg.checkpoint)))
-                trained = (trusted(saved["config"]), state, saved["config"]["env"])
+                trained = (trusted(saved["config"], trust), state, saved["config"]["env"])
             try:
                 self._parts = planner_parts(cfg.teacher, rules, items, trained)
             except ValueError as error:

@@ -68,6 +68,8 @@ BAD = [
     ("train", ["items=recorded"], ["items.path", "no value"]),
     ("train", ["model.actor.filters=-4"], ["filters=-4", ">= 1"]),
     ("train", ["model.actor._target_=os.system"], ["os.system"]),
+    ("train", ["trust=[os]"], ["trust='os'", "modules of your own"]),
+    ("evaluate", ["planner=joint_dbl", "trust=5"], ["trust=5", "modules of your own"]),
     ("train", ["model.actor.receptive_field=4"], ["receptive_field=4", "odd"]),
     ("train", ["model.actor.compute_dtype=float8"], ["float8", "bfloat16"]),
     ("train", ["model=fcn4d", "env.tote_size=[4,4,1]"], ["tote_size=[4, 4, 1]", "eq. 3"]),

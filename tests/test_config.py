@@ -14,7 +14,7 @@ from pickplace.metrics import read_csv
 from pickplace.models.actors import as_collection_policy, fcn_grasp
 from pickplace.models.critics import Conv4dCritic, PooledCritic
 from pickplace.train import make_losses, train
-from pickplace.trust import refuse_foreign_targets
+from pickplace.trust import modules, refuse_foreign_targets
 
 CONF = config.conf_dir()
 TINY = [
@@ -231,6 +231,26 @@ def test_foreign_targets_are_refused(target, place):
 def test_targets_in_other_places_are_refused(node):
     with pytest.raises(ValueError, match="expected none in this place"):
         refuse_foreign_targets(node)
+
+
+@pytest.mark.parametrize(
+    ("target", "trust"),
+    [("mine.Net", ["mine"]), ("mine.deep.Net", ["other", "mine.deep"]), ("mine.Net", "mine")],
+)
+def test_a_trusted_module_may_be_named(target, trust):
+    refuse_foreign_targets({"model": {"actor": {"_target_": target, "part": {"_target_": target}}}}, modules(trust))
+
+
+@pytest.mark.parametrize("target", ["mine.os.system", "mine", "mines.Net", "os.system", None, 5, "torch.load"])
+def test_trust_goes_no_further_than_its_modules(target):
+    with pytest.raises(ValueError, match="checkpoint is refused"):
+        refuse_foreign_targets({"model": {"actor": {"_target_": target}}}, modules(["mine"]))
+
+
+@pytest.mark.parametrize("trust", ["os", ["mine", "subprocess"], ["builtins"], "pickplace", 5, [3], None, "a b", [""]])
+def test_trust_in_what_is_nobodys_own_is_refused(trust):
+    with pytest.raises(ValueError, match="trust=.*: expected names of modules of your own"):
+        modules(trust)
 
 
 def test_our_own_configs_are_accepted():

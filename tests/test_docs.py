@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pickplace import Planner, commands, config, evaluate, export, plan, show, train
+from pickplace import Planner, checkpoint, commands, config, evaluate, export, plan, show, train
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -209,21 +209,41 @@ def test_own_planner(run):
     assert ours["planner_settings"] == {"height_weight": 10}
 
 
-def test_own_model(run, capsys):
+def test_own_model(run):
     folder = run("train", "own_model", "model=mlp", "model.actor.hidden=8", *TRAINING)
-    followed = ["planner=mlp", f"planner.run={folder}"]
-    ours = result(run("evaluate", "own_model", *followed, *EVALUATION, folder="evaluation"))
-    assert ours["planner"] == "mlp" and set(ours["failures"]) == {"stuck"}
-    with pytest.raises(SystemExit):
-        run("evaluate", "own_model", f"checkpoint={folder}", *EVALUATION, folder="refused")
-    assert "own_model.Mlp" in capsys.readouterr().err
+    given = [f"checkpoint={folder}", "trust=own_model"]
+    ours = result(run("evaluate", "own_model", *given, *EVALUATION, folder="evaluation"))
+    assert ours["planner"] == "policy" and set(ours["failures"]) == {"stuck"}
+
+
+def test_a_module_is_trusted_by_who_loads_a_run_and_by_nobody_else(run, monkeypatch, capsys):
+    folder = run("train", "own_model", "model=mlp", "model.actor.hidden=8", "trust=own_model", *TRAINING)
+
+    def resume(*words):
+        monkeypatch.setattr(sys, "argv", ["pickplace-train", f"resume={folder}", "total_frames=128", *words])
+        train.main()
+
+    for trust in ([], ["trust=[own_models,model]"]):
+        with pytest.raises(SystemExit):
+            resume(*trust)
+        assert "'own_model.Mlp': the checkpoint is refused" in capsys.readouterr().err
+        with pytest.raises(SystemExit):
+            run("evaluate", "own_model", f"checkpoint={folder}", *trust, folder="refused")
+        assert "'own_model.Mlp': the checkpoint is refused" in capsys.readouterr().err
+    resume("trust=[own_model]")
+    assert checkpoint.read(checkpoint.locate(folder, prefer="last"))[1]["frames"] == 128
+    with pytest.raises(ValueError, match=r"own_model\.Mlp"):
+        Planner.load(folder)
+    bin_depth, tote_depth = torch.zeros(5, 5), torch.full((6, 6), 5)
+    bin_depth[2, 2] = 1
+    assert Planner.load(folder, trust=["own_model"]).plan(bin_depth, tote_depth).status == "ok"
 
 
 def test_own_items(run):
     folder = run("train", "own_items", "items=batches", *TRAINING, "model.actor.filters=8", "env.tote_size=[4,4,2]")
-    followed = ["items=batches", "planner=own_run", f"planner.run={folder}", "env.tote_size=[4,4,2]"]
-    ours = result(run("evaluate", "own_items", *followed, *EVALUATION, folder="evaluation"))
-    assert ours["planner"] == "own_run" and ours["items"]["run"] == 3
+    given = [f"checkpoint={folder}", "trust=own_items"]
+    ours = result(run("evaluate", "own_items", *given, *EVALUATION, folder="evaluation"))
+    assert ours["items"]["run"] == 3 and ours["env"]["tote_size"] == [4, 4, 2]
 
 
 def test_own_items_come_in_batches(monkeypatch):

@@ -175,6 +175,8 @@ def test_evaluation_table_of_a_policy():
     assert rows["checkpoint"] == "run/checkpoints/best (1,200,000 frames, seed 3)"
     assert rows["warm start"] == "imitated JointDBL"
     assert "one decision" not in rows
+    known_only_at_decision = {key: facts[key] for key in ("candidates", "mask_at_decision")}  # a planner of a user's
+    assert table(RESULT | known_only_at_decision)["mask; candidates K"] == "in training unknown, at decision no; 10"
     assert "warm start" not in table(RESULT | facts | {"warm_start": None})
 
 

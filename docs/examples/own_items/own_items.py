@@ -1,11 +1,7 @@
 """An item distribution of one's own: items arrive in batches of the same kind."""
 
-from omegaconf import OmegaConf
-
-from pickplace import Item, checkpoint
+from pickplace import Item
 from pickplace.items import Kinds, hashed_uniform
-from pickplace.planners import PolicyPlanner
-from pickplace.planners.policy import restore_policy
 
 
 class Batches(Kinds):
@@ -31,15 +27,3 @@ class Batches(Kinds):
         x = (across * (bin_size[0] - w + 1)).long()
         y = (along * (bin_size[1] - d + 1)).long()
         return Item(x, y, w, d, h)
-
-
-class OwnRun:
-    """The planner that follows the policy of a run whose config you trust: it says which classes are made."""
-
-    name = "own_run"
-
-    def __init__(self, rules, run):
-        state, facts = checkpoint.read(checkpoint.locate(run))
-        cfg = OmegaConf.create(facts["config"])
-        policy = restore_policy(cfg, rules, state["policy"], cfg.env.rotations)
-        self.decide = PolicyPlanner(rules, policy).decide

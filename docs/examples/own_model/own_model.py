@@ -3,10 +3,8 @@
 import torch
 from torch import nn
 
-from pickplace import checkpoint
 from pickplace.models.actors import MASKED
 from pickplace.models.depth import clip_depth
-from pickplace.planners import PolicyPlanner
 
 
 class Mlp(nn.Module):
@@ -48,15 +46,3 @@ class Mlp(nn.Module):
     def action_log_probs(self, bin_depth, tote_depth):
         """Log-probabilities of all flat actions without any mask, ``[N, N_a]``."""
         return self(bin_depth, tote_depth).log_softmax(-1)
-
-
-class Trained:
-    """The planner that follows the policy of a run, at the sizes that it was trained at."""
-
-    name = "mlp"
-
-    def __init__(self, rules, run, candidates="all"):
-        state, facts = checkpoint.read(checkpoint.locate(run))
-        hidden, masked = facts["config"]["model"]["actor"]["hidden"], facts["config"]["algo"]["mask_infeasible"]
-        policy = checkpoint.restore(lambda: Mlp(rules, masked, hidden), state["policy"], "policy")
-        self.decide = PolicyPlanner(rules, policy.eval(), candidates).decide
