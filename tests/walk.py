@@ -173,7 +173,7 @@ def contributor(walk: Walk) -> None:
         "from pickplace.planners.corner import Corner\nfrom pickplace.planners.heuristics",
     )
     walk.edit(package, '"IndividualHeuristic", "JointDBL"', '"Corner", "IndividualHeuristic", "JointDBL"')
-    walk.edit("pickplace/config.py", '    "IndividualHeuristic",\n', '    "Corner",\n    "IndividualHeuristic",\n')
+    walk.edit("pickplace/trust.py", '    "IndividualHeuristic",\n', '    "Corner",\n    "IndividualHeuristic",\n')
     teacher = (walk.clone / "conf/warm_start/joint_dbl.yaml").read_text()
     walk.write("conf/warm_start/corner.yaml", teacher.replace("joint_dbl", "corner"))
     walk.run("make format")
