@@ -65,7 +65,7 @@ memory: $(STAMP)  ## watch the memory of a planner and of two trainings (an hour
 bench: $(STAMP)  ## run the benchmarks on a quiet machine (half an hour), and write docs/performance.md
 	$(BIN)/pip install --quiet --disable-pip-version-check 'jumanji>=1.1,<2' || echo "jumanji: not to be had, its part is skipped"
 	$(BIN)/pip install --quiet --disable-pip-version-check 'sb3-contrib>=2.3,<3' || echo "sb3-contrib: not to be had, its part is skipped"
-	for part in learning training environment collector conv4d decision startup report; do \
+	for part in learning training workers environment collector conv4d decision startup report; do \
 		$(BIN)/python benchmarks/$$part.py || exit 1; \
 	done
 

@@ -143,9 +143,24 @@ def training(result: dict) -> str:
     )
 
 
+def workers(result: dict) -> str:
+    rows = [
+        (case, name, time(figures), f"{row['single']['ms'] / figures['ms']:.2f}")
+        for case, row in result["rows"].items()
+        for name, figures in row.items()
+    ]
+    lines = [
+        "## Collecting in worker processes\n",
+        f"Batches of {result['repeats']} trainings of {result['frames']:,} frames each, turn by turn, on all cores of "
+        "the machine.\n",
+        *table("training | `collector=` | a batch, collected and learnt from | speed against `single`", rows),
+    ]
+    return "\n".join([*lines, machine(result)])
+
+
 def main() -> None:
     parts = [HEAD]
-    for write in (learning, training, environment, collector, conv4d, decision, startup):
+    for write in (learning, training, workers, environment, collector, conv4d, decision, startup):
         path = RESULTS / f"{write.__name__}.json"
         if path.is_file():
             parts.append(write(json.loads(path.read_text())))

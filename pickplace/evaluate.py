@@ -22,7 +22,7 @@ from pickplace.geometry import Failure, Item
 from pickplace.planners.policy import PolicyPlanner, planner_parts
 from pickplace.replay import Recording, animation, observe, page, picture
 from pickplace.report import evaluation_table
-from pickplace.trust import modules, trusted
+from pickplace.trust import own_modules, trusted
 from pickplace.warm_start import taught_by
 
 log = logging.getLogger(__name__)
@@ -164,11 +164,16 @@ def summarise(result: Episodes) -> dict:
     }
 
 
+def resolved(node: DictConfig) -> Any:
+    """A part of a config as plain values."""
+    return OmegaConf.to_container(node, resolve=True)
+
+
 def episodes_of(cfg: DictConfig) -> dict:
     """What says which episodes an evaluation plays."""
     return {
-        "env": OmegaConf.to_container(cfg.env, resolve=True),
-        "items": OmegaConf.to_container(cfg["items"], resolve=True),
+        "env": resolved(cfg.env),
+        "items": resolved(cfg["items"]),
         "stream": cfg.evaluation.stream,
         "episodes": cfg.evaluation.episodes,
         "seed": cfg.evaluation.seed,
@@ -287,7 +292,7 @@ def prepare(cfg: DictConfig) -> tuple:
         raise ValueError(f"evaluation.stream={cfg.evaluation.stream}: expected validation or test.")
     if "model" in cfg and cfg.checkpoint is None:
         raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
-    modules(cfg.trust)
+    own_modules(cfg.trust)
     config.use_machine(cfg)
     settings = {key: value for key, value in cfg.planner.items() if key != "_target_"}
     facts: dict[str, Any] = {"planner_settings": settings, "checkpoint": None}
@@ -296,12 +301,12 @@ def prepare(cfg: DictConfig) -> tuple:
         folder = checkpoint.locate(str(cfg.checkpoint))
         state, saved = checkpoint.read(folder)
         theirs = trusted(saved["config"], cfg.trust)
-        groups = {"env": cfg.env, "items": cfg["items"]}
+        groups = {key: OmegaConf.create(resolved(cfg[key])) for key in ("env", "items")}
         ours = [o for o in HydraConfig.get().overrides.task if o.lstrip("+~").split("=")[0].split(".")[0] in TRAINED]
         merged = config.apply_overrides(theirs, ours, groups)
         with open_dict(cfg):
-            for group in TRAINED:
-                cfg[group] = merged[group]
+            for group in TRAINED:  # resolved where they come from: here a reference could lead elsewhere
+                cfg[group] = resolved(merged[group])
         trained = (cfg, state, saved["config"]["env"])
         facts |= {
             "checkpoint": str(folder),

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import torch
 from filelock import FileLock, Timeout
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace import checkpoint, config
-from pickplace.trust import trusted
+from pickplace.trust import own_modules, trusted
 
 log = logging.getLogger(__name__)
 
 #: What a checkpoint counts, and how a run begins: frames, iterations, best validation occupancy, latest validation.
 COUNTERS = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
-
 
 #: What the state of running episodes is tied to.
 RULES = ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "min_support", "strict_support")
@@ -41,11 +41,11 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
         if isinstance(value, bool) or not isinstance(value, kind) or not -(2**63) < value < 2**63:
             raise ValueError(told(reprlib.repr(key)[1:-1], reprlib.repr(value), "a number"))
     # Only who resumes a run says what to trust, never the checkpoint.
-    said = [word for word in overrides if word.lstrip("+").partition("=")[0] == "trust"]
-    trust = config.apply_overrides(OmegaConf.create({"trust": []}), said).trust
+    given = OverridesParser.create().parse_overrides(overrides)
+    trust = own_modules(next((word.value() for word in reversed(given) if word.key_or_group == "trust"), None))
     saved = trusted(facts["config"], trust)
-    saved["trust"] = trust
-    cfg = config.apply_overrides(saved, [word for word in overrides if word not in said])
+    saved["trust"] = list(trust)
+    cfg = config.apply_overrides(saved, [str(word.input_line) for word in given if word.key_or_group != "trust"])
     for key in FIXED:
         was, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
         if was != now:
@@ -117,8 +117,13 @@ def claim(run_dir: Path):
 
 
 @contextmanager
-def saying_what_is_safe(safe):
-    """Add to what ends a training the checkpoint, ``safe()``, from which it can be taken up."""
+def saying_what_is_safe(safe, trust: str = ""):
+    """Add to what ends a training the checkpoint, ``safe()``, from which it can be taken up.
+
+    Args:
+        safe: gives its folder, or None.
+        trust: what has to be said beside it, see :func:`pickplace.trust.trust_needed`.
+    """
     try:
         yield
     except (OSError, FloatingPointError, config.WorkerDied, checkpoint.CheckpointError) as error:
@@ -126,6 +131,6 @@ def saying_what_is_safe(safe):
         if folder := safe():
             # The same batch would lead to the same numbers.
             other = " algo.lr=<a smaller one>" if isinstance(error, FloatingPointError) else ""
-            hint = f"What was saved before is whole: python -m pickplace.train resume={folder}{other}"
+            hint = f"What was saved before is whole: python -m pickplace.train resume={folder}{trust}{other}"
         kind = ValueError if isinstance(error, OSError) else type(error)
         raise kind(f"{config.sentence(error).rstrip('.')}. {hint}") from error

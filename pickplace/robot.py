@@ -95,7 +95,7 @@ class Planner:
             path: a run folder, a checkpoint, or ``pretrained/<name>``.
             candidates: ``"all"``, or ``K``: how many of the most probable actions are tried.
             device: where to compute, ``"cpu"`` or ``"cuda"``.
-            trust: modules of your own whose classes the checkpoint's config may make; it may make pickplace's only.
+            trust: modules of your own that the checkpoint's config may make classes of, beside pickplace's own.
             **sizes: what differs from the training's settings, such as ``tote_size=(30, 30, 10)``; see
                 :class:`~pickplace.geometry.Rules`. The policy serves any bin and tote.
 

@@ -26,7 +26,7 @@ from pickplace.models.actors import Policy, as_actor, as_collection_policy, chec
 from pickplace.report import learning_curve
 from pickplace.resume import COUNTERS, StopRequest, claim, load_optimizer, resumed_config, saying_what_is_safe
 from pickplace.training_report import write_report
-from pickplace.trust import modules
+from pickplace.trust import own_modules, saved_form, trust_needed
 from pickplace.warm_start import Phase, WarmStart, imitation_loss
 
 log = logging.getLogger(__name__)
@@ -60,6 +60,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         As :func:`train`.
     """
     check_settings(cfg)
+    settled_config = saved_form(cfg)
     algo, device = cfg.algo, config.use_machine(cfg)
     torch.manual_seed(cfg.seed)
 
@@ -118,7 +119,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         facts = {
             **dict(zip(COUNTERS, (frames, iteration, best, latest), strict=True)),
             "curriculum": curriculum.state_dict(),
-            "config": OmegaConf.to_container(cfg, resolve=False),
+            "config": settled_config,
             "versions": versions(),
             "commit": commit(),
         }
@@ -143,7 +144,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         cleanup.callback(logger.close)
         left = max(cfg.total_frames - frames, 0)
         log.info("%s frames to train, at tote height %d of %d", f"{left:,}", curriculum.level, curriculum.end)
-        cleanup.enter_context(saying_what_is_safe(lambda: safe))
+        cleanup.enter_context(saying_what_is_safe(lambda: safe, trust_needed(cfg)))
         cleanup.enter_context(watched(collector))
         batches = iter(collector)
         while frames < cfg.total_frames and not stop.requested:
@@ -201,7 +202,8 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             save("last")
 
     if stop.requested:  # a sweep ends here too, instead of going on to its next job
-        log.info("stopped at %s frames; continue with: python -m pickplace.train resume=%s", f"{frames:,}", run_dir)
+        again = f"python -m pickplace.train resume={run_dir}{trust_needed(cfg)}"
+        log.info("stopped at %s frames; continue with: %s", f"{frames:,}", again)
     if (run_dir / "metrics.csv").is_file():
         learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
         if episodes is not None and frames >= cfg.total_frames:
@@ -230,7 +232,7 @@ def check_settings(cfg: DictConfig) -> None:
         value = OmegaConf.select(cfg, key)
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 2**63:
             raise ValueError(f"{key}={value}: expected a whole number >= {least} and < 2**63.")
-    modules(cfg.trust)
+    own_modules(cfg.trust)
     if cfg.algo.loss not in ("a2c", "ppo"):
         raise ValueError(f"algo.loss={cfg.algo.loss}: expected ppo or a2c.")
     for key in ("algo.mask_infeasible", "algo.normalize_advantage"):

@@ -4,7 +4,6 @@ import hydra
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from torchrl.modules import ValueOperator
 
 from pickplace import PickPlaceEnv, config
@@ -14,7 +13,6 @@ from pickplace.metrics import read_csv
 from pickplace.models.actors import as_collection_policy, fcn_grasp
 from pickplace.models.critics import Conv4dCritic, PooledCritic
 from pickplace.train import make_losses, train
-from pickplace.trust import modules, refuse_foreign_targets
 
 CONF = config.conf_dir()
 TINY = [
@@ -201,64 +199,6 @@ def test_refused_overrides_on_a_saved_config(override, message):
     with pytest.raises(ValueError) as error:
         config.apply_overrides(composed("experiment=smoke"), [override])
     assert message in str(error.value)
-
-
-@pytest.mark.parametrize(
-    "target",
-    [
-        "os.system", "pickplace.checkpoint.shutil.rmtree", "builtins.eval", "pickplace", None, 5,
-        "pickplace.export.export", "pickplace.checkpoint.write", "${planner._target_}",
-    ],
-)  # fmt: skip
-@pytest.mark.parametrize("place", ["env", "model.actor", "curriculum.advance", "collector"])
-def test_foreign_targets_are_refused(target, place):
-    node = {"_target_": target}
-    for key in reversed(place.split(".")):
-        node = {key: node}
-    with pytest.raises(ValueError, match="checkpoint is refused; expected one of pickplace"):
-        refuse_foreign_targets(node)
-
-
-@pytest.mark.parametrize(
-    "node",
-    [
-        {"model": {"actor": {"hidden": {"_target_": "pickplace.items.Kinds"}}}},
-        {"items": {"kinds": [[{"_target_": "pickplace.items.Kinds"}]]}},
-        {"_target_": "pickplace.items.Kinds"},
-        {"model": [{"_target_": "pickplace.models.actors.fcn4d"}]},
-    ],
-)
-def test_targets_in_other_places_are_refused(node):
-    with pytest.raises(ValueError, match="expected none in this place"):
-        refuse_foreign_targets(node)
-
-
-@pytest.mark.parametrize(
-    ("target", "trust"),
-    [("mine.Net", ["mine"]), ("mine.deep.Net", ["other", "mine.deep"]), ("mine.Net", "mine")],
-)
-def test_a_trusted_module_may_be_named(target, trust):
-    refuse_foreign_targets({"model": {"actor": {"_target_": target, "part": {"_target_": target}}}}, modules(trust))
-
-
-@pytest.mark.parametrize("target", ["mine.os.system", "mine", "mines.Net", "os.system", None, 5, "torch.load"])
-def test_trust_goes_no_further_than_its_modules(target):
-    with pytest.raises(ValueError, match="checkpoint is refused"):
-        refuse_foreign_targets({"model": {"actor": {"_target_": target}}}, modules(["mine"]))
-
-
-@pytest.mark.parametrize("trust", ["os", ["mine", "subprocess"], ["builtins"], "pickplace", 5, [3], None, "a b", [""]])
-def test_trust_in_what_is_nobodys_own_is_refused(trust):
-    with pytest.raises(ValueError, match="trust=.*: expected names of modules of your own"):
-        modules(trust)
-
-
-def test_our_own_configs_are_accepted():
-    groups = ("env", "items", "model", "curriculum", "curriculum/advance", "curriculum/sample", "collector", "logger")
-    for group in (*groups, "warm_start"):
-        for name in options(group):
-            cfg = composed(f"{group}={name}")
-            refuse_foreign_targets(OmegaConf.to_container(cfg, resolve=False))
 
 
 @pytest.mark.parametrize("part", ["advance", "sample"])

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -216,7 +217,7 @@ def test_own_model(run):
     assert ours["planner"] == "policy" and set(ours["failures"]) == {"stuck"}
 
 
-def test_a_module_is_trusted_by_who_loads_a_run_and_by_nobody_else(run, monkeypatch, capsys):
+def test_a_module_is_trusted_by_who_loads_a_run_and_by_nobody_else(run, monkeypatch, capsys, tmp_path):
     folder = run("train", "own_model", "model=mlp", "model.actor.hidden=8", "trust=own_model", *TRAINING)
 
     def resume(*words):
@@ -234,9 +235,23 @@ def test_a_module_is_trusted_by_who_loads_a_run_and_by_nobody_else(run, monkeypa
     assert checkpoint.read(checkpoint.locate(folder, prefer="last"))[1]["frames"] == 128
     with pytest.raises(ValueError, match=r"own_model\.Mlp"):
         Planner.load(folder)
-    bin_depth, tote_depth = torch.zeros(5, 5), torch.full((6, 6), 5)
+    bin_depth, tote_depth = np.zeros((5, 5)), np.full((6, 6), 5)
     bin_depth[2, 2] = 1
     assert Planner.load(folder, trust=["own_model"]).plan(bin_depth, tote_depth).status == "ok"
+    np.save(tmp_path / "bin.npy", bin_depth)
+    np.save(tmp_path / "tote.npy", tote_depth)
+    maps = ["--bin", str(tmp_path / "bin.npy"), "--tote", str(tmp_path / "tote.npy")]
+    plan.run(plan.parser().parse_args([str(folder), *maps, "--trust", "own_model"]))
+    assert '"status": "ok"' in capsys.readouterr().out
+
+
+def test_a_teacher_of_a_trusted_module(run, capsys):
+    teacher = run("train", "own_model", "model=mlp", "model.actor.hidden=8", *TRAINING)
+    taught = ["warm_start=policy", f"warm_start.checkpoint={teacher}", "warm_start.frames=64", *TRAINING]
+    with pytest.raises(SystemExit):
+        run("train", "own_model", *taught, folder="refused")
+    assert "if own_model is yours, say trust=own_model" in capsys.readouterr().err
+    run("train", "own_model", *taught, "trust=own_model", folder="taught")
 
 
 def test_own_items(run):

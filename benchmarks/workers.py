@@ -1,0 +1,46 @@
+"""What worker processes buy a whole training on this machine: python benchmarks/workers.py
+
+``collector=single`` and ``multi_sync`` train turn by turn; a batch is collected and learnt from.
+"""
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from common import save, spread
+
+from pickplace.metrics import read_csv
+
+FRAMES, REPEATS = 65_536, 3
+NEVER = ["evaluation_interval=1_000_000_000", "evaluation.episodes=1", "evaluation.batch_size=1"]
+CASES = {
+    "`quick`, all cores": ["experiment=quick"],
+    "`quick`, one thread a process": ["experiment=quick", "threads=1"],
+    "`quick`, one thread a process, one pass over a batch": ["experiment=quick", "threads=1", "algo.epochs=1"],
+}
+COLLECTORS = {"single": ["collector=single"], "multi_sync, 2 workers": ["collector=multi_sync", "collector.workers=2"]}
+
+
+def batches(overrides: list[str]) -> list[float]:
+    """Milliseconds that each batch of a training took, without the first ones, which warm up."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "pickplace.train", *overrides, *NEVER]
+        command += [f"total_frames={FRAMES}", f"hydra.run.dir={folder}/run"]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        rows = read_csv(Path(folder) / "run" / "metrics.csv")
+    return [row["time/collect_ms"] + row["time/update_ms"] for row in rows[4:]]
+
+
+def main() -> None:
+    times = {case: {name: [] for name in COLLECTORS} for case in CASES}
+    for _ in range(REPEATS):
+        for case, overrides in CASES.items():
+            for name, collector in COLLECTORS.items():
+                times[case][name] += batches([*overrides, *collector])
+    rows = {case: {name: spread(values) for name, values in row.items()} for case, row in times.items()}
+    save("workers", {"frames": FRAMES, "repeats": REPEATS, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()

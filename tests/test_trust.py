@@ -1,0 +1,228 @@
+"""What a checkpoint's config may make: pickplace's own, each in its place, and what a user says he trusts."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from pickplace import Planner, checkpoint, config
+from pickplace.trust import TRAINED_WITH, own_modules, refuse_foreign_targets, saved_form, trust_needed, trusted
+
+SHIPPED = config.PACKAGE / "pretrained" / "r4"
+
+
+def composed(*overrides):
+    with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
+        return compose("train", list(overrides))
+
+
+def changed(**values):
+    """The config of a training with values put into it, by their places with ``__`` for the dots."""
+    content = saved_form(composed("experiment=quick"))
+    for place, value in values.items():
+        *parents, last = place.split("__")
+        node = content
+        for parent in parents:
+            node = node.setdefault(parent, {})
+        node[last] = value
+    return content
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch):
+    """A module and a package of a user's, ``mine`` and ``mypkg``, which import things that must not be called."""
+    (tmp_path / "mine.py").write_text(
+        "import os\nfrom torch import load, nn\nfrom os import system\nclass Net(nn.Module): ...\ndef make(): ...\n"
+        "VALUE = 5\n"
+    )
+    package = tmp_path / "mypkg"
+    package.mkdir()
+    (package / "__init__.py").write_text("from mypkg.nets import Net\n")
+    (package / "nets.py").write_text("from torch import load\nclass Net: ...\n")
+    (package / "__main__.py").write_text("raise SystemExit('it was run')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield
+    for name in ("mine", "mypkg", "mypkg.nets"):
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system", "pickplace.checkpoint.shutil.rmtree", "builtins.eval", "pickplace", None, 5,
+        "pickplace.export.export", "pickplace.checkpoint.write", "${planner._target_}", ["os.system"], "",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("place", ["env", "model.actor", "curriculum.advance", "collector"])
+def test_foreign_targets_are_refused(target, place):
+    node = {"_target_": target}
+    for key in reversed(place.split(".")):
+        node = {key: node}
+    with pytest.raises(ValueError, match="checkpoint is refused; expected one of pickplace"):
+        refuse_foreign_targets(node)
+
+
+@pytest.mark.parametrize(
+    "node",
+    [
+        {"model": {"actor": {"hidden": {"_target_": "pickplace.items.Kinds"}}}},
+        {"items": {"kinds": [[{"_target_": "pickplace.items.Kinds"}]]}},
+        {"_target_": "pickplace.items.Kinds"},
+        {"model": [{"_target_": "pickplace.models.actors.fcn4d"}]},
+    ],
+)
+def test_targets_in_other_places_are_refused(node):
+    with pytest.raises(ValueError, match="expected none in this place"):
+        refuse_foreign_targets(node)
+
+
+def test_our_own_configs_are_accepted():
+    groups = ("env", "items", "model", "curriculum", "curriculum/advance", "curriculum/sample", "collector", "logger")
+    for group in (*groups, "warm_start"):
+        folder = config.conf_dir() / group
+        for path in folder.glob("*.yaml"):
+            values = ["items.path=items.csv"] if path.stem == "recorded" else []
+            cfg = composed(f"{group}={path.stem}", *values)
+            assert trusted(saved_form(cfg)).env == cfg.env
+
+
+EVIL = json.dumps({"_target_": "torch.load", "f": "evil.pt", "weights_only": False})
+HIDDEN = {
+    "a resolver": {"model__actor__filters": "${oc.env:HOME}"},
+    "a resolver whose name is a reference": {"model__actor": "${${k}:${s}}", "k": "oc.create", "s": EVIL},
+    "one in a value": {"model__actor__filters": "${${k}:${s}}", "k": "oc.create", "s": EVIL},
+    "one in text": {"items__path": "data/${oc.env:HOME}"},
+    "a reference in text": {"items__path": "data/${seed}"},
+    "an escaped reference": {"items__path": "\\${seed}"},
+    "a reference to what may be made elsewhere": {"model__actor__filters": "${logger}"},
+    "a reference to what may not be made": {"model__actor__filters": "${evil}", "evil": {"_target_": "os.system"}},
+    "a reference to a part": {"model__actor__filters": "${algo}"},
+    "a list of parts": {"model__actor__filters": "${parts}", "parts": [[1], [2]]},
+    "a reference as what is made": {"model__actor___target_": "${evil}", "evil": "os.system"},
+    "a long list": {"model__actor__filters": "${many}", "many": list(range(101))},
+    "copies of copies": {f"a{n}": {"x": f"${{a{n - 1}}}", "y": f"${{a{n - 1}}}"} for n in range(1, 60)} | {"a0": {}},
+    "a circle": {"model__actor__filters": "${model.actor.filters}"},
+    "nothing there": {"model__actor__filters": "${nowhere}"},
+}
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_what_interpolations_hide_is_refused(name):
+    with pytest.raises(ValueError, match="refused|cannot be read"):
+        trusted(changed(**HIDDEN[name]))
+
+
+def test_references_to_values_follow_what_they_lead_to():
+    content = changed(model__actor__filters="${seed}", items__kinds="${algo.kinds}", algo__kinds=[1, 2], seed=32)
+    cfg = trusted(content)
+    assert cfg.model.actor.filters == 32 and cfg["items"].kinds == [1, 2]
+
+
+@pytest.mark.parametrize("command", ["load", "evaluate", "resume"])
+def test_a_checkpoint_that_hides_a_pickle_runs_nothing(command, tmp_path):
+    """With a whole checksum: nothing but its config is bad."""
+    folder = tmp_path / "run" / "checkpoints" / "last"
+    folder.mkdir(parents=True)
+    (folder / checkpoint.TENSORS).write_bytes((SHIPPED / checkpoint.TENSORS).read_bytes())
+    facts = json.loads((SHIPPED / checkpoint.FACTS).read_text())
+    (tmp_path / "evil.pt").write_bytes(f"cos\nsystem\n(S'touch {tmp_path}/pwned'\ntR.".encode())
+    actor = {**facts["config"]["model"]["actor"], "filters": json.loads(EVIL) | {"f": str(tmp_path / "evil.pt")}}
+    facts["config"] |= {"k": "oc.create", "s": json.dumps(actor)}
+    facts["config"]["model"]["actor"] = "${${k}:${s}}"
+    facts |= {"curriculum": {}, "iteration": 1, "best": 0.5, "latest": {}}
+    (folder / checkpoint.FACTS).write_text(json.dumps(facts))
+    if command == "load":
+        with pytest.raises(ValueError, match="no resolver"):
+            Planner.load(folder)
+    else:
+        module, key = {"evaluate": ("evaluate", "checkpoint"), "resume": ("train", "resume")}[command]
+        words = [sys.executable, "-m", f"pickplace.{module}", f"{key}={folder}"]
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 2 and "no resolver" in done.stderr
+    assert not (tmp_path / "pwned").exists()
+
+
+@pytest.mark.parametrize(
+    ("target", "trust"),
+    [
+        ("mine.Net", ["mine"]), ("mine.make", "mine"), ("mypkg.nets.Net", ["mine", "mypkg.nets"]),
+        ("mypkg.Net", ["mypkg"]),
+    ],
+)  # fmt: skip
+def test_what_a_trusted_module_defines_may_be_made_anywhere(target, trust, mine):
+    trusted(changed(model__actor___target_=target, model__actor__part={"_target_": target}), trust)
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "mine.os.system", "mine.system", "mine.load", "mine.nn", "mine.VALUE", "mine", "mine.", "mine. Net",
+        "mine..Net", "mine.Missing", "mine.__setattr__", "mine.${evil}", "mines.Net", "mypkg.nets.Net",
+        "mypkg.nets", "mypkg.__main__", "mypkg.nets.load", "os.system", "torch.load", "", None, 5, ["mine.Net"],
+    ],
+)  # fmt: skip
+def test_trust_goes_no_further_than_what_its_modules_define(target, mine):
+    with pytest.raises(ValueError, match="checkpoint is refused"):
+        trusted(changed(model__actor___target_=target, evil="load"), ["mine", "mypkg"])
+
+
+def test_a_trusted_module_that_is_not_there(mine):
+    with pytest.raises(ValueError, match="trust=nowhere: it cannot be imported .*; expected it on PYTHONPATH"):
+        trusted(changed(model__actor___target_="nowhere.Net"), ["nowhere"])
+
+
+def test_the_refusal_says_what_to_type():
+    with pytest.raises(ValueError, match=r"if mypkg\.nets is yours, say trust=mypkg\.nets \(--trust mypkg\.nets to"):
+        trusted(changed(model__actor___target_="mypkg.nets.Net"))
+    with pytest.raises(ValueError, match=r"expected one of [^;]*\.$"):  # nobody should trust these
+        trusted(changed(model__actor___target_="os.system"))
+
+
+@pytest.mark.parametrize(
+    "trust",
+    ["os", ["mine", "subprocess"], ["builtins"], "pickplace", "torch", "hydra.utils", 5, [3], "a b", [""], {"a": 1}],
+)
+def test_trust_in_what_is_nobodys_own_is_refused(trust):
+    with pytest.raises(ValueError, match="trust=.*: expected names of modules of your own"):
+        own_modules(trust)
+
+
+def test_names_of_modules():
+    assert own_modules(None) == own_modules([]) == ()
+    assert own_modules("mine") == ("mine",) and own_modules(OmegaConf.create(["mine", "my.nets"])) == (
+        "mine",
+        "my.nets",
+    )
+
+
+def test_what_is_saved(monkeypatch):
+    """References stay, resolvers are worked out, and trust is not handed on."""
+    monkeypatch.setenv("DATA", "/data")
+    path = "items.path='${oc.env:DATA}/items.csv'"
+    cfg = composed("items=recorded", path, "total_frames=${seed}", "seed=7", "trust=[mine]", "+algo.part=${evaluation}")
+    saved = saved_form(cfg)
+    assert saved["items"]["path"] == "/data/items.csv" and saved["total_frames"] == "${seed}" and saved["trust"] == []
+    assert saved["algo"]["part"]["stream"] == "validation"
+    assert saved["model"]["critic"]["tote_clip"] == "${..actor.tote_clip}"
+    assert trusted(saved).total_frames == 7
+
+
+def test_what_to_say_to_load_a_run_again():
+    assert trust_needed(composed()) == ""
+    changes = ["model.actor._target_=my.nets.Net", "items._target_=mine.Items", "+algo.more._target_=mine.Items"]
+    assert trust_needed(composed(*changes)) == " trust=[mine,my.nets]"
+
+
+@pytest.mark.parametrize("key", TRAINED_WITH)
+def test_a_config_that_no_training_wrote(key):
+    content = changed()
+    *parents, last = key.split(".")
+    node = content
+    for parent in parents:
+        node = node[parent]
+    del node[last]
+    with pytest.raises(ValueError, match=f"no {key}"):
+        trusted(content)
