@@ -1,7 +1,6 @@
 """Evaluation: what it writes, that it counts every episode, and that nothing but the question changes the answer."""
 
 import json
-import logging
 import os
 import subprocess
 import sys
@@ -16,23 +15,14 @@ from pickplace.planners import JointDBL, RandomFeasible
 
 
 @pytest.fixture
-def run(monkeypatch, tmp_path, capsys):
+def run(run, tmp_path):
     """Evaluate in this process, in an empty folder; returns exit code, standard error and ``evaluation.json``."""
-    monkeypatch.chdir(tmp_path)
 
     def call(*arguments):
         folder = tmp_path / f"result{len(list(tmp_path.iterdir()))}"
-        monkeypatch.setattr(sys, "argv", ["pickplace-evaluate", *arguments, f"hydra.run.dir={folder}"])
-        code = 0
-        try:
-            evaluate.main()
-        except SystemExit as exit:
-            code = exit.code or 0
-        finally:
-            logging.root.handlers.clear()  # the files of this run may be gone when the next one logs
+        code, _, err = run("evaluate", *arguments, f"hydra.run.dir={folder}")
         path = folder / "evaluation.json"
-        result = json.loads(path.read_text()) if path.is_file() else None
-        return code, capsys.readouterr().err, result
+        return code, err, json.loads(path.read_text()) if path.is_file() else None
 
     return call
 

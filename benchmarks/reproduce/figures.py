@@ -170,12 +170,13 @@ def rl_methods(results, path) -> bool:
     if not axes.lines:
         return False
     axes.set_xticks(range(len(TOTES)), TOTES)
+    axes.set_xlim(-0.5, len(TOTES) - 0.5)
     axes.set_ylabel("occupancy, R=4")
     axes.set_ylim(0, 1.05)
     axes.grid(axis="x", alpha=0)
     for edge in range(1, len(TOTES)):
         axes.axvline(edge - 0.5, color="#dddddd", lw=0.8)
-    legend(figure, [axes])
+    legend(figure, [axes], ncols=4)
     return save(figure, path)
 
 
