@@ -8,7 +8,9 @@ from pickplace.geometry import Rules
 from pickplace.models.conv4d import check_width
 from pickplace.models.depth import clip_depth
 
-PADDED_ROWS = 512  # what bf16 products are rounded up to: one is prepared for each number of rows, which takes time
+#: What the rows of a bf16 product are rounded up to, beyond how many: one is prepared and kept for each number of rows,
+#: which takes time and memory. A single decision has few, and is not slowed down.
+PADDED_ROWS = ((4096, 512), (64, 64))
 
 
 class FootprintFcn(nn.Module):
@@ -94,8 +96,9 @@ class FootprintFcn(nn.Module):
             outcome: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
         """
         lower, count = self.compute_dtype != torch.float32, len(row)
-        if lower and count > 8 * PADDED_ROWS:
-            row, outcome = (F.pad(index, (0, -count % PADDED_ROWS)) for index in (row, outcome))
+        if lower:
+            padding = next((-count % step for beyond, step in PADDED_ROWS if count > beyond), 0)
+            row, outcome = (F.pad(index, (0, padding)) for index in (row, outcome))
         x = self._inputs(bin_depth, tote_depth, row, outcome)
         with torch.autocast(tote_depth.device.type, self.compute_dtype, enabled=lower):
             x = F.relu(self.hidden(F.relu(self.patch(x))))
