@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import hydra
+import yaml  # type: ignore[import-untyped]
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import (
@@ -129,6 +130,13 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: dict[str, D
     return cfg
 
 
+def begun_with(run_dir: Path) -> list[str]:
+    """The words of the command that began a run, as Hydra noted them; empty where it did not."""
+    notes = Path(run_dir) / ".hydra" / "overrides.yaml"
+    words = yaml.safe_load(notes.read_text()) if notes.is_file() else None
+    return [word for word in words if isinstance(word, str)] if isinstance(words, list) else []
+
+
 def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> None:
     """Refuse keys that nothing reads: Hydra adds what it finds in a preset, or after a ``+``, misspelt or not.
 
@@ -162,7 +170,11 @@ def _unknown_key(key: str, cfg: DictConfig, prefix: str = "") -> str:
 
 
 def sentence(error: Exception) -> str:
-    """What went wrong, in one line for a person."""
+    """What went wrong, in one line for a person, without characters that a terminal would obey."""
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in _sentence(error))
+
+
+def _sentence(error: Exception) -> str:
     if isinstance(error, OverrideParseException):
         reasons = [line for line in error.message.splitlines() if not line.startswith(("Error parsing", "See https"))]
         return f"{error.override!r}: expected <key>=<value> ({' '.join(reasons)})."

@@ -307,12 +307,12 @@ def prepare(cfg: DictConfig) -> tuple:
         with open_dict(cfg):
             for group in TRAINED:  # resolved where they come from: here a reference could lead elsewhere
                 cfg[group] = resolved(merged[group])
-        trained = (cfg, state, saved["config"]["env"])
+        trained = (cfg, state, resolved(theirs.env))
         facts |= {
             "checkpoint": str(folder),
             "trained": {"frames": saved["frames"], "seed": merged.seed, "commit": saved["commit"]},
             "mask_in_training": merged.algo.mask_infeasible,
-            "warm_start": taught_by(saved["config"]),
+            "warm_start": taught_by(resolved(theirs)),
         }
 
     ev, items = cfg.evaluation, config.instantiate(cfg["items"])

@@ -5,6 +5,8 @@ depend on the batch size, and every method that plays an episode meets the same 
 """
 
 import csv
+import io
+import math
 from itertools import product
 from pathlib import Path
 
@@ -106,6 +108,10 @@ class Kinds(ItemDistribution):
         return torch.searchsorted(self._edges.to(uniform.device), uniform, right=True)
 
 
+#: What is still read of a list of items, and how many kinds there may be: more would fill the memory.
+MOST_TEXT, MOST_KINDS = 100_000_000, 100_000
+
+
 class Uniform(Kinds):
     """Cuboids whose sides and heights are drawn uniformly and independently from closed ranges.
 
@@ -121,6 +127,9 @@ class Uniform(Kinds):
                 raise ValueError(
                     f"items.{name}={limits!r}: expected [least, greatest], whole cells with 1 <= least <= greatest."
                 )
+        count = math.prod(high - low + 1 for low, high in ranges.values())
+        if count > MOST_KINDS:
+            raise ValueError(f"items: the ranges have {count:,} kinds of items; expected at most {MOST_KINDS:,}.")
         super().__init__(list(product(*(range(low, high + 1) for low, high in ranges.values()))))
 
 
@@ -144,7 +153,10 @@ class Recorded(ItemDistribution):
             raise ValueError(f"items.path={str(path)!r}: no such file; expected a CSV with columns w,d,h (and x,y).")
         try:
             with self.path.open(newline="", encoding="utf-8-sig") as file:
-                reader = csv.reader(file)
+                text = file.read(MOST_TEXT + 1)
+                if len(text) > MOST_TEXT:
+                    raise ValueError(f"items.path={str(path)!r}: longer than {MOST_TEXT:,} characters.")
+                reader = csv.reader(io.StringIO(text, newline=""))
                 table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{path}: {error}; expected a CSV in UTF-8.") from error

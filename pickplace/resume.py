@@ -20,6 +20,9 @@ log = logging.getLogger(__name__)
 #: What a checkpoint counts, and how a run begins: frames, iterations, best validation occupancy, latest validation.
 COUNTERS = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
 
+#: What no checkpoint may reach by itself, only who resumes it: other machines, and databases elsewhere.
+AT_HOME = {"collector.address": ("local", None), "logger.uri": ("null", None), "logger.offline": ("true", True, None)}
+
 #: What the state of running episodes is tied to.
 RULES = ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "min_support", "strict_support")
 FIXED = ("seed", *(f"env.{key}" for key in RULES), "env.num_envs", "items", "algo.mask_infeasible", "collector.workers")
@@ -45,6 +48,14 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     trust = own_modules(next((word.value() for word in reversed(given) if word.key_or_group == "trust"), None))
     saved = trusted(facts["config"], trust)
     saved["trust"] = list(trust)
+    named = {word.key_or_group for word in given}
+    for key, harmless in AT_HOME.items():
+        value = OmegaConf.select(saved, key)
+        if value not in harmless and key not in named:
+            raise ValueError(
+                f"{key}={value}: the checkpoint would reach out of this run's folder or this machine; expected that "
+                f"you say so again, {key}={value}, or {key}={harmless[0]}."
+            )
     cfg = config.apply_overrides(saved, [str(word.input_line) for word in given if word.key_or_group != "trust"])
     for key in FIXED:
         was, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
@@ -96,6 +107,18 @@ class StopRequest:
             signal.signal(number, handler)
 
 
+def refuse_links(run_dir: Path) -> None:
+    """Refuse a run folder, which may come from others, that would make a resumed run write somewhere else.
+
+    Raises:
+        ValueError: for a link, a pipe or a device in it, naming it.
+    """
+    for folder in (run_dir, run_dir / "checkpoints", run_dir / ".hydra"):
+        for entry in os.scandir(folder) if folder.is_dir() else ():
+            if entry.is_symlink() or not (entry.is_file() or entry.is_dir()):
+                raise ValueError(f"{entry.path}: a link or no regular file; expected only files and folders in a run.")
+
+
 @contextmanager
 def claim(run_dir: Path):
     """Hold a run folder for this process, until the end of the block or of the process, however it ends.
@@ -122,7 +145,7 @@ def saying_what_is_safe(safe, trust: str = ""):
 
     Args:
         safe: gives its folder, or None.
-        trust: what has to be said beside it, see :func:`pickplace.trust.trust_needed`.
+        trust: what has to be said beside it, `` trust=[...]`` or nothing.
     """
     try:
         yield

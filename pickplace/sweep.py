@@ -13,7 +13,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from pickplace.checkpoint import CheckpointError, locate
-from pickplace.config import FAILURE, SweepCallback, claimed, one_sentence
+from pickplace.config import FAILURE, SweepCallback, begun_with, claimed, one_sentence
 from pickplace.metrics import read_csv
 
 log = logging.getLogger(__name__)
@@ -74,8 +74,7 @@ class Run:
 
 def read_run(folder: Path) -> Run:
     """Read a run folder, whatever state the run was left in."""
-    words = map(str, OmegaConf.load(folder / ".hydra" / "overrides.yaml"))
-    run = Run(folder.name, dict(word.lstrip("+").partition("=")[::2] for word in words))
+    run = Run(folder.name, dict(word.lstrip("+").partition("=")[::2] for word in begun_with(folder)))
     if (folder / "metrics.csv").is_file():
         rows = read_csv(folder / "metrics.csv")
         run.frames = int(rows[-1]["frames"]) if rows else 0

@@ -24,9 +24,17 @@ from pickplace.evaluate import Episodes, commit, confidence95, play, versions
 from pickplace.geometry import Failure
 from pickplace.models.actors import Policy, as_actor, as_collection_policy, check_sizes
 from pickplace.report import learning_curve
-from pickplace.resume import COUNTERS, StopRequest, claim, load_optimizer, resumed_config, saying_what_is_safe
+from pickplace.resume import (
+    COUNTERS,
+    StopRequest,
+    claim,
+    load_optimizer,
+    refuse_links,
+    resumed_config,
+    saying_what_is_safe,
+)
 from pickplace.training_report import write_report
-from pickplace.trust import own_modules, saved_form, trust_needed
+from pickplace.trust import own_modules, saved_form, trust_needed, trusted
 from pickplace.warm_start import Phase, WarmStart, imitation_loss
 
 log = logging.getLogger(__name__)
@@ -60,7 +68,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         As :func:`train`.
     """
     check_settings(cfg)
-    settled_config = saved_form(cfg)
+    settled_config, again = loadable(cfg)
     algo, device = cfg.algo, config.use_machine(cfg)
     torch.manual_seed(cfg.seed)
 
@@ -144,7 +152,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         cleanup.callback(logger.close)
         left = max(cfg.total_frames - frames, 0)
         log.info("%s frames to train, at tote height %d of %d", f"{left:,}", curriculum.level, curriculum.end)
-        cleanup.enter_context(saying_what_is_safe(lambda: safe, trust_needed(cfg)))
+        cleanup.enter_context(saying_what_is_safe(lambda: safe, again))
         cleanup.enter_context(watched(collector))
         batches = iter(collector)
         while frames < cfg.total_frames and not stop.requested:
@@ -202,8 +210,8 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             save("last")
 
     if stop.requested:  # a sweep ends here too, instead of going on to its next job
-        again = f"python -m pickplace.train resume={run_dir}{trust_needed(cfg)}"
-        log.info("stopped at %s frames; continue with: %s", f"{frames:,}", again)
+        command = f"python -m pickplace.train resume={run_dir}{again}"
+        log.info("stopped at %s frames; continue with: %s", f"{frames:,}", command)
     if (run_dir / "metrics.csv").is_file():
         learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
         if episodes is not None and frames >= cfg.total_frames:
@@ -256,6 +264,20 @@ def check_settings(cfg: DictConfig) -> None:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not number or not low <= value < float("inf") or (high is not None and value > high):
             raise ValueError(f"{key}={value}: expected a number >= {low}{'' if high is None else f' and <= {high}'}.")
+
+
+def loadable(cfg: DictConfig) -> tuple[dict, str]:
+    """The config as checkpoints hold it, and what has to be said to load one: `` trust=[...]``, or nothing.
+
+    What could be saved but never be loaded is told now, not after hours.
+    """
+    content = saved_form(cfg)
+    own = trust_needed(OmegaConf.to_container(cfg, resolve=True))
+    try:
+        trusted(content, own)
+    except ValueError as error:
+        log.warning("checkpoints of this run will not be loaded again: %s", error)
+    return content, f" trust=[{','.join(own)}]" if own else ""
 
 
 def make_losses(algo: DictConfig, policy: Policy, critic: ValueOperator) -> tuple[GAE, A2CLoss | ClipPPOLoss]:
@@ -405,6 +427,7 @@ def resume_run(overrides: list[str]) -> float:
     if folder.parent.name != "checkpoints":
         raise ValueError(f"resume={place}: expected a run folder, or one of its checkpoints: last, best or previous.")
     run_dir = folder.parent.parent
+    refuse_links(run_dir)
     with claim(run_dir):  # before reading what another process may be writing
         state, facts = checkpoint.read(folder)
         cfg = resumed_config(place, facts, [item for item in overrides if not item.startswith("resume=")])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from pickplace.config import begun_with
 from pickplace.geometry import Rules
 from pickplace.metrics import read_csv
 from pickplace.replay import ASSETS, page
@@ -95,7 +96,5 @@ def _levels(rows: list[dict]) -> str:
 
 
 def _command(run_dir: Path) -> str:
-    """The command that began the run, as Hydra noted it."""
-    notes = run_dir / ".hydra" / "overrides.yaml"
-    words = [str(word) for word in OmegaConf.load(notes)] if notes.is_file() else []
-    return " ".join(["python -m pickplace.train", *map(shlex.quote, words)])
+    """The command that began the run."""
+    return " ".join(["python -m pickplace.train", *map(shlex.quote, begun_with(run_dir))])

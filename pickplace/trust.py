@@ -5,8 +5,8 @@ import inspect
 import re
 import reprlib
 import sys
-from collections.abc import Collection, Iterator
-from typing import Any
+from collections.abc import Collection
+from importlib.metadata import packages_distributions
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -67,37 +67,43 @@ def _may_be_own(module) -> bool:
     return named and module.partition(".")[0] not in THEIRS
 
 
-def targets(node, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every place in a config where something is made, and what it names."""
-    if isinstance(node, dict):
-        if "_target_" in node:
-            yield path, node["_target_"]
-        for key, value in node.items():
-            yield from targets(value, f"{path}.{key}" if path else str(key))
-    elif isinstance(node, list):
-        for index, value in enumerate(node):
-            yield from targets(value, f"{path}[{index}]")
-
-
-def refuse_foreign_targets(node, trust: Collection[str] = ()) -> None:
+def refuse_foreign_targets(node, trust: Collection[str] = (), path: str = "", within: bool = False) -> None:
     """Refuse a config that would make anything unexpected.
 
     Args:
-        node: the config, with every reference resolved.
+        node: the config, or a part of it, with every reference resolved.
         trust: modules beside pickplace's own, see :func:`own_modules`. What they define themselves may be made in any
-            place; to know what that is, they are imported.
+            place, and out of any of pickplace's own parts; to know what that is, they are imported.
+        path: where the part is.
+        within: is it a part of something that a trusted module defines?
 
     Raises:
         ValueError: naming the ``_target_`` and its place.
     """
-    for path, target in targets(node):
-        allowed = [f"pickplace.{name}" for name in TARGETS.get(path, ())]
-        if target not in allowed and not _defined_by(target, trust):
-            expected = f"one of {', '.join(allowed)}" if allowed else "none in this place"
-            module = target.rpartition(".")[0] if isinstance(target, str) else ""
-            if _may_be_own(module) and module not in trust:
-                expected += f"; if {module} is yours, say trust={module} (--trust {module} to pickplace-plan)"
-            raise ValueError(f"{path}._target_={target!r}: the checkpoint is refused; expected {expected}.")
+    if isinstance(node, dict):
+        if "_target_" in node:
+            target = node["_target_"]
+            own = _defined_by(target, trust)
+            places = TARGETS.values() if within else [TARGETS.get(path, ())]
+            allowed = [f"pickplace.{name}" for names in places for name in names]
+            if not own and target not in allowed:
+                expected = f"one of {', '.join(allowed)}" if allowed else "none in this place"
+                expected += _advice(target, trust)
+                raise ValueError(f"{path}._target_={target!r}: the checkpoint is refused; expected {expected}.")
+            within = within or own
+        for key, value in node.items():
+            refuse_foreign_targets(value, trust, f"{path}.{key}" if path else str(key), within)
+    elif isinstance(node, list):
+        for index, value in enumerate(node):
+            refuse_foreign_targets(value, trust, f"{path}[{index}]", within)
+
+
+def _advice(target, trust: Collection[str]) -> str:
+    """How to trust a module that may be the user's own: one that is not installed as somebody's package."""
+    module = target.rpartition(".")[0] if isinstance(target, str) else ""
+    if not _may_be_own(module) or module in trust or module.partition(".")[0] in packages_distributions():
+        return ""
+    return f"; if {module} is yours, say trust={module} (--trust {module} to pickplace-plan)"
 
 
 def _defined_by(target, trust: Collection[str]) -> bool:
@@ -117,65 +123,62 @@ def _defined_by(target, trust: Collection[str]) -> bool:
     return (inspect.isclass(found) or inspect.isfunction(found)) and f"{home}.".startswith(f"{module}.")
 
 
-def refuse_resolvers(node, path: str = "") -> None:
-    """Refuse interpolations but plain references to other keys: a resolver reads files and variables, or makes nodes.
+def refuse_interpolations(node, path: tuple = (), root=None) -> None:
+    """Refuse all interpolations but references to a value in the same config, before anything resolves them.
+
+    A resolver reads files and variables or makes nodes; a reference to a part, or to a reference, could copy parts into
+    parts until the memory is full.
 
     Raises:
-        ValueError: naming the value and its place.
+        ValueError: naming the interpolation and its place.
     """
-    if isinstance(node, dict):
-        for key, value in node.items():
-            refuse_resolvers(value, f"{path}.{key}" if path else str(key))
-    elif isinstance(node, list):
-        for index, value in enumerate(node):
-            refuse_resolvers(value, f"{path}[{index}]")
-    elif isinstance(node, str) and "${" in node and not REFERENCE.fullmatch(node):
-        raise ValueError(f"{path}={reprlib.repr(node)}: the checkpoint is refused; expected no resolver in its config.")
+    root = node if root is None else root
+    if isinstance(node, (dict, list)):
+        for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+            refuse_interpolations(value, (*path, key), root)
+    elif isinstance(node, str) and "${" in node:
+        place = f"{'.'.join(map(str, path))}={reprlib.repr(node)}: the checkpoint is refused; expected"
+        if not REFERENCE.fullmatch(node):
+            raise ValueError(f"{place} no resolver in its config.")
+        if not _leads_to_a_value(node, path, root):
+            raise ValueError(f"{place} a reference to a number, a short text or a short list of such.")
 
 
-def refuse_references_to_parts(node: Any, path: str = "") -> None:
-    """Refuse references to anything but values and short lists of them: copies of parts in parts could fill the memory.
-
-    Args:
-        node: a DictConfig or a ListConfig.
-        path: where it is in the config.
-
-    Raises:
-        ValueError: naming the reference's place.
-    """
-    keys: Any = node if isinstance(node, DictConfig) else range(len(node))
-    for key in keys:
-        place = f"{path}.{key}" if path else str(key)
-        if OmegaConf.is_missing(node, key):
-            continue
-        value = node[key]
-        if OmegaConf.is_interpolation(node, key):
-            if not _is_value(value):
-                raise ValueError(f"{place}: the checkpoint is refused; expected no reference to a part of its config.")
-        elif OmegaConf.is_config(value):
-            refuse_references_to_parts(value, place)
+def _leads_to_a_value(reference: str, path: tuple, root) -> bool:
+    """Does a reference at some place lead to a value that is none itself?"""
+    name = reference[2:-1].lstrip(".")
+    up = len(reference) - 3 - len(name)
+    found = root
+    for key in (*(path[:-up] if up else ()), *name.split(".")):
+        try:
+            found = found[int(key) if isinstance(found, list) else key] if isinstance(found, (dict, list)) else None
+        except (KeyError, IndexError, ValueError):
+            return False
+    values = found if isinstance(found, list) else [found]
+    return len(values) <= 100 and not any(
+        isinstance(value, (dict, list)) or (isinstance(value, str) and ("${" in value or len(value) > 1000))
+        for value in values
+    )
 
 
-def _is_value(value) -> bool:
-    """A number, a text, or a short list of such."""
-    values = value if isinstance(value, (list, ListConfig)) else [value]
-    return len(values) <= 100 and not any(isinstance(part, (dict, list, DictConfig, ListConfig)) for part in values)
-
-
-def settled(raw, resolved):
+def settled(raw, resolved, path: tuple = (), root=None):
     """A config to be saved: references to values as they are, so that overrides reach both; all else resolved.
 
     Args:
         raw: a config's plain values, not resolved.
         resolved: the same, resolved.
+        path: where they are in the config.
+        root: the whole config, not resolved.
     """
+    root = raw if root is None else root
     if isinstance(raw, dict):
-        return {
-            key: resolved[key] if key == "_target_" else settled(value, resolved[key]) for key, value in raw.items()
-        }
+        kept = {key: settled(value, resolved[key], (*path, key), root) for key, value in raw.items()}
+        return kept | {"_target_": resolved["_target_"]} if "_target_" in raw else kept
     if isinstance(raw, list):
-        return [settled(*pair) for pair in zip(raw, resolved, strict=True)]
-    return raw if isinstance(raw, str) and REFERENCE.fullmatch(raw) and _is_value(resolved) else resolved
+        pairs = enumerate(zip(raw, resolved, strict=True))
+        return [settled(*pair, (*path, index), root) for index, pair in pairs]
+    plain = isinstance(raw, str) and REFERENCE.fullmatch(raw) and _leads_to_a_value(raw, path, root)
+    return raw if plain else resolved
 
 
 def saved_form(cfg: DictConfig) -> dict:
@@ -184,11 +187,16 @@ def saved_form(cfg: DictConfig) -> dict:
     return {**settled(raw, resolved), "trust": []}
 
 
-def trust_needed(cfg: DictConfig) -> str:
-    """What has to be said to load this run again: `` trust=[...]``, or nothing if all is pickplace's own."""
-    named = {target.rpartition(".")[0] for _, target in targets(OmegaConf.to_container(cfg, resolve=True))}
-    own = sorted(module for module in named if module.partition(".")[0] != "pickplace")
-    return f" trust=[{','.join(own)}]" if own else ""
+def trust_needed(node, among: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """The modules that have to be trusted to load a run of this config, resolved, again."""
+    if isinstance(node, dict):
+        if isinstance(target := node.get("_target_"), str):
+            among = tuple({*among, target.rpartition(".")[0]})
+        node = list(node.values())
+    if isinstance(node, list):
+        for value in node:
+            among = trust_needed(value, among)
+    return tuple(sorted(module for module in among if _may_be_own(module)))
 
 
 #: What every config of a training has.
@@ -199,6 +207,7 @@ TRAINED_WITH = (
     "items._target_",
     "model.actor._target_",
     "algo.mask_infeasible",
+    "seed",
 )
 
 
@@ -214,11 +223,9 @@ def trusted(content: dict, trust=()) -> DictConfig:
     """
     own = own_modules(trust)
     try:
-        # What is written, and what it leads to: one without the other could hide something.
-        refuse_resolvers(content)
-        refuse_foreign_targets(content, own)
+        refuse_interpolations(content)
+        refuse_foreign_targets(content, own)  # as it is written, and below as it is meant
         cfg = OmegaConf.create(content)
-        refuse_references_to_parts(cfg)
         refuse_foreign_targets(OmegaConf.to_container(cfg, resolve=True), own)
         missing = [key for key in TRAINED_WITH if OmegaConf.select(cfg, key) is None]
     except (OmegaConfBaseException, RecursionError, AttributeError, TypeError) as error:
@@ -226,4 +233,6 @@ def trusted(content: dict, trust=()) -> DictConfig:
         raise ValueError(f"The checkpoint's config cannot be read ({reason}).") from error
     if missing:
         raise ValueError(f"The checkpoint's config has no {missing[0]}; expected one that a training wrote.")
+    if not isinstance(cfg.seed, int) or isinstance(cfg.seed, bool):
+        raise ValueError(f"seed={reprlib.repr(cfg.seed)}: the checkpoint is refused; expected a whole number.")
     return cfg

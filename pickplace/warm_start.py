@@ -4,7 +4,7 @@ from enum import Enum
 
 import torch
 import torch.nn.functional as F
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -56,7 +56,8 @@ class WarmStart:
             trained = None
             if cfg.checkpoint is not None:
                 state, saved = checkpoint.read(checkpoint.locate(str(cfg.checkpoint)))
-                trained = (trusted(saved["config"], trust), state, saved["config"]["env"])
+                theirs = trusted(saved["config"], trust)
+                trained = (theirs, state, OmegaConf.to_container(theirs.env, resolve=True))
             try:
                 self._parts = planner_parts(cfg.teacher, rules, items, trained)
             except ValueError as error:

@@ -164,8 +164,9 @@ def test_without_a_mask_every_grasp_has_the_score_of_its_footprint(rotations, ef
                 assert (got == 7.0).all()
 
 
-@pytest.mark.parametrize(("num_envs", "least", "most"), [(2, 1, 64), (40, 65, 4096), (300, 4097, 10**6)])
+@pytest.mark.parametrize(("num_envs", "least", "most"), [(1, 1, 64), (40, 65, 4096), (300, 4097, 10**6)])
 def test_bfloat16_is_close_and_any_number_of_rows_will_do(num_envs, least, most, monkeypatch):
+    torch.manual_seed(1)
     env = PickPlaceEnv(num_envs=num_envs, masks=("outcome",))
     state = env.rollout(4, break_when_any_done=False)[:, -1]
     exact = fcn_grasp(env.rules, True, head_std=1.0, compute_dtype="float32")

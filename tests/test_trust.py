@@ -1,6 +1,7 @@
 """What a checkpoint's config may make: pickplace's own, each in its place, and what a user says he trusts."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from pickplace import Planner, checkpoint, config
+from pickplace.resume import refuse_links, resumed_config
 from pickplace.trust import TRAINED_WITH, own_modules, refuse_foreign_targets, saved_form, trust_needed, trusted
 
 SHIPPED = config.PACKAGE / "pretrained" / "r4"
@@ -102,6 +104,9 @@ HIDDEN = {
     "a reference to a part": {"model__actor__filters": "${algo}"},
     "a list of parts": {"model__actor__filters": "${parts}", "parts": [[1], [2]]},
     "a reference as what is made": {"model__actor___target_": "${evil}", "evil": "os.system"},
+    "a reference to a reference": {"model__actor__filters": "${a}", "a": "${seed}"},
+    "a reference through a reference": {"model__actor__filters": "${a.seed}", "a": "${env}"},
+    "a long text": {"model__actor__filters": "${text}", "text": "x" * 1001},
     "a long list": {"model__actor__filters": "${many}", "many": list(range(101))},
     "copies of copies": {f"a{n}": {"x": f"${{a{n - 1}}}", "y": f"${{a{n - 1}}}"} for n in range(1, 60)} | {"a0": {}},
     "a circle": {"model__actor__filters": "${model.actor.filters}"},
@@ -211,9 +216,83 @@ def test_what_is_saved(monkeypatch):
 
 
 def test_what_to_say_to_load_a_run_again():
-    assert trust_needed(composed()) == ""
-    changes = ["model.actor._target_=my.nets.Net", "items._target_=mine.Items", "+algo.more._target_=mine.Items"]
-    assert trust_needed(composed(*changes)) == " trust=[mine,my.nets]"
+    assert trust_needed(saved_form(composed())) == ()
+    changes = {"model__actor___target_": "my.nets.Net", "items___target_": "mine.Items"}
+    changes["algo__more"] = [{"_target_": "mine.Items"}, {"_target_": "torch.nn.ReLU"}]
+    assert trust_needed(changed(**changes)) == ("mine", "my.nets")
+
+
+def test_references_that_double_at_every_step_are_refused_at_once():
+    """OmegaConf would follow 2^35 of them."""
+    steps = {"p0": "${Z}", "q0": "${Y}", "Z": {}, "Y": {}}
+    for i in range(1, 36):
+        steps |= {f"p{i}": f"${{q{i - 1}.x{i - 1}}}", f"q{i}": f"${{p{i - 1}.x{i - 1}}}"}
+    for i in range(35):
+        steps["Z"][f"x{i}"], steps["Y"][f"x{i}"] = f"${{q{i}}}", f"${{p{i}}}"
+    with pytest.raises(ValueError, match="expected a reference to"):
+        trusted(changed(**steps, a="${p35}"))
+
+
+def test_parts_of_pickplace_within_what_is_trusted(mine):
+    inner = {"_target_": "pickplace.items.Kinds", "kinds": [[1, 1, 1]]}
+    trusted(changed(items={"_target_": "mine.make", "base": inner}), ["mine"])
+    with pytest.raises(ValueError, match="items.base._target_='os.system'"):
+        trusted(changed(items={"_target_": "mine.make", "base": {"_target_": "os.system"}}), ["mine"])
+
+
+def test_nobody_is_told_to_trust_an_installed_package():
+    with pytest.raises(ValueError, match=r"expected one of [^;]*\.$"):
+        trusted(changed(model__actor___target_="sympy.sympify"))
+
+
+@pytest.mark.parametrize("seed", ["\x1b[31m", None, True, 1.5])
+def test_a_seed_is_a_whole_number(seed):
+    with pytest.raises(ValueError, match="seed"):
+        trusted(changed(seed=seed))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "harmless"),
+    [
+        ("collector.address", "ray://192.0.2.1:1", "local"),
+        ("logger.uri", "http://192.0.2.1", "null"),
+        ("logger.offline", False, "true"),
+    ],
+)
+def test_a_checkpoint_reaches_other_machines_only_if_the_user_says_so_again(key, value, harmless):
+    content = changed(**{key.replace(".", "__"): value})
+    facts = {"config": content, "curriculum": {}, "frames": 5, "iteration": 1, "best": 0.5, "latest": {}}
+    with pytest.raises(ValueError, match=f"{key}={value}: the checkpoint would reach out .* or {key}={harmless}"):
+        resumed_config("run", facts, [])
+    assert OmegaConf.select(resumed_config("run", facts, [f"{key}={harmless}"]), key) != value
+
+
+@pytest.mark.parametrize(
+    "name", ["train.log", ".metrics.csv.new", "report.html", "checkpoints/best", ".hydra/x", "pipe"]
+)
+def test_a_run_folder_with_links_is_not_resumed(name, tmp_path):
+    for folder in ("run/checkpoints", "run/.hydra"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "run" / "metrics.csv").write_text("frames\n")
+    refuse_links(tmp_path / "run")
+    if name == "pipe":
+        os.mkfifo(tmp_path / "run" / name)
+    else:
+        (tmp_path / "run" / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ValueError, match=f"{name}: a link or no regular file"):
+        refuse_links(tmp_path / "run")
+
+
+def test_notes_of_a_run_are_read_as_they_stand(tmp_path, monkeypatch):
+    monkeypatch.setenv("MY_SECRET", "secret")
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / ".hydra" / "overrides.yaml").write_text("- seed=1\n- a='${oc.env:MY_SECRET}'\n- [nested]\n- 5\n")
+    assert config.begun_with(tmp_path) == ["seed=1", "a='${oc.env:MY_SECRET}'"]
+    assert config.begun_with(tmp_path / "nowhere") == []
+
+
+def test_errors_hold_nothing_that_a_terminal_obeys():
+    assert config.sentence(ValueError("bad \x1b[31m key\x07")) == "bad \\x1b[31m key\\x07"
 
 
 @pytest.mark.parametrize("key", TRAINED_WITH)
