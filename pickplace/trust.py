@@ -211,6 +211,13 @@ TRAINED_WITH = (
 )
 
 
+#: Where a large number alone would take all memory or start processes without end, the largest that is accepted.
+MOST = {
+    "env.bin_size": 2_000, "env.tote_size": 2_000, "env.effector_size": 2_000, "env.num_envs": 65_536,
+    "collector.workers": 1_024,
+}  # fmt: skip
+
+
 def trusted(content: dict, trust=()) -> DictConfig:
     """A checkpoint's config, once it is known to be one of a training and to make nothing unexpected.
 
@@ -233,6 +240,11 @@ def trusted(content: dict, trust=()) -> DictConfig:
         raise ValueError(f"The checkpoint's config cannot be read ({reason}).") from error
     if missing:
         raise ValueError(f"The checkpoint's config has no {missing[0]}; expected one that a training wrote.")
+    for key, most in MOST.items():
+        value = OmegaConf.select(cfg, key)
+        for number in value if isinstance(value, ListConfig) else [value]:
+            if isinstance(number, (int, float)) and number > most:
+                raise ValueError(f"{key}={reprlib.repr(number)}: the checkpoint is refused; expected at most {most:,}.")
     if not isinstance(cfg.seed, int) or isinstance(cfg.seed, bool):
         raise ValueError(f"seed={reprlib.repr(cfg.seed)}: the checkpoint is refused; expected a whole number.")
     return cfg

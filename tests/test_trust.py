@@ -245,6 +245,18 @@ def test_nobody_is_told_to_trust_an_installed_package():
         trusted(changed(model__actor___target_="sympy.sympify"))
 
 
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        ("env__bin_size", [10**6, 10**6, 1]), ("env__tote_size", [6, 6, 10**6]), ("env__effector_size", [1e9, 3]),
+        ("env__num_envs", 10**9), ("collector__workers", 4096),
+    ],
+)  # fmt: skip
+def test_numbers_that_would_take_all_memory_are_refused(place, value):
+    with pytest.raises(ValueError, match=f"{place.replace('__', '.')}=.*: the checkpoint is refused; expected at most"):
+        trusted(changed(**{place: value}))
+
+
 @pytest.mark.parametrize("seed", ["\x1b[31m", None, True, 1.5])
 def test_a_seed_is_a_whole_number(seed):
     with pytest.raises(ValueError, match="seed"):
