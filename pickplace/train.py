@@ -25,6 +25,7 @@ from pickplace.geometry import Failure
 from pickplace.models.actors import Policy, as_actor, as_collection_policy, check_sizes
 from pickplace.report import learning_curve
 from pickplace.resume import (
+    AT_HOME,
     COUNTERS,
     StopRequest,
     claim,
@@ -267,7 +268,7 @@ def check_settings(cfg: DictConfig) -> None:
 
 
 def loadable(cfg: DictConfig) -> tuple[dict, str]:
-    """The config as checkpoints hold it, and what has to be said to load one: `` trust=[...]``, or nothing.
+    """The config as checkpoints hold it, and what has to be said to resume one, such as `` trust=[...]``; or nothing.
 
     What could be saved but never be loaded is told now, not after hours.
     """
@@ -277,7 +278,9 @@ def loadable(cfg: DictConfig) -> tuple[dict, str]:
         trusted(content, own)
     except ValueError as error:
         log.warning("checkpoints of this run will not be loaded again: %s", error)
-    return content, f" trust=[{','.join(own)}]" if own else ""
+    said = {key: OmegaConf.select(cfg, key) for key in AT_HOME}
+    words = [f" {key}={value}" for key, value in said.items() if value not in AT_HOME[key]]
+    return content, "".join([f" trust=[{','.join(own)}]" if own else "", *words])
 
 
 def make_losses(algo: DictConfig, policy: Policy, critic: ValueOperator) -> tuple[GAE, A2CLoss | ClipPPOLoss]:

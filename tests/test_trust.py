@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from pickplace import Planner, checkpoint, config
 from pickplace.resume import refuse_links, resumed_config
+from pickplace.train import loadable
 from pickplace.trust import TRAINED_WITH, own_modules, refuse_foreign_targets, saved_form, trust_needed, trusted
 
 SHIPPED = config.PACKAGE / "pretrained" / "r4"
@@ -277,6 +278,8 @@ def test_a_checkpoint_reaches_other_machines_only_if_the_user_says_so_again(key,
     with pytest.raises(ValueError, match=f"{key}={value}: the checkpoint would reach out .* or {key}={harmless}"):
         resumed_config("run", facts, [])
     assert OmegaConf.select(resumed_config("run", facts, [f"{key}={harmless}"]), key) != value
+    _, again = loadable(OmegaConf.create(content))  # what a stopped run prints is enough
+    assert OmegaConf.select(resumed_config("run", facts, again.split()), key) == value
 
 
 @pytest.mark.parametrize(
