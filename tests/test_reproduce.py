@@ -122,6 +122,27 @@ def test_every_figure_is_drawn_from_few_results_and_from_none(tmp_path):
         assert (tmp_path / f"{name}.svg").read_text().startswith("<?xml")
 
 
+def test_the_numbers_behind_a_figure_are_those_of_its_cells():
+    cell = next(cell for cell in PARTS["rl_methods"] if cell.name == "fcn4d-R4-s0-6x6x10-K1")
+    curve = {"validation_frames": [100], "validation_occupancy": [0.3]}
+    found = {cell.name: result(0.21, method="fcn4d", versions={}), cell.training: {"frames": 100, "curve": curve}}
+    behind = results.behind(PARTS["rl_methods"], found)
+    assert behind == {
+        "cells": {
+            cell.name: {
+                "training": "fcn4d-R4-s0",
+                "method": "fcn4d",
+                "occupancy": {"mean": 0.21, "ci95": [0.21 - 0.01, 0.21 + 0.01]},
+                "episodes": 100,
+                "latency_ms": {"p50": 2.0},
+            }
+        },
+        "trainings": {"fcn4d-R4-s0": {"frames": 100, "curve": curve}},
+    }
+    assert json.loads(run.one_line_a_list(behind)) == behind
+    assert results.behind(PARTS["rl_methods"], {}) == {"cells": {}, "trainings": {}}
+
+
 def test_a_plan_of_single_cells_can_be_executed_but_where_the_effector_collides():
     """A 4x4x2 tote, items 1x1x1 in reading order: the plan fills the first layer; walls are in the way of none."""
     from pickplace import PickPlaceEnv

@@ -31,18 +31,22 @@ METHODS = {
 TOTES = ("6x6x5", "6x6x10", "10x10x5", "10x10x10", "30x30x5", "30x30x10")
 
 
+def trained_for(method: str) -> tuple[str, str]:
+    """A cell's method, and what it was trained for where its name ends with that: ``("fcn4d", "tall")``."""
+    ends = (end for end in ("small", "mixed", "tall", "deep_bin") if method.endswith(f"_{end}"))
+    end = next(ends, "")
+    return method.removesuffix(f"_{end}"), end
+
+
 def label(method: str) -> str:
     """What to call a method of a cell."""
-    for end in ("_small", "_mixed", "_tall", "_deep_bin"):
-        method = method.removesuffix(end)
+    method, _ = trained_for(method)
     return METHODS.get(method, (method,))[0]
 
 
 def style(method: str) -> dict:
     """How a method is drawn in every figure."""
-    for end in ("_small", "_mixed", "_tall", "_deep_bin"):
-        method = method.removesuffix(end)
-    name, colour, marker = METHODS[method]
+    name, colour, marker = METHODS[trained_for(method)[0]]
     return {"label": name, "color": colour, "marker": marker}
 
 
@@ -284,6 +288,7 @@ def latency(results, path) -> bool:
     if not axes.lines:
         return False
     axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.set_xlabel("milliseconds a decision (median, one core)")
     axes.set_ylabel("occupancy, 27 kinds of items, 6x6x5, R=4")
     legend(figure, [axes], ncols=4)
@@ -292,24 +297,27 @@ def latency(results, path) -> bool:
 
 PRESETS = {
     "items=mixed, 6x6x5": "mixed-6x6x5", "items=mixed, 8x8x8": "mixed-8x8x8",
-    "items=tall, 6x6x5": "tall-6x6x5", "env=deep_bin, 6x6x5": "deep_bin-6x6x5",
+    "items=tall, 6x6x5": "tall-6x6x5", "items=tall, 8x8x8": "tall-8x8x8", "env=deep_bin, 6x6x5": "deep_bin-6x6x5",
 }  # fmt: skip
 
 
 def presets(results, path) -> bool:
-    figure, (axes,) = canvas(8.5, 4.2)
+    figure, (axes,) = canvas(9, 4.5)
     rows = [
         ("fcn_grasp", lambda kind, tote: f"fcn_grasp_{kind}-{tote}"),
         ("lookahead", lambda kind, tote: f"lookahead_{kind}-{tote}"),
         ("joint_dbl", lambda kind, tote: f"joint_dbl-{kind}-{tote}"),
+        ("individual_heuristic_cells", lambda kind, tote: f"individual_heuristic_cells-{kind}-{tote}"),
         ("individual_heuristic", lambda kind, tote: f"individual_heuristic-{kind}-{tote}"),
+        ("individual_rl", lambda kind, tote: f"individual_rl_{kind}-{tote}-K10"),
         ("fcn4d", lambda kind, tote: f"fcn4d_{kind}-{tote}-K10"),
+        ("typical", lambda kind, tote: f"typical_{kind}-{tote}-K10"),
         ("mcts_outcomes", lambda kind, tote: f"mcts-{kind}-{tote}-mask_true"),
         ("random", lambda kind, tote: f"random-{kind}-{tote}"),
     ]
     for number, (method, name) in enumerate(rows):
         found = [results.get(name(*preset.split("-"))) for preset in PRESETS.values()]
-        points(axes, np.arange(len(PRESETS)) + 0.1 * (number - 3), found, method, line="")
+        points(axes, np.arange(len(PRESETS)) + 0.08 * (number - 4.5), found, method, line="")
     if not axes.lines:
         return False
     axes.set_xticks(range(len(PRESETS)), PRESETS)

@@ -8,7 +8,7 @@ import cells as definitions
 import claims
 import figures
 from claims import difference
-from run import RESULTS
+from run import RESULTS, one_line_a_list
 
 ROOT = RESULTS.parents[1]
 INDICATIVE = 20  # episodes below which a figure only indicates
@@ -38,6 +38,7 @@ def table(cells, results) -> list[str]:
     lines = ["| method | cell | occupancy | episodes | a decision | budget |", "|---|---|---|---|---|---|"]
     for cell in cells:
         labels = " ".join(definitions.AXES[axis][0].format(value) for axis, value in cell.axes)
+        labels = f"{figures.trained_for(cell.method)[1].removesuffix('small')} {labels}".strip()
         result = results.get(cell.name)
         lines.append(
             f"| {figures.label(cell.method)} | {labels} | {occupancy(result)} | {episodes(result)} | "
@@ -103,6 +104,32 @@ def no_better_than_random(result, results) -> str:
     return ""
 
 
+#: What a figure draws of a result: all but what each episode gave, which the cell's own JSON holds.
+DRAWN = ("method", "axes", "command", "occupancy", "episodes", "latency_ms", "attempted")
+DRAWN_OF_PLANS = ("occupancy_planned", "share_executed", "placements", "plans_executed_whole")
+DRAWN_OF_TRAININGS = ("command", "frames", "cpu_seconds", "curve", "attempted")
+
+
+def behind(cells, results) -> dict:
+    """The numbers behind a figure: ``{"cells": {name: ...}, "trainings": {name: ...}}``, of what has been computed."""
+
+    def some(name, keys):
+        found = {key: results[name][key] for key in keys if key in results[name]}
+        if "occupancy" in found:
+            found["occupancy"] = {key: found["occupancy"][key] for key in ("mean", "ci95")}
+        return found
+
+    trainings = dict.fromkeys(cell.training for cell in cells if cell.training in results)
+    return {
+        "cells": {
+            cell.name: {"training": cell.training, **some(cell.name, DRAWN + DRAWN_OF_PLANS)}
+            for cell in cells
+            if cell.name in results
+        },
+        "trainings": {name: some(name, DRAWN_OF_TRAININGS) for name in trainings},
+    }
+
+
 def main() -> None:
     _, parts = definitions.read()
     results = load()
@@ -115,7 +142,14 @@ def main() -> None:
         text.append(f"## {title}\n")
         if draw(results, RESULTS / "figures" / name):
             text.append(f"![{title}](results/figures/{name}.png)\n")
-            text.append(f"[SVG](results/figures/{name}.svg); behind it: `benchmarks/reproduce/{name}.yaml`.\n")
+            numbers = behind(parts[name], results)
+            if name == "optimum":
+                numbers["optimum"] = {f"{tote}-R{r}": value for (tote, r), value in figures.OPTIMA.items()}
+            (RESULTS / "figures" / f"{name}.json").write_text(one_line_a_list(numbers))
+            text.append(
+                f"[SVG](results/figures/{name}.svg), [JSON](results/figures/{name}.json); what it consists of: "
+                f"`benchmarks/reproduce/{name}.yaml`.\n"
+            )
         if name == "placement_only":
             text += figures.placement_table(parts[name], results)
         else:

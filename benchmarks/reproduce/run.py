@@ -258,17 +258,20 @@ def write(cell: Cell, minutes: float, result: dict) -> str:
     facts = {"commit": commit(), "versions": versions()} if cell.kind == "train" or "attempted" in result else {}
     path = result_of(cell)
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({**head, **facts, **result}, indent=1)
-    # Lists of numbers on one line each; the pattern must not backtrack on long ones that hold something else.
-    numbers = re.compile(r"\[\s+(-?[\d.e+-]+(?:,\s+-?[\d.e+-]+)*)\s+\]")
-    text = numbers.sub(lambda found: f"[{' '.join(found[1].split())}]", text)
-    path.with_suffix(".part").write_text(text + "\n")
+    path.with_suffix(".part").write_text(one_line_a_list({**head, **facts, **result}))
     path.with_suffix(".part").replace(path)
     if "attempted" in result:
         return f"attempted: {result['attempted']}"
     if cell.kind == "train":
         return f"{result['frames']:,} frames in {result['cpu_seconds']:.0f} s"
     return f"{result['occupancy']['mean']:.4f}, {result['episodes']} episodes" if "occupancy" in result else "done"
+
+
+def one_line_a_list(content: dict) -> str:
+    """JSON, indented, with a list of numbers on one line."""
+    # The pattern must not backtrack on long lists that hold something else.
+    numbers = re.compile(r"\[\s+(-?[\d.e+-]+(?:,\s+-?[\d.e+-]+)*)\s+\]")
+    return numbers.sub(lambda found: f"[{' '.join(found[1].split())}]", json.dumps(content, indent=1)) + "\n"
 
 
 def command_of(cell: Cell, result: dict | None = None) -> str:
