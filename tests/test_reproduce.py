@@ -172,7 +172,10 @@ def test_a_plan_of_single_cells_can_be_executed_but_where_the_effector_collides(
     assert placement_only.replay(env, floating)[0][0] == "rests_elsewhere"
 
 
-@pytest.mark.parametrize("path", sorted((FOLDER.parents[1] / "docs" / "results").rglob("*.json")), ids=lambda p: p.stem)
+KEPT = [*run.RESULTS.glob("cells/*.json"), *run.RESULTS.glob("trainings/*.json")]
+
+
+@pytest.mark.parametrize("path", sorted(KEPT), ids=lambda path: path.stem)
 def test_a_result_that_is_kept_belongs_to_a_cell_of_today(path):
     found = json.loads(path.read_text())
     every = {cell.name: cell for part in PARTS.values() for cell in part} | TRAININGS
@@ -180,6 +183,13 @@ def test_a_result_that_is_kept_belongs_to_a_cell_of_today(path):
     assert all(word in found["command"] for word in every[path.stem].overrides if "evaluation." not in word)
     assert "attempted" in found or "curve" in found or 0 <= found["occupancy"]["mean"] <= 1
     assert "/tmp" not in path.read_text() and "/home" not in path.read_text()
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_figure_was_drawn_from_the_results_that_are_kept(name):
+    drawn = json.loads((run.RESULTS / "figures" / f"{name}.json").read_text())
+    kept = results.behind(PARTS[name], results.load())
+    assert {key: drawn[key] for key in kept} == kept, "make results"
 
 
 def test_a_command_that_uses_up_its_budget_is_told_to_end(tmp_path):
