@@ -140,16 +140,14 @@ def main() -> None:
     text += ["## What the paper claims, and what we find\n", *claims.table(results), ""]
     for name, (title, draw) in figures.FIGURES.items():
         text.append(f"## {title}\n")
+        numbers = behind(parts[name], results)
+        if name == "optimum":
+            numbers["optimum"] = {f"{tote}-R{r}": value for (tote, r), value in figures.OPTIMA.items()}
+        (RESULTS / "figures" / f"{name}.json").write_text(one_line_a_list(numbers))
         if draw(results, RESULTS / "figures" / name):
             text.append(f"![{title}](results/figures/{name}.png)\n")
-            numbers = behind(parts[name], results)
-            if name == "optimum":
-                numbers["optimum"] = {f"{tote}-R{r}": value for (tote, r), value in figures.OPTIMA.items()}
-            (RESULTS / "figures" / f"{name}.json").write_text(one_line_a_list(numbers))
-            text.append(
-                f"[SVG](results/figures/{name}.svg), [JSON](results/figures/{name}.json); what it consists of: "
-                f"`benchmarks/reproduce/{name}.yaml`.\n"
-            )
+            text.append(f"[SVG](results/figures/{name}.svg), [JSON](results/figures/{name}.json);")
+            text.append(f"what it consists of: `benchmarks/reproduce/{name}.yaml`.\n")
         if name == "placement_only":
             text += figures.placement_table(parts[name], results)
         else:
