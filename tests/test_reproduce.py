@@ -51,34 +51,120 @@ def test_an_entry_with_a_misspelt_key(entry):
         cells.expand(entry, "train")
 
 
-def result(mean, **more):
-    """Ten episodes, of which every other one is a little better."""
-    episodes = [mean + 0.001 * (number % 2) for number in range(10)]
-    occupancy = {"mean": mean, "ci95": [mean - 0.01, mean + 0.01], "per_episode": episodes}
-    return {"occupancy": occupancy, "episodes": 100, "latency_ms": {"p50": 2.0}, **more}
+def result(mean, episodes=100, **more):
+    """Episodes of which every other one is a little better."""
+    each = [mean + 0.001 * (number % 2) for number in range(episodes)]
+    occupancy = {"mean": mean, "ci95": [mean - 0.01, mean + 0.01], "per_episode": each}
+    return {"occupancy": occupancy, "episodes": episodes, "latency_ms": {"p50": 2.0}, **more}
 
 
-def test_claims_follow_the_figures():
-    found = {f"fcn4d-R3-s0-6x6x5-K{k}": result(mean) for k, mean in ((1, 0.8), (10, 0.9), (50, 0.905))}
-    assert claims.k_settles(found)[0] is True
-    found["fcn4d-R3-s0-6x6x5-K50"] = result(0.95)
-    assert claims.k_settles(found)[0] is False
-    assert claims.k_settles({}) == (None, "")
+def training(level, *validations, tote="6,6,5", **more):
+    """A training that came so high, and what it validated every 100 frames."""
+    frames = [100 * (number + 1) for number in range(len(validations))]
+    curve = {"level": [1, level], "validation_frames": frames, "validation_occupancy": [*validations]}
+    return {"curve": curve, "frames": 1000, "command": f"train env.tote_size=[{tote}] seed=0", **more}
+
+
+def words(groups):
+    return {group.name: group.word() for group in groups}
+
+
+def test_k_settles_where_ten_are_better_than_one_and_fifty_no_better():
+    def claim(one, ten, fifty):
+        means = {1: one, 10: ten, 50: fifty}
+        return words(claims.k_settles({f"fcn4d-R3-s0-6x6x5-K{k}": result(mean) for k, mean in means.items()}))
+
+    assert claim(0.8, 0.9, 0.905) == {"fcn_grasp_unmasked": "not known yet", "fcn4d": "yes"}
+    assert claim(0.8, 0.9, 0.95)["fcn4d"] == "in part (1 of 2, against 1)"
+    assert claim(0.9, 0.9, 0.9)["fcn4d"] == "yes so far (1 of 2)"  # it is settled at K=1
+
+
+def test_mcts_is_far_behind_where_a_trained_policy_is():
     tree = {"mcts-R4-6x6x5-mask_false": result(0.3)}
-    assert claims.mcts_far_behind(tree) == (None, "")  # behind what?
-    assert claims.mcts_far_behind(tree | {"fcn4d-R4-s0-6x6x5-K1": result(0.5)})[0] is True
-    assert claims.mcts_far_behind(tree | {"fcn4d-R4-s0-6x6x5-K1": result(0.35)})[0] is False
-    curve = {"validation_occupancy": [0.3, 0.2], "validation_frames": [1, 2]}
-    found = {"typical-6x6x5-s0": {"curve": curve}, "fcn4d-R4-s0": {"curve": {**curve, "validation_occupancy": [0.7]}}}
-    assert claims.typical_learns_poorly(found)[0] is True
+    assert set(words(claims.mcts_far_behind(tree)).values()) == {"not known yet"}  # behind what?
+    ours = {"training": "t"}
+    for mean, level, word in ((0.5, 5, "yes so far (1 of 6)"), (0.35, 5, "no (1 of 6)"), (0.35, 2, "undecided")):
+        found = tree | {"fcn4d-R4-s0-6x6x5-K1": result(mean, **ours), "t": training(level)}
+        assert words(claims.mcts_far_behind(found))["fcn4d"] == word
+    assert "fcn4d came to a tote height of 2 of 5 in 1,000 frames" in claims.verdict(claims.mcts_far_behind(found))
 
 
-def test_a_difference_within_the_noise_decides_nothing():
+def test_what_an_unfinished_training_gives_does_not_decide_how_sizes_compare():
+    cells = {"fcn4d-R4-s0-6x6x5-K10": 0.5, "fcn4d-R4-s0-6x6x10-K10": 0.3}
+    found = {name: result(mean, training="t") for name, mean in cells.items()}
+    assert words(claims.high_tote_is_harder(found | {"t": training(5)}))["fcn4d"] == "yes"
+    assert words(claims.high_tote_is_harder(found | {"t": training(2)}))["fcn4d"] == "undecided"
+    assert words(claims.high_tote_is_harder(found | {"t": training(5, tote="6,6,10")}))["fcn4d"] == "undecided"
+
+
+def test_typical_learns_poorly_where_all_its_seeds_do_after_as_many_frames():
+    found = {f"typical-6x6x5-s{seed}": training(1, 0.1, 0.2, 0.9) for seed in range(3)}
+    found |= {f"fcn4d-R4-s{seed}": training(1, 0.1, 0.3) for seed in range(3)}
+    assert words(claims.typical_learns_poorly(found)) == {"typical": "yes"}  # 0.2 against 0.3; the 0.9 came later
+    found["fcn4d-R4-s1"] = training(1, 0.1, 0.24)
+    assert words(claims.typical_learns_poorly(found)) == {"typical": "undecided"}
+    assert words(claims.typical_learns_poorly({"typical-6x6x5-s0": training(1, 0.1)})) == {"typical": "not known yet"}
+
+
+def individual(gain_small, gain_wide, alone=0.5):
+    """R=3, K=10: what joint planning packs more than each individual method, at 6x6x5 and 10x10x5."""
+    found = {}
+    for tote, gain in (("6x6x5", gain_small), ("10x10x5", gain_wide)):
+        found[f"individual_rl-R3-s0-{tote}-K10"] = result(alone)
+        found[f"individual_heuristic-R3-{tote}"] = result(alone - 0.1)
+        found[f"individual_heuristic_cells-R3-{tote}"] = result(alone + 0.3)
+        found[f"fcn_grasp_unmasked-R3-s0-{tote}-K10"] = result(alone + gain)
+    return found
+
+
+def test_joint_planning_is_held_against_the_best_individual_method():
+    found = individual(0.2, 0.1)
+    assert words(claims.joint_beats_individual(found))["fcn_grasp_unmasked"] == "yes so far (2 of 24)"
+    assert words(claims.joint_beats_every_cell(found))["fcn_grasp_unmasked"] == "no (2 of 24)"
+    assert words(claims.most_on_small_totes(found)) == {"fcn_grasp_unmasked": "yes so far (1 of 16)"}
+    assert words(claims.most_on_small_totes(individual(0.1, 0.2))) == {"fcn_grasp_unmasked": "no (1 of 16)"}
+    behind = individual(-0.1, -0.2)
+    assert words(claims.joint_beats_individual(behind))["fcn_grasp_unmasked"] == "no (2 of 24)"
+    assert words(claims.most_on_small_totes(behind)) == {"fcn_grasp_unmasked": "undecided"}  # to lose less is no gain
+    del found["individual_heuristic-R3-6x6x5"]  # the best of what? attempted in vain is an answer, not yet is none
+    assert words(claims.joint_beats_individual(found))["fcn_grasp_unmasked"] == "yes so far (1 of 24)"
+    found["individual_heuristic-R3-6x6x5"] = {"attempted": "hours"}
+    assert words(claims.joint_beats_individual(found))["fcn_grasp_unmasked"] == "yes so far (2 of 24)"
+
+
+def test_a_difference_within_the_noise_or_of_few_episodes_decides_nothing():
     ours, theirs = result(0.5), result(0.5)
     theirs["occupancy"]["per_episode"] = ours["occupancy"]["per_episode"][1:] + [0.5]
-    assert claims.gap({"a": ours, "b": theirs}, "a", "b")[0] is None
-    assert claims.gap({"a": result(0.6), "b": theirs}, "a", "b")[0] is True
-    assert claims.gap({"a": ours}, "a", "b") is None
+    assert claims.compare({"a": ours, "b": theirs}, "", "a", "b").verdict is None
+    assert claims.compare({"a": result(0.6), "b": theirs}, "", "a", "b").verdict is True
+    assert claims.compare({"a": result(0.6), "b": theirs}, "", "a", "b", margin=0.2).verdict is False
+    assert claims.compare({"a": ours}, "", "a", "b") is None
+    for episodes in (1, 2, 19):
+        comparison = claims.compare({"a": result(0.6, episodes), "b": theirs}, "it", "a", "b")
+        assert comparison.verdict is None and str(comparison).startswith(f"it ({episodes} episodes) +0.1")
+
+
+def test_a_large_tote_that_few_episodes_filled_decides_nothing():
+    name = "fcn_grasp-R4-s0-30x30x5-Kall"
+    assert words(claims.large_totes_work({name: result(0.9)}))["fcn_grasp"] == "yes so far (1 of 2)"
+    assert words(claims.large_totes_work({name: result(0.79)}))["fcn_grasp"] == "undecided"
+    assert words(claims.large_totes_work({name: result(0.7)}))["fcn_grasp"] == "no (1 of 2)"
+    assert words(claims.large_totes_work({name: result(0.9, episodes=5)}))["fcn_grasp"] == "undecided"
+
+
+def test_every_claim_has_a_row_with_and_without_results():
+    for found in ({}, results.load()):
+        rows = claims.table(found)[2:]
+        assert len(rows) == len(claims.CLAIMS) and all(row.count("|") == 4 for row in rows)
+
+
+def test_seeds_are_drawn_as_one_point_with_the_range_of_both():
+    found = {"m-s0": result(0.5), "m-s2": result(0.6), "m-s1": {"attempted": "hours"}}
+    point = figures.pooled(found, "m-s*")
+    assert point["seeds"] == 2 and point["occupancy"] == {"mean": 0.55, "ci95": (0.5, 0.6)}
+    assert figures.pooled(found, "m-s0")["occupancy"]["ci95"] == (0.49, 0.51)
+    assert "attempted" in figures.pooled(found, "m-s1")
+    assert figures.pooled(found, "n-s*") is None
 
 
 def test_tables_say_what_is_missing_attempted_and_no_better_than_random():
@@ -109,14 +195,14 @@ def test_tables_say_what_is_missing_attempted_and_no_better_than_random():
 def test_every_figure_is_drawn_from_few_results_and_from_none(tmp_path):
     found = {}
     for name, part in PARTS.items():
-        assert figures.FIGURES[name][1]({}, tmp_path / name) is False
+        assert figures.FIGURES[name][-1]({}, tmp_path / name) is False
         found |= {cell.name: result(0.5 + 0.001 * number) for number, cell in enumerate(part[::2])}
     curve = {"validation_occupancy": [0.3, 0.5], "validation_frames": [100, 200]}
     assert not set(found) & set(TRAININGS)
     found |= {name: {"curve": curve} for name in TRAININGS}
     shares = {key: {"mean": 0.5, "ci95": [0.4, 0.6]} for key in ("occupancy_planned", "occupancy")}
     found["py3dbp-R1-6x6x5"] = {"kind": "placement_only", "placements": {"executed": 3, "unstable": 1}, **shares}
-    for name, (_, draw) in figures.FIGURES.items():
+    for name, (_, _, draw) in figures.FIGURES.items():
         assert draw(found, tmp_path / name) is True
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
         assert (tmp_path / f"{name}.svg").read_text().startswith("<?xml")
@@ -210,6 +296,29 @@ def test_a_training_is_taken_up_where_its_budget_ended(tmp_path, monkeypatch):
     assert again["frames"] > first["frames"] and again["cpu_seconds"] > first["cpu_seconds"]
     assert again["curve"]["frames"][-1] == again["frames"]
     assert run.checkpoint_of("tiny").name == "last"  # it was never validated
+
+
+def test_what_a_smaller_budget_cut_short_is_computed_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "RESULTS", tmp_path)
+    trained = cells.Cell("t", "train", (), "t", ())
+    tested = cells.Cell("e", "evaluate", ("evaluation.episodes=50",), "e", (), "t")
+
+    def done(cell, minutes, **result):
+        path = run.result_of(cell)
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps(result))
+        return run.is_done(cell, minutes, {"t": trained})
+
+    assert not run.is_done(trained, 60, {})
+    assert done(trained, 60, budget_minutes=60, frames=10, frames_asked=20, cpu_seconds=5)
+    assert not done(trained, 60, budget_minutes=10, frames=10, frames_asked=20, cpu_seconds=5)
+    assert not done(trained, 60, budget_minutes=10, attempted="hours")
+    assert done(trained, 60, budget_minutes=10, frames=20, frames_asked=20, cpu_seconds=5)
+    assert done(tested, 60, budget_minutes=10, episodes=50)
+    assert not done(tested, 60, budget_minutes=10, episodes=49)
+    assert done(tested, 10, budget_minutes=10, episodes=49)
+    assert done(tested, 60, budget_minutes=10, episodes=50, of_training={"frames": 20, "cpu_seconds": 5})
+    assert not done(tested, 60, budget_minutes=10, episodes=50, of_training={"frames": 10, "cpu_seconds": 5})
 
 
 def test_a_failure_that_may_pass_leaves_no_result(tmp_path, monkeypatch):

@@ -3,27 +3,32 @@
 from pathlib import Path
 
 import numpy as np
+import torch
+
+from pickplace.evaluate import confidence95
 
 #: Methods: label, colour (Okabe and Ito's, told apart by colour-blind readers), marker. Ours are filled, filled out.
 METHODS = {
     "fcn_grasp": ("fcn_grasp, mask", "#0072b2", "o"),
     "fcn_grasp_unmasked": ("fcn_grasp, no mask", "#56b4e9", "o"),
     "fcn4d": ("fcn4d (the paper's)", "#d55e00", "s"),
-    "fcn4d_masked": ("fcn4d, mask", "#e69f00", "s"),
+    "fcn4d_masked": ("fcn4d, mask", "#cc79a7", "s"),
     "fcn4d_warm": ("fcn4d, mask, warm start", "#8c5a00", "s"),
     "fcn4d_noclip": ("4D FCN, no clipping", "#cc79a7", "^"),
     "fcn4d_none": ("fcn4d, no curriculum", "#e69f00", "s"),
     "fcn4d_paper": ("fcn4d, curriculum paper", "#009e73", "s"),
-    "typical": ("typical", "#009e73", "v"),
+    "fcn_grasp_high": ("fcn_grasp, trained at 6x6x10", "#0072b2", "o"),
+    "fcn_grasp_noclip": ("fcn_grasp, no clipping", "#cc79a7", "^"),
+    "typical": ("typical", "#7f7f00", "v"),
     "individual_rl": ("individual, RL", "#e69f00", "D"),
     "individual_heuristic": ("individual, heuristic", "#cc79a7", "D"),
     "individual_heuristic_cells": ("individual, heuristic, every cell", "#7a3b69", "d"),
     "joint_dbl": ("joint DBL", "#000000", "P"),
     "mcts": ("MCTS", "#009e73", "X"),
-    "mcts_outcomes": ("MCTS over outcomes", "#44aa99", "X"),
+    "mcts_outcomes": ("MCTS over outcomes", "#332288", "X"),
     "random": ("random, feasible", "#8c8c8c", "x"),
     "uniform": ("uniform, all actions", "#b0b0b0", "+"),
-    "lookahead": ("lookahead", "#d55e00", "o"),
+    "lookahead": ("lookahead", "#56b4e9", "p"),
     "py3dbp": ("py3dbp", "#d55e00", "s"),
     "rectpack": ("rectpack", "#009e73", "s"),
 }
@@ -80,36 +85,85 @@ def legend(figure, axes, **where) -> None:
     handles = {}
     for part in axes:
         handles |= dict(reversed(pair) for pair in zip(*part.get_legend_handles_labels(), strict=True))
-    order = [METHODS[method][0] for method in METHODS if METHODS[method][0] in handles]
-    order = list(dict.fromkeys([*order, *handles]))
+    known = [text for text, *_ in METHODS.values()]
+    order = sorted(handles, key=lambda name: next((i for i, text in enumerate(known) if name.startswith(text)), 99))
     figure.legend(
         [handles[name] for name in order], order, frameon=False, **({"loc": "outside lower center", "ncols": 5} | where)
     )
 
 
-def points(axes, xs, found, method, line="-", **more) -> None:
-    """Means with their intervals; hollow where there are few episodes."""
+def pooled(results, name: str) -> dict | None:
+    """A cell, or with ``s*`` in its name all its seeds as one result; None where there is none.
+
+    The mean is that over seeds; the interval is that over episodes, of each the mean over seeds, widened to the range
+    of the seeds. ``short`` says that a policy's training had less than half of its frames.
+    """
+    names = [name.replace("s*", f"s{seed}") for seed in range(3)] if "s*" in name else [name]
+    there = [results[name] for name in names if name in results]
+    found = [result for result in there if "occupancy" in result]
+    if not found:
+        return there[0] if there else None
+    trained = [results.get(result.get("training"), {}) for result in found]
+    means = np.array([result["occupancy"]["mean"] for result in found])
+    low, high = found[0]["occupancy"]["ci95"]
+    if len(found) > 1:
+        length = min(len(result["occupancy"]["per_episode"]) for result in found)
+        episodes = np.mean([result["occupancy"]["per_episode"][:length] for result in found], 0)
+        low, high = confidence95(torch.tensor(episodes))
+    return {
+        **found[0],
+        "occupancy": {"mean": means.mean(), "ci95": (min(low, *means), max(high, *means))},
+        "episodes": min(result["episodes"] for result in found),
+        "seeds": len(found),
+        "short": any(part.get("frames", 1) < 0.5 * part.get("frames_asked", 1) for part in trained),
+    }
+
+
+def points(axes, xs, results, names, method, line="-", **more) -> None:
+    """Cells' means with their intervals: hollow with few episodes, pale with a short training, an "a" if attempted."""
+    look, found = style(method) | more, [pooled(results, name) for name in names]
+    for x, result in zip(xs, found, strict=True):
+        if result and "attempted" in result:
+            axes.text(x, 0.0, "a", color=look["color"], fontsize=8, ha="center", va="center")
     pairs = [(x, result) for x, result in zip(xs, found, strict=True) if result and "occupancy" in result]
     if not pairs:
         return
-    xs = [x for x, _ in pairs]
-    mean = np.array([result["occupancy"]["mean"] for _, result in pairs])
-    low, high = np.array([result["occupancy"]["ci95"] for _, result in pairs]).T
-    bars = [np.maximum(mean - np.maximum(low, 0), 0), np.maximum(np.minimum(high, 1) - mean, 0)]
-    look = style(method) | more
-    axes.errorbar(xs, mean, yerr=bars, ls=line, lw=1.3, ms=5, capsize=2.5, elinewidth=1, **look)
-    few = [i for i, (_, result) in enumerate(pairs) if result.get("episodes", 100) < 20]
-    if few:
-        hollow = {"marker": look["marker"], "color": "white", "markeredgecolor": look["color"]}
-        axes.plot([xs[i] for i in few], mean[few], ls="", ms=5, zorder=5, **hollow)
+    xs, mean = [x for x, _ in pairs], np.array([result["occupancy"]["mean"] for _, result in pairs])
+    axes.plot(xs, mean, ls=line, lw=1.3, color=look["color"], alpha=0.6)
+    handle = axes.errorbar([], [], ls=line, lw=1.3, ms=5, **look)  # for the legend: not hollow, not pale
+    handle.set_label(look["label"])
+    for x, result in pairs:
+        value, (low, high) = result["occupancy"]["mean"], result["occupancy"]["ci95"]
+        bars = [[max(value - max(low, 0), 0)], [max(min(high, 1) - value, 0)]]
+        axes.errorbar(
+            [x], [value], yerr=bars, ls="", ms=5, capsize=2.5, elinewidth=1, color=look["color"], marker=look["marker"],
+            markerfacecolor="white" if result.get("episodes", 100) < 20 else look["color"],
+            alpha=0.35 if result["short"] else 1.0,
+        )  # fmt: skip
+
+
+def widened(axes) -> None:
+    """An axis of occupancies that widens towards 1, where good methods differ: logarithmic in what is left empty."""
+    least = 1e-3
+    axes.set_yscale(
+        "function",
+        functions=(
+            lambda share: -np.log10(np.maximum(1 - share, least)),
+            lambda height: 1 - 10.0**-height,
+        ),
+    )
+    axes.set_ylim(0, 0.999)
+    ticks = (0, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998)
+    axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
 
 
 def candidates(results, path) -> bool:
     figure, (axes,) = canvas(6, 4)
     counts = (1, 2, 3, 5, 10, 20, 50)
     for method in ("fcn_grasp_unmasked", "fcn_grasp", "fcn4d"):
-        points(axes, counts, [results.get(f"{method}-R3-s0-6x6x5-K{k}") for k in counts], method)
-    if everything := results.get("fcn_grasp-R3-s0-6x6x5-Kall"):
+        points(axes, counts, results, [f"{method}-R3-s*-6x6x5-K{k}" for k in counts], method)
+    if everything := pooled(results, "fcn_grasp-R3-s*-6x6x5-Kall"):
         mean = everything["occupancy"]["mean"]
         axes.axhline(mean, color=METHODS["fcn_grasp"][1], ls=":", lw=1)
         axes.text(50, mean, "fcn_grasp, best feasible", ha="right", va="bottom", fontsize=8)
@@ -120,36 +174,38 @@ def candidates(results, path) -> bool:
     axes.minorticks_off()
     axes.set_xlabel("K, most probable actions that are tried")
     axes.set_ylabel("occupancy at 6x6x5, R=3")
-    axes.set_ylim(0, 1.05)
+    axes.set_ylim(-0.02, 1.05)
     legend(figure, [axes], ncols=3)
     return save(figure, path)
 
 
 def individual(results, path) -> bool:
-    figure, axes = canvas(9, 6, 2, 3, sharex=True, sharey=True)
+    figure, axes = canvas(10, 7.5, 2, 3, sharex=True, sharey=True)
     rotations = (1, 2, 3, 4)
     for part, tote in zip(axes, TOTES, strict=True):
-        for method, name in (
-            ("fcn_grasp", "fcn_grasp-R{}-s0-{}-Kall"),
-            ("fcn_grasp_unmasked", "fcn_grasp_unmasked-R{}-s0-{}-K10"),
+        rows = (
+            ("fcn_grasp", "fcn_grasp-R{}-s*-{}-Kall"),
+            ("fcn_grasp_unmasked", "fcn_grasp_unmasked-R{}-s*-{}-K10"),
             ("fcn4d", "fcn4d-R{}-s0-{}-K10"),
             ("individual_rl", "individual_rl-R{}-s0-{}-K10"),
             ("individual_heuristic", "individual_heuristic-R{}-{}"),
             ("individual_heuristic_cells", "individual_heuristic_cells-R{}-{}"),
             ("joint_dbl", "joint_dbl-R{}-{}"),
             ("random", "random-R{}-{}"),
-        ):
-            points(part, rotations, [results.get(name.format(r, tote)) for r in rotations], method)
+        )
+        for number, (method, name) in enumerate(rows):
+            xs = [r + 0.06 * (number - len(rows) / 2 + 0.5) for r in rotations]
+            points(part, xs, results, [name.format(r, tote) for r in rotations], method)
         part.set_title(tote, fontsize=10)
-        part.set_xticks(rotations)
-        part.set_xlim(0.7, 4.3)
-        part.set_ylim(0, 1.05)
+        part.set_xticks(rotations, rotations)
+        part.set_xlim(0.6, 4.4)
+        widened(part)
     if not any(part.lines for part in axes):
         return False
     for part in axes[3:]:
         part.set_xlabel("R, rotations to choose from")
     for part in axes[::3]:
-        part.set_ylabel("occupancy")
+        part.set_ylabel("occupancy (the axis widens towards 1)")
     legend(figure, axes, ncols=4)
     return save(figure, path)
 
@@ -157,12 +213,13 @@ def individual(results, path) -> bool:
 def rl_methods(results, path) -> bool:
     figure, (axes,) = canvas(9, 4.5)
     rows = [
-        ("fcn_grasp", "fcn_grasp-R4-s0-{}-Kall", {}),
-        ("fcn_grasp_unmasked", "fcn_grasp_unmasked-R4-s0-{}-K1", {}),
-        ("fcn4d_warm", "fcn4d_warm-R4-s0-{}-Kall", {}),
-        ("fcn4d", "fcn4d-R4-s0-{}-K1", {}),
-        ("fcn4d_noclip", "fcn4d_noclip-R4-s0-{}-K1", {}),
-        ("typical", "typical-R4-s0-{}-K1", {}),
+        ("fcn_grasp", "fcn_grasp-R4-s*-{}-Kall", {"label": "fcn_grasp, mask, K=all"}),
+        ("fcn4d_warm", "fcn4d_warm-R4-s0-{}-Kall", {"label": "fcn4d, mask, warm start, K=all"}),
+        ("fcn_grasp_unmasked", "fcn_grasp_unmasked-R4-s*-{}-K1", {"label": "fcn_grasp, no mask, K=1"}),
+        ("fcn4d", "fcn4d-R4-s0-{}-K1", {"label": "fcn4d (the paper's), K=1"}),
+        ("fcn4d_noclip", "fcn4d_noclip-R4-s0-{}-K1", {"label": "4D FCN, no clipping, K=1"}),
+        ("typical", "typical-R4-s0-{}-K1", {"label": "typical, K=1"}),
+        ("individual_rl", "individual_rl-R4-s0-{}-K1", {"label": "individual, RL, K=1"}),
         ("mcts_outcomes", "mcts-R4-{}-mask_true", {}),
         ("mcts", "mcts-R4-{}-mask_false", {}),
         ("random", "random-R4-{}", {}),
@@ -170,17 +227,17 @@ def rl_methods(results, path) -> bool:
     ]
     for number, (method, name, more) in enumerate(rows):
         xs = np.arange(len(TOTES)) + 0.08 * (number - len(rows) / 2 + 0.5)
-        points(axes, xs, [results.get(name.format(tote)) for tote in TOTES], method, line="", **more)
+        points(axes, xs, results, [name.format(tote) for tote in TOTES], method, line="", **more)
     if not axes.lines:
         return False
     axes.set_xticks(range(len(TOTES)), TOTES)
     axes.set_xlim(-0.5, len(TOTES) - 0.5)
     axes.set_ylabel("occupancy, R=4")
-    axes.set_ylim(0, 1.05)
+    axes.set_ylim(-0.03, 1.05)
     axes.grid(axis="x", alpha=0)
     for edge in range(1, len(TOTES)):
         axes.axvline(edge - 0.5, color="#dddddd", lw=0.8)
-    legend(figure, [axes], ncols=4)
+    legend(figure, [axes], ncols=3)
     return save(figure, path)
 
 
@@ -204,22 +261,32 @@ def learning_curves(results, path) -> bool:
 
     figure, axes = canvas(10, 9, 3, 2, sharey=True)
     seeds = (0, 1, 2)
-    for method, name in (
-        ("fcn_grasp", "fcn_grasp-R4-s{}"), ("fcn_grasp_unmasked", "fcn_grasp_unmasked-R4-s{}"),
-        ("fcn4d", "fcn4d-R4-s{}"), ("typical", "typical-6x6x5-s{}"), ("individual_rl", "individual_rl-R4-s{}"),
+    for method, name, k in (
+        ("fcn_grasp", "fcn_grasp-R4-s{}", "all"), ("fcn_grasp_unmasked", "fcn_grasp_unmasked-R4-s{}", 1),
+        ("fcn4d", "fcn4d-R4-s{}", 10), ("typical", "typical-6x6x5-s{}", 10),
+        ("individual_rl", "individual_rl-R4-s{}", 10),
     ):  # fmt: skip
-        band(axes[0], results, [name.format(seed) for seed in seeds], method)
+        band(axes[0], results, [name.format(seed) for seed in seeds], method, label=f"{label(method)}, K={k}")
     panels = [
         (1, "fcn4d: curriculum", {"fcn4d": "adaptive", "fcn4d_paper": "paper, 60,000 a level", "fcn4d_none": "none"}),
-        (2, "fcn4d: masking", {"fcn4d": "no mask", "fcn4d_masked": "mask", "fcn4d_warm": "mask, warm start"}),
+        (
+            2,
+            "fcn4d: masking",
+            {
+                "fcn4d": "no mask, K=10",
+                "fcn4d_masked": "mask, K=all",
+                "fcn4d_warm": "mask, warm start, K=all",
+            },
+        ),
     ]
     for number, title, rows in panels:
         for method, text in rows.items():
             band(axes[number], results, [f"{method}-R4-s{seed}" for seed in seeds], method, label=text)
         axes[number].set_title(title, fontsize=10)
-    band(axes[3], results, [f"fcn4d-R4-s{seed}" for seed in seeds], "fcn4d", label="depth clipped (eq. 4)")
-    band(axes[3], results, [f"fcn4d_noclip-6x6x5-s{seed}" for seed in seeds], "fcn4d_noclip", label="not clipped")
-    axes[3].set_title("fcn4d: clipping (at 5, which takes nothing here)", fontsize=10)
+    names = [f"fcn_grasp_high-R4-s{seed}" for seed in seeds]
+    band(axes[3], results, names, "fcn_grasp_high", label="depth clipped (eq. 4)")
+    band(axes[3], results, [f"fcn_grasp_noclip-R4-s{seed}" for seed in seeds], "fcn_grasp_noclip", label="not clipped")
+    axes[3].set_title("fcn_grasp: clipping, trained and validated at 6x6x10", fontsize=10)
     band(axes[4], results, [f"fcn_grasp-R4-s{seed}" for seed in seeds], "fcn_grasp", label="adaptive")
     for method, text, colour in (
         ("fcn_grasp_paper", "paper, 60,000 a level", "#009e73"),
@@ -229,8 +296,9 @@ def learning_curves(results, path) -> bool:
         names = [f"{method}-R4-s{seed}" for seed in seeds]
         band(axes[4], results, names, "fcn_grasp", label=text, color=colour)
     axes[4].set_title("fcn_grasp: curriculum", fontsize=10)
-    band(axes[5], results, [f"fcn_grasp-R4-s{seed}" for seed in seeds], "fcn_grasp", label="mask")
-    band(axes[5], results, ["fcn_grasp_unmasked-R4-s0"], "fcn_grasp_unmasked", label="no mask")
+    band(axes[5], results, [f"fcn_grasp-R4-s{seed}" for seed in seeds], "fcn_grasp", label="mask, K=all")
+    names = [f"fcn_grasp_unmasked-R4-s{seed}" for seed in seeds]
+    band(axes[5], results, names, "fcn_grasp_unmasked", label="no mask, K=1")
     axes[5].set_title("fcn_grasp: masking", fontsize=10)
     axes[0].set_title("networks", fontsize=10)
     if not any(part.lines for part in axes):
@@ -246,7 +314,7 @@ def learning_curves(results, path) -> bool:
             part.text(0.5, 0.5, "not computed yet", transform=part.transAxes, ha="center", color="#8c8c8c")
     for part in axes[4:]:
         part.set_xlabel("frames")
-    figure.supylabel("occupancy at 6x6x5, R=4, validation stream (band: least and greatest seed)")
+    figure.supylabel("occupancy, R=4, validation stream (band: least and greatest seed)")
     return save(figure, path)
 
 
@@ -261,9 +329,10 @@ def optimum(results, path) -> bool:
     figure, (axes,) = canvas(8, 4.2)
     methods = ("fcn_grasp", "joint_dbl", "individual_heuristic", "mcts", "random")
     for number, method in enumerate(methods):
-        found = [results.get(f"{method}_small-{tote}-R{r}") for tote, r in OPTIMA]
+        seeds = "-s*" if method == "fcn_grasp" else ""
+        names = [f"{method}_small-{tote}-R{r}{seeds}" for tote, r in OPTIMA]
         xs = np.arange(len(OPTIMA)) + 0.12 * (number - 2)
-        points(axes, xs, found, "mcts_outcomes" if method == "mcts" else method, line="")
+        points(axes, xs, results, names, "mcts_outcomes" if method == "mcts" else method, line="")
     if not axes.lines:
         return False
     for x, value in enumerate(OPTIMA.values()):
@@ -283,8 +352,14 @@ def latency(results, path) -> bool:
         ("joint_dbl", ["joint_dbl-mixed-6x6x5"], {}),
     ]
     for method, names, more in series:
-        found = [results[name] for name in names if "occupancy" in results.get(name, {})]
-        points(axes, [result["latency_ms"]["p50"] for result in found], found, method, **more)
+        names = [name for name in names if "occupancy" in results.get(name, {})]
+        times = [results[name]["latency_ms"]["p50"] for name in names]
+        points(axes, times, results, names, method, **more)
+        for name, time in zip(names, times, strict=True):
+            if name.startswith(("lookahead", "mcts")):  # how many samples, or simulations
+                where = (time, results[name]["occupancy"]["mean"])
+                number = name.rpartition("-")[2].replace("sim", " simulations").replace("samples", " samples")
+                axes.annotate(number, where, (5, -9), textcoords="offset points", fontsize=7)
     if not axes.lines:
         return False
     axes.set_xscale("log")
@@ -304,8 +379,8 @@ PRESETS = {
 def presets(results, path) -> bool:
     figure, (axes,) = canvas(9, 4.5)
     rows = [
-        ("fcn_grasp", lambda kind, tote: f"fcn_grasp_{kind}-{tote}"),
-        ("lookahead", lambda kind, tote: f"lookahead_{kind}-{tote}"),
+        ("fcn_grasp", lambda kind, tote: f"fcn_grasp_{kind}-{'' if kind == 'mixed' else 's*-'}{tote}"),
+        ("lookahead", lambda kind, tote: f"lookahead_{kind}-{'' if kind == 'mixed' else 's0-'}{tote}"),
         ("joint_dbl", lambda kind, tote: f"joint_dbl-{kind}-{tote}"),
         ("individual_heuristic_cells", lambda kind, tote: f"individual_heuristic_cells-{kind}-{tote}"),
         ("individual_heuristic", lambda kind, tote: f"individual_heuristic-{kind}-{tote}"),
@@ -313,22 +388,27 @@ def presets(results, path) -> bool:
         ("fcn4d", lambda kind, tote: f"fcn4d_{kind}-{tote}-K10"),
         ("typical", lambda kind, tote: f"typical_{kind}-{tote}-K10"),
         ("mcts_outcomes", lambda kind, tote: f"mcts-{kind}-{tote}-mask_true"),
+        ("mcts", lambda kind, tote: f"mcts-{kind}-{tote}-mask_false"),
         ("random", lambda kind, tote: f"random-{kind}-{tote}"),
     ]
     for number, (method, name) in enumerate(rows):
-        found = [results.get(name(*preset.split("-"))) for preset in PRESETS.values()]
-        points(axes, np.arange(len(PRESETS)) + 0.08 * (number - 4.5), found, method, line="")
+        names = [name(*preset.split("-")) for preset in PRESETS.values()]
+        xs = np.arange(len(PRESETS)) + 0.07 * (number - len(rows) / 2 + 0.5)
+        points(axes, xs, results, names, method, line="")
     if not axes.lines:
         return False
     axes.set_xticks(range(len(PRESETS)), PRESETS)
     axes.set_ylabel("occupancy, R=4")
-    axes.set_ylim(0, 1.05)
+    axes.set_ylim(-0.03, 1.05)
+    axes.grid(axis="x", alpha=0)
+    for edge in range(1, len(PRESETS)):
+        axes.axvline(edge - 0.5, color="#dddddd", lw=0.8)
     legend(figure, [axes], ncols=4)
     return save(figure, path)
 
 
 OUTCOMES = {
-    "executed": ("executed", "#0072b2"),
+    "executed": ("can be executed, given all before", "#0072b2"),
     "effector_collides": ("out of the effector's reach", "#d55e00"),
     "rests_elsewhere": ("rests elsewhere", "#e69f00"),
     "unstable": ("unstable", "#cc79a7"),
@@ -390,14 +470,52 @@ def placement_table(cells, results) -> list[str]:
     return lines
 
 
-#: By the name of the yaml file: title, and what draws it; it returns False where nothing has been computed yet.
+#: By the name of the yaml file: title, caption, and what draws it; it returns False where nothing was computed yet.
 FIGURES = {
-    "candidates": ("K, the number of candidates", candidates),
-    "individual": ("Joint against individual planning", individual),
-    "learning_curves": ("Learning curves", learning_curves),
-    "rl_methods": ("Joint planning against the RL methods and tree search", rl_methods),
-    "optimum": ("Against the exact optimum", optimum),
-    "latency": ("What a search buys for its time", latency),
-    "presets": ("Where a tote is far from full", presets),
-    "placement_only": ("What a placement-only plan is worth", placement_only),
+    "candidates": (
+        "K, the number of candidates",
+        "How many of a policy's most probable actions are tried before one is executed; 6x6x5, R=3.",
+        candidates,
+    ),
+    "individual": (
+        "Joint against individual planning",
+        "Occupancy over the rotations to choose from, one panel a tote. K=10 for what was trained without a mask; "
+        "fcn_grasp with a mask takes the best of all feasible actions.",
+        individual,
+    ),
+    "learning_curves": (
+        "Learning curves",
+        "Validation at full height while training, R=4, at 6x6x5 but for the panel about clipping; each network with "
+        "the K that it is used with, so that masks and search are not told apart here: the table below has K=1 too.",
+        learning_curves,
+    ),
+    "rl_methods": (
+        "Joint planning against the RL methods and tree search",
+        "R=4. K=1, as in the paper, but for what was trained with a mask: it takes the best of all feasible actions.",
+        rl_methods,
+    ),
+    "optimum": (
+        "Against the exact optimum",
+        "Totes of height 1, small enough for dynamic programming over every state (`tests/dynamic_programming.py`); "
+        "2,000 episodes, 200 of the tree search.",
+        optimum,
+    ),
+    "latency": (
+        "What a search buys for its time",
+        "27 kinds of items, 6x6x5, R=4; time is the median of a decision in one thread.",
+        latency,
+    ),
+    "presets": (
+        "Where a tote is far from full",
+        "R=4; policies were trained for these items and bins, at 6x6x5 (mixed: see its card), and are used at 8x8x8 as "
+        "they are. K=10 for what was trained without a mask.",
+        presets,
+    ),
+    "placement_only": (
+        "What a placement-only plan is worth",
+        "A public packer plans every item's place without a gripper in mind. Left: of its placements, those that the "
+        "robot could execute if all before them had been, by hand if need be. Right: what it plans to fill, and what "
+        "is filled when the first placement fails.",
+        placement_only,
+    ),
 }

@@ -95,7 +95,8 @@ def replay(env: PickPlaceEnv, packer) -> tuple[list[str], float, float]:
             executed = filled / volume
         outcomes.append(outcome)
         filled += w * d * h
-        heights[0, x : x + wide, y : y + deep] = z + h  # as planned, so that what follows is judged by itself
+        # As planned, so that what follows is judged by itself; what is already above it stays.
+        heights[0, x : x + wide, y : y + deep] = under.clamp(min=z + h)
     return outcomes, filled / volume, filled / volume if executed is None else executed
 
 

@@ -19,9 +19,15 @@ Made by `make results` from the JSON in [`results/`](results), which `make repro
 holds the command of its cell. All methods meet the same episodes of the test stream, seed 0. Brackets are 95%
 confidence intervals of the mean over episodes; ° marks fewer than {indicative} episodes: indicative. *Budget* is what
 the method was trained with: frames, and minutes of one core; a cell has an hour at most, or what its JSON says.
-What is *no better than random* feasible choices on the same episodes is not a trained policy, whatever else it does.
-*Attempted* cells could not be done within their budget, or within 20 GiB, and tell how far off they were. The time of a
-decision is that of one tote, one thread, on a machine that did other work beside.
+s0, s1 and s2 are training seeds; what has s0 alone was trained once. *No better than random* marks a policy that is not
+surely above random feasible choices on the same episodes, which know the mask; a policy that was trained with a mask
+does not without one. *Attempted* cells could not be done within their budget, or within 20 GiB, and tell how far off
+they were. The time of a decision is that of one tote, one thread, on a machine that did other work beside; that of
+"What a search buys" was measured on a machine that did nothing else.
+
+In the figures a point is the mean over episodes, and over seeds where there are several. Bars are 95% confidence
+intervals over episodes, widened to the range of the seeds. Hollow: fewer than {indicative} episodes. Pale: the training
+was cut short before half of its frames. An "a": attempted.
 
 {done} of {total} cells are done.
 """
@@ -51,7 +57,8 @@ def occupancy(result) -> str:
     if result is None:
         return "not yet"
     if "attempted" in result:
-        return f"attempted: {result['attempted']}"
+        memory = f", {result['peak_mib'] / 1024:.1f} GiB" if result.get("peak_mib") else ""
+        return f"attempted: {result['attempted'].removesuffix('.')}{memory}"
     low, high = result["occupancy"]["ci95"]
     return f"{result['occupancy']['mean']:.4f} ({low:.4f} to {high:.4f})"
 
@@ -72,7 +79,10 @@ def decision(result) -> str:
 def budget(cell, results) -> str:
     """What was spent on the policy that the cell evaluates."""
     if cell.training is None:
-        return next((f"`{o[11:]}`" for o in cell.overrides if o.startswith("checkpoint=")), "none")
+        given = next((o[11:] for o in cell.overrides if o.startswith("checkpoint=")), None)
+        trained = (results.get(cell.name, {}).get("trained") or {}).get("frames")
+        words = [f"`{given}`" if given else "none", f"{trained:,} frames" if trained else ""]
+        return ", ".join(filter(None, words))
     trained = results.get(cell.training)
     if trained is None:
         return "not yet"
@@ -86,6 +96,29 @@ def budget(cell, results) -> str:
     if trained["warm_start"]:
         words.append("warm start")
     return ", ".join(words)
+
+
+def trained_with(cells, results) -> str:
+    """A sentence for a figure: seeds, frames and time of every method that was trained for it."""
+    methods = {}
+    for cell in cells:
+        trained = results.get(cell.training, {})
+        if "frames" in trained:
+            methods.setdefault(figures.label(cell.method), {})[cell.training] = trained
+    words = []
+    for method, trainings in methods.items():
+        seeds = len({dict(part["axes"]).get("seed", 0) for part in trainings.values()})
+        frames, minutes = (
+            sorted({round(part[key] / unit) for part in trainings.values()})
+            for key, unit in (("frames", 1), ("cpu_seconds", 60))
+        )
+        cost = f"{between(frames)} frames, {between(minutes)} minutes of one core"
+        words.append(f"{method}, {seeds} seed{'s' * (seeds > 1)}, {cost}")
+    return f"Trained: {'; '.join(words)}.\n" if words else ""
+
+
+def between(values: list[int]) -> str:
+    return f"{values[0]:,}" if values[0] == values[-1] else f"{values[0]:,} to {values[-1]:,}"
 
 
 def no_better_than_random(result, results) -> str:
@@ -138,16 +171,21 @@ def main() -> None:
     done = sum(name in results for name in every)
     text = [HEAD.format(indicative=INDICATIVE, done=done, total=len(every))]
     text += ["## What the paper claims, and what we find\n", *claims.table(results), ""]
-    for name, (title, draw) in figures.FIGURES.items():
+    for name, (title, caption, draw) in figures.FIGURES.items():
         text.append(f"## {title}\n")
-        numbers = behind(parts[name], results)
+        numbers, picture = behind(parts[name], results), RESULTS / "figures" / name
         if name == "optimum":
             numbers["optimum"] = {f"{tote}-R{r}": value for (tote, r), value in figures.OPTIMA.items()}
-        (RESULTS / "figures" / f"{name}.json").write_text(one_line_a_list(numbers))
-        if draw(results, RESULTS / "figures" / name):
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        picture.with_suffix(".json").write_text(one_line_a_list(numbers))
+        if draw(results, picture):
             text.append(f"![{title}](results/figures/{name}.png)\n")
+            text.append(f"{caption} {trained_with(parts[name], results)}")
             text.append(f"[SVG](results/figures/{name}.svg), [JSON](results/figures/{name}.json);")
             text.append(f"what it consists of: `benchmarks/reproduce/{name}.yaml`.\n")
+        else:
+            for suffix in (".png", ".svg"):  # of results that are no longer there
+                picture.with_suffix(suffix).unlink(missing_ok=True)
         if name == "placement_only":
             text += figures.placement_table(parts[name], results)
         else:

@@ -4,7 +4,7 @@
 
 Each cell runs in a process of its own, in one thread; its budget is CPU time. What stops early is taken up again: a
 training goes on from its last checkpoint, an evaluation begins anew. A finished cell is one JSON file that holds its
-command.
+command. What a smaller budget cut short is computed again, and so is an evaluation whose training has gone on.
 """
 
 import argparse
@@ -185,9 +185,11 @@ def evaluate(cell: Cell, minutes: float) -> dict:
     pilot = json.loads((folder / "pilot.json").read_text()) if (folder / "pilot.json").is_file() else {}
     if not (folder / "evaluation.json").is_file():
         if cost["rc"] == 0:
+            hours = pilot["seconds_a_filled_episode"] / 3600
             return {
-                "attempted": f"one episode would take {pilot['seconds_a_filled_episode'] / 3600:.1f} hours",
+                "attempted": f"to fill one tote would take {hours:.1f} hours",
                 **pilot,
+                "peak_mib": cost["peak_mib"],
             }
         return {**pilot, **attempted(child, cost, "no episode was finished within three times the budget")}
     result = json.loads((folder / "evaluation.json").read_text())
@@ -220,6 +222,32 @@ def placement_only(cell: Cell, minutes: float) -> dict:
     return {**json.loads((folder / "result.json").read_text()), **cost}
 
 
+def result_if_any(cell: Cell) -> dict | None:
+    """A cell's result, None if there is none yet."""
+    path = result_of(cell)
+    return json.loads(path.read_text()) if path.is_file() else None
+
+
+def identity(trained: dict) -> dict:
+    """What tells a training from the same one that has gone on, or that was run again."""
+    return {key: trained.get(key) for key in ("frames", "cpu_seconds")}
+
+
+def is_done(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> bool:
+    """Is there a result that so many minutes would not better?"""
+    result = result_if_any(cell)
+    if result is None:
+        return False
+    asked = next(
+        (int(word.partition("=")[2]) for word in cell.overrides if word.startswith("evaluation.episodes=")), 100
+    )
+    short = "attempted" in result or result.get("frames", 0) < result.get("frames_asked", 0)
+    if short or result.get("episodes", asked) < asked:
+        return result["budget_minutes"] >= minutes
+    trained = result_if_any(trainings[cell.training]) if cell.training else None
+    return trained is None or result.get("of_training", identity(trained)) == identity(trained)
+
+
 COMPUTE = {"train": train, "evaluate": evaluate, "placement_only": placement_only}
 
 
@@ -230,10 +258,9 @@ def compute(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> str:
         Failed: if there is no result, and why.
     """
     if cell.training is not None:
-        path = result_of(trainings[cell.training])
-        if not path.is_file():
+        trained = result_if_any(trainings[cell.training])
+        if trained is None:
             raise Failed(f"its training, {cell.training}, is not done")
-        trained = json.loads(path.read_text())
         if "attempted" in trained:
             return write(cell, minutes, {"attempted": f"its training: {trained['attempted']}"})
         if not (OUTPUTS / "train" / cell.training / "checkpoints").is_dir():
@@ -241,6 +268,8 @@ def compute(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> str:
     result = COMPUTE[cell.kind](cell, minutes)
     if stopped.is_set():
         raise Failed("stopped")
+    if cell.training is not None:
+        result["of_training"] = identity(trained)
     return write(cell, minutes, result)
 
 
@@ -303,10 +332,13 @@ def main() -> None:
     chosen = [cell for name in arguments.figure or figures for cell in figures[name]]
     chosen = list({cell.name: cell for cell in chosen if re.search(arguments.match, cell.name)}.values())
     first = list({cell.training: trainings[cell.training] for cell in chosen if cell.training}.values())
-    missing = [[cell for cell in part if not result_of(cell).is_file()] for part in (first, chosen)]
-    say(f"{len(first) + len(chosen)} cells, {sum(map(len, missing))} to compute")
+
+    def missing(part: list[Cell]) -> list[Cell]:
+        return [cell for cell in part if not is_done(cell, arguments.minutes, trainings)]
+
+    say(f"{len(first) + len(chosen)} cells, {len(missing(first)) + len(missing(chosen))} to compute")
     if arguments.list:
-        for cell in missing[0] + missing[1]:
+        for cell in missing(first) + missing(chosen):
             say(f"  {cell.kind} {cell.name}: {command_of(cell)}")
         return
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -321,9 +353,9 @@ def main() -> None:
             word = f"failed, {error}" if isinstance(error, Failed) else f"failed, {type(error).__name__}: {error}"
         say(f"{cell.kind} {cell.name}: {word}")
 
-    for part in missing:  # what evaluations need comes before them
+    for part in (first, chosen):  # what evaluations need comes before them
         with ThreadPoolExecutor(arguments.jobs) as pool:
-            list(pool.map(work, part))
+            list(pool.map(work, missing(part)))
 
 
 def say(text: str) -> None:
