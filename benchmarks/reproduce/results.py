@@ -22,8 +22,8 @@ the method was trained with: frames, and minutes of one core; a cell has an hour
 s0, s1 and s2 are training seeds; what has s0 alone was trained once. *No better than random* marks a policy that is not
 surely above random feasible choices on the same episodes, which know the mask; a policy that was trained with a mask
 does not without one. *Attempted* cells could not be done within their budget, or within 20 GiB, and tell how far off
-they were. The time of a decision is that of one tote, one thread, on a machine that did other work beside; that of
-"What a search buys" was measured on a machine that did nothing else.
+they were. The time of a decision is CPU time, of one tote in one thread; (wall) marks what was measured by the clock,
+on a machine that did other work beside.
 
 In the figures a point is the mean over episodes, and over seeds where there are several. Bars are 95% confidence
 intervals over episodes, widened to the range of the seeds. Hollow: fewer than {indicative} episodes. Pale: the training
@@ -73,7 +73,8 @@ def decision(result) -> str:
     latency = (result or {}).get("latency_ms")
     if not latency:
         return ""
-    return f"{latency['p50'] / 1e3:.1f} s" if latency["p50"] >= 1e3 else f"{latency['p50']:.1f} ms"
+    time = figures.milliseconds(result)
+    return (f"{time / 1e3:.1f} s" if time >= 1e3 else f"{time:.1f} ms") + " (wall)" * ("cpu_p50" not in latency)
 
 
 def budget(cell, results) -> str:
