@@ -76,7 +76,7 @@ def test_k_settles_where_ten_are_better_than_one_and_fifty_no_better():
 
     assert claim(0.8, 0.9, 0.905) == {"fcn_grasp_unmasked": "not known yet", "fcn4d": "yes"}
     assert claim(0.8, 0.9, 0.95)["fcn4d"] == "in part (1 of 2, against 1)"
-    assert claim(0.9, 0.9, 0.9)["fcn4d"] == "yes so far (1 of 2)"  # it is settled at K=1
+    assert claim(0.9, 0.9, 0.9)["fcn4d"] == "yes (1 of 2, not all sure)"  # it is settled at K=1
 
 
 def test_mcts_is_far_behind_where_a_trained_policy_is():

@@ -55,7 +55,13 @@ class Group:
             return "yes"
         if yes and no:
             return f"in part ({yes} of {every}, against {no})"
-        return f"yes so far ({yes} of {every})" if yes else f"no ({no} of {every})"
+        if yes:
+            return (
+                f"yes so far ({yes} of {every})"
+                if None in self.comparisons
+                else f"yes ({yes} of {every}, not all sure)"
+            )
+        return f"no ({no} of {every})"
 
     def reasons(self) -> list[str]:
         why = [self.why] if self.why and any(comparison.verdict is False for comparison in self.found) else []
