@@ -15,8 +15,8 @@ METHODS = {
     "fcn4d_masked": ("fcn4d, mask", "#cc79a7", "s"),
     "fcn4d_warm": ("fcn4d, mask, warm start", "#8c5a00", "s"),
     "fcn4d_noclip": ("4D FCN, no clipping", "#cc79a7", "^"),
-    "fcn4d_none": ("fcn4d, no curriculum", "#e69f00", "s"),
-    "fcn4d_paper": ("fcn4d, curriculum paper", "#009e73", "s"),
+    "fcn4d_none": ("fcn4d, no curriculum", "#332288", "s"),
+    "fcn4d_paper": ("fcn4d, curriculum paper", "#44aa99", "s"),
     "fcn_grasp_high": ("fcn_grasp, trained at 6x6x10", "#0072b2", "o"),
     "fcn_grasp_noclip": ("fcn_grasp, no clipping", "#cc79a7", "^"),
     "typical": ("typical", "#7f7f00", "v"),
@@ -25,7 +25,7 @@ METHODS = {
     "individual_heuristic_cells": ("individual, heuristic, every cell", "#7a3b69", "d"),
     "joint_dbl": ("joint DBL", "#000000", "P"),
     "mcts": ("MCTS", "#009e73", "X"),
-    "mcts_outcomes": ("MCTS over outcomes", "#332288", "X"),
+    "mcts_outcomes": ("MCTS over outcomes", "#005f46", "X"),
     "random": ("random, feasible", "#8c8c8c", "x"),
     "uniform": ("uniform, all actions", "#b0b0b0", "+"),
     "lookahead": ("lookahead", "#56b4e9", "p"),
@@ -289,9 +289,9 @@ def learning_curves(results, path) -> bool:
     axes[3].set_title("fcn_grasp: clipping, trained and validated at 6x6x10", fontsize=10)
     band(axes[4], results, [f"fcn_grasp-R4-s{seed}" for seed in seeds], "fcn_grasp", label="adaptive")
     for method, text, colour in (
-        ("fcn_grasp_paper", "paper, 60,000 a level", "#009e73"),
-        ("fcn_grasp_mixture", "mixture", "#cc79a7"),
-        ("fcn_grasp_none", "none", "#e69f00"),
+        ("fcn_grasp_paper", "paper, 60,000 a level", "#44aa99"),
+        ("fcn_grasp_mixture", "mixture", "#aa4499"),
+        ("fcn_grasp_none", "none", "#332288"),
     ):
         names = [f"{method}-R4-s{seed}" for seed in seeds]
         band(axes[4], results, names, "fcn_grasp", label=text, color=colour)
