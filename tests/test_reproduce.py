@@ -152,6 +152,33 @@ def test_a_large_tote_that_few_episodes_filled_decides_nothing():
     assert words(claims.large_totes_work({name: result(0.9, episodes=5)}))["fcn_grasp"] == "undecided"
 
 
+def test_what_was_attempted_in_vain_is_not_waited_for():
+    tree = {f"mcts-R4-{tote}-mask_false": result(0.3) for tote in figures.TOTES[:4]}
+    tree |= {f"mcts-R4-{tote}-mask_false": {"attempted": "hours"} for tote in figures.TOTES[4:]}
+    ours = {f"fcn4d-R4-s0-{tote}-K1": result(0.6) for tote in figures.TOTES}
+    assert words(claims.mcts_far_behind(tree | ours))["fcn4d"] == "yes; 2 attempted in vain"
+    assert words(claims.mcts_far_behind({name: {"attempted": "hours"} for name in {**tree, **ours}})) == {
+        "fcn_grasp_unmasked": "attempted",
+        "fcn4d": "attempted",
+    }
+
+
+def test_no_verdict_about_small_totes_from_few_episodes_or_half_a_training():
+    found = individual(0.2, 0.1)
+    found["fcn_grasp_unmasked-R3-s0-10x10x5-K10"] = result(0.6, episodes=5)
+    assert words(claims.most_on_small_totes(found)) == {"fcn_grasp_unmasked": "undecided"}
+    found = individual(0.1, -0.2) | {"t": training(2)}
+    found["fcn_grasp_unmasked-R3-s0-10x10x5-K10"]["training"] = "t"
+    assert words(claims.most_on_small_totes(found)) == {"fcn_grasp_unmasked": "undecided"}
+
+
+def test_clipping_is_judged_by_trainings_that_came_up_to_the_clip():
+    found = {f"fcn_grasp-R4-s{seed}-6x6x10-Kall": result(0.9) for seed in range(3)}
+    found |= {f"fcn_grasp_noclip-R4-s{seed}-6x6x10-Kall": result(0.8, training="t") for seed in range(3)}
+    assert words(claims.clipping_helps(found | {"t": training(10, tote="6,6,10")}))["fcn_grasp"] == "yes"
+    assert words(claims.clipping_helps(found | {"t": training(2, tote="6,6,10")}))["fcn_grasp"] == "undecided"
+
+
 def test_every_claim_has_a_row_with_and_without_results():
     for found in ({}, results.load()):
         rows = claims.table(found)[2:]
@@ -160,11 +187,18 @@ def test_every_claim_has_a_row_with_and_without_results():
 
 def test_seeds_are_drawn_as_one_point_with_the_range_of_both():
     found = {"m-s0": result(0.5), "m-s2": result(0.6), "m-s1": {"attempted": "hours"}}
-    point = figures.pooled(found, "m-s*")
-    assert point["seeds"] == 2 and point["occupancy"] == {"mean": 0.55, "ci95": (0.5, 0.6)}
+    assert figures.pooled(found, "m-s*")["occupancy"] == {"mean": 0.55, "ci95": (0.5, 0.6)}
     assert figures.pooled(found, "m-s0")["occupancy"]["ci95"] == (0.49, 0.51)
     assert "attempted" in figures.pooled(found, "m-s1")
     assert figures.pooled(found, "n-s*") is None
+    noisy = [result(0.5), result(0.5)]
+    for seed, part in enumerate(noisy):  # each has the other's luck, so that their means over seeds are all alike
+        part["occupancy"]["per_episode"] = [0.2 + 0.6 * ((number + seed) % 2) for number in range(100)]
+    low, high = figures.pooled({"m-s0": noisy[0], "m-s1": noisy[1]}, "m-s*")["occupancy"]["ci95"]
+    assert (low, high) == pytest.approx((0.5, 0.5))
+    noisy[1]["occupancy"]["per_episode"] = noisy[0]["occupancy"]["per_episode"]
+    low, high = figures.pooled({"m-s0": noisy[0], "m-s1": noisy[1]}, "m-s*")["occupancy"]["ci95"]
+    assert 0.5 - low == pytest.approx(1.96 * 0.3 / 10, rel=0.03) == high - 0.5
 
 
 def test_tables_say_what_is_missing_attempted_and_no_better_than_random():
@@ -206,6 +240,16 @@ def test_every_figure_is_drawn_from_few_results_and_from_none(tmp_path):
     found |= {name: {"curve": curve} for name in TRAININGS}
     shares = {key: {"mean": 0.5, "ci95": [0.4, 0.6]} for key in ("occupancy_planned", "occupancy")}
     found["py3dbp-R1-6x6x5"] = {"kind": "placement_only", "placements": {"executed": 3, "unstable": 1}, **shares}
+    # Whatever a result may be: attempted, of few episodes, of a training that was cut short, of some seeds only.
+    for number, name in enumerate(sorted(name for name in found if name not in TRAININGS)):
+        if number % 5 == 1:
+            found[name] = {"attempted": "to fill one tote would take 3.0 hours", "peak_mib": 900}
+        elif number % 5 == 2:
+            found[name] |= {"episodes": 3}
+        elif number % 5 == 3:
+            found[name] |= {"training": "short"}
+    found |= {f"fcn_grasp-R3-s{seed}-6x6x5-Kall": {"attempted": "hours"} for seed in range(3)}
+    found["short"] = {"frames": 10, "frames_asked": 30}
     for name, (_, _, draw) in figures.FIGURES.items():
         assert draw(found, tmp_path / name) is True
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
@@ -270,6 +314,9 @@ def test_a_result_that_is_kept_belongs_to_a_cell_of_today(path):
     found = json.loads(path.read_text())
     every = {cell.name: cell for part in PARTS.values() for cell in part} | TRAININGS
     assert found["cell"] == path.stem and path.stem in every
+    if every[path.stem].training:  # and to the training as it is kept
+        kept = results.RESULTS / "trainings" / f"{every[path.stem].training}.json"
+        assert found["of_training"] == run.identity(json.loads(kept.read_text()))
     assert all(word in found["command"] for word in every[path.stem].overrides if "evaluation." not in word)
     assert "attempted" in found or "curve" in found or 0 <= found["occupancy"]["mean"] <= 1
     assert "/tmp" not in path.read_text() and "/home" not in path.read_text()
@@ -318,11 +365,13 @@ def test_what_a_smaller_budget_cut_short_is_computed_again(tmp_path, monkeypatch
     assert not done(trained, 60, budget_minutes=10, frames=10, frames_asked=20, cpu_seconds=5)
     assert not done(trained, 60, budget_minutes=10, attempted="hours")
     assert done(trained, 60, budget_minutes=10, frames=20, frames_asked=20, cpu_seconds=5)
-    assert done(tested, 60, budget_minutes=10, episodes=50)
-    assert not done(tested, 60, budget_minutes=10, episodes=49)
-    assert done(tested, 10, budget_minutes=10, episodes=49)
-    assert done(tested, 60, budget_minutes=10, episodes=50, of_training={"frames": 20, "cpu_seconds": 5})
-    assert not done(tested, 60, budget_minutes=10, episodes=50, of_training={"frames": 10, "cpu_seconds": 5})
+    now, before = {"frames": 20, "cpu_seconds": 5}, {"frames": 10, "cpu_seconds": 5}
+    assert not done(tested, 60, budget_minutes=10, episodes=49, of_training=now)
+    assert done(tested, 10, budget_minutes=10, episodes=49, of_training=now)
+    assert not done(tested, 10, budget_minutes=10, episodes=49, of_training=before)
+    assert not done(tested, 10, budget_minutes=10, attempted="its training", of_training=before)
+    assert done(tested, 60, budget_minutes=10, episodes=50, of_training=now)
+    assert not done(tested, 60, budget_minutes=10, episodes=50, of_training=before)
 
 
 def test_a_failure_that_may_pass_leaves_no_result(tmp_path, monkeypatch):

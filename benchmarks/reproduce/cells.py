@@ -22,7 +22,6 @@ AXES = {
     "env": ("{}", "env={}"),
     "simulations": ("{}sim", "planner.simulations={}"),
     "samples": ("{}samples", "planner.samples={}"),
-    "curriculum": ("{}", "curriculum={}"),
     "mask": ("mask_{}", "planner.mask={}"),
 }
 

@@ -1,30 +1,40 @@
 """The paper's claims, each held against our figures, for each network: borne out, not, in part, or not known yet.
 
-A claim is a list of comparisons. One is decided where the 95% interval of a paired difference, at least twenty episodes
-long, lies on one side of a margin; it is not where a network that was not trained up to its tote's height would decide.
+A claim is a list of comparisons, of training seed 0 but where they name seeds. One is decided where the 95% interval of
+a paired difference, of at least twenty episodes, lies on one side of a margin; not where it would be decided by a
+network that was not trained up to its tote's height.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import hypot
 
 import torch
-from figures import TOTES
+from figures import FEW, TOTES
 
 from pickplace.evaluate import confidence95
 
-FEW = 20  # episodes below which a figure only indicates, and decides nothing
 ROTATIONS = (1, 2, 3, 4)
+ATTEMPTED = "attempted"  # in place of a comparison one side of which could not be computed
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was compared, the difference with its interval, whether it bears the claim out, and what to know of it."""
+    """One difference.
+
+    Attributes:
+        text: what was compared.
+        verdict: whether it bears the claim out; None: not to be told.
+        difference: mean, and its 95% interval.
+        remark: what to know of it.
+        sound: with episodes and trainings enough to decide.
+    """
 
     text: str
     verdict: bool | None
     difference: tuple[float, float, float]
     remark: str = ""
+    sound: bool = True
 
     def __str__(self):
         centre, low, high = self.difference
@@ -33,35 +43,34 @@ class Comparison:
 
 @dataclass
 class Group:
-    """All comparisons of a claim for one network: what there is of them, None for what there is not; why, if not."""
+    """All comparisons of a claim for one network, ``ATTEMPTED``, or None for what is not yet; and why, if it fails."""
 
     name: str
-    comparisons: list[Comparison | None] = field(default_factory=list)
+    comparisons: list[Comparison | str | None] = field(default_factory=list)
     why: str = ""
 
     @property
     def found(self) -> list[Comparison]:
-        return [comparison for comparison in self.comparisons if comparison]
+        return [comparison for comparison in self.comparisons if isinstance(comparison, Comparison)]
 
     def word(self) -> str:
         """The verdict, with the number of comparisons behind it where it is not all of them."""
         verdicts = [comparison.verdict for comparison in self.found]
-        yes, no, every = verdicts.count(True), verdicts.count(False), len(self.comparisons)
+        yes, no, in_vain = verdicts.count(True), verdicts.count(False), self.comparisons.count(ATTEMPTED)
+        every = len(self.comparisons) - in_vain
+        tail = f"; {in_vain} attempted in vain" if in_vain else ""
         if not verdicts:
-            return "not known yet"
+            return "not known yet" if None in self.comparisons else ATTEMPTED
         if not yes and not no:
             return "undecided"
         if yes == every:
-            return "yes"
+            return f"yes{tail}"
         if yes and no:
-            return f"in part ({yes} of {every}, against {no})"
+            return f"in part ({yes} of {every}, against {no}){tail}"
         if yes:
-            return (
-                f"yes so far ({yes} of {every})"
-                if None in self.comparisons
-                else f"yes ({yes} of {every}, not all sure)"
-            )
-        return f"no ({no} of {every})"
+            sure = f"so far ({yes} of {every})" if None in self.comparisons else f"({yes} of {every}, not all sure)"
+            return f"yes {sure}{tail}"
+        return f"no ({no} of {every}){tail}"
 
     def reasons(self) -> list[str]:
         why = [self.why] if self.why and any(comparison.verdict is False for comparison in self.found) else []
@@ -103,8 +112,10 @@ def untrained(results, name: str) -> str:
     return f"{name.partition('-')[0]} came to a tote height of {levels[-1]} of {full} in {training['frames']:,} frames"
 
 
-def compare(results, text: str, ours: str, theirs: str, margin: float = 0.0, learned: Iterable[str] = ()):
-    """Is one cell above another by more than a margin? None where one of them is not there.
+def compare(
+    results, text: str, ours: str, theirs: str, margin: float = 0.0, learned: Iterable[str] = ()
+) -> Comparison | str | None:
+    """Is one cell above another by more than a margin? ``ATTEMPTED`` or None where one of them is not there.
 
     Args:
         results: every result.
@@ -114,16 +125,25 @@ def compare(results, text: str, ours: str, theirs: str, margin: float = 0.0, lea
         margin: of mean occupancy.
         learned: cells whose policy must have been trained to the end, or nothing is decided.
     """
-    if mean(results, ours) is None or mean(results, theirs) is None:
+    if any("attempted" in results.get(name, {}) for name in (ours, theirs)):
+        return ATTEMPTED
+    if ours not in results or theirs not in results:
         return None
     gap = difference(results[ours], results[theirs])
     episodes = min(len(results[name]["occupancy"]["per_episode"]) for name in (ours, theirs))
     if gap is None or episodes < FEW:
         gap = gap or (mean(results, ours) - mean(results, theirs), -1.0, 1.0)
-        return Comparison(f"{text} ({episodes} episodes)", None, gap)
-    verdict, remarks = decided(gap[1], gap[2], margin), [untrained(results, name) for name in learned]
-    remark = next(filter(None, remarks), "")
-    return Comparison(text, None if remark else verdict, gap, remark)
+        return Comparison(f"{text} ({episodes} episodes)", None, gap, sound=False)
+    remark = next(filter(None, (untrained(results, name) for name in learned)), "")
+    verdict = None if remark else decided(gap[1], gap[2], margin)
+    return Comparison(text, verdict, gap, remark, sound=not remark)
+
+
+def unless_untrained(comparison, results, name: str):
+    """A comparison; if it fails, and the policy of this cell was not trained to the end, it is not decided."""
+    if isinstance(comparison, Comparison) and not comparison.verdict and (remark := untrained(results, name)):
+        return replace(comparison, verdict=None, remark=remark, sound=False)
+    return comparison
 
 
 JOINT = ("fcn_grasp_unmasked", "fcn4d")
@@ -143,20 +163,19 @@ def best_of(results, names) -> str | None:
     return max(there, key=there.get, default=None)
 
 
-def against(results, joint: str, individual) -> list[Comparison | None]:
-    """A joint network against the best of these methods, at every tote and R."""
+def against(results, joint: str, individual) -> list[Comparison | str | None]:
+    """A joint network against the best of these methods, at every tote and R; each has had an hour at most."""
     found = []
     for tote in TOTES:
         for r in rotations_of(joint):
             ours, best = f"{joint}-R{r}-s0-{tote}-K10", best_of(results, [name.format(r, tote) for name in individual])
-            text = f"{tote} R={r}, minus {best.partition('-')[0]}" if best else ""
-            comparison = compare(results, text, ours, best) if best else None
-            remark = untrained(results, best) if best else ""
-            if comparison and remark:  # said, not decisive: it has had the same frames
-                comparison = Comparison(comparison.text, comparison.verdict, comparison.difference, remark)
-            if comparison and comparison.verdict is False and (own := untrained(results, ours)):
-                comparison = Comparison(comparison.text, None, comparison.difference, own)
-            found.append(comparison)
+            if best is None:
+                found.append(None)
+                continue
+            comparison = compare(results, f"{tote} R={r}, minus {best.partition('-')[0]}", ours, best)
+            if isinstance(comparison, Comparison):  # to be said, though it has had the same hour
+                comparison = replace(comparison, remark=untrained(results, best))
+            found.append(unless_untrained(comparison, results, ours))
     return found
 
 
@@ -166,7 +185,7 @@ def joint_beats_individual(results) -> list[Group]:
 
 
 def joint_beats_every_cell(results) -> list[Group]:
-    why = "with three or four rotations, trying every cell makes up for the pick that was fixed beforehand"
+    why = "the more rotations, the more trying every cell makes up for the pick that was fixed beforehand"
     return [Group(joint, against(results, joint, EVERY_CELL), why) for joint in JOINT]
 
 
@@ -179,15 +198,16 @@ def most_on_small_totes(results) -> list[Group]:
     for small, wide in pairs:
         for r in ROTATIONS:
             ours, theirs = gains[small, r], gains[wide, r]
-            if ours is None or theirs is None:
-                found.append(None)
+            if not (isinstance(ours, Comparison) and isinstance(theirs, Comparison)):
+                found.append(ATTEMPTED if ATTEMPTED in (ours, theirs) else None)
                 continue
             (a, low, high), (b, lower, higher) = ours.difference, theirs.difference
             half = hypot((high - low) / 2, (higher - lower) / 2)  # other episodes: the two do not pair
             more = (a - b, a - b - half, a - b + half)
-            verdict = decided(*more[1:], 0.0)
-            verdict = None if verdict and low <= 0 else verdict  # a smaller loss is no gain
-            found.append(Comparison(f"R={r}, gain at {small} minus at {wide}", verdict, more))
+            sound, verdict = ours.sound and theirs.sound, decided(*more[1:], 0.0)
+            verdict = None if not sound or (verdict and low <= 0) else verdict  # a smaller loss is no gain
+            remark = ours.remark or theirs.remark
+            found.append(Comparison(f"R={r}, gain at {small} minus at {wide}", verdict, more, remark, sound))
     return [Group(joint, found)]
 
 
@@ -196,11 +216,10 @@ def k_settles(results) -> list[Group]:
     groups = []
     for joint in JOINT:
         names = {k: f"{joint}-R3-s0-6x6x5-K{k}" for k in (1, 10, 50)}
-        rise = compare(results, "K=10 minus K=1", names[10], names[1])
-        more = compare(results, "K=50 minus K=10", names[50], names[10], margin=0.01)
-        if more:
-            verdict = None if more.verdict is None else not more.verdict
-            more = Comparison(more.text, verdict, more.difference, untrained(results, names[10]))
+        rise = compare(results, "K=10 minus K=1", names[10], names[1], learned=[names[10]])
+        more = compare(results, "K=50 minus K=10", names[50], names[10], margin=0.01, learned=[names[10]])
+        if isinstance(more, Comparison) and more.verdict is not None:
+            more = replace(more, verdict=not more.verdict)
         groups.append(
             Group(joint, [rise, more], "a policy that is not sure of what is feasible gains from more than ten")
         )
@@ -233,7 +252,10 @@ def high_tote_is_harder(results) -> list[Group]:
 
 
 def typical_learns_poorly(results) -> list[Group]:
-    """After as many frames, every seed of it is below every seed of fcn4d by more than a twentieth."""
+    """After as many frames, every seed of it is below every seed of fcn4d by more than a twentieth.
+
+    The figures are validations while training, of few episodes: the range of the seeds stands for an interval.
+    """
     curves = [
         [results.get(name.format(seed), {}).get("curve") for seed in range(3)]
         for name in ("typical-6x6x5-s{}", "fcn4d-R4-s{}")
@@ -246,7 +268,8 @@ def typical_learns_poorly(results) -> list[Group]:
     low, high = min(paper) - max(typical), max(paper) - min(typical)
     middle = sum(paper) / len(paper) - sum(typical) / len(typical)
     text = f"fcn4d minus it after {frames:,} frames, {len(paper)} and {len(typical)} of 3 seeds (least, greatest)"
-    verdict = decided(low, high, 0.05) if len(typical) == len(paper) == 3 else None
+    learned = min(paper) > 0.2  # about what random feasible choices fill; else there is nothing to be worse than
+    verdict = decided(low, high, 0.05) if learned and len(typical) == len(paper) == 3 else None
     return [Group("typical", [Comparison(text, verdict, (middle, low, high))])]
 
 
@@ -259,7 +282,7 @@ def at(curve: dict, frames: int) -> float:
 def clipping_helps(results) -> list[Group]:
     """Where the tote is higher than the clip: trained low with it, against trained at the size itself without."""
     names = [(f"fcn_grasp-R4-s{s}-6x6x10-Kall", f"fcn_grasp_noclip-R4-s{s}-6x6x10-Kall") for s in range(3)]
-    grasp = [compare(results, f"seed {s}, clipped minus not", *pair) for s, pair in enumerate(names)]
+    grasp = [compare(results, f"seed {s}, clipped minus not", *pair, learned=pair) for s, pair in enumerate(names)]
     paper = []
     for tote in ("6x6x10", "10x10x10", "30x30x10"):
         names = [f"{method}-R4-s0-{tote}-K1" for method in ("fcn4d", "fcn4d_noclip")]
@@ -275,9 +298,7 @@ def mcts_far_behind(results) -> list[Group]:
         for tote in TOTES:
             ours, tree = f"{joint}-R4-s0-{tote}-K1", f"mcts-R4-{tote}-mask_false"
             comparison = compare(results, f"{tote}, minus mcts", ours, tree, margin=0.1)
-            if comparison and comparison.verdict is False and (remark := untrained(results, ours)):
-                comparison = Comparison(comparison.text, None, comparison.difference, remark)
-            found.append(comparison)
+            found.append(unless_untrained(comparison, results, ours))
         groups.append(Group(joint, found))
     return groups
 
@@ -290,18 +311,21 @@ def large_totes_work(results) -> list[Group]:
         for tote in TOTES[4:]:
             name = f"{method}-R4-s0-{tote}-K{k}"
             if mean(results, name) is None:
-                found.append(None)
+                found.append(ATTEMPTED if name in results else None)
                 continue
             low, high = results[name]["occupancy"]["ci95"]
             gap = (mean(results, name) - 0.8, low - 0.8, high - 0.8)
-            few, remark = results[name]["episodes"] < FEW, untrained(results, name)
+            few = results[name]["episodes"] < FEW
             text = f"{tote} minus 0.8" + f" ({results[name]['episodes']} episodes)" * few
-            verdict = decided(gap[1], gap[2], 0.0)
-            verdict = None if few or (remark and verdict is False) else verdict
-            found.append(Comparison(text, verdict, gap, remark))
+            comparison = Comparison(text, None if few else decided(gap[1], gap[2], 0.0), gap, sound=not few)
+            found.append(unless_untrained(comparison, results, name))
         groups.append(Group(method, found))
     return groups
 
+
+HOW = f"""For each network, of training seed 0 but where seeds are named. *Yes* and *no* need a 95% interval that lies
+on one side, {FEW} episodes, and a training that came up to its tote's height; numbers count comparisons.
+"""
 
 #: What the paper says, and what holds it against our figures.
 CLAIMS = [

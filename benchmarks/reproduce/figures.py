@@ -24,15 +24,14 @@ METHODS = {
     "individual_heuristic": ("individual, heuristic", "#cc79a7", "D"),
     "individual_heuristic_cells": ("individual, heuristic, every cell", "#7a3b69", "d"),
     "joint_dbl": ("joint DBL", "#000000", "P"),
-    "mcts": ("MCTS", "#009e73", "X"),
-    "mcts_outcomes": ("MCTS over outcomes", "#005f46", "X"),
+    "mcts": ("MCTS, no mask", "#009e73", "X"),
+    "mcts_outcomes": ("MCTS, mask", "#005f46", "X"),
     "random": ("random, feasible", "#8c8c8c", "x"),
     "uniform": ("uniform, all actions", "#b0b0b0", "+"),
     "lookahead": ("lookahead", "#56b4e9", "p"),
-    "py3dbp": ("py3dbp", "#d55e00", "s"),
-    "rectpack": ("rectpack", "#009e73", "s"),
 }
 
+FEW = 20  # episodes below which a figure only indicates
 TOTES = ("6x6x5", "6x6x10", "10x10x5", "10x10x10", "30x30x5", "30x30x10")
 
 
@@ -114,7 +113,6 @@ def pooled(results, name: str) -> dict | None:
         **found[0],
         "occupancy": {"mean": means.mean(), "ci95": (min(low, *means), max(high, *means))},
         "episodes": min(result["episodes"] for result in found),
-        "seeds": len(found),
         "short": any(part.get("frames", 1) < 0.5 * part.get("frames_asked", 1) for part in trained),
     }
 
@@ -130,14 +128,13 @@ def points(axes, xs, results, names, method, line="-", **more) -> None:
         return
     xs, mean = [x for x, _ in pairs], np.array([result["occupancy"]["mean"] for _, result in pairs])
     axes.plot(xs, mean, ls=line, lw=1.3, color=look["color"], alpha=0.6)
-    handle = axes.errorbar([], [], ls=line, lw=1.3, ms=5, **look)  # for the legend: not hollow, not pale
-    handle.set_label(look["label"])
+    axes.errorbar([], [], ls=line, lw=1.3, ms=5, **look)  # for the legend: not hollow, not pale
     for x, result in pairs:
         value, (low, high) = result["occupancy"]["mean"], result["occupancy"]["ci95"]
         bars = [[max(value - max(low, 0), 0)], [max(min(high, 1) - value, 0)]]
         axes.errorbar(
             [x], [value], yerr=bars, ls="", ms=5, capsize=2.5, elinewidth=1, color=look["color"], marker=look["marker"],
-            markerfacecolor="white" if result.get("episodes", 100) < 20 else look["color"],
+            markerfacecolor="white" if result["episodes"] < FEW else look["color"],
             alpha=0.35 if result["short"] else 1.0,
         )  # fmt: skip
 
@@ -163,7 +160,7 @@ def candidates(results, path) -> bool:
     counts = (1, 2, 3, 5, 10, 20, 50)
     for method in ("fcn_grasp_unmasked", "fcn_grasp", "fcn4d"):
         points(axes, counts, results, [f"{method}-R3-s*-6x6x5-K{k}" for k in counts], method)
-    if everything := pooled(results, "fcn_grasp-R3-s*-6x6x5-Kall"):
+    if (everything := pooled(results, "fcn_grasp-R3-s*-6x6x5-Kall")) and "occupancy" in everything:
         mean = everything["occupancy"]["mean"]
         axes.axhline(mean, color=METHODS["fcn_grasp"][1], ls=":", lw=1)
         axes.text(50, mean, "fcn_grasp, best feasible", ha="right", va="bottom", fontsize=8)
@@ -351,15 +348,15 @@ def milliseconds(result) -> float:
 def latency(results, path) -> bool:
     figure, (axes,) = canvas(6.5, 4.2)
     series = [
-        ("fcn_grasp", ["fcn_grasp_mixed-6x6x5"], {}),
-        ("lookahead", [f"lookahead-6x6x5-{n}samples" for n in (8, 32, 128)], {}),
-        ("mcts_outcomes", [f"mcts_mixed-6x6x5-{n}sim" for n in (100, 500, 2000, 5000)], {}),
-        ("joint_dbl", ["joint_dbl-mixed-6x6x5"], {}),
+        ("fcn_grasp", ["fcn_grasp_mixed-6x6x5"]),
+        ("lookahead", [f"lookahead-6x6x5-{n}samples" for n in (8, 32, 128)]),
+        ("mcts_outcomes", [f"mcts_mixed-6x6x5-{n}sim" for n in (100, 500, 2000, 5000)]),
+        ("joint_dbl", ["joint_dbl-mixed-6x6x5"]),
     ]
-    for method, names, more in series:
+    for method, names in series:
         names = [name for name in names if "occupancy" in results.get(name, {})]
         times = [milliseconds(results[name]) for name in names]
-        points(axes, times, results, names, method, **more)
+        points(axes, times, results, names, method)
         for name, time in zip(names, times, strict=True):
             if name.startswith(("lookahead", "mcts")):  # how many samples, or simulations
                 where = (time, results[name]["occupancy"]["mean"])
@@ -491,7 +488,7 @@ FIGURES = {
     "learning_curves": (
         "Learning curves",
         "Validation at full height while training, R=4, at 6x6x5 but for the panel about clipping; each network with "
-        "the K that it is used with, so that masks and search are not told apart here: the table below has K=1 too.",
+        "the K that it is used with, so that masks and search are not told apart here: the table below has other K.",
         learning_curves,
     ),
     "rl_methods": (

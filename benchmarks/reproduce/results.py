@@ -11,13 +11,11 @@ from claims import difference
 from run import RESULTS, one_line_a_list
 
 ROOT = RESULTS.parents[1]
-INDICATIVE = 20  # episodes below which a figure only indicates
-
 HEAD = """# The paper's comparison, run again
 
 Made by `make results` from the JSON in [`results/`](results), which `make reproduce` computes cell by cell; each JSON
 holds the command of its cell. All methods meet the same episodes of the test stream, seed 0. Brackets are 95%
-confidence intervals of the mean over episodes; ° marks fewer than {indicative} episodes: indicative. *Budget* is what
+confidence intervals of the mean over episodes; ° marks fewer than {few} episodes: indicative. *Budget* is what
 the method was trained with: frames, and minutes of one core; a cell has an hour at most, or what its JSON says.
 s0, s1 and s2 are training seeds; what has s0 alone was trained once. *No better than random* marks a policy that is not
 surely above random feasible choices on the same episodes, which know the mask; a policy that was trained with a mask
@@ -26,7 +24,7 @@ they were. The time of a decision is CPU time, of one tote in one thread; (wall)
 on a machine that did other work beside.
 
 In the figures a point is the mean over episodes, and over seeds where there are several. Bars are 95% confidence
-intervals over episodes, widened to the range of the seeds. Hollow: fewer than {indicative} episodes. Pale: the training
+intervals over episodes, widened to the range of the seeds. Hollow: fewer than {few} episodes. Pale: the training
 was cut short before half of its frames. An "a": attempted.
 
 {done} of {total} cells are done.
@@ -66,7 +64,7 @@ def occupancy(result) -> str:
 def episodes(result) -> str:
     if result is None or "occupancy" not in result:
         return ""
-    return f"{result['episodes']}{'°' if result['episodes'] < INDICATIVE else ''}"
+    return f"{result['episodes']}{'°' if result['episodes'] < figures.FEW else ''}"
 
 
 def decision(result) -> str:
@@ -108,13 +106,16 @@ def trained_with(cells, results) -> str:
             methods.setdefault(figures.label(cell.method), {})[cell.training] = trained
     words = []
     for method, trainings in methods.items():
-        seeds = len({dict(part["axes"]).get("seed", 0) for part in trainings.values()})
+        alike = {}
+        for part in trainings.values():
+            alike.setdefault(str({**part["axes"], "seed": 0}), []).append(part)
+        seeds = between(sorted(map(len, alike.values())))
         frames, minutes = (
             sorted({round(part[key] / unit) for part in trainings.values()})
             for key, unit in (("frames", 1), ("cpu_seconds", 60))
         )
         cost = f"{between(frames)} frames, {between(minutes)} minutes of one core"
-        words.append(f"{method}, {seeds} seed{'s' * (seeds > 1)}, {cost}")
+        words.append(f"{method}, {seeds} seed{'s' * (seeds != '1')}, {cost}")
     return f"Trained: {'; '.join(words)}.\n" if words else ""
 
 
@@ -138,7 +139,7 @@ def no_better_than_random(result, results) -> str:
     return ""
 
 
-#: What a figure draws of a result: all but what each episode gave, which the cell's own JSON holds.
+#: What stands behind a figure; what each episode gave, from which seeds are pooled, is in the cells' own JSON.
 DRAWN = ("method", "axes", "command", "occupancy", "episodes", "latency_ms", "attempted")
 DRAWN_OF_PLANS = ("occupancy_planned", "share_executed", "placements", "plans_executed_whole")
 DRAWN_OF_TRAININGS = ("command", "frames", "cpu_seconds", "curve", "attempted")
@@ -170,8 +171,8 @@ def main() -> None:
     every = {cell.name for cells in parts.values() for cell in cells}
     every |= {cell.training for cells in parts.values() for cell in cells if cell.training}
     done = sum(name in results for name in every)
-    text = [HEAD.format(indicative=INDICATIVE, done=done, total=len(every))]
-    text += ["## What the paper claims, and what we find\n", *claims.table(results), ""]
+    text = [HEAD.format(few=figures.FEW, done=done, total=len(every))]
+    text += ["## What the paper claims, and what we find\n", claims.HOW, *claims.table(results), ""]
     for name, (title, caption, draw) in figures.FIGURES.items():
         text.append(f"## {title}\n")
         numbers, picture = behind(parts[name], results), RESULTS / "figures" / name

@@ -29,6 +29,7 @@ from pickplace.metrics import read_csv
 ROOT = Path(__file__).parents[2]
 RESULTS, OUTPUTS = ROOT / "docs" / "results", ROOT / "outputs" / "reproduce"
 SPENT = "cost.json"  # in the folder of a training
+NOTHING = {"cpu_seconds": 0.0, "peak_mib": 0}
 MEMORY = 20 * 2**30  # bytes that a cell may reserve: what asks for more is told so, and takes nothing from others
 
 
@@ -119,7 +120,8 @@ def attempted(child: Child, cost: dict, reason: str) -> dict:
 def train(cell: Cell, minutes: float) -> dict:
     """Train, or go on training, for at most so many minutes in all; the curve and what it cost."""
     folder = run_dir_of(cell)
-    last, before = folder / "checkpoints" / "last", spent(folder)
+    last = folder / "checkpoints" / "last"
+    before = spent(folder) if last.is_dir() else NOTHING  # without a checkpoint it begins anew
     if not (last.is_dir() and before["cpu_seconds"] >= 60 * minutes):
         action = [f"resume={folder}"] if last.is_dir() else [*cell.overrides, "threads=1", f"hydra.run.dir={folder}"]
         child = Child([sys.executable, "-m", "pickplace.train", *action], OUTPUTS / "logs" / f"{cell.name}.log")
@@ -148,7 +150,7 @@ def train(cell: Cell, minutes: float) -> dict:
 def spent(folder: Path) -> dict:
     """CPU time and peak memory of a training so far, over all its resumptions."""
     path = folder / SPENT
-    return json.loads(path.read_text()) if path.is_file() else {"cpu_seconds": 0.0, "peak_mib": 0}
+    return json.loads(path.read_text()) if path.is_file() else NOTHING
 
 
 def curve(rows: list[dict], points: int = 100) -> dict:
@@ -242,10 +244,10 @@ def is_done(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> bool:
         (int(word.partition("=")[2]) for word in cell.overrides if word.startswith("evaluation.episodes=")), 100
     )
     short = "attempted" in result or result.get("frames", 0) < result.get("frames_asked", 0)
-    if short or result.get("episodes", asked) < asked:
-        return result["budget_minutes"] >= minutes
+    if (short or result.get("episodes", asked) < asked) and result["budget_minutes"] < minutes:
+        return False
     trained = result_if_any(trainings[cell.training]) if cell.training else None
-    return trained is None or result.get("of_training", identity(trained)) == identity(trained)
+    return trained is None or result.get("of_training") == identity(trained)
 
 
 COMPUTE = {"train": train, "evaluate": evaluate, "placement_only": placement_only}
@@ -262,7 +264,8 @@ def compute(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> str:
         if trained is None:
             raise Failed(f"its training, {cell.training}, is not done")
         if "attempted" in trained:
-            return write(cell, minutes, {"attempted": f"its training: {trained['attempted']}"})
+            words = f"its training: {trained['attempted']}"
+            return write(cell, minutes, {"attempted": words, "of_training": identity(trained)})
         if not (OUTPUTS / "train" / cell.training / "checkpoints").is_dir():
             raise Failed(f"the run folder of {cell.training} is not here; delete its result to train it again")
     result = COMPUTE[cell.kind](cell, minutes)
