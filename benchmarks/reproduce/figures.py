@@ -491,8 +491,8 @@ FIGURES = {
     "learning_curves": (
         "Learning curves",
         "Validation at full height while training, R=4, at 6x6x5 but for the panel about clipping; some axes widen "
-        "towards 1. Each network with the K that it is used with, so that masks and search are not told apart here; the "
-        "table below has other K.",
+        "towards 1. Each network with the K that it is used with, so that masks and search are not told apart here; "
+        "the table below has other K.",
         learning_curves,
     ),
     "rl_methods": (
