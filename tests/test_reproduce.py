@@ -86,7 +86,7 @@ def test_mcts_is_far_behind_where_a_trained_policy_is():
     for mean, level, word in ((0.5, 5, "yes so far (1 of 6)"), (0.35, 5, "no (1 of 6)"), (0.35, 2, "undecided")):
         found = tree | {"fcn4d-R4-s0-6x6x5-K1": result(mean, **ours), "t": training(level)}
         assert words(claims.mcts_far_behind(found))["fcn4d"] == word
-    assert "fcn4d (the paper's) came to a tote height of 2 of 5 in 1,000 frames" in claims.verdict(
+    assert "*fcn4d (the paper's)* came to a tote height of 2 of 5 in 1,000 frames" in claims.verdict(
         claims.mcts_far_behind(found)
     )
 

@@ -80,8 +80,13 @@ class Group:
         """Every comparison, or of many the least and the greatest."""
         found = sorted(self.found, key=lambda comparison: comparison.difference[0])
         if len(found) > 4:
-            return f"{label(self.name)}: {len(found)} comparisons, from {found[0]} up to {found[-1]}"
-        return f"{label(self.name)}: {'; '.join(map(str, self.found))}" if found else ""
+            return f"{called(self.name)}: {len(found)} comparisons, from {found[0]} up to {found[-1]}"
+        return f"{called(self.name)}: {'; '.join(map(str, self.found))}" if found else ""
+
+
+def called(name: str) -> str:
+    """A method, or that of a cell, as tables call it."""
+    return f"*{label(name.partition('-')[0])}*"
 
 
 def mean(results, name) -> float | None:
@@ -109,7 +114,8 @@ def untrained(results, name: str) -> str:
     full = int(word.rstrip("]").rpartition(",")[2])
     if not levels or levels[-1] >= full:
         return ""
-    return f"{label(name.partition('-')[0])} came to a tote height of {levels[-1]} of {full} in {training['frames']:,} frames"
+    came = f"{levels[-1]} of {full} in {training['frames']:,} frames"
+    return f"{called(name)} came to a tote height of {came}"
 
 
 def compare(
@@ -172,7 +178,7 @@ def against(results, joint: str, individual) -> list[Comparison | str | None]:
             if best is None:
                 found.append(None)
                 continue
-            comparison = compare(results, f"{tote} R={r}, minus {label(best.partition('-')[0])}", ours, best)
+            comparison = compare(results, f"{tote} R={r}, minus {called(best)}", ours, best)
             if isinstance(comparison, Comparison):  # to be said, though it has had the same hour
                 comparison = replace(comparison, remark=untrained(results, best))
             found.append(unless_untrained(comparison, results, ours))
@@ -344,7 +350,7 @@ CLAIMS = [
 
 def verdict(groups: list[Group]) -> str:
     """One word where all networks agree, else one for each; and why, where they do not bear it out."""
-    words = {label(group.name): group.word() for group in groups}
+    words = {called(group.name): group.word() for group in groups}
     if len(set(words.values())) == 1:
         text = next(iter(words.values()))
     else:
