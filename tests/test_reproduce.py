@@ -22,10 +22,10 @@ FOLDER = Path(__file__).parents[1] / "benchmarks" / "reproduce"
 TRAININGS, PARTS = cells.read()
 
 
-def test_every_training_composes_and_every_evaluation_too():
+def test_trainings_and_evaluations_of_every_method_compose():
     evaluations = {cell.name: cell for part in PARTS.values() for cell in part if cell.kind == "evaluate"}
     with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
-        for cell in TRAININGS.values():
+        for cell in {cell.method: cell for cell in TRAININGS.values()}.values():  # of each method the last
             assert compose("train", list(cell.overrides)).total_frames >= 300_000
         for overrides in {
             (cell.method, *sorted(dict(cell.axes))): cell.overrides for cell in evaluations.values()
