@@ -178,7 +178,9 @@ def test_clipping_is_judged_by_trainings_that_came_up_to_the_clip():
     found = {f"fcn_grasp-R4-s{seed}-6x6x10-Kall": result(0.9) for seed in range(3)}
     found |= {f"fcn_grasp_noclip-R4-s{seed}-6x6x10-Kall": result(0.8, training="t") for seed in range(3)}
     assert words(claims.clipping_helps(found | {"t": training(10, tote="6,6,10")}))["fcn_grasp"] == "yes"
-    assert words(claims.clipping_helps(found | {"t": training(2, tote="6,6,10")}))["fcn_grasp"] == "undecided"
+    assert words(claims.clipping_helps(found | {"t": training(8, tote="6,6,10")}))["fcn_grasp"] == "undecided"
+    short = claims.clipping_helps(found | {"t": training(9, tote="6,6,10")})
+    assert words(short)["fcn_grasp"] == "yes" and "9 of 10" in claims.verdict(short)
 
 
 def test_every_claim_has_a_row_with_and_without_results():
