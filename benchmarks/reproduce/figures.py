@@ -349,6 +349,8 @@ def milliseconds(result) -> float:
 
 
 def latency(results, path) -> bool:
+    from matplotlib.ticker import LogLocator
+
     figure, (axes,) = canvas(6.5, 4.2)
     series = [
         ("fcn_grasp", ["fcn_grasp_mixed-6x6x5"]),
@@ -360,15 +362,19 @@ def latency(results, path) -> bool:
         names = [name for name in names if "occupancy" in results.get(name, {})]
         times = [milliseconds(results[name]) for name in names]
         points(axes, times, results, names, method)
-        for name, time in zip(names, times, strict=True):
+        for place, (name, time) in enumerate(zip(names, times, strict=True)):
             if name.startswith(("lookahead", "mcts")):  # how many samples, or simulations
                 where = (time, results[name]["occupancy"]["mean"])
                 number = name.rpartition("-")[2].replace("sim", " simulations").replace("samples", " samples")
-                axes.annotate(number, where, (5, -9), textcoords="offset points", fontsize=7)
+                offset = (6, 4 if place % 2 else -10)  # neighbours may stand close
+                axes.annotate(number, where, offset, textcoords="offset points", fontsize=7)
     if not axes.lines:
         return False
     axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
+    axes.minorticks_off()
+    axes.margins(x=0.15)
     axes.set_xlabel("milliseconds of CPU time a decision")
     axes.set_ylabel("occupancy, 27 kinds of items, 6x6x5, R=4")
     legend(figure, [axes], ncols=4)
