@@ -24,7 +24,7 @@ METHODS = {
     "individual_heuristic": ("individual, heuristic", "#cc79a7", "D"),
     "individual_heuristic_cells": ("individual, heuristic, every cell", "#7a3b69", "d"),
     "joint_dbl": ("joint DBL", "#000000", "P"),
-    "mcts": ("MCTS, no mask", "#009e73", "X"),
+    "mcts": ("MCTS", "#009e73", "X"),
     "mcts_outcomes": ("MCTS, mask", "#005f46", "X"),
     "random": ("random, feasible", "#8c8c8c", "x"),
     "uniform": ("uniform, all actions", "#b0b0b0", "+"),
@@ -139,18 +139,17 @@ def points(axes, xs, results, names, method, line="-", **more) -> None:
         )  # fmt: skip
 
 
-def widened(axes) -> None:
+def widened(axes, top: float = 0.999) -> None:
     """An axis of occupancies that widens towards 1, where good methods differ: logarithmic in what is left empty."""
-    least = 1e-3
     axes.set_yscale(
         "function",
         functions=(
-            lambda share: -np.log10(np.maximum(1 - share, least)),
+            lambda share: -np.log10(np.maximum(1 - share, 1 - top)),
             lambda height: 1 - 10.0**-height,
         ),
     )
-    axes.set_ylim(0, 0.999)
-    ticks = (0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998)
+    axes.set_ylim(0, top)
+    ticks = [tick for tick in (0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 0.9995, 0.9998) if tick < top]
     axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
 
@@ -196,7 +195,7 @@ def individual(results, path) -> bool:
         part.set_title(tote, fontsize=10)
         part.set_xticks(rotations, rotations)
         part.set_xlim(0.6, 4.4)
-        widened(part)
+        widened(part, top=0.9999)
     if not any(part.lines for part in axes):
         return False
     for part in axes[3:]:
@@ -218,7 +217,7 @@ def rl_methods(results, path) -> bool:
         ("typical", "typical-R4-s0-{}-K1", {"label": "typical, K=1"}),
         ("individual_rl", "individual_rl-R4-s0-{}-K1", {"label": "individual, RL, K=1"}),
         ("mcts_outcomes", "mcts-R4-{}-mask_true", {}),
-        ("mcts", "mcts-R4-{}-mask_false", {}),
+        ("mcts", "mcts-R4-{}-mask_false", {"label": "MCTS, no mask"}),
         ("random", "random-R4-{}", {}),
         ("uniform", "uniform-R4-{}", {}),
     ]
@@ -405,7 +404,7 @@ def presets(results, path) -> bool:
     for number, (method, name) in enumerate(rows):
         names = [name(*preset.split("-")) for preset in PRESETS.values()]
         xs = np.arange(len(PRESETS)) + 0.07 * (number - len(rows) / 2 + 0.5)
-        points(axes, xs, results, names, method, line="")
+        points(axes, xs, results, names, method, line="", **({"label": "MCTS, no mask"} if method == "mcts" else {}))
     if not axes.lines:
         return False
     axes.set_xticks(range(len(PRESETS)), PRESETS)
