@@ -139,7 +139,7 @@ def watched(collector):
     """
     workers = getattr(collector, "procs", [])
 
-    def look(*_):
+    def look(signum=None, _=None):
         dead = [number for number, worker in enumerate(workers) if not worker.is_alive()]
         if dead:  # first of all one that was killed: others may have ended because of it
             number = min(dead, key=lambda number: workers[number].exitcode == 0)
@@ -148,6 +148,8 @@ def watched(collector):
             again = threading.Timer(0.5, signal.pthread_kill, (threading.main_thread().ident, signal.SIGCHLD))
             again.daemon = True
             again.start()
+            if signum and sys.exc_info()[1]:
+                return  # an error is on its way out, maybe of this death: do not break in on its cleaning up
             raise WorkerDied(f"collector worker {number + 1} of {len(workers)} has died (exit code {code}).")
 
     previous = signal.signal(signal.SIGCHLD, look)
