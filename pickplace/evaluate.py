@@ -147,10 +147,8 @@ def decision_latency(make_env, planner, decisions: int) -> dict[str, float] | No
         times.append((time.perf_counter() - start) * 1e3)
         cpu_times.append((time.process_time() - cpu_start) * 1e3)
         _, observation = env.step_and_maybe_reset(observation.set("action", action))
-    p50, p95 = (
-        torch.tensor(times, dtype=torch.float64).quantile(torch.tensor([0.5, 0.95], dtype=torch.float64)).tolist()
-    )
-    return {"p50": p50, "p95": p95, "cpu_p50": float(torch.tensor(cpu_times, dtype=torch.float64).quantile(0.5))}
+    wall, cpu = torch.tensor([times, cpu_times], dtype=torch.float64)
+    return {"p50": float(wall.quantile(0.5)), "p95": float(wall.quantile(0.95)), "cpu_p50": float(cpu.quantile(0.5))}
 
 
 def summarise(result: Episodes) -> dict:

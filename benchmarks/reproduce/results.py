@@ -140,8 +140,10 @@ def no_better_than_random(result, results) -> str:
 
 
 #: What stands behind a figure; what each episode gave, from which seeds are pooled, is in the cells' own JSON.
-DRAWN = ("method", "axes", "command", "occupancy", "episodes", "latency_ms", "attempted")
-DRAWN_OF_PLANS = ("occupancy_planned", "share_executed", "placements", "plans_executed_whole")
+DRAWN = (
+    "method", "axes", "command", "occupancy", "episodes", "latency_ms", "attempted",
+    "occupancy_planned", "share_executed", "placements", "plans_executed_whole",
+)  # fmt: skip
 DRAWN_OF_TRAININGS = ("command", "frames", "cpu_seconds", "curve", "attempted")
 
 
@@ -157,9 +159,7 @@ def behind(cells, results) -> dict:
     trainings = dict.fromkeys(cell.training for cell in cells if cell.training in results)
     return {
         "cells": {
-            cell.name: {"training": cell.training, **some(cell.name, DRAWN + DRAWN_OF_PLANS)}
-            for cell in cells
-            if cell.name in results
+            cell.name: {"training": cell.training, **some(cell.name, DRAWN)} for cell in cells if cell.name in results
         },
         "trainings": {name: some(name, DRAWN_OF_TRAININGS) for name in trainings},
     }
