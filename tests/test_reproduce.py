@@ -369,13 +369,43 @@ def test_what_a_smaller_budget_cut_short_is_computed_again(tmp_path, monkeypatch
     assert not done(trained, 60, budget_minutes=10, frames=10, frames_asked=20, cpu_seconds=5)
     assert not done(trained, 60, budget_minutes=10, attempted="hours")
     assert done(trained, 60, budget_minutes=10, frames=20, frames_asked=20, cpu_seconds=5)
-    now, before = {"frames": 20, "cpu_seconds": 5}, {"frames": 10, "cpu_seconds": 5}
+    now, before = run.identity({"frames": 20}), run.identity({"frames": 10})
     assert not done(tested, 60, budget_minutes=10, episodes=49, of_training=now)
     assert done(tested, 10, budget_minutes=10, episodes=49, of_training=now)
     assert not done(tested, 10, budget_minutes=10, episodes=49, of_training=before)
     assert not done(tested, 10, budget_minutes=10, attempted="its training", of_training=before)
     assert done(tested, 60, budget_minutes=10, episodes=50, of_training=now)
     assert not done(tested, 60, budget_minutes=10, episodes=50, of_training=before)
+
+
+def test_a_training_whose_weights_are_elsewhere_is_repeated_where_an_evaluation_needs_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(run, "OUTPUTS", tmp_path / "outputs")
+    trained = cells.Cell("t", "train", (), "t", ())
+    tested = cells.Cell("e", "evaluate", (), "e", (), "t")
+
+    def names():
+        return [cell.name for cell in run.trainings_to_run([tested], {"t": trained}, lambda cell: 60)]
+
+    def write(cell, **result):
+        run.result_of(cell).parent.mkdir(parents=True, exist_ok=True)
+        run.result_of(cell).write_text(json.dumps(result))
+
+    curve = {"frames": [10, 20], "validation_occupancy": [0.5]}
+    assert names() == ["t"]
+    write(trained, frames=20, frames_asked=20, cpu_seconds=5, curve=curve)
+    assert names() == ["t"]
+    (run.run_dir_of(trained) / "checkpoints").mkdir(parents=True)
+    assert names() == []
+    (run.run_dir_of(trained) / "checkpoints").rmdir()
+    repeated = {"frames": 20, "cpu_seconds": 7, "curve": curve}
+    write(tested, episodes=100, of_training=run.identity(repeated))
+    assert names() == []
+    curve["validation_occupancy"] = [0.6]
+    write(trained, frames=20, frames_asked=20, cpu_seconds=5, curve=curve)
+    assert names() == ["t"]
+    write(trained, attempted="no memory")
+    assert names() == []
 
 
 def test_a_failure_that_may_pass_leaves_no_result(tmp_path, monkeypatch):

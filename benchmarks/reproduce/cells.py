@@ -37,6 +37,7 @@ class Cell:
         method: as figures call it.
         axes: values of the grid, by axis.
         training: the training whose checkpoint it evaluates, or None.
+        minutes: its budget, CPU time of one core.
     """
 
     name: str
@@ -45,19 +46,21 @@ class Cell:
     method: str
     axes: tuple[tuple[str, object], ...]
     training: str | None = None
+    minutes: float = 60
 
 
 def expand(entry: dict, kind: str) -> list[Cell]:
     """The cells of an entry of a yaml file.
 
     Args:
-        entry: ``method``; ``set``, overrides as one line; ``grid``, lists of values by axis; and, for evaluations,
-            ``training``: the name of one, in which ``{axis}`` stands for the grid's value.
+        entry: ``method``; ``set``, overrides as one line; ``grid``, lists of values by axis; ``minutes``, the budget
+            of each cell, 60 by default; and, for evaluations, ``training``: the name of one, in which ``{axis}`` stands
+            for the grid's value.
 
     Raises:
         ValueError: for a key or an axis that there is not.
     """
-    known = {"method", "set", "grid", "training", "kind"}
+    known = {"method", "set", "grid", "training", "kind", "minutes"}
     if unknown := set(entry) - known:
         raise ValueError(f"{sorted(unknown)[0]}: expected one of {', '.join(sorted(known))}.")
     kind, grid = entry.get("kind", kind), entry.get("grid", {})
@@ -74,7 +77,8 @@ def expand(entry: dict, kind: str) -> list[Cell]:
                 continue  # of the training; every method meets the same episodes
             overrides.append(override.format(str(value).replace("x", ",") if axis == "tote" else value))
         training = entry["training"].format(**axes) if "training" in entry else None
-        cells.append(Cell("-".join(labels), kind, tuple(overrides), entry["method"], tuple(axes.items()), training))
+        name, minutes = "-".join(labels), entry.get("minutes", 60)
+        cells.append(Cell(name, kind, tuple(overrides), entry["method"], tuple(axes.items()), training, minutes))
     return cells
 
 

@@ -1,13 +1,15 @@
 """Computes the cells of the comparison that are not there yet, and writes docs/results/: make reproduce.
 
-    python benchmarks/reproduce/run.py [--figure NAME ...] [--match TEXT] [--minutes 60] [--jobs 1] [--list]
+    python benchmarks/reproduce/run.py [--figure NAME ...] [--match TEXT] [--minutes M] [--jobs 1] [--list]
 
 Each cell runs in a process of its own, in one thread; its budget is CPU time. What stops early is taken up again: a
 training goes on from its last checkpoint, an evaluation begins anew. A finished cell is one JSON file that holds its
-command. What a smaller budget cut short is computed again, and so is an evaluation whose training has gone on.
+command. What a smaller budget cut short is computed again, and so is an evaluation whose training has gone on. A
+training whose run folder is not here, but on the machine that it ran on, is repeated where an evaluation needs it.
 """
 
 import argparse
+import hashlib
 import json
 import os
 import re
@@ -17,6 +19,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -231,8 +234,9 @@ def result_if_any(cell: Cell) -> dict | None:
 
 
 def identity(trained: dict) -> dict:
-    """What tells a training from the same one that has gone on, or that was run again."""
-    return {key: trained.get(key) for key in ("frames", "cpu_seconds")}
+    """What tells a training from one that went otherwise or further; repeated bit for bit, it stays the same."""
+    curve = json.dumps(trained.get("curve"), sort_keys=True).encode()
+    return {"frames": trained.get("frames"), "curve": hashlib.sha256(curve).hexdigest()[:16]}
 
 
 def is_done(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> bool:
@@ -248,6 +252,20 @@ def is_done(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> bool:
         return False
     trained = result_if_any(trainings[cell.training]) if cell.training else None
     return trained is None or result.get("of_training") == identity(trained)
+
+
+def trainings_to_run(chosen: list[Cell], trainings: dict[str, Cell], budget: Callable[[Cell], float]) -> list[Cell]:
+    """What the chosen cells need: trainings that are not done, and those done elsewhere whose weights are not here."""
+
+    def missing(cell):
+        return not is_done(cell, budget(cell), trainings)
+
+    def weights_gone(cell):
+        return "attempted" not in result_if_any(cell) and not (run_dir_of(cell) / "checkpoints").is_dir()
+
+    needed = list({cell.training: trainings[cell.training] for cell in chosen if cell.training}.values())
+    waiting = {cell.training for cell in chosen if missing(cell)}
+    return [cell for cell in needed if missing(cell) or (cell.name in waiting and weights_gone(cell))]
 
 
 COMPUTE = {"train": train, "evaluate": evaluate, "placement_only": placement_only}
@@ -267,7 +285,7 @@ def compute(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> str:
             words = f"its training: {trained['attempted']}"
             return write(cell, minutes, {"attempted": words, "of_training": identity(trained)})
         if not (OUTPUTS / "train" / cell.training / "checkpoints").is_dir():
-            raise Failed(f"the run folder of {cell.training} is not here; delete its result to train it again")
+            raise Failed(f"the run folder of {cell.training} is not here")
     result = COMPUTE[cell.kind](cell, minutes)
     if stopped.is_set():
         raise Failed("stopped")
@@ -325,7 +343,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--figure", action="append", help="only the cells of this figure; may be repeated")
     parser.add_argument("--match", default="", help="only cells in whose name this regular expression is found")
-    parser.add_argument("--minutes", type=float, default=60, help="budget of a cell, CPU time of one core")
+    parser.add_argument("--minutes", type=float, help="budget of a cell, CPU time of one core (default: as defined)")
     parser.add_argument("--jobs", type=int, default=1, help="cells that run side by side, one core each")
     parser.add_argument("--list", action="store_true", help="tell what is done and what is not, and end")
     arguments = parser.parse_args()
@@ -334,14 +352,18 @@ def main() -> None:
         parser.error(f"--figure {sorted(unknown)[0]}: expected one of {', '.join(figures)}.")
     chosen = [cell for name in arguments.figure or figures for cell in figures[name]]
     chosen = list({cell.name: cell for cell in chosen if re.search(arguments.match, cell.name)}.values())
-    first = list({cell.training: trainings[cell.training] for cell in chosen if cell.training}.values())
+    needed = {cell.training for cell in chosen if cell.training}
 
-    def missing(part: list[Cell]) -> list[Cell]:
-        return [cell for cell in part if not is_done(cell, arguments.minutes, trainings)]
+    def budget(cell: Cell) -> float:
+        return cell.minutes if arguments.minutes is None else arguments.minutes
 
-    say(f"{len(first) + len(chosen)} cells, {len(missing(first)) + len(missing(chosen))} to compute")
+    def missing() -> list[Cell]:
+        return [cell for cell in chosen if not is_done(cell, budget(cell), trainings)]
+
+    to_train = trainings_to_run(chosen, trainings, budget)
+    say(f"{len(needed) + len(chosen)} cells, {len(to_train) + len(missing())} to compute")
     if arguments.list:
-        for cell in missing(first) + missing(chosen):
+        for cell in to_train + missing():
             say(f"  {cell.kind} {cell.name}: {command_of(cell)}")
         return
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -351,14 +373,14 @@ def main() -> None:
         if stopped.is_set():
             return
         try:
-            word = compute(cell, arguments.minutes, trainings)
+            word = compute(cell, budget(cell), trainings)
         except Exception as error:  # of a run of days, one cell
             word = f"failed, {error}" if isinstance(error, Failed) else f"failed, {type(error).__name__}: {error}"
         say(f"{cell.kind} {cell.name}: {word}")
 
-    for part in (first, chosen):  # what evaluations need comes before them
-        with ThreadPoolExecutor(arguments.jobs) as pool:
-            list(pool.map(work, missing(part)))
+    with ThreadPoolExecutor(arguments.jobs) as pool:
+        list(pool.map(work, to_train))
+        list(pool.map(work, missing()))  # now that it is known whether a training went on
 
 
 def say(text: str) -> None:
