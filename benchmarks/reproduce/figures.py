@@ -490,7 +490,9 @@ FIGURES = {
     "individual": (
         "Joint against individual planning",
         "Occupancy over the rotations to choose from, one panel a tote. K=10 for what was trained without a mask; "
-        "fcn_grasp with a mask takes the best of all feasible actions.",
+        "fcn_grasp with a mask takes the best of all feasible actions. The paper's individual heuristic ends where no "
+        "corner of a free rectangle passes: an empty tote and a closed layer leave four, all by the walls, so that the "
+        "first item ends 22 of 100 episodes, and flatter packings, of more rotations, end sooner.",
         individual,
     ),
     "learning_curves": (
