@@ -404,7 +404,7 @@ def test_a_training_whose_weights_are_elsewhere_is_repeated_where_an_evaluation_
     curve["validation_occupancy"] = [0.6]
     write(trained, frames=20, frames_asked=20, cpu_seconds=5, curve=curve)
     assert names() == ["t"]
-    write(trained, attempted="no memory")
+    write(trained, attempted="no memory", budget_minutes=60)
     assert names() == []
 
 
