@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections import Counter
 from pathlib import Path
 
 import cells as definitions
@@ -21,7 +22,8 @@ says so. s0, s1 and s2 are training seeds; what has one of them alone was traine
 policy that is not surely above random feasible choices on the same episodes, which know the mask; a policy that was
 trained with a mask does not without one. *Attempted* cells could not be done within their budget, or within 20 GiB, and
 tell how far off they were. The time of a decision is CPU time, of one tote in one thread; (wall) marks what was
-measured by the clock, on a machine that did other work beside.
+measured by the clock, on a machine that did other work beside. Processors differ, and so do times and what a budget of
+minutes is worth. Computed on: {processors}
 
 In the figures a point is the mean over episodes, and over seeds where there are several. Bars are 95% confidence
 intervals over episodes, widened to the range of the seeds. Hollow: fewer than {few} episodes. Pale: the training
@@ -35,6 +37,14 @@ def load() -> dict[str, dict]:
     """Every result that there is, by the name of its cell."""
     paths = [*(RESULTS / "cells").glob("*.json"), *(RESULTS / "trainings").glob("*.json")]
     return {path.stem: json.loads(path.read_text()) for path in sorted(paths)}
+
+
+def processors(results) -> str:
+    """A sentence on what the cells were computed on."""
+    count = Counter(result.get("processor", "") for result in results.values())
+    unknown = count.pop("", 0)
+    words = [f"{name}, {number} cells" for name, number in sorted(count.items())]
+    return "; ".join([*words, *[f"not noted, {unknown} cells"] * bool(unknown)]) + "."
 
 
 def table(cells, results) -> list[str]:
@@ -171,7 +181,7 @@ def main() -> None:
     every = {cell.name for cells in parts.values() for cell in cells}
     every |= {cell.training for cells in parts.values() for cell in cells if cell.training}
     done = sum(name in results for name in every)
-    text = [HEAD.format(few=figures.FEW, done=done, total=len(every))]
+    text = [HEAD.format(few=figures.FEW, done=done, total=len(every), processors=processors(results))]
     text += ["## What the paper claims, and what we find\n", claims.HOW, *claims.table(results), ""]
     for name, (title, caption, draw) in figures.FIGURES.items():
         text.append(f"## {title}\n")

@@ -12,6 +12,7 @@ import argparse
 import hashlib
 import json
 import os
+import platform
 import re
 import resource
 import signal
@@ -304,6 +305,7 @@ def write(cell: Cell, minutes: float, result: dict) -> str:
         "training": cell.training,
         "command": command_of(cell, result),
         "budget_minutes": minutes,
+        "processor": processor(),
     }
     facts = {"commit": commit(), "versions": versions()} if cell.kind == "train" or "attempted" in result else {}
     path = result_of(cell)
@@ -315,6 +317,17 @@ def write(cell: Cell, minutes: float, result: dict) -> str:
     if cell.kind == "train":
         return f"{result['frames']:,} frames in {result['cpu_seconds']:.0f} s"
     return f"{result['occupancy']['mean']:.4f}, {result['episodes']} episodes" if "occupancy" in result else "done"
+
+
+def processor() -> str:
+    """What times and budgets were measured on."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    facts = dict(re.split(r"\s*:\s*", line, maxsplit=1) for line in lines if ":" in line)
+    units = [unit for unit in ("amx_bf16", "avx512_bf16") if unit in facts.get("flags", "").split()]
+    return ", ".join([facts.get("model name", platform.machine()), *units[:1]])
 
 
 def one_line_a_list(content: dict) -> str:
