@@ -264,7 +264,7 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """The commit of the checkout that the package runs from, with ``+`` if it was altered; None outside a checkout."""
+    """The commit of the checkout that the package runs from; None outside one. ``+``: altered, docs aside."""
     root = config.PACKAGE.parent
     if not (root / ".git").exists():
         return None
@@ -274,7 +274,7 @@ def commit() -> str | None:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
     try:
-        return run("rev-parse", "HEAD").strip() + ("+" if run("status", "--porcelain", "-uno").strip() else "")
+        return run("rev-parse", "HEAD").strip() + ("+" if run("status", "--porcelain", "-uno", "--", ".", ":!docs").strip() else "")
     except (OSError, subprocess.CalledProcessError):
         return None
 
