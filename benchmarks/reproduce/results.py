@@ -21,9 +21,9 @@ the method was trained with: frames, and minutes of one core; a cell has an hour
 says so. s0, s1 and s2 are training seeds; what has one of them alone was trained once. *No better than random* marks a
 policy that is not surely above random feasible choices on the same episodes, which know the mask; a policy that was
 trained with a mask does not without one. *Attempted* cells could not be done within their budget, or within 20 GiB, and
-tell how far off they were. The time of a decision is CPU time, of one tote in one thread; (wall) marks what was
-measured by the clock, on a machine that did other work beside. Processors differ, and so do times and what a budget of
-minutes is worth. Computed on: {processors}
+tell how far off they were. The time of a decision is the mean of CPU time over an episode, of one tote in one thread;
+older cells have the median, and the oldest by the clock, on a machine that did other work beside. Processors differ,
+and so do times and what a budget of minutes is worth. Computed on: {processors}
 
 In the figures a point is the mean over episodes, and over seeds where there are several. Bars are 95% confidence
 intervals over episodes, widened to the range of the seeds. Hollow: fewer than {few} episodes. Pale: the training
@@ -82,7 +82,8 @@ def decision(result) -> str:
     if not latency:
         return ""
     time = figures.milliseconds(result)
-    return (f"{time / 1e3:.1f} s" if time >= 1e3 else f"{time:.1f} ms") + " (wall)" * ("cpu_p50" not in latency)
+    older = "" if "cpu_mean" in latency else " (median)" if "cpu_p50" in latency else " (median, wall)"
+    return (f"{time / 1e3:.1f} s" if time >= 1e3 else f"{time:.1f} ms") + older
 
 
 def budget(cell, results) -> str:
