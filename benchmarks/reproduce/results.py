@@ -21,7 +21,7 @@ the method was trained with: frames, and minutes of one core; a cell has an hour
 says so. s0, s1 and s2 are training seeds; what has one of them alone was trained once. *No better than random* marks a
 policy that is not surely above random feasible choices on the same episodes, which know the mask; a policy that was
 trained with a mask does not without one. *Attempted* cells could not be done within their budget, or within 20 GiB, and
-tell how far off they were. The time of a decision is the mean of CPU time over an episode, of one tote in one thread;
+tell how far off they were. The time of a decision is a mean of CPU time, of one tote in one thread, over 20 or more;
 older cells have the median, and the oldest by the clock, on a machine that did other work beside. Processors differ,
 and so do times and what a budget of minutes is worth. Computed on: {processors}
 
