@@ -362,12 +362,12 @@ def latency(results, path) -> bool:
         names = [name for name in names if "occupancy" in results.get(name, {})]
         times = [milliseconds(results[name]) for name in names]
         points(axes, times, results, names, method)
-        for place, (name, time) in enumerate(zip(names, times, strict=True)):
-            if name.startswith(("lookahead", "mcts")):  # how many samples, or simulations
+        for name, time in zip(names, times, strict=True):
+            if name.startswith(("lookahead", "mcts")):  # how many samples, or simulations: off the line, which rises
                 where = (time, results[name]["occupancy"]["mean"])
                 number = name.rpartition("-")[2].replace("sim", " simulations").replace("samples", " samples")
-                offset = (6, 4 if place % 2 else -10)  # neighbours may stand close
-                axes.annotate(number, where, offset, textcoords="offset points", fontsize=7)
+                offset, side = ((6, -11), "left") if name.startswith("lookahead") else ((-6, 5), "right")
+                axes.annotate(number, where, offset, textcoords="offset points", fontsize=7, ha=side)
     if not axes.lines:
         return False
     axes.set_xscale("log")
