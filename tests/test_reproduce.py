@@ -205,6 +205,14 @@ def test_seeds_are_drawn_as_one_point_with_the_range_of_both():
     assert 0.5 - low == pytest.approx(1.96 * 0.3 / 10, rel=0.03) == high - 0.5
 
 
+def test_where_another_seed_alone_met_a_tote_it_is_drawn_and_judged():
+    found = {"fcn4d-R4-s0-6x6x5-K1": result(0.5), "fcn4d-R4-s1-6x6x5-K1": result(0.6)}
+    found["fcn4d-R4-s1-30x30x5-K1"] = result(0.7)
+    assert figures.one_seed(found, "fcn4d-R4-s0-6x6x5-K1") == "fcn4d-R4-s0-6x6x5-K1"
+    assert figures.one_seed(found, "fcn4d-R4-s0-30x30x5-K1") == "fcn4d-R4-s1-30x30x5-K1"
+    assert figures.one_seed(found, "fcn4d-R4-s0-30x30x10-K1") == "fcn4d-R4-s0-30x30x10-K1"  # none has
+
+
 def test_tables_say_what_is_missing_attempted_and_no_better_than_random():
     cell = next(cell for cell in PARTS["rl_methods"] if cell.name == "typical-R4-s0-6x6x5-K1")
     setting = {"env": {"tote_size": [6, 6, 5], "num_envs": 16}, "items": {"kinds": []}}

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from math import hypot
 
 import torch
-from figures import FEW, TOTES, label
+from figures import FEW, TOTES, label, one_seed
 
 from pickplace.evaluate import confidence95
 
@@ -174,7 +174,8 @@ def against(results, joint: str, individual) -> list[Comparison | str | None]:
     found = []
     for tote in TOTES:
         for r in rotations_of(joint):
-            ours, best = f"{joint}-R{r}-s0-{tote}-K10", best_of(results, [name.format(r, tote) for name in individual])
+            ours = one_seed(results, f"{joint}-R{r}-s0-{tote}-K10")
+            best = best_of(results, [one_seed(results, name.format(r, tote)) for name in individual])
             if best is None:
                 found.append(None)
                 continue
@@ -239,7 +240,7 @@ def no_loss_with_size(results) -> list[Group]:
     """No tote but 6x6x10 is packed worse than 6x6x5 by more than a hundredth."""
     groups = []
     for method, k in SIZES:
-        names = {tote: f"{method}-R4-s0-{tote}-K{k}" for tote in TOTES}
+        names = {tote: one_seed(results, f"{method}-R4-s0-{tote}-K{k}") for tote in TOTES}
         small = names["6x6x5"]
         found = [
             compare(results, f"{tote} minus 6x6x5", names[tote], small, -0.01, learned=[small]) for tote in TOTES[2:]
@@ -291,7 +292,7 @@ def clipping_helps(results) -> list[Group]:
     grasp = [compare(results, f"seed {s}, clipped minus not", *pair, learned=pair) for s, pair in enumerate(names)]
     paper = []
     for tote in ("6x6x10", "10x10x10", "30x30x10"):
-        names = [f"{method}-R4-s0-{tote}-K1" for method in ("fcn4d", "fcn4d_noclip")]
+        names = [one_seed(results, f"{method}-R4-s0-{tote}-K1") for method in ("fcn4d", "fcn4d_noclip")]
         paper.append(compare(results, f"{tote}, clipped minus not", *names, learned=reversed(names)))
     return [Group("fcn_grasp", grasp), Group("fcn4d", paper)]
 
@@ -302,7 +303,7 @@ def mcts_far_behind(results) -> list[Group]:
     for joint in JOINT:
         found = []
         for tote in TOTES:
-            ours, tree = f"{joint}-R4-s0-{tote}-K1", f"mcts-R4-{tote}-mask_false"
+            ours, tree = one_seed(results, f"{joint}-R4-s0-{tote}-K1"), f"mcts-R4-{tote}-mask_false"
             comparison = compare(results, f"{tote}, minus mcts", ours, tree, margin=0.1)
             found.append(unless_untrained(comparison, results, ours))
         groups.append(Group(joint, found))
@@ -315,7 +316,7 @@ def large_totes_work(results) -> list[Group]:
     for method, k in SIZES:
         found = []
         for tote in TOTES[4:]:
-            name = f"{method}-R4-s0-{tote}-K{k}"
+            name = one_seed(results, f"{method}-R4-s0-{tote}-K{k}")
             if mean(results, name) is None:
                 found.append(ATTEMPTED if name in results else None)
                 continue
@@ -329,9 +330,9 @@ def large_totes_work(results) -> list[Group]:
     return groups
 
 
-HOW = f"""For each network, of training seed 0 but where seeds are named. *Yes* and *no* need a 95% interval that lies
-on one side, {FEW} episodes, and a training that came up to its tote's height, or one cell
-less; numbers count comparisons.
+HOW = f"""For each network, of training seed 0 but where seeds are named, or where seed 1 alone met the widest totes.
+*Yes* and *no* need a 95% interval that lies on one side, {FEW} episodes, and a training that came up to its tote's
+height, or one cell less; numbers count comparisons.
 """
 
 #: What the paper says, and what holds it against our figures.
