@@ -1,11 +1,12 @@
 """Computes the cells of the comparison that are not there yet, and writes docs/results/: make reproduce.
 
-    python benchmarks/reproduce/run.py [--figure NAME ...] [--match TEXT] [--minutes M] [--jobs 1] [--list]
+    python benchmarks/reproduce/run.py [--figure NAME ...] [--match TEXT] [--minutes M] [--jobs 1] [--again] [--list]
 
 Each cell runs in a process of its own, in one thread; its budget is CPU time. What stops early is taken up again: a
 training goes on from its last checkpoint, an evaluation begins anew. A finished cell is one JSON file that holds its
 command. What a smaller budget cut short is computed again, and so is an evaluation whose training has gone on. A
 training whose run folder is not here, but on the machine that it ran on, is repeated where an evaluation needs it.
+With --again all chosen evaluations are; git tells how they differ.
 """
 
 import argparse
@@ -255,11 +256,8 @@ def is_done(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> bool:
     return trained is None or result.get("of_training") == identity(trained)
 
 
-def trainings_to_run(chosen: list[Cell], trainings: dict[str, Cell], budget: Callable[[Cell], float]) -> list[Cell]:
-    """What the chosen cells need: trainings that are not done, and those done elsewhere whose weights are not here."""
-
-    def missing(cell):
-        return not is_done(cell, budget(cell), trainings)
+def trainings_to_run(chosen: list[Cell], trainings: dict[str, Cell], missing: Callable[[Cell], bool]) -> list[Cell]:
+    """What the chosen cells need: trainings that are missing, and those done elsewhere whose weights are not here."""
 
     def weights_gone(cell):
         return "attempted" not in result_if_any(cell) and not (run_dir_of(cell) / "checkpoints").is_dir()
@@ -358,6 +356,7 @@ def main() -> None:
     parser.add_argument("--match", default="", help="only cells in whose name this regular expression is found")
     parser.add_argument("--minutes", type=float, help="budget of a cell, CPU time of one core (default: as defined)")
     parser.add_argument("--jobs", type=int, default=1, help="cells that run side by side, one core each")
+    parser.add_argument("--again", action="store_true", help="evaluate what is done, too")
     parser.add_argument("--list", action="store_true", help="tell what is done and what is not, and end")
     arguments = parser.parse_args()
     trainings, figures = definitions.read()
@@ -370,13 +369,13 @@ def main() -> None:
     def budget(cell: Cell) -> float:
         return cell.minutes if arguments.minutes is None else arguments.minutes
 
-    def missing() -> list[Cell]:
-        return [cell for cell in chosen if not is_done(cell, budget(cell), trainings)]
+    def missing(cell: Cell) -> bool:
+        return (arguments.again and cell.kind != "train") or not is_done(cell, budget(cell), trainings)
 
-    to_train = trainings_to_run(chosen, trainings, budget)
-    say(f"{len(needed) + len(chosen)} cells, {len(to_train) + len(missing())} to compute")
+    to_train = trainings_to_run(chosen, trainings, missing)
+    say(f"{len(needed) + len(chosen)} cells, {len(to_train) + sum(map(missing, chosen))} to compute")
     if arguments.list:
-        for cell in to_train + missing():
+        for cell in [*to_train, *filter(missing, chosen)]:
             say(f"  {cell.kind} {cell.name}: {command_of(cell)}")
         return
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -393,7 +392,7 @@ def main() -> None:
 
     with ThreadPoolExecutor(arguments.jobs) as pool:
         list(pool.map(work, to_train))
-        list(pool.map(work, missing()))  # now that it is known whether a training went on
+        list(pool.map(work, filter(missing, chosen)))  # now that it is known whether a training went on
 
 
 def say(text: str) -> None:
