@@ -16,8 +16,9 @@ class Lookahead:
     Each candidate is followed by the policy itself, on the same imagined item streams as the others (common random
     numbers), so that their difference is known far better than their values. More streams are spent where candidates
     are close. The policy's own choice stands unless another's mean difference to it is positive by ``confidence``
-    standard errors: a rollout algorithm (Tesauro & Galperin 1996) that noise cannot make worse than its policy, to
-    that confidence. The imagined items come from the item distribution, never from the stream that is played.
+    standard errors: a rollout algorithm (Tesauro & Galperin 1996) that the items' noise cannot make worse than its
+    policy, to that confidence; a critic that errs can, where the policy fills nearly all. The imagined items come from
+    the item distribution, never from the stream that is played.
 
     Args:
         rules: the task's sizes.
