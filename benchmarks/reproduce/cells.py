@@ -77,7 +77,7 @@ def expand(entry: dict, kind: str) -> list[Cell]:
                 continue  # of the training; every method meets the same episodes
             overrides.append(override.format(str(value).replace("x", ",") if axis == "tote" else value))
         training = entry["training"].format(**axes) if "training" in entry else None
-        name, minutes = "-".join(labels), entry.get("minutes", 60)
+        name, minutes = "-".join(labels), entry.get("minutes", Cell.minutes)
         cells.append(Cell(name, kind, tuple(overrides), entry["method"], tuple(axes.items()), training, minutes))
     return cells
 

@@ -240,11 +240,11 @@ def no_loss_with_size(results) -> list[Group]:
     """No tote but 6x6x10 is packed worse than 6x6x5 by more than a hundredth."""
     groups = []
     for method, k in SIZES:
-        names = {tote: one_seed(results, f"{method}-R4-s0-{tote}-K{k}") for tote in TOTES}
-        small = names["6x6x5"]
-        found = [
-            compare(results, f"{tote} minus 6x6x5", names[tote], small, -0.01, learned=[small]) for tote in TOTES[2:]
-        ]
+        found = []
+        for tote in TOTES[2:]:
+            name = one_seed(results, f"{method}-R4-s0-{tote}-K{k}")
+            small = name.replace(tote, "6x6x5")  # of the same training
+            found.append(compare(results, f"{tote} minus 6x6x5", name, small, -0.01, learned=[small]))
         groups.append(Group(method, found))
     return groups
 
