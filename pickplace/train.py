@@ -213,6 +213,12 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     if stop.requested:  # a sweep ends here too, instead of going on to its next job
         command = f"python -m pickplace.train resume={run_dir}{again}"
         log.info("stopped at %s frames; continue with: %s", f"{frames:,}", command)
+    elif curriculum.level < curriculum.end:
+        log.info(
+            "the tote grew to height %d of %d only, so the policy was trained on no higher one; "
+            "train longer, or let a level end sooner (curriculum.advance, see docs/curriculum.md)",
+            *(curriculum.level, curriculum.end),
+        )
     if (run_dir / "metrics.csv").is_file():
         learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
         if episodes is not None and frames >= cfg.total_frames:
@@ -414,7 +420,7 @@ def crossed(before: int, now: int, interval: int) -> bool:
 
 def progress_line(frames: int, total: int, speed: float, curriculum: Curriculum, metrics: dict) -> str:
     """Frames, speed, level, occupancy and time to go."""
-    left = int((total - frames) / speed)
+    left = int(max(total - frames, 0) / speed)  # the last batch is collected whole
     occupancy = metrics.get("train/occupancy", float("nan"))
     return (
         f"{frames / total:4.0%} {frames:>11,} frames | {speed:6,.0f}/s | "

@@ -248,6 +248,15 @@ def test_evaluation_of_a_run(run, smoke_run, tmp_path):
     assert {path.name for path in (tmp_path / "result").iterdir()} >= {"tote.png", "evaluation.md"}
 
 
+def test_a_tote_that_did_not_grow_is_told(run):
+    settings = ["experiment=smoke", "env.tote_size=[4,4,2]", "curriculum.start_height=1", "curriculum.advance.window=4"]
+    for needed, told in ((1.0, True), (0.0, False)):
+        threshold = [f"curriculum.advance.occupancy={needed}", f"hydra.run.dir={needed}"]
+        code, out, err = run("train", *settings, "curriculum=adaptive", *threshold)
+        assert code == 0, err
+        assert ("the tote grew to height 1 of 2 only" in out) == told
+
+
 def test_sweep_and_own_curriculum(run, tmp_path):
     folder = tmp_path / "mine" / "curriculum"
     folder.mkdir(parents=True)

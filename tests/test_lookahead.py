@@ -42,7 +42,7 @@ def test_equal_candidates_meet_equal_items():
     env = make_env(0, 3)
     planner = Lookahead(env.rules, untrained(env.rules), env.items)
     heights = torch.zeros(4, 4, 4, dtype=torch.int32)
-    volume = planner._play_out(heights, torch.ones(4, dtype=torch.int64), torch.tensor([0, 0, 1, 2]), 16)
+    volume = planner._play_out(heights, torch.ones(4, dtype=torch.int64), torch.tensor([0, 0, 1, 2]), 16, None)
     assert volume.shape == (4, 16) and torch.equal(volume[0], volume[1])
     assert not torch.equal(volume[0], volume[2]) and not torch.equal(volume[2], volume[3])
     assert volume.unique().numel() > 2 and volume.max() <= 16
@@ -57,7 +57,7 @@ def test_the_horizon_adds_the_critics_value():
         return torch.full((len(tote_depth), 1), 100.0)
 
     planner = Lookahead(env.rules, policy, env.items, critic, horizon=2)
-    volume = planner._play_out(torch.zeros(1, 4, 4).int(), torch.ones(1).long(), torch.zeros(1).long(), 64)
+    volume = planner._play_out(torch.zeros(1, 4, 4).int(), torch.ones(1).long(), torch.zeros(1).long(), 64, 2)
     assert len(seen) == 1 and (volume >= 100).sum() == seen[0]
     assert (volume[volume >= 100] <= 100 + 2 * 4).all()
 
@@ -69,6 +69,24 @@ def test_it_is_better_than_its_policy():
     search = Lookahead(rules, untrained(rules), make(0, 1).items, candidates=8, samples=16, rounds=1)
     improved = play(make, search, 32, 32).occupancy
     assert confidence95(improved - alone, least=-1.0)[0] > 0.1
+
+
+def test_a_critic_that_errs_does_not_make_it_worse_than_its_policy(monkeypatch):
+    make = partial(make_env, tote_size=(4, 4, 2))
+    rules, items = make(0, 1).rules, make(0, 1).items
+    policy = PolicyPlanner(rules, untrained(rules))
+
+    def worst(bin_depth, tote_depth):  # of any two states, the one with fewer columns full
+        return -100.0 * (tote_depth == 0).flatten(1).sum(1, keepdim=True)
+
+    def search():
+        return Lookahead(rules, untrained(rules), items, worst, candidates=8, samples=16, rounds=1)
+
+    alone, checked = (play(make, planner, 48, 48).occupancy for planner in (policy, search()))
+    monkeypatch.setattr(Lookahead, "_confirm", lambda self, best, *state: best)
+    misled = play(make, search(), 48, 48).occupancy
+    assert confidence95(misled - alone, least=-1.0)[1] < 0
+    assert confidence95(checked - alone, least=-1.0)[0] > 0
 
 
 def test_with_no_doubt_allowed_it_is_its_policy():

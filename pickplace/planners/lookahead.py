@@ -17,8 +17,9 @@ class Lookahead:
     numbers), so that their difference is known far better than their values. More streams are spent where candidates
     are close. The policy's own choice stands unless another's mean difference to it is positive by ``confidence``
     standard errors: a rollout algorithm (Tesauro & Galperin 1996) that the items' noise cannot make worse than its
-    policy, to that confidence; a critic that errs can, where the policy fills nearly all. The imagined items come from
-    the item distribution, never from the stream that is played.
+    policy, to that confidence. A critic that errs could, where the policy fills nearly all: what wins by its judgement
+    must gain without it too, both played out to the end. The imagined items come from the item distribution, never
+    from the stream that is played.
 
     Args:
         rules: the task's sizes.
@@ -27,7 +28,7 @@ class Lookahead:
         candidates: how many of the policy's most probable choices are played out.
         critic: the value of a state, ``(bin_depth, tote_depth) -> [N, 1]``, in cells; None: there is none.
         horizon: items after which the critic judges the state; None, or without a critic: played out to the end.
-        samples: imagined streams in the first round; each later round doubles them.
+        samples: imagined streams in the first round, each later round doubles them; and of what is played to the end.
         rounds: the greatest number of rounds.
         confidence: standard errors by which a candidate must beat the policy's choice.
         seed: of the imagined items.
@@ -57,7 +58,8 @@ class Lookahead:
             raise ValueError(f"planner.confidence={confidence!r}: expected a number >= 0.")
         if not isinstance(policy, OutcomePolicy):
             raise ValueError("planner=lookahead: expected a checkpoint of model=fcn_grasp, trained with a mask.")
-        self.rules, self.policy, self.critic, self.horizon = rules, policy, critic, horizon
+        self.rules, self.policy, self.critic = rules, policy, critic
+        self.horizon = horizon if critic is not None else None
         self.items = imagined(items)
         self.candidates, self.samples, self.rounds, self.confidence = candidates, samples, rounds, confidence
         self.seed, self._decisions = seed, 0
@@ -96,7 +98,7 @@ class Lookahead:
             if len(row) == 0:
                 break
             after = self.rules.put_down(heights[row], placements.rows(row), choice[row, column])
-            volume = self._play_out(after, tote_height[row], row, streams)  # [rows, streams]
+            volume = self._play_out(after, tote_height[row], row, streams, self.horizon)  # [rows, streams]
             first = volume[(column == 0).nonzero()[:, 0]]  # one for each problem that is open
             problem = torch.unique_consecutive(row, return_inverse=True)[1]
             difference = volume - first[problem]
@@ -111,14 +113,32 @@ class Lookahead:
             open_ = open_ & ~hopeless
             streams *= 2
         surely = (count > 0) & (mean > self.confidence * error) & (mean > 0)
-        return torch.where(surely, mean, 0.0).argmax(1)
+        best = torch.where(surely, mean, 0.0).argmax(1)
+        return best if self.horizon is None else self._confirm(best, heights, tote_height, placements, choice)
 
-    def _play_out(self, heights: Tensor, tote_height: Tensor, problem: Tensor, streams: int) -> Tensor:
+    def _confirm(self, best: Tensor, heights, tote_height, placements, choice) -> Tensor:
+        """``best``, int64 ``[N]``, without the departures that do not gain when played out to the end, with no critic.
+
+        Two standard errors guard against the items' noise, not against the critic's own error, which outweighs what
+        candidates differ by where the policy fills nearly all.
+        """
+        row = best.nonzero()[:, 0]
+        if len(row) == 0:
+            return best
+        both = row.repeat_interleave(2)  # the policy's own choice and the candidate, on the same items
+        column = torch.stack([torch.zeros_like(row), best[row]], 1).flatten()
+        after = self.rules.put_down(heights[both], placements.rows(both), choice[both, column])
+        volume = self._play_out(after, tote_height[both], both, self.samples, None).mean(1)
+        gain = volume[1::2] - volume[::2]
+        return best.index_put((row,), torch.where(gain > 0, best[row], 0))
+
+    def _play_out(self, heights: Tensor, tote_height: Tensor, problem: Tensor, streams: int, horizon) -> Tensor:
         """Volume that the policy goes on to place, float64 ``[M, streams]``.
 
         Args:
             heights: int32 ``[M, W_T, D_T]``.
             problem: int64 ``[M]``; equal ones meet equal items.
+            horizon: items after which the critic judges the state; None: played out to the end.
         """
         rules, items = self.rules, self.items
         self._decisions += 1
@@ -140,7 +160,7 @@ class Lookahead:
             if len(row) == 0:
                 break
             bin_depth, tote_depth = rules.bin_depth(item), (tote_height[row, None, None] - heights).float()
-            if self.critic is not None and step == self.horizon:
+            if step == horizon:
                 volume[row] += self.critic(bin_depth, tote_depth)[:, 0].double()
                 break
             outcome = self.policy(bin_depth, tote_depth, mask).argmax(1)
