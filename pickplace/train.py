@@ -217,7 +217,8 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         log.info(
             "the tote grew to height %d of %d only, so the policy was trained on no higher one; "
             "train longer, or let a level end sooner (curriculum.advance, see docs/curriculum.md)",
-            *(curriculum.level, curriculum.end),
+            curriculum.level,
+            curriculum.end,
         )
     if (run_dir / "metrics.csv").is_file():
         learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
