@@ -26,7 +26,9 @@ PLANNERS = (
 TARGETS = {
     "env": ("PickPlaceEnv", "env.PickPlaceEnv"),
     "items": ("items.Kinds", "items.Uniform", "items.Recorded"),
-    "model.actor": tuple(f"models.actors.{name}" for name in ("fcn_grasp", "fcn4d", "typical", "individual_rl")),
+    "model.actor": tuple(
+        f"models.actors.{name}" for name in ("fcn_grasp", "fcn4d", "typical", "individual_rl", "individual_grasp")
+    ),
     "model.critic": ("models.critics.pooled_critic", "models.critics.conv4d_critic"),
     "curriculum": ("curriculum.Curriculum",),
     "curriculum.advance": tuple(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pickplace import Item, PickPlaceEnv, Rules
 from pickplace.evaluate import play
-from pickplace.models.actors import fcn4d, individual_rl
+from pickplace.models.actors import fcn4d, fcn_grasp, individual_grasp, individual_rl
 from pickplace.planners import IndividualHeuristic, PolicyPlanner, RandomFeasible
 from pickplace.planners.individual import corner_footprints
 
@@ -85,27 +85,36 @@ def random_states(rules, count, seed, steps=8):
     return td
 
 
+#: Individual policies, and the joint ones whose networks they have.
+NETWORKS = {individual_rl: fcn4d, individual_grasp: fcn_grasp}
+both = pytest.mark.parametrize("individual", NETWORKS)
+
+
 @pytest.mark.parametrize("rotations", [1, 3, 4])
-def test_individual_rl_is_fcn4d_at_the_heuristic_pick(rotations):
+@both
+def test_an_individual_policy_is_the_joint_one_at_the_heuristic_pick(individual, rotations):
     rules = PickPlaceEnv(rotations=rotations, num_envs=1).rules
     td = random_states(rules, 32, rotations)
-    policy = individual_rl(rules, mask_infeasible=False, filters=6, head_std=1.0)
-    whole = fcn4d(rules, mask_infeasible=False, filters=6)
-    whole.load_state_dict(policy.state_dict())
+    maps = td["bin_depth"], td["tote_depth"]
+    policy = individual(rules, mask_infeasible=False, filters=6, head_std=1.0)
+    joint = NETWORKS[individual](rules, mask_infeasible=False, filters=6)
+    joint.load_state_dict(policy.state_dict())
     pick = rules.heuristic_pick(rules.read_item(td["bin_depth"]))
-    logits = whole(td["bin_depth"], td["tote_depth"]).unflatten(1, (rules.num_picks, -1))
-    assert torch.allclose(policy(td["bin_depth"], td["tote_depth"]), logits[torch.arange(32), pick], atol=1e-5)
+    rows = torch.arange(32)
+    expected = joint.action_log_probs(*maps).unflatten(1, (rules.num_picks, -1))[rows, pick].log_softmax(-1)
+    assert torch.allclose(policy(*maps).log_softmax(-1), expected, atol=1e-5)
     # Over the flat actions it is the same distribution, with nothing at any other pick.
-    over_actions = policy.action_log_probs(td["bin_depth"], td["tote_depth"]).exp().unflatten(1, (rules.num_picks, -1))
+    over_actions = policy.action_log_probs(*maps).exp().unflatten(1, (rules.num_picks, -1))
     assert torch.allclose(over_actions.sum((1, 2)), torch.ones(32))
-    assert torch.allclose(over_actions[torch.arange(32), pick].sum(1), torch.ones(32))
+    assert torch.allclose(over_actions[rows, pick].sum(1), torch.ones(32))
 
 
 @pytest.mark.parametrize("candidates", [1, 200, "all"])
-def test_individual_rl_never_picks_elsewhere(candidates):
+@both
+def test_an_individual_policy_never_picks_elsewhere(individual, candidates):
     rules = PickPlaceEnv(rotations=1, num_envs=1).rules
     td = random_states(rules, 512, 0, steps=12)
-    policy = individual_rl(rules, mask_infeasible=False, filters=6, head_std=1.0)
+    policy = individual(rules, mask_infeasible=False, filters=6, head_std=1.0)
     action = PolicyPlanner(rules, policy, candidates).decide(td)
     pick = rules.heuristic_pick(rules.read_item(td["bin_depth"]))
     assert torch.equal(action // (rules.num_places * rules.rotations), pick)
@@ -116,10 +125,11 @@ def test_individual_rl_never_picks_elsewhere(candidates):
         assert torch.equal(td["action_mask"].gather(1, action[:, None])[:, 0], at_pick)
 
 
-def test_individual_rl_under_a_mask_fails_where_it_must():
+@both
+def test_an_individual_policy_under_a_mask_fails_where_it_must(individual):
     rules = PickPlaceEnv(rotations=1, num_envs=1).rules
     td = random_states(rules, 512, 0, steps=12)
-    policy = individual_rl(rules, mask_infeasible=True, filters=6, head_std=1.0)
+    policy = individual(rules, mask_infeasible=True, filters=6, head_std=1.0)
     choice = policy(td["bin_depth"], td["tote_depth"], td["action_mask"]).argmax(1)
     action = policy.to_action(choice, td["bin_depth"])
     pick = rules.heuristic_pick(rules.read_item(td["bin_depth"]))

@@ -20,7 +20,9 @@ METHODS = {
     "fcn_grasp_high": ("fcn_grasp, trained at 6x6x10", "#0072b2", "o"),
     "fcn_grasp_noclip": ("fcn_grasp, no clipping", "#cc79a7", "^"),
     "typical": ("typical", "#7f7f00", "v"),
-    "individual_rl": ("individual, RL", "#e69f00", "D"),
+    "individual_grasp": ("individual, fcn_grasp's network, mask", "#004d40", "D"),
+    "individual_grasp_unmasked": ("individual, fcn_grasp's network, no mask", "#44aa99", "D"),
+    "individual_rl": ("individual, RL (the paper's)", "#e69f00", "D"),
     "individual_heuristic": ("individual, heuristic", "#cc79a7", "D"),
     "individual_heuristic_cells": ("individual, heuristic, every cell", "#7a3b69", "d"),
     "joint_dbl": ("joint DBL", "#000000", "P"),
@@ -189,6 +191,8 @@ def individual(results, path) -> bool:
             ("fcn_grasp", "fcn_grasp-R{}-s*-{}-Kall"),
             ("fcn_grasp_unmasked", "fcn_grasp_unmasked-R{}-s*-{}-K10"),
             ("fcn4d", "fcn4d-R{}-s0-{}-K10"),
+            ("individual_grasp", "individual_grasp-R{}-s*-{}-Kall"),
+            ("individual_grasp_unmasked", "individual_grasp_unmasked-R{}-s0-{}-K10"),
             ("individual_rl", "individual_rl-R{}-s0-{}-K10"),
             ("individual_heuristic", "individual_heuristic-R{}-{}"),
             ("individual_heuristic_cells", "individual_heuristic_cells-R{}-{}"),
@@ -499,7 +503,8 @@ FIGURES = {
         "Occupancy over the rotations to choose from, one panel a tote. K=10 for what was trained without a mask; "
         "fcn_grasp with a mask takes the best of all feasible actions. The paper's individual heuristic ends where no "
         "corner of a free rectangle passes: an empty tote and a closed layer leave four, all by the walls, so that the "
-        "first item ends 22 of 100 episodes, and flatter packings, of more rotations, end sooner.",
+        "first item ends 22 of 100 episodes, and flatter packings, of more rotations, end sooner. Individual planning "
+        "with fcn_grasp's network is trained as fcn_grasp is, but for the pick.",
         individual,
     ),
     "learning_curves": (

@@ -93,31 +93,30 @@ class FlatPolicy(nn.Module):
         return self(bin_depth, tote_depth).log_softmax(-1)
 
 
-class IndividualPolicy(FlatPolicy):
-    """``individual_rl``, what the paper compares with: the pick is heuristic, only place and rotation are learnt.
+class AtHeuristicPick:
+    """Individual planning: the pick is heuristic, and the policy that this is mixed into scores place and rotation.
 
-    The network is that of ``fcn4d``; its features after the last ``3x3x3x3`` convolution are selected at the pick cell,
-    so that nothing else of them is computed. With a mask, a state in which nothing can be placed with the heuristic
-    pick is left unmasked: the policy fails then, as it must.
-
-    Args: as :class:`FlatPolicy`.
+    With a mask, a state in which nothing can be placed with the heuristic pick is left unmasked: the policy fails then,
+    as it must.
     """
 
     choice_key = "placement"
-    excludes = "every pick but the heuristic one"
+    excludes: str | None = "every pick but the heuristic one"
+    rules: Rules
 
-    def _at_pick(self, actions: Tensor, pick: Tensor) -> Tensor:
-        """The part of ``[N, N_a]`` that belongs to a pick cell ``[N]``: ``[N, W_T * D_T * R]``."""
-        return actions.unflatten(1, (self.rules.num_picks, -1))[torch.arange(len(pick), device=pick.device), pick]
+    def _scores(self, bin_depth: Tensor, tote_depth: Tensor, pick: Tensor) -> Tensor:
+        """A logit for each place and rotation with the pick cells ``[N]``: ``[N, W_T * D_T * R]``."""
+        raise NotImplementedError
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Logits ``[N, W_T * D_T * R]``."""
         pick = self.rules.heuristic_pick(self.rules.read_item(bin_depth))
-        logits = self.network(bin_depth, tote_depth, pick).unflatten(1, (-1, 4))
-        logits = logits[..., : self.rules.rotations].flatten(1)
+        logits = self._scores(bin_depth, tote_depth, pick)
         if action_mask is None:
             return logits
-        allowed = self._at_pick(action_mask, pick)
+        allowed = action_mask.unflatten(1, (self.rules.num_picks, -1))[
+            torch.arange(len(pick), device=pick.device), pick
+        ]
         return torch.where(allowed | ~allowed.any(1, keepdim=True), logits, MASKED)
 
     def to_action(self, choice: Tensor, bin_depth: Tensor, *_) -> Tensor:
@@ -133,9 +132,23 @@ class IndividualPolicy(FlatPolicy):
         """Minus infinity for every pick but the heuristic one."""
         choice = torch.arange(self.rules.num_places * self.rules.rotations, device=bin_depth.device)
         pick = self.rules.heuristic_pick(self.rules.read_item(bin_depth))
-        score = self(bin_depth, tote_depth).log_softmax(-1)
+        score = self.forward(bin_depth, tote_depth).log_softmax(-1)
         out = score.new_full((len(score), self.rules.num_actions), -torch.inf)
         return out.scatter_(1, pick[:, None] * len(choice) + choice, score)
+
+
+class IndividualPolicy(AtHeuristicPick, FlatPolicy):
+    """``individual_rl``, what the paper compares with: the pick is heuristic, only place and rotation are learnt.
+
+    The network is that of ``fcn4d``; its features after the last ``3x3x3x3`` convolution are selected at the pick cell,
+    so that nothing else of them is computed.
+
+    Args: as :class:`FlatPolicy`.
+    """
+
+    def _scores(self, bin_depth: Tensor, tote_depth: Tensor, pick: Tensor) -> Tensor:
+        logits = self.network(bin_depth, tote_depth, pick).unflatten(1, (-1, 4))
+        return logits[..., : self.rules.rotations].flatten(1)
 
 
 class TypicalPolicy(FlatPolicy):
@@ -231,8 +244,8 @@ class GraspPolicy(nn.Module):
     """
 
     choice_key = "grasp"
-    excludes = None
-    masks = ()
+    excludes: str | None = None
+    masks: tuple[str, ...] = ()
     mask_infeasible = False
     in_keys = ["bin_depth", "tote_depth"]
     scored: Tensor  # see `_scored`
@@ -245,11 +258,14 @@ class GraspPolicy(nn.Module):
         self.miss, self.outside = (nn.Parameter(torch.zeros(())) for _ in range(2))
         self.register_buffer("scored", self._scored(), persistent=False)
 
+    def _maps(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
+        """Logits of every (grasp class, place cell), ``[N, Q*O*O, W_T*D_T]``."""
+        scores = self.network(bin_depth, tote_depth, self.rules.parities).flatten(1)
+        return torch.cat([scores, self.outside.expand(len(scores), 1)], 1)[:, self.scored]
+
     def _choices(self, bin_depth: Tensor, tote_depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Logit per flat action of each choice, the choice's number of flat actions, and each pick's grasp class."""
-        scores = self.network(bin_depth, tote_depth, self.rules.parities).flatten(1)
-        scores = torch.cat([scores, self.outside.expand(len(scores), 1)], 1)
-        maps = scores[:, self.scored]  # [N, Q*O*O, W_T*D_T]
+        maps = self._maps(bin_depth, tote_depth)
         logits = torch.cat([maps.flatten(1), self.miss.expand(len(maps), 1)], 1)
         picks = self._pick_classes(bin_depth)
         missing = (picks < 0).sum((1, 2)) * self.rules.num_places
@@ -320,6 +336,29 @@ class GraspPolicy(nn.Module):
         return rows[batch, picks + 1].transpose(2, 3).flatten(1)  # [N, P, R, places] -> [N, N_a]
 
 
+class IndividualGraspPolicy(AtHeuristicPick, GraspPolicy):
+    """``individual_grasp``: the pick is heuristic; ``fcn_grasp``'s network scores where the item can be set down then.
+
+    Beside ``fcn_grasp`` it tells what deciding the pick jointly is worth, all else equal.
+
+    Args:
+        rules: the task's sizes.
+        mask_infeasible: choose among what is feasible with the heuristic pick only.
+        network: arguments of :class:`~pickplace.models.fcn_grasp.FootprintFcn`.
+    """
+
+    def __init__(self, rules: Rules, mask_infeasible: bool = False, **network):
+        super().__init__(rules, **network)
+        self.mask_infeasible = mask_infeasible
+        self.masks = ("action",) if mask_infeasible else ()
+        self.in_keys = ["bin_depth", "tote_depth"] + ["action_mask"] * mask_infeasible
+
+    def _scores(self, bin_depth: Tensor, tote_depth: Tensor, pick: Tensor) -> Tensor:
+        row = torch.arange(len(pick), device=pick.device)[:, None]
+        grasp = self._pick_classes(bin_depth)[row[:, 0], pick]  # [N, R]
+        return self._maps(bin_depth, tote_depth)[row, grasp].transpose(1, 2).flatten(1)
+
+
 Policy = FlatPolicy | OutcomePolicy | GraspPolicy
 
 
@@ -342,6 +381,11 @@ def fcn4d(rules: Rules, mask_infeasible: bool, **network) -> FlatPolicy:
 def individual_rl(rules: Rules, mask_infeasible: bool, **network) -> IndividualPolicy:
     """The paper's individual planning by reinforcement learning (config ``model=individual_rl``)."""
     return IndividualPolicy(rules, mask_infeasible, **network)
+
+
+def individual_grasp(rules: Rules, mask_infeasible: bool, **network) -> IndividualGraspPolicy:
+    """Individual planning with the network of ``fcn_grasp`` (config ``model=individual_grasp``)."""
+    return IndividualGraspPolicy(rules, mask_infeasible, **network)
 
 
 def typical(rules: Rules, mask_infeasible: bool, **network) -> TypicalPolicy:
@@ -400,6 +444,6 @@ def check_sizes(policy: Policy, rules: Rules) -> list[str]:
             broken.append(
                 f"env.{key}={list(size)}: expected sides of at least {field} (receptive field {field}, eq. 3)."
             )
-    if broken and isinstance(policy, FlatPolicy):
+    if broken and isinstance(policy.network, Conv4dPolicy):
         raise ValueError(" ".join(broken))
     return broken
