@@ -251,7 +251,7 @@ def k_settles(results) -> list[Group]:
     return groups
 
 
-SIZES = (("fcn_grasp", "all"), ("fcn_grasp_unmasked", 10), ("fcn4d", 10))
+SIZES = (("fcn_grasp", "all"), ("fcn_grasp_unmasked", 10), ("fcn4d", 10), ("fcn4d_warm", "all"))
 
 
 def no_loss_with_size(results) -> list[Group]:
