@@ -134,6 +134,19 @@ def test_joint_planning_is_held_against_the_best_individual_method():
     assert words(claims.joint_beats_individual(found))["fcn_grasp_unmasked"] == "yes so far (2 of 24)"
 
 
+def test_joint_planning_is_held_against_its_own_network_with_and_without_a_mask():
+    found = {f"individual_grasp-R1-s0-{tote}-Kall": result(0.6) for tote in ("6x6x5", "10x10x5")}
+    found |= {"fcn_grasp-R1-s0-6x6x5-Kall": result(0.9), "fcn_grasp-R1-s0-10x10x5-Kall": result(0.8)}
+    assert words(claims.joint_beats_the_same_network(found)) == {
+        "fcn_grasp": "yes so far (2 of 24)",
+        "fcn_grasp_unmasked": "not known yet",
+    }
+    assert words(claims.most_on_small_totes_with_the_same_network(found))["fcn_grasp"] == "yes so far (1 of 16)"
+    found["individual_grasp_unmasked-R1-s0-6x6x5-K10"] = result(0.5)
+    found["fcn_grasp_unmasked-R1-s0-6x6x5-K10"] = result(0.4)
+    assert words(claims.joint_beats_the_same_network(found))["fcn_grasp_unmasked"] == "no (1 of 24)"
+
+
 def test_a_difference_within_the_noise_or_of_few_episodes_decides_nothing():
     ours, theirs = result(0.5), result(0.5)
     theirs["occupancy"]["per_episode"] = ours["occupancy"]["per_episode"][1:] + [0.5]
