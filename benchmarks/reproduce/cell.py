@@ -49,7 +49,10 @@ def main() -> None:
             log.info("attempted only: to fill one tote would take %.1f hours", alone / 3600)
             return
         if alone * cfg.evaluation.episodes > seconds:
-            together = decisions * seconds_a_step(make_env, planner, BATCH, 1)
+            together = seconds_a_step(make_env, planner, BATCH, 1)
+            if together < 1:  # of which warming up is a part
+                together = seconds_a_step(make_env, planner, BATCH, 3)
+            together *= decisions
             faster = together < seconds and together < BATCH * alone / 2
             cfg.evaluation.batch_size = BATCH if faster else 1
             until -= together if faster else 0  # where the last batch begins that ends in time
