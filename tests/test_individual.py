@@ -77,7 +77,8 @@ def test_every_cell_meets_the_reference(rotations, reference):
 
 def random_states(rules, count, seed, steps=8):
     """Bins and totes in the middle of a random episode."""
-    env = PickPlaceEnv(rotations=rules.rotations, num_envs=count, masks=("action",), seed=seed)
+    sizes = {"rotations": rules.rotations, "effector_size": rules.effector_size}
+    env = PickPlaceEnv(**sizes, num_envs=count, masks=("action",), seed=seed)
     planner = RandomFeasible(rules, seed)
     td = env.reset()
     for _ in range(steps):
@@ -125,16 +126,43 @@ def test_an_individual_policy_never_picks_elsewhere(individual, candidates):
         assert torch.equal(td["action_mask"].gather(1, action[:, None])[:, 0], at_pick)
 
 
+@pytest.mark.parametrize("rotations, effector", [(1, (3, 3)), (4, (3, 3)), (4, (2, 3))])
 @both
-def test_an_individual_policy_under_a_mask_fails_where_it_must(individual):
-    rules = PickPlaceEnv(rotations=1, num_envs=1).rules
+def test_an_individual_policy_under_a_mask_fails_where_it_must(individual, rotations, effector):
+    rules = PickPlaceEnv(rotations=rotations, effector_size=effector, num_envs=1).rules
     td = random_states(rules, 512, 0, steps=12)
+    maps = td["bin_depth"], td["tote_depth"], td["tote_height"][:, 0]
     policy = individual(rules, mask_infeasible=True, filters=6, head_std=1.0)
-    choice = policy(td["bin_depth"], td["tote_depth"], td["action_mask"]).argmax(1)
-    action = policy.to_action(choice, td["bin_depth"])
+    choice = policy(*maps[:2], td["action_mask"]).argmax(1)
     pick = rules.heuristic_pick(rules.read_item(td["bin_depth"]))
     possible = td["action_mask"].unflatten(1, (rules.num_picks, -1))[torch.arange(512), pick].any(1)
-    assert torch.equal(td["action_mask"].gather(1, action[:, None])[:, 0], possible)
+    assert possible.any() and (rotations > 1 or not possible.all())
+    for action in (policy.to_action(choice, *maps), PolicyPlanner(rules, policy, "all").decide(td)):
+        assert torch.equal(action // (rules.num_places * rotations), pick)
+        assert torch.equal(td["action_mask"].gather(1, action[:, None])[:, 0], possible)
+
+
+def test_with_a_mask_it_is_the_joint_network_among_the_footprints_that_the_heuristic_pick_reaches():
+    rules = PickPlaceEnv(rotations=4, num_envs=1).rules
+    td = random_states(rules, 16, 1, steps=9)
+    maps = td["bin_depth"], td["tote_depth"], td["tote_height"][:, 0]
+    policy = individual_grasp(rules, mask_infeasible=True, filters=6, head_std=1.0)
+    joint = fcn_grasp(rules, mask_infeasible=True, filters=6)
+    joint.load_state_dict(policy.state_dict())
+    pick = rules.heuristic_pick(rules.read_item(td["bin_depth"]))
+    reached = torch.zeros(16, rules.num_outcomes, dtype=torch.bool)
+    each = rules.num_places * rules.rotations
+    for row in range(16):
+        for action in range(int(pick[row]) * each, (int(pick[row]) + 1) * each):
+            if td["action_mask"][row, action]:
+                reached[row, joint.to_choice(torch.tensor([action]), *(part[row : row + 1] for part in maps))] = True
+    assert reached.any(1).all()
+    logits = policy(*maps[:2], td["action_mask"])
+    assert torch.allclose(logits.softmax(1), joint(*maps[:2], reached).softmax(1), atol=1e-6)
+    # Over the flat actions, without the mask: one, at the heuristic pick, even over the ways to a footprint.
+    over_actions = policy.action_log_probs(*maps[:2]).exp()
+    assert torch.allclose(over_actions.sum(1), torch.ones(16))
+    assert torch.allclose(over_actions.unflatten(1, (-1, each))[torch.arange(16), pick].sum(1), torch.ones(16))
 
 
 def test_bad_candidates():

@@ -13,6 +13,7 @@ import placement_only
 import pytest
 import results
 import run
+from cell import BATCH, fitting_batch
 from hydra import compose, initialize_config_dir
 
 from pickplace import config
@@ -455,3 +456,9 @@ def test_an_evaluation_leaves_the_command_that_gives_the_same(tmp_path, monkeypa
     subprocess.run([sys.executable, *command, f"hydra.run.dir={tmp_path / 'again'}"], check=True, capture_output=True)
     again = json.loads((tmp_path / "again" / "evaluation.json").read_text())
     assert again["occupancy"]["mean"] == found["occupancy"]["mean"]
+
+
+def test_a_batch_is_played_where_it_ends_in_time_and_is_worth_it():
+    assert fitting_batch(alone=10, together=20, seconds=60) == (BATCH, 40)
+    assert fitting_batch(alone=10, together=70, seconds=60) == (1, 60)  # it would not end
+    assert fitting_batch(alone=1, together=0.6 * BATCH, seconds=60) == (1, 60)  # as fast one by one

@@ -18,6 +18,7 @@ MODELS = {
     "flat": lambda rules: actors.fcn4d(rules, mask_infeasible=False, filters=4),
     "individual": lambda rules: actors.individual_rl(rules, mask_infeasible=False, filters=4),
     "individual_grasp": lambda rules: actors.individual_grasp(rules, mask_infeasible=False, filters=8, hidden=8),
+    "individual_outcome": lambda rules: actors.individual_grasp(rules, mask_infeasible=True, filters=8, hidden=8),
 }
 
 

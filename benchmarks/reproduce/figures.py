@@ -504,8 +504,8 @@ FIGURES = {
         "fcn_grasp with a mask takes the best of all feasible actions. The paper's individual heuristic ends where no "
         "corner of a free rectangle passes: an empty tote and a closed layer leave four, all by the walls, so that the "
         "first item ends 22 of 100 episodes, and flatter packings, of more rotations, end sooner. Individual planning "
-        "with fcn_grasp's network is trained as fcn_grasp is, but for the pick: with one rotation an item in the end "
-        "effector's corner hardly reaches the cells along two of the tote's walls, 11 of 36 at 6x6.",
+        "with fcn_grasp's network is trained as fcn_grasp is, but for the pick: with 1, 2 and 3 rotations an item in "
+        "the end effector's corner hardly reaches 11, 6 and 1 of the 36 cells of a 6x6 tote, by its walls.",
         individual,
     ),
     "learning_curves": (

@@ -93,6 +93,11 @@ class FlatPolicy(nn.Module):
         return self(bin_depth, tote_depth).log_softmax(-1)
 
 
+def at_pick(actions: Tensor, rules: Rules, pick: Tensor) -> Tensor:
+    """The part of ``[N, N_a]`` that belongs to a pick cell ``[N]``: ``[N, W_T * D_T * R]``."""
+    return actions.unflatten(1, (rules.num_picks, -1))[torch.arange(len(pick), device=pick.device), pick]
+
+
 class AtHeuristicPick:
     """Individual planning: the pick is heuristic, and the policy that this is mixed into scores place and rotation.
 
@@ -192,8 +197,8 @@ class OutcomePolicy(nn.Module):
     """
 
     choice_key = "outcome"
-    excludes = "failed picks and footprints outside the tote"
-    masks = ("outcome",)
+    excludes: str | None = "failed picks and footprints outside the tote"
+    masks: tuple[str, ...] = ("outcome",)
     mask_infeasible = True
     in_keys = ["bin_depth", "tote_depth", "outcome_mask"]
 
@@ -337,26 +342,67 @@ class GraspPolicy(nn.Module):
 
 
 class IndividualGraspPolicy(AtHeuristicPick, GraspPolicy):
-    """``individual_grasp``: the pick is heuristic; ``fcn_grasp``'s network scores where the item can be set down then.
+    """``individual_grasp`` without masking: heuristic pick; ``fcn_grasp``'s network scores where that can put the item.
 
-    Beside ``fcn_grasp`` it tells what deciding the pick jointly is worth, all else equal.
-
-    Args:
-        rules: the task's sizes.
-        mask_infeasible: choose among what is feasible with the heuristic pick only.
-        network: arguments of :class:`~pickplace.models.fcn_grasp.FootprintFcn`.
+    Args: as :class:`GraspPolicy`.
     """
-
-    def __init__(self, rules: Rules, mask_infeasible: bool = False, **network):
-        super().__init__(rules, **network)
-        self.mask_infeasible = mask_infeasible
-        self.masks = ("action",) if mask_infeasible else ()
-        self.in_keys = ["bin_depth", "tote_depth"] + ["action_mask"] * mask_infeasible
 
     def _scores(self, bin_depth: Tensor, tote_depth: Tensor, pick: Tensor) -> Tensor:
         row = torch.arange(len(pick), device=pick.device)[:, None]
         grasp = self._pick_classes(bin_depth)[row[:, 0], pick]  # [N, R]
         return self._maps(bin_depth, tote_depth)[row, grasp].transpose(1, 2).flatten(1)
+
+
+class IndividualOutcomePolicy(OutcomePolicy):
+    """``individual_grasp`` with masking: chooses among the distinct footprints that the heuristic pick reaches.
+
+    In a state in which none of them is feasible it chooses among them all, and fails, as it must.
+
+    Args: as :class:`OutcomePolicy`.
+    """
+
+    choice_key = "footprint"
+    excludes = AtHeuristicPick.excludes
+    masks = ("action",)
+    in_keys = ["bin_depth", "tote_depth", "action_mask"]
+
+    def _reached(self, bin_depth: Tensor, action_mask: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """The pick cell, int64 ``[N]``; the outcome of each place and rotation with it, int64 ``[N, W_T * D_T * R]``,
+        -1 outside the tote; and which of them to choose among, bool."""
+        item = self.rules.read_item(bin_depth)
+        pick = self.rules.heuristic_pick(item)
+        outcome = at_pick(self.rules.action_outcomes(item), self.rules, pick)
+        if action_mask is None:
+            return pick, outcome, outcome >= 0
+        allowed = at_pick(action_mask, self.rules, pick)
+        return pick, outcome, torch.where(allowed.any(1, keepdim=True), allowed, outcome >= 0)
+
+    def _ways(self, outcome: Tensor, allowed: Tensor) -> Tensor:
+        """How many of the allowed places and rotations lead to each outcome, int64 ``[N, Q * W_T * D_T]``."""
+        ways = outcome.new_zeros(len(outcome), self.rules.num_outcomes + 1)
+        return ways.scatter_add_(1, outcome + 1, allowed.long())[:, 1:]
+
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor, action_mask: Tensor) -> Tensor:
+        """Logits ``[N, Q * W_T * D_T]``."""
+        _, outcome, allowed = self._reached(bin_depth, action_mask)
+        return super().forward(bin_depth, tote_depth, self._ways(outcome, allowed) > 0)
+
+    def to_action(self, choice: Tensor, bin_depth: Tensor, tote_depth: Tensor, tote_height: Tensor) -> Tensor:
+        placements = self.rules.placements_from_depth(bin_depth, tote_depth, tote_height)
+        pick, outcome, allowed = self._reached(bin_depth, self.rules.action_mask(placements))
+        number = torch.arange(outcome.shape[1], device=choice.device)
+        placement = pick_one(torch.where(allowed & (outcome == choice[:, None]), number, -1))
+        return pick * len(number) + placement.clamp(min=0)
+
+    def action_log_probs(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
+        """Minus infinity for every pick but the heuristic one, and outside the tote."""
+        pick, outcome, allowed = self._reached(bin_depth)
+        ways = self._ways(outcome, allowed)
+        share = super().forward(bin_depth, tote_depth, ways > 0).log_softmax(-1) - ways.clamp(min=1).log()
+        score = torch.where(allowed, share.gather(1, outcome.clamp(min=0)), -torch.inf)
+        out = score.new_full((len(score), self.rules.num_actions), -torch.inf)
+        number = torch.arange(outcome.shape[1], device=pick.device)
+        return out.scatter_(1, pick[:, None] * len(number) + number, score)
 
 
 Policy = FlatPolicy | OutcomePolicy | GraspPolicy
@@ -383,9 +429,9 @@ def individual_rl(rules: Rules, mask_infeasible: bool, **network) -> IndividualP
     return IndividualPolicy(rules, mask_infeasible, **network)
 
 
-def individual_grasp(rules: Rules, mask_infeasible: bool, **network) -> IndividualGraspPolicy:
+def individual_grasp(rules: Rules, mask_infeasible: bool, **network) -> IndividualOutcomePolicy | IndividualGraspPolicy:
     """Individual planning with the network of ``fcn_grasp`` (config ``model=individual_grasp``)."""
-    return IndividualGraspPolicy(rules, mask_infeasible, **network)
+    return (IndividualOutcomePolicy if mask_infeasible else IndividualGraspPolicy)(rules, **network)
 
 
 def typical(rules: Rules, mask_infeasible: bool, **network) -> TypicalPolicy:
@@ -428,7 +474,7 @@ def check_sizes(policy: Policy, rules: Rules) -> list[str]:
     """The paper's conditions on sizes in training: eq. 2 on the items, eq. 3 on the bin and the tote.
 
     Returns:
-        A sentence for each condition that an ``fcn_grasp`` policy does not meet; it trains all the same.
+        A sentence for each condition that a policy with ``fcn_grasp``'s network does not meet; it trains all the same.
 
     Raises:
         ValueError: for the 4D networks, which cannot learn then.
@@ -444,6 +490,6 @@ def check_sizes(policy: Policy, rules: Rules) -> list[str]:
             broken.append(
                 f"env.{key}={list(size)}: expected sides of at least {field} (receptive field {field}, eq. 3)."
             )
-    if broken and isinstance(policy.network, Conv4dPolicy):
+    if broken and isinstance(policy, FlatPolicy):
         raise ValueError(" ".join(broken))
     return broken

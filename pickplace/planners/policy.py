@@ -47,8 +47,10 @@ class PolicyPlanner:
                 with set_exploration_type(ExplorationType.DETERMINISTIC):
                     return self.policy.to_action(outcome, bin_depth, tote_depth, tote_height).clamp(min=0)
             mask = rules.action_mask(placements)
-            if self.policy.choice_key == "action":  # computes the allowed actions only
-                return self.policy(bin_depth, tote_depth, mask).argmax(1)
+            if self.policy.choice_key in ("action", "footprint"):  # computes what is allowed only
+                choice = self.policy(bin_depth, tote_depth, mask).argmax(1)
+                with set_exploration_type(ExplorationType.DETERMINISTIC):
+                    return self.policy.to_action(choice, bin_depth, tote_depth, tote_height)
             score = self.policy.action_log_probs(bin_depth, tote_depth)
             # If none is feasible of those that a policy with a pick of its own chooses among: its most probable one.
             return torch.where(mask, score, score - FAR).argmax(1)
