@@ -49,6 +49,8 @@ class PolicyPlanner:
             mask = rules.action_mask(placements)
             if self.policy.choice_key in ("action", "footprint"):  # computes what is allowed only
                 choice = self.policy(bin_depth, tote_depth, mask).argmax(1)
+                if self.policy.choice_key == "action":
+                    return choice
                 with set_exploration_type(ExplorationType.DETERMINISTIC):
                     return self.policy.to_action(choice, bin_depth, tote_depth, tote_height)
             score = self.policy.action_log_probs(bin_depth, tote_depth)
