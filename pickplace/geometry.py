@@ -243,6 +243,10 @@ class Rules:
         ox, oy = offset[:, :, 0].unbind(-1)  # before turning, [N, P]
         return torch.where(failure == 0, (ox + oy) * FAR + oy, FAR**2).argmin(1)
 
+    def at_pick(self, actions: Tensor, pick: Tensor) -> Tensor:
+        """The part of ``[N, N_a]`` that belongs to the pick cells ``[N]``: ``[N, W_T * D_T * R]``."""
+        return actions.unflatten(1, (self.num_picks, -1))[torch.arange(len(pick), device=pick.device), pick]
+
     def _offsets(self, item: Item) -> tuple[Tensor, Tensor]:
         """Which offsets a pick can have, and what they become by turning; offsets are ``(ox, oy)`` row by row.
 

@@ -63,10 +63,10 @@ def main() -> None:
             return
         until = seconds
         if alone * cfg.evaluation.episodes > seconds:
-            together = seconds_a_step(make_env, planner, BATCH, 1)
-            if together < 1:  # of which warming up is a part
-                together = seconds_a_step(make_env, planner, BATCH, 3)
-            cfg.evaluation.batch_size, until = fitting_batch(alone, decisions * together, seconds)
+            step = seconds_a_step(make_env, planner, BATCH, 1)
+            if step < 1:  # of which warming up is a part
+                step = seconds_a_step(make_env, planner, BATCH, 3)
+            cfg.evaluation.batch_size, until = fitting_batch(alone, decisions * step, seconds)
         make_env, planner, facts = prepare(cfg)  # anew: the pilot's decisions have drawn from the planner's generator
         result, _ = evaluate(cfg, make_env, planner, facts, until=began + until)
         result["batch_size"] = cfg.evaluation.batch_size

@@ -14,6 +14,8 @@ choice. Every policy offers
 * ``excludes``: what this distribution gives probability 0 all the same, by construction; None if nothing.
 """
 
+from abc import ABC, abstractmethod
+
 import torch
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
@@ -93,12 +95,20 @@ class FlatPolicy(nn.Module):
         return self(bin_depth, tote_depth).log_softmax(-1)
 
 
-def at_pick(actions: Tensor, rules: Rules, pick: Tensor) -> Tensor:
-    """The part of ``[N, N_a]`` that belongs to a pick cell ``[N]``: ``[N, W_T * D_T * R]``."""
-    return actions.unflatten(1, (rules.num_picks, -1))[torch.arange(len(pick), device=pick.device), pick]
+def spread_over_actions(log_probs: Tensor, rules: Rules, pick: Tensor) -> Tensor:
+    """``[N, W_T * D_T * R]`` with the pick cells ``[N]`` as ``[N, N_a]``: minus infinity for every other pick."""
+    number = torch.arange(log_probs.shape[1], device=pick.device)
+    out = log_probs.new_full((len(log_probs), rules.num_actions), -torch.inf)
+    return out.scatter_(1, pick[:, None] * len(number) + number, log_probs)
 
 
-class AtHeuristicPick:
+def count_ways(outcome: Tensor, allowed: Tensor, rules: Rules) -> Tensor:
+    """How many of the allowed actions, bool ``[N, M]``, have each outcome; of int64 ``[N, M]``, ``[N, Q*W_T*D_T]``."""
+    ways = outcome.new_zeros(len(outcome), rules.num_outcomes + 1)
+    return ways.scatter_add_(1, outcome + 1, allowed.long())[:, 1:]
+
+
+class AtHeuristicPick(ABC):
     """Individual planning: the pick is heuristic, and the policy that this is mixed into scores place and rotation.
 
     With a mask, a state in which nothing can be placed with the heuristic pick is left unmasked: the policy fails then,
@@ -109,9 +119,9 @@ class AtHeuristicPick:
     excludes: str | None = "every pick but the heuristic one"
     rules: Rules
 
+    @abstractmethod
     def _scores(self, bin_depth: Tensor, tote_depth: Tensor, pick: Tensor) -> Tensor:
         """A logit for each place and rotation with the pick cells ``[N]``: ``[N, W_T * D_T * R]``."""
-        raise NotImplementedError
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Logits ``[N, W_T * D_T * R]``."""
@@ -119,9 +129,7 @@ class AtHeuristicPick:
         logits = self._scores(bin_depth, tote_depth, pick)
         if action_mask is None:
             return logits
-        allowed = action_mask.unflatten(1, (self.rules.num_picks, -1))[
-            torch.arange(len(pick), device=pick.device), pick
-        ]
+        allowed = self.rules.at_pick(action_mask, pick)
         return torch.where(allowed | ~allowed.any(1, keepdim=True), logits, MASKED)
 
     def to_action(self, choice: Tensor, bin_depth: Tensor, *_) -> Tensor:
@@ -135,11 +143,8 @@ class AtHeuristicPick:
 
     def action_log_probs(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
         """Minus infinity for every pick but the heuristic one."""
-        choice = torch.arange(self.rules.num_places * self.rules.rotations, device=bin_depth.device)
         pick = self.rules.heuristic_pick(self.rules.read_item(bin_depth))
-        score = self.forward(bin_depth, tote_depth).log_softmax(-1)
-        out = score.new_full((len(score), self.rules.num_actions), -torch.inf)
-        return out.scatter_(1, pick[:, None] * len(choice) + choice, score)
+        return spread_over_actions(self.forward(bin_depth, tote_depth).log_softmax(-1), self.rules, pick)
 
 
 class IndividualPolicy(AtHeuristicPick, FlatPolicy):
@@ -228,11 +233,10 @@ class OutcomePolicy(nn.Module):
         """Without a mask: an action whose pick misses, or that leaves the tote, has no outcome, so probability 0."""
         item = self.rules.read_item(bin_depth)
         outcome = self.rules.action_outcomes(item)  # [N, N_a], -1 where nothing reaches the tote
-        ways = outcome.new_zeros(len(outcome), self.rules.num_outcomes + 1)
-        ways.scatter_add_(1, outcome + 1, torch.ones_like(outcome))
+        ways = count_ways(outcome, outcome >= 0, self.rules)
         logits = self.network(bin_depth, tote_depth, self.rules.parities).flatten(1)
-        logits = torch.where(ways[:, 1:] > 0, logits, MASKED)
-        share = logits.log_softmax(-1) - ways[:, 1:].clamp(min=1).log()
+        logits = torch.where(ways > 0, logits, MASKED)
+        share = logits.log_softmax(-1) - ways.clamp(min=1).log()
         return torch.where(outcome >= 0, share.gather(1, outcome.clamp(min=0)), MASKED)
 
 
@@ -371,21 +375,16 @@ class IndividualOutcomePolicy(OutcomePolicy):
         -1 outside the tote; and which of them to choose among, bool."""
         item = self.rules.read_item(bin_depth)
         pick = self.rules.heuristic_pick(item)
-        outcome = at_pick(self.rules.action_outcomes(item), self.rules, pick)
+        outcome = self.rules.at_pick(self.rules.action_outcomes(item), pick)
         if action_mask is None:
             return pick, outcome, outcome >= 0
-        allowed = at_pick(action_mask, self.rules, pick)
+        allowed = self.rules.at_pick(action_mask, pick)
         return pick, outcome, torch.where(allowed.any(1, keepdim=True), allowed, outcome >= 0)
-
-    def _ways(self, outcome: Tensor, allowed: Tensor) -> Tensor:
-        """How many of the allowed places and rotations lead to each outcome, int64 ``[N, Q * W_T * D_T]``."""
-        ways = outcome.new_zeros(len(outcome), self.rules.num_outcomes + 1)
-        return ways.scatter_add_(1, outcome + 1, allowed.long())[:, 1:]
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor, action_mask: Tensor) -> Tensor:
         """Logits ``[N, Q * W_T * D_T]``."""
         _, outcome, allowed = self._reached(bin_depth, action_mask)
-        return super().forward(bin_depth, tote_depth, self._ways(outcome, allowed) > 0)
+        return super().forward(bin_depth, tote_depth, count_ways(outcome, allowed, self.rules) > 0)
 
     def to_action(self, choice: Tensor, bin_depth: Tensor, tote_depth: Tensor, tote_height: Tensor) -> Tensor:
         placements = self.rules.placements_from_depth(bin_depth, tote_depth, tote_height)
@@ -397,12 +396,10 @@ class IndividualOutcomePolicy(OutcomePolicy):
     def action_log_probs(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
         """Minus infinity for every pick but the heuristic one, and outside the tote."""
         pick, outcome, allowed = self._reached(bin_depth)
-        ways = self._ways(outcome, allowed)
+        ways = count_ways(outcome, allowed, self.rules)
         share = super().forward(bin_depth, tote_depth, ways > 0).log_softmax(-1) - ways.clamp(min=1).log()
         score = torch.where(allowed, share.gather(1, outcome.clamp(min=0)), -torch.inf)
-        out = score.new_full((len(score), self.rules.num_actions), -torch.inf)
-        number = torch.arange(outcome.shape[1], device=pick.device)
-        return out.scatter_(1, pick[:, None] * len(number) + number, score)
+        return spread_over_actions(score, self.rules, pick)
 
 
 Policy = FlatPolicy | OutcomePolicy | GraspPolicy

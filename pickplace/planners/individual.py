@@ -32,15 +32,10 @@ class IndividualHeuristic:
     def decide(self, observation: TensorDictBase) -> Tensor:
         rules, tote_height = self.rules, observation["tote_height"].reshape(-1)
         placements = rules.placements_from_depth(observation["bin_depth"], observation["tote_depth"], tote_height)
-        item, rows = placements.item, torch.arange(len(tote_height), device=tote_height.device)
+        item = placements.item
         pick = rules.heuristic_pick(item)
-
-        def at_pick(actions: Tensor) -> Tensor:
-            """``[N, N_a]`` to ``[N, places * R]``."""
-            return actions.unflatten(1, (rules.num_picks, -1))[rows, pick]
-
-        outcome = at_pick(rules.action_outcomes(item))
-        succeeds = at_pick(rules.action_mask(placements))
+        outcome = rules.at_pick(rules.action_outcomes(item), pick)
+        succeeds = rules.at_pick(rules.action_mask(placements), pick)
         allowed = outcome >= 0
         if self.candidates == "corners":
             heights = (tote_height[:, None, None] - observation["tote_depth"]).int()

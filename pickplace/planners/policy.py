@@ -41,18 +41,15 @@ class PolicyPlanner:
         rules = self.rules
         if self.candidates == "all":
             placements = rules.placements_from_depth(bin_depth, tote_depth, tote_height)
-            if self.policy.choice_key == "outcome":  # never looks at the N_a actions one by one
-                mask = rules.outcome_mask(placements).flatten(1)
-                outcome = self.policy(bin_depth, tote_depth, mask).argmax(1)
-                with set_exploration_type(ExplorationType.DETERMINISTIC):
-                    return self.policy.to_action(outcome, bin_depth, tote_depth, tote_height).clamp(min=0)
-            mask = rules.action_mask(placements)
-            if self.policy.choice_key in ("action", "footprint"):  # computes what is allowed only
+            kind = self.policy.choice_key
+            # Outcomes are found without a look at the N_a actions one by one.
+            mask = rules.outcome_mask(placements).flatten(1) if kind == "outcome" else rules.action_mask(placements)
+            if kind in ("action", "outcome", "footprint"):  # computes what is allowed only
                 choice = self.policy(bin_depth, tote_depth, mask).argmax(1)
-                if self.policy.choice_key == "action":
+                if kind == "action":
                     return choice
                 with set_exploration_type(ExplorationType.DETERMINISTIC):
-                    return self.policy.to_action(choice, bin_depth, tote_depth, tote_height)
+                    return self.policy.to_action(choice, bin_depth, tote_depth, tote_height).clamp(min=0)
             score = self.policy.action_log_probs(bin_depth, tote_depth)
             # If none is feasible of those that a policy with a pick of its own chooses among: its most probable one.
             return torch.where(mask, score, score - FAR).argmax(1)
