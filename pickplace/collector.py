@@ -132,15 +132,19 @@ def ignore_signals() -> None:
 def watched(collector):
     """While inside, a worker process that dies raises an error in the main thread at once, whatever it waits for.
 
-    TorchRL 0.14.1 looks after its workers between waits only, and then ends them by a signal that ours ignore.
+    TorchRL 0.14.1 looks after its workers between waits only. It ends them by a signal that ours ignore, then closes
+    them: an error while they run, and a closed one tells nothing more.
 
     Raises:
         WorkerDied: saying which worker died, and how; the other ones are killed.
     """
     workers = getattr(collector, "procs", [])
 
+    def open_ones() -> list:
+        return [worker for worker in workers if not worker._closed]
+
     def look(signum=None, _=None):
-        dead = [number for number, worker in enumerate(workers) if not worker.is_alive()]
+        dead = [number for number, worker in enumerate(workers) if not worker._closed and not worker.is_alive()]
         if dead:  # first of all one that was killed: others may have ended because of it
             number = min(dead, key=lambda number: workers[number].exitcode == 0)
             code = workers[number].exitcode
@@ -157,14 +161,14 @@ def watched(collector):
         try:
             look()
             yield
-        except (OSError, EOFError, RuntimeError):
-            for worker in workers:  # a broken pipe may tell of a death before the signal does
+        except (OSError, EOFError, RuntimeError, ValueError):
+            for worker in open_ones():  # a broken pipe may tell of a death before the signal does
                 worker.join(0.5)
             look()
             raise
     except WorkerDied:
         signal.signal(signal.SIGCHLD, previous)
-        for worker in workers:
+        for worker in open_ones():
             worker.kill()
             worker.join()
         raise

@@ -3,6 +3,7 @@
 import csv
 import multiprocessing
 import os
+import queue
 import shutil
 import signal
 import subprocess
@@ -16,9 +17,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 from test_resume import start, wait_for_rows
+from torchrl._utils import _check_for_faulty_process
 
 from pickplace import Planner, checkpoint, config
-from pickplace.collector import watched
+from pickplace.collector import ignore_signals, watched
 from pickplace.config import WorkerDied
 from pickplace.evaluate import main as evaluate_main
 from pickplace.resume import claim
@@ -55,6 +57,32 @@ def test_a_worker_s_death_is_told_until_it_is_heard():
             time.sleep(60)
         time.sleep(60)
     time.sleep(0.6)  # and not once we have left
+
+
+def work(deaf, ready):
+    if deaf:
+        ignore_signals()
+    ready.release()
+    time.sleep(60)
+
+
+@pytest.mark.parametrize("deaf", [True, False])
+def test_a_worker_s_death_that_torchrl_sees_first_is_told(deaf):
+    """Our signal handler keeps out of an error's handling, and TorchRL ends the other workers its own way."""
+    spawn = multiprocessing.get_context("spawn")
+    ready = spawn.Semaphore(0)
+    workers = [spawn.Process(target=work, args=(deaf, ready), daemon=True) for _ in range(2)]
+    for worker in workers:
+        worker.start()
+    for _ in workers:
+        assert ready.acquire(timeout=240)
+    with pytest.raises(WorkerDied, match=r"1 of 2 has died \(exit code -9\)"), watched(SimpleNamespace(procs=workers)):
+        try:
+            raise queue.Empty
+        except queue.Empty:
+            workers[0].kill()
+            workers[0].join()
+            _check_for_faulty_process(workers)
 
 
 def test_a_second_process_in_the_same_run_folder_is_refused(tmp_path):
