@@ -12,11 +12,11 @@ METHODS = {
     "fcn_grasp": ("fcn_grasp, mask", "#0072b2", "o"),
     "fcn_grasp_unmasked": ("fcn_grasp, no mask", "#56b4e9", "o"),
     "fcn4d": ("fcn4d (the paper's)", "#d55e00", "s"),
-    "fcn4d_masked": ("fcn4d, mask", "#cc79a7", "s"),
     "fcn4d_warm": ("fcn4d, mask, warm start", "#8c5a00", "s"),
     "fcn4d_noclip": ("4D FCN, no clipping", "#cc79a7", "^"),
-    "fcn4d_none": ("fcn4d, no curriculum", "#332288", "s"),
-    "fcn4d_paper": ("fcn4d, curriculum paper", "#44aa99", "s"),
+    "fcn_grasp_paper": ("fcn_grasp, curriculum paper", "#44aa99", "o"),
+    "fcn_grasp_mixture": ("fcn_grasp, curriculum mixture", "#aa4499", "o"),
+    "fcn_grasp_none": ("fcn_grasp, no curriculum", "#332288", "o"),
     "fcn_grasp_high": ("fcn_grasp, trained at 6x6x10", "#0072b2", "o"),
     "fcn_grasp_noclip": ("fcn_grasp, no clipping", "#cc79a7", "^"),
     "typical": ("typical", "#7f7f00", "v"),
@@ -248,7 +248,7 @@ def rl_methods(results, path) -> bool:
 
 
 def band(axes, results, names, method, **more) -> None:
-    """Validation occupancy over frames: the mean over seeds, and their range."""
+    """Validation occupancy over frames: the mean over seeds, and their range; thin, seeds that got further."""
     curves = [results[name]["curve"] for name in names if name in results and "curve" in results[name]]
     curves = [curve for curve in curves if curve["validation_frames"]]
     if not curves:
@@ -260,53 +260,54 @@ def band(axes, results, names, method, **more) -> None:
     look["label"] += f" ({len(curves)} seed{'s' * (len(curves) > 1)})"
     axes.plot(frames, values.mean(0), lw=1.3, ms=3, **look)
     axes.fill_between(frames, values.min(0), values.max(0), color=look["color"], alpha=0.2, lw=0)
+    for curve in curves:
+        further = slice(length - 1, None)
+        axes.plot(
+            curve["validation_frames"][further], curve["validation_occupancy"][further],
+            lw=0.8, alpha=0.6, color=look["color"],
+        )  # fmt: skip
 
 
 def learning_curves(results, path) -> bool:
     from matplotlib.ticker import EngFormatter
 
     figure, axes = canvas(10, 9, 3, 2)
-    seeds = (0, 1, 2)
-    for method, name, k in (
-        ("fcn_grasp", "fcn_grasp-R4-s{}", "all"), ("fcn_grasp_unmasked", "fcn_grasp_unmasked-R4-s{}", 1),
-        ("fcn4d", "fcn4d-R4-s{}", 10), ("typical", "typical-6x6x5-s{}", 10),
-        ("individual_rl", "individual_rl-R4-s{}", 10),
-    ):  # fmt: skip
-        band(axes[0], results, [name.format(seed) for seed in seeds], method, label=f"{label(method)}, K={k}")
-    panels = [
-        (1, "fcn4d: curriculum", {"fcn4d": "adaptive", "fcn4d_paper": "paper, 60,000 a level", "fcn4d_none": "none"}),
-        (
-            2,
-            "fcn4d: masking",
-            {
-                "fcn4d": "no mask, K=10",
-                "fcn4d_masked": "mask, K=all",
-                "fcn4d_warm": "mask, warm start, K=all",
-            },
-        ),
-    ]
-    for number, title, rows in panels:
-        for method, text in rows.items():
-            band(axes[number], results, [f"{method}-R4-s{seed}" for seed in seeds], method, label=text)
-        axes[number].set_title(title, fontsize=10)
-    names = [f"fcn_grasp_high-R4-s{seed}" for seed in seeds]
-    band(axes[3], results, names, "fcn_grasp_high", label="depth clipped (eq. 4)")
-    band(axes[3], results, [f"fcn_grasp_noclip-R4-s{seed}" for seed in seeds], "fcn_grasp_noclip", label="not clipped")
-    axes[3].set_title("fcn_grasp: clipping, trained and validated at 6x6x10", fontsize=10)
-    band(axes[4], results, [f"fcn_grasp-R4-s{seed}" for seed in seeds], "fcn_grasp", label="adaptive")
-    for method, text, colour in (
-        ("fcn_grasp_paper", "paper, 60,000 a level", "#44aa99"),
-        ("fcn_grasp_mixture", "mixture", "#aa4499"),
-        ("fcn_grasp_none", "none", "#332288"),
-    ):
-        names = [f"{method}-R4-s{seed}" for seed in seeds]
-        band(axes[4], results, names, "fcn_grasp", label=text, color=colour)
-    axes[4].set_title("fcn_grasp: curriculum", fontsize=10)
-    band(axes[5], results, [f"fcn_grasp-R4-s{seed}" for seed in seeds], "fcn_grasp", label="mask, K=all")
-    names = [f"fcn_grasp_unmasked-R4-s{seed}" for seed in seeds]
-    band(axes[5], results, names, "fcn_grasp_unmasked", label="no mask, K=1")
-    axes[5].set_title("fcn_grasp: masking", fontsize=10)
-    axes[0].set_title("networks", fontsize=10)
+    # Of each line the training, without its seed, the method as which it is drawn, and its text.
+    panels = {
+        "networks": [
+            ("fcn_grasp-R4", "fcn_grasp", "fcn_grasp, mask, K=all"),
+            ("fcn_grasp_unmasked-R4", "fcn_grasp_unmasked", "fcn_grasp, no mask, K=1"),
+            ("fcn4d-R4", "fcn4d", "fcn4d (the paper's), K=10"),
+            ("typical-6x6x5", "typical", "typical, K=10"),
+            ("individual_rl-R4", "individual_rl", "individual, RL (the paper's), K=10"),
+        ],
+        "fcn_grasp's network: the pick": [
+            ("fcn_grasp-R4", "fcn_grasp", "decided with the place"),
+            ("individual_grasp-R4", "individual_grasp", "left to the heuristic"),
+        ],
+        "fcn4d: masking": [
+            ("fcn4d-R4", "fcn4d", "no mask, K=10"),
+            ("fcn4d_warm-R4", "fcn4d_warm", "mask, warm start, K=all"),
+        ],
+        "fcn_grasp: clipping, trained and validated at 6x6x10": [
+            ("fcn_grasp_high-R4", "fcn_grasp_high", "depth clipped (eq. 4)"),
+            ("fcn_grasp_noclip-R4", "fcn_grasp_noclip", "not clipped"),
+        ],
+        "fcn_grasp: curriculum": [
+            ("fcn_grasp-R4", "fcn_grasp", "adaptive"),
+            ("fcn_grasp_paper-R4", "fcn_grasp_paper", "paper, 60,000 a level"),
+            ("fcn_grasp_mixture-R4", "fcn_grasp_mixture", "mixture"),
+            ("fcn_grasp_none-R4", "fcn_grasp_none", "none"),
+        ],
+        "fcn_grasp: masking": [
+            ("fcn_grasp-R4", "fcn_grasp", "mask, K=all"),
+            ("fcn_grasp_unmasked-R4", "fcn_grasp_unmasked", "no mask, K=1"),
+        ],
+    }
+    for part, (title, rows) in zip(axes, panels.items(), strict=True):
+        part.set_title(title, fontsize=10)
+        for training, method, text in rows:
+            band(part, results, [f"{training}-s{seed}" for seed in range(3)], method, label=text)
     if not any(part.lines for part in axes):
         return False
     for part in axes:
