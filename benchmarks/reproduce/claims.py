@@ -114,8 +114,7 @@ def untrained(results, name: str, short: int = 2) -> str:
     full = int(word.rstrip("]").rpartition(",")[2])
     if not levels or levels[-1] > full - short:
         return ""
-    came = f"{levels[-1]} of {full} in {training['frames']:,} frames"
-    return f"{called(name)} came to a tote height of {came}"
+    return f"{called(name)} came to a tote height of {levels[-1]} of {full} only"
 
 
 def compare(
@@ -376,24 +375,24 @@ CLAIMS = [
 
 
 def verdict(groups: list[Group]) -> str:
-    """One word where all networks agree, else one for each; and why, where they do not bear it out."""
+    """One word where all networks agree, else one for each."""
     words = {called(group.name): group.word() for group in groups}
     if len(set(words.values())) == 1:
-        text = next(iter(words.values()))
-    else:
-        text = "; ".join(f"{name}: {word}" for name, word in words.items())
-    reasons = list(dict.fromkeys(reason for group in groups for reason in group.reasons()))
-    return f"{text}. {'; '.join(reasons)}" if reasons else text
+        return next(iter(words.values()))
+    return "<br>".join(f"{name}: {word}" for name, word in words.items())
+
+
+def reasons(groups: list[Group]) -> str:
+    """Why networks do not bear a claim out, and what to know of those that do."""
+    return "; ".join(dict.fromkeys(reason for group in groups for reason in group.reasons()))
 
 
 def table(results) -> list[str]:
-    """Lines of a table: claim, verdict, figures; and why, where we find otherwise."""
-    lines = [
-        "| the paper's claim | our figures bear it out | occupancy, difference and its 95% interval |",
-        "|---|---|---|",
-    ]
-    for claim, check in CLAIMS:
-        groups = check(results)
-        evidence = ". ".join(filter(None, (group.evidence() for group in groups)))
-        lines.append(f"| {claim} | {verdict(groups)} | {evidence} |")
+    """Lines of a table, claim, verdict and why; and of a list with the differences behind each."""
+    checked = [(claim, check(results)) for claim, check in CLAIMS]
+    lines = ["| the paper's claim | our figures bear it out | why not, and what to know |", "|---|---|---|"]
+    lines += [f"| {claim} | {verdict(groups)} | {reasons(groups)} |" for claim, groups in checked]
+    lines += ["", "The differences of occupancy behind each verdict, and their 95% intervals:", ""]
+    for claim, groups in checked:
+        lines += [f"- **{claim}**", *(f"  - {evidence}" for group in groups if (evidence := group.evidence()))]
     return lines
