@@ -155,8 +155,32 @@ def test_a_difference_within_the_noise_or_of_few_episodes_decides_nothing():
     assert claims.compare({"a": result(0.6), "b": theirs}, "", "a", "b", margin=0.2).verdict is False
     assert claims.compare({"a": ours}, "", "a", "b") is None
     for episodes in (1, 2, 19):
-        comparison = claims.compare({"a": result(0.6, episodes), "b": theirs}, "it", "a", "b")
-        assert comparison.verdict is None and str(comparison).startswith(f"it ({episodes} episodes) +0.1")
+        few = result(0.6, episodes)
+        comparison = claims.compare({"a": few, "b": theirs}, "it", "a", "b")
+        gap = sum(few["occupancy"]["per_episode"]) - sum(theirs["occupancy"]["per_episode"][:episodes])
+        assert comparison.verdict is None and comparison.text == f"it ({episodes} episodes)"
+        assert comparison.difference[0] == pytest.approx(gap / episodes)
+
+
+def test_every_seed_of_a_method_must_beat_every_seed_of_another():
+    found = {f"individual_grasp-R1-s{seed}-6x6x5-Kall": result(0.6 + 0.01 * seed) for seed in range(3)}
+    found["fcn_grasp-R1-s0-6x6x5-Kall"] = result(0.7)
+    for mean, word in ((0.65, "yes so far (1 of 24)"), (0.61, "undecided"), (0.5, "undecided")):
+        found["fcn_grasp-R1-s2-6x6x5-Kall"] = result(mean)
+        groups = claims.joint_beats_the_same_network(found)
+        assert words(groups)["fcn_grasp"] == word
+    [comparison] = groups[0].found
+    assert comparison.text.endswith(", 2 seeds against 3")
+    assert comparison.difference == pytest.approx((-0.01, -0.12, 0.1))
+
+
+def test_a_policy_is_compared_with_itself_where_two_cells_have_it():
+    found = {f"fcn_grasp-R4-s{seed}-6x6x5-Kall": result(0.5 + 0.2 * seed) for seed in range(2)}
+    found |= {f"fcn_grasp-R4-s{seed}-10x10x5-Kall": result(0.52 + 0.2 * seed) for seed in range(3)}
+    group = claims.no_loss_with_size(found)[0]
+    assert group.word() == "yes so far (1 of 4)"
+    assert group.found[0].text == "10x10x5 minus 6x6x5, 2 seeds"
+    assert group.found[0].difference == pytest.approx((0.02, 0.02, 0.02))
 
 
 def test_a_large_tote_that_few_episodes_filled_decides_nothing():

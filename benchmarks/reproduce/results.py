@@ -8,8 +8,10 @@ from pathlib import Path
 import cells as definitions
 import claims
 import figures
-from claims import difference
+import torch
 from run import RESULTS, one_line_a_list
+
+from pickplace.evaluate import confidence95
 
 ROOT = RESULTS.parents[1]
 HEAD = """# The paper's comparison, run again
@@ -145,8 +147,9 @@ def no_better_than_random(result, results) -> str:
         return alike and all(other["env"][key] == result["env"][key] for key in keys)
 
     for other in filter(same, results.values()):
-        gap = difference(result, other)
-        return "" if gap and gap[1] > 0 else ", **no better than random**"
+        pairs = zip(result["occupancy"]["per_episode"], other["occupancy"]["per_episode"], strict=False)
+        gaps = torch.tensor([ours - theirs for ours, theirs in pairs], dtype=torch.float64)
+        return "" if len(gaps) > 1 and confidence95(gaps, least=-1.0)[0] > 0 else ", **no better than random**"
     return ""
 
 
