@@ -40,7 +40,7 @@ class Comparison:
 
     def __str__(self):
         centre, low, high = self.difference
-        return f"{self.text} {centre:+.3f} ({low:+.3f} to {high:+.3f})"
+        return f"{self.text} {centre:+.4f} ({low:+.4f} to {high:+.4f})"
 
 
 @dataclass
@@ -79,11 +79,14 @@ class Group:
         return list(dict.fromkeys([*why, *(comparison.remark for comparison in self.found if comparison.remark)]))
 
     def evidence(self) -> str:
-        """Every comparison, or of many the least and the greatest."""
-        found = sorted(self.found, key=lambda comparison: comparison.difference[0])
-        if len(found) > 4:
-            return f"{called(self.name)}: {len(found)} comparisons, from {found[0]} up to {found[-1]}"
-        return f"{called(self.name)}: {'; '.join(map(str, self.found))}" if found else ""
+        """Every comparison; of many the least and the greatest first."""
+        if not self.found:
+            return ""
+        every = "; ".join(map(str, self.found))
+        if len(self.found) > 4:
+            low, *_, high = sorted(self.found, key=lambda comparison: comparison.difference[0])
+            every = f"from {low} up to {high}<details><summary>all {len(self.found)}</summary>{every}</details>"
+        return f"{called(self.name)}: {every}"
 
 
 def called(name: str) -> str:
