@@ -4,6 +4,7 @@ import signal
 import sys
 import threading
 from collections import OrderedDict
+from collections.abc import Sequence
 from contextlib import contextmanager
 from functools import partial
 
@@ -195,8 +196,7 @@ def single(make_env, policy, num_envs: int, rollout_length: int, seed: int) -> C
         trust_policy=True,
         auto_register_policy_transforms=False,  # the policy needs none; saying so silences a warning
     )
-    collector.map_fn("start", [(seed,)])
-    return collector
+    return _started(collector, [(seed,)])
 
 
 def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, workers: int = 2) -> MultiSyncCollector:
@@ -217,8 +217,7 @@ def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, 
         auto_register_policy_transforms=False,
         init_fn=ignore_signals,
     )
-    collector.map_fn("start", _seeds(seed, workers))
-    return collector
+    return _started(collector, _seeds(seed, workers))
 
 
 def ray(
@@ -260,7 +259,16 @@ def ray(
         },
     )  # fmt: skip
     collector._weight_sync_initialized = True  # silences a warning on the scheme that there is none of
-    collector.map_fn("start", _seeds(seed, workers))
+    return _started(collector, _seeds(seed, workers))
+
+
+def _started(collector, seeds: Sequence[tuple[int, ...]]):
+    """The collector with each worker's streams begun, or nothing left of it: a process would wait for its workers."""
+    try:
+        collector.map_fn("start", seeds)
+    except BaseException:
+        collector.shutdown()
+        raise
     return collector
 
 
@@ -274,4 +282,4 @@ def _share(num_envs: int, workers: int) -> int:
 def _seeds(seed: int, workers: int) -> list[tuple[int, int]]:
     """Each worker's item stream and generator: all draw the same items, and actions of their own; large odd steps keep
     the generators apart from those of ``seed + 1``."""
-    return [(seed, seed * 1_000_003 + worker + 1) for worker in range(workers)]
+    return [(seed, (seed * 1_000_003 + worker + 1) % 2**63) for worker in range(workers)]

@@ -1,6 +1,7 @@
 """Hydra around the commands: where the config files are, overrides on saved configs, and errors in one sentence."""
 
 import errno
+import inspect
 import logging
 import os
 import re
@@ -8,6 +9,7 @@ import shutil
 import sys
 from contextlib import contextmanager, nullcontext, suppress
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,7 +49,9 @@ def instantiate(node: DictConfig, **kwargs):
     """``hydra.utils.instantiate`` with ``kwargs`` handed over as they are, and constructors' errors as themselves."""
     try:
         # A partial, since Hydra would turn dataclasses among the arguments into configs.
-        return hydra.utils.instantiate(node, _partial_=True, _convert_="all")(**kwargs)
+        make = hydra.utils.instantiate(node, _partial_=True, _convert_="all")
+        _refuse_unknown_arguments(node, make, kwargs)
+        return make(**kwargs)
     except TypeError as error:
         raise ValueError(f"{node.get('_target_')}: {error}.") from error
     except InstantiationException as error:
@@ -57,6 +61,17 @@ def instantiate(node: DictConfig, **kwargs):
             raise
         what = str(error).splitlines()[0].partition(", set env var")[0].rstrip(":")
         raise ValueError(f"{what}: {error.__cause__}.") from error
+
+
+def _refuse_unknown_arguments(node: DictConfig, make: partial, given: dict) -> None:
+    """Refuse keys of a node that what is made from it does not take, as :func:`refuse_unknown_keys` does elsewhere."""
+    taken = inspect.signature(make.func).parameters
+    if any(parameter.kind == parameter.VAR_KEYWORD for parameter in taken.values()):
+        return
+    if unknown := [key for key in make.keywords if key not in taken]:
+        prefix = f"{node._get_full_key(None)}." if node._get_full_key(None) else ""
+        theirs = OmegaConf.create({key: None for key in taken if key not in given})
+        raise ValueError(_unknown_key(prefix + unknown[0], theirs, prefix))
 
 
 def missing_extra(group: str, extra: str) -> ValueError:
@@ -242,12 +257,12 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
     Args:
         config_name: the file in ``conf/``.
         task: what to do.
-        from_checkpoint: groups that this command's own config lacks; overrides of them reach ``task`` as they are.
+        from_checkpoint: groups whose keys a checkpoint brings; overrides of them reach ``task`` as they are.
     """
     full_error = os.environ.get("HYDRA_FULL_ERROR", "")
     overrides = sys.argv[1:]
     opened = tuple(f"{group}." for group in from_checkpoint)
-    sys.argv[1:] = [f"+{word}" if word.startswith(opened) else word for word in overrides]
+    sys.argv[1:] = [f"++{word}" if word.startswith(opened) else word for word in overrides]
 
     def app(cfg: DictConfig):
         hydra_cfg = HydraConfig.get()

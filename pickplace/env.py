@@ -9,7 +9,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from pickplace.geometry import Failure, Item, Rules
-from pickplace.items import STREAMS, ItemDistribution, Kinds
+from pickplace.items import STREAMS, ItemDistribution, Kinds, check_seed
 
 STARTS_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes
 PAPER_KINDS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1))
@@ -82,8 +82,7 @@ class PickPlaceEnv(EnvBase):
         rules = Rules(bin_size, tote_size, effector_size, rotations, pick_rule, min_support, strict_support)
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise ValueError(f"num_envs={num_envs!r}: expected a whole number >= 1.")
-        if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
-            raise ValueError(f"seed={seed!r}: expected a whole number >= 0 and < 2**63.")
+        check_seed(seed)
         if stream not in STREAMS:
             raise ValueError(f"stream={stream!r}: expected one of {', '.join(STREAMS)}.")
         if not set(masks) <= {"action", "outcome"}:
@@ -151,7 +150,8 @@ class PickPlaceEnv(EnvBase):
 
     # ------------------------------------------------------------------ EnvBase
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
-        """As ``EnvBase.reset``; the rows that a partial reset leaves alone come back as they are.
+        """As ``EnvBase.reset``, without further arguments: ``set_seed`` begins another item stream. The rows that a
+        partial reset leaves alone come back as they are.
 
         TorchRL would fill those rows with zeros where ``tensordict`` has only ``_reset``, and copy every mask cell by
         cell where it has more; but all that an agent sees of them is still here.
@@ -159,7 +159,8 @@ class PickPlaceEnv(EnvBase):
         if tensordict is None or "_reset" not in tensordict:
             return super().reset(tensordict, **kwargs)
         rows = tensordict["_reset"].reshape(self.num_envs, 1)
-        state = self._reset(tensordict)
+        kwargs.pop("select_reset_only", None)  # of ``EnvBase.reset``: what an agent sees is all that counts here
+        state = self._reset(tensordict, **kwargs)
         for key in ("done", "terminated", "truncated", "failure"):
             if key in tensordict:
                 state[key] = torch.where(rows, state[key], tensordict[key])
@@ -167,11 +168,14 @@ class PickPlaceEnv(EnvBase):
 
     def _set_seed(self, seed: int | None):
         """Start the item stream over: the next reset of slot ``i`` plays episode ``first_episode + i``."""
-        self.item_seed.fill_(0 if seed is None else seed)
+        self.item_seed.fill_(0 if seed is None else check_seed(seed))
         slots = torch.arange(self.num_envs, device=self.device)
         self.episode.copy_(self.first_episode + slots - self.episode_stride)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        if kwargs:
+            name, value = next(iter(kwargs.items()))
+            raise TypeError(f"reset({name}={value!r}): expected a TensorDict only; set_seed(seed) begins a stream.")
         rows = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         height = None
         if tensordict is not None:
@@ -200,6 +204,8 @@ class PickPlaceEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].reshape(self.num_envs)
+        if not torch.can_cast(action.dtype, torch.int64):
+            raise ValueError(f"action={action[0].item()} ({action.dtype}): expected whole numbers, as integers.")
         if bool(((action < 0) | (action >= self.rules.num_actions)).any()):
             bad = action[(action < 0) | (action >= self.rules.num_actions)][0].item()
             raise ValueError(f"action={bad}: expected between 0 and {self.rules.num_actions - 1} (N_a - 1).")
@@ -226,6 +232,12 @@ class PickPlaceEnv(EnvBase):
         return self._observation().update({key: value[:, None] for key, value in result.items()})
 
     # ------------------------------------------------------------------ state
+    def _load_from_state_dict(self, *args, **kwargs):
+        """Load into masks of our own: the last ones have been handed out with an observation, see `_store`."""
+        for name in self.masks:
+            setattr(self, f"{name}_mask", getattr(self, f"{name}_mask").clone())
+        super()._load_from_state_dict(*args, **kwargs)
+
     @property
     def current_item(self) -> Item:
         """The item that lies in each bin."""

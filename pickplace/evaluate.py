@@ -380,7 +380,7 @@ TRAINED = ("env", "items", "model", "algo")
 
 def main() -> None:
     """Entry point of ``pickplace-evaluate``."""
-    config.command("evaluate", run, from_checkpoint=("model",))
+    config.command("evaluate", run, from_checkpoint=("model", "items"))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from tensordict import TensorDict
 
 from pickplace.env import PickPlaceEnv
 from pickplace.geometry import Failure
-from pickplace.items import Kinds
+from pickplace.items import Kinds, check_seed
 from pickplace.replay import Recording, observe
 from pickplace.report import draw_scene, item_colours
 
@@ -23,8 +23,9 @@ KEYS = ("bin_depth", "tote_depth", "tote_height")  # what an agent sees
 
 def _make_env(num_envs: int, items, settings: dict) -> PickPlaceEnv:
     """The batched environment behind both faces; a list of ``(w, d, h)`` is short for ``Kinds``."""
-    if "masks" in settings:
-        raise ValueError(f"masks={settings['masks']!r}: expected no such argument; the action mask always comes along.")
+    for key, why in (("masks", "the action mask always comes along"), ("seed", "reset(seed=...) begins a stream")):
+        if key in settings:
+            raise ValueError(f"{key}={settings[key]!r}: expected no such argument; {why}.")
     items = Kinds(items) if isinstance(items, (list, tuple)) else items
     return PickPlaceEnv(items=items, num_envs=num_envs, **settings)
 
@@ -59,12 +60,6 @@ def _tote_heights(given, env: PickPlaceEnv) -> torch.Tensor:
     if (heights < low).any() or (heights > high).any():
         raise ValueError(f"options['tote_height']={given!r}: expected {wanted}.")
     return torch.as_tensor(np.broadcast_to(heights, count).astype(np.int64))[:, None].to(env.device)
-
-
-def _item_seed(seed, generator: np.random.Generator) -> int:
-    if seed is None:
-        return int(generator.integers(2**31))
-    return int(seed)
 
 
 class PickPlaceGymEnv(gymnasium.Env):
@@ -125,10 +120,11 @@ class PickPlaceGymEnv(gymnasium.Env):
         self._started = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        seed = None if seed is None else check_seed(seed)
         super().reset(seed=seed)
         heights = _tote_heights(_options(options, ("tote_height",)).get("tote_height"), self._env)
         if seed is not None or not self._started:
-            self._env.set_seed(_item_seed(seed, self.np_random))
+            self._env.set_seed(int(self.np_random.integers(2**31)) if seed is None else seed)
             self._started = True
         state = self._env.reset(TensorDict({"tote_height": heights}, [1], device=self._env.device))
         if self.render_mode:
@@ -251,8 +247,9 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         self._started = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        if seed is not None and not isinstance(seed, (int, np.integer)):
+        if isinstance(seed, (list, tuple, np.ndarray)):
             raise ValueError(f"seed={seed!r}: expected one whole number; its stream gives each slot its own episodes.")
+        seed = None if seed is None else check_seed(seed)
         super().reset(seed=seed)
         options = _options(options, ("tote_height", "reset_mask"))
         heights = _tote_heights(options.get("tote_height"), self._env)
@@ -265,7 +262,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         if seed is not None or not self._started:
             if not rows.all():
                 raise ValueError(f"seed={seed!r}: expected none with a reset_mask; a stream begins for all slots.")
-            self._env.set_seed(_item_seed(seed, self.np_random))
+            self._env.set_seed(int(self.np_random.integers(2**31)) if seed is None else seed)
             self._started = True
         self._reset_rows(rows, heights)
         self._ended &= ~rows
@@ -276,7 +273,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         if not self._started:
             raise gymnasium.error.ResetNeeded("step() before reset().")
         actions = np.asarray(actions)
-        if not self.action_space.contains(actions.astype(np.int64, copy=False)):
+        if actions.dtype.kind not in "iu" or not self.action_space.contains(actions.astype(np.int64, copy=False)):
             wanted = f"{self.num_envs} whole numbers in [0, {self.single_action_space.n})"
             raise ValueError(f"actions={actions!r}: expected {wanted}.")
         waiting = self._ended.copy()

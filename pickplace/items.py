@@ -8,6 +8,7 @@ import csv
 import io
 import math
 from itertools import product
+from numbers import Integral
 from pathlib import Path
 
 import torch
@@ -17,6 +18,18 @@ from pickplace.geometry import Item
 
 #: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
 STREAMS = ("train", "validation", "test")
+MOST_SEEDS = 2**62  # the hash of one family's seed is that of another's only where the seeds lie further apart
+
+
+def check_seed(seed: int, key: str = "seed") -> int:
+    """The seed, if it is one.
+
+    Raises:
+        ValueError: naming the ``key``, if it is not.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= seed < MOST_SEEDS:
+        raise ValueError(f"{key}={seed!r}: expected a whole number >= 0 and < 2**62.")
+    return int(seed)
 
 
 def _mix(x: Tensor) -> Tensor:

@@ -44,7 +44,7 @@ class Alternative:
     pick_cell: tuple[int, int]
     place_cell: tuple[int, int]
     rotation_degrees: int
-    probability: float  #: that the policy gives, without a mask: of the footprint if all are tried, else of the action
+    probability: float  #: that the policy gives, without a mask: of the action, or the footprint if it chooses one
     rejected: str | None  #: why it would fail; None if it would succeed
     chosen: bool
 
@@ -56,7 +56,7 @@ class Plan:
     Lengths are in metres if ``cell_size`` was given, else in cells; ``item`` and the ``cell`` of a pose are in cells.
     """
 
-    status: str  #: "ok"; "stuck": nothing at all is feasible; "rejected": none of the K candidates is
+    status: str  #: "ok"; "stuck": nothing at all is feasible; "rejected": what the policy would do is not
     item: dict[str, int]  #: the item seen in the bin: x, y, w, d, h
     pick: Pose | None  #: in the bin's frame; z is the item's top
     place: Pose | None  #: in the tote's frame; z is the item's top once it rests

@@ -22,6 +22,7 @@ from pickplace.collector import rng_state, set_rng_state, watched
 from pickplace.curriculum import Curriculum, push_level
 from pickplace.evaluate import Episodes, commit, confidence95, play, versions
 from pickplace.geometry import Failure
+from pickplace.items import check_seed
 from pickplace.models.actors import Policy, as_actor, as_collection_policy, check_sizes
 from pickplace.report import learning_curve
 from pickplace.resume import (
@@ -103,6 +104,9 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     env_config = OmegaConf.to_container(cfg.env, resolve=True)
     make_env = partial(training_env, env_config, items, cfg.device, policy.masks, cfg.env.num_envs, curriculum)
     acting = as_collection_policy(policy)
+    advantage, loss = make_losses(algo, policy, critic)
+    learned = [*policy.in_keys, policy.choice_key, "log_prob", "advantage", "value_target"]
+    optimizer = torch.optim.Adam(loss.parameters(), lr=algo.lr, eps=1e-5)
     collector = config.instantiate(
         cfg.collector,
         make_env=make_env,
@@ -111,9 +115,6 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         rollout_length=algo.rollout_length,
         seed=cfg.seed,
     )
-    advantage, loss = make_losses(algo, policy, critic)
-    learned = [*policy.in_keys, policy.choice_key, "log_prob", "advantage", "value_target"]
-    optimizer = torch.optim.Adam(loss.parameters(), lr=algo.lr, eps=1e-5)
     episodes = None  # of the latest validation
 
     def save(name: str) -> None:
@@ -242,12 +243,13 @@ def check_settings(cfg: DictConfig) -> None:
     at_least = {
         "total_frames": 1, "evaluation_interval": 1, "checkpoint_interval": 1, "progress_interval": 1,
         "env.num_envs": 1, "algo.rollout_length": 1, "algo.epochs": 1, "algo.minibatch_size": 1,
-        "evaluation.episodes": 1, "evaluation.batch_size": 1, "seed": 0,
+        "evaluation.episodes": 1, "evaluation.batch_size": 1,
     }  # fmt: skip
     for key, least in at_least.items():
         value = OmegaConf.select(cfg, key)
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 2**63:
             raise ValueError(f"{key}={value}: expected a whole number >= {least} and < 2**63.")
+    check_seed(cfg.seed)
     own_modules(cfg.trust)
     if cfg.algo.loss not in ("a2c", "ppo"):
         raise ValueError(f"algo.loss={cfg.algo.loss}: expected ppo or a2c.")

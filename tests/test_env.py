@@ -1,5 +1,6 @@
 """The environment as a TorchRL citizen, and properties that any packing must have."""
 
+import copy
 import re
 
 import pytest
@@ -210,6 +211,17 @@ def test_step_returns_a_new_tensordict_and_leaves_its_input_alone():
     assert all(same(live, copy) for live, copy in kept)
 
 
+def test_loading_a_state_leaves_what_was_handed_out_alone():
+    env = make_env(masks=("action", "outcome"))
+    td = env.reset()
+    state = copy.deepcopy(env.state_dict())
+    after = env.step(td.set("action", first_feasible(td)))["next"]
+    before = after.clone()
+    env.load_state_dict(state)
+    assert same(after, before)
+    assert same(env._observation(), td.exclude("action", "done", "terminated", "truncated", "next"))
+
+
 def test_every_row_may_fail_at_once():
     env = make_env()
     td = env.reset()
@@ -308,6 +320,8 @@ def test_a_reset_state_always_has_a_feasible_action():
         ({"min_support": -0.1}, ["min_support", "-0.1"]),
         ({"min_support": 1.0, "strict_support": True}, ["1x1x1"]),
         ({"num_envs": 0}, ["num_envs", "0"]),
+        ({"rotations": 4.0}, ["rotations=4.0"]),
+        ({"rotations": True}, ["rotations=True"]),
         # Deep bin walls: the effector cannot reach an item in the corner of a bin smaller than itself.
         ({"kinds": [(1, 1, 1)], "bin_size": (2, 2, 2)}, ["1x1x1"]),
         # A tote smaller than the effector: only an item level with its rim can be placed.
@@ -336,6 +350,20 @@ def test_an_action_out_of_range_is_refused(action):
     td = env.reset()
     with pytest.raises(ValueError, match=rf"action.*{re.escape(str(action))}"):
         env.step(td.set("action", torch.tensor([0, 0, action, 0])))
+
+
+@pytest.mark.parametrize("action", [float("nan"), 0.0, 28.5])
+def test_an_action_is_an_integer(action):
+    env = make_env()
+    with pytest.raises(ValueError, match=rf"action={action} .*: expected whole numbers"):
+        env.step(env.reset().set("action", torch.full((4,), action)))
+
+
+def test_reset_takes_no_seed():
+    env = make_env()
+    for td in (None, TensorDict({"_reset": torch.tensor([[True], [False], [True], [False]])}, [4])):
+        with pytest.raises(TypeError, match=r"reset\(seed=2\): expected a TensorDict only; set_seed"):
+            env.reset(td, seed=2)
 
 
 # The rules

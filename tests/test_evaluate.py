@@ -171,6 +171,16 @@ def test_more_rotations_than_trained_are_refused(run, two_rotations):
     assert err.startswith("error: ") and err.count("\n") == 1 and "Traceback" not in err
 
 
+def test_a_key_of_the_checkpoint_s_items(run):
+    """It is one of theirs, and not of the command's own items."""
+    arguments = ["checkpoint=pretrained/mixed", "env.tote_size=[8,8,2]", "evaluation.episodes=2"]
+    code, err, result = run(*arguments, "items.height=[1,1]")
+    assert code == 0, err
+    assert (result["items"]["width"], result["items"]["height"]) == ([1, 3], [1, 1])
+    code, err, _ = run(*arguments, "items=paper", "items.kinds=[[1,1,1]]")
+    assert code == 0, err
+
+
 def test_confidence_interval_by_hand():
     # Mean 0.8; deviations -0.1, 0, 0, 0.1: variance 0.02 / 3, standard error sqrt(0.02 / 3 / 4) = 0.0408248;
     # Student's t with 3 degrees of freedom at 97.5%: 3.182446.

@@ -18,8 +18,10 @@ import pytest
 import torch
 from test_resume import start, wait_for_rows
 from torchrl._utils import _check_for_faulty_process
+from torchrl.collectors import RandomPolicy
+from torchrl.envs import TransformedEnv
 
-from pickplace import Planner, checkpoint, config
+from pickplace import PickPlaceEnv, Planner, checkpoint, collector, config
 from pickplace.collector import ignore_signals, watched
 from pickplace.config import WorkerDied
 from pickplace.evaluate import main as evaluate_main
@@ -45,6 +47,26 @@ def test_a_dead_worker_ends_the_run_in_one_sentence(tmp_path):
     assert sentence.startswith("error: collector worker 2 of 2 has died (exit code -9). What was saved before")
     assert f" is whole: python -m pickplace.train resume={run_dir}/checkpoints/" in sentence
     assert checkpoint.read(run_dir / "checkpoints" / "last")
+
+
+def slots(first: int, count: int) -> TransformedEnv:
+    return TransformedEnv(PickPlaceEnv(num_envs=count, first_episode=first))
+
+
+def test_workers_that_cannot_begin_are_ended():
+    """Left behind, they would keep the command from ending."""
+    before = set(multiprocessing.active_children())
+    policy = RandomPolicy(PickPlaceEnv(num_envs=2).action_spec)
+    with pytest.raises(ValueError, match="seed=-1"):
+        collector.multi_sync(slots, policy, num_envs=4, rollout_length=2, seed=-1)
+    assert set(multiprocessing.active_children()) <= before
+
+
+@pytest.mark.parametrize("seed", [2**62 - 1, 20_000_000_000_000])
+def test_any_seed_is_one_for_the_workers(seed):
+    seeds = collector._seeds(seed, 3)
+    assert {item_seed for item_seed, _ in seeds} == {seed}
+    assert len({torch.Generator().manual_seed(own).initial_seed() for _, own in seeds}) == 3
 
 
 def test_a_worker_s_death_is_told_until_it_is_heard():

@@ -238,6 +238,11 @@ def test_async_vectorisation():
         (lambda: vector().step(np.zeros(2, dtype=np.int64)), "before reset"),
         (lambda: step_after_reset(vector(), np.array([0, -1])), "actions="),
         (lambda: step_after_reset(vector(), np.array([0])), "actions="),
+        (lambda: step_after_reset(vector(), np.array([0.0, 1.7])), "actions="),
+        (lambda: make(seed=5), r"seed=5: expected no such argument; reset\(seed=...\)"),
+        (lambda: vector(seed=5), "seed=5: expected no such argument"),
+        (lambda: make().reset(seed=2**63), "seed=.*expected a whole number"),
+        (lambda: vector().reset(seed=2**63), "seed=.*expected a whole number"),
     ],
 )
 def test_bad_input_is_refused_in_a_sentence(act, message):

@@ -6,7 +6,7 @@ from scipy.stats import chisquare
 from tensordict import TensorDict
 
 from pickplace import PickPlaceEnv
-from pickplace.items import STREAMS, Kinds, Recorded, Uniform, hashed_uniform
+from pickplace.items import MOST_SEEDS, STREAMS, Kinds, Recorded, Uniform, hashed_uniform
 
 
 def numbers(stream="train", seed=0, episode=0, count=50_000):
@@ -39,6 +39,20 @@ def test_no_two_addresses_share_a_number():
     seed, episode, step = (part.flatten() for part in torch.meshgrid(*[torch.arange(15)] * 3, indexing="ij"))
     rows = torch.cat([hashed_uniform(stream, seed, episode, step, 1)[0] for stream in STREAMS])
     assert len(rows.unique()) == len(rows) == 3 * 15**3
+
+
+def test_families_never_meet():
+    """Two keys are one where ``seed * factor + family`` is: as its numbers show, for seeds too far apart."""
+    factor = 0x2545F4914F6CDD1D
+    for apart in (1, 2):
+        seed = apart * pow(factor, -1, 2**64) % 2**64  # times the factor it makes up for the family's number
+        seed = min(seed, 2**64 - seed)
+        at = torch.tensor(seed)
+        rows = {stream: hashed_uniform(stream, at, at * 0, at * 0, 3).tolist() for stream in STREAMS}
+        base = {stream: hashed_uniform(stream, at * 0, at * 0, at * 0, 3).tolist() for stream in STREAMS}
+        pairs = zip(STREAMS[apart:], STREAMS, strict=False)
+        assert any(rows[a] == base[b] or rows[b] == base[a] for a, b in pairs)
+        assert seed >= MOST_SEEDS
 
 
 def test_items_do_not_depend_on_the_batch():
@@ -230,10 +244,12 @@ def test_rows_that_do_not_fit(tmp_path, text, message):
     assert message in str(error.value)
 
 
-@pytest.mark.parametrize("seed", [-1, 2**70, 1.5, "a"])
+@pytest.mark.parametrize("seed", [-1, 2**62, 2**70, 1.5, "a", True])
 def test_bad_seeds(seed):
     with pytest.raises(ValueError, match="seed=.*expected a whole number"):
         PickPlaceEnv(seed=seed)
+    with pytest.raises(ValueError, match="seed=.*expected a whole number"):
+        PickPlaceEnv().set_seed(seed)
 
 
 @pytest.mark.parametrize("height", [4.5, 4.0, float("nan")])

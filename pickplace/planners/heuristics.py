@@ -5,6 +5,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from pickplace.geometry import FAR, Rules
+from pickplace.items import check_seed
 
 
 class UniformRandom:
@@ -18,7 +19,7 @@ class UniformRandom:
     name = "uniform"
 
     def __init__(self, rules: Rules, seed: int = 0):
-        self.rules, self._generator = rules, torch.Generator().manual_seed(_checked(seed))
+        self.rules, self._generator = rules, torch.Generator().manual_seed(check_seed(seed, "planner.seed"))
 
     def decide(self, observation: TensorDictBase) -> Tensor:
         """Flat actions, int64 ``[N]``."""
@@ -38,7 +39,7 @@ class RandomFeasible:
     name = "random"
 
     def __init__(self, rules: Rules, seed: int = 0):
-        self.rules, self.seed = rules, _checked(seed)
+        self.rules, self.seed = rules, check_seed(seed, "planner.seed")
         self._generator: torch.Generator | None = None
 
     def decide(self, observation: TensorDictBase) -> Tensor:
@@ -84,13 +85,6 @@ class JointDBL:
             reaching = torch.where((reaching >= 0) & (best[:, parity, None] == least), reaching, highest)
             action = torch.minimum(action, reaching.amin(1, keepdim=True))
         return action[:, 0].clamp(max=highest - 1)
-
-
-def _checked(seed: int) -> int:
-    """A seed that is one."""
-    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:
-        raise ValueError(f"planner.seed={seed!r}: expected a whole number >= 0 and < 2**63.")
-    return seed
 
 
 def _placements(rules: Rules, observation: TensorDictBase):

@@ -6,7 +6,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace.geometry import Rules
-from pickplace.items import ItemDistribution, imagined
+from pickplace.items import ItemDistribution, check_seed, imagined
 from pickplace.models.actors import MASKED, OutcomePolicy
 
 
@@ -49,7 +49,7 @@ class Lookahead:
         confidence: float = 2.0,
         seed: int = 0,
     ):
-        whole = {"candidates": (candidates, 1), "samples": (samples, 2), "rounds": (rounds, 1), "seed": (seed, 0)}
+        whole = {"candidates": (candidates, 1), "samples": (samples, 2), "rounds": (rounds, 1)}
         whole |= {"horizon": (horizon, 1)} if horizon is not None else {}
         for key, (value, least) in whole.items():
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
@@ -62,7 +62,7 @@ class Lookahead:
         self.horizon = horizon if critic is not None else None
         self.items = imagined(items)
         self.candidates, self.samples, self.rounds, self.confidence = candidates, samples, rounds, confidence
-        self.seed, self._decisions = seed, 0
+        self.seed, self._decisions = check_seed(seed, "planner.seed"), 0
 
     @torch.no_grad()
     def decide(self, observation: TensorDictBase) -> Tensor:

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from pickplace.geometry import Item, Rules
-from pickplace.items import ItemDistribution, imagined
+from pickplace.items import ItemDistribution, check_seed, imagined
 
 
 @dataclass(eq=False)
@@ -70,7 +70,7 @@ class MCTS:
         wave: int = 256,
         seed: int = 0,
     ):
-        for key, value, least in (("simulations", simulations, 1), ("wave", wave, 1), ("seed", seed, 0)):
+        for key, value, least in (("simulations", simulations, 1), ("wave", wave, 1)):
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise ValueError(f"planner.{key}={value!r}: expected a whole number >= {least}.")
         for key, number, most in (("exploration", exploration, math.inf), ("widening", widening, 1)):
@@ -79,7 +79,8 @@ class MCTS:
         if not isinstance(mask, bool):
             raise ValueError(f"planner.mask={mask!r}: expected true or false.")
         self.rules, self.items, self.simulations, self.mask = rules, imagined(items), simulations, mask
-        self.exploration, self.widening, self.wave, self.seed = exploration, widening, wave, seed
+        self.exploration, self.widening, self.wave = exploration, widening, wave
+        self.seed = check_seed(seed, "planner.seed")
         self._random = np.random.default_rng(seed)
         self._sampled, self._depths, self._walks = 0, 0, 0
 
