@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import stat
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -117,7 +118,8 @@ def locate(path, prefer: str = "best") -> Path:
     Args:
         path: a run folder (then its ``checkpoints/<prefer>``), a checkpoint, or ``pretrained/<name>``: weights that
             the package ships, unless a folder of that name is here.
-        prefer: ``"best"`` or ``"last"``.
+        prefer: ``"best"``, or ``"last"`` to go on with a run; then one that was killed before its first ``last`` goes
+            on from ``best``.
 
     Raises:
         CheckpointError: if there is none.
@@ -129,13 +131,18 @@ def locate(path, prefer: str = "best") -> Path:
             raise CheckpointError(f"checkpoint={str(path)!r}: the package ships no such weights; expected {names}.")
         return PRETRAINED / parts[1]
     path = Path(path).absolute()
-    for folder in (path / "checkpoints" / prefer, path):
+    preferred = ("last", "best") if prefer == "last" else (prefer,)
+    for folder in (*(path / "checkpoints" / name for name in preferred), path):
         for candidate in (folder, folder.with_name(f".{folder.name}.old")):
             if (candidate / FACTS).is_file():
                 return candidate
+    key = "resume" if prefer == "last" else "checkpoint"
+    for other in (path / "checkpoints" / name for name in ("last", PREVIOUS)):
+        if (other / FACTS).is_file():
+            raise CheckpointError(f"{key}={str(path)!r}: no {prefer} checkpoint there; expected {key}={other}.")
     raise CheckpointError(
-        f"checkpoint={str(path)!r}: no checkpoint there; expected a run folder, or one of its checkpoints: best, last "
-        "or previous."
+        f"{key}={str(path)!r}: no checkpoint there; expected a run folder, or one of its checkpoints: best, last or "
+        "previous."
     )
 
 
@@ -147,7 +154,7 @@ def read(folder: Path) -> tuple[dict, dict]:
             newest whole checkpoint beside it, if there is one.
     """
     try:
-        return _read(folder)
+        return _read_whole(folder)
     except CheckpointError as error:
         others = []
         for name in [PREVIOUS, "last", "best"] if Path(folder).parent.name == "checkpoints" else []:
@@ -159,6 +166,16 @@ def read(folder: Path) -> tuple[dict, dict]:
             raise
         frames, other = max(others)
         raise CheckpointError(f"{error} {other}, at {frames:,} frames, is whole.") from error
+
+
+def _read_whole(folder: Path) -> tuple[dict, dict]:
+    """Read again where a training may have replaced the one file before the other was read."""
+    for _ in range(4):
+        try:
+            return _read(folder)
+        except CheckpointError:
+            time.sleep(0.05)
+    return _read(folder)
 
 
 def _read(folder: Path) -> tuple[dict, dict]:

@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 
 PACKAGE = Path(__file__).resolve().parent
 LOCK = ".lock"  # in a run folder, held by the process that trains there
+TAKEN = "{}: another process is training there; expected another run folder, or to wait for it."
 FAILURE = "failure.txt"  # in a sweep's run folder, why the run failed
 
 
@@ -146,10 +147,44 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: dict[str, D
 
 
 def begun_with(run_dir: Path) -> list[str]:
-    """The words of the command that began a run, as Hydra noted them; empty where it did not."""
-    notes = Path(run_dir) / ".hydra" / "overrides.yaml"
-    words = yaml.safe_load(notes.read_text()) if notes.is_file() else None
+    """The overrides of the command that began a run, as Hydra noted them; empty where it did not."""
+    words = _noted(run_dir, "overrides.yaml")
     return [word for word in words if isinstance(word, str)] if isinstance(words, list) else []
+
+
+def own_configs(run_dir: Path) -> list[str]:
+    """The words of the command that began a run which say where its config files were found, as Hydra noted them."""
+    notes = _noted(run_dir, "hydra.yaml")
+    try:
+        sources = notes["hydra"]["runtime"]["config_sources"]
+        folders = [source["path"] for source in sources if source["provider"] == "command-line"]
+        said = [word for word in notes["hydra"]["overrides"]["hydra"] if "hydra.searchpath" in word]
+    except (KeyError, TypeError):
+        return []
+    return [*(word for folder in folders for word in ("--config-dir", folder)), *said]
+
+
+def changed_since(run_dir: Path, cfg: DictConfig) -> list[str]:
+    """The values, ``key=value``, in which a config is no longer that with which its run began."""
+    began = _noted(run_dir, "config.yaml")
+    if not isinstance(began, dict):
+        return []
+
+    def values(node, path: str = "") -> dict:
+        if not isinstance(node, dict):
+            return {path.removeprefix("."): node}
+        return {key: value for name in node for key, value in values(node[name], f"{path}.{name}").items()}
+
+    try:
+        before, now = (values(OmegaConf.to_container(OmegaConf.create(c), resolve=True)) for c in (began, cfg))
+    except OmegaConfBaseException:  # a reference that leads nowhere any more
+        return []
+    return [f"{key}={value}" for key, value in now.items() if value != before.get(key)]
+
+
+def _noted(run_dir: Path, name: str):
+    path = Path(run_dir) / ".hydra" / name
+    return yaml.safe_load(path.read_text()) if path.is_file() else None
 
 
 def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> None:
@@ -241,6 +276,38 @@ def one_sentence():
         sys.exit(2)
 
 
+class Occupied(ValueError):
+    """A run folder that holds a training already."""
+
+
+def refuse_occupied(run_dir: Path) -> None:
+    """Refuse a folder for a new run in which a training has left a checkpoint: two runs would be mixed.
+
+    Raises:
+        Occupied: naming the folder.
+    """
+    saved = run_dir / "checkpoints"
+    if saved.is_dir() and any(not entry.name.endswith(".new") for entry in saved.iterdir()):
+        raise Occupied(f"{run_dir}: there is a training already; expected another run folder, or resume={run_dir}.")
+
+
+class Refused(BaseException):
+    """Why a run is refused before it begins; Hydra would only warn of an error in a callback."""
+
+
+class FreshFolder(Callback):
+    """Refuses a run folder that another training is in, before Hydra overwrites the notes on that training."""
+
+    def on_run_start(self, config: DictConfig, **kwargs) -> None:
+        folder = Path(config.hydra.run.dir)
+        try:
+            if claimed(folder):
+                raise ValueError(TAKEN.format(folder))
+            refuse_occupied(folder)
+        except ValueError as error:
+            raise Refused(str(error)) from None
+
+
 class SweepCallback(Callback):
     """Lets :func:`command` know the folder of a sweep whose jobs cannot even be composed; the end of a sweep is told to
     it even where Hydra does not, since a job failed or was stopped."""
@@ -283,6 +350,8 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
         try:
             with _sweep_end(), _tidy():
                 hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(app)()
+        except Refused as error:
+            raise ValueError(str(error)) from None
         except ConfigCompositionException as error:
             if not (key := re.match("Could not override '(.*)'", str(error))):
                 raise
@@ -312,8 +381,9 @@ def _job():
         yield
     except Exception as error:
         folder = Path(HydraConfig.get().runtime.output_dir)
-        with suppress(OSError):  # the disk may be what is wrong
-            (folder / FAILURE).write_text(f"{sentence(error)}\n")
+        if not isinstance(error, Occupied):  # what is there has not failed
+            with suppress(OSError):  # the disk may be what is wrong
+                (folder / FAILURE).write_text(f"{sentence(error)}\n")
         log.error("run %s failed: %s", folder.name, sentence(error))
         raise JobFailed(f"run {folder.name}: {sentence(error)}") from error
     finally:

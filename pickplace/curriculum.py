@@ -9,7 +9,7 @@ level there.
 import math
 import reprlib
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -292,6 +292,8 @@ class Staged(Advance):
 
     def __init__(self, stages):
         self.stages, least = [], 0
+        if not isinstance(stages, Sequence) or isinstance(stages, str):
+            raise ValueError(f"curriculum.advance.stages={stages!r}: expected a list of {{frames: F, height: H}}.")
         for stage in stages:
             if not isinstance(stage, Mapping) or set(stage) != {"frames", "height"}:
                 raise ValueError(f"curriculum.advance.stages: got {stage!r}, expected {{frames: F, height: H}}.")

@@ -1,5 +1,6 @@
 """Evaluation: one code path for every planner, on fixed item streams; and the ``pickplace-evaluate`` command."""
 
+import hashlib
 import json
 import logging
 import platform
@@ -177,9 +178,12 @@ def resolved(node: DictConfig) -> Any:
 
 def episodes_of(cfg: DictConfig) -> dict:
     """What says which episodes an evaluation plays."""
+    items = resolved(cfg["items"])
+    if "path" in items and Path(items["path"]).is_file():  # recorded: what it held, not only where it was
+        items["sha256"] = hashlib.sha256(Path(items["path"]).read_bytes()).hexdigest()
     return {
         "env": resolved(cfg.env),
-        "items": resolved(cfg["items"]),
+        "items": items,
         "stream": cfg.evaluation.stream,
         "episodes": cfg.evaluation.episodes,
         "seed": cfg.evaluation.seed,

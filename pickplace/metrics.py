@@ -219,12 +219,19 @@ def _run_id(place: Path, frames: int) -> str | None:
 
 
 def read_csv(path) -> list[dict[str, float]]:
-    """The complete rows of a ``metrics.csv``; a metric that a row lacks is left out."""
+    """The complete rows of a ``metrics.csv``; a metric that a row lacks is left out.
+
+    Raises:
+        ValueError: naming the file and the line, where something is no number.
+    """
     with Path(path).open(newline="") as file:
         text = file.read()
     lines = text[: text.rfind("\n") + 1].splitlines()  # a killed run may have cut the last line short
     rows = []
-    for row in csv.DictReader(lines):
-        rows.append({key: float(value) for key, value in row.items() if value})
-        rows[-1]["frames"] = int(rows[-1]["frames"])
+    for number, row in enumerate(csv.DictReader(lines), start=2):
+        try:
+            rows.append({key: float(value) for key, value in row.items() if value})
+            rows[-1]["frames"] = int(rows[-1]["frames"])
+        except (TypeError, ValueError, KeyError, OverflowError) as error:
+            raise ValueError(f"{path}, line {number}: expected a number in each column ({error}).") from error
     return rows

@@ -63,6 +63,8 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
             raise ValueError(
                 f"{key}={now}: the run began with {was}, and a resumed run cannot change it; start a new one."
             )
+    if type(cfg.total_frames) is not int:
+        raise ValueError(f"total_frames={cfg.total_frames}: expected a whole number >= 1 and < 2**63.")
     if cfg.total_frames != saved.total_frames and cfg.total_frames < facts["frames"]:
         raise ValueError(
             f"total_frames={cfg.total_frames}: the run has trained {facts['frames']} frames already; expected more."
@@ -130,9 +132,7 @@ def claim(run_dir: Path):
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        raise ValueError(
-            f"{run_dir}: another process is training there; expected another run folder, or to wait for it."
-        ) from None
+        raise ValueError(config.TAKEN.format(run_dir)) from None
     try:
         yield
     finally:

@@ -1,6 +1,7 @@
 """Training by PPO, and the ``pickplace-train`` command. :func:`run` reads from top to bottom."""
 
 import logging
+import shlex
 import sys
 import time
 from contextlib import ExitStack
@@ -35,7 +36,7 @@ from pickplace.resume import (
     resumed_config,
     saying_what_is_safe,
 )
-from pickplace.training_report import write_report
+from pickplace.training_report import REPORT, write_report
 from pickplace.trust import own_modules, saved_form, trust_needed, trusted
 from pickplace.warm_start import Phase, WarmStart, imitation_loss
 
@@ -51,10 +52,14 @@ def train(cfg: DictConfig, run_dir: Path) -> float:
 
     Returns:
         Mean occupancy of the final policy at full tote height on the validation stream, for sweepers to optimise.
+
+    Raises:
+        ValueError: for settings that make no sense, or a run folder that holds another training.
     """
     if cfg.resume is not None:
         raise ValueError(f"resume={cfg.resume}: expected as resume=<run folder> on the command line, without a +.")
     with claim(run_dir):
+        config.refuse_occupied(run_dir)
         return run(cfg, run_dir)
 
 
@@ -212,7 +217,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             save("last")
 
     if stop.requested:  # a sweep ends here too, instead of going on to its next job
-        command = f"python -m pickplace.train resume={run_dir}{again}"
+        command = f"python -m pickplace.train resume={shlex.quote(str(run_dir))}{again}"
         log.info("stopped at %s frames; continue with: %s", f"{frames:,}", command)
     elif curriculum.level < curriculum.end:
         log.info(
@@ -223,8 +228,10 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         )
     if (run_dir / "metrics.csv").is_file():
         learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
-        if episodes is not None and frames >= cfg.total_frames:
+        told = episodes is None and (run_dir / REPORT).is_file()  # by the process before this one
+        if frames >= cfg.total_frames and not told:
             log.info("writing the report")
+            episodes = episodes or validate(cfg, build_env, planner)
             extremes = {int(episodes.occupancy.argmin()), int(episodes.occupancy.argmax())}
             replayed = validate(cfg, build_env, planner, record=extremes)
             write_report(run_dir, cfg, replayed, rules, versions() | {"commit": commit()})
@@ -265,7 +272,7 @@ def check_settings(cfg: DictConfig) -> None:
     if (start := cfg.algo.lr_decay_start) is not None and not (isinstance(start, (int, float)) and 0 <= start <= 1):
         raise ValueError(f"algo.lr_decay_start={start}: expected a share of total_frames between 0 and 1, or null.")
     ranges = {
-        "algo.gamma": (0, 1), "algo.lmbda": (0, 1), "algo.lr": (0, None), "algo.clip_epsilon": (0, None),
+        "algo.gamma": (0, 1), "algo.lmbda": (0, 1), "algo.lr": (0, None), "algo.clip_epsilon": (0, 1),
         "algo.entropy_coeff": (0, None), "algo.critic_coeff": (0, None), "algo.max_grad_norm": (0, None),
         "algo.reward_scale": (0, None),
     }  # fmt: skip

@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.config import begun_with
+from pickplace.config import begun_with, changed_since, own_configs
 from pickplace.geometry import Rules
 from pickplace.metrics import read_csv
 from pickplace.replay import ASSETS, page
 from pickplace.report import failure_mix
+
+REPORT = "report.html"
 
 
 def write_report(run_dir: Path, cfg: DictConfig, episodes, rules: Rules, facts: dict) -> None:
@@ -51,7 +53,7 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, rules: Rules, facts: 
         "curve": base64.b64encode((run_dir / "learning_curve.png").read_bytes()).decode(),
         "failures": base64.b64encode(failures.getvalue()).decode(),
         "tables": _validations(rows) + _levels(rows),
-        "command": escape(_command(run_dir)),
+        "command": escape(_command(run_dir, cfg)),
         "config": escape(OmegaConf.to_yaml(cfg, resolve=True)),
         "versions": escape("\n".join(f"{name}: {value}" for name, value in facts.items())),
         "replay": escape(page(ordered, rules, f"{cfg.evaluation.stream} stream, seed {cfg.evaluation.seed}")),
@@ -59,7 +61,13 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, rules: Rules, facts: 
     html = (ASSETS / "report.html").read_text(encoding="utf-8")
     # In one pass, so that nothing in the content is taken for a mark.
     html = re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], html)
-    (run_dir / "report.html").write_text(html, encoding="utf-8")
+    fresh = run_dir / f".{REPORT}.new"
+    try:
+        fresh.write_text(html, encoding="utf-8")
+        fresh.replace(run_dir / REPORT)
+    except OSError as error:
+        fresh.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(run_dir / REPORT)) from error
 
 
 def _table(head: tuple, rows: list[tuple]) -> str:
@@ -95,6 +103,8 @@ def _levels(rows: list[dict]) -> str:
     return "<br>" + _table(head, lines) if lines else ""
 
 
-def _command(run_dir: Path) -> str:
-    """The command that began the run."""
-    return " ".join(["python -m pickplace.train", *map(shlex.quote, begun_with(run_dir))])
+def _command(run_dir: Path, cfg: DictConfig) -> str:
+    """The command that began the run, and what was changed when it was resumed."""
+    command = " ".join(["python -m pickplace.train", *map(shlex.quote, [*own_configs(run_dir), *begun_with(run_dir)])])
+    changed = changed_since(run_dir, cfg)
+    return f"{command}\n\nChanged when it was resumed: {', '.join(changed)}" if changed else command

@@ -58,7 +58,7 @@ def unfinished(run_dir: Path) -> set[tuple[str, int]]:
 
 def command(run_dir: Path, settings: list[str]) -> list[str]:
     """To begin a run, or to go on with it."""
-    saved = any((run_dir / "checkpoints" / name).is_dir() for name in ("last", ".last.old"))
+    saved = any((run_dir / "checkpoints" / name).is_dir() for name in ("last", ".last.old", "best", ".best.old"))
     return [f"resume={run_dir}"] if saved else [*settings, f"hydra.run.dir={run_dir}"]
 
 

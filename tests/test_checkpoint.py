@@ -88,6 +88,21 @@ def test_locate_knows_runs_and_checkpoints(tmp_path):
         checkpoint.locate(tmp_path / "elsewhere")
 
 
+def test_a_reader_that_comes_between_the_files_reads_again(tmp_path, monkeypatch):
+    facts = {"frames": 1, "config": {}}
+    checkpoint.write(tmp_path / "last", {"policy": {"w": torch.zeros(3)}}, facts)
+    load, times = checkpoint.load, []
+
+    def replaced(blob):
+        times.append(1)
+        if len(times) == 1:
+            raise ValueError("altered")
+        return load(blob)
+
+    monkeypatch.setattr(checkpoint, "load", replaced)
+    assert checkpoint.read(tmp_path / "last")[1]["frames"] == 1
+
+
 def test_restore_names_what_does_not_fit():
     def make():
         return torch.nn.Linear(2, 3)
@@ -235,6 +250,13 @@ def test_facts_that_are_no_facts(tmp_path, text):
     (folder / checkpoint.FACTS).write_bytes(text.encode("latin-1"))
     with pytest.raises(CheckpointError, match="cannot be read"):
         checkpoint.read(folder)
+
+
+@pytest.mark.parametrize("row", ["xyz,1", "1,xyz", ",2", "inf,1", "1,2,3"])
+def test_metrics_that_are_no_numbers(tmp_path, row):
+    (tmp_path / "metrics.csv").write_text(f"frames,a\n1,2\n{row}\n")
+    with pytest.raises(ValueError, match="metrics.csv, line 3: expected a number"):
+        read_csv(tmp_path / "metrics.csv")
 
 
 def test_metrics_survive_a_cut_line_and_a_resume(tmp_path):

@@ -60,6 +60,8 @@ BAD = [
     ("train", ["algo.loss=dqn"], ["algo.loss=dqn", "ppo or a2c"]),
     ("train", ["algo.lr=-1"], ["algo.lr=-1", ">= 0"]),
     ("train", ["algo.gamma=1.5"], ["algo.gamma=1.5", "<= 1"]),
+    ("train", ["algo.clip_epsilon=1.5"], ["algo.clip_epsilon=1.5", "<= 1"]),
+    ("train", ["curriculum/advance=staged", "curriculum.advance.stages=5"], ["stages=5", "a list of"]),
     ("train", ["total_frames=many"], ["total_frames=many", "whole number"]),
     ("train", ["items.kinds=[[9,9,1]]"], ["item 9x9x1", "bin_size"]),
     ("train", ["items.kinds=[[1,1,9]]"], ["item 1x1x9", "tote_size[2]=5"]),

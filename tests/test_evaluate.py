@@ -171,6 +171,21 @@ def test_more_rotations_than_trained_are_refused(run, two_rotations):
     assert err.startswith("error: ") and err.count("\n") == 1 and "Traceback" not in err
 
 
+def test_recorded_items_are_compared_by_what_they_are(run, tmp_path):
+    """Not by where they were."""
+    table = tmp_path / "items.csv"
+    arguments = ["planner=joint_dbl", "items=recorded", f"items.path={table}", "evaluation.episodes=1"]
+    arguments += ["evaluation.latency_decisions=0"]
+    table.write_text("w,d,h\n1,1,1\n2,1,1\n")
+    code, err, _ = run(*arguments)
+    assert code == 0, err
+    other = next(tmp_path.glob("*/evaluation.json"))
+    assert run(*arguments, f"compare={other}")[0] == 0
+    table.write_text("w,d,h\n1,1,1\n2,2,1\n")
+    code, err, _ = run(*arguments, f"compare={other}")
+    assert code == 2 and "its items is" in err
+
+
 def test_a_key_of_the_checkpoint_s_items(run):
     """It is one of theirs, and not of the command's own items."""
     arguments = ["checkpoint=pretrained/mixed", "env.tote_size=[8,8,2]", "evaluation.episodes=2"]

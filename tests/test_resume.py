@@ -1,7 +1,9 @@
 """A run that is killed and resumed equals one that never was, bit for bit, with both collectors."""
 
+import html
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -9,9 +11,11 @@ import time
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from pickplace import checkpoint
 from pickplace.metrics import read_csv
+from pickplace.train import train
 
 ITERATION = 8 * 16  # frames: env.num_envs * algo.rollout_length of experiment=smoke
 SETTINGS = [
@@ -109,6 +113,45 @@ def test_killed_and_resumed_equals_uninterrupted(reference, tmp_path):
     assert ITERATION <= saved < 24 * ITERATION
     finish(start(f"resume={run_dir}"))
     assert_same(reference_dir, run_dir)
+
+
+def test_a_run_killed_before_its_first_last_goes_on_from_best(reference, tmp_path):
+    reference_dir, _ = reference
+    run_dir = tmp_path / "run"
+    shutil.copytree(reference_dir, run_dir)
+    shutil.rmtree(run_dir / "checkpoints/last")
+    assert checkpoint.locate(run_dir, "last") == run_dir / "checkpoints/best"
+    shutil.rmtree(run_dir / "checkpoints/best")
+    with pytest.raises(checkpoint.CheckpointError, match="no best checkpoint there; expected checkpoint=.*/previous"):
+        checkpoint.locate(run_dir)
+
+
+def test_a_new_run_where_another_has_been_is_refused(reference, tmp_path):
+    """Before anything in the folder is changed, Hydra's notes included."""
+    reference_dir, settings = reference
+    run_dir = tmp_path / "run"
+    shutil.copytree(reference_dir, run_dir)
+    before = {path: path.read_bytes() for path in run_dir.rglob("*") if path.is_file()}
+    process = start(*settings, "seed=7", f"hydra.run.dir={run_dir}")
+    error = process.communicate(timeout=240)[1]
+    assert process.returncode == 2
+    sentence = f"error: {run_dir}: there is a training already; expected another run folder, or resume={run_dir}."
+    assert error.strip().splitlines()[-1] == sentence
+    assert {path: path.read_bytes() for path in run_dir.rglob("*") if path.is_file()} == before
+    with pytest.raises(ValueError, match="there is a training already"):
+        train(OmegaConf.create({"resume": None}), run_dir)
+
+
+def test_a_report_that_was_cut_short_is_written_by_a_resume(reference, tmp_path):
+    reference_dir, _ = reference
+    run_dir = tmp_path / "run"
+    shutil.copytree(reference_dir, run_dir)
+    (run_dir / "report.html").unlink()
+    finish(start(f"resume={run_dir}", "algo.epochs=3"))
+    text = html.unescape((run_dir / "report.html").read_text())
+    assert "\n\nChanged when it was resumed: algo.epochs=3</pre>" in text
+    finish(start(f"resume={run_dir}"))
+    assert html.unescape((run_dir / "report.html").read_text()) == text  # nothing new to tell
 
 
 def test_sigterm_saves_and_a_resume_goes_on_exactly(reference, tmp_path):

@@ -16,6 +16,7 @@ import os
 import platform
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -126,6 +127,8 @@ def train(cell: Cell, minutes: float) -> dict:
     """Train, or go on training, for at most so many minutes in all; the curve and what it cost."""
     folder = run_dir_of(cell)
     last = folder / "checkpoints" / "last"
+    if not last.is_dir():  # stopped before: nothing to go on from
+        shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     before = spent(folder) if last.is_dir() else NOTHING  # without a checkpoint it begins anew
     if not (last.is_dir() and before["cpu_seconds"] >= 60 * minutes):
         action = [f"resume={folder}"] if last.is_dir() else [*cell.overrides, "threads=1", f"hydra.run.dir={folder}"]
