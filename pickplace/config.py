@@ -66,7 +66,10 @@ def instantiate(node: DictConfig, **kwargs):
 
 def _refuse_unknown_arguments(node: DictConfig, make: partial, given: dict) -> None:
     """Refuse keys of a node that what is made from it does not take, as :func:`refuse_unknown_keys` does elsewhere."""
-    taken = inspect.signature(make.func).parameters
+    try:
+        taken = inspect.signature(make.func).parameters
+    except (AttributeError, TypeError, ValueError):  # nothing of Python's own making
+        return
     if any(parameter.kind == parameter.VAR_KEYWORD for parameter in taken.values()):
         return
     if unknown := [key for key in make.keywords if key not in taken]:
@@ -299,7 +302,12 @@ class FreshFolder(Callback):
     """Refuses a run folder that another training is in, before Hydra overwrites the notes on that training."""
 
     def on_run_start(self, config: DictConfig, **kwargs) -> None:
-        folder = Path(config.hydra.run.dir)
+        before = HydraConfig.instance().cfg
+        try:
+            HydraConfig.instance().set_config(config)  # for references such as ${hydra:job.name}
+            folder = Path(config.hydra.run.dir)
+        finally:
+            HydraConfig.instance().cfg = before
         try:
             if claimed(folder):
                 raise ValueError(TAKEN.format(folder))

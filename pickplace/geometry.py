@@ -22,6 +22,7 @@ grasp classes.
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property, reduce
+from numbers import Integral
 from typing import NamedTuple
 
 import torch
@@ -78,6 +79,10 @@ class Step(NamedTuple):
     footprint: Tensor  # int64 [N, 4]: x, y, w, d of the footprint in the tote
 
 
+def _is_whole(value) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
 def _sizes(name: str, value, count: int) -> tuple[int, ...]:
     """``value`` as a tuple of ``count`` positive ints."""
     try:
@@ -121,7 +126,7 @@ class Rules:
         object.__setattr__(self, "bin_size", _sizes("bin_size", self.bin_size, 3))
         object.__setattr__(self, "tote_size", _sizes("tote_size", self.tote_size, 3))
         object.__setattr__(self, "effector_size", _sizes("effector_size", self.effector_size, 2))
-        if type(self.rotations) is not int or not 1 <= self.rotations <= 4:
+        if not _is_whole(self.rotations) or not 1 <= self.rotations <= 4:
             raise ValueError(f"rotations={self.rotations!r}: expected 1, 2, 3 or 4 (quarter turns to choose from).")
         if self.pick_rule not in ("contain", "overlap"):
             raise ValueError(f"pick_rule={self.pick_rule!r}: expected 'contain' or 'overlap'.")
@@ -129,7 +134,7 @@ class Rules:
             raise ValueError(f"min_support={self.min_support!r}: expected a share between 0 and 1.")
         if not isinstance(self.strict_support, bool):
             raise ValueError(f"strict_support={self.strict_support!r}: expected true or false.")
-        if self.longest_side is not None and (type(self.longest_side) is not int or self.longest_side < 1):
+        if self.longest_side is not None and (not _is_whole(self.longest_side) or self.longest_side < 1):
             raise ValueError(f"longest_side={self.longest_side!r}: expected a whole number >= 1, or None.")
 
     # ------------------------------------------------------------------ sizes

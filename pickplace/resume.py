@@ -1,5 +1,6 @@
 """How a training is stopped and taken up again: signals, the run folder's lock, what a resumed run may change."""
 
+import json
 import logging
 import os
 import reprlib
@@ -13,7 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace import checkpoint, config
-from pickplace.trust import own_modules, trusted
+from pickplace.trust import own_modules, saved_form, trusted
 
 log = logging.getLogger(__name__)
 
@@ -70,6 +71,25 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
             f"total_frames={cfg.total_frames}: the run has trained {facts['frames']} frames already; expected more."
         )
     return cfg
+
+
+def begun_already(cfg: DictConfig, run_dir: Path) -> tuple[dict, dict, Path] | None:
+    """State, facts and folder of the checkpoint to go on from, if this very run was begun in its folder: a job of a
+    sweep that a scheduler has preempted, and starts again.
+
+    Raises:
+        Occupied: if it was another run.
+    """
+    try:
+        folder = checkpoint.locate(run_dir, prefer="last")
+        state, facts = checkpoint.read(folder)
+    except checkpoint.CheckpointError:
+        config.refuse_occupied(run_dir)
+        return None
+    if facts["config"] != json.loads(json.dumps(saved_form(cfg))) or "curriculum" not in facts:
+        config.refuse_occupied(run_dir)
+    log.info("going on with %s at %s frames", run_dir, f"{facts['frames']:,}")
+    return state, facts, folder
 
 
 def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
@@ -132,7 +152,7 @@ def claim(run_dir: Path):
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        raise ValueError(config.TAKEN.format(run_dir)) from None
+        raise config.Occupied(config.TAKEN.format(run_dir)) from None
     try:
         yield
     finally:

@@ -30,6 +30,7 @@ from pickplace.resume import (
     AT_HOME,
     COUNTERS,
     StopRequest,
+    begun_already,
     claim,
     load_optimizer,
     refuse_links,
@@ -59,8 +60,7 @@ def train(cfg: DictConfig, run_dir: Path) -> float:
     if cfg.resume is not None:
         raise ValueError(f"resume={cfg.resume}: expected as resume=<run folder> on the command line, without a +.")
     with claim(run_dir):
-        config.refuse_occupied(run_dir)
-        return run(cfg, run_dir)
+        return run(cfg, run_dir, begun_already(cfg, run_dir))
 
 
 def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None = None) -> float:
@@ -154,7 +154,8 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             set_rng_state(checkpoint.fitting(state, rng_state(device), "random generator"), device)
         settings = OmegaConf.to_container(cfg, resolve=True)
         logger = config.instantiate(cfg.logger, folder=run_dir, frames=frames, settings=settings)
-        stop, started, first_frames, saved = StopRequest(), time.perf_counter(), frames, frames
+        stop, started, first_frames = StopRequest(), time.perf_counter(), frames
+        saved = frames if safe is None or "last" in safe.name else None  # the frames of `last`
         cleanup.callback(stop.restore)
         cleanup.callback(logger.close)
         left = max(cfg.total_frames - frames, 0)
@@ -203,10 +204,10 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
                 latest = validation_metrics(episodes)
                 metrics |= {f"eval/{key}": value for key, value in latest.items()}
                 log.info("%s frames: validation occupancy %.4f", f"{frames:,}", latest["occupancy"])
-                if latest["occupancy"] > best:
-                    best = latest["occupancy"]
-                    save("best")
             logger.log(metrics, frames)
+            if latest.get("occupancy", best) > best:  # after its row, which a run that goes on from here needs
+                best = latest["occupancy"]
+                save("best")
             if crossed(before, frames, cfg.checkpoint_interval):
                 save("last")
                 saved = frames

@@ -181,7 +181,10 @@ def test_recorded_items_are_compared_by_what_they_are(run, tmp_path):
     assert code == 0, err
     other = next(tmp_path.glob("*/evaluation.json"))
     assert run(*arguments, f"compare={other}")[0] == 0
-    table.write_text("w,d,h\n1,1,1\n2,2,1\n")
+    elsewhere = table.rename(tmp_path / "moved.csv")
+    arguments[2] = f"items.path={elsewhere}"
+    assert run(*arguments, f"compare={other}")[0] == 0
+    elsewhere.write_text("w,d,h\n1,1,1\n2,2,1\n")
     code, err, _ = run(*arguments, f"compare={other}")
     assert code == 2 and "its items is" in err
 

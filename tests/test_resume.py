@@ -120,10 +120,13 @@ def test_a_run_killed_before_its_first_last_goes_on_from_best(reference, tmp_pat
     run_dir = tmp_path / "run"
     shutil.copytree(reference_dir, run_dir)
     shutil.rmtree(run_dir / "checkpoints/last")
-    assert checkpoint.locate(run_dir, "last") == run_dir / "checkpoints/best"
-    shutil.rmtree(run_dir / "checkpoints/best")
     with pytest.raises(checkpoint.CheckpointError, match="no best checkpoint there; expected checkpoint=.*/previous"):
-        checkpoint.locate(run_dir)
+        shutil.copytree(run_dir, tmp_path / "other")
+        shutil.rmtree(tmp_path / "other/checkpoints/best")
+        checkpoint.locate(tmp_path / "other")
+    shutil.rmtree(run_dir / "checkpoints/previous")
+    finish(start(f"resume={run_dir}"))
+    assert_same(reference_dir, run_dir)
 
 
 def test_a_new_run_where_another_has_been_is_refused(reference, tmp_path):
@@ -140,6 +143,23 @@ def test_a_new_run_where_another_has_been_is_refused(reference, tmp_path):
     assert {path: path.read_bytes() for path in run_dir.rglob("*") if path.is_file()} == before
     with pytest.raises(ValueError, match="there is a training already"):
         train(OmegaConf.create({"resume": None}), run_dir)
+
+
+def test_a_job_of_a_sweep_that_is_started_again_goes_on(tmp_path):
+    """As after a preemption; with another config it is refused, and what is there has not failed."""
+    sweep = ["-m", *SETTINGS, f"hydra.sweep.dir={tmp_path}", "seed=0"]
+    process = start(*sweep)
+    wait_for_rows(process, tmp_path / "0", 5)
+    process.kill()
+    process.wait()
+    out = finish(start(*sweep))
+    assert f"going on with {tmp_path / '0'} at " in out
+    state = outcome(tmp_path / "0")
+    assert state[1]["frames"] == 24 * ITERATION
+    process = start(*sweep, "algo.lr=1e-4")
+    assert "there is a training already" in process.communicate(timeout=240)[1]
+    assert process.returncode == 2 and not (tmp_path / "0" / "failure.txt").exists()
+    assert outcome(tmp_path / "0")[1:] == state[1:]
 
 
 def test_a_report_that_was_cut_short_is_written_by_a_resume(reference, tmp_path):

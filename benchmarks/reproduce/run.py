@@ -16,7 +16,6 @@ import os
 import platform
 import re
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -29,6 +28,7 @@ from pathlib import Path
 import cells as definitions
 from cells import Cell
 
+from pickplace.checkpoint import CheckpointError, locate
 from pickplace.evaluate import commit, versions
 from pickplace.metrics import read_csv
 
@@ -127,11 +127,13 @@ def train(cell: Cell, minutes: float) -> dict:
     """Train, or go on training, for at most so many minutes in all; the curve and what it cost."""
     folder = run_dir_of(cell)
     last = folder / "checkpoints" / "last"
-    if not last.is_dir():  # stopped before: nothing to go on from
-        shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-    before = spent(folder) if last.is_dir() else NOTHING  # without a checkpoint it begins anew
+    try:
+        begun = bool(locate(folder, prefer="last"))
+    except CheckpointError:
+        begun = False
+    before = spent(folder) if begun else NOTHING  # without a checkpoint it begins anew
     if not (last.is_dir() and before["cpu_seconds"] >= 60 * minutes):
-        action = [f"resume={folder}"] if last.is_dir() else [*cell.overrides, "threads=1", f"hydra.run.dir={folder}"]
+        action = [f"resume={folder}"] if begun else [*cell.overrides, "threads=1", f"hydra.run.dir={folder}"]
         child = Child([sys.executable, "-m", "pickplace.train", *action], OUTPUTS / "logs" / f"{cell.name}.log")
         cost = child.wait(minutes - before["cpu_seconds"] / 60)
         cost["cpu_seconds"] += before["cpu_seconds"]
