@@ -190,7 +190,7 @@ def individual(results, path) -> bool:
         rows = (
             ("fcn_grasp", "fcn_grasp-R{}-s*-{}-Kall"),
             ("fcn_grasp_unmasked", "fcn_grasp_unmasked-R{}-s*-{}-K10"),
-            ("fcn4d", "fcn4d-R{}-s0-{}-K10"),
+            ("fcn4d", "fcn4d-R{}-s*-{}-K10"),
             ("individual_grasp", "individual_grasp-R{}-s*-{}-Kall"),
             ("individual_grasp_unmasked", "individual_grasp_unmasked-R{}-s0-{}-K10"),
             ("individual_rl", "individual_rl-R{}-s0-{}-K10"),
@@ -222,7 +222,7 @@ def rl_methods(results, path) -> bool:
         ("fcn_grasp", "fcn_grasp-R4-s*-{}-Kall", {"label": "fcn_grasp, mask, K=all"}),
         ("fcn4d_warm", "fcn4d_warm-R4-s0-{}-Kall", {"label": "fcn4d, mask, warm start, K=all"}),
         ("fcn_grasp_unmasked", "fcn_grasp_unmasked-R4-s*-{}-K1", {"label": "fcn_grasp, no mask, K=1"}),
-        ("fcn4d", "fcn4d-R4-s0-{}-K1", {"label": "fcn4d (the paper's), K=1"}),
+        ("fcn4d", "fcn4d-R4-s*-{}-K1", {"label": "fcn4d (the paper's), K=1"}),
         ("fcn4d_noclip", "fcn4d_noclip-R4-s0-{}-K1", {"label": "4D FCN, no clipping, K=1"}),
         ("typical", "typical-R4-s0-{}-K1", {"label": "typical, K=1"}),
         ("individual_rl", "individual_rl-R4-s0-{}-K1", {"label": "individual, RL, K=1"}),
