@@ -169,13 +169,24 @@ def read(folder: Path) -> tuple[dict, dict]:
 
 
 def _read_whole(folder: Path) -> tuple[dict, dict]:
-    """Read again where a training may have replaced the one file before the other was read."""
-    for _ in range(4):
+    """Read again where a training has replaced the one file before the other was read."""
+    while True:
+        files = _files(folder)
         try:
             return _read(folder)
         except CheckpointError:
-            time.sleep(0.05)
-    return _read(folder)
+            time.sleep(0.01)  # between the renames there is neither
+            if _files(folder) == files:
+                raise
+
+
+def _files(folder: Path) -> list[tuple[int, int]] | None:
+    """Which files a checkpoint consists of, as another one has others; None where they are missing."""
+    try:
+        found = [(Path(folder) / name).lstat() for name in (FACTS, TENSORS)]
+    except OSError:
+        return None
+    return [(entry.st_ino, entry.st_mtime_ns) for entry in found]
 
 
 def _read(folder: Path) -> tuple[dict, dict]:

@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 
 PACKAGE = Path(__file__).resolve().parent
 LOCK = ".lock"  # in a run folder, held by the process that trains there
+OCCUPIED = "{0}: there is a training already; expected another run folder, or resume={0}."
 TAKEN = "{}: another process is training there; expected another run folder, or to wait for it."
 FAILURE = "failure.txt"  # in a sweep's run folder, why the run failed
 
@@ -291,7 +292,7 @@ def refuse_occupied(run_dir: Path) -> None:
     """
     saved = run_dir / "checkpoints"
     if saved.is_dir() and any(not entry.name.endswith(".new") for entry in saved.iterdir()):
-        raise Occupied(f"{run_dir}: there is a training already; expected another run folder, or resume={run_dir}.")
+        raise Occupied(OCCUPIED.format(run_dir))
 
 
 class Refused(BaseException):

@@ -87,7 +87,7 @@ def begun_already(cfg: DictConfig, run_dir: Path) -> tuple[dict, dict, Path] | N
         config.refuse_occupied(run_dir)
         return None
     if facts["config"] != json.loads(json.dumps(saved_form(cfg))) or "curriculum" not in facts:
-        config.refuse_occupied(run_dir)
+        raise config.Occupied(config.OCCUPIED.format(run_dir))
     log.info("going on with %s at %s frames", run_dir, f"{facts['frames']:,}")
     return state, facts, folder
 

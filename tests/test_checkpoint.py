@@ -96,6 +96,7 @@ def test_a_reader_that_comes_between_the_files_reads_again(tmp_path, monkeypatch
     def replaced(blob):
         times.append(1)
         if len(times) == 1:
+            checkpoint.write(tmp_path / "last", {"policy": {"w": torch.ones(3)}}, facts)
             raise ValueError("altered")
         return load(blob)
 
