@@ -8,7 +8,7 @@ import gymnasium
 if TYPE_CHECKING:
     from pickplace.env import PickPlaceEnv
     from pickplace.geometry import Failure, Item, Rules
-    from pickplace.robot import Plan, Planner
+    from pickplace.robot import DepthMapError, Plan, Planner
 
 gymnasium.register(
     "pickplace/PickPlace-v0",
@@ -17,10 +17,10 @@ gymnasium.register(
 )
 
 __version__ = "0.1.0"
-__all__ = ["Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "Rules", "__version__"]
+__all__ = ["DepthMapError", "Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "Rules", "__version__"]
 
 _HOMES = {"PickPlaceEnv": "env", "Failure": "geometry", "Item": "geometry", "Rules": "geometry"}
-_HOMES |= {"Plan": "robot", "Planner": "robot"}
+_HOMES |= {"DepthMapError": "robot", "Plan": "robot", "Planner": "robot"}
 
 
 def __getattr__(name: str):

@@ -45,10 +45,11 @@ class Episodes:
 
 
 def confidence95(values: Tensor, least: float = 0.0, most: float = 1.0) -> tuple[float, float]:
-    """95% confidence interval of the mean, by Student's t.
+    """95% confidence interval of the mean, by Student's t, as far as such a value can be.
 
     Args:
-        values: ``[E]``; fewer than two tell nothing, and give the whole range ``least .. most`` of such a value.
+        values: ``[E]``; fewer than two tell nothing, and give the whole range.
+        least, most: the range of such a value.
     """
     if len(values) < 2:
         return least, most
@@ -56,7 +57,7 @@ def confidence95(values: Tensor, least: float = 0.0, most: float = 1.0) -> tuple
 
     mean, error = values.double().mean(), values.double().std() / len(values) ** 0.5
     margin = t.ppf(0.975, len(values) - 1) * error
-    return float(mean - margin), float(mean + margin)
+    return max(float(mean - margin), least), min(float(mean + margin), most)
 
 
 @torch.no_grad()
@@ -174,6 +175,11 @@ def summarise(result: Episodes) -> dict:
 def resolved(node: DictConfig) -> Any:
     """A part of a config as plain values."""
     return OmegaConf.to_container(node, resolve=True)
+
+
+def plain(value: Any) -> Any:
+    """What JSON writes for a tensor, a number of numpy's, or anything else that a planner of your own counts."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def episodes_of(cfg: DictConfig) -> dict:
@@ -310,7 +316,7 @@ def prepare(cfg: DictConfig) -> tuple:
         raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
     own_modules(cfg.trust)
     config.use_machine(cfg)
-    settings = {key: value for key, value in cfg.planner.items() if key != "_target_"}
+    settings = {key: value for key, value in resolved(cfg.planner).items() if key != "_target_"}
     facts: dict[str, Any] = {"planner_settings": settings, "checkpoint": None}
     trained = None
     if cfg.checkpoint is not None:
@@ -332,6 +338,10 @@ def prepare(cfg: DictConfig) -> tuple:
         }
 
     ev, items = cfg.evaluation, config.instantiate(cfg["items"])
+    if not items.varies:
+        facts["same_items"] = True
+        if ev.episodes > 1:
+            log.warning("items.path has x,y: all episodes are of the same items, and an interval tells of no others.")
 
     def make_env(first, count):
         return config.instantiate(
@@ -341,6 +351,8 @@ def prepare(cfg: DictConfig) -> tuple:
 
     parts = planner_parts(cfg.planner, make_env(0, 1).rules, items, trained)
     planner = config.instantiate(cfg.planner, **parts)
+    if not isinstance(getattr(planner, "name", None), str):  # told now, not after all episodes have been played
+        raise ValueError(f"planner: {type(planner).__name__} has no name; expected an attribute name, a string.")
     if isinstance(planner, PolicyPlanner):
         masked = planner.candidates == "all" or planner.policy.excludes or False
         facts |= {"candidates": planner.candidates, "mask_at_decision": masked}
@@ -369,7 +381,7 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
     result, episodes = evaluate(cfg, make_env, planner, facts, record=range(max(replay, 1)))
     if other:
         result["paired_difference"] = paired_difference(result, other)
-    (run_dir / "evaluation.json").write_text(json.dumps(result, indent=1))
+    (run_dir / "evaluation.json").write_text(json.dumps(result, indent=1, default=plain))
     picture(episodes.recordings[0], rules, run_dir / "tote.png")
     if replay:
         title = f"{cfg.checkpoint or planner.name}, {ev.stream} stream, seed {ev.seed}"

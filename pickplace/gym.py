@@ -117,6 +117,9 @@ class PickPlaceGymEnv(gymnasium.Env):
         self.observation_space, self.action_space = _spaces(self._env)
         self._recording: Recording | None = None  # of the running episode, for rendering
         self._window: tuple | None = None  # the figure and the image in it
+        self._colours = (
+            item_colours([(0, 0, 0, *size) for size in self._env.items.sizes.tolist()]) if render_mode else {}
+        )
         self._started = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
@@ -171,7 +174,7 @@ class PickPlaceGymEnv(gymnasium.Env):
         if self._recording is None:
             raise gymnasium.error.ResetNeeded("render() before reset().")
         rules, item = self._env.rules, self._env.current_item
-        scene = draw_scene(self._recording, rules, item_colours(self._recording.boxes))
+        scene = draw_scene(self._recording, rules, self._colours)
         inset = scene.add_axes((0.01, 0.04, 0.09, 0.18))
         inset.imshow(rules.bin_depth(item)[0].cpu().numpy().T, origin="lower", cmap="YlOrBr", vmin=0)
         inset.set_title("bin", fontsize="medium")
@@ -261,7 +264,8 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
                 raise ValueError(f"options['reset_mask']={options['reset_mask']!r}: expected {wanted}.")
         if seed is not None or not self._started:
             if not rows.all():
-                raise ValueError(f"seed={seed!r}: expected none with a reset_mask; a stream begins for all slots.")
+                when = "in the first reset" if seed is None else f"with seed={seed!r}"
+                raise ValueError(f"options['reset_mask'] {when}: expected none; a stream begins for all slots.")
             self._env.set_seed(int(self.np_random.integers(2**31)) if seed is None else seed)
             self._started = True
         self._reset_rows(rows, heights)

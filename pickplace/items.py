@@ -52,7 +52,7 @@ def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, cou
 
 def _is_length(value) -> bool:
     """Is it a positive whole number of cells that fits the tensors?"""
-    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value < 2**31
+    return isinstance(value, Integral) and not isinstance(value, bool) and 1 <= int(value) < 2**31
 
 
 class ItemDistribution:
@@ -61,10 +61,12 @@ class ItemDistribution:
     Attributes:
         sizes: int64 ``[K, 3]``, every size ``(w, d, h)`` that may arrive, in cells.
         length: number of items in an episode, or None if they never end.
+        varies: whether episodes differ at all.
     """
 
     sizes: Tensor
     length: int | None = None
+    varies: bool = True
 
     def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size) -> Item:
         """The ``step``-th item (from 0) of each ``episode``, int64 ``[N]``; size 0 after the last one."""
@@ -182,6 +184,7 @@ class Recorded(ItemDistribution):
         numbers = torch.tensor(rows, dtype=torch.int64)
         self.sizes = numbers[:, :3]
         self._corner = numbers[:, 3:] if len(header) == 5 else None
+        self.varies = self._corner is None  # else not even where the items lie
         self._lines = [line for line, row in table[1:] if any(row)]
         self._loop = loop
         self.length = None if loop else len(rows)

@@ -308,10 +308,11 @@ def evaluation_table(result: dict) -> str:
     env, occupancy, latency = result["env"], result["occupancy"], result["latency_ms"]
     low, high = occupancy["ci95"]
     failures = ", ".join(f"{name} {count}" for name, count in result["failures"].items())
+    same = ", all of the same items" if result.get("same_items") else ""
     rows = [
         ("planner", result["planner"]),
         ("tote, rotations", f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}"),
-        ("episodes", f"{result['episodes']} of the {result['stream']} stream, seed {result['seed']}"),
+        ("episodes", f"{result['episodes']} of the {result['stream']} stream, seed {result['seed']}{same}"),
         ("occupancy", f"{occupancy['mean']:.4f} (95% interval {low:.4f} to {high:.4f}), least {occupancy['min']:.4f}"),
         ("items placed", f"{result['items_placed']:.1f} an episode"),
         ("episodes ended by", failures),

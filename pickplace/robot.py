@@ -6,6 +6,7 @@ cell ``(0, 0)`` on the inner floor; x runs along the first axis of the depth map
 seen from above.
 """
 
+import os
 import reprlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -22,6 +23,9 @@ from pickplace.geometry import Failure, Item, Rules
 from pickplace.models.actors import Policy
 from pickplace.planners.policy import PolicyPlanner, restore_policy
 from pickplace.trust import trusted
+
+#: Beyond the tolerance, in cells: three cells of 0.05 m are not exactly 0.15 m in binary fractions.
+ROUNDING = 1e-6
 
 
 class DepthMapError(ValueError):
@@ -56,7 +60,9 @@ class Plan:
     Lengths are in metres if ``cell_size`` was given, else in cells; ``item`` and the ``cell`` of a pose are in cells.
     """
 
-    status: str  #: "ok"; "stuck": nothing at all is feasible; "rejected": what the policy would do is not
+    #: "ok"; "stuck": nothing at all is feasible; "impossible": nor would it be in an empty tote; "rejected": something
+    #: is feasible, but not what the policy would do
+    status: str
     item: dict[str, int]  #: the item seen in the bin: x, y, w, d, h
     pick: Pose | None  #: in the bin's frame; z is the item's top
     place: Pose | None  #: in the tote's frame; z is the item's top once it rests
@@ -66,7 +72,7 @@ class Plan:
     occupancy_before: float  #: share of the tote's volume below the surface that the depth map shows, 0 to 1
     occupancy_after: float
     alternatives: list[Alternative]  #: the most probable choices, best first
-    reasons: dict[str, int] | None  #: if stuck: how many of all flat actions fail for which reason
+    reasons: dict[str, int] | None  #: if stuck or impossible: how many of all flat actions fail for which reason
 
     def as_dict(self) -> dict:
         """The plan as plain values, ready for JSON."""
@@ -102,6 +108,8 @@ class Planner:
         Raises:
             ValueError: for a checkpoint that cannot be used, or bad sizes.
         """
+        if not isinstance(path, (str, os.PathLike)):
+            raise ValueError(f"path={path!r}: expected a run folder, a checkpoint, or pretrained/<name>.")
         state, facts = checkpoint.read(checkpoint.locate(path))
         cfg = trusted(facts["config"], trust)
         known = {field.name for field in fields(Rules)}
@@ -113,7 +121,7 @@ class Planner:
         if rules.pick_rule == "overlap" and rules.longest_side is None:  # then the number of grasps depends on it
             longest = int(config.instantiate(cfg["items"]).sizes[:, :2].max())
             rules = replace(rules, longest_side=longest)
-        policy = restore_policy(cfg, rules, state["policy"], cfg.env.rotations)
+        policy = restore_policy(cfg, rules, state["policy"], env)
         return cls(rules, policy.to(config.usable_device(device)), candidates)
 
     @torch.inference_mode()
@@ -135,7 +143,7 @@ class Planner:
             cell_size: side of a cell in metres, if the maps and ``tote_height`` are in metres; None: they are in cells.
             tolerance: how far, in cells, a measured height may be from a whole number of cells; below 0.5.
             alternatives: how many of the most probable choices to report, and the chosen one if it is further down;
-                0 is fastest.
+                0 is fastest. Where nothing is feasible it takes longest: all actions are simulated for the reasons.
 
         Raises:
             DepthMapError: for a map of another shape or type, a value that is not finite, out of range or too far from
@@ -153,7 +161,7 @@ class Planner:
 
             def good(length):  # the range first: far beyond it nothing can be rounded
                 cells = length / unit
-                return 0.5 < cells < 2**20 - 0.5 and abs(cells - round(cells)) <= tolerance
+                return 0.5 < cells < 2**20 - 0.5 and abs(cells - round(cells)) <= tolerance + ROUNDING
 
             height = round(_number("tote_height", tote_height, wanted, good) / unit)
         bin_map = _snap("bin_depth", bin_depth, rules.bin_size[:2], unit, tolerance, 2**20)
@@ -180,18 +188,22 @@ class Planner:
         heights = (height - tote_map)[None].int().to(device)
         item = rules.read_item(observation["bin_depth"])
         at = torch.tensor([height], device=device)
-        feasible = bool(rules.outcome_mask(rules.placements(heights, at, item)).any())
-        action = None  # one that succeeds
-        if feasible:
+        action, reasons = None, None  # an action that succeeds; why none does
+        if _any_feasible(rules, heights, at, item):
+            status = "rejected"
             decided = self._planner.decide(observation)
             step = rules.apply(heights, at, item, decided)
-            action = decided if int(step.failure[0]) == 0 else None
+            if int(step.failure[0]) == 0:
+                action, status = decided, "ok"
+        else:
+            status = "stuck" if _any_feasible(rules, torch.zeros_like(heights), at, item) else "impossible"
+            reasons = self._reasons(heights, at, item)
 
         capacity = height * rules.num_places
         before = int(heights.sum()) / capacity
         volume = int(item.w * item.d * item.h)
         plan = Plan(
-            status="ok" if action is not None else "rejected" if feasible else "stuck",
+            status=status,
             item={key: int(value) for key, value in item._asdict().items()},
             pick=None,
             place=None,
@@ -201,7 +213,7 @@ class Planner:
             occupancy_before=before,
             occupancy_after=before if action is None else before + volume / capacity,
             alternatives=self._alternatives(observation, heights, at, item, action, alternatives),
-            reasons=None if feasible else self._reasons(heights, at, item),
+            reasons=reasons,
         )
         if action is None:
             return plan
@@ -296,13 +308,18 @@ class Planner:
         return {failure.name.lower(): counts[failure] for failure in Failure if counts[failure]}
 
 
+def _any_feasible(rules: Rules, heights: Tensor, tote_height: Tensor, item: Item) -> bool:
+    """Can anything be done with the item in this tote?"""
+    return bool(rules.outcome_mask(rules.placements(heights, tote_height, item)).any())
+
+
 def _number(name: str, value, wanted: str, good) -> float:
     """A finite number for which ``good`` holds."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         number = float("nan")
-    if isinstance(value, (bool, str)) or not abs(number) < float("inf") or not good(number):
+    if isinstance(value, (bool, np.bool_, str, bytes)) or not abs(number) < float("inf") or not good(number):
         raise DepthMapError(f"{name}={reprlib.repr(value)}: expected {wanted}.")
     return number
 
@@ -310,7 +327,10 @@ def _number(name: str, value, wanted: str, good) -> float:
 def _snap(name: str, values, grid: tuple[int, int], unit: float, tolerance: float, highest: int) -> Tensor:
     """A measured map as whole cells, int64 ``grid``, each value between 0 and ``highest``."""
     try:
-        array = values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
+        if isinstance(values, Tensor):
+            values = values.detach().cpu()
+            values = values.float() if values.dtype == torch.bfloat16 else values  # which numpy does not have
+        array = np.asarray(values)  # of a masked array what is under the mask, too
     except (TypeError, ValueError) as error:
         raise DepthMapError(f"{name}: expected an array of {grid[0]}x{grid[1]} numbers ({error}).") from error
     if array.shape != tuple(grid):
@@ -319,10 +339,13 @@ def _snap(name: str, values, grid: tuple[int, int], unit: float, tolerance: floa
         )
     if array.dtype.kind not in "iuf":
         raise DepthMapError(f"{name}: got values of type {array.dtype}, expected numbers.")
+    if isinstance(values, np.ma.MaskedArray) and np.ma.getmaskarray(values).any():
+        x, y = np.argwhere(np.ma.getmaskarray(values))[0].tolist()
+        raise DepthMapError(f"{name}[{x}, {y}]: got a masked value, expected a measured one.")
     with np.errstate(all="ignore"):
         cells = array.astype(np.float64) / unit
         whole = np.round(cells)
-        far = ~(np.abs(cells - whole) <= tolerance)  # also where it is not a number
+        far = ~(np.abs(cells - whole) <= tolerance + ROUNDING)  # also where it is not a number
     out = ~((whole >= 0) & (whole <= highest))
     if (far | out).any():
         x, y = np.argwhere(far | out)[0].tolist()

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 
+import numpy
 import pytest
 import torch
 
@@ -208,6 +209,52 @@ def test_confidence_interval_by_hand():
     assert evaluate.confidence95(torch.tensor([0.5] * 5)) == (0.5, 0.5)
     assert evaluate.confidence95(torch.tensor([0.5])) == (0.0, 1.0)
     assert evaluate.confidence95(torch.tensor([0.5]), least=-1.0) == (-1.0, 1.0)
+    assert evaluate.confidence95(torch.tensor([1.0, 1.0, 0.96]))[1] == 1.0  # 1.044 is no occupancy
+    assert evaluate.confidence95(torch.tensor([0.0, 0.0, 0.04]))[0] == 0.0
+    low, high = evaluate.confidence95(torch.tensor([0.01, -0.01, 0.01]), least=-1.0)
+    assert -1 < low < 0 < high
+
+
+class Counting(JointDBL):
+    """Keeps what JSON does not know."""
+
+    name = "counting"
+
+    def __init__(self, rules, weights):
+        super().__init__(rules)
+        self.weights = weights
+
+    def statistics(self):
+        return {"seen": torch.tensor([3, 4]), "share": numpy.float32(0.5), "device": torch.device("cpu")}
+
+
+class Nameless(JointDBL):
+    name = None
+
+
+def test_planners_of_ones_own_lose_no_result(run):
+    arguments = [
+        "evaluation.episodes=2",
+        "evaluation.latency_decisions=0",
+        "trust=[test_evaluate]",
+        "planner=joint_dbl",
+    ]
+    code, err, result = run(*arguments, "planner._target_=test_evaluate.Counting", "+planner.weights=[1,{a:2.5}]")
+    assert code == 0, err
+    assert result["planner_settings"]["weights"] == [1, {"a": 2.5}]
+    assert (result["seen"], result["share"], result["device"]) == ([3, 4], 0.5, "cpu")
+    code, err, result = run(*arguments, "planner._target_=test_evaluate.Nameless")
+    assert code == 2 and "planner: Nameless has no name; expected" in err and result is None
+
+
+def test_recorded_items_with_places_are_the_same_in_every_episode(run, tmp_path, caplog):
+    table = tmp_path / "items.csv"
+    arguments = ["planner=joint_dbl", "items=recorded", f"items.path={table}", "evaluation.episodes=3"]
+    for header, row, same in (("w,d,h,x,y", "2,1,1,0,3", True), ("w,d,h", "2,1,1", None)):
+        table.write_text(f"{header}\n{row}\n{row}\n")
+        code, err, result = run(*arguments, "evaluation.latency_decisions=0")
+        assert code == 0, err
+        assert result.get("same_items") == same
 
 
 def test_the_validation_group_serves_an_evaluation_too(run):

@@ -13,7 +13,7 @@ from pickplace.geometry import Rules
 from pickplace.items import Kinds
 from pickplace.models.actors import MASKED, fcn_grasp
 from pickplace.models.critics import PooledCritic
-from pickplace.models.fcn_grasp import FootprintFcn
+from pickplace.models.fcn_grasp import FootprintFcn, matrix_dtype
 
 
 def random_state(generator, batch, bin_size, tote_size):
@@ -178,8 +178,10 @@ def test_bfloat16_is_close_and_any_number_of_rows_will_do(num_envs, least, most,
     assert (wanted - got).abs().max() < 0.05 * wanted[wanted > MASKED].std() + 0.05
     for able, expected in (({"amx_bf16": True}, torch.bfloat16), ({}, torch.float32)):
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda able=able: able, raising=False)
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-        assert FootprintFcn().compute_dtype == expected
+        monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda able=able: not able)
+        assert matrix_dtype("auto", "cpu") == expected  # whatever a GPU beside it can do
+        assert matrix_dtype("auto", "cuda") != expected
+        assert matrix_dtype("float32", "cpu") == torch.float32
 
 
 def test_nothing_allowed_anywhere_gives_no_logit():

@@ -92,6 +92,12 @@ def test_uniform_ranges():
     assert chisquare(torch.bincount((item.w - 1) * 3 + item.h - 2)).pvalue > 1e-4
 
 
+def test_lengths_of_numpy_are_lengths():
+    two = torch.ones(1).int().numpy()[0] + 1
+    assert Kinds([(two, two, 1)]).sizes.tolist() == [[2, 2, 1]]
+    assert len(Uniform((1, two), (two, two)).sizes) == 2 * 1 * 3
+
+
 @pytest.mark.parametrize(
     ("make", "key"),
     [

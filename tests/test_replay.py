@@ -232,6 +232,17 @@ def test_page_opens_steps_plays_and_changes_episodes(browser, tmp_path):
     assert [name for name in fetched if not name.startswith(("data:", "blob:"))] == []
 
 
+def test_page_of_very_many_moves(browser, tmp_path):
+    """More than a function takes arguments."""
+    moves = [Move((1, 1, 1, 1, 1 + n % 2), (0, 0), (0, 0), 0, (0, 0, 1, 1), 0, Failure.NONE) for n in range(1500)]
+    path = tmp_path / "replay.html"
+    recordings = [Recording(n, 5, moves, Failure.STUCK, (0, 0, 1, 1, 4), 1.0) for n in range(100)]
+    path.write_text(replay.page(recordings, Rules(), "many"), encoding="utf-8")
+    state = open_page(browser, path)
+    assert state()["moves"] == 1500
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
 def test_page_shows_a_failure_in_place(browser, tmp_path):
     rules, result = record(planner=lambda rules: policy_planner(rules, 1))
     failing = next(r for r in result.recordings if r.ending not in (Failure.STUCK, Failure.NONE))

@@ -17,10 +17,9 @@ from oracle import Oracle
 from oracle import Rules as OracleRules
 from tensordict import TensorDict
 
-from pickplace import Failure, Planner, Rules, checkpoint, config, plan
+from pickplace import DepthMapError, Failure, Planner, Rules, checkpoint, config, plan
 from pickplace.models.actors import fcn4d, fcn_grasp
 from pickplace.planners import PolicyPlanner
-from pickplace.robot import DepthMapError
 
 EMPTY = np.full((6, 6), 5)
 ITEM = np.zeros((5, 5), dtype=np.int64)
@@ -88,7 +87,10 @@ def test_plans_agree_with_the_oracle_and_with_plane_geometry(cell, candidates, m
     )  # fmt: skip
     action = int(PolicyPlanner(rules, planner._planner.policy, candidates).decide(observation))
     feasible = 0 in codes
-    assert result.status == ("stuck" if not feasible else "ok" if codes[action] == 0 else "rejected")
+    empty = oracle_of(rules, bin_depth, np.full_like(tote_depth, height), height)
+    elsewhere = any(empty.try_action(other)[0] == 0 for other in range(rules.num_actions))
+    nothing = "stuck" if elsewhere else "impossible"
+    assert result.status == (nothing if not feasible else "ok" if codes[action] == 0 else "rejected")
     assert result.action == (action if result.status == "ok" else None)
 
     # Alternatives: simulated as the oracle does, best first, the chosen one the first that would succeed.
@@ -107,7 +109,7 @@ def test_plans_agree_with_the_oracle_and_with_plane_geometry(cell, candidates, m
         assert chosen.action == result.action
         assert chosen.probability == pytest.approx(good[0].probability, rel=1e-5)
 
-    if result.status == "stuck":
+    if not feasible:
         assert result.reasons == {Failure(code).name.lower(): count for code, count in Counter(codes).items()}
         assert result.occupancy_after == result.occupancy_before
     else:
@@ -141,6 +143,36 @@ def test_metres_and_noise_within_the_tolerance_change_nothing(planner):
     assert metric.place.center == pytest.approx([0.05 * value for value in plain.place.center])
     assert metric.pick.cell == plain.pick.cell
     assert json.loads(json.dumps(metric.as_dict()))["place"]["cell"] == list(metric.place.cell)
+
+
+def test_only_rounding_goes_beyond_the_tolerance(planner):
+    high = np.where(ITEM, 3, 0)
+    exact = planner.plan(high, EMPTY, tolerance=0)
+    assert 0.15 / 0.05 != 3 and planner.plan(high * 0.05, EMPTY * 0.05, 5 * 0.05, 0.05, 0).action == exact.action
+    with pytest.raises(DepthMapError, match="within 0"):
+        planner.plan(high * 1.00001, EMPTY, tolerance=0)
+
+
+def test_stuck_in_this_tote_or_in_any(planner):
+    """A robot that is told to bring an empty tote must not be told so for ever."""
+    full = planner.plan(ITEM, np.zeros((6, 6)))
+    assert full.status == "stuck" and sum(full.reasons.values()) == planner.rules.num_actions
+    long = np.zeros((5, 5))
+    long[:4, 1] = 1  # an end effector of 3x3 does not cover it
+    assert planner.plan(long, EMPTY).status == planner.plan(long, np.zeros((6, 6))).status == "impossible"
+    assert planner.plan(ITEM * 6, EMPTY).status == "impossible"
+    assert planner.plan(ITEM * 6, EMPTY + 1, tote_height=6).status == "ok"
+
+
+def test_maps_of_other_kinds(planner):
+    plain = planner.plan(ITEM, EMPTY)
+    for make in (
+        lambda a: torch.tensor(a, dtype=torch.bfloat16),
+        lambda a: torch.tensor(a, dtype=torch.float32, requires_grad=True),
+        lambda a: np.ma.masked_array(a, mask=False),
+        lambda a: np.asfortranarray(a.astype(">u2")),
+    ):
+        assert planner.plan(make(ITEM), make(EMPTY)) == plain
 
 
 def test_tote_height_of_the_moment(planner):
@@ -181,6 +213,8 @@ BAD = [
     ({"bin_depth": changed(ITEM, (0, 0), np.inf)}, "bin_depth[0, 0]: got inf cells"),
     ({"bin_depth": changed(ITEM, (4, 0), -1)}, "bin_depth[4, 0]: got -1 cells, expected 0 to"),
     ({"bin_depth": changed(ITEM, (1, 2), 1.3)}, "bin_depth[1, 2]: got 1.3 cells, expected a whole number of cells"),
+    ({"bin_depth": np.ma.masked_equal(ITEM, 1)}, "bin_depth[1, 2]: got a masked value, expected a measured one."),
+    ({"tote_depth": np.ma.masked_array(EMPTY, EMPTY > 0)}, "tote_depth[0, 0]: got a masked value"),
     ({"tote_depth": EMPTY.T[:, :5]}, "tote_depth: got shape [6, 5], expected [6, 6]"),
     ({"tote_depth": changed(EMPTY, (3, 1), 6)}, "tote_depth[3, 1]: got 6 cells, expected 0 to 5 cells"),
     ({"tote_depth": changed(EMPTY, (3, 1), -1)}, "tote_depth[3, 1]: got -1 cells"),
@@ -189,6 +223,8 @@ BAD = [
     ({"cell_size": 0}, "cell_size=0: expected a length in metres, 1e-6 to 1e6"),
     ({"cell_size": "5cm"}, "cell_size='5cm': expected a length"),
     ({"cell_size": float("nan")}, "cell_size=nan"),
+    ({"cell_size": b"1"}, "cell_size=b'1': expected a length"),
+    ({"cell_size": np.True_}, "cell_size=np.True_" if np.__version__ >= "2" else "cell_size=True"),
     ({"cell_size": 1e-320}, "cell_size=1e-320: expected a length in metres, 1e-6 to 1e6"),
     ({"tote_height": 0}, "tote_height=0: expected a whole number of cells, 1 to 1048575"),
     ({"tote_height": 4.5}, "tote_height=4.5"),
@@ -223,6 +259,15 @@ def test_load(tmp_path):
             Planner.load("pretrained/r4", **sizes)
     with pytest.raises(ValueError, match="pretrained/r9.*expected .*pretrained/r4"):
         Planner.load("pretrained/r9")
+    with pytest.raises(ValueError, match="path=None: expected a run folder"):
+        Planner.load(None)
+
+
+def test_a_policy_without_a_mask_serves_end_effectors_as_long_as_its_own():
+    turned = Planner.load("pretrained/unmasked", effector_size=(2, 3), tote_size=(7, 8, 5))
+    assert turned.plan(ITEM, np.full((7, 8), 5)).status == "ok"
+    with pytest.raises(ValueError, match=r"env.effector_size=\[4, 4\]: the checkpoint was trained with \[3, 3\], and"):
+        Planner.load("pretrained/unmasked", effector_size=(4, 4))
 
 
 # ---------------------------------------------------------------------- pickplace-plan

@@ -38,7 +38,12 @@ was cut short before half of its frames. An "a": attempted.
 def load() -> dict[str, dict]:
     """Every result that there is, by the name of its cell."""
     paths = [*(RESULTS / "cells").glob("*.json"), *(RESULTS / "trainings").glob("*.json")]
-    return {path.stem: json.loads(path.read_text()) for path in sorted(paths)}
+    results = {path.stem: json.loads(path.read_text()) for path in sorted(paths)}
+    for result in results.values():
+        if "occupancy" in result:  # older cells' intervals go beyond what an occupancy can be
+            low, high = result["occupancy"]["ci95"]
+            result["occupancy"]["ci95"] = [max(low, 0.0), min(high, 1.0)]
+    return results
 
 
 def processors(results) -> str:

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from pickplace.geometry import Rules
 from pickplace.models.conv4d import Conv4dCritic, check_width
 from pickplace.models.depth import depth_levels, item_code, one_hot
-from pickplace.models.fcn_grasp import matrix_dtype
+from pickplace.models.fcn_grasp import check_dtype, matrix_dtype
 
 
 class PooledCritic(nn.Module):
@@ -46,7 +46,7 @@ class PooledCritic(nn.Module):
         for key, value in {**widths, "depth_range": depth_range, "item_range": item_range}.items():
             check_width(f"model.critic.{key}", value)
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
-        self.compute_dtype = matrix_dtype("model.critic.compute_dtype", compute_dtype)
+        self.compute_dtype = check_dtype("model.critic.compute_dtype", compute_dtype)
         self.around = nn.Conv2d(depth_range, filters, receptive_field, padding=receptive_field // 2)
         self.item = nn.Linear(3 * item_range, filters, bias=False)
         self.room = nn.Parameter(torch.zeros(filters))
@@ -61,11 +61,11 @@ class PooledCritic(nn.Module):
         levels = depth_levels(tote_depth, self.tote_clip, self.depth_range)
         planes = one_hot(levels.flatten(1), self.depth_range).view(-1, self.depth_range, *levels.shape[1:])
         room = tote_depth[..., None] / 5
-        lower = self.compute_dtype != torch.float32
-        with torch.autocast(tote_depth.device.type, self.compute_dtype, enabled=lower):
-            x = self.around(planes.to(self.compute_dtype, memory_format=torch.channels_last)).permute(0, 2, 3, 1)
-            x = x + self.item(item_code(bin_depth, self.item_range).to(self.compute_dtype))[:, None, None]
-            x = x + room.to(self.compute_dtype) * self.room.to(self.compute_dtype)
+        dtype = matrix_dtype(self.compute_dtype, tote_depth.device.type)
+        with torch.autocast(tote_depth.device.type, dtype, enabled=dtype != torch.float32):
+            x = self.around(planes.to(dtype, memory_format=torch.channels_last)).permute(0, 2, 3, 1)
+            x = x + self.item(item_code(bin_depth, self.item_range).to(dtype))[:, None, None]
+            x = x + room.to(dtype) * self.room.to(dtype)
             x = F.relu(self.hidden(F.relu(x)))
         share, more = self.head(x.float()).unbind(-1)
         value = (share * room[..., 0] + more / 5).sum((1, 2))

@@ -66,7 +66,7 @@ class FootprintFcn(nn.Module):
         self.receptive_field, self.reach = receptive_field, reach
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
         self.rooms = rooms
-        self.compute_dtype = matrix_dtype("model.compute_dtype", compute_dtype)
+        self.compute_dtype = check_dtype("model.compute_dtype", compute_dtype)
         self.planes = max(
             3 * reach + 2, depth_range, item_range, rooms
         )  # around: -reach .. reach; under: holes 0 .. reach
@@ -95,16 +95,17 @@ class FootprintFcn(nn.Module):
             row: int64 ``[M]``, which problem.
             outcome: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
         """
-        lower, count = self.compute_dtype != torch.float32, len(row)
+        dtype, count = matrix_dtype(self.compute_dtype, tote_depth.device.type), len(row)
+        lower = dtype != torch.float32
         if lower:
             padding = next((-count % step for beyond, step in PADDED_ROWS if count > beyond), 0)
             row, outcome = (F.pad(index, (0, padding)) for index in (row, outcome))
-        x = self._inputs(bin_depth, tote_depth, row, outcome)
-        with torch.autocast(tote_depth.device.type, self.compute_dtype, enabled=lower):
+        x = self._inputs(bin_depth, tote_depth, row, outcome, dtype)
+        with torch.autocast(tote_depth.device.type, dtype, enabled=lower):
             x = F.relu(self.hidden(F.relu(self.patch(x))))
         return self.head(x.float())[:count]  # in full: scores that differ a little must not be rounded to a tie
 
-    def _inputs(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, outcome: Tensor) -> Tensor:
+    def _inputs(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, outcome: Tensor, dtype) -> Tensor:
         """What the first layer sees of some footprints, ``[M, inputs]``: one-hot, cell by cell, then the five codes."""
         side, reach = self.receptive_field, self.reach
         _, wide, long = tote_depth.shape
@@ -134,7 +135,7 @@ class FootprintFcn(nn.Module):
         sizes = [(size - 1).clamp(0, self.item_range - 1)[row].to(torch.int16) for size in (item.w, item.d, item.h)]
         codes = [*sizes, (room + 1).clamp(0, self.rooms - 1), (deepest - rest).clamp(0, self.depth_range - 1)]
         level = torch.cat([level, torch.stack(codes, 1)], 1)
-        planes = torch.eye(self.planes + 1, self.planes, dtype=self.compute_dtype, device=row.device)
+        planes = torch.eye(self.planes + 1, self.planes, dtype=dtype, device=row.device)
         return F.embedding(level.int(), planes).flatten(1)
 
     def _under(self, bin_size, device: torch.device) -> Tensor:
@@ -148,17 +149,22 @@ class FootprintFcn(nn.Module):
         return (maps[0][:, None, :, None] & maps[1][None, :, None]).flatten(2)
 
 
-def matrix_dtype(key: str, name: str) -> torch.dtype:
-    """What matrix products are computed in: ``"float32"``, ``"bfloat16"``, or what is fastest here for ``"auto"``.
+def check_dtype(key: str, name: str) -> str:
+    """The name, if it is one that :func:`matrix_dtype` knows.
 
     Raises:
-        ValueError: for another name, naming the key.
+        ValueError: if it is not, naming the key.
     """
     if name not in ("auto", "float32", "bfloat16"):
         raise ValueError(f"{key}={name!r}: expected 'auto', 'float32' or 'bfloat16'.")
+    return name
+
+
+def matrix_dtype(name: str, device: str) -> torch.dtype:
+    """What matrix products are computed in on a type of device; for ``"auto"`` what is fastest there."""
     if name != "auto":
         return getattr(torch, name)
-    if torch.cuda.is_available():
+    if device == "cuda":
         return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
     able = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
     return torch.bfloat16 if any(able.get(key) for key in ("amx_bf16", "avx512_bf16", "bf16")) else torch.float32

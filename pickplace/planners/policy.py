@@ -108,30 +108,44 @@ def planner_parts(planner: DictConfig, rules: Rules, items: ItemDistribution, tr
             name = NEEDS_POLICY[planner._target_]
             raise ValueError(f"checkpoint=null: planner={name} needs a checkpoint; expected a run folder.")
         cfg, state, env = trained
-        parts["policy"] = restore_policy(cfg, rules, state["policy"], env["rotations"]).to(cfg.device)
+        parts["policy"] = restore_policy(cfg, rules, state["policy"], env).to(cfg.device)
         if NEEDS_POLICY[planner._target_] == "lookahead":
             parts["critic"] = restore_critic(cfg, rules, state, env["tote_size"])
     return parts
 
 
-def restore_policy(cfg: DictConfig, rules: Rules, state: dict, trained_rotations: int) -> Policy:
+def restore_policy(cfg: DictConfig, rules: Rules, state: dict, trained: dict) -> Policy:
     """The policy of a checkpoint, for these rules; the sizes need not be those that it was trained with.
 
     Args:
         cfg: the checkpoint's config, with any overrides on top.
         rules: the task's sizes.
         state: the policy's tensors, ``state["policy"]`` of :func:`pickplace.checkpoint.read`.
-        trained_rotations: ``R`` in training, which nothing may exceed.
+        trained: the group ``env`` in training; its ``rotations`` must not be exceeded.
 
     Raises:
-        ValueError: for more rotations than were trained, or tensors that do not fit the config.
+        ValueError: for more rotations than were trained, or tensors that do not fit the config or the sizes.
     """
-    if rules.rotations > trained_rotations:
+    if rules.rotations > trained["rotations"]:
         raise ValueError(
-            f"env.rotations={rules.rotations}: the checkpoint was trained with {trained_rotations}; expected no more."
+            f"env.rotations={rules.rotations}: the checkpoint was trained with {trained['rotations']}; "
+            "expected no more."
         )
     make = partial(config.instantiate, cfg.model.actor, rules=rules, mask_infeasible=cfg.algo.mask_infeasible)
-    return checkpoint.restore(make, state, "policy").eval()
+    try:
+        return checkpoint.restore(make, state, "policy").eval()
+    except checkpoint.CheckpointError as error:
+        sizes = {
+            key: ([*getattr(rules, key)], [*trained.get(key, ())]) for key in ("effector_size", "bin_size", "tote_size")
+        }
+        sizes = {key: (ours, theirs) for key, (ours, theirs) in sizes.items() if theirs and ours != theirs}
+        if not sizes:
+            raise
+        ours = ", ".join(f"env.{key}={size}" for key, (size, _) in sizes.items())
+        theirs = ", ".join(f"{size}" for _, size in sizes.values())
+        raise checkpoint.CheckpointError(
+            f"{ours}: the checkpoint was trained with {theirs}, and its policy does not serve every other size."
+        ) from error
 
 
 def restore_critic(cfg: DictConfig, rules: Rules, state: dict, trained_tote: list[int]):
