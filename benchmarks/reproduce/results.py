@@ -1,6 +1,7 @@
 """Draws the figures of the comparison and writes docs/results.md from the JSON in docs/results/: make results."""
 
 import json
+import re
 import sys
 from collections import Counter
 from pathlib import Path
@@ -28,8 +29,8 @@ older cells have the median, and the oldest by the clock, on a machine that did 
 and so do times and what a budget of minutes is worth. Computed on: {processors}
 
 In the figures a point is the mean over episodes, and over seeds where there are several. Bars are 95% confidence
-intervals over episodes, widened to the range of the seeds. Hollow: fewer than {few} episodes. Pale: the training
-was cut short before half of its frames. An "a": attempted.
+intervals over episodes, widened to the range of the seeds; they have no width where all episodes are alike. Hollow:
+fewer than {few} episodes. Pale: the training was cut short before half of its frames. An "a": attempted.
 
 {done} of {total} cells are done.
 """
@@ -61,8 +62,10 @@ def table(cells, results) -> list[str]:
         labels = " ".join(definitions.AXES[axis][0].format(value) for axis, value in cell.axes)
         labels = f"{figures.trained_for(cell.method)[1].removesuffix('small')} {labels}".strip()
         result = results.get(cell.name)
+        masked = cell.method.startswith("mcts") and "planner.mask=true" in cell.overrides
+        method = figures.label("mcts_outcomes" if masked else cell.method)
         lines.append(
-            f"| {figures.label(cell.method)} | {labels} | {occupancy(result)} | {episodes(result)} | "
+            f"| {method} | {labels} | {occupancy(result)} | {episodes(result)} | "
             f"{decision(result)} | {budget(cell, results)}{no_better_than_random(result, results)} |"
         )
     return lines
@@ -97,8 +100,10 @@ def budget(cell, results) -> str:
     """What was spent on the policy that the cell evaluates."""
     if cell.training is None:
         given = next((o[11:] for o in cell.overrides if o.startswith("checkpoint=")), None)
-        trained = (results.get(cell.name, {}).get("trained") or {}).get("frames")
+        result = results.get(cell.name, {})
+        trained = (result.get("trained") or {}).get("frames")
         words = [f"`{given}`" if given else "none", f"{trained:,} frames" if trained else ""]
+        words += ["warm start"] if result.get("warm_start") else []
         return ", ".join(filter(None, words))
     trained = results.get(cell.training)
     if trained is None:
@@ -126,7 +131,7 @@ def trained_with(cells, results) -> str:
     for method, trainings in methods.items():
         alike = {}
         for part in trainings.values():
-            alike.setdefault(str({**part["axes"], "seed": 0}), []).append(part)
+            alike.setdefault(re.sub(r"\bseed=\d+", "", part["command"]), []).append(part)
         seeds = between(sorted(map(len, alike.values())))
         frames, minutes = (
             sorted({round(part[key] / unit) for part in trainings.values()})
