@@ -20,6 +20,7 @@ from tensordict import TensorDict
 from pickplace import DepthMapError, Failure, Planner, Rules, checkpoint, config, plan
 from pickplace.models.actors import fcn4d, fcn_grasp
 from pickplace.planners import PolicyPlanner
+from pickplace.planners.policy import restore_policy
 
 EMPTY = np.full((6, 6), 5)
 ITEM = np.zeros((5, 5), dtype=np.int64)
@@ -268,6 +269,11 @@ def test_a_policy_without_a_mask_serves_end_effectors_as_long_as_its_own():
     assert turned.plan(ITEM, np.full((7, 8), 5)).status == "ok"
     with pytest.raises(ValueError, match=r"env.effector_size=\[4, 4\]: the checkpoint was trained with \[3, 3\], and"):
         Planner.load("pretrained/unmasked", effector_size=(4, 4))
+    state, facts = checkpoint.read(checkpoint.locate("pretrained/unmasked"))
+    del state["policy"]["miss"]  # what is damaged is not said to be of another size
+    cfg = OmegaConf.create(facts["config"])
+    with pytest.raises(ValueError, match="policy.*miss"):
+        restore_policy(cfg, Rules(tote_size=(9, 9, 5)), state["policy"], {"rotations": 4, "tote_size": [6, 6, 5]})
 
 
 # ---------------------------------------------------------------------- pickplace-plan

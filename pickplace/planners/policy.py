@@ -1,5 +1,6 @@
 """The planner that follows a trained policy."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -131,18 +132,23 @@ def restore_policy(cfg: DictConfig, rules: Rules, state: dict, trained: dict) ->
             f"env.rotations={rules.rotations}: the checkpoint was trained with {trained['rotations']}; "
             "expected no more."
         )
-    make = partial(config.instantiate, cfg.model.actor, rules=rules, mask_infeasible=cfg.algo.mask_infeasible)
-    try:
+
+    def restored(rules: Rules) -> Policy:
+        make = partial(config.instantiate, cfg.model.actor, rules=rules, mask_infeasible=cfg.algo.mask_infeasible)
         return checkpoint.restore(make, state, "policy").eval()
+
+    try:
+        return restored(rules)
     except checkpoint.CheckpointError as error:
-        sizes = {
-            key: ([*getattr(rules, key)], [*trained.get(key, ())]) for key in ("effector_size", "bin_size", "tote_size")
+        sizes: dict[str, Any] = {
+            key: tuple(trained[key]) for key in ("effector_size", "bin_size", "tote_size") if key in trained
         }
-        sizes = {key: (ours, theirs) for key, (ours, theirs) in sizes.items() if theirs and ours != theirs}
+        sizes = {key: size for key, size in sizes.items() if size != getattr(rules, key)}
         if not sizes:
             raise
-        ours = ", ".join(f"env.{key}={size}" for key, (size, _) in sizes.items())
-        theirs = ", ".join(f"{size}" for _, size in sizes.values())
+        restored(replace(rules, **sizes))  # if that fails too, it is not for the sizes
+        ours = ", ".join(f"env.{key}={[*getattr(rules, key)]}" for key in sizes)
+        theirs = ", ".join(f"{[*size]}" for size in sizes.values())
         raise checkpoint.CheckpointError(
             f"{ours}: the checkpoint was trained with {theirs}, and its policy does not serve every other size."
         ) from error
