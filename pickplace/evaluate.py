@@ -341,7 +341,7 @@ def prepare(cfg: DictConfig) -> tuple:
     if not items.varies:
         facts["same_items"] = True
         if ev.episodes > 1:
-            log.warning("items.path has x,y: all episodes are of the same items, and an interval tells of no others.")
+            log.warning("All episodes are of the same items, in the same places: an interval tells of no others.")
 
     def make_env(first, count):
         return config.instantiate(

@@ -103,7 +103,8 @@ class Planner:
             device: where to compute, ``"cpu"`` or ``"cuda"``.
             trust: modules of your own that the checkpoint's config may make classes of, beside pickplace's own.
             **sizes: what differs from the training's settings, such as ``tote_size=(30, 30, 10)``; see
-                :class:`~pickplace.geometry.Rules`. The policy serves any bin and tote.
+                :class:`~pickplace.geometry.Rules`. The policy serves any bin and tote, and if it was trained
+                with a mask any end effector.
 
         Raises:
             ValueError: for a checkpoint that cannot be used, or bad sizes.
@@ -345,7 +346,8 @@ def _snap(name: str, values, grid: tuple[int, int], unit: float, tolerance: floa
     with np.errstate(all="ignore"):
         cells = array.astype(np.float64) / unit
         whole = np.round(cells)
-        far = ~(np.abs(cells - whole) <= tolerance + ROUNDING)  # also where it is not a number
+        fine = np.finfo(array.dtype if array.dtype.kind == "f" else float).eps  # of metres that are float32, too
+        far = ~(np.abs(cells - whole) <= tolerance + ROUNDING + fine * np.abs(cells))  # also where it is not a number
     out = ~((whole >= 0) & (whole <= highest))
     if (far | out).any():
         x, y = np.argwhere(far | out)[0].tolist()

@@ -130,7 +130,8 @@ def check_plan(planner: Planner, bin_cells: np.ndarray, heights: np.ndarray, rim
     item = rules.read_item(torch.tensor(bin_cells)[None].float())
     tote, at = torch.tensor(heights, dtype=torch.int32)[None], torch.tensor([rim])
     feasible = rules.action_mask(rules.placements(tote, at, item))[0]
-    assert (plan["status"] == "stuck") == (not feasible.any())
+    nothing = "stuck" if rules.outcome_mask(rules.placements(tote * 0, at, item)).any() else "impossible"
+    assert feasible.any() if plan["status"] in ("ok", "rejected") else plan["status"] == nothing and not feasible.any()
     if plan["status"] != "ok":
         return
     assert feasible[plan["action"]]

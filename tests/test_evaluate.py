@@ -13,6 +13,7 @@ from pickplace import PickPlaceEnv, evaluate
 from pickplace.geometry import Failure
 from pickplace.items import Recorded
 from pickplace.planners import JointDBL, RandomFeasible
+from pickplace.report import evaluation_table
 
 
 @pytest.fixture
@@ -247,7 +248,7 @@ def test_planners_of_ones_own_lose_no_result(run):
     assert code == 2 and "planner: Nameless has no name; expected" in err and result is None
 
 
-def test_recorded_items_with_places_are_the_same_in_every_episode(run, tmp_path, caplog):
+def test_recorded_items_with_places_are_the_same_in_every_episode(run, tmp_path):
     table = tmp_path / "items.csv"
     arguments = ["planner=joint_dbl", "items=recorded", f"items.path={table}", "evaluation.episodes=3"]
     for header, row, same in (("w,d,h,x,y", "2,1,1,0,3", True), ("w,d,h", "2,1,1", None)):
@@ -255,6 +256,7 @@ def test_recorded_items_with_places_are_the_same_in_every_episode(run, tmp_path,
         code, err, result = run(*arguments, "evaluation.latency_decisions=0")
         assert code == 0, err
         assert result.get("same_items") == same
+        assert (", all of the same items" in evaluation_table(result)) == bool(same)
 
 
 def test_the_validation_group_serves_an_evaluation_too(run):

@@ -164,6 +164,9 @@ def test_neither_side_wins_by_what_the_other_was_not_trained_for():
     assert words(groups)["fcn_grasp_unmasked"] == "2 undecided, 22 not known yet"
     assert claims.reasons(groups) == "*individual, RL (the paper's)* came to a tote height of 3 of 5 only"
     assert words(claims.most_on_small_totes(found))["fcn_grasp_unmasked"] == "1 undecided, 15 not known yet"
+    for tote in ("6x6x5", "10x10x5"):  # nor where another of the methods beats it, since trained it might not
+        found[f"individual_heuristic-R3-{tote}"] = result(0.55)
+    assert words(claims.joint_beats_individual(found))["fcn_grasp_unmasked"] == "2 undecided, 22 not known yet"
     behind = individual(-0.1, -0.1) | {"t": training(3)}  # who wins although it had no time, wins
     behind["individual_rl-R3-s0-6x6x5-K10"]["training"] = "t"
     assert words(claims.joint_beats_individual(behind))["fcn_grasp_unmasked"].startswith("2 no")

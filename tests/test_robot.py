@@ -150,6 +150,8 @@ def test_only_rounding_goes_beyond_the_tolerance(planner):
     high = np.where(ITEM, 3, 0)
     exact = planner.plan(high, EMPTY, tolerance=0)
     assert 0.15 / 0.05 != 3 and planner.plan(high * 0.05, EMPTY * 0.05, 5 * 0.05, 0.05, 0).action == exact.action
+    deep = (EMPTY * 0 + 117).astype(np.float32) * np.float32(0.05)
+    assert planner.plan(high * 0.05, deep, 200 * 0.05, 0.05, 0).status == "ok"
     with pytest.raises(DepthMapError, match="within 0"):
         planner.plan(high * 1.00001, EMPTY, tolerance=0)
 
