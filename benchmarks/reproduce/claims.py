@@ -156,7 +156,13 @@ def untrained(results, name: str, short: int = 2) -> str:
 
 
 def compare(
-    results, text: str, ours: str, theirs: str, margin: float = 0.0, learned: Sequence[str] = ()
+    results,
+    text: str,
+    ours: str,
+    theirs: str,
+    margin: float = 0.0,
+    learned: Sequence[str] = (),
+    rivals: Sequence[str] = (),
 ) -> Comparison | str | None:
     """Is one cell above another by more than a margin? ``ATTEMPTED`` or None where one of them is not there.
 
@@ -170,6 +176,7 @@ def compare(
         theirs: the cell that it is held against.
         margin: of mean occupancy.
         learned: cells whose policy must have been trained to the end, or nothing is decided.
+        rivals: cells that lose together with ``theirs``, which is the best of them.
     """
     if in_vain(results, ours) or in_vain(results, theirs):
         return ATTEMPTED
@@ -186,18 +193,10 @@ def compare(
     if episodes < FEW:
         return Comparison(f"{text} ({episodes} episodes)", None, gap, sound=False, single=single)
     verdict = decided(gap[1], gap[2], margin)
-    losers = {True: [theirs], False: [ours], None: [ours, theirs]}[verdict]
+    losers = {True: [theirs, *rivals], False: [ours], None: [ours, theirs]}[verdict]
     short = [remark for name in (*learned, *losers) if (remark := untrained(results, name))]
     remark = next(filter(None, [*short, *(untrained(results, name, short=1) for name in learned)]), "")
     return Comparison(text, None if short else verdict, gap, remark, sound=not short, single=single)
-
-
-def unless_untrained(comparison, results, losers):
-    """A comparison; undecided if it was won, and any of these may have lost for want of training."""
-    remark = next(filter(None, (untrained(results, name) for name in losers)), "")
-    if remark and isinstance(comparison, Comparison) and comparison.verdict:
-        return replace(comparison, verdict=None, remark=remark, sound=False)
-    return comparison
 
 
 JOINT = ("fcn_grasp_unmasked", "fcn4d")
@@ -227,12 +226,11 @@ def against(results, joint: str, individual) -> list[Comparison | str | None]:
     found = []
     for tote in TOTES:
         for r in rotations_of(joint):
-            best = best_of(results, [name.format(r, tote) for name in individual])
-            if best is None:
-                found.append(None)
+            ours, *rivals = (name.format(r, tote) for name in (joint, *individual))
+            if best := best_of(results, rivals):
+                found.append(compare(results, f"{tote} R={r}, minus {called(best)}", ours, best, rivals=rivals))
             else:
-                comparison = compare(results, f"{tote} R={r}, minus {called(best)}", joint.format(r, tote), best)
-                found.append(unless_untrained(comparison, results, [name.format(r, tote) for name in individual]))
+                found.append(None)
     return found
 
 
@@ -317,9 +315,11 @@ def k_settles(results) -> list[Group]:
 
 
 #: Networks as they are used, and the K that they are used with.
-USED = tuple(
-    f"{method}-R{{}}-s*-{{}}-K{k}"
-    for method, k in (("fcn_grasp", "all"), ("fcn_grasp_unmasked", 10), ("fcn4d", 10), ("fcn4d_warm", "all"))
+USED = (
+    "fcn_grasp-R{}-s*-{}-Kall",
+    "fcn_grasp_unmasked-R{}-s*-{}-K10",
+    "fcn4d-R{}-s*-{}-K10",
+    "fcn4d_warm-R{}-s*-{}-Kall",
 )
 
 

@@ -133,7 +133,7 @@ def points(axes, xs, results, names, method, line="-", **more) -> None:
     axes.errorbar([], [], ls=line, lw=1.3, ms=5, **look)  # for the legend: not hollow, not pale
     for x, result in pairs:
         value, (low, high) = result["occupancy"]["mean"], result["occupancy"]["ci95"]
-        bars = [[max(value - max(low, 0), 0)], [max(min(high, 1) - value, 0)]]
+        bars = [[value - low], [high - value]]
         axes.errorbar(
             [x], [value], yerr=bars, ls="", ms=5, capsize=2.5, elinewidth=1, color=look["color"], marker=look["marker"],
             markerfacecolor="white" if result["episodes"] < FEW else look["color"],
