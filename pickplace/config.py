@@ -368,6 +368,11 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
         except ValueError as error:  # Hydra's own, which does not say where
             if isinstance(error.__cause__, OSError):  # such as a log file that cannot be opened
                 raise error.__cause__ from None
+            for word in overrides:
+                group, _, choice = word.lstrip("+").partition("=")
+                if choice in ("null", "") and (conf_dir() / group).is_dir():
+                    names = sorted(file.stem for file in (conf_dir() / group).glob("*.yaml"))
+                    raise ValueError(f"{word}: expected {group}=<one of {', '.join(names)}>.") from error
             raise ValueError(f"{' '.join(overrides)}: {error}.") from error
         finally:
             os.environ["HYDRA_FULL_ERROR"] = full_error

@@ -11,6 +11,7 @@ import reprlib
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral, Real
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -34,6 +35,11 @@ def _fraction(key: str, value) -> float:
     if not isinstance(value, (int, float)) or isinstance(value, bool) or not 0 <= value <= 1:
         raise ValueError(f"{key}={value!r}: expected a number between 0 and 1.")
     return float(value)
+
+
+def _plain_number(value) -> bool:
+    """Is it a finite number that JSON keeps?"""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < math.inf
 
 
 class Current:
@@ -93,8 +99,14 @@ class ToteHeightCurriculum(Transform):
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         if tensordict is None:  # a plain env.reset()
             tensordict = TensorDict(batch_size=self.parent.batch_size, device=self.parent.device)
-        height = self.sampler(int(self.level), self.min_height, tensordict.numel()).to(self.level.device)
-        height = height.reshape(*tensordict.batch_size, 1)
+        count = tensordict.numel()
+        height = self.sampler(int(self.level), self.min_height, count)
+        if not isinstance(height, Tensor) or height.shape != (count,) or height.is_floating_point():
+            raise ValueError(
+                f"curriculum.sample: {type(self.sampler).__name__} gave {reprlib.repr(height)}; expected heights, an "
+                f"int64 tensor [{count}]."
+            )
+        height = height.to(self.level.device).reshape(*tensordict.batch_size, 1)
         reset, running = tensordict.get("_reset", None), tensordict.get("tote_height", None)
         # Collectors hide `tote_height` from a reset: then running rows hold a draw too, but nobody reads it.
         if reset is not None and running is not None:
@@ -139,7 +151,7 @@ class Advance:
 
     Attributes:
         window: how many of the latest episodes at the level's own height the tally keeps.
-        remembers: names of the attributes that are state of the rule's own, each a plain number.
+        remembers: names of the attributes that are state of the rule's own, each a plain number, from :meth:`setup` on.
         start, end: the first and the last height, known after :meth:`setup`.
     """
 
@@ -152,7 +164,10 @@ class Advance:
         return start
 
     def update(self, tally: Tally) -> tuple[int, dict]:
-        """The level from now on, and what else to log; called after each batch."""
+        """The level from now on, a whole number, and what else to log, numbers by name; called after each batch.
+
+        A level beyond the first or the last height is taken for that height.
+        """
         raise NotImplementedError
 
     def least_frames(self, batch: int) -> float:
@@ -330,6 +345,10 @@ class Curriculum:
     """
 
     def __init__(self, advance: Advance, sample, start_height: int | None = None, end_height: int | None = None):
+        if not isinstance(advance, Advance):
+            raise ValueError(f"curriculum.advance={advance!r}: expected a rule, such as curriculum/advance=threshold.")
+        if not callable(sample):
+            raise ValueError(f"curriculum.sample={sample!r}: expected a sampler, such as curriculum/sample=recent.")
         self.advance, self.sample = advance, sample
         self.start_height, self.end_height = start_height, end_height
 
@@ -350,7 +369,8 @@ class Curriculum:
         start = min_height if self.start_height is None else self.start_height
         self.start = _whole("curriculum.start_height", start, min_height, self.end)
         first = self.advance.setup(self.start, self.end, _whole("total_frames", total_frames))
-        self.tally = Tally(first, deque(maxlen=self.advance.window))
+        self.tally = Tally(self._within(first), deque(maxlen=self.advance.window))
+        self._remembered()
 
     @property
     def level(self) -> int:
@@ -401,6 +421,11 @@ class Curriculum:
         tally.frames, tally.episodes = frames, tally.episodes + len(own)
         tally.window.extend(own)
         level, logs = self.advance.update(tally)
+        level = self._within(level)
+        self._remembered()
+        for name, value in logs.items():
+            if not isinstance(value, Real):
+                raise ValueError(f"{self._rule}: it logs {name}={reprlib.repr(value)}; expected a number.")
         logs |= {"level": level, "frames_at_level": tally.level_frames, "episodes": tally.episodes}
         logs["progress"] = (level - self.start) / (self.end - self.start) if self.end > self.start else 1.0
         if tally.window:
@@ -411,10 +436,27 @@ class Curriculum:
             self.tally = Tally(level, deque(maxlen=self.advance.window), frames, began=frames)
         return {f"curriculum/{key}": value for key, value in logs.items()}
 
+    @property
+    def _rule(self) -> str:
+        return f"curriculum.advance: {type(self.advance).__name__}"
+
+    def _within(self, level) -> int:
+        """A level of the rule's, between the first and the last height."""
+        if isinstance(level, bool) or not isinstance(level, Integral):
+            raise ValueError(f"{self._rule} wants level {reprlib.repr(level)}; expected a whole number.")
+        return min(max(int(level), self.start), self.end)
+
+    def _remembered(self) -> dict:
+        """The rule's own state; what could not be saved, or be loaded again, is told now, not after hours."""
+        state = {key: getattr(self.advance, key, None) for key in self.advance.remembers}
+        for name, value in state.items():
+            if not _plain_number(value):
+                raise ValueError(f"{self._rule} remembers {name}={reprlib.repr(value)}; expected a plain number.")
+        return state
+
     def state_dict(self) -> dict:
         """Level, tallies and the rule's own state, in plain JSON types; JSON keeps floats exactly."""
-        rule = {key: getattr(self.advance, key) for key in self.advance.remembers}
-        return vars(self.tally) | {"window": list(self.tally.window), "advance": rule}
+        return vars(self.tally) | {"window": list(self.tally.window), "advance": self._remembered()}
 
     def load_state_dict(self, state: dict) -> None:
         """Continue where :meth:`state_dict` was taken; call after :meth:`setup`.
@@ -439,7 +481,7 @@ class Curriculum:
             )
         window = deque((_fraction(key("window"), share) for share in state["window"]), self.advance.window)
         for name, value in rule.items():
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < math.inf:
+            if not _plain_number(value):
                 raise ValueError(f"{key(name)}={value!r}: expected a number.")
         self.tally = Tally(level, window, **counts)
         vars(self.advance).update(rule)

@@ -92,7 +92,7 @@ class PickPlaceGymEnv(gymnasium.Env):
 
     ## Episode End
     Termination: the action fails, or nothing can be done with the item that arrives. Truncation: a recorded item stream
-    has ended.
+    has ended; nothing more comes then, so a learner that continues truncated episodes by a value had better take 0.
 
     ## Information
     `occupancy`: share of the tote's volume that is filled; `failure`: why the action or the episode failed (`"none"`,

@@ -92,6 +92,16 @@ def begun_already(cfg: DictConfig, run_dir: Path) -> tuple[dict, dict, Path] | N
     return state, facts, folder
 
 
+def frames_of_best(run_dir: Path) -> int:
+    """The frames of ``checkpoints/best``, -1 without one. A run that goes on from an earlier checkpoint, perhaps with
+    other settings, may never come to it again.
+    """
+    try:
+        return int(json.loads((Path(run_dir) / "checkpoints" / "best" / checkpoint.FACTS).read_bytes())["frames"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return -1
+
+
 def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
     """Give Adam the moments of a checkpoint; parameters without a gradient so far have none.
 
@@ -169,11 +179,13 @@ def saying_what_is_safe(safe, trust: str = ""):
     """
     try:
         yield
-    except (OSError, FloatingPointError, config.WorkerDied, checkpoint.CheckpointError) as error:
+    except Exception as error:
         hint = "Nothing had been saved before."
         if folder := safe():
             # The same batch would lead to the same numbers.
             other = " algo.lr=<a smaller one>" if isinstance(error, FloatingPointError) else ""
             hint = f"What was saved before is whole: python -m pickplace.train resume={folder}{trust}{other}"
-        kind = ValueError if isinstance(error, OSError) else type(error)
-        raise kind(f"{config.sentence(error).rstrip('.')}. {hint}") from error
+        kept = (FloatingPointError, config.WorkerDied, checkpoint.CheckpointError)
+        raise (type(error) if isinstance(error, kept) else ValueError)(
+            f"{config.sentence(error).rstrip('.')}. {hint}"
+        ) from error

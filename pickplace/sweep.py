@@ -12,7 +12,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from pickplace.checkpoint import CheckpointError, locate
+from pickplace.checkpoint import FACTS, CheckpointError, locate
 from pickplace.config import FAILURE, SweepCallback, begun_with, claimed, one_sentence
 from pickplace.metrics import read_csv
 
@@ -81,7 +81,7 @@ def read_run(folder: Path) -> Run:
         run.validations = [row for row in rows if "eval/occupancy" in row]
     else:  # logger=none
         try:
-            facts = json.loads((locate(folder, "last") / "state.json").read_text())
+            facts = json.loads((locate(folder, "last") / FACTS).read_text())
             run.frames = facts["frames"]
             if facts["latest"]:
                 latest = {f"eval/{key}": value for key, value in facts["latest"].items()}
@@ -92,9 +92,17 @@ def read_run(folder: Path) -> Run:
         run.status, run.error = "failed", (folder / FAILURE).read_text().strip()
     elif claimed(folder):
         run.status = "running"
-    elif run.frames >= OmegaConf.load(folder / ".hydra" / "config.yaml").total_frames:
+    elif run.frames >= _budget(folder):
         run.status = "finished"
     return run
+
+
+def _budget(folder: Path) -> int:
+    """The frames that a run is to train: those of its latest checkpoint, since a resumed run may be given more."""
+    try:
+        return json.loads((locate(folder, "last") / FACTS).read_text())["config"]["total_frames"]
+    except (CheckpointError, OSError, ValueError, KeyError):
+        return OmegaConf.load(folder / ".hydra" / "config.yaml").total_frames
 
 
 def summarize(folder: Path) -> list[Run]:

@@ -13,6 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.modules import ValueOperator
 from torchrl.objectives import A2CLoss, ClipPPOLoss
@@ -32,6 +33,7 @@ from pickplace.resume import (
     StopRequest,
     begun_already,
     claim,
+    frames_of_best,
     load_optimizer,
     refuse_links,
     resumed_config,
@@ -102,8 +104,15 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     frames, iteration, best, latest = (facts.get(k, d) for k, d in COUNTERS.items())
     if resume:
         curriculum.load_state_dict(facts["curriculum"])
+        if (later := frames_of_best(run_dir)) > frames:
+            best = COUNTERS["best"]
+            log.info("checkpoints/best is of frame %s, which is still to come; a validation replaces it", f"{later:,}")
     if shortage := curriculum.check_budget(cfg.total_frames, cfg.env.num_envs * algo.rollout_length):
         log.warning(shortage)
+    if learning_rate(algo, cfg.env.num_envs * algo.rollout_length, cfg.total_frames) == 0 < algo.lr:
+        log.warning(
+            "total_frames=%d: one batch, for which algo.lr has fallen to 0; nothing is learnt", cfg.total_frames
+        )
 
     # TorchRL's parts: collector, advantage, loss.
     env_config = OmegaConf.to_container(cfg.env, resolve=True)
@@ -184,6 +193,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
 
             # Learn: advantages (and what the teacher would do) once, then epochs of shuffled minibatches.
             batch["next", "reward"] = batch["next", "reward"] * algo.reward_scale
+            batch["next", "terminated"] |= bin_is_empty(batch["next"])
             with torch.no_grad():
                 advantage(batch)
             for group in optimizer.param_groups:
@@ -258,7 +268,11 @@ def check_settings(cfg: DictConfig) -> None:
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 2**63:
             raise ValueError(f"{key}={value}: expected a whole number >= {least} and < 2**63.")
     check_seed(cfg.seed)
+    check_seed(cfg.evaluation.seed, "evaluation.seed")
     own_modules(cfg.trust)
+    for key in ("items", "env", "model.actor", "model.critic", "curriculum", "collector", "planner", "logger"):
+        if not OmegaConf.is_dict(node := OmegaConf.select(cfg, key)) or "_target_" not in node:
+            raise ValueError(f"{key}={node}: expected the settings of something to make, with a _target_.")
     if cfg.algo.loss not in ("a2c", "ppo"):
         raise ValueError(f"algo.loss={cfg.algo.loss}: expected ppo or a2c.")
     for key in ("algo.mask_infeasible", "algo.normalize_advantage"):
@@ -270,7 +284,8 @@ def check_settings(cfg: DictConfig) -> None:
         )
     if cfg.evaluation.stream != "validation":
         raise ValueError(f"evaluation.stream={cfg.evaluation.stream}: training picks its best policy on validation.")
-    if (start := cfg.algo.lr_decay_start) is not None and not (isinstance(start, (int, float)) and 0 <= start <= 1):
+    start = cfg.algo.lr_decay_start
+    if start is not None and (isinstance(start, bool) or not isinstance(start, (int, float)) or not 0 <= start <= 1):
         raise ValueError(f"algo.lr_decay_start={start}: expected a share of total_frames between 0 and 1, or null.")
     ranges = {
         "algo.gamma": (0, 1), "algo.lmbda": (0, 1), "algo.lr": (0, None), "algo.clip_epsilon": (0, 1),
@@ -282,6 +297,11 @@ def check_settings(cfg: DictConfig) -> None:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not number or not low <= value < float("inf") or (high is not None and value > high):
             raise ValueError(f"{key}={value}: expected a number >= {low}{'' if high is None else f' and <= {high}'}.")
+    if cfg.algo.loss == "a2c" and cfg.algo.normalize_advantage and cfg.env.num_envs * cfg.algo.rollout_length == 1:
+        raise ValueError(
+            "algo.normalize_advantage=True: a batch of one frame (env.num_envs x algo.rollout_length) has no variance; "
+            "expected more frames, or false."
+        )
 
 
 def loadable(cfg: DictConfig) -> tuple[dict, str]:
@@ -330,7 +350,11 @@ def training_env(env_config, items, device, masks, total_envs, curriculum, first
 
 
 def learning_rate(algo: DictConfig, frames: int, total_frames: int) -> float:
-    """``algo.lr``, falling linearly to 0 over the last part of the run if ``algo.lr_decay_start`` is set."""
+    """``algo.lr``; if ``algo.lr_decay_start`` is set, it falls linearly over the last part, to 0 in the last batch.
+
+    Args:
+        frames: of the run, with this batch.
+    """
     if algo.lr_decay_start is None:
         return algo.lr
     left = (1 - frames / total_frames) / max(1 - algo.lr_decay_start, 1e-9)
@@ -342,7 +366,7 @@ def update(loss, optimizer, data: TensorDictBase, algo: DictConfig, policy, phas
 
     The loss is TorchRL's in phase ``REWARD``; its critic's part alone, with or without imitation, before.
     """
-    totals: dict[str, torch.Tensor | float] = {}
+    totals: dict[str, Tensor | float] = {}
     steps = 0
     for _ in range(algo.epochs):
         for index in torch.randperm(len(data), device=data.device).split(algo.minibatch_size):
@@ -392,6 +416,15 @@ DIAGNOSTICS = {
     "loss_imitation": "loss_imitation",
     "agreement": "agreement",
 }
+
+
+def bin_is_empty(state: TensorDictBase) -> Tensor:
+    """Where no item has arrived, bool ``[..., 1]``: a recorded stream has ended.
+
+    The environment calls that a truncation; but nothing can be gained after it, and no action is ever taken there, so
+    a critic would never learn the value by which GAE continues a truncated episode.
+    """
+    return state["bin_depth"].flatten(-2).amax(-1, keepdim=True) == 0
 
 
 def episode_metrics(batch: TensorDictBase) -> dict[str, float]:

@@ -4,6 +4,7 @@ import copy
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -411,6 +412,63 @@ def test_samplers_draw_from_the_global_generator(sampler):
     assert not torch.equal(first, sampler(9, 1, 50))
     torch.set_rng_state(state)
     assert torch.equal(first, sampler(9, 1, 50))
+
+
+# ---------------------------------------------------------------- rules and samplers of one's own
+
+
+class Own(Advance):
+    """Gives and logs what it is told to."""
+
+    remembers = ("seen",)
+
+    def __init__(self, level, seen=0, logs=None):
+        self.level, self.seen, self.logs = level, seen, logs or {}
+
+    def update(self, tally):
+        return self.level, dict(self.logs)
+
+
+@pytest.mark.parametrize(("wanted", "level"), [(9, 4), (5, 4), (4, 4), (-3, 2), (np.int64(3), 3)])
+def test_a_level_beyond_the_heights_is_the_nearest(wanted, level):
+    curriculum = make(Own(wanted), low=2, high=4)
+    assert play(curriculum, 10)["curriculum/level"] == curriculum.level == level
+    again = make(Own(wanted), low=2, high=4)
+    again.load_state_dict(through_json(curriculum.state_dict()))
+    assert again.level == level
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        (Own(1.5), "curriculum.advance: Own wants level 1.5; expected a whole number"),
+        (Own(True), "Own wants level True"),
+        (Own(1, logs={"mood": "good"}), "curriculum.advance: Own: it logs mood='good'; expected a number"),
+        (Own(1, seen=torch.tensor(1)), r"Own remembers seen=tensor\(1\); expected a plain number"),
+        (Own(1, seen=float("nan")), "Own remembers seen=nan"),
+    ],
+)
+def test_what_a_rule_of_ones_own_gives_is_checked_at_once(rule, message):
+    with pytest.raises(ValueError, match=message):
+        play(make(rule), 10)
+
+
+def test_a_rule_that_lacks_what_it_remembers_is_told_before_the_first_batch():
+    rule = Own(1)
+    del rule.seen
+    with pytest.raises(ValueError, match="Own remembers seen=None"):
+        make(rule)
+
+
+@pytest.mark.parametrize("drawn", [lambda count: torch.ones(count - 1).long(), lambda count: torch.ones(count), list])
+def test_a_sampler_that_draws_something_else_is_named(drawn):
+    def sampler(level, least, count):
+        return drawn(count) if drawn is not list else [1] * count
+
+    with pytest.raises(
+        ValueError, match=r"curriculum.sample: function gave .*; expected heights, an int64 tensor \[6\]"
+    ):
+        make_env(level=3, sampler=sampler).reset()
 
 
 # ---------------------------------------------------------------- the transform

@@ -25,7 +25,7 @@ from pickplace import PickPlaceEnv, Planner, checkpoint, collector, config
 from pickplace.collector import ignore_signals, watched
 from pickplace.config import WorkerDied
 from pickplace.evaluate import main as evaluate_main
-from pickplace.resume import claim
+from pickplace.resume import claim, saying_what_is_safe
 from pickplace.train import main as train_main
 from pickplace.train import resume_run
 
@@ -140,6 +140,13 @@ def test_a_loss_that_is_not_finite_stops_the_run_with_a_summary(smoke, tmp_path)
     assert "advantage" in message and "not finite)" in message
     assert message.endswith("Nothing had been saved before.")
     assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+@pytest.mark.parametrize("error", [ValueError("level=9"), RuntimeError("out of memory"), TypeError("no")])
+def test_whatever_ends_a_training_names_the_checkpoint(error, tmp_path):
+    told = pytest.raises(ValueError, match=f"{error}.*What was saved before is whole: .* resume={tmp_path}$")
+    with told, saying_what_is_safe(lambda: tmp_path):
+        raise error
 
 
 def test_a_full_disk_ends_the_run_and_the_checkpoint_before_is_whole(smoke, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pickplace import PickPlaceEnv
 from pickplace.geometry import Rules
 from pickplace.items import Kinds
-from pickplace.models.actors import MASKED, fcn_grasp
+from pickplace.models.actors import MASKED, as_collection_policy, fcn_grasp
 from pickplace.models.critics import PooledCritic
 from pickplace.models.fcn_grasp import FootprintFcn, matrix_dtype
 
@@ -139,6 +139,17 @@ def test_only_what_the_mask_allows_is_computed_and_it_is_the_same(rotations, mon
     torch.testing.assert_close(logits, torch.where(mask, everywhere, MASKED))
     logits.logsumexp(1).sum().backward()
     assert all(parameter.grad is not None for parameter in policy.parameters())
+
+
+@pytest.mark.parametrize("bias", [-1e30, -1e12, 1e30])
+def test_no_score_is_so_bad_that_what_the_mask_forbids_is_chosen(bias):
+    env = PickPlaceEnv(tote_size=(4, 4, 3), num_envs=64, masks=("action", "outcome"))
+    state = env.reset()
+    policy = fcn_grasp(env.rules, True, head_std=1.0, compute_dtype="float32")
+    policy.network.head.bias.data.fill_(bias)
+    chosen = as_collection_policy(policy)(state)
+    assert state["action_mask"].gather(1, chosen["action"][:, None]).all()
+    assert chosen["log_prob"].isfinite().all()
 
 
 @pytest.mark.parametrize("effector", [(3, 3), (2, 3), (3, 1)])

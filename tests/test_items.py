@@ -5,8 +5,9 @@ import torch
 from scipy.stats import chisquare
 from tensordict import TensorDict
 
-from pickplace import PickPlaceEnv
+from pickplace import PickPlaceEnv, train
 from pickplace.items import MOST_SEEDS, STREAMS, Kinds, Recorded, Uniform, hashed_uniform
+from pickplace.train import make_losses
 
 
 def numbers(stream="train", seed=0, episode=0, count=50_000):
@@ -194,6 +195,23 @@ def test_a_recorded_stream_that_ends_while_others_play_on(tmp_path):
         assert after["next", "truncated"][:, 0].tolist() == ends
         assert after["next", "terminated"][:, 0].tolist() == [False, number == 2]
         assert after["next", "done"][:, 0].tolist() == [ends[0], ends[1] or number == 2]
+
+
+def test_a_learner_expects_nothing_after_the_end_of_a_recording(smoke, tmp_path, monkeypatch):
+    """Though it truncates: nothing more comes, and no critic learns the value of an empty bin."""
+    batches = []
+
+    def recording(*args):
+        advantage, loss = make_losses(*args)
+        return lambda batch: batches.append(advantage(batch).clone()), loss
+
+    monkeypatch.setattr(train, "make_losses", recording)
+    stream(tmp_path, "w,d,h\n1,1,1\n2,1,1\n")
+    smoke(tmp_path / "run", "items=recorded", f"items.path={tmp_path}/items.csv", "env.tote_size=[5,5,1]")
+    ended = torch.cat([batch["next", "truncated"].flatten() for batch in batches])
+    target = torch.cat([batch["value_target"].flatten() for batch in batches])
+    assert ended.sum() > 20
+    torch.testing.assert_close(target[ended], torch.full_like(target[ended], 2 * 0.25))  # 2 cells, by reward_scale
 
 
 def test_recorded_stream_may_loop(tmp_path):

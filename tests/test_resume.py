@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from pickplace import checkpoint
 from pickplace.metrics import read_csv
-from pickplace.train import train
+from pickplace.train import resume_run, train
 
 ITERATION = 8 * 16  # frames: env.num_envs * algo.rollout_length of experiment=smoke
 SETTINGS = [
@@ -209,6 +209,20 @@ def test_a_stop_request_ends_a_sweep(tmp_path):
     process.communicate(timeout=120)
     assert process.returncode == 130
     assert (sweep / "0" / "checkpoints" / "last").is_dir() and not (sweep / "1").exists()
+
+
+def test_a_best_that_the_run_never_had_is_replaced(smoke, tmp_path):
+    """Of a branch that was given up, when a run goes on with other settings from an earlier checkpoint."""
+    run_dir = tmp_path / "run"
+    smoke(run_dir, "checkpoint_interval=128")
+    state, facts = checkpoint.read(run_dir / "checkpoints/previous")
+    assert facts["frames"] == 384
+    checkpoint.write(run_dir / "checkpoints/previous", state, {**facts, "best": 0.99})
+    checkpoint.write(run_dir / "checkpoints/best", state, {**facts, "frames": 512, "best": 0.995})
+    resume_run([f"resume={run_dir}/checkpoints/previous", "algo.lr=0", "total_frames=1024"])
+    best = checkpoint.read(run_dir / "checkpoints/best")[1]
+    validated = {row["frames"]: row.get("eval/occupancy") for row in read_csv(run_dir / "metrics.csv")}
+    assert validated[best["frames"]] == pytest.approx(best["best"]) and best["best"] < 0.99
 
 
 def test_resume_with_a_longer_budget(reference):

@@ -62,6 +62,17 @@ def test_a_sweep_s_table_tells_how_every_run_ended(tmp_path):
     assert is_png(tmp_path / "sweep.png")
 
 
+def test_a_run_resumed_with_more_frames_and_stopped_is_not_finished(smoke, tmp_path):
+    made_up(tmp_path, "0", ["seed=1"], [0.5], total=512)
+    (tmp_path / "0" / "metrics.csv").unlink()
+    smoke(tmp_path / "0")
+    assert read_run(tmp_path / "0").status == "finished"
+    state, facts = checkpoint.read(tmp_path / "0/checkpoints/last")
+    facts["config"]["total_frames"] = 4096
+    checkpoint.write(tmp_path / "0/checkpoints/last", state, facts)
+    assert read_run(tmp_path / "0").status == "stopped"
+
+
 def test_a_sweep_of_many_runs_and_one_of_none(tmp_path):
     for number in range(50):
         made_up(tmp_path, str(number), [f"seed={number}"], [number / 50])

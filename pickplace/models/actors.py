@@ -31,7 +31,9 @@ from pickplace.geometry import Rules
 from pickplace.models.conv4d import Conv4dPolicy
 from pickplace.models.fcn_grasp import FootprintFcn
 
-MASKED = -1e9  # the logit of what must not be chosen: its probability is exactly 0 in float32
+#: The logit of what must not be chosen: its probability is exactly 0 in float32, however bad the rest is. What float32
+#: has left below it is for differences from the greatest logit.
+MASKED = -1e38
 
 
 class Choice(Categorical):

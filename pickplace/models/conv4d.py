@@ -87,9 +87,9 @@ class Conv4dPolicy(nn.Module):
         chunk_bytes: int = 64 * 2**20,
     ):
         super().__init__()
-        check_width("filters", filters)
+        check_width("model.actor.filters", filters)
         if compute_dtype not in DTYPES:
-            raise ValueError(f"compute_dtype={compute_dtype!r}: expected one of {', '.join(DTYPES)}.")
+            raise ValueError(f"model.actor.compute_dtype={compute_dtype!r}: expected one of {', '.join(DTYPES)}.")
         self.rotations = rotations
         self.filters = filters
         self.bin_clip = bin_clip
@@ -244,8 +244,8 @@ class Conv4dCritic(nn.Module):
         depth_scale: float = 5.0,
     ):
         super().__init__()
-        check_width("filters", filters)
-        check_width("hidden", hidden)
+        check_width("model.critic.filters", filters)
+        check_width("model.critic.hidden", hidden)
         self.bin_size = tuple(bin_size)[:2]
         self.tote_size = tuple(tote_size)[:2]
         self.bin_clip = bin_clip

@@ -56,17 +56,17 @@ class FootprintFcn(nn.Module):
     ):
         super().__init__()
         if not isinstance(receptive_field, int) or receptive_field < 3 or receptive_field % 2 == 0:
-            raise ValueError(f"model.receptive_field={receptive_field!r}: expected an odd number >= 3.")
+            raise ValueError(f"model.actor.receptive_field={receptive_field!r}: expected an odd number >= 3.")
         sizes = {"filters": filters, "hidden": hidden, "depth_range": depth_range, "item_range": item_range}
         sizes["rooms"] = rooms = depth_range if rooms is None else rooms
         for key, value in {**sizes, "tote_clip": tote_clip, "reach": reach, "out_channels": out_channels}.items():
-            check_width(f"model.{key}", value)
+            check_width(f"model.actor.{key}", value)
         if not isinstance(head_std, (int, float)) or head_std < 0:
-            raise ValueError(f"model.head_std={head_std!r}: expected a number >= 0.")
+            raise ValueError(f"model.actor.head_std={head_std!r}: expected a number >= 0.")
         self.receptive_field, self.reach = receptive_field, reach
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
         self.rooms = rooms
-        self.compute_dtype = check_dtype("model.compute_dtype", compute_dtype)
+        self.compute_dtype = check_dtype("model.actor.compute_dtype", compute_dtype)
         self.planes = max(
             3 * reach + 2, depth_range, item_range, rooms
         )  # around: -reach .. reach; under: holes 0 .. reach
