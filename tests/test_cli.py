@@ -309,3 +309,17 @@ def test_paired_difference(run, tmp_path):
     assert paired["ci95"][0] < paired["mean"] < paired["ci95"][1]
     code, _, err = run("evaluate", "planner=joint_dbl", *settings, "evaluation.seed=1", "compare=a/evaluation.json")
     assert code == 2 and "its seed is 0, expected 1" in err
+
+
+def test_only_the_same_episodes_are_compared(run):
+    settings = ["env.tote_size=[4,4,1]", "evaluation.episodes=2", "evaluation.latency_decisions=0", "planner=joint_dbl"]
+    assert run("evaluate", *settings, "hydra.run.dir=a")[0] == 0
+    for key, value in (
+        ("env.rotations", 2), ("env.effector_size", [2, 3]), ("env.bin_size", [5, 4, 1]), ("env.tote_size", [4, 5, 1]),
+        ("env.pick_rule", "overlap"), ("env.min_support", 0.25), ("env.strict_support", True),
+        ("evaluation.episodes", 3), ("evaluation.stream", "validation"), ("items", "mixed"),
+    ):  # fmt: skip
+        more = ["env.tote_size=[7,7,3]"] if key == "items" else []
+        code, _, err = run("evaluate", *settings, *more, f"{key}={value}".replace(" ", ""), "compare=a/evaluation.json")
+        wanted = key if key.startswith("env.") else f"its {key.removeprefix('evaluation.')} is"
+        assert code == 2 and wanted in err, (key, err)

@@ -506,3 +506,13 @@ def test_masks_of_empty_totes_are_kept_and_are_the_same(kept, masks, monkeypatch
             "action" not in masks or "outcome" in masks
         )
         assert len(env._starts) * size <= kept + 12 * size
+
+
+def test_partial_reset_keeps_why_the_others_ended():
+    env = PickPlaceEnv(num_envs=4, seed=0)
+    td = env.reset()
+    after = env.step(td.set("action", (~td["action_mask"]).int().argmax(-1)))["next"]
+    chosen = torch.tensor([True, False, True, False])
+    reset = env.reset(after.clone().set("_reset", chosen[:, None]))
+    for key in ("done", "terminated", "truncated", "failure"):
+        assert torch.equal(reset[key][~chosen], after[key][~chosen]) and not reset[key][chosen].any(), key

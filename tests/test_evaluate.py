@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy
 import pytest
@@ -265,3 +266,31 @@ def test_the_validation_group_serves_an_evaluation_too(run):
         "planner=joint_dbl", "env.tote_size=[4,4,1]", "evaluation=validation", "evaluation.episodes=4"
     )
     assert (code, error, result["stream"]) == (0, "", "validation")
+
+
+@pytest.mark.parametrize(("stream", "seed"), [("validation", 3), ("test", 4)])
+def test_a_command_plays_the_stream_and_the_seed_that_it_names(run, tmp_path, stream, seed):
+    settings = [f"evaluation.stream={stream}", f"evaluation.seed={seed}", "evaluation.latency_decisions=0"]
+    code, _, result = run("planner=joint_dbl", "env.tote_size=[4,4,2]", "evaluation.episodes=6", *settings)
+
+    def make_env(first, count):
+        return PickPlaceEnv(
+            tote_size=(4, 4, 2), stream=stream, seed=seed, num_envs=count, first_episode=first, masks=()
+        )
+
+    wanted = evaluate.play(make_env, JointDBL(make_env(0, 1).rules), 6, 6).occupancy.tolist()
+    assert (code, result["occupancy"]["per_episode"]) == (0, wanted)
+
+
+def test_latencies_are_medians_and_a_mean_in_milliseconds(monkeypatch):
+    """A search may think long about few states."""
+
+    def clock(*costs):
+        readings = [reading for number, cost in enumerate(costs) for reading in (number, number + cost)]
+        return iter(readings).__next__
+
+    ticking = SimpleNamespace(perf_counter=clock(0.002, 0.002, 0.009), process_time=clock(0.001, 0.001, 0.010))
+    monkeypatch.setattr(evaluate, "time", ticking)
+    env = PickPlaceEnv(num_envs=1, tote_size=(4, 4, 2))
+    found = evaluate.decision_latency(lambda *_: env, JointDBL(env.rules), 3)
+    assert found == pytest.approx({"p50": 2.0, "p95": 8.3, "cpu_p50": 1.0, "cpu_mean": 4.0})

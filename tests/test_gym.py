@@ -15,6 +15,7 @@ from tensordict import TensorDict
 import pickplace
 from pickplace import PickPlaceEnv
 from pickplace.gym import KEYS
+from pickplace.items import Recorded
 from pickplace.report import draw_scene
 
 ID = "pickplace/PickPlace-v0"
@@ -282,3 +283,38 @@ def test_maskable_ppo_runs():
     model = contrib.MaskablePPO("MultiInputPolicy", make(), n_steps=64, batch_size=32, seed=0)
     model.learn(128)
     assert model.num_timesteps == 128
+
+
+def test_a_picture_shows_its_own_episode(monkeypatch):
+    env = make(render_mode="rgb_array")
+    _, info = env.reset(seed=0)
+    empty = env.render()
+    env.step(int(np.flatnonzero(info["action_mask"])[0]))
+    assert (env.render() != empty).any()
+    env.reset(seed=0)
+    assert (env.render() == empty).all()
+
+
+def test_the_picture_of_the_bin_lies_as_the_map_of_the_tote(monkeypatch):
+    seen = []
+    monkeypatch.setattr("pickplace.gym.draw_scene", lambda *given: seen.append(draw_scene(*given)) or seen[-1])
+    env = make(bin_size=(3, 6, 1), render_mode="rgb_array")
+    observation, _ = env.reset(seed=0)
+    env.render()
+    image = seen[-1].axes[-1].images[0]
+    assert np.array_equal(image.get_array(), observation["bin_depth"].T) and image.origin == "lower"
+
+
+def test_a_step_that_resets_says_nothing_of_what_its_action_would_have_done(tmp_path):
+    """After a failure the environment underneath plays action 0, which may place a recorded stream's last item."""
+    (tmp_path / "items.csv").write_text("w,d,h,x,y\n1,1,1,0,0\n1,1,1,0,0\n")
+    items = Recorded(tmp_path / "items.csv")
+    env = gymnasium.make_vec(ID, num_envs=2, **{**SMALL, "tote_size": (4, 5, 1), "items": items})
+    _, info = env.reset(seed=0)
+    _, _, *flags, info = env.step(np.array([np.flatnonzero(mask)[-1] for mask in info["action_mask"]]))
+    assert info["action_mask"][:, 0].all() and not np.any(flags)
+    _, _, terminated, truncated, _ = env.step(np.array([np.flatnonzero(~mask)[0] for mask in info["action_mask"]]))
+    assert terminated.all() and not truncated.any()
+    observation, reward, *flags, info = env.step(np.zeros(2, dtype=np.int64))
+    assert not np.any(flags) and not reward.any() and (observation["tote_depth"] == 1).all()
+    assert info["failure"].tolist() == ["none"] * 2

@@ -168,3 +168,34 @@ def test_with_a_mask_it_is_the_joint_network_among_the_footprints_that_the_heuri
 def test_bad_candidates():
     with pytest.raises(ValueError, match=r"planner.candidates='all': expected 'corners' or 'cells'"):
         IndividualHeuristic(Rules(), "all")
+
+
+@pytest.mark.parametrize("candidates", ["corners", "cells"])
+@pytest.mark.parametrize(("rotations", "tote"), [(1, (6, 6, 5)), (3, (5, 7, 3)), (4, (7, 5, 3))])
+def test_the_first_candidate_that_succeeds_is_played(candidates, rotations, tote):
+    """In the order (top, y, x, flat index); if all fail the first; and corners are fewer than cells."""
+    env = PickPlaceEnv(rotations=rotations, tote_size=tote, num_envs=48, masks=("action",), seed=1)
+    rules, td = env.rules, env.reset()
+    for _ in range(6):
+        _, td = env.step_and_maybe_reset(td.set("action", RandomFeasible(rules, 1).decide(td)))
+    item, heights, height = env.current_item, env.heights, env.tote_height
+    top = rules.resting_top(heights, height, item)
+    corners = corner_footprints(rules, heights, top, item)
+    each = rules.num_places * rules.rotations
+    first = rules.heuristic_pick(item) * each
+    failed = torch.stack([rules.apply(heights, height, item, first + n).failure for n in range(each)], 1)
+    lies = torch.stack([rules.apply(heights, height, item, first + n).footprint for n in range(each)], 1)
+    chosen = IndividualHeuristic(rules, candidates).decide(td) - first
+    missed = 0
+    for row in range(48):
+        found = []
+        for n, (x, y, w, d) in enumerate(lies[row].tolist()):
+            if min(x, y) < 0 or x + w > tote[0] or y + d > tote[1]:
+                continue
+            parity = n % rotations % 2
+            if candidates == "cells" or corners[row, parity, x, y]:
+                found.append((failed[row, n].item() > 0, top[row, parity, x, y].item(), y, x, n))
+        if found:
+            assert chosen[row] == min(found)[-1]
+            missed += min(found)[0]
+    assert candidates == "cells" or missed > 0

@@ -4,12 +4,14 @@ from functools import partial
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
-from pickplace import PickPlaceEnv
+from pickplace import PickPlaceEnv, Rules, checkpoint
 from pickplace.evaluate import confidence95, play
 from pickplace.items import Kinds, Recorded
 from pickplace.models.actors import fcn_grasp
 from pickplace.planners import Lookahead, PolicyPlanner
+from pickplace.planners.policy import restore_critic
 
 SMALL = {"tote_size": (4, 4, 1)}
 
@@ -91,7 +93,7 @@ def test_a_critic_that_errs_does_not_make_it_worse_than_its_policy(monkeypatch):
 
 def test_with_no_doubt_allowed_it_is_its_policy():
     rules = make_env(0, 1).rules
-    search = Lookahead(rules, untrained(rules), make_env(0, 1).items, samples=2, rounds=1, confidence=1e9)
+    search = Lookahead(rules, untrained(rules), make_env(0, 1).items, samples=16, rounds=1, confidence=1e9)
     alone = PolicyPlanner(rules, untrained(rules))
     results = [play(make_env, planner, 16, 16).occupancy for planner in (search, alone)]
     assert torch.equal(*results)
@@ -120,3 +122,33 @@ def test_bad_settings_are_refused(settings, words):
     env = make_env(0, 1)
     with pytest.raises(ValueError, match=words):
         Lookahead(**{"rules": env.rules, "policy": untrained(env.rules), "items": env.items, **settings})
+
+
+def test_each_call_imagines_other_items():
+    env = make_env(0, 3)
+    search = Lookahead(env.rules, untrained(env.rules), env.items)
+    state = torch.zeros(1, 4, 4, dtype=torch.int32), torch.ones(1, dtype=torch.int64), torch.tensor([0])
+    assert not torch.equal(search._play_out(*state, 16, None), search._play_out(*state, 16, None))
+
+
+@pytest.mark.parametrize(("gain", "departs"), [(0.8, True), (0.6, False)])
+def test_a_candidate_must_win_by_standard_errors_of_its_mean(gain, departs, monkeypatch):
+    """Of 32 streams, each of which differs from the mean by 2: the standard error is 2 / sqrt(31), 0.36."""
+    env = make_env(0, 1)
+    observation, policy = env.reset(), untrained(env.rules)
+    search = Lookahead(env.rules, policy, env.items, candidates=2, samples=32, rounds=1, confidence=2.0)
+    noise = torch.tensor([2.0, -2.0], dtype=torch.float64).repeat(16)
+    monkeypatch.setattr(search, "_play_out", lambda *_: torch.stack([torch.zeros_like(noise), gain + noise]))
+    own = PolicyPlanner(env.rules, policy).decide(observation)
+    assert (search.decide(observation) != own).item() == departs
+
+
+def test_a_checkpoints_critic_judges_in_cells():
+    """Nearly all of an empty tote's 180 cells, a little less for the discount; near nothing in a full one."""
+    state, facts = checkpoint.read(checkpoint.locate("pretrained/r4"))
+    cfg = OmegaConf.create({**facts["config"], "device": "cpu"})
+    critic = restore_critic(cfg, Rules(), state, [6, 6, 5])
+    item = torch.zeros(1, 5, 5)
+    item[0, 1:3, 2] = 1.0
+    empty, full = (critic(item, torch.full((1, 6, 6), depth)).item() for depth in (5.0, 0.0))
+    assert 100 < empty < 185 and abs(full) < 10

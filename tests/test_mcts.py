@@ -7,6 +7,7 @@ from pickplace import PickPlaceEnv
 from pickplace.evaluate import play
 from pickplace.items import Kinds, Recorded
 from pickplace.planners import MCTS
+from pickplace.planners.mcts import _Edge, _Node
 
 OPTIMUM = 0.9456  # 4x4x1, R=4, see tests/test_optimum.py
 
@@ -101,3 +102,44 @@ def test_bad_settings_are_refused(settings, words):
     env = make_env(0, 1)
     with pytest.raises(ValueError, match=words):
         MCTS(env.rules, env.items, **settings)
+
+
+def test_what_was_tried_is_chosen_by_ucb1():
+    env = PickPlaceEnv(num_envs=1, tote_size=(4, 4, 1))
+    node = _Node(torch.zeros(4, 4), torch.zeros(5), [])
+    node.edges = {n: _Edge(node, n, visits, visits * mean) for n, (visits, mean) in enumerate([(100, 0.6), (25, 0.45)])}
+    # sqrt(ln 125 / n) is 0.220 and 0.439
+    for weight, best in ((0, 0), (0.6, 0), (0.75, 1)):
+        assert MCTS(env.rules, env.items, mask=True, exploration=weight)._choose(node).action == best
+
+
+def test_the_most_visited_action_is_played():
+    """And not one that was lucky once."""
+    env = PickPlaceEnv(num_envs=1, tote_size=(4, 4, 1), masks=("outcome",))
+    state = env.reset()
+    often, lucky = state["outcome_mask"][0].nonzero()[:2, 0].tolist()
+    search = MCTS(env.rules, env.items, 1, mask=True)
+    root = _Node(env.heights[0], env.item[0], [])
+    root.edges = {lucky: _Edge(root, lucky, 2, 1.9), often: _Edge(root, often, 90, 45.0)}
+    search._nodes, search._walk_down = lambda *_: [root], lambda _: ([], True)
+    placements = env.rules.placements(env.heights, env.tote_height, env.current_item)
+    reaching = env.rules.actions_reaching(placements, torch.tensor([often]))[0]
+    assert search.decide(state).item() == reaching[reaching >= 0].min()
+
+
+@pytest.mark.parametrize("mask", [True, False])
+def test_a_return_is_what_the_walk_places_and_its_rollout(mask):
+    env = PickPlaceEnv(num_envs=1, tote_size=(4, 4, 2), masks=())
+    search = MCTS(env.rules, env.items, 200, mask=mask, wave=7)
+    roots, nodes = [], search._nodes
+    search._nodes = lambda *args: roots.append(nodes(*args)) or roots[-1]
+    search._play_out = lambda heights, *_: torch.zeros(len(heights), dtype=torch.float64)
+    search.decide(env.reset())
+    stack, placed = [roots[0][0]], 0
+    while stack:
+        for edge in stack.pop().edges.values():
+            below = sum(child.total for node in edge.bins for child in node.edges.values())
+            assert edge.total == pytest.approx(edge.visits * edge.volume / 32 + below)
+            placed += edge.volume > 0
+            stack += edge.bins
+    assert placed

@@ -265,3 +265,56 @@ def test_page_without_a_policy_or_any_success(browser, tmp_path):
     wait_until(browser, "replay.state().ending !== ''")
     assert state()["moves"] == len(result.recordings[0].moves)
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+#: Notes the scene that is drawn, and where each square of the heat map lies.
+WATCH = """
+window.squares = {};
+const update = THREE.Object3D.prototype.updateMatrix, set = THREE.InstancedMesh.prototype.setMatrixAt;
+THREE.Object3D.prototype.updateMatrix = function () {
+  if (this.isScene) window.scene = this;
+  return update.call(this);
+};
+THREE.InstancedMesh.prototype.setMatrixAt = function (n, m) {
+  window.squares[n] = [...m.elements.slice(12, 15)];
+  return set.call(this, n, m);
+};
+"""
+
+
+@pytest.mark.parametrize("cell", ["odd", "mixed"])
+def test_page_puts_things_where_they_are(browser, tmp_path, cell):
+    """On a tote that is not square: a carried item ends in its footprint, and the heat map lies on the surface."""
+    rules, result = record(cell, policy_planner)
+    path = tmp_path / "replay.html"
+    path.write_text(replay.page(result.recordings, rules, "policy"), encoding="utf-8")
+    open_page(browser, path, "#episode=0&step=0")
+    browser.execute_script(WATCH + "document.getElementById('seek').step = 'any'")
+    wide, deep, _ = rules.tote_size
+    heights, turns = np.zeros((wide, deep)), set()
+    for number, move in enumerate(result.recordings[0].moves):
+        if move.failure:
+            break
+        for moment in (0, 0.75):  # before it, and set down but not let go
+            script = (
+                "window.scene = null; const s = document.getElementById('seek'); s.value = arguments[0]; s.oninput();"
+                "document.getElementById('heat').onchange()"  # which draws the map again
+            )
+            browser.execute_script(script, number + moment)
+            wait_until(browser, "!!window.scene")
+            if moment == 0:
+                squares = browser.execute_script("return window.squares")
+                for place in range(wide * deep):
+                    x, y = divmod(place, deep)
+                    assert squares[str(place)] == pytest.approx([x + 0.5, y + 0.5, heights[x, y] + 0.02], abs=1e-4)
+        where = browser.execute_script(
+            "const item = scene.children.find(o => o.isGroup && o.children.length === 2 && o.children[0].isMesh);"
+            "return [...item.position.toArray(), item.rotation.z]"
+        )
+        x, y, w, d = move.footprint
+        top = move.z + move.item[4]
+        assert where[:3] == pytest.approx([x + w / 2, y + d / 2, move.z + move.item[4] / 2], abs=0.01)
+        assert where[3] == pytest.approx({0: 0, 1: np.pi / 2, 2: np.pi, 3: -np.pi / 2}[move.rotation], abs=1e-6)
+        heights[x : x + w, y : y + d] = top
+        turns.add(move.rotation)
+    assert len(turns) > 1

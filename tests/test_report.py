@@ -183,3 +183,32 @@ def test_evaluation_table_of_a_policy():
 def test_importing_the_package_does_not_import_matplotlib():
     code = "import sys, pickplace.report, pickplace.evaluate; sys.exit('matplotlib' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_height_map_lies_as_the_tote(monkeypatch):
+    """x to the right, y upwards."""
+    boxes, size = [(0, 0, 0, 2, 1, 1), (2, 3, 0, 1, 1, 2)], (3, 4, 2)
+    recording = recording_of(boxes, size)
+    figure = report.draw_scene(recording, Rules(tote_size=size), report.item_colours(boxes))
+    plan = figure.axes[1]
+    shown = np.zeros((3, 4), dtype=int)
+    for text in plan.texts:
+        x, y = text.get_position()
+        shown[x, y] = int(text.get_text())
+    expected = [[1, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 2]]
+    assert shown.tolist() == expected
+    assert np.asarray(plan.images[0].get_array()).T.tolist() == expected and plan.images[0].origin == "lower"
+    assert (plan.get_xlabel(), plan.get_ylabel()) == ("x (cells)", "y (cells)")
+
+
+def test_the_picture_in_3d_shows_items_where_they_lie():
+    """The middle of a cube is half a cell above that of the floor below it."""
+    size = (3, 4, 1)
+    for x, y in ((0, 0), (2, 0), (0, 3), (2, 3)):
+        boxes = [(x, y, 0, 1, 1, 1)]
+        figure = report.draw_scene(recording_of(boxes, size), Rules(tote_size=size), report.item_colours(boxes))
+        tote, cube = (part for part in figure.axes[0].collections if type(part).__name__ == "PolyCollection")
+        corner, along_x, _, along_y = tote.get_paths()[0].vertices[:4]
+        floor = corner + (along_x - corner) * (x + 0.5) / 3 + (along_y - corner) * (y + 0.5) / 4
+        middle = np.mean([path.vertices[:3] for path in cube.get_paths()], axis=(0, 1))
+        assert middle == pytest.approx(floor + [0, 0.5])

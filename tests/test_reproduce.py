@@ -16,7 +16,8 @@ import run
 from cell import BATCH, fitting_batch
 from hydra import compose, initialize_config_dir
 
-from pickplace import config
+from pickplace import PickPlaceEnv, config
+from pickplace.items import Kinds
 
 FOLDER = Path(__file__).parents[1] / "benchmarks" / "reproduce"
 
@@ -383,9 +384,6 @@ def test_the_numbers_behind_a_figure_are_those_of_its_cells():
 
 def test_a_plan_of_single_cells_can_be_executed_but_where_the_effector_collides():
     """A 4x4x2 tote, items 1x1x1 in reading order: the plan fills the first layer; walls are in the way of none."""
-    from pickplace import PickPlaceEnv
-    from pickplace.items import Kinds
-
     env = PickPlaceEnv(tote_size=(4, 4, 2), items=Kinds([(1, 1, 1)]), num_envs=1, stream="test")
 
     def packer(size, turns):
@@ -541,3 +539,79 @@ def test_a_batch_is_played_where_it_ends_in_time_and_is_worth_it():
     assert fitting_batch(alone=10, together=20, seconds=60) == (BATCH, 40)
     assert fitting_batch(alone=10, together=70, seconds=60) == (1, 60)  # it would not end
     assert fitting_batch(alone=1, together=0.6 * BATCH, seconds=60) == (1, 60)  # as fast one by one
+
+
+def test_clipping_helps_where_fcn4d_with_it_is_better():
+    for clipped, plain, word in ((0.5, 0.3, "yes, all 3 (3 by one seed)"), (0.3, 0.5, "no, all 3 (3 by one seed)")):
+        found = {f"fcn4d-R4-s0-{tote}-K1": result(clipped) for tote in ("6x6x10", "10x10x10", "30x30x10")}
+        found |= {f"fcn4d_noclip-R4-s0-{tote}-K1": result(plain) for tote in ("6x6x10", "10x10x10", "30x30x10")}
+        assert words(claims.clipping_helps(found))["fcn4d"] == word
+
+
+def test_no_loss_is_a_loss_of_less_than_a_hundredth():
+    for wide, word in ((0.495, "1 yes (by one seed)"), (0.5, "1 yes (by one seed)"), (0.48, "1 no (by one seed)")):
+        found = {"fcn4d-R4-s0-6x6x5-K10": result(0.5), "fcn4d-R4-s0-10x10x5-K10": result(wide)}
+        assert words(claims.no_loss_with_size(found))["fcn4d"] == f"{word}, 7 not known yet"
+
+
+def test_a_gain_on_small_totes_is_as_unsure_as_both_of_its_sides():
+    found = {}
+    for tote, gain, noise in (("6x6x5", 0.2, 0.0), ("10x10x5", 0.1, 0.6)):
+        found[f"individual_grasp-R1-s0-{tote}-Kall"] = result(0.3)
+        found[f"fcn_grasp-R1-s0-{tote}-Kall"] = result(0.3 + gain)
+        each = found[f"fcn_grasp-R1-s0-{tote}-Kall"]["occupancy"]["per_episode"]
+        each[:] = [share + noise * (-1) ** number for number, share in enumerate(each)]
+    group = claims.most_on_small_totes_with_the_same_network(found)[0]
+    assert group.word() == "1 undecided, 15 not known yet"
+    centre, low, high = group.found[0].difference
+    # Student's t with 99 degrees of freedom: 1.984; a sample's deviation of 0.6 * sqrt(100 / 99)
+    assert centre == pytest.approx(0.1) and high - centre == pytest.approx(1.984 * 0.6 / 99**0.5, rel=0.01)
+    assert centre - low == pytest.approx(high - centre)
+
+
+def drawn(monkeypatch, name, found, tmp_path):
+    """The axes of a figure."""
+    made = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: made.append(figure) or True)
+    assert figures.FIGURES[name][-1](found, tmp_path / name)
+    return made[0].axes
+
+
+def test_a_point_is_drawn_under_the_name_of_its_method(monkeypatch, tmp_path):
+    names = {
+        "mcts-R4-6x6x5-mask_true": "MCTS, mask", "mcts-R4-6x6x5-mask_false": "MCTS, no mask",
+        "random-R4-6x6x5": "random, feasible", "fcn4d-R4-s0-6x6x5-K1": "fcn4d (the paper's), K=1",
+        "fcn4d_noclip-R4-s0-6x6x5-K1": "4D FCN, no clipping, K=1", "typical-R4-s0-6x6x5-K1": "typical, K=1",
+    }  # fmt: skip
+    found = {name: result(0.1 + 0.1 * number) for number, name in enumerate(names)}
+    axes = drawn(monkeypatch, "rl_methods", found, tmp_path)[-1]
+    looks = {text: handle[0] for handle, text in zip(*axes.get_legend_handles_labels(), strict=True)}
+    points = {(line.get_color(), line.get_marker()): line.get_ydata() for line in axes.lines if len(line.get_ydata())}
+    assert {text: points[look.get_color(), look.get_marker()][0] for text, look in looks.items()} == pytest.approx(
+        {text: 0.1 + 0.1 * number for number, text in enumerate(names.values())}
+    )
+
+
+@pytest.mark.parametrize(("episodes", "hollow"), [(19, True), (20, False)])
+def test_a_point_of_few_episodes_is_hollow(monkeypatch, tmp_path, episodes, hollow):
+    axes = drawn(monkeypatch, "rl_methods", {"random-R4-6x6x5": result(0.3, episodes)}, tmp_path)[-1]
+    [point] = [line for line in axes.lines if len(line.get_ydata()) == 1 and line.get_marker() == "x"]
+    assert (point.get_markerfacecolor() == "white") == hollow
+
+
+def test_a_plan_may_turn_items():
+    """Items of 2x1 side by side, all turned, in a tote so low that nothing collides."""
+    env = PickPlaceEnv(tote_size=(4, 4, 1), items=Kinds([(2, 1, 1)]), num_envs=1, stream="test")
+
+    def packer(size, turns):
+        places = iter([(x, y) for x in range(4) for y in (0, 2)])
+        return lambda w, d, h: (*place, 0, d, w) if (place := next(places, None)) else None
+
+    assert placement_only.replay(env, packer) == (["executed"] * 8, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(("frames", "short"), [(49, True), (50, False)])
+def test_a_point_is_pale_where_a_seed_had_less_than_half_of_its_training(frames, short):
+    found = {"m-s0": result(0.5, training="a"), "m-s1": result(0.6, training="b")}
+    found |= {"a": {"frames": 100, "frames_asked": 100}, "b": {"frames": frames, "frames_asked": 100}}
+    assert figures.pooled(found, "m-s*")["short"] == short

@@ -379,3 +379,41 @@ def test_load_of_a_policy_whose_grasps_depend_on_the_items(tmp_path):
     assert loaded.plan(ITEM, np.full((5, 5), 2)).status == "ok"
     with pytest.raises(DepthMapError, match="the item is longer than any in training, expected at most 2"):
         loaded.plan(changed(ITEM, (3, 2), 1), np.full((5, 5), 2))
+
+
+def test_every_length_is_in_metres(planner):
+    low = EMPTY - 2  # something two cells high lies everywhere
+    plain, metric = planner.plan(ITEM, low), planner.plan(ITEM * 0.05, low * 0.05, cell_size=0.05)
+    assert plain.drop_height == 2 and metric.drop_height == pytest.approx(0.1)
+    for pose, other in ((plain.pick, metric.pick), (plain.place, metric.place)):
+        assert other.cell == pose.cell and other.center == pytest.approx([0.05 * length for length in pose.center])
+
+
+def test_command_hands_every_option_on(command, tmp_path):
+    item = np.zeros((5, 4))
+    item[1:3, 2] = 1.1
+    np.save(tmp_path / "bin.npy", item)
+    np.save(tmp_path / "tote.npy", np.full((7, 6), 4.0))
+    arguments = ["pretrained/r4", "--bin", "bin.npy", "--tote", "tote.npy"]
+    arguments += ["--bin-size", 5, 4, 1, "--tote-size", 7, 6, 9, "--effector-size", 2, 2, "--rotations", 1]
+    code, out, err = command(*arguments, "--tote-height", 4, "--alternatives", 1)
+    assert code == 0, err
+    plan = json.loads(out)
+    assert plan["status"] == "ok" and plan["rotation_degrees"] == 0 and len(plan["alternatives"]) == 1
+    assert plan["occupancy_after"] == pytest.approx(2 / (7 * 6 * 4))
+    assert plan["pick"]["center"][:2] == pytest.approx([2, 2.5], abs=0.5)  # an effector of two cells covers both
+    assert "within 0.05" in command(*arguments, "--tote-height", 4, "--tolerance", 0.05)[2]
+
+
+def test_a_request_has_the_last_word(command):
+    """Over what the command line says for all."""
+    plain = {"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist()}
+    metric = {"bin_depth": (ITEM * 0.05).tolist(), "tote_depth": (EMPTY * 0.05).tolist(), "cell_size": 0.05}
+    low = {"bin_depth": ITEM.tolist(), "tote_depth": (EMPTY - 3).tolist(), "tote_height": 2, "alternatives": 2}
+    lines = "\n".join(json.dumps(request) for request in (plain, metric, low)).encode()
+    code, out, err = command("pretrained/r4", "--cell-size", 1, "--alternatives", 0, lines=lines)
+    replies = [json.loads(line) for line in out.splitlines()]
+    assert code == 0 and [reply.get("status") for reply in replies] == ["ok"] * 3, err
+    assert replies[1]["pick"]["center"] == pytest.approx([0.05 * length for length in replies[0]["pick"]["center"]])
+    assert replies[2]["occupancy_after"] == pytest.approx(2 / 72)
+    assert [bool(reply["alternatives"]) for reply in replies] == [False, False, True]
