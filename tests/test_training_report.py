@@ -9,10 +9,12 @@ import subprocess
 import sys
 import zlib
 
+import numpy as np
 import pytest
 
 from pickplace.metrics import read_csv
-from pickplace.report import failure_mix
+from pickplace.report import failure_mix, figure_of, learning_curve
+from pickplace.training_report import _levels
 
 
 @pytest.fixture(scope="module")
@@ -67,3 +69,36 @@ def test_failure_mix(table, tmp_path):
     (tmp_path / "metrics.csv").write_text(table)
     failure_mix(tmp_path / "metrics.csv", tmp_path / "mix.png")
     assert (tmp_path / "mix.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are drawn."""
+    figures = []
+    monkeypatch.setattr("pickplace.report.figure_of", lambda *size: figures.append(figure_of(*size)) or figures[-1])
+    return figures
+
+
+def test_failures_are_shares_of_the_episodes_and_not_of_the_batches(drawn, tmp_path):
+    """Of 200 batches two are averaged: one episode that was stuck, and three that were not."""
+    rows = [f"{2 * i + k},{1 - k},{k},{1 + 2 * k}" for i in range(100) for k in (0, 1)]
+    head = "frames,train/failure_stuck,train/failure_overflow,train/episodes"
+    (tmp_path / "metrics.csv").write_text("\n".join([head, *rows, ""]))
+    failure_mix(tmp_path / "metrics.csv", tmp_path / "mix.png")
+    lowest, upper = drawn[0].axes[0].collections  # in the order of the failures
+    assert [lowest.get_label(), upper.get_label()] == ["stuck", "overflow"]
+    edge = lowest.get_paths()[0].vertices
+    assert edge[edge[:, 0] == 100, 1].max() == pytest.approx(0.25)
+
+
+def test_a_validation_s_bar_is_its_interval(drawn, tmp_path):
+    table = "frames,eval/occupancy,eval/ci95_low,eval/ci95_high\n100,0.5,0.4,0.8\n"
+    (tmp_path / "metrics.csv").write_text(table)
+    learning_curve(tmp_path / "metrics.csv", tmp_path / "curve.png")
+    [bar] = drawn[0].axes[0].collections
+    assert np.allclose(bar.get_segments()[0], [[100, 0.4], [100, 0.8]])
+
+
+def test_a_height_s_occupancy_is_that_of_its_last_batches():
+    rows = [{"frames": i, "curriculum/occupancy_at_2": i / 100} for i in range(1, 51)]
+    assert "<td>0.4050</td><td>1 to 50</td>" in _levels(rows)  # the mean of 0.31 to 0.50
