@@ -370,7 +370,7 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
                 raise error.__cause__ from None
             for word in overrides:
                 group, _, choice = word.lstrip("+").partition("=")
-                if choice in ("null", "") and (conf_dir() / group).is_dir():
+                if choice in ("null", "") and group != "experiment" and (conf_dir() / group).is_dir():
                     names = sorted(file.stem for file in (conf_dir() / group).glob("*.yaml"))
                     raise ValueError(f"{word}: expected {group}=<one of {', '.join(names)}>.") from error
             raise ValueError(f"{' '.join(overrides)}: {error}.") from error

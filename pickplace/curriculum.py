@@ -101,10 +101,10 @@ class ToteHeightCurriculum(Transform):
             tensordict = TensorDict(batch_size=self.parent.batch_size, device=self.parent.device)
         count = tensordict.numel()
         height = self.sampler(int(self.level), self.min_height, count)
-        if not isinstance(height, Tensor) or height.shape != (count,) or height.is_floating_point():
+        if not isinstance(height, Tensor) or height.numel() != count or height.is_floating_point():
             raise ValueError(
-                f"curriculum.sample: {type(self.sampler).__name__} gave {reprlib.repr(height)}; expected heights, an "
-                f"int64 tensor [{count}]."
+                f"curriculum.sample: {type(self.sampler).__name__} gave {reprlib.repr(height)}; expected heights, "
+                f"whole numbers in a tensor [{count}]."
             )
         height = height.to(self.level.device).reshape(*tensordict.batch_size, 1)
         reset, running = tensordict.get("_reset", None), tensordict.get("tote_height", None)
@@ -420,8 +420,10 @@ class Curriculum:
         own = occupancy[heights == tally.level].tolist()
         tally.frames, tally.episodes = frames, tally.episodes + len(own)
         tally.window.extend(own)
-        level, logs = self.advance.update(tally)
-        level = self._within(level)
+        answer = self.advance.update(tally)
+        if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], dict):
+            raise ValueError(f"{self._rule}: update gave {reprlib.repr(answer)}; expected (level, {{name: number}}).")
+        level, logs = self._within(answer[0]), {**answer[1]}
         self._remembered()
         for name, value in logs.items():
             if not isinstance(value, Real):
@@ -451,7 +453,9 @@ class Curriculum:
         state = {key: getattr(self.advance, key, None) for key in self.advance.remembers}
         for name, value in state.items():
             if not _plain_number(value):
-                raise ValueError(f"{self._rule} remembers {name}={reprlib.repr(value)}; expected a plain number.")
+                raise ValueError(
+                    f"{self._rule} remembers {name}={reprlib.repr(value)}; expected a plain, finite number."
+                )
         return state
 
     def state_dict(self) -> dict:

@@ -92,14 +92,18 @@ def begun_already(cfg: DictConfig, run_dir: Path) -> tuple[dict, dict, Path] | N
     return state, facts, folder
 
 
-def frames_of_best(run_dir: Path) -> int:
-    """The frames of ``checkpoints/best``, -1 without one. A run that goes on from an earlier checkpoint, perhaps with
-    other settings, may never come to it again.
+def best_of_another_course(run_dir: Path, frames: int, content: dict) -> int | None:
+    """The frames of a run's ``best`` if it may never come to it, going on from ``frames`` with other settings, or None.
+
+    Args:
+        content: the settings from now on, in the form that checkpoints hold.
     """
     try:
-        return int(json.loads((Path(run_dir) / "checkpoints" / "best" / checkpoint.FACTS).read_bytes())["frames"])
-    except (OSError, ValueError, TypeError, KeyError):
-        return -1
+        facts = json.loads((checkpoint.locate(run_dir) / checkpoint.FACTS).read_bytes())
+        same = facts["config"] == json.loads(json.dumps(content))
+        return None if same or facts["frames"] <= frames else int(facts["frames"])
+    except (checkpoint.CheckpointError, OSError, ValueError, TypeError, KeyError):
+        return None  # no best, or one that nothing can be told of
 
 
 def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:

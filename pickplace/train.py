@@ -32,8 +32,8 @@ from pickplace.resume import (
     COUNTERS,
     StopRequest,
     begun_already,
+    best_of_another_course,
     claim,
-    frames_of_best,
     load_optimizer,
     refuse_links,
     resumed_config,
@@ -104,9 +104,12 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     frames, iteration, best, latest = (facts.get(k, d) for k, d in COUNTERS.items())
     if resume:
         curriculum.load_state_dict(facts["curriculum"])
-        if (later := frames_of_best(run_dir)) > frames:
+        if (later := best_of_another_course(run_dir, frames, settled_config)) is not None:
             best = COUNTERS["best"]
-            log.info("checkpoints/best is of frame %s, which is still to come; a validation replaces it", f"{later:,}")
+            log.warning(
+                "checkpoints/best, of frame %s, is of an earlier course of this run; the next validation replaces it",
+                f"{later:,}",
+            )
     if shortage := curriculum.check_budget(cfg.total_frames, cfg.env.num_envs * algo.rollout_length):
         log.warning(shortage)
     if learning_rate(algo, cfg.env.num_envs * algo.rollout_length, cfg.total_frames) == 0 < algo.lr:
@@ -215,7 +218,8 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
                 metrics |= {f"eval/{key}": value for key, value in latest.items()}
                 log.info("%s frames: validation occupancy %.4f", f"{frames:,}", latest["occupancy"])
             logger.log(metrics, frames)
-            if latest.get("occupancy", best) > best:  # after its row, which a run that goes on from here needs
+            # After its row, which a run that goes on from here needs.
+            if "eval/occupancy" in metrics and latest["occupancy"] > best:
                 best = latest["occupancy"]
                 save("best")
             if crossed(before, frames, cfg.checkpoint_interval):

@@ -444,13 +444,20 @@ def test_a_level_beyond_the_heights_is_the_nearest(wanted, level):
         (Own(1.5), "curriculum.advance: Own wants level 1.5; expected a whole number"),
         (Own(True), "Own wants level True"),
         (Own(1, logs={"mood": "good"}), "curriculum.advance: Own: it logs mood='good'; expected a number"),
-        (Own(1, seen=torch.tensor(1)), r"Own remembers seen=tensor\(1\); expected a plain number"),
+        (Own(1, seen=torch.tensor(1)), r"Own remembers seen=tensor\(1\); expected a plain, finite number"),
         (Own(1, seen=float("nan")), "Own remembers seen=nan"),
     ],
 )
 def test_what_a_rule_of_ones_own_gives_is_checked_at_once(rule, message):
     with pytest.raises(ValueError, match=message):
         play(make(rule), 10)
+
+
+@pytest.mark.parametrize("answer", [2, (2, None), None])
+def test_a_rule_that_does_not_answer_with_a_level_and_logs_is_named(answer, monkeypatch):
+    monkeypatch.setattr(Own, "update", lambda self, tally: answer)
+    with pytest.raises(ValueError, match=r"Own: update gave .*; expected \(level, {name: number}\)"):
+        play(make(Own(1)), 10)
 
 
 def test_a_rule_that_lacks_what_it_remembers_is_told_before_the_first_batch():
@@ -466,7 +473,7 @@ def test_a_sampler_that_draws_something_else_is_named(drawn):
         return drawn(count) if drawn is not list else [1] * count
 
     with pytest.raises(
-        ValueError, match=r"curriculum.sample: function gave .*; expected heights, an int64 tensor \[6\]"
+        ValueError, match=r"curriculum.sample: function gave .*; expected heights, whole numbers in a tensor \[6\]"
     ):
         make_env(level=3, sampler=sampler).reset()
 

@@ -14,6 +14,7 @@ import torch
 from omegaconf import OmegaConf
 
 from pickplace import checkpoint
+from pickplace import train as train_module
 from pickplace.metrics import read_csv
 from pickplace.train import resume_run, train
 
@@ -211,18 +212,30 @@ def test_a_stop_request_ends_a_sweep(tmp_path):
     assert (sweep / "0" / "checkpoints" / "last").is_dir() and not (sweep / "1").exists()
 
 
-def test_a_best_that_the_run_never_had_is_replaced(smoke, tmp_path):
-    """Of a branch that was given up, when a run goes on with other settings from an earlier checkpoint."""
-    run_dir = tmp_path / "run"
-    smoke(run_dir, "checkpoint_interval=128")
+@pytest.mark.parametrize("changed", [["algo.lr=0"], []])
+def test_a_best_that_the_run_never_had_is_replaced(changed, smoke, tmp_path, monkeypatch):
+    """Of a course that was given up, when a run goes on with other settings; with the same it comes there again."""
+    run_dir, before = tmp_path / "run", []
+    smoke(run_dir, "checkpoint_interval=128", "total_frames=896")
     state, facts = checkpoint.read(run_dir / "checkpoints/previous")
-    assert facts["frames"] == 384
+    assert facts["frames"] == 768  # so that no validation follows at once
     checkpoint.write(run_dir / "checkpoints/previous", state, {**facts, "best": 0.99})
-    checkpoint.write(run_dir / "checkpoints/best", state, {**facts, "frames": 512, "best": 0.995})
-    resume_run([f"resume={run_dir}/checkpoints/previous", "algo.lr=0", "total_frames=1024"])
+    checkpoint.write(run_dir / "checkpoints/best", state, {**facts, "frames": 896, "best": 0.995})
+    validate = train_module.validate
+
+    def watched(*args, **kwargs):
+        before.append(checkpoint.read(run_dir / "checkpoints/best")[1]["frames"])
+        return validate(*args, **kwargs)
+
+    monkeypatch.setattr(train_module, "validate", watched)
+    resume_run([f"resume={run_dir}/checkpoints/previous", *changed])
     best = checkpoint.read(run_dir / "checkpoints/best")[1]
     validated = {row["frames"]: row.get("eval/occupancy") for row in read_csv(run_dir / "metrics.csv")}
-    assert validated[best["frames"]] == pytest.approx(best["best"]) and best["best"] < 0.99
+    assert before[0] == 896
+    if changed:
+        assert validated[best["frames"]] == pytest.approx(best["best"]) and best["best"] < 0.99
+    else:
+        assert (best["frames"], best["best"]) == (896, 0.995)
 
 
 def test_resume_with_a_longer_budget(reference):

@@ -31,8 +31,8 @@ from pickplace.geometry import Rules
 from pickplace.models.conv4d import Conv4dPolicy
 from pickplace.models.fcn_grasp import FootprintFcn
 
-#: The logit of what must not be chosen: its probability is exactly 0 in float32, however bad the rest is. What float32
-#: has left below it is for differences from the greatest logit.
+#: The logit of what must not be chosen, far below what a network may score: its probability is exactly 0 in float32.
+#: What float32 has left below it is for differences from the greatest logit.
 MASKED = -1e38
 
 
