@@ -146,6 +146,16 @@ def locate(path, prefer: str = "best") -> Path:
     )
 
 
+def read_facts(path, prefer: str = "best") -> dict:
+    """The facts of the checkpoint that :func:`locate` finds, without its tensors, so unchecked; empty if unreadable."""
+    try:
+        facts = json.loads((locate(path, prefer) / FACTS).read_bytes())
+    except (CheckpointError, OSError, ValueError, RecursionError):
+        return {}
+    whole = isinstance(facts, dict) and isinstance(facts.get("frames"), int) and isinstance(facts.get("config"), dict)
+    return facts if whole else {}
+
+
 def read(folder: Path) -> tuple[dict, dict]:
     """Read a checkpoint folder: the state as written, and its facts.
 

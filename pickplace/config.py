@@ -368,7 +368,7 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
         except ValueError as error:  # Hydra's own, which does not say where
             if isinstance(error.__cause__, OSError):  # such as a log file that cannot be opened
                 raise error.__cause__ from None
-            for word in overrides:
+            for word in overrides:  # a group without a choice, which experiment may do
                 group, _, choice = word.lstrip("+").partition("=")
                 if choice in ("null", "") and group != "experiment" and (conf_dir() / group).is_dir():
                     names = sorted(file.stem for file in (conf_dir() / group).glob("*.yaml"))

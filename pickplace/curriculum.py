@@ -209,7 +209,7 @@ class Frames(Advance):
     def update(self, tally):
         # Never down: a run resumed with a longer budget may have more frames to divide.
         due = self.start + tally.frames // self.share > tally.level
-        return min(tally.level + due, self.end), {}
+        return tally.level + due, {}
 
     def least_frames(self, batch):
         return (self.end - self.start) * max(self.share, batch)
@@ -247,9 +247,9 @@ class Threshold(Advance):
         full = len(tally.window) == self.window
         reached = full and tally.mean >= self.occupancy - TOLERANCE
         if reached or tally.level_frames >= self.max_frames:
-            return min(tally.level + 1, self.end), {}
+            return tally.level + 1, {}
         if full and tally.mean < self.demote_below - TOLERANCE:
-            return max(tally.level - 1, self.start), {}
+            return tally.level - 1, {}
         return tally.level, {}
 
     def least_frames(self, batch):  # an episode takes at least one frame

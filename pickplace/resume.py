@@ -98,12 +98,10 @@ def best_of_another_course(run_dir: Path, frames: int, content: dict) -> int | N
     Args:
         content: the settings from now on, in the form that checkpoints hold.
     """
-    try:
-        facts = json.loads((checkpoint.locate(run_dir) / checkpoint.FACTS).read_bytes())
-        same = facts["config"] == json.loads(json.dumps(content))
-        return None if same or facts["frames"] <= frames else int(facts["frames"])
-    except (checkpoint.CheckpointError, OSError, ValueError, TypeError, KeyError):
-        return None  # no best, or one that nothing can be told of
+    facts = checkpoint.read_facts(run_dir)
+    if not facts or facts["frames"] <= frames or facts["config"] == json.loads(json.dumps(content)):
+        return None
+    return facts["frames"]
 
 
 def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
@@ -190,6 +188,5 @@ def saying_what_is_safe(safe, trust: str = ""):
             other = " algo.lr=<a smaller one>" if isinstance(error, FloatingPointError) else ""
             hint = f"What was saved before is whole: python -m pickplace.train resume={folder}{trust}{other}"
         kept = (FloatingPointError, config.WorkerDied, checkpoint.CheckpointError)
-        raise (type(error) if isinstance(error, kept) else ValueError)(
-            f"{config.sentence(error).rstrip('.')}. {hint}"
-        ) from error
+        kind = type(error) if isinstance(error, kept) else ValueError
+        raise kind(f"{config.sentence(error).rstrip('.')}. {hint}") from error

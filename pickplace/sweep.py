@@ -4,7 +4,6 @@
 """
 
 import csv
-import json
 import logging
 import sys
 from dataclasses import dataclass, field
@@ -12,7 +11,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from pickplace.checkpoint import FACTS, CheckpointError, locate
+from pickplace.checkpoint import read_facts
 from pickplace.config import FAILURE, SweepCallback, begun_with, claimed, one_sentence
 from pickplace.metrics import read_csv
 
@@ -75,34 +74,25 @@ class Run:
 def read_run(folder: Path) -> Run:
     """Read a run folder, whatever state the run was left in."""
     run = Run(folder.name, dict(word.lstrip("+").partition("=")[::2] for word in begun_with(folder)))
+    facts = read_facts(folder, "last")
     if (folder / "metrics.csv").is_file():
         rows = read_csv(folder / "metrics.csv")
         run.frames = int(rows[-1]["frames"]) if rows else 0
         run.validations = [row for row in rows if "eval/occupancy" in row]
-    else:  # logger=none
-        try:
-            facts = json.loads((locate(folder, "last") / FACTS).read_text())
-            run.frames = facts["frames"]
-            if facts["latest"]:
-                latest = {f"eval/{key}": value for key, value in facts["latest"].items()}
-                run.validations = [{"frames": run.frames, **latest}]
-        except (CheckpointError, OSError, ValueError, KeyError):
-            pass  # it never came to a checkpoint
+    elif facts:  # logger=none
+        run.frames = facts["frames"]
+        if latest := facts.get("latest"):
+            run.validations = [{"frames": run.frames, **{f"eval/{key}": value for key, value in latest.items()}}]
     if (folder / FAILURE).is_file():
         run.status, run.error = "failed", (folder / FAILURE).read_text().strip()
     elif claimed(folder):
         run.status = "running"
-    elif run.frames >= _budget(folder):
-        run.status = "finished"
+    else:
+        # By the checkpoint's config, if there is one: a resumed run may be given more frames.
+        cfg = OmegaConf.create(facts["config"]) if facts else OmegaConf.load(folder / ".hydra" / "config.yaml")
+        if run.frames >= cfg.total_frames:
+            run.status = "finished"
     return run
-
-
-def _budget(folder: Path) -> int:
-    """The frames that a run is to train: those of its latest checkpoint, since a resumed run may be given more."""
-    try:
-        return json.loads((locate(folder, "last") / FACTS).read_text())["config"]["total_frames"]
-    except (CheckpointError, OSError, ValueError, KeyError):
-        return OmegaConf.load(folder / ".hydra" / "config.yaml").total_frames
 
 
 def summarize(folder: Path) -> list[Run]:

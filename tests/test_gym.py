@@ -285,7 +285,7 @@ def test_maskable_ppo_runs():
     assert model.num_timesteps == 128
 
 
-def test_a_picture_shows_its_own_episode(monkeypatch):
+def test_a_picture_shows_its_own_episode():
     env = make(render_mode="rgb_array")
     _, info = env.reset(seed=0)
     empty = env.render()

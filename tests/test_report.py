@@ -185,7 +185,7 @@ def test_importing_the_package_does_not_import_matplotlib():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_the_height_map_lies_as_the_tote(monkeypatch):
+def test_the_height_map_lies_as_the_tote():
     """x to the right, y upwards."""
     boxes, size = [(0, 0, 0, 2, 1, 1), (2, 3, 0, 1, 1, 2)], (3, 4, 2)
     recording = recording_of(boxes, size)
