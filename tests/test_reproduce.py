@@ -1,6 +1,7 @@
 """The comparison: its cells are commands that exist, and what it writes follows from the results."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from hydra import compose, initialize_config_dir
 
 from pickplace import PickPlaceEnv, config
 from pickplace.items import Kinds
+from pickplace.metrics import CsvLogger
 
 FOLDER = Path(__file__).parents[1] / "benchmarks" / "reproduce"
 
@@ -493,13 +495,27 @@ def test_a_training_whose_weights_are_elsewhere_is_repeated_where_an_evaluation_
         run.result_of(cell).parent.mkdir(parents=True, exist_ok=True)
         run.result_of(cell).write_text(json.dumps(result))
 
-    curve = {"frames": [10, 20], "validation_occupancy": [0.5]}
+    def keep_weights(frames):
+        folder = run.run_dir_of(trained)
+        (folder / "checkpoints" / "last").mkdir(parents=True, exist_ok=True)
+        (folder / "checkpoints" / "last" / "state.json").write_text(json.dumps({"frames": frames}))
+        table = CsvLogger(folder)
+        table.log({"train/occupancy": 0.4, "curriculum/level": 1}, 10)
+        table.log({"train/occupancy": 0.5, "curriculum/level": 1, "eval/occupancy": 0.5}, 20)
+        table.close()
+
+    curve = {"frames": [10, 20], "training_occupancy": [0.4, 0.5], "level": [1, 1]}
+    curve |= {"validation_frames": [20], "validation_occupancy": [0.5]}
     assert names() == ["t"]
     write(trained, frames=20, frames_asked=20, cpu_seconds=5, curve=curve)
     assert names() == ["t"]
-    (run.run_dir_of(trained) / "checkpoints").mkdir(parents=True)
+    keep_weights(10)  # repeated, and stopped on the way
+    assert names() == ["t"]
+    with pytest.raises(run.Failed, match="the weights of t are not here"):
+        run.compute(tested, 60, {"t": trained})
+    keep_weights(20)
     assert names() == []
-    (run.run_dir_of(trained) / "checkpoints").rmdir()
+    shutil.rmtree(run.run_dir_of(trained))
     repeated = {"frames": 20, "cpu_seconds": 7, "curve": curve}
     write(tested, episodes=100, of_training=run.identity(repeated))
     assert names() == []

@@ -153,7 +153,7 @@ def train(cell: Cell, minutes: float) -> dict:
         "warm_start": (facts["config"].get("warm_start") or {}).get("frames", 0),
         "mask_in_training": facts["config"]["algo"]["mask_infeasible"],
         "trained_with": {"commit": facts["commit"], "versions": facts["versions"]},
-        "curve": curve([row for row in read_csv(folder / "metrics.csv") if row["frames"] <= facts["frames"]]),
+        "curve": curve_until(facts["frames"], folder),
     }
 
 
@@ -161,6 +161,11 @@ def spent(folder: Path) -> dict:
     """CPU time and peak memory of a training so far, over all its resumptions."""
     path = folder / SPENT
     return json.loads(path.read_text()) if path.is_file() else NOTHING
+
+
+def curve_until(frames: int, folder: Path) -> dict:
+    """The curve of a run folder, as far as its last checkpoint."""
+    return curve([row for row in read_csv(folder / "metrics.csv") if row["frames"] <= frames])
 
 
 def curve(rows: list[dict], points: int = 100) -> dict:
@@ -246,6 +251,16 @@ def identity(trained: dict) -> dict:
     return {"frames": trained.get("frames"), "curve": hashlib.sha256(curve).hexdigest()[:16]}
 
 
+def weights_are_here(cell: Cell, trained: dict) -> bool:
+    """Does its run folder hold the training that the result tells of, not another one or a part of it?"""
+    folder = run_dir_of(cell)
+    state = folder / "checkpoints" / "last" / "state.json"
+    if not state.is_file():
+        return False
+    frames = json.loads(state.read_text())["frames"]
+    return identity({"frames": frames, "curve": curve_until(frames, folder)}) == identity(trained)
+
+
 def is_done(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> bool:
     """Is there a result that so many minutes would not better?"""
     result = result_if_any(cell)
@@ -265,7 +280,8 @@ def trainings_to_run(chosen: list[Cell], trainings: dict[str, Cell], missing: Ca
     """What the chosen cells need: trainings that are missing, and those done elsewhere whose weights are not here."""
 
     def weights_gone(cell):
-        return "attempted" not in result_if_any(cell) and not (run_dir_of(cell) / "checkpoints").is_dir()
+        trained = result_if_any(cell)
+        return "attempted" not in trained and not weights_are_here(cell, trained)
 
     needed = list({cell.training: trainings[cell.training] for cell in chosen if cell.training}.values())
     waiting = {cell.training for cell in chosen if missing(cell)}
@@ -288,8 +304,8 @@ def compute(cell: Cell, minutes: float, trainings: dict[str, Cell]) -> str:
         if "attempted" in trained:
             words = f"its training: {trained['attempted']}"
             return write(cell, minutes, {"attempted": words, "of_training": identity(trained)})
-        if not (OUTPUTS / "train" / cell.training / "checkpoints").is_dir():
-            raise Failed(f"the run folder of {cell.training} is not here")
+        if not weights_are_here(trainings[cell.training], trained):
+            raise Failed(f"the weights of {cell.training} are not here")
     result = COMPUTE[cell.kind](cell, minutes)
     if stopped.is_set():
         raise Failed("stopped")
