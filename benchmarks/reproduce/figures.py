@@ -516,8 +516,8 @@ FIGURES = {
         "towards 1. Each network with the K that it is used with, so that masks and search are not told apart here; "
         "the table below has other K. A thin line goes on where the mean ends. Without clipping the 4D network is "
         "fcn4d at 6x6x5, bit for bit, and not drawn. Where the tote is one cell high the end effector may hang over "
-        "its walls; on another processor seed 1 of fcn4d hit them with every first item once the tote was two cells high, "
-        "found no reward to learn from for the rest of its hour, and had 0 where it has 0.35 at K=10 here.",
+        "its walls; on another processor seed 1 of fcn4d hit them with every first item once the tote was two cells "
+        "high, found no reward to learn from for the rest of its hour, and had 0 where it has 0.35 at K=10 here.",
         learning_curves,
     ),
     "rl_methods": (

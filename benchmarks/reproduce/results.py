@@ -19,15 +19,15 @@ HEAD = """# The paper's comparison, run again
 
 Made by `make results` from the JSON in [`results/`](results), which `make reproduce` computes cell by cell; each JSON
 holds the command of its cell. All methods meet the same episodes of the test stream, seed 0. Brackets are 95%
-confidence intervals of the mean over episodes; ° marks fewer than {few} episodes: indicative. *Budget* is what
-the method was trained with: frames, and minutes of one core; a cell has an hour, seeds 1 and 2 of fcn4d with R=4
-six minutes more, and less where its definition says so. s0, s1 and s2 are training seeds; what has one of them alone was trained once. *No better than random* marks a
-policy that is not surely above random feasible choices on the same episodes, which know the mask; a policy that was
-trained with a mask does not without one. *Attempted* cells could not be done within their budget, or within 20 GiB, and
-tell how far off they were. The time of a decision is a mean of CPU time, of one tote in one thread, over 20 or more;
-older cells have the median, and the oldest by the clock, on a machine that did other work beside. Processors differ,
-and so do times, what a budget of minutes is worth, and what a seed comes to
-([how much](experiments.md#the-same-seeds-on-another-processor)). Computed on: {processors}
+confidence intervals of the mean over episodes; ° marks fewer than {few} episodes: indicative. *Budget* is what the
+method was trained with: frames, and minutes of one core; a cell has an hour, seeds 1 and 2 of fcn4d with R=4 six
+minutes more, and less where its definition says so. s0, s1 and s2 are training seeds; what has one of them alone was
+trained once. *No better than random* marks a policy that is not surely above random feasible choices on the same
+episodes, which know the mask; a policy that was trained with a mask does not without one. *Attempted* cells could not
+be done within their budget, or within 20 GiB, and tell how far off they were. The time of a decision is a mean of CPU
+time, of one tote in one thread, over 20 or more; older cells have the median, and the oldest by the clock, on a
+machine that did other work beside. Processors differ, and so do times, what a budget of minutes is worth, and what a
+seed comes to ([how much](experiments.md#the-same-seeds-on-another-processor)). Computed on: {processors}
 
 In the figures a point is the mean over episodes, and over seeds where there are several. Bars are 95% confidence
 intervals over episodes, widened to the range of the seeds; they have no width where all episodes are alike. Hollow:
