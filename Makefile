@@ -19,13 +19,13 @@ $(STAMP): pyproject.toml $(LOCK)
 	@touch $@
 
 demo: $(STAMP)  ## pack totes with the weights that come along, and show it in a browser
-	$(BIN)/python -m pickplace.evaluate checkpoint=pretrained/r4 evaluation.episodes=20 hydra.run.dir=outputs/demo $(ARGS)
-	@$(BIN)/python -m pickplace.show outputs/demo/replay.html
+	$(BIN)/pickplace-evaluate checkpoint=pretrained/r4 evaluation.episodes=20 hydra.run.dir=outputs/demo $(ARGS)
+	@echo "Open outputs/demo/replay.html in a browser."
 
 train: RUN_DIR := $(RUN)
 train: $(STAMP)  ## train (experiment=quick; ARGS="key=value ..." adds overrides), evaluate, and show a packed tote
-	$(BIN)/python -m pickplace.train experiment=quick hydra.run.dir=$(RUN_DIR) $(ARGS)
-	$(BIN)/python -m pickplace.evaluate checkpoint=$(RUN_DIR) hydra.run.dir=$(RUN_DIR)/evaluation
+	$(BIN)/pickplace-train experiment=quick hydra.run.dir=$(RUN_DIR) $(ARGS)
+	$(BIN)/pickplace-evaluate checkpoint=$(RUN_DIR) hydra.run.dir=$(RUN_DIR)/evaluation
 	@printf '\n%s\n' "Run folder $(RUN_DIR):"
 	@printf '  %-32s%s\n' \
 	  checkpoints/best 'the policy, for pickplace-evaluate checkpoint=$(RUN_DIR)' \

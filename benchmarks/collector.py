@@ -12,8 +12,8 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
 
 from pickplace import PickPlaceEnv
-from pickplace.collector import single
-from pickplace.curriculum import Current, Curriculum, NoAdvance
+from pickplace.training.collectors import single
+from pickplace.training.curriculum import Current, Curriculum, NoAdvance
 
 BATCHES = (256, 1024)
 MASKS = (("action",), ("outcome",))

@@ -7,8 +7,8 @@ import torch
 from common import interleave, save, use_one_core
 
 from pickplace import PickPlaceEnv
-from pickplace.models.actors import fcn4d, fcn_grasp
 from pickplace.planners import PolicyPlanner
+from pickplace.policies.actors import fcn4d, fcn_grasp
 
 TOTES = ((6, 6, 5), (10, 10, 10), (30, 30, 10))
 POLICIES = {"fcn_grasp": (fcn_grasp, {}), "fcn4d": (fcn4d, {"compute_dtype": "bfloat16"})}

@@ -31,7 +31,7 @@ SLOTS = 128
 def ours(seed: int, whole: bool) -> dict:
     """One run of ``experiment=quick``, to its end or to the last mark: its validations, how its time was spent."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "pickplace.train", "experiment=quick", f"seed={seed}"]
+        command = [sys.executable, "-m", "pickplace.training.train", "experiment=quick", f"seed={seed}"]
         command += ["evaluation_interval=50_000", f"hydra.run.dir={folder}"]
         started, curve = time.perf_counter(), []
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -71,7 +71,7 @@ def peer(seconds: float) -> dict | None:
     except ImportError:
         sys.stderr.write("sb3-contrib is not installed: the peer is skipped (pip install sb3-contrib)\n")
         return None
-    from pickplace.gym import PickPlaceVectorEnv
+    from pickplace.envs.gymnasium import PickPlaceVectorEnv
 
     class Slots(VecEnv):
         """`PickPlaceVectorEnv` as stable-baselines3 wants it, the two maps as one image."""

@@ -13,9 +13,9 @@ from common import save
 from hydra import compose, initialize_config_dir
 from torchrl.envs import TransformedEnv
 
-from pickplace import config
-from pickplace.models.actors import OutcomePolicy
-from pickplace.train import train
+from pickplace.policies.actors import OutcomePolicy
+from pickplace.runs import hydra_app as config
+from pickplace.training.train import train
 
 FRAMES = 300_000
 

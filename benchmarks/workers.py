@@ -10,7 +10,7 @@ from pathlib import Path
 
 from common import save, spread
 
-from pickplace.metrics import read_csv
+from pickplace.runs.loggers import read_csv
 
 FRAMES, REPEATS = 65_536, 3
 NEVER = ["evaluation_interval=1_000_000_000", "evaluation.episodes=1", "evaluation.batch_size=1"]
@@ -25,7 +25,7 @@ COLLECTORS = {"single": ["collector=single"], "multi_sync, 2 workers": ["collect
 def batches(overrides: list[str]) -> list[float]:
     """Milliseconds that each batch of a training took, without the first ones, which warm up."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "pickplace.train", *overrides, *NEVER]
+        command = [sys.executable, "-m", "pickplace.training.train", *overrides, *NEVER]
         command += [f"total_frames={FRAMES}", f"hydra.run.dir={folder}/run"]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         rows = read_csv(Path(folder) / "run" / "metrics.csv")

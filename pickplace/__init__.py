@@ -6,21 +6,21 @@ from typing import TYPE_CHECKING
 import gymnasium
 
 if TYPE_CHECKING:
-    from pickplace.env import PickPlaceEnv
-    from pickplace.geometry import Failure, Item, Rules
-    from pickplace.robot import DepthMapError, Plan, Planner
+    from pickplace.envs.torchrl import PickPlaceEnv
+    from pickplace.robot.planner import DepthMapError, Plan, Planner
+    from pickplace.task.geometry import Failure, Item, Rules
 
 gymnasium.register(
     "pickplace/PickPlace-v0",
-    entry_point="pickplace.gym:PickPlaceGymEnv",
-    vector_entry_point="pickplace.gym:PickPlaceVectorEnv",
+    entry_point="pickplace.envs.gymnasium:PickPlaceGymEnv",
+    vector_entry_point="pickplace.envs.gymnasium:PickPlaceVectorEnv",
 )
 
 __version__ = "0.1.0"
 __all__ = ["DepthMapError", "Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "Rules", "__version__"]
 
-_HOMES = {"PickPlaceEnv": "env", "Failure": "geometry", "Item": "geometry", "Rules": "geometry"}
-_HOMES |= {"DepthMapError": "robot", "Plan": "robot", "Planner": "robot"}
+_HOMES = {"PickPlaceEnv": "envs.torchrl", "Failure": "task.geometry", "Item": "task.geometry", "Rules": "task.geometry"}
+_HOMES |= {"DepthMapError": "robot.planner", "Plan": "robot.planner", "Planner": "robot.planner"}
 
 
 def __getattr__(name: str):

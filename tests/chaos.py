@@ -16,8 +16,8 @@ from pathlib import Path
 
 from test_resume import ITERATION, SETTINGS, assert_same
 
-from pickplace import train
-from pickplace.metrics import read_csv
+from pickplace.runs.loggers import read_csv
+from pickplace.training import train
 
 UNFINISHED = ".last.new", ".last.old"  # in checkpoints/, while it saves
 

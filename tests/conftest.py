@@ -7,7 +7,9 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hypothesis import HealthCheck, settings
 
-from pickplace import config, evaluate, train
+from pickplace.evaluation import evaluate
+from pickplace.runs import hydra_app as config
+from pickplace.training import train
 
 # A busy machine is no fault of the code.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])

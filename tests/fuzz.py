@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from pickplace import Planner, Rules
-from pickplace.geometry import Item
-from pickplace.models.actors import fcn_grasp
-from pickplace.plan import answer
-from pickplace.robot import DepthMapError
+from pickplace.policies.actors import fcn_grasp
+from pickplace.robot.json_lines import answer
+from pickplace.robot.planner import DepthMapError
+from pickplace.task.geometry import Item
 
 DEFAULTS = {"tote_height": None, "cell_size": None, "tolerance": 0.25, "alternatives": 3}
 ODD = [

@@ -41,7 +41,7 @@ def training(minutes: float, *overrides: str) -> str:
         command = [
             sys.executable,
             "-m",
-            "pickplace.train",
+            "pickplace.training.train",
             "experiment=quick",
             "total_frames=1_000_000_000",
             "threads=1",
@@ -63,7 +63,7 @@ def planning(lines: int) -> str:
     """Answer so many requests, good and bad ones."""
     draw = np.random.default_rng(0)
     process = subprocess.Popen(
-        [sys.executable, "-m", "pickplace.plan", "pretrained/r4", "--threads", "1"],
+        [sys.executable, "-m", "pickplace.robot.json_lines", "pretrained/r4", "--threads", "1"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE,
     )  # fmt: skip
     samples = []

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save
 
-from pickplace import checkpoint
-from pickplace.checkpoint import CheckpointError
-from pickplace.metrics import CsvLogger, read_csv
+from pickplace.runs import checkpoint
+from pickplace.runs.checkpoint import CheckpointError
+from pickplace.runs.loggers import CsvLogger, read_csv
 
 leaves = st.one_of(
     st.integers(-(2**40), 2**40),

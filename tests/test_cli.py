@@ -11,14 +11,14 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from pickplace import checkpoint
+from pickplace.runs import checkpoint
 
 
 @pytest.fixture(scope="module")
 def smoke_run(tmp_path_factory):
     """A small finished run."""
     run_dir = tmp_path_factory.mktemp("smoke") / "run"
-    command = [sys.executable, "-m", "pickplace.train", "experiment=smoke", f"hydra.run.dir={run_dir}"]
+    command = [sys.executable, "-m", "pickplace.training.train", "experiment=smoke", f"hydra.run.dir={run_dir}"]
     subprocess.run(command, check=True, capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
     return run_dir
 
@@ -27,7 +27,7 @@ BAD = [
     ("train", ["algo.gama=0.9"], ["algo.gama", "'gamma'"]),
     ("train", ["+algo.gama=0.9"], ["algo.gama", "'gamma'"]),
     ("train", ["+env.foo=1"], ["PickPlaceEnv", "'foo'"]),
-    ("train", ["+curriculum.advance.foo=1"], ["pickplace.curriculum.Threshold", "foo"]),
+    ("train", ["+curriculum.advance.foo=1"], ["pickplace.training.curriculum.Threshold", "foo"]),
     ("train", ["-m", "algo.gama=0.9,1"], ["algo.gama", "'gamma'"]),
     ("train", ["-m", "env.rotations=5,6"], ["rotations=5", "1, 2, 3 or 4"]),
     ("train", ["-m", "curriculum=none,mien"], ["curriculum/mien", "adaptive"]),
@@ -276,7 +276,7 @@ def test_sweep_and_own_curriculum(run, tmp_path):
     folder.mkdir(parents=True)
     (folder / "mine.yaml").write_text(
         "defaults:\n  - advance: threshold\n  - sample: recent\n  - _self_\n"
-        "_target_: pickplace.curriculum.Curriculum\nstart_height: 1\nend_height: null\n"
+        "_target_: pickplace.training.curriculum.Curriculum\nstart_height: 1\nend_height: null\n"
         "advance: {occupancy: 0.1, window: 5}\n"
     )
     settings = ["experiment=smoke", "curriculum=mine", "env.tote_size=[4,4,2]", "hydra.sweep.dir=sweep"]
@@ -288,7 +288,7 @@ def test_sweep_and_own_curriculum(run, tmp_path):
 
 @pytest.mark.parametrize(
     "command",
-    [[sys.executable, "-m", "pickplace.train"], [str(Path(sys.executable).with_name("pickplace-evaluate"))]],
+    [[sys.executable, "-m", "pickplace.training.train"], [str(Path(sys.executable).with_name("pickplace-evaluate"))]],
     ids=["module", "script"],
 )
 def test_help_from_any_directory(command, tmp_path):

@@ -6,13 +6,15 @@ import torch
 from hydra import compose, initialize_config_dir
 from torchrl.modules import ValueOperator
 
-from pickplace import PickPlaceEnv, config
-from pickplace.curriculum import Curriculum
-from pickplace.items import ItemDistribution
-from pickplace.metrics import read_csv
-from pickplace.models.actors import as_collection_policy, fcn_grasp
-from pickplace.models.critics import Conv4dCritic, PooledCritic
-from pickplace.train import make_losses, train
+from pickplace import PickPlaceEnv
+from pickplace.policies.actors import as_collection_policy, fcn_grasp
+from pickplace.policies.networks.critics import Conv4dCritic, PooledCritic
+from pickplace.runs import hydra_app as config
+from pickplace.runs.loggers import read_csv
+from pickplace.runs.registry import build
+from pickplace.task.items import ItemDistribution
+from pickplace.training.curriculum import Curriculum
+from pickplace.training.train import make_losses, train
 
 CONF = config.conf_dir()
 TINY = [
@@ -34,7 +36,7 @@ def composed(*overrides, name="train"):
 @pytest.mark.parametrize("name", options("env"))
 def test_every_env(name):
     cfg = composed(f"env={name}")
-    env = config.instantiate(cfg.env, items=config.instantiate(cfg["items"]), num_envs=2)
+    env = build("env", cfg.env, items=build("items", cfg["items"]), num_envs=2)
     assert isinstance(env, PickPlaceEnv)
     assert env.reset()["action_mask"].any(1).all()
 
@@ -44,28 +46,28 @@ def test_every_item_distribution(name, tmp_path):
     table = tmp_path / "items.csv"
     table.write_text("w,d,h\n1,1,1\n2,1,1\n")
     cfg = composed(f"items={name}", *([f"items.path={table}"] if name == "recorded" else []))
-    assert isinstance(config.instantiate(cfg["items"]), ItemDistribution)
+    assert isinstance(build("items", cfg["items"]), ItemDistribution)
 
 
 @pytest.mark.parametrize("masked", [True, False])
 @pytest.mark.parametrize("name", options("model"))
 def test_every_model(name, masked):
     cfg, rules = composed(f"model={name}"), PickPlaceEnv(num_envs=1).rules
-    policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=masked)
+    policy = build("model.actor", cfg.model.actor, rules=rules, mask_infeasible=masked)
     assert policy.mask_infeasible is masked
-    assert isinstance(config.instantiate(cfg.model.critic, rules=rules), Conv4dCritic | PooledCritic)
+    assert isinstance(build("model.critic", cfg.model.critic, rules=rules), Conv4dCritic | PooledCritic)
 
 
 @pytest.mark.parametrize("name", options("curriculum"))
 def test_every_curriculum(name):
-    assert isinstance(config.instantiate(composed(f"curriculum={name}").curriculum), Curriculum)
+    assert isinstance(build("curriculum", composed(f"curriculum={name}").curriculum), Curriculum)
 
 
 @pytest.mark.parametrize("name", options("logger"))
 def test_every_logger(name, tmp_path):
     if name not in ("csv", "none"):
         pytest.importorskip(name)
-    logger = config.instantiate(composed(f"logger={name}").logger, folder=tmp_path, frames=0)
+    logger = build("logger", composed(f"logger={name}").logger, folder=tmp_path, frames=0)
     logger.log({"train/occupancy": 0.5}, 10)
     logger.close()
     kept = read_csv(tmp_path / "metrics.csv") if name != "none" else []
@@ -81,9 +83,9 @@ def test_every_planner(name):
         kwargs["items"] = env.items
     if name in ("policy", "lookahead"):
         model = composed().model.actor
-        kwargs["policy"] = config.instantiate(model, rules=env.rules, mask_infeasible=True)
+        kwargs["policy"] = build("model.actor", model, rules=env.rules, mask_infeasible=True)
     observation = env.reset()
-    action = config.instantiate(cfg.planner, rules=env.rules, **kwargs).decide(observation)
+    action = build("planner", cfg.planner, rules=env.rules, **kwargs).decide(observation)
     assert ((action >= 0) & (action < env.rules.num_actions)).all()
     if name not in ("uniform", "individual_heuristic", "mcts"):
         assert observation["action_mask"].gather(1, action[:, None]).all()
@@ -206,4 +208,4 @@ def test_refused_overrides_on_a_saved_config(override, message):
 def test_the_parts_of_every_curriculum_can_be_exchanged(composition, part):
     for name in options(f"curriculum/{part}"):
         cfg = composed(f"curriculum={composition}", f"curriculum/{part}={name}")
-        config.instantiate(cfg.curriculum).setup(1, 5, 10**9)
+        build("curriculum", cfg.curriculum).setup(1, 5, 10**9)

@@ -17,7 +17,7 @@ from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from pickplace import PickPlaceEnv
-from pickplace.curriculum import (
+from pickplace.training.curriculum import (
     Advance,
     Current,
     Curriculum,
@@ -675,7 +675,7 @@ def test_a_users_curriculum_is_one_file(tmp_path):
     (tmp_path / "curriculum").mkdir()
     (tmp_path / "curriculum" / "mine.yaml").write_text(
         "defaults: [{advance: plateau}, {sample: uniform}, _self_]\n"
-        "_target_: pickplace.curriculum.Curriculum\n"
+        "_target_: pickplace.training.curriculum.Curriculum\n"
         "start_height: 2\n"
         "advance: {patience: 7}\n"
     )

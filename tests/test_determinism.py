@@ -7,7 +7,8 @@ import pytest
 import torch
 from test_resume import assert_same
 
-from pickplace import Planner, evaluate
+from pickplace import Planner
+from pickplace.evaluation import evaluate
 
 PAPER = [(1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1)]
 

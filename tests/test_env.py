@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs, step_mdp
 
 from pickplace import PickPlaceEnv
-from pickplace.items import Kinds
+from pickplace.task.items import Kinds
 
 PAPER = [(1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1)]
 OBSERVATION = ("bin_depth", "tote_depth", "tote_height", "action_mask")
@@ -486,7 +486,7 @@ def test_the_oracle_by_hand():
 @pytest.mark.parametrize("kept", [0, 5000, 2**26])
 @pytest.mark.parametrize("masks", [("action",), ("outcome", "action"), ()])
 def test_masks_of_empty_totes_are_kept_and_are_the_same(kept, masks, monkeypatch):
-    monkeypatch.setattr("pickplace.env.STARTS_BYTES", kept)
+    monkeypatch.setattr("pickplace.envs.torchrl.STARTS_BYTES", kept)
     kinds = [(1, 1, 1), (2, 1, 2), (1, 3, 1)]
     env = make_env(kinds, tote_size=(4, 4, 4), num_envs=12, masks=masks)
     generator = torch.Generator().manual_seed(0)

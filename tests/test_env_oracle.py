@@ -10,7 +10,7 @@ from oracle import SUCCESS, Oracle, Rules, can_always_start
 from tensordict import TensorDict
 
 from pickplace import PickPlaceEnv
-from pickplace.items import Kinds
+from pickplace.task.items import Kinds
 
 NUM_ENVS, STEPS = (1, 4, 8, 12), 25  # per configuration: 25 to 300 transitions
 SUPPORTS = (0.0, 0.25, 1 / 3, 0.5, 0.6, 2 / 3, 0.75, 1.0)

@@ -10,11 +10,12 @@ import numpy
 import pytest
 import torch
 
-from pickplace import PickPlaceEnv, evaluate
-from pickplace.geometry import Failure
-from pickplace.items import Recorded
+from pickplace import PickPlaceEnv
+from pickplace.evaluation import evaluate
 from pickplace.planners import JointDBL, RandomFeasible
-from pickplace.report import evaluation_table
+from pickplace.task.geometry import Failure
+from pickplace.task.items import Recorded
+from pickplace.views.figures import evaluation_table
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def two_rotations(tmp_path_factory):
     """The folder of a short run with ``R = 2``."""
     run_dir = tmp_path_factory.mktemp("two") / "run"
     settings = ["experiment=smoke", "env.rotations=2", "total_frames=256", f"hydra.run.dir={run_dir}"]
-    command = [sys.executable, "-m", "pickplace.train", *settings]
+    command = [sys.executable, "-m", "pickplace.training.train", *settings]
     subprocess.run(command, check=True, capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
     return run_dir
 

@@ -21,13 +21,16 @@ from torchrl._utils import _check_for_faulty_process
 from torchrl.collectors import RandomPolicy
 from torchrl.envs import TransformedEnv
 
-from pickplace import PickPlaceEnv, Planner, checkpoint, collector, config
-from pickplace.collector import ignore_signals, watched
-from pickplace.config import WorkerDied
-from pickplace.evaluate import main as evaluate_main
-from pickplace.resume import claim, saying_what_is_safe
-from pickplace.train import main as train_main
-from pickplace.train import resume_run
+from pickplace import PickPlaceEnv, Planner
+from pickplace.evaluation.evaluate import main as evaluate_main
+from pickplace.runs import checkpoint
+from pickplace.runs import hydra_app as config
+from pickplace.runs.hydra_app import WorkerDied
+from pickplace.runs.resume import claim, saying_what_is_safe
+from pickplace.training import collectors as collector
+from pickplace.training.collectors import ignore_signals, watched
+from pickplace.training.train import main as train_main
+from pickplace.training.train import resume_run
 
 ENDLESS = ["experiment=smoke", "total_frames=10_000_000", "threads=1"]
 
@@ -45,7 +48,7 @@ def test_a_dead_worker_ends_the_run_in_one_sentence(tmp_path):
     assert process.returncode == 2
     sentence = error.strip().splitlines()[-1]
     assert sentence.startswith("error: collector worker 2 of 2 has died (exit code -9). What was saved before")
-    assert f" is whole: python -m pickplace.train resume={run_dir}/checkpoints/" in sentence
+    assert f" is whole: pickplace-train resume={run_dir}/checkpoints/" in sentence
     assert checkpoint.read(run_dir / "checkpoints" / "last")
 
 

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pickplace import PickPlaceEnv
-from pickplace.geometry import Rules
-from pickplace.items import Kinds
-from pickplace.models.actors import MASKED, as_collection_policy, fcn_grasp
-from pickplace.models.critics import PooledCritic
-from pickplace.models.fcn_grasp import FootprintFcn, matrix_dtype
+from pickplace.policies.actors import MASKED, as_collection_policy, fcn_grasp
+from pickplace.policies.networks.critics import PooledCritic
+from pickplace.policies.networks.footprint_fcn import FootprintFcn, matrix_dtype
+from pickplace.task.geometry import Rules
+from pickplace.task.items import Kinds
 
 
 def random_state(generator, batch, bin_size, tote_size):

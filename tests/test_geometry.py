@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pickplace import Rules
-from pickplace.geometry import Item
+from pickplace.task.geometry import Item
 
 SIDES, ODD = st.integers(1, 4), st.sampled_from([1, 3])
 

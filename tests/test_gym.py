@@ -14,9 +14,9 @@ from tensordict import TensorDict
 
 import pickplace
 from pickplace import PickPlaceEnv
-from pickplace.gym import KEYS
-from pickplace.items import Recorded
-from pickplace.report import draw_scene
+from pickplace.envs.gymnasium import KEYS
+from pickplace.task.items import Recorded
+from pickplace.views.figures import draw_scene
 
 ID = "pickplace/PickPlace-v0"
 SMALL = {"tote_size": (4, 5, 2), "items": [(1, 1, 1), (2, 1, 1), (2, 2, 1)]}
@@ -60,7 +60,9 @@ def test_stable_baselines_checker():
 @given(st.integers(0, 2**31), st.integers(1, 3), st.sampled_from([1, 2]))
 def test_single_against_the_batched_environment(seed, slots, height):
     """Episode ``e`` of a seed is slot ``e`` of the environment underneath, in all that an agent gets."""
-    below = PickPlaceEnv(tote_size=(4, 5, 2), items=pickplace.gym.Kinds(SMALL["items"]), num_envs=slots, seed=seed)
+    below = PickPlaceEnv(
+        tote_size=(4, 5, 2), items=pickplace.envs.gymnasium.Kinds(SMALL["items"]), num_envs=slots, seed=seed
+    )
     states = below.reset(TensorDict({"tote_height": torch.full((slots, 1), height)}, [slots]))
     env, generator = make(), np.random.default_rng(seed)
     histories = []
@@ -179,7 +181,7 @@ def test_observations_are_copies():
 
 def test_a_recorded_stream_truncates(tmp_path):
     (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
-    env = make(items=pickplace.items.Recorded(tmp_path / "items.csv"), render_mode="rgb_array")
+    env = make(items=pickplace.task.items.Recorded(tmp_path / "items.csv"), render_mode="rgb_array")
     _, info = env.reset(seed=0)
     for expected in (False, True):
         _, _, terminated, truncated, info = env.step(int(np.flatnonzero(info["action_mask"])[0]))
@@ -200,7 +202,9 @@ def test_render():
 def test_an_item_keeps_its_colour_through_an_episode(monkeypatch):
     """Whatever is placed after it."""
     seen = []
-    monkeypatch.setattr("pickplace.gym.draw_scene", lambda *given: (seen.append(given[2]), draw_scene(*given))[1])
+    monkeypatch.setattr(
+        "pickplace.envs.gymnasium.draw_scene", lambda *given: (seen.append(given[2]), draw_scene(*given))[1]
+    )
     env = make(items=[(2, 2, 1), (1, 1, 1)], render_mode="rgb_array")
     _, info = env.reset(seed=0)
     while info["action_mask"].any():
@@ -297,7 +301,9 @@ def test_a_picture_shows_its_own_episode():
 
 def test_the_picture_of_the_bin_lies_as_the_map_of_the_tote(monkeypatch):
     seen = []
-    monkeypatch.setattr("pickplace.gym.draw_scene", lambda *given: seen.append(draw_scene(*given)) or seen[-1])
+    monkeypatch.setattr(
+        "pickplace.envs.gymnasium.draw_scene", lambda *given: seen.append(draw_scene(*given)) or seen[-1]
+    )
     env = make(bin_size=(3, 6, 1), render_mode="rgb_array")
     observation, _ = env.reset(seed=0)
     env.render()

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pickplace import Item, PickPlaceEnv, Rules
-from pickplace.evaluate import play
-from pickplace.models.actors import fcn4d, fcn_grasp, individual_grasp, individual_rl
+from pickplace.evaluation.evaluate import play
 from pickplace.planners import IndividualHeuristic, PolicyPlanner, RandomFeasible
 from pickplace.planners.individual import corner_footprints
+from pickplace.policies.actors import fcn4d, fcn_grasp, individual_grasp, individual_rl
 
 
 def maximal_rectangles(free):

@@ -5,9 +5,10 @@ import torch
 from scipy.stats import chisquare
 from tensordict import TensorDict
 
-from pickplace import PickPlaceEnv, train
-from pickplace.items import MOST_SEEDS, STREAMS, Kinds, Recorded, Uniform, hashed_uniform
-from pickplace.train import make_losses
+from pickplace import PickPlaceEnv
+from pickplace.task.items import MOST_SEEDS, STREAMS, Kinds, Recorded, Uniform, hashed_uniform
+from pickplace.training import train
+from pickplace.training.train import make_losses
 
 
 def numbers(stream="train", seed=0, episode=0, count=50_000):

@@ -6,12 +6,13 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from pickplace import PickPlaceEnv, Rules, checkpoint
-from pickplace.evaluate import confidence95, play
-from pickplace.items import Kinds, Recorded
-from pickplace.models.actors import fcn_grasp
+from pickplace import PickPlaceEnv, Rules
+from pickplace.evaluation.evaluate import confidence95, play
 from pickplace.planners import Lookahead, PolicyPlanner
 from pickplace.planners.policy import restore_critic
+from pickplace.policies.actors import fcn_grasp
+from pickplace.runs import checkpoint
+from pickplace.task.items import Kinds, Recorded
 
 SMALL = {"tote_size": (4, 4, 1)}
 

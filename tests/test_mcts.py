@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from pickplace import PickPlaceEnv
-from pickplace.evaluate import play
-from pickplace.items import Kinds, Recorded
+from pickplace.evaluation.evaluate import play
 from pickplace.planners import MCTS
 from pickplace.planners.mcts import _Edge, _Node
+from pickplace.task.items import Kinds, Recorded
 
 OPTIMUM = 0.9456  # 4x4x1, R=4, see tests/test_optimum.py
 

@@ -6,10 +6,13 @@ import pytest
 from dynamic_programming import optimal_occupancy
 from hydra import compose, initialize_config_dir
 
-from pickplace import PickPlaceEnv, checkpoint, config
-from pickplace.evaluate import play
+from pickplace import PickPlaceEnv
+from pickplace.evaluation.evaluate import play
 from pickplace.planners import JointDBL, PolicyPlanner, RandomFeasible
-from pickplace.train import train
+from pickplace.runs import checkpoint
+from pickplace.runs import hydra_app as config
+from pickplace.runs.registry import build
+from pickplace.training.train import train
 
 OPTIMA = {  # rules of the task, "Exact optimum"
     (3, 3, 1): 0.7864,
@@ -56,8 +59,8 @@ def test_fcn_grasp_trained_there_comes_within_2_percent(tmp_path):
     state, _ = checkpoint.read(tmp_path / "checkpoints" / "last")
     make = make_env(4)
     rules = make(0, 1).rules
-    build = partial(config.instantiate, cfg.model.actor, rules=rules, mask_infeasible=True)
-    policy = checkpoint.restore(build, state["policy"], "policy")
+    make_policy = partial(build, "model.actor", cfg.model.actor, rules=rules, mask_infeasible=True)
+    policy = checkpoint.restore(make_policy, state["policy"], "policy")
     occupancy = play(make, PolicyPlanner(rules, policy), 2000, 1000).occupancy
     noise = occupancy.std() / len(occupancy) ** 0.5
     assert occupancy.mean() < OPTIMA[4, 4, 4] + 3 * noise

@@ -8,10 +8,10 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace import PickPlaceEnv
-from pickplace.evaluate import play
-from pickplace.items import Uniform
-from pickplace.models.actors import FlatPolicy, GraspPolicy, OutcomePolicy, as_actor, as_collection_policy
+from pickplace.evaluation.evaluate import play
 from pickplace.planners import JointDBL, PolicyPlanner, RandomFeasible
+from pickplace.policies.actors import FlatPolicy, GraspPolicy, OutcomePolicy, as_actor, as_collection_policy
+from pickplace.task.items import Uniform
 
 # planner, tote, R, items, occupancy and its standard error, from an independent prototype of the rules. Where no error
 # is known (None): that of 100 episodes, as those of joint_dbl with mixed items are, and of rounding to 0.01.

@@ -7,8 +7,9 @@ import sys
 import pytest
 from safetensors import safe_open
 
-from pickplace import checkpoint, evaluate
-from pickplace.export import CARD, asks_critic
+from pickplace.evaluation import evaluate
+from pickplace.evaluation.export import CARD, asks_critic
+from pickplace.runs import checkpoint
 
 CARDS = sorted(checkpoint.PRETRAINED.glob(f"*/{CARD}"))
 
@@ -49,7 +50,7 @@ def test_card_tells_what_the_weights_are(path):
 def test_export_refuses_an_evaluation_of_something_else(tmp_path):
     wrong = tmp_path / "evaluation.json"
     wrong.write_text(json.dumps({"trained": {"frames": 1, "seed": 0, "commit": None}}))
-    command = [sys.executable, "-m", "pickplace.export", "pretrained/r4", str(tmp_path / "out"), str(wrong)]
+    command = [sys.executable, "-m", "pickplace.evaluation.export", "pretrained/r4", str(tmp_path / "out"), str(wrong)]
     result = subprocess.run(command, capture_output=True, text=True)
     assert result.returncode == 2 and "it evaluates a policy of" in result.stderr and result.stderr.count("\n") == 1
     assert not (tmp_path / "out").exists()

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 import torch
 
-from pickplace import Failure, PickPlaceEnv, Rules, evaluate, replay
-from pickplace.items import Kinds, Uniform
-from pickplace.models.actors import fcn_grasp
+from pickplace import Failure, PickPlaceEnv, Rules
+from pickplace.evaluation import evaluate
 from pickplace.planners import JointDBL, PolicyPlanner, UniformRandom
-from pickplace.replay import Move, Recording
+from pickplace.policies.actors import fcn_grasp
+from pickplace.task.items import Kinds, Uniform
+from pickplace.views import replay
+from pickplace.views.replay import Move, Recording
 
 CELLS = {
     "paper": ({}, None),

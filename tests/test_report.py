@@ -6,9 +6,10 @@ import sys
 import numpy as np
 import pytest
 
-from pickplace import replay, report
-from pickplace.geometry import Failure, Rules
-from pickplace.replay import Move, Recording
+from pickplace.task.geometry import Failure, Rules
+from pickplace.views import figures as report
+from pickplace.views import replay
+from pickplace.views.replay import Move, Recording
 
 
 def random_boxes(rng, size, count):
@@ -181,7 +182,7 @@ def test_evaluation_table_of_a_policy():
 
 
 def test_importing_the_package_does_not_import_matplotlib():
-    code = "import sys, pickplace.report, pickplace.evaluate; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, pickplace.views.figures, pickplace.evaluation.evaluate; sys.exit('matplotlib' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

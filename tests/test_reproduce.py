@@ -17,9 +17,10 @@ import run
 from cell import BATCH, fitting_batch
 from hydra import compose, initialize_config_dir
 
-from pickplace import PickPlaceEnv, config
-from pickplace.items import Kinds
-from pickplace.metrics import CsvLogger
+from pickplace import PickPlaceEnv
+from pickplace.runs import hydra_app as config
+from pickplace.runs.loggers import CsvLogger
+from pickplace.task.items import Kinds
 
 FOLDER = Path(__file__).parents[1] / "benchmarks" / "reproduce"
 

@@ -13,10 +13,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from pickplace import checkpoint
-from pickplace import train as train_module
-from pickplace.metrics import read_csv
-from pickplace.train import resume_run, train
+from pickplace.runs import checkpoint
+from pickplace.runs.loggers import read_csv
+from pickplace.training import train as train_module
+from pickplace.training.train import resume_run, train
 
 ITERATION = 8 * 16  # frames: env.num_envs * algo.rollout_length of experiment=smoke
 SETTINGS = [
@@ -38,7 +38,7 @@ SETTINGS = [
 
 def start(*overrides, own_group=False):
     """A training process of its own."""
-    command = [sys.executable, "-m", "pickplace.train", *overrides]
+    command = [sys.executable, "-m", "pickplace.training.train", *overrides]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(
         command,

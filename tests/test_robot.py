@@ -17,10 +17,14 @@ from oracle import Oracle
 from oracle import Rules as OracleRules
 from tensordict import TensorDict
 
-from pickplace import DepthMapError, Failure, Planner, Rules, checkpoint, config, plan
-from pickplace.models.actors import fcn4d, fcn_grasp
+from pickplace import DepthMapError, Failure, Planner, Rules
 from pickplace.planners import PolicyPlanner
 from pickplace.planners.policy import restore_policy
+from pickplace.policies.actors import fcn4d, fcn_grasp
+from pickplace.robot import json_lines as plan
+from pickplace.runs import checkpoint
+from pickplace.runs import hydra_app as config
+from pickplace.runs.registry import build
 
 EMPTY = np.full((6, 6), 5)
 ITEM = np.zeros((5, 5), dtype=np.int64)
@@ -372,7 +376,7 @@ def test_load_of_a_policy_whose_grasps_depend_on_the_items(tmp_path):
     with hydra.initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
         cfg = hydra.compose("train", overrides)
     rules = Rules(tote_size=(5, 5, 2), pick_rule="overlap", longest_side=2)
-    policy = config.instantiate(cfg.model.actor, rules=rules, mask_infeasible=False)
+    policy = build("model.actor", cfg.model.actor, rules=rules, mask_infeasible=False)
     facts = {"frames": 0, "config": OmegaConf.to_container(cfg), "commit": None}
     checkpoint.write(tmp_path / "it", {"policy": policy.state_dict()}, facts)
     loaded = Planner.load(tmp_path / "it")

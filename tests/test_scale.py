@@ -11,13 +11,14 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from test_curriculum import make_env
 
-from pickplace import checkpoint, config
-from pickplace import collector as collectors
-from pickplace.config import WorkerDied
-from pickplace.curriculum import push_level
-from pickplace.metrics import read_csv
-from pickplace.sweep import labels, read_run, summarize
-from pickplace.train import resume_run
+from pickplace.runs import checkpoint
+from pickplace.runs import hydra_app as config
+from pickplace.runs.hydra_app import WorkerDied
+from pickplace.runs.loggers import read_csv
+from pickplace.training import collectors
+from pickplace.training.curriculum import push_level
+from pickplace.training.sweep import labels, read_run, summarize
+from pickplace.training.train import resume_run
 
 SMOKE = ["experiment=smoke", "threads=1"]
 

@@ -8,15 +8,19 @@ from torch import nn
 from torchrl.collectors import RandomPolicy
 from torchrl.modules import ValueOperator
 
-from pickplace import PickPlaceEnv, checkpoint, collector, config, train
-from pickplace.curriculum import Current, Curriculum, NoAdvance
-from pickplace.evaluate import play
-from pickplace.metrics import read_csv
-from pickplace.models.actors import as_collection_policy, fcn_grasp
-from pickplace.models.critics import PooledCritic
+from pickplace import PickPlaceEnv
+from pickplace.evaluation.evaluate import play
 from pickplace.planners import JointDBL
-from pickplace.train import learning_rate, make_losses, training_env, update
-from pickplace.warm_start import Phase, imitation_loss
+from pickplace.policies.actors import as_collection_policy, fcn_grasp
+from pickplace.policies.networks.critics import PooledCritic
+from pickplace.runs import checkpoint
+from pickplace.runs.loggers import read_csv
+from pickplace.runs.registry import build
+from pickplace.training import collectors as collector
+from pickplace.training import train
+from pickplace.training.curriculum import Current, Curriculum, NoAdvance
+from pickplace.training.imitation import Phase, imitation_loss
+from pickplace.training.train import learning_rate, make_losses, training_env, update
 
 
 class Judgement(nn.Module):
@@ -150,7 +154,7 @@ def test_the_slots_of_all_workers_share_the_episodes_of_a_stream():
     curriculum = Curriculum(NoAdvance(), Current())
     curriculum.setup(1, 2, 100)
     cfg = composed("env.tote_size=[4,4,2]")
-    env_config, items = {k: v for k, v in cfg.env.items() if k != "num_envs"}, config.instantiate(cfg["items"])
+    env_config, items = {k: v for k, v in cfg.env.items() if k != "num_envs"}, build("items", cfg["items"])
     played = []
     for first in (0, 2):
         env = training_env(env_config, items, "cpu", ("outcome",), 4, curriculum, first_episode=first, num_envs=2)
@@ -174,10 +178,10 @@ def test_each_worker_has_slots_of_its_own():
 
 def test_validation_plays_its_own_stream_at_full_height():
     cfg = composed("experiment=smoke", "env.tote_size=[4,4,2]", "evaluation.seed=3", "seed=5", "evaluation.episodes=6")
-    items = config.instantiate(cfg["items"])
+    items = build("items", cfg["items"])
 
     def build_env(**settings):
-        return config.instantiate(cfg.env, items=items, **settings)
+        return build("env", cfg.env, items=items, **settings)
 
     def make_env(first, count):
         return PickPlaceEnv(

@@ -12,9 +12,9 @@ import zlib
 import numpy as np
 import pytest
 
-from pickplace.metrics import read_csv
-from pickplace.report import failure_mix, figure_of, learning_curve
-from pickplace.training_report import _levels
+from pickplace.runs.loggers import read_csv
+from pickplace.training.report import _levels
+from pickplace.views.figures import failure_mix, figure_of, learning_curve
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def run_dir(tmp_path_factory):
     """A small run without a mask, so that episodes end in many ways."""
     folder = tmp_path_factory.mktemp("report") / "run {{title}} <1>"
     command = [
-        sys.executable, "-m", "pickplace.train", "experiment=smoke", "algo.mask_infeasible=false", "seed=3",
+        sys.executable, "-m", "pickplace.training.train", "experiment=smoke", "algo.mask_infeasible=false", "seed=3",
         f"hydra.run.dir='{folder}'",
     ]  # fmt: skip
     subprocess.run(command, check=True, capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
@@ -37,7 +37,7 @@ def test_report_agrees_with_the_metrics(run_dir):
     for row in rows:
         assert f"<td>{row['frames']:,}</td><td>{row['eval/occupancy']:.4f}</td>" in outside
     assert f"<b>{max(row['eval/occupancy'] for row in rows):.4f}</b>" in outside
-    assert "python -m pickplace.train experiment=smoke algo.mask_infeasible=false seed=3" in outside
+    assert "pickplace-train experiment=smoke algo.mask_infeasible=false seed=3" in outside
     assert "mask_infeasible: false" in outside and "torchrl:" in outside and "mask in training: no" in outside
     assert not re.search(r'(src|href)="(?!data:)', outside)
     assert not re.findall(r"\{\{\w+\}\}", outside)
@@ -75,7 +75,9 @@ def test_failure_mix(table, tmp_path):
 def drawn(monkeypatch):
     """The figures that are drawn."""
     figures = []
-    monkeypatch.setattr("pickplace.report.figure_of", lambda *size: figures.append(figure_of(*size)) or figures[-1])
+    monkeypatch.setattr(
+        "pickplace.views.figures.figure_of", lambda *size: figures.append(figure_of(*size)) or figures[-1]
+    )
     return figures
 
 

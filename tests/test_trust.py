@@ -9,10 +9,19 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from pickplace import Planner, checkpoint, config
-from pickplace.resume import refuse_links, resumed_config
-from pickplace.train import loadable
-from pickplace.trust import TRAINED_WITH, own_modules, refuse_foreign_targets, saved_form, trust_needed, trusted
+from pickplace import Planner
+from pickplace.runs import checkpoint
+from pickplace.runs import hydra_app as config
+from pickplace.runs.allowlist import (
+    TRAINED_WITH,
+    own_modules,
+    refuse_foreign_targets,
+    saved_form,
+    trust_needed,
+    trusted,
+)
+from pickplace.runs.resume import refuse_links, resumed_config
+from pickplace.training.train import loadable
 
 SHIPPED = config.PACKAGE / "pretrained" / "r4"
 
@@ -55,8 +64,8 @@ def mine(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "target",
     [
-        "os.system", "pickplace.checkpoint.shutil.rmtree", "builtins.eval", "pickplace", None, 5,
-        "pickplace.export.export", "pickplace.checkpoint.write", "${planner._target_}", ["os.system"], "",
+        "os.system", "pickplace.runs.checkpoint.shutil.rmtree", "builtins.eval", "pickplace", None, 5,
+        "pickplace.evaluation.export.export", "pickplace.runs.checkpoint.write", "${planner._target_}", ["os.system"], "",
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("place", ["env", "model.actor", "curriculum.advance", "collector"])
@@ -71,10 +80,10 @@ def test_foreign_targets_are_refused(target, place):
 @pytest.mark.parametrize(
     "node",
     [
-        {"model": {"actor": {"hidden": {"_target_": "pickplace.items.Kinds"}}}},
-        {"items": {"kinds": [[{"_target_": "pickplace.items.Kinds"}]]}},
-        {"_target_": "pickplace.items.Kinds"},
-        {"model": [{"_target_": "pickplace.models.actors.fcn4d"}]},
+        {"model": {"actor": {"hidden": {"_target_": "pickplace.task.items.Kinds"}}}},
+        {"items": {"kinds": [[{"_target_": "pickplace.task.items.Kinds"}]]}},
+        {"_target_": "pickplace.task.items.Kinds"},
+        {"model": [{"_target_": "pickplace.policies.actors.fcn4d"}]},
     ],
 )
 def test_targets_in_other_places_are_refused(node):
@@ -144,7 +153,7 @@ def test_a_checkpoint_that_hides_a_pickle_runs_nothing(command, tmp_path):
         with pytest.raises(ValueError, match="no resolver"):
             Planner.load(folder)
     else:
-        module, key = {"evaluate": ("evaluate", "checkpoint"), "resume": ("train", "resume")}[command]
+        module, key = {"evaluate": ("evaluation.evaluate", "checkpoint"), "resume": ("training.train", "resume")}[command]
         words = [sys.executable, "-m", f"pickplace.{module}", f"{key}={folder}"]
         done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode == 2 and "no resolver" in done.stderr
@@ -235,7 +244,7 @@ def test_references_that_double_at_every_step_are_refused_at_once():
 
 
 def test_parts_of_pickplace_within_what_is_trusted(mine):
-    inner = {"_target_": "pickplace.items.Kinds", "kinds": [[1, 1, 1]]}
+    inner = {"_target_": "pickplace.task.items.Kinds", "kinds": [[1, 1, 1]]}
     trusted(changed(items={"_target_": "mine.make", "base": inner}), ["mine"])
     with pytest.raises(ValueError, match="items.base._target_='os.system'"):
         trusted(changed(items={"_target_": "mine.make", "base": {"_target_": "os.system"}}), ["mine"])

@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pickplace import PickPlaceEnv, items
-from pickplace.models import actors
+from pickplace import PickPlaceEnv
 from pickplace.planners import JointDBL, RandomFeasible
-from pickplace.warm_start import Phase, WarmStart, imitation_loss, taught_by
+from pickplace.policies import actors
+from pickplace.task import items
+from pickplace.training.imitation import Phase, WarmStart, imitation_loss, taught_by
 
 MODELS = {
     "outcome": lambda rules: actors.fcn_grasp(rules, mask_infeasible=True, filters=8, hidden=8),

@@ -39,8 +39,8 @@ def test_wheel_trains_from_another_directory(wheel, tmp_path):
     site = tmp_path / "site"
     zipfile.ZipFile(wheel).extractall(site)
     code = (
-        f"import sys; sys.path.insert(0, {str(site)!r}); import pickplace.config as c; "
-        f"assert str(c.conf_dir()).startswith({str(site)!r}), c.conf_dir(); import pickplace.train as t; "
+        f"import sys; sys.path.insert(0, {str(site)!r}); import pickplace.runs.hydra_app as c; "
+        f"assert str(c.conf_dir()).startswith({str(site)!r}), c.conf_dir(); import pickplace.training.train as t; "
         "sys.argv = ['pickplace-train', 'experiment=smoke', 'hydra.run.dir=run']; t.main()"
     )
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}

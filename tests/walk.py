@@ -20,9 +20,9 @@ BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 #: What makes a command small, by how it begins. Sizes, items and everything else stay as the page has them.
 SMALL = {
-    "python -m pickplace.train resume=": "",
-    "python -m pickplace.train": "total_frames=512 env.num_envs=8 evaluation.episodes=4 threads=1",
-    "python -m pickplace.evaluate": "evaluation.episodes=4 evaluation.latency_decisions=0 threads=1",
+    "pickplace-train resume=": "",
+    "pickplace-train": "total_frames=512 env.num_envs=8 evaluation.episodes=4 threads=1",
+    "pickplace-evaluate": "evaluation.episodes=4 evaluation.latency_decisions=0 threads=1",
     "make demo": 'ARGS="evaluation.episodes=2 threads=1"',
     "make train": 'RUN=outputs/made ARGS="total_frames=2048 evaluation.episodes=4 threads=1"',
     "make test": 'ARGS="tests/test_geometry.py"',
@@ -182,7 +182,7 @@ def contributor(walk: Walk) -> None:
     walk.run("git -c user.name=New -c user.email=new@example.org commit --quiet -m 'Planner corner'", "the hooks")
     walk.run("make lint")
     walk.run("make test ARGS='tests/test_config.py tests/test_docs.py -k \"corner or reference or comment\"'")
-    walk.run("python -m pickplace.evaluate planner=corner " + SMALL["python -m pickplace.evaluate"])
+    walk.run("pickplace-evaluate planner=corner " + SMALL["pickplace-evaluate"])
 
 
 WALKERS = {walker.__name__: walker for walker in (researcher, engineer, contributor)}

@@ -1,6 +1,6 @@
 """Evaluates one cell in a process of its own: python benchmarks/reproduce/cell.py MINUTES override ...
 
-As ``pickplace.evaluate``, but within a budget. Where the first steps say that all episodes fit one by one, they
+As ``pickplace.evaluation.evaluate``, but within a budget. Where the first steps say that all episodes fit one by one, they
 are played as ``evaluation.batch_size`` says; else in batches until the time is up, where a batch is faster and ends in
 time, or one by one; where one alone would take twice the budget, none, and that time is the result.
 """
@@ -13,8 +13,9 @@ import time
 import torch
 from omegaconf import DictConfig
 
-from pickplace import config
-from pickplace.evaluate import evaluate, prepare
+from pickplace.evaluation.evaluate import evaluate, prepare
+from pickplace.runs import hydra_app as config
+from pickplace.runs.registry import build
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +52,7 @@ def main() -> None:
     def task(cfg: DictConfig, run_dir):
         began = time.process_time()
         make_env, planner, _ = prepare(cfg.copy())
-        rules, items = make_env(0, 1).rules, config.instantiate(cfg["items"])
+        rules, items = make_env(0, 1).rules, build("items", cfg["items"])
         decisions = rules.num_places * rules.tote_size[2] / float(items.sizes.prod(1).double().mean())  # fill a tote
         seconds_a_step(make_env, planner, 1, 1)  # warms up
         step = seconds_a_step(make_env, planner, 1, 3)

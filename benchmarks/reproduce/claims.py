@@ -14,7 +14,7 @@ from math import hypot
 import torch
 from figures import FEW, TOTES, label, pooled
 
-from pickplace.evaluate import confidence95
+from pickplace.evaluation.evaluate import confidence95
 
 ROTATIONS = (1, 2, 3, 4)
 ATTEMPTED = "attempted"  # in place of a comparison one side of which could not be computed

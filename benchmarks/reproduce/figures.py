@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pickplace.evaluate import confidence95
+from pickplace.evaluation.evaluate import confidence95
 
 #: Methods: label, colour (Okabe and Ito's, told apart by colour-blind readers), marker. Ours are filled, filled out.
 METHODS = {

@@ -14,8 +14,8 @@ from pathlib import Path
 import torch
 
 from pickplace import PickPlaceEnv
-from pickplace.evaluate import confidence95
-from pickplace.geometry import NEVER
+from pickplace.evaluation.evaluate import confidence95
+from pickplace.task.geometry import NEVER
 
 STREAM, SEED = "test", 0
 

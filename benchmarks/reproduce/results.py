@@ -12,7 +12,7 @@ import figures
 import torch
 from run import RESULTS, one_line_a_list
 
-from pickplace.evaluate import confidence95
+from pickplace.evaluation.evaluate import confidence95
 
 ROOT = RESULTS.parents[1]
 HEAD = """# The paper's comparison, run again

@@ -28,9 +28,9 @@ from pathlib import Path
 import cells as definitions
 from cells import Cell
 
-from pickplace.checkpoint import CheckpointError, locate
-from pickplace.evaluate import commit, versions
-from pickplace.metrics import read_csv
+from pickplace.evaluation.evaluate import commit, versions
+from pickplace.runs.checkpoint import CheckpointError, locate
+from pickplace.runs.loggers import read_csv
 
 ROOT = Path(__file__).parents[2]
 RESULTS, OUTPUTS = ROOT / "docs" / "results", ROOT / "outputs" / "reproduce"
@@ -134,7 +134,9 @@ def train(cell: Cell, minutes: float) -> dict:
     before = spent(folder) if begun else NOTHING  # without a checkpoint it begins anew
     if not (last.is_dir() and before["cpu_seconds"] >= 60 * minutes):
         action = [f"resume={folder}"] if begun else [*cell.overrides, "threads=1", f"hydra.run.dir={folder}"]
-        child = Child([sys.executable, "-m", "pickplace.train", *action], OUTPUTS / "logs" / f"{cell.name}.log")
+        child = Child(
+            [sys.executable, "-m", "pickplace.training.train", *action], OUTPUTS / "logs" / f"{cell.name}.log"
+        )
         cost = child.wait(minutes - before["cpu_seconds"] / 60)
         cost["cpu_seconds"] += before["cpu_seconds"]
         cost["peak_mib"] = max(cost["peak_mib"], before["peak_mib"])

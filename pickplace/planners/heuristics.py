@@ -4,8 +4,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pickplace.geometry import FAR, Rules
-from pickplace.items import check_seed
+from pickplace.task.geometry import FAR, Rules
+from pickplace.task.items import check_seed
 
 
 class UniformRandom:

@@ -4,7 +4,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pickplace.geometry import FAR, Item, Rules
+from pickplace.task.geometry import FAR, Item, Rules
 
 CANDIDATES = ("corners", "cells")
 
@@ -57,7 +57,7 @@ def corner_footprints(rules: Rules, heights: Tensor, top: Tensor, item: Item) ->
 
     Args:
         heights: int32 ``[N, W_T, D_T]``.
-        top: of :class:`~pickplace.geometry.Placements`; footprints that cannot rest are in no corner.
+        top: of :class:`~pickplace.task.geometry.Placements`; footprints that cannot rest are in no corner.
         item: what is placed.
     """
     found = torch.zeros_like(top, dtype=torch.bool)

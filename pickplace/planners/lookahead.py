@@ -5,9 +5,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pickplace.geometry import Rules
-from pickplace.items import ItemDistribution, check_seed, imagined
-from pickplace.models.actors import MASKED, OutcomePolicy
+from pickplace.policies.actors import MASKED, OutcomePolicy
+from pickplace.task.geometry import Rules
+from pickplace.task.items import ItemDistribution, check_seed, imagined
 
 
 class Lookahead:

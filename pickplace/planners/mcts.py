@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pickplace.geometry import Item, Rules
-from pickplace.items import ItemDistribution, check_seed, imagined
+from pickplace.task.geometry import Item, Rules
+from pickplace.task.items import ItemDistribution, check_seed, imagined
 
 
 @dataclass(eq=False)

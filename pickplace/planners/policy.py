@@ -11,10 +11,11 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ValueOperator
 
-from pickplace import checkpoint, config
-from pickplace.geometry import FAR, Rules
-from pickplace.items import ItemDistribution
-from pickplace.models.actors import Policy
+from pickplace.policies.actors import Policy
+from pickplace.runs import checkpoint
+from pickplace.runs.registry import build
+from pickplace.task.geometry import FAR, Rules
+from pickplace.task.items import ItemDistribution
 
 
 class PolicyPlanner:
@@ -22,7 +23,7 @@ class PolicyPlanner:
 
     Args:
         rules: the task's sizes.
-        policy: a policy of :mod:`pickplace.models.actors` made for these rules.
+        policy: a policy of :mod:`pickplace.policies.actors` made for these rules.
         candidates: ``K``, how many of the most probable flat actions, over all ``N_a`` and without a mask, are tried;
             if none succeeds the most probable one is played, and fails. ``"all"`` plays the best feasible one.
     """
@@ -121,7 +122,7 @@ def restore_policy(cfg: DictConfig, rules: Rules, state: dict, trained: dict) ->
     Args:
         cfg: the checkpoint's config, with any overrides on top.
         rules: the task's sizes.
-        state: the policy's tensors, ``state["policy"]`` of :func:`pickplace.checkpoint.read`.
+        state: the policy's tensors, ``state["policy"]`` of :func:`pickplace.runs.checkpoint.read`.
         trained: the group ``env`` in training; its ``rotations`` must not be exceeded.
 
     Raises:
@@ -134,7 +135,7 @@ def restore_policy(cfg: DictConfig, rules: Rules, state: dict, trained: dict) ->
         )
 
     def restored(rules: Rules) -> Policy:
-        make = partial(config.instantiate, cfg.model.actor, rules=rules, mask_infeasible=cfg.algo.mask_infeasible)
+        make = partial(build, "model.actor", cfg.model.actor, rules=rules, mask_infeasible=cfg.algo.mask_infeasible)
         return checkpoint.restore(make, state, "policy").eval()
 
     try:
@@ -160,14 +161,14 @@ def restore_critic(cfg: DictConfig, rules: Rules, state: dict, trained_tote: lis
     Args:
         cfg: the checkpoint's config.
         rules: the task's sizes.
-        state: as of :func:`pickplace.checkpoint.read`, with or without ``state["critic"]``.
+        state: as of :func:`pickplace.runs.checkpoint.read`, with or without ``state["critic"]``.
         trained_tote: ``tote_size`` in training.
     """
     if "critic" not in state:
         return None
 
     def make():
-        return ValueOperator(config.instantiate(cfg.model.critic, rules=rules), ["bin_depth", "tote_depth"])
+        return ValueOperator(build("model.critic", cfg.model.critic, rules=rules), ["bin_depth", "tote_depth"])
 
     with torch.device("meta"):
         any_size = getattr(make().module, "any_size", False)

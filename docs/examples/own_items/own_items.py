@@ -1,7 +1,7 @@
 """An item distribution of one's own: items arrive in batches of the same kind."""
 
 from pickplace import Item
-from pickplace.items import Kinds, hashed_uniform
+from pickplace.task.items import Kinds, hashed_uniform
 
 
 class Batches(Kinds):

@@ -3,8 +3,8 @@
 import torch
 from torch import nn
 
-from pickplace.models.actors import MASKED
-from pickplace.models.depth import clip_depth
+from pickplace.policies.actors import MASKED
+from pickplace.policies.networks.depth import clip_depth
 
 
 class Mlp(nn.Module):

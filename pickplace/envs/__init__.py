@@ -1,0 +1,1 @@
+"""The environment for TorchRL and for Gymnasium."""

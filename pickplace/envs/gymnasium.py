@@ -1,0 +1,340 @@
+"""The Gymnasium face of :class:`~pickplace.envs.torchrl.PickPlaceEnv`: ``gymnasium.make`` and ``gymnasium.make_vec``."""
+
+import os
+import sys
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from tensordict import TensorDict
+
+from pickplace.envs.torchrl import PickPlaceEnv
+from pickplace.task.geometry import Failure
+from pickplace.task.items import Kinds, check_seed
+from pickplace.views.figures import draw_scene, item_colours
+from pickplace.views.replay import Recording, observe
+
+KEYS = ("bin_depth", "tote_depth", "tote_height")  # what an agent sees
+
+
+def _make_env(num_envs: int, items, settings: dict) -> PickPlaceEnv:
+    """The batched environment behind both faces; a list of ``(w, d, h)`` is short for ``Kinds``."""
+    for key, why in (("masks", "the action mask always comes along"), ("seed", "reset(seed=...) begins a stream")):
+        if key in settings:
+            raise ValueError(f"{key}={settings[key]!r}: expected no such argument; {why}.")
+    items = Kinds(items) if isinstance(items, (list, tuple)) else items
+    return PickPlaceEnv(items=items, num_envs=num_envs, **settings)
+
+
+def _spaces(env: PickPlaceEnv) -> tuple[spaces.Dict, spaces.Discrete]:
+    """Observation and action space of one problem."""
+    spec = env.observation_spec
+    boxes: dict[str, spaces.Space] = {}
+    for key in KEYS:
+        space, shape = spec[key].space, tuple(spec[key].shape[1:])
+        dtype = np.int64 if key == "tote_height" else np.float32
+        boxes[key] = spaces.Box(space.low.min().item(), space.high.max().item(), shape, dtype)
+    return spaces.Dict(boxes), spaces.Discrete(env.rules.num_actions)
+
+
+def _options(options: dict | None, known: tuple[str, ...]) -> dict:
+    options = dict(options or {})
+    if unknown := sorted(set(options) - set(known)):
+        raise ValueError(f"options[{unknown[0]!r}]: there is no such option; expected {', '.join(known)}.")
+    return options
+
+
+def _tote_heights(given, env: PickPlaceEnv) -> torch.Tensor:
+    """``options["tote_height"]`` as int64 ``[N, 1]``: a whole number, or one for each problem; None: full height."""
+    low, high, count = env.min_tote_height, env.rules.tote_size[2], env.num_envs
+    heights = np.asarray(high if given is None else given)
+    wanted = f"a whole number of cells between {low} (the tallest item) and {high} (tote_size[2])"
+    if heights.dtype.kind not in "iu" or heights.shape not in ((), (count,)):
+        raise ValueError(
+            f"options['tote_height']={given!r}: expected {wanted}" + f", or {count} of them." * (count > 1)
+        )
+    if (heights < low).any() or (heights > high).any():
+        raise ValueError(f"options['tote_height']={given!r}: expected {wanted}.")
+    return torch.as_tensor(np.broadcast_to(heights, count).astype(np.int64))[:, None].to(env.device)
+
+
+class PickPlaceGymEnv(gymnasium.Env):
+    """
+    ## Description
+    A suction robot takes items one by one from a bin and packs them into a tote. Where it grips an item decides where
+    it can set it down: the end effector must hit neither the tote's walls nor what is already inside. Pick cell, place
+    cell and rotation are one action. See *Simultaneous Planning for Item Picking and Placing by Deep Reinforcement
+    Learning* (Tanaka et al., IROS 2020).
+
+    ## Action Space
+    `Discrete(N_a)`: the flat index `(((x_B * D_B + y_B) * W_T + x_T) * D_T + y_T) * R + r` of pick cell, place cell and
+    rotation. Most actions fail; `action_masks()` tells which would succeed.
+
+    ## Observation Space
+    A `Dict`:
+
+    | key | shape, type | meaning |
+    |---|---|---|
+    | `bin_depth` | `(W_B, D_B)` float32 | height above the bin's floor, 0 where empty; cells |
+    | `tote_depth` | `(W_T, D_T)` float32 | remaining height up to the rim; cells |
+    | `tote_height` | `(1,)` int64 | height of the episode's tote; cells |
+
+    ## Rewards
+    The volume placed, in cells; 0 for an action that fails. An episode's return is the volume packed.
+
+    ## Starting State
+    An empty tote, and a bin with the first item of an episode. `reset(seed=s)` begins the item stream `s`; later resets
+    without a seed go on to its next episode. `options={"tote_height": h}` sets the height of this episode's tote.
+
+    ## Episode End
+    Termination: the action fails, or nothing can be done with the item that arrives. Truncation: a recorded item stream
+    has ended; nothing more comes then, so a learner that continues truncated episodes by a value had better take 0.
+
+    ## Information
+    `occupancy`: share of the tote's volume that is filled; `failure`: why the action or the episode failed (`"none"`,
+    `"pick_miss"`, ..., `"stuck"`); `action_mask`: as `action_masks()`.
+
+    ## Arguments
+    `bin_size`, `tote_size`, `effector_size`, `rotations`, `pick_rule`, `min_support`, `strict_support`, `stream`,
+    `device`: as of `pickplace.PickPlaceEnv`. `items`: an item distribution, or a list of `(w, d, h)`; by default the
+    paper's four kinds. `render_mode`: `"rgb_array"` or `"human"`.
+
+    ## Version History
+    * v0: first version.
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 4}
+    action_space: spaces.Discrete
+
+    def __init__(self, items=None, render_mode: str | None = None, **settings):
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode={render_mode!r}: expected 'rgb_array', 'human' or None.")
+        self._env, self.render_mode = _make_env(1, items, settings), render_mode
+        self.observation_space, self.action_space = _spaces(self._env)
+        self._recording: Recording | None = None  # of the running episode, for rendering
+        self._window: tuple | None = None  # the figure and the image in it
+        self._colours = (
+            item_colours([(0, 0, 0, *size) for size in self._env.items.sizes.tolist()]) if render_mode else {}
+        )
+        self._started = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        seed = None if seed is None else check_seed(seed)
+        super().reset(seed=seed)
+        heights = _tote_heights(_options(options, ("tote_height",)).get("tote_height"), self._env)
+        if seed is not None or not self._started:
+            self._env.set_seed(int(self.np_random.integers(2**31)) if seed is None else seed)
+            self._started = True
+        state = self._env.reset(TensorDict({"tote_height": heights}, [1], device=self._env.device))
+        if self.render_mode:
+            self._recording = Recording(int(self._env.episode[0]), int(heights[0]))
+        self._show()
+        return self._observation(state), self._info(state)
+
+    def step(self, action):
+        if not self._started:
+            raise gymnasium.error.ResetNeeded("step() before reset().")
+        if not self.action_space.contains(action):
+            raise ValueError(f"action={action!r}: expected a whole number in [0, {self.action_space.n}).")
+        actions = torch.as_tensor([int(action)], device=self._env.device)
+        if self._recording is not None:
+            before = TensorDict({"tote_height": self._env.tote_height[:, None].clone()}, [1], device=self._env.device)
+            move = observe(self._env.rules, None, before, self._env.heights, self._env.current_item, actions)[0]
+            self._recording.moves.append(move)
+        state = self._env.step(TensorDict({"action": actions}, [1], device=self._env.device))["next"]
+        if self._recording is not None and bool(state["done"]):
+            self._recording.ending = Failure(int(state["failure"]))
+        self._show()
+        flags = bool(state["terminated"]), bool(state["truncated"])
+        return self._observation(state), float(state["reward"]), *flags, self._info(state)
+
+    def action_masks(self) -> np.ndarray:
+        """Which actions would succeed, bool ``[N_a]``: the name that sb3-contrib's MaskablePPO looks for."""
+        return self._env.action_mask[0].cpu().numpy().copy()
+
+    def _observation(self, state) -> dict[str, np.ndarray]:
+        return {key: state[key][0].cpu().numpy().copy() for key in KEYS}
+
+    def _info(self, state) -> dict[str, Any]:
+        failure = Failure(int(state["failure"])).name.lower()
+        return {"occupancy": float(state["occupancy"]), "failure": failure, "action_mask": self.action_masks()}
+
+    # ------------------------------------------------------------------ rendering
+    def render(self) -> np.ndarray | None:
+        if self.render_mode == "rgb_array":
+            return self._picture()
+        return None  # a window follows by itself
+
+    def _picture(self) -> np.ndarray:
+        """The tote in 3D, its height map and the bin, uint8 ``[600, 1200, 3]``."""
+        if self._recording is None:
+            raise gymnasium.error.ResetNeeded("render() before reset().")
+        rules, item = self._env.rules, self._env.current_item
+        scene = draw_scene(self._recording, rules, self._colours)
+        inset = scene.add_axes((0.01, 0.04, 0.09, 0.18))
+        inset.imshow(rules.bin_depth(item)[0].cpu().numpy().T, origin="lower", cmap="YlOrBr", vmin=0)
+        inset.set_title("bin", fontsize="medium")
+        inset.set_xticks([])
+        inset.set_yticks([])
+        scene.set_dpi(100)
+        scene.canvas.draw()
+        return np.asarray(scene.canvas.buffer_rgba())[..., :3].copy()
+
+    def _show(self) -> None:
+        """In mode ``human``: bring the window up to date."""
+        if self.render_mode != "human":
+            return
+        display = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        if not display:
+            gymnasium.logger.warn("render_mode='human': there is no display, so no window is shown; try 'rgb_array'.")
+            return
+        from matplotlib import pyplot
+
+        if self._window is None:
+            figure = pyplot.figure("pickplace", figsize=(12, 6))
+            axes = figure.add_axes((0, 0, 1, 1))
+            axes.set_axis_off()
+            self._window = figure, axes.imshow(self._picture())
+        self._window[1].set_data(self._picture())
+        pyplot.pause(1 / self.metadata["render_fps"])
+
+    def close(self) -> None:
+        if self._window is not None:
+            from matplotlib import pyplot
+
+            pyplot.close(self._window[0])
+            self._window = None
+
+
+class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
+    """Many problems at once, as tensors: what ``gymnasium.make_vec("pickplace/PickPlace-v0", num_envs=N)`` makes.
+
+    Spaces, rewards and information are those of :class:`PickPlaceGymEnv`. ``reset(seed=s)`` begins the item stream
+    ``s``: slot ``i`` plays its episodes ``i``, ``i + N``, ``i + 2 N``, ... ``options``: ``tote_height`` (a number, or
+    one for each slot) and ``reset_mask`` (bool ``[N]``, the slots to reset). What resets itself has full height.
+
+    Args:
+        num_envs: ``N``.
+        items: an item distribution, or a list of ``(w, d, h)``.
+        autoreset_mode: Gymnasium's ``"NextStep"`` (the default), ``"SameStep"`` or ``"Disabled"``.
+        **settings: as of :class:`PickPlaceGymEnv`; there is no rendering.
+    """
+
+    single_action_space: spaces.Discrete
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        items=None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **settings,
+    ):
+        if render_mode is not None:
+            raise ValueError(f"render_mode={render_mode!r}: expected None; render a single environment.")
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError as error:
+            modes = ", ".join(repr(mode.value) for mode in AutoresetMode)
+            raise ValueError(f"autoreset_mode={autoreset_mode!r}: expected one of {modes}.") from error
+        self._env, self.num_envs = _make_env(num_envs, items, settings), num_envs
+        self.metadata = {**PickPlaceGymEnv.metadata, "render_modes": [], "autoreset_mode": self.autoreset_mode}
+        self.single_observation_space, self.single_action_space = _spaces(self._env)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._ended = np.zeros(num_envs, dtype=bool)  # slots that wait for their reset
+        self._started = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        if isinstance(seed, (list, tuple, np.ndarray)):
+            raise ValueError(f"seed={seed!r}: expected one whole number; its stream gives each slot its own episodes.")
+        seed = None if seed is None else check_seed(seed)
+        super().reset(seed=seed)
+        options = _options(options, ("tote_height", "reset_mask"))
+        heights = _tote_heights(options.get("tote_height"), self._env)
+        rows = np.ones(self.num_envs, dtype=bool)
+        if "reset_mask" in options:
+            rows = np.asarray(options["reset_mask"])
+            if rows.shape != (self.num_envs,) or rows.dtype != bool or not rows.any():
+                wanted = f"bool of shape ({self.num_envs},), at least one True"
+                raise ValueError(f"options['reset_mask']={options['reset_mask']!r}: expected {wanted}.")
+        if seed is not None or not self._started:
+            if not rows.all():
+                when = "in the first reset" if seed is None else f"with seed={seed!r}"
+                raise ValueError(f"options['reset_mask'] {when}: expected none; a stream begins for all slots.")
+            self._env.set_seed(int(self.np_random.integers(2**31)) if seed is None else seed)
+            self._started = True
+        self._reset_rows(rows, heights)
+        self._ended &= ~rows
+        state = self._env._observation()
+        return self._observations(state), self._infos(state, rows)
+
+    def step(self, actions):
+        if not self._started:
+            raise gymnasium.error.ResetNeeded("step() before reset().")
+        actions = np.asarray(actions)
+        if actions.dtype.kind not in "iu" or not self.action_space.contains(actions.astype(np.int64, copy=False)):
+            wanted = f"{self.num_envs} whole numbers in [0, {self.single_action_space.n})"
+            raise ValueError(f"actions={actions!r}: expected {wanted}.")
+        waiting = self._ended.copy()
+        if waiting.any() and self.autoreset_mode == AutoresetMode.DISABLED:
+            raise gymnasium.error.ResetNeeded(f"slots {np.flatnonzero(waiting).tolist()} have ended: reset them first.")
+        chosen = torch.as_tensor(np.where(waiting, 0, actions), dtype=torch.int64, device=self._env.device)
+        step = TensorDict({"action": chosen}, [self.num_envs], device=self._env.device)
+        state = self._env.step(step)["next"]
+        reward, terminated, truncated = (
+            state[key][:, 0].cpu().numpy().copy() for key in ("reward", "terminated", "truncated")
+        )
+        reward = reward.astype(np.float64)
+        infos: dict[str, Any] = {}
+        if waiting.any():  # their action did not count: this step is their reset
+            self._reset_rows(waiting)
+            reward[waiting], terminated[waiting], truncated[waiting] = 0, False, False
+            fresh = self._env._observation()
+            rows = torch.as_tensor(waiting, device=self._env.device)
+            for key in (*KEYS, "occupancy", "failure", "action_mask"):
+                state[key] = torch.where(rows.view(-1, *[1] * (state[key].ndim - 1)), fresh[key], state[key])
+        self._ended = terminated | truncated
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
+            final = self._observations(state)
+            infos["final_obs"] = np.full(self.num_envs, None, dtype=object)
+            for slot in np.flatnonzero(self._ended):
+                infos["final_obs"][slot] = {key: value[slot] for key, value in final.items()}
+            infos["final_info"] = self._infos(state, self._ended)
+            infos["_final_obs"] = infos["_final_info"] = self._ended.copy()
+            self._reset_rows(self._ended)
+            state = self._env._observation()
+            self._ended = np.zeros(self.num_envs, dtype=bool)
+        infos |= self._infos(state, np.ones(self.num_envs, dtype=bool))
+        return self._observations(state), reward, terminated, truncated, infos
+
+    def action_masks(self) -> np.ndarray:
+        """Which actions would succeed, bool ``[N, N_a]``."""
+        return self._env.action_mask.cpu().numpy().copy()
+
+    def _reset_rows(self, rows: np.ndarray, heights: torch.Tensor | None = None) -> None:
+        heights = _tote_heights(None, self._env) if heights is None else heights
+        mask = torch.as_tensor(rows.copy(), device=self._env.device)[:, None]
+        td = TensorDict({"_reset": mask, "tote_height": heights}, [self.num_envs], device=self._env.device)
+        self._env.reset(td)
+
+    def _observations(self, state) -> dict[str, np.ndarray]:
+        return {key: state[key].cpu().numpy().copy() for key in KEYS}
+
+    def _infos(self, state, rows: np.ndarray) -> dict[str, Any]:
+        """Gymnasium's convention: an array for each key, and a mask ``_key`` of the slots that have it."""
+        names = np.array([failure.name.lower() for failure in Failure], dtype=object)
+        infos = {
+            "occupancy": state["occupancy"][:, 0].double().cpu().numpy().copy(),
+            "failure": names[state["failure"][:, 0].cpu().numpy()],
+            "action_mask": state["action_mask"].cpu().numpy().copy(),
+        }
+        for key in list(infos):
+            empty = None if infos[key].dtype == object else 0
+            infos[key][~rows] = empty
+            infos[f"_{key}"] = rows.copy()
+        return infos

@@ -1,0 +1,1 @@
+"""Policies over joint (pick, place, rotation) actions."""

@@ -1,0 +1,1 @@
+"""The networks behind the policies, and the critics."""

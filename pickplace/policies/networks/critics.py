@@ -1,0 +1,82 @@
+"""Value networks, which share nothing with the policies. Acting needs none; ``planner=lookahead`` asks one."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pickplace.policies.networks.conv4d import Conv4dCritic, check_width
+from pickplace.policies.networks.depth import depth_levels, item_code, one_hot
+from pickplace.policies.networks.footprint_fcn import check_dtype, matrix_dtype
+from pickplace.task.geometry import Rules
+
+
+class PooledCritic(nn.Module):
+    """The critic beside ``fcn_grasp``: what each column of the tote will yet hold, judged from around it, and summed.
+
+    A convolution over the one-hot clipped tote (a cell outside it is in no plane), the item's size added, then ``1x1``
+    layers that say for each cell which share of its unclipped room will be filled, and how much more or less. The sum
+    over the cells is the value, so that one set of weights serves any tote.
+
+    Args:
+        filters: width of the convolution.
+        receptive_field: side of the square that is seen around a cell, odd; cells.
+        hidden: width of the 1x1 layer before the output.
+        tote_clip, depth_range, item_range, compute_dtype: as in :class:`FootprintFcn`.
+
+    Shapes:
+        ``bin_depth [..., W_B, D_B]``, ``tote_depth [..., W_T, D_T]`` -> ``[..., 1]``.
+    """
+
+    any_size = True
+
+    def __init__(
+        self,
+        filters: int = 32,
+        receptive_field: int = 5,
+        hidden: int = 32,
+        tote_clip: int = 3,
+        depth_range: int = 5,
+        item_range: int = 3,
+        compute_dtype: str = "auto",
+    ):
+        super().__init__()
+        if not isinstance(receptive_field, int) or receptive_field < 1 or receptive_field % 2 == 0:
+            raise ValueError(f"model.critic.receptive_field={receptive_field!r}: expected an odd number >= 1.")
+        widths = {"filters": filters, "hidden": hidden, "tote_clip": tote_clip}
+        for key, value in {**widths, "depth_range": depth_range, "item_range": item_range}.items():
+            check_width(f"model.critic.{key}", value)
+        self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
+        self.compute_dtype = check_dtype("model.critic.compute_dtype", compute_dtype)
+        self.around = nn.Conv2d(depth_range, filters, receptive_field, padding=receptive_field // 2)
+        self.item = nn.Linear(3 * item_range, filters, bias=False)
+        self.room = nn.Parameter(torch.zeros(filters))
+        self.hidden = nn.Linear(filters, hidden)
+        self.head = nn.Linear(hidden, 2)
+        nn.init.normal_(self.head.weight, std=0.01)
+        nn.init.zeros_(self.head.bias)
+
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
+        batch = tote_depth.shape[:-2]
+        bin_depth, tote_depth = bin_depth.flatten(0, -3), tote_depth.flatten(0, -3)
+        levels = depth_levels(tote_depth, self.tote_clip, self.depth_range)
+        planes = one_hot(levels.flatten(1), self.depth_range).view(-1, self.depth_range, *levels.shape[1:])
+        room = tote_depth[..., None] / 5
+        dtype = matrix_dtype(self.compute_dtype, tote_depth.device.type)
+        with torch.autocast(tote_depth.device.type, dtype, enabled=dtype != torch.float32):
+            x = self.around(planes.to(dtype, memory_format=torch.channels_last)).permute(0, 2, 3, 1)
+            x = x + self.item(item_code(bin_depth, self.item_range).to(dtype))[:, None, None]
+            x = x + room.to(dtype) * self.room.to(dtype)
+            x = F.relu(self.hidden(F.relu(x)))
+        share, more = self.head(x.float()).unbind(-1)
+        value = (share * room[..., 0] + more / 5).sum((1, 2))
+        return value.view(*batch, 1)
+
+
+def pooled_critic(rules: Rules, **network) -> PooledCritic:
+    """The critic beside ``fcn_grasp``, for any sizes (config ``model=fcn_grasp``)."""
+    return PooledCritic(**network)
+
+
+def conv4d_critic(rules: Rules, **network) -> Conv4dCritic:
+    """The critic beside ``fcn4d``, for these sizes (config ``model=fcn4d``)."""
+    return Conv4dCritic(rules.bin_size, rules.tote_size, **network)

@@ -1,0 +1,55 @@
+"""Depth maps as the networks see them: clipped to a fixed range, then padded (fcn4d) or one-hot (fcn_grasp)."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pickplace.task.geometry import Rules
+
+
+def clip_depth(depth: Tensor, limit: float | None, floor: float | None = None) -> Tensor:
+    """Shift each depth map down until nothing in it is greater than ``limit`` (depth clipping, eq. 4).
+
+    ``s - max(max(s) - limit, 0)``, the inner maximum over the whole map of one environment. Differences
+    between cells are kept, only the greatest value is bounded, so that a policy serves any tote height. What
+    lies further than ``limit`` below the maximum goes negative, as eq. 4 has it; ``floor`` (not in the paper)
+    clamps it.
+
+    Args:
+        depth: ``[..., W, D]``; every leading dimension is a batch dimension.
+        limit: ``H_max`` of eq. 4, or None for no clipping.
+        floor: least value of the result, or None for no floor. Applied after the clipping.
+
+    Returns:
+        ``[..., W, D]``
+    """
+    if limit is not None:
+        depth = depth - (depth.amax((-2, -1), keepdim=True) - limit).clamp_min(0)
+    return depth if floor is None else depth.clamp_min(floor)
+
+
+def pad_depth(depth: Tensor, cells: int, value: float) -> Tensor:
+    """Surround each map ``[..., W, D]`` by ``cells`` cells of ``value``: ``[..., W + 2 cells, D + 2 cells]``.
+
+    The paper pads the bin with -1 and the tote with 0, after clipping and before broadcasting the maps to 4D.
+    """
+    return F.pad(depth, (cells,) * 4, value=value)
+
+
+def depth_levels(tote_depth: Tensor, tote_clip: int, depth_range: int) -> Tensor:
+    """Clipped depths (eq. 4) counted from ``tote_clip`` downwards, uint8 in ``[0, depth_range)``, same shape."""
+    return (tote_clip - clip_depth(tote_depth, tote_clip)).clamp(0, depth_range - 1).to(torch.uint8)
+
+
+def one_hot(levels: Tensor, count: int) -> Tensor:
+    """Planes of uint8 levels, bool ``[N, M]`` to ``[N, count * M]``, plane by plane; other levels are in no plane."""
+    plane = torch.arange(count, dtype=torch.uint8, device=levels.device)
+    return (levels[:, None] == plane[:, None]).flatten(1)
+
+
+def item_code(bin_depth: Tensor, item_range: int) -> Tensor:
+    """The item's width, depth and height as one-hot codes, bool ``[N, 3 * item_range]``."""
+    item = Rules.read_item(bin_depth)
+    size = torch.stack([item.w, item.d, item.h], -1).clamp(1, item_range)
+    step = torch.arange(1, item_range + 1, device=size.device)
+    return (size[..., None] == step).flatten(1)

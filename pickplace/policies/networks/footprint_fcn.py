@@ -1,0 +1,174 @@
+"""The fully convolutional network behind ``fcn_grasp``: the tote around a footprint, seen from what would lie there."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pickplace.policies.networks.conv4d import check_width
+from pickplace.policies.networks.depth import clip_depth
+from pickplace.task.geometry import Rules
+
+#: What the rows of a bf16 product are rounded up to, beyond how many: one is prepared and kept for each number of rows,
+#: which takes time and memory. A single decision has few, and is not slowed down.
+PADDED_ROWS = ((4096, 512), (64, 64))
+
+
+class FootprintFcn(nn.Module):
+    """Scores footprints by what surrounds them, as heights relative to the item that would lie there.
+
+    A convolution of ``receptive_field x receptive_field`` and two of ``1x1``, one set of weights for any tote, computed
+    as matrix products over the patches around the footprints that are asked for. A patch is centred on its footprint
+    and turned with it, so that an item that is turned is seen as one that is not. Its cells are one-hot: around the
+    footprint, the height above the top that the item would have; under it, the depth of the hole that it would close;
+    nothing outside the tote. After the patch come the item's width, depth and height, the room above its top (too
+    little, none, or how much), and how far above the deepest place of the tote it rests (the clipped depth of
+    eq. 4), one-hot each.
+
+    Args:
+        out_channels: scores of each footprint.
+        filters: width of the convolution.
+        receptive_field: side of the square that is seen, odd, at least 3; cells.
+        hidden: width of the 1x1 layer before the output.
+        tote_clip: ``H_1_max`` of eq. 4, in whole cells.
+        depth_range: number of clipped depths told apart.
+        rooms: number of rooms above the top told apart: too little, none, 1, 2, ... cells; None: ``depth_range``. Few
+            serve totes that are higher than those in training.
+        reach: heights around a footprint are told apart up to so many cells above and below the item's top.
+        item_range: sides and heights from this one on look alike.
+        head_std: standard deviation of the last layer's initial weights.
+        compute_dtype: ``"float32"``, ``"bfloat16"`` (autocast of the matrix products), or ``"auto"``: bfloat16 where
+            the processor has units for it.
+    """
+
+    def __init__(
+        self,
+        out_channels: int = 1,
+        filters: int = 96,
+        receptive_field: int = 5,
+        hidden: int = 64,
+        tote_clip: int = 3,
+        depth_range: int = 5,
+        reach: int = 3,
+        item_range: int = 3,
+        head_std: float = 0.01,
+        compute_dtype: str = "auto",
+        rooms: int | None = None,
+    ):
+        super().__init__()
+        if not isinstance(receptive_field, int) or receptive_field < 3 or receptive_field % 2 == 0:
+            raise ValueError(f"model.actor.receptive_field={receptive_field!r}: expected an odd number >= 3.")
+        sizes = {"filters": filters, "hidden": hidden, "depth_range": depth_range, "item_range": item_range}
+        sizes["rooms"] = rooms = depth_range if rooms is None else rooms
+        for key, value in {**sizes, "tote_clip": tote_clip, "reach": reach, "out_channels": out_channels}.items():
+            check_width(f"model.actor.{key}", value)
+        if not isinstance(head_std, (int, float)) or head_std < 0:
+            raise ValueError(f"model.actor.head_std={head_std!r}: expected a number >= 0.")
+        self.receptive_field, self.reach = receptive_field, reach
+        self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
+        self.rooms = rooms
+        self.compute_dtype = check_dtype("model.actor.compute_dtype", compute_dtype)
+        self.planes = max(
+            3 * reach + 2, depth_range, item_range, rooms
+        )  # around: -reach .. reach; under: holes 0 .. reach
+        self.patch = nn.Linear(self.planes * (receptive_field**2 + 5), filters)
+        self.hidden = nn.Linear(filters, hidden)
+        self.head = nn.Linear(hidden, out_channels)
+        nn.init.normal_(self.head.weight, std=head_std)
+        nn.init.zeros_(self.head.bias)
+
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor, parities: int) -> Tensor:
+        """Scores of all footprints, float32 ``[N, parities, W_T, D_T, out_channels]``, be they in the tote or not.
+
+        Args:
+            bin_depth, tote_depth: ``[N, W_B, D_B]``, ``[N, W_T, D_T]``.
+            parities: 1, or 2 to turn the footprints too.
+        """
+        count = parities * tote_depth[0].numel()
+        index = torch.arange(len(tote_depth) * count, device=tote_depth.device)
+        out = self.at(bin_depth, tote_depth, index // count, index % count)
+        return out.view(len(tote_depth), parities, *tote_depth.shape[1:], -1)
+
+    def at(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, outcome: Tensor) -> Tensor:
+        """The scores of some footprints only, float32 ``[M, out_channels]``.
+
+        Args:
+            row: int64 ``[M]``, which problem.
+            outcome: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
+        """
+        dtype, count = matrix_dtype(self.compute_dtype, tote_depth.device.type), len(row)
+        lower = dtype != torch.float32
+        if lower:
+            padding = next((-count % step for beyond, step in PADDED_ROWS if count > beyond), 0)
+            row, outcome = (F.pad(index, (0, padding)) for index in (row, outcome))
+        x = self._inputs(bin_depth, tote_depth, row, outcome, dtype)
+        with torch.autocast(tote_depth.device.type, dtype, enabled=lower):
+            x = F.relu(self.hidden(F.relu(self.patch(x))))
+        return self.head(x.float())[:count]  # in full: scores that differ a little must not be rounded to a tie
+
+    def _inputs(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, outcome: Tensor, dtype) -> Tensor:
+        """What the first layer sees of some footprints, ``[M, inputs]``: one-hot, cell by cell, then the five codes."""
+        side, reach = self.receptive_field, self.reach
+        _, wide, long = tote_depth.shape
+        item = Rules.read_item(bin_depth)
+        turned = outcome >= wide * long
+        # Patches begin some cells before their footprint along the item's own axes, to have it in their middle.
+        before_w, before_d = (side // 2 - (size - 1) // 2 for size in (item.w[row], item.d[row]))
+        margin = side + max(bin_depth.shape[1:])
+        stride = long + 2 * margin
+        x = outcome // long % wide + margin - torch.where(turned, before_d, before_w)
+        y = outcome % long + margin - torch.where(turned, before_w, before_d)
+        tap = torch.arange(side, device=row.device)
+        steps = torch.stack([tap[:, None] * stride + tap, tap[:, None] + tap * stride]).flatten(1)
+        # Depths as small whole numbers: comparing a row of them is what takes the time.
+        depth = clip_depth(tote_depth, 8_000, floor=-900).to(torch.int16)
+        deepest = depth.amax((1, 2)).clamp(min=self.tote_clip)[row]
+        depth = F.pad(depth, (margin,) * 4, value=OUTSIDE)
+        corner = (row * (wide + 2 * margin) + x) * stride + y
+        seen = depth.flatten()[steps[turned.long()] + corner[:, None]]  # [M, side * side]
+        under = self._under(bin_depth.shape[1:], row.device)[item.w[row], item.d[row]]
+        rest = torch.where(under, seen, FAR_DOWN).amin(1)  # depth of what the item rests on
+        room = rest - item.h[row].to(torch.int16)  # above its top
+        around = (room[:, None] - seen).clamp_(-reach, reach).add_(reach)
+        hole = (seen - rest[:, None]).clamp_(0, reach).add_(2 * reach + 1)
+        level = torch.where(under, hole, around).masked_fill_(seen == OUTSIDE, self.planes)
+
+        sizes = [(size - 1).clamp(0, self.item_range - 1)[row].to(torch.int16) for size in (item.w, item.d, item.h)]
+        codes = [*sizes, (room + 1).clamp(0, self.rooms - 1), (deepest - rest).clamp(0, self.depth_range - 1)]
+        level = torch.cat([level, torch.stack(codes, 1)], 1)
+        planes = torch.eye(self.planes + 1, self.planes, dtype=dtype, device=row.device)
+        return F.embedding(level.int(), planes).flatten(1)
+
+    def _under(self, bin_size, device: torch.device) -> Tensor:
+        """Which cells of a patch lie under an item of ``w x d``, bool ``[W_B + 1, D_B + 1, side * side]``."""
+        side, maps = self.receptive_field, []
+        tap = torch.arange(side, device=device)
+        for longest in bin_size:
+            size = torch.arange(longest + 1, device=device)[:, None]
+            begin = side // 2 - (size - 1) // 2
+            maps.append((tap >= begin) & (tap < begin + size))
+        return (maps[0][:, None, :, None] & maps[1][None, :, None]).flatten(2)
+
+
+def check_dtype(key: str, name: str) -> str:
+    """The name, if it is one that :func:`matrix_dtype` knows.
+
+    Raises:
+        ValueError: if it is not, naming the key.
+    """
+    if name not in ("auto", "float32", "bfloat16"):
+        raise ValueError(f"{key}={name!r}: expected 'auto', 'float32' or 'bfloat16'.")
+    return name
+
+
+def matrix_dtype(name: str, device: str) -> torch.dtype:
+    """What matrix products are computed in on a type of device; for ``"auto"`` what is fastest there."""
+    if name != "auto":
+        return getattr(torch, name)
+    if device == "cuda":
+        return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
+    able = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+    return torch.bfloat16 if any(able.get(key) for key in ("amx_bf16", "avx512_bf16", "bf16")) else torch.float32
+
+
+OUTSIDE = -1000  # the depth of a cell that is not in the tote
+FAR_DOWN = 10_000  # deeper than any tote

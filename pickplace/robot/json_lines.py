@@ -1,0 +1,164 @@
+"""The ``pickplace-plan`` command: one plan from two ``.npy`` files, or a process that answers JSON lines."""
+
+import argparse
+import json
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pickplace.runs.hydra_app import one_sentence
+
+if TYPE_CHECKING:
+    from pickplace.robot.planner import Planner
+
+#: What a request may hold; ``id`` comes back as it is.
+REQUEST = ("id", "bin_depth", "tote_depth", "tote_height", "cell_size", "tolerance", "alternatives")
+
+
+def main() -> None:
+    """Entry point of ``pickplace-plan``."""
+    with one_sentence():
+        run(parser().parse_args())
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    options = argparse.ArgumentParser(
+        prog="pickplace-plan",
+        description="Where to pick, where to place and how to turn. With --bin and --tote: one plan, as JSON. Without: "
+        'reads a request a line from standard input, {"bin_depth": [[...]], "tote_depth": [[...]]}, and answers each '
+        "with a plan in one line; a bad line is answered with an error, and the process goes on.",
+        epilog="Maps, frames of reference and errors: docs/robot.md",
+    )
+    options.add_argument("checkpoint", help="a run folder, a checkpoint, or pretrained/<name>")
+    options.add_argument("--bin", metavar="NPY", help="depth map [W_B, D_B]: height above the bin's floor")
+    options.add_argument("--tote", metavar="NPY", help="depth map [W_T, D_T]: remaining height, from surface to rim")
+    options.add_argument(
+        "--tote-height", type=float, metavar="H", help="height of the tote's rim; default: that of --tote-size"
+    )
+    options.add_argument(
+        "--cell-size", type=float, metavar="M", help="side of a cell in metres, if the maps are in metres"
+    )
+    options.add_argument(
+        "--tolerance",
+        type=float,
+        metavar="T",
+        default=0.25,
+        help="heights are off by at most so many cells (default %(default)s)",
+    )
+    options.add_argument(
+        "--candidates", metavar="K", default="all", help="K most probable actions are tried, or all (the default)"
+    )
+    options.add_argument(
+        "--alternatives", type=int, metavar="N", default=10, help="best choices that are reported (default %(default)s)"
+    )
+    options.add_argument("--bin-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
+    options.add_argument("--tote-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
+    options.add_argument("--effector-size", type=int, nargs=2, metavar=("W", "D"), help="cells; default: as trained")
+    options.add_argument("--rotations", type=int, metavar="R", help="quarter turns to choose from; default: as trained")
+    options.add_argument(
+        "--trust",
+        action="append",
+        metavar="MODULE",
+        default=[],
+        help="a module of yours that the checkpoint's config may name",
+    )
+    options.add_argument("--threads", type=int, metavar="N", help="CPU threads; default: torch's")
+    options.add_argument("--device", default="cpu", help="cpu (the default) or cuda")
+    options.add_argument("--time", action="store_true", help="print the latency of each plan on standard error")
+    return options
+
+
+def run(args: argparse.Namespace) -> None:
+    """Load the planner, then plan once or for each line.
+
+    Raises:
+        ValueError: for arguments, a checkpoint or maps that cannot be used.
+    """
+    import torch  # here, so that --help need not wait for it
+
+    from pickplace.robot.planner import Planner
+
+    if (args.bin is None) != (args.tote is None):
+        missing = "--bin" if args.bin is None else "--tote"
+        raise ValueError(f"{missing}: no file; expected both --bin and --tote, or neither to read JSON lines.")
+    if args.threads is not None:
+        if args.threads < 1:
+            raise ValueError(f"--threads={args.threads}: expected a whole number >= 1.")
+        torch.set_num_threads(args.threads)
+    sizes = {key: getattr(args, key) for key in ("bin_size", "tote_size", "effector_size", "rotations")}
+    sizes = {key: value for key, value in sizes.items() if value is not None}
+    candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates
+    planner = Planner.load(args.checkpoint, candidates=candidates, device=args.device, trust=args.trust, **sizes)
+    defaults = {key: getattr(args, key) for key in ("tote_height", "cell_size", "tolerance", "alternatives")}
+    if args.bin is not None:
+        result = timed(planner, args.time, bin_depth=read_map(args.bin), tote_depth=read_map(args.tote), **defaults)
+        sys.stdout.write(json.dumps(result, indent=1) + "\n")
+        return
+    for line in sys.stdin.buffer:
+        if line.strip():
+            sys.stdout.write(json.dumps(answer(planner, line, defaults, args.time)) + "\n")
+            sys.stdout.flush()
+
+
+def timed(planner: "Planner", tell: bool, **request) -> dict:
+    """A plan as plain values; its latency goes to standard error if asked for."""
+    start = time.perf_counter()
+    plan = planner.plan(**request).as_dict()
+    if tell:
+        sys.stderr.write(f"planned in {(time.perf_counter() - start) * 1e3:.1f} ms\n")
+        sys.stderr.flush()
+    return plan
+
+
+def answer(planner: "Planner", line: bytes, defaults: dict, tell: bool = False) -> dict:
+    """The reply to one line: a plan, or ``{"error": ...}`` in one sentence; with the request's ``id`` if it has one."""
+    reply = {}
+    try:
+        request = json.loads(line.decode(), parse_constant=refuse_constant, parse_float=finite)
+        if not isinstance(request, dict):
+            raise ValueError(f"got {type(request).__name__}, expected an object with bin_depth and tote_depth.")
+        if "id" in request:
+            reply["id"] = request.pop("id")
+        if unknown := sorted(set(request) - set(REQUEST)):
+            raise ValueError(f"{unknown[0][:40]}: there is no such key; expected any of {', '.join(REQUEST)}.")
+        for key in ("bin_depth", "tote_depth"):
+            if key not in request:
+                raise ValueError(f"{key}: missing; expected a depth map as a list of rows.")
+        return {**reply, **timed(planner, tell, **{**defaults, **request})}
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        return {**reply, "error": f"the line is not JSON: {error}."}
+    except ValueError as error:
+        return {**reply, "error": " ".join(str(error).split())}
+
+
+def finite(text: str) -> float:
+    """JSON takes 1e999, which Python reads as infinity and would write as such."""
+    number = float(text)
+    return number if abs(number) < float("inf") else refuse_constant(text)
+
+
+def refuse_constant(name: str):
+    """Python's parser takes NaN and Infinity, which JSON does not have."""
+    raise ValueError(f"the line is not JSON: got {name[:20]}, expected a finite number.")
+
+
+def read_map(path: str) -> np.ndarray:
+    """A depth map from a ``.npy`` file; nothing in it is unpickled.
+
+    Raises:
+        ValueError: naming the file.
+    """
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(f"{path}: cannot be read as a .npy file ({error}).") from error
+    if not isinstance(values, np.ndarray):
+        raise ValueError(f"{path}: expected a .npy file with one array, got an archive.")
+    return values
+
+
+if __name__ == "__main__":
+    main()

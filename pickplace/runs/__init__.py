@@ -1,0 +1,1 @@
+"""Run folders: configs, checkpoints, resuming, loggers."""

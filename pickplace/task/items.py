@@ -1,0 +1,226 @@
+"""Item distributions: which item arrives next, and where it lies in its bin.
+
+An item is a counter-based hash of (stream, seed, episode, step), so there is no generator to save, the items do not
+depend on the batch size, and every method that plays an episode meets the same ones.
+"""
+
+import csv
+import io
+import math
+from itertools import product
+from numbers import Integral
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pickplace.task.geometry import Item
+
+#: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
+STREAMS = ("train", "validation", "test")
+MOST_SEEDS = 2**62  # the hash of one family's seed is that of another's only where the seeds lie further apart
+
+
+def check_seed(seed: int, key: str = "seed") -> int:
+    """The seed, if it is one.
+
+    Raises:
+        ValueError: naming the ``key``, if it is not.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= seed < MOST_SEEDS:
+        raise ValueError(f"{key}={seed!r}: expected a whole number >= 0 and < 2**62.")
+    return int(seed)
+
+
+def _mix(x: Tensor) -> Tensor:
+    """Scramble int64 counters (the finalizer of MurmurHash3, Appleby 2011)."""
+    for factor in (-0x00AE502812AA7333, -0x3B314601E57A13AD):
+        x = x ^ ((x >> 33) & 0x7FFFFFFF)
+        x = x * factor
+    return x ^ ((x >> 33) & 0x7FFFFFFF)
+
+
+def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, count: int) -> Tensor:
+    """Uniform numbers in [0, 1) from the item's address, float64 ``[count, N]``: the same address, the same numbers."""
+    family = STREAMS.index(stream) + 1
+    key = seed
+    for part in (family, episode, step):
+        key = _mix(key * 0x2545F4914F6CDD1D + part + 0x1B873593)
+    key = _mix(key + torch.arange(1, count + 1, device=key.device)[:, None] * 0x1E3779B97F4A7C15)
+    return ((key >> 11) & ((1 << 53) - 1)).double() / float(1 << 53)
+
+
+def _is_length(value) -> bool:
+    """Is it a positive whole number of cells that fits the tensors?"""
+    return isinstance(value, Integral) and not isinstance(value, bool) and 1 <= int(value) < 2**31
+
+
+class ItemDistribution:
+    """What an item distribution offers to the environment.
+
+    Attributes:
+        sizes: int64 ``[K, 3]``, every size ``(w, d, h)`` that may arrive, in cells.
+        length: number of items in an episode, or None if they never end.
+        varies: whether episodes differ at all.
+    """
+
+    sizes: Tensor
+    length: int | None = None
+    varies: bool = True
+
+    def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size) -> Item:
+        """The ``step``-th item (from 0) of each ``episode``, int64 ``[N]``; size 0 after the last one."""
+        kind, across, along = hashed_uniform(stream, seed, episode, step, 3)
+        w, d, h = self.sizes.to(step.device)[self._index(kind, step)].unbind(-1)
+        x = (across * (bin_size[0] - w + 1)).long()
+        y = (along * (bin_size[1] - d + 1)).long()
+        return Item(x, y, w, d, h)
+
+    def _index(self, uniform: Tensor, step: Tensor) -> Tensor:
+        """Which row of ``sizes`` arrives, int64 ``[N]``."""
+        raise NotImplementedError
+
+    def corners(self, kind: int, bin_size) -> list[tuple[int, int]]:
+        """Every bin position ``(x, y)`` at which kind number ``kind`` may arrive."""
+        w, d, _ = self.sizes[kind].tolist()
+        return list(product(range(bin_size[0] - w + 1), range(bin_size[1] - d + 1)))
+
+    def label(self, kind: int) -> str:
+        """What to call kind number ``kind`` in a message."""
+        return "item {}x{}x{}".format(*self.sizes[kind].tolist())
+
+
+class Kinds(ItemDistribution):
+    """A list of kinds with weights.
+
+    Args:
+        kinds: ``(w, d, h)`` triples, in cells.
+        weights: a relative frequency for each kind; None means equally likely.
+
+    Raises:
+        ValueError: an empty list, a size that is not a positive whole number, or weights that do not fit the kinds.
+    """
+
+    def __init__(self, kinds, weights=None):
+        if not isinstance(kinds, (list, tuple)) or not kinds:
+            raise ValueError(f"items.kinds={kinds!r}: expected a list of at least one (w, d, h).")
+        for kind in kinds:
+            if not isinstance(kind, (list, tuple)) or len(kind) != 3 or not all(map(_is_length, kind)):
+                raise ValueError(f"items.kinds: got {kind!r}, expected (w, d, h) in positive whole cells.")
+        if weights is None:
+            weights = [1.0] * len(kinds)
+        if not isinstance(weights, (list, tuple)) or len(weights) != len(kinds):
+            raise ValueError(f"items.weights={weights!r}: expected {len(kinds)} numbers, one for each kind.")
+        numbers = all(isinstance(v, (int, float)) and 0 <= v < float("inf") for v in weights)
+        if not numbers or not 0 < sum(weights) < float("inf"):
+            raise ValueError(f"items.weights={weights!r}: expected finite numbers >= 0 that are not all 0.")
+        used = [i for i, v in enumerate(weights) if v > 0]
+        self.sizes = torch.tensor([list(kinds[i]) for i in used], dtype=torch.int64)
+        share = torch.tensor([weights[i] for i in used], dtype=torch.float64)
+        self._edges = (share.cumsum(0) / share.sum())[:-1]
+
+    def _index(self, uniform, step):
+        return torch.searchsorted(self._edges.to(uniform.device), uniform, right=True)
+
+
+#: What is still read of a list of items, and how many kinds there may be: more would fill the memory.
+MOST_TEXT, MOST_KINDS = 100_000_000, 100_000
+
+
+class Uniform(Kinds):
+    """Cuboids whose sides and heights are drawn uniformly and independently from closed ranges.
+
+    Args:
+        width, depth, height: ``(least, greatest)``, in cells.
+    """
+
+    def __init__(self, width=(1, 3), depth=(1, 3), height=(1, 3)):
+        ranges = {"width": width, "depth": depth, "height": height}
+        for name, limits in ranges.items():
+            pair = isinstance(limits, (list, tuple)) and len(limits) == 2 and all(map(_is_length, limits))
+            if not pair or limits[0] > limits[1]:
+                raise ValueError(
+                    f"items.{name}={limits!r}: expected [least, greatest], whole cells with 1 <= least <= greatest."
+                )
+        count = math.prod(high - low + 1 for low, high in ranges.values())
+        if count > MOST_KINDS:
+            raise ValueError(f"items: the ranges have {count:,} kinds of items; expected at most {MOST_KINDS:,}.")
+        super().__init__(list(product(*(range(low, high + 1) for low, high in ranges.values()))))
+
+
+class Recorded(ItemDistribution):
+    """A recorded stream: the items of a CSV file in their order; every episode starts at the first row.
+
+    Args:
+        path: a file with a header ``w,d,h`` and optionally ``x,y`` (the item's min corner in the bin), one item a row.
+            Without ``x,y`` the position is random.
+        loop: after the last row start over, instead of ending (truncating) the episode.
+
+    Raises:
+        ValueError: a missing file or column, or a value that is not a whole number, naming the line.
+    """
+
+    def __init__(self, path, loop=False):
+        if not isinstance(loop, bool):
+            raise ValueError(f"items.loop={loop!r}: expected true or false.")
+        self.path = Path(str(path))
+        if not self.path.is_file():
+            raise ValueError(f"items.path={str(path)!r}: no such file; expected a CSV with columns w,d,h (and x,y).")
+        try:
+            with self.path.open(newline="", encoding="utf-8-sig") as file:
+                text = file.read(MOST_TEXT + 1)
+                if len(text) > MOST_TEXT:
+                    raise ValueError(f"items.path={str(path)!r}: longer than {MOST_TEXT:,} characters.")
+                reader = csv.reader(io.StringIO(text, newline=""))
+                table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise ValueError(f"{path}: {error}; expected a CSV in UTF-8.") from error
+        header = table[0][1] if table else []
+        if header not in (["w", "d", "h"], ["w", "d", "h", "x", "y"]):
+            raise ValueError(f"{path}: the header is {','.join(header)!r}, expected 'w,d,h' or 'w,d,h,x,y'.")
+        rows = [self._row(line, row, header) for line, row in table[1:] if any(row)]
+        if not rows:
+            raise ValueError(f"{path}: no items, expected at least one row below the header.")
+        numbers = torch.tensor(rows, dtype=torch.int64)
+        self.sizes = numbers[:, :3]
+        self._corner = numbers[:, 3:] if len(header) == 5 else None
+        self.varies = self._corner is None  # else not even where the items lie
+        self._lines = [line for line, row in table[1:] if any(row)]
+        self._loop = loop
+        self.length = None if loop else len(rows)
+
+    def _row(self, line, row, header):
+        whole = all(field.isdecimal() and len(field) < 10 for field in row)
+        values = [int(field) for field in row] if whole else []
+        if len(values) != len(header) or min(values[:3]) < 1:
+            raise ValueError(
+                f"{self.path}, line {line}: got {','.join(row)!r}, expected {','.join(header)} as whole numbers "
+                "with w, d, h >= 1 and x, y >= 0."
+            )
+        return values
+
+    def sample(self, stream, seed, episode, step, bin_size):
+        item = super().sample(stream, seed, episode, step, bin_size)
+        if self._corner is not None:
+            x, y = self._corner.to(step.device)[self._index(None, step)].unbind(-1)
+            item = item._replace(x=x, y=y)
+        if self.length is None:
+            return item
+        left = step < self.length
+        return Item(*(torch.where(left, part, 0) for part in item))
+
+    def _index(self, uniform, step):
+        return step % len(self.sizes) if self._loop else step.clamp(max=len(self.sizes) - 1)
+
+    def corners(self, kind, bin_size):
+        if self._corner is None:
+            return super().corners(kind, bin_size)
+        return [tuple(self._corner[kind].tolist())]
+
+    def label(self, kind):
+        return f"{self.path}, line {self._lines[kind]}: " + super().label(kind)
+
+
+def imagined(items: ItemDistribution) -> ItemDistribution:
+    """What a search samples items from: of a recorded stream, which it must not look up, its sizes, equally likely."""
+    return Kinds(items.sizes.tolist()) if isinstance(items, Recorded) else items

@@ -1,0 +1,1 @@
+"""Training by PPO under a curriculum of tote heights."""

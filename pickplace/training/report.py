@@ -1,0 +1,110 @@
+"""``report.html``: what a training run did, on one page."""
+
+import base64
+import io
+import re
+import shlex
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from pickplace.runs.hydra_app import begun_with, changed_since, own_configs
+from pickplace.runs.loggers import read_csv
+from pickplace.task.geometry import Rules
+from pickplace.views.figures import failure_mix
+from pickplace.views.replay import ASSETS, page
+
+REPORT = "report.html"
+
+
+def write_report(run_dir: Path, cfg: DictConfig, episodes, rules: Rules, facts: dict) -> None:
+    """Write ``report.html``: curves, tables, the worst and the best episode, and how to make the run again.
+
+    Args:
+        run_dir: the run folder, with ``metrics.csv`` and ``learning_curve.png``.
+        cfg: the composed config.
+        episodes: the last validation, an :class:`pickplace.evaluation.evaluate.Episodes` with recordings.
+        rules: the task's sizes.
+        facts: versions and commit.
+    """
+    rows = read_csv(run_dir / "metrics.csv")
+    failures = io.BytesIO()
+    failure_mix(run_dir / "metrics.csv", failures)
+    best = max((row for row in rows if "eval/occupancy" in row), key=lambda row: row["eval/occupancy"])
+    ordered = sorted(episodes.recordings, key=lambda recording: recording.occupancy)
+    sizes = "x".join(map(str, rules.tote_size))
+    policy = str(cfg.model.actor._target_).rpartition(".")[2]
+    count, mean = len(episodes.occupancy), float(episodes.occupancy.mean())
+    tiles = [
+        (f"{best['eval/occupancy']:.4f}", f"best validation, after {best['frames']:,} frames (checkpoints/best)"),
+        (f"{mean:.4f}", f"last validation, {count} episodes at full height"),
+        (f"{float(episodes.occupancy.min()):.4f}", "its worst episode"),
+        (f"{int(rows[-1]['curriculum/level'])} of {rules.tote_size[2]}", "tote height reached"),
+    ]
+    parts = {
+        "title": escape(f"Training {policy} for a {sizes} tote"),
+        "subtitle": escape(
+            f"R={rules.rotations}, {rows[-1]['frames']:,} frames, seed {cfg.seed}, "
+            f"mask in training: {'yes' if cfg.algo.mask_infeasible else 'no'}, K={cfg.planner.candidates}"
+        ),
+        "tiles": "".join(f"<div><b>{value}</b><span>{text}</span></div>" for value, text in tiles),
+        "curve": base64.b64encode((run_dir / "learning_curve.png").read_bytes()).decode(),
+        "failures": base64.b64encode(failures.getvalue()).decode(),
+        "tables": _validations(rows) + _levels(rows),
+        "command": escape(_command(run_dir, cfg)),
+        "config": escape(OmegaConf.to_yaml(cfg, resolve=True)),
+        "versions": escape("\n".join(f"{name}: {value}" for name, value in facts.items())),
+        "replay": escape(page(ordered, rules, f"{cfg.evaluation.stream} stream, seed {cfg.evaluation.seed}")),
+    }
+    html = (ASSETS / "report.html").read_text(encoding="utf-8")
+    # In one pass, so that nothing in the content is taken for a mark.
+    html = re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], html)
+    fresh = run_dir / f".{REPORT}.new"
+    try:
+        fresh.write_text(html, encoding="utf-8")
+        fresh.replace(run_dir / REPORT)
+    except OSError as error:
+        fresh.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(run_dir / REPORT)) from error
+
+
+def _table(head: tuple, rows: list[tuple]) -> str:
+    cells = "".join(f"<th>{name}</th>" for name in head)
+    lines = ["".join(f"<td>{value}</td>" for value in row) for row in rows]
+    return f"<table><tr>{cells}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
+
+
+def _validations(rows: list[dict]) -> str:
+    found = [
+        (
+            f"{row['frames']:,}",
+            f"{row['eval/occupancy']:.4f}",
+            f"{row['eval/ci95_low']:.4f} to {row['eval/ci95_high']:.4f}",
+            int(row["curriculum/level"]),
+        )
+        for row in rows
+        if "eval/occupancy" in row
+    ]
+    step = max(1, len(found) // 12)  # a long run has many; these and the last one tell the story
+    return _table(("frames", "validation", "95% interval", "tote height in training"), found[:-1:step] + found[-1:])
+
+
+def _levels(rows: list[dict]) -> str:
+    """Mean training occupancy at each tote height, over the last batches in which an episode of it ended."""
+    heights = sorted({int(key.rpartition("_")[2]) for row in rows for key in row if "curriculum/occupancy_at_" in key})
+    lines = []
+    for height in heights:
+        seen = [row for row in rows if f"curriculum/occupancy_at_{height}" in row]
+        values = [row[f"curriculum/occupancy_at_{height}"] for row in seen[-20:]]
+        lines.append((height, f"{np.mean(values):.4f}", f"{seen[0]['frames']:,} to {seen[-1]['frames']:,}"))
+    head = ("tote height", "training occupancy when last trained", "frames")
+    return "<br>" + _table(head, lines) if lines else ""
+
+
+def _command(run_dir: Path, cfg: DictConfig) -> str:
+    """The command that began the run, and what was changed when it was resumed."""
+    command = " ".join(["pickplace-train", *map(shlex.quote, [*own_configs(run_dir), *begun_with(run_dir)])])
+    changed = changed_since(run_dir, cfg)
+    return f"{command}\n\nChanged when it was resumed: {', '.join(changed)}" if changed else command

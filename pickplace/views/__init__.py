@@ -1,0 +1,1 @@
+"""Recordings, the replay page and figures."""
