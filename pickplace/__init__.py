@@ -8,26 +8,35 @@ import gymnasium
 if TYPE_CHECKING:
     from pickplace.envs.torchrl import PickPlaceEnv
     from pickplace.robot.planner import DepthMapError, Plan, Planner
-    from pickplace.task.geometry import Failure, Item, Rules
+    from pickplace.task.cell import CellSpec
+    from pickplace.task.state import Failure, Item, State
 
 gymnasium.register(
     "pickplace/PickPlace-v0",
-    entry_point="pickplace.envs.gymnasium:PickPlaceGymEnv",
+    entry_point="pickplace.views.gymnasium:RenderedPickPlaceEnv",
     vector_entry_point="pickplace.envs.gymnasium:PickPlaceVectorEnv",
 )
 
 __version__ = "0.1.0"
-__all__ = ["DepthMapError", "Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "Rules", "__version__"]
 
-_HOMES = {"PickPlaceEnv": "envs.torchrl", "Failure": "task.geometry", "Item": "task.geometry", "Rules": "task.geometry"}
-_HOMES |= {"DepthMapError": "robot.planner", "Plan": "robot.planner", "Planner": "robot.planner"}
+#: The module of each public name; it is imported when it is asked for, since torch and torchrl take seconds.
+_MODULES = {
+    "CellSpec": "task.cell",
+    "DepthMapError": "robot.planner",
+    "Failure": "task.state",
+    "Item": "task.state",
+    "PickPlaceEnv": "envs.torchrl",
+    "Plan": "robot.planner",
+    "Planner": "robot.planner",
+    "State": "task.state",
+}
+__all__ = ["CellSpec", "DepthMapError", "Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "State", "__version__"]
 
 
 def __getattr__(name: str):
-    """What the package offers is imported when it is asked for: torch and torchrl take seconds."""
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"pickplace.{_HOMES[name]}"), name)
+    return getattr(import_module(f"pickplace.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

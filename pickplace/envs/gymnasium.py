@@ -1,7 +1,5 @@
-"""The Gymnasium face of :class:`~pickplace.envs.torchrl.PickPlaceEnv`: ``gymnasium.make`` and ``gymnasium.make_vec``."""
+"""Gymnasium environments over :class:`~pickplace.envs.torchrl.PickPlaceEnv`: one problem, or many side by side."""
 
-import os
-import sys
 from typing import Any
 
 import gymnasium
@@ -13,16 +11,12 @@ from gymnasium.vector.utils import batch_space
 from tensordict import TensorDict
 
 from pickplace.envs.torchrl import PickPlaceEnv
-from pickplace.task.geometry import Failure
 from pickplace.task.items import Kinds, check_seed
-from pickplace.views.figures import draw_scene, item_colours
-from pickplace.views.replay import Recording, observe
-
-KEYS = ("bin_depth", "tote_depth", "tote_height")  # what an agent sees
+from pickplace.task.state import Failure
 
 
 def _make_env(num_envs: int, items, settings: dict) -> PickPlaceEnv:
-    """The batched environment behind both faces; a list of ``(w, d, h)`` is short for ``Kinds``."""
+    """Return the batched environment below; a list of ``(w, d, h)`` is short for ``Kinds``."""
     for key, why in (("masks", "the action mask always comes along"), ("seed", "reset(seed=...) begins a stream")):
         if key in settings:
             raise ValueError(f"{key}={settings[key]!r}: expected no such argument; {why}.")
@@ -31,14 +25,12 @@ def _make_env(num_envs: int, items, settings: dict) -> PickPlaceEnv:
 
 
 def _spaces(env: PickPlaceEnv) -> tuple[spaces.Dict, spaces.Discrete]:
-    """Observation and action space of one problem."""
-    spec = env.observation_spec
+    """Return observation and action space of one problem."""
     boxes: dict[str, spaces.Space] = {}
-    for key in KEYS:
-        space, shape = spec[key].space, tuple(spec[key].shape[1:])
-        dtype = np.int64 if key == "tote_height" else np.float32
-        boxes[key] = spaces.Box(space.low.min().item(), space.high.max().item(), shape, dtype)
-    return spaces.Dict(boxes), spaces.Discrete(env.rules.num_actions)
+    for key, term in env.terms.items():
+        low, high, shape, dtype = term.bounds(env.cell, env.min_tote_height)
+        boxes[key] = spaces.Box(low, high, shape, torch.empty(0, dtype=dtype).numpy().dtype.type)
+    return spaces.Dict(boxes), spaces.Discrete(env.cell.num_actions)
 
 
 def _options(options: dict | None, known: tuple[str, ...]) -> dict:
@@ -49,8 +41,8 @@ def _options(options: dict | None, known: tuple[str, ...]) -> dict:
 
 
 def _tote_heights(given, env: PickPlaceEnv) -> torch.Tensor:
-    """``options["tote_height"]`` as int64 ``[N, 1]``: a whole number, or one for each problem; None: full height."""
-    low, high, count = env.min_tote_height, env.rules.tote_size[2], env.num_envs
+    """Return ``options["tote_height"]``, a whole number or one per problem, as int64 ``[N, 1]``; None: full height."""
+    low, high, count = env.min_tote_height, env.cell.tote_size[2], env.num_envs
     heights = np.asarray(high if given is None else given)
     wanted = f"a whole number of cells between {low} (the tallest item) and {high} (tote_size[2])"
     if heights.dtype.kind not in "iu" or heights.shape not in ((), (count,)):
@@ -79,9 +71,11 @@ class PickPlaceGymEnv(gymnasium.Env):
 
     | key | shape, type | meaning |
     |---|---|---|
-    | `bin_depth` | `(W_B, D_B)` float32 | height above the bin's floor, 0 where empty; cells |
-    | `tote_depth` | `(W_T, D_T)` float32 | remaining height up to the rim; cells |
-    | `tote_height` | `(1,)` int64 | height of the episode's tote; cells |
+    | `bin_depth` | `(W_B, D_B)` float32 | height above the bin's floor, 0 where empty; height units |
+    | `tote_depth` | `(W_T, D_T)` float32 | remaining height up to the rim; height units |
+    | `tote_height` | `(1,)` int64 | height of the episode's tote; height units |
+
+    and what `observation=` adds (see `PickPlaceEnv`).
 
     ## Rewards
     The volume placed, in cells; 0 for an action that fails. An episode's return is the volume packed.
@@ -99,27 +93,20 @@ class PickPlaceGymEnv(gymnasium.Env):
     `"pick_miss"`, ..., `"stuck"`); `action_mask`: as `action_masks()`.
 
     ## Arguments
-    `bin_size`, `tote_size`, `effector_size`, `rotations`, `pick_rule`, `min_support`, `strict_support`, `stream`,
-    `device`: as of `pickplace.PickPlaceEnv`. `items`: an item distribution, or a list of `(w, d, h)`; by default the
-    paper's four kinds. `render_mode`: `"rgb_array"` or `"human"`.
+    `items`: an item distribution, or a list of `(w, d, h)`; by default the paper's four kinds. The settings of
+    `pickplace.CellSpec`; `stream`, `observation` and `device` of `pickplace.PickPlaceEnv`. `render_mode`: `"rgb_array"`
+    or `"human"`, with `gymnasium.make`.
 
     ## Version History
     * v0: first version.
     """
 
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 4}
+    metadata: dict[str, Any] = {"render_modes": []}
     action_space: spaces.Discrete
 
-    def __init__(self, items=None, render_mode: str | None = None, **settings):
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode={render_mode!r}: expected 'rgb_array', 'human' or None.")
-        self._env, self.render_mode = _make_env(1, items, settings), render_mode
+    def __init__(self, items=None, **settings):
+        self._env = _make_env(1, items, settings)
         self.observation_space, self.action_space = _spaces(self._env)
-        self._recording: Recording | None = None  # of the running episode, for rendering
-        self._window: tuple | None = None  # the figure and the image in it
-        self._colours = (
-            item_colours([(0, 0, 0, *size) for size in self._env.items.sizes.tolist()]) if render_mode else {}
-        )
         self._started = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
@@ -130,9 +117,6 @@ class PickPlaceGymEnv(gymnasium.Env):
             self._env.set_seed(int(self.np_random.integers(2**31)) if seed is None else seed)
             self._started = True
         state = self._env.reset(TensorDict({"tote_height": heights}, [1], device=self._env.device))
-        if self.render_mode:
-            self._recording = Recording(int(self._env.episode[0]), int(heights[0]))
-        self._show()
         return self._observation(state), self._info(state)
 
     def step(self, action):
@@ -141,73 +125,20 @@ class PickPlaceGymEnv(gymnasium.Env):
         if not self.action_space.contains(action):
             raise ValueError(f"action={action!r}: expected a whole number in [0, {self.action_space.n}).")
         actions = torch.as_tensor([int(action)], device=self._env.device)
-        if self._recording is not None:
-            before = TensorDict({"tote_height": self._env.tote_height[:, None].clone()}, [1], device=self._env.device)
-            move = observe(self._env.rules, None, before, self._env.heights, self._env.current_item, actions)[0]
-            self._recording.moves.append(move)
         state = self._env.step(TensorDict({"action": actions}, [1], device=self._env.device))["next"]
-        if self._recording is not None and bool(state["done"]):
-            self._recording.ending = Failure(int(state["failure"]))
-        self._show()
         flags = bool(state["terminated"]), bool(state["truncated"])
         return self._observation(state), float(state["reward"]), *flags, self._info(state)
 
     def action_masks(self) -> np.ndarray:
-        """Which actions would succeed, bool ``[N_a]``: the name that sb3-contrib's MaskablePPO looks for."""
+        """Return which actions would succeed, bool ``[N_a]``; sb3-contrib's MaskablePPO looks for this name."""
         return self._env.action_mask[0].cpu().numpy().copy()
 
     def _observation(self, state) -> dict[str, np.ndarray]:
-        return {key: state[key][0].cpu().numpy().copy() for key in KEYS}
+        return {key: state[key][0].cpu().numpy().copy() for key in self._env.terms}
 
     def _info(self, state) -> dict[str, Any]:
         failure = Failure(int(state["failure"])).name.lower()
         return {"occupancy": float(state["occupancy"]), "failure": failure, "action_mask": self.action_masks()}
-
-    # ------------------------------------------------------------------ rendering
-    def render(self) -> np.ndarray | None:
-        if self.render_mode == "rgb_array":
-            return self._picture()
-        return None  # a window follows by itself
-
-    def _picture(self) -> np.ndarray:
-        """The tote in 3D, its height map and the bin, uint8 ``[600, 1200, 3]``."""
-        if self._recording is None:
-            raise gymnasium.error.ResetNeeded("render() before reset().")
-        rules, item = self._env.rules, self._env.current_item
-        scene = draw_scene(self._recording, rules, self._colours)
-        inset = scene.add_axes((0.01, 0.04, 0.09, 0.18))
-        inset.imshow(rules.bin_depth(item)[0].cpu().numpy().T, origin="lower", cmap="YlOrBr", vmin=0)
-        inset.set_title("bin", fontsize="medium")
-        inset.set_xticks([])
-        inset.set_yticks([])
-        scene.set_dpi(100)
-        scene.canvas.draw()
-        return np.asarray(scene.canvas.buffer_rgba())[..., :3].copy()
-
-    def _show(self) -> None:
-        """In mode ``human``: bring the window up to date."""
-        if self.render_mode != "human":
-            return
-        display = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-        if not display:
-            gymnasium.logger.warn("render_mode='human': there is no display, so no window is shown; try 'rgb_array'.")
-            return
-        from matplotlib import pyplot
-
-        if self._window is None:
-            figure = pyplot.figure("pickplace", figsize=(12, 6))
-            axes = figure.add_axes((0, 0, 1, 1))
-            axes.set_axis_off()
-            self._window = figure, axes.imshow(self._picture())
-        self._window[1].set_data(self._picture())
-        pyplot.pause(1 / self.metadata["render_fps"])
-
-    def close(self) -> None:
-        if self._window is not None:
-            from matplotlib import pyplot
-
-            pyplot.close(self._window[0])
-            self._window = None
 
 
 class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
@@ -296,7 +227,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
             reward[waiting], terminated[waiting], truncated[waiting] = 0, False, False
             fresh = self._env._observation()
             rows = torch.as_tensor(waiting, device=self._env.device)
-            for key in (*KEYS, "occupancy", "failure", "action_mask"):
+            for key in (*self._env.terms, "occupancy", "failure", "action_mask"):
                 state[key] = torch.where(rows.view(-1, *[1] * (state[key].ndim - 1)), fresh[key], state[key])
         self._ended = terminated | truncated
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
@@ -313,7 +244,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         return self._observations(state), reward, terminated, truncated, infos
 
     def action_masks(self) -> np.ndarray:
-        """Which actions would succeed, bool ``[N, N_a]``."""
+        """Return which actions would succeed, bool ``[N, N_a]``."""
         return self._env.action_mask.cpu().numpy().copy()
 
     def _reset_rows(self, rows: np.ndarray, heights: torch.Tensor | None = None) -> None:
@@ -323,10 +254,10 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         self._env.reset(td)
 
     def _observations(self, state) -> dict[str, np.ndarray]:
-        return {key: state[key].cpu().numpy().copy() for key in KEYS}
+        return {key: state[key].cpu().numpy().copy() for key in self._env.terms}
 
     def _infos(self, state, rows: np.ndarray) -> dict[str, Any]:
-        """Gymnasium's convention: an array for each key, and a mask ``_key`` of the slots that have it."""
+        """Return Gymnasium's convention: an array for each key, and a mask ``_key`` of the slots that have it."""
         names = np.array([failure.name.lower() for failure in Failure], dtype=object)
         infos = {
             "occupancy": state["occupancy"][:, 0].double().cpu().numpy().copy(),

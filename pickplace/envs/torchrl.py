@@ -1,18 +1,26 @@
 """The environment: one TorchRL ``EnvBase`` that simulates a batch of bins and totes as tensors."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from pickplace.task.geometry import Failure, Item, Rules
-from pickplace.task.items import STREAMS, ItemDistribution, Kinds, check_seed
+from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
+from pickplace.task.checks import whole_number
+from pickplace.task.feasibility import action_mask, footprint_mask, placing_maps
+from pickplace.task.items import PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
+from pickplace.task.observation import Term, check_terms, observe
+from pickplace.task.state import Failure, Item, State
+from pickplace.task.transition import apply
 
-STARTS_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes
-PAPER_KINDS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1))
+CACHE_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes
+
+#: The masks that the environment can emit, bool ``[N, ...]`` each.
+MASKS = {"action": action_mask, "footprint": lambda cell, maps: footprint_mask(cell, maps).flatten(1)}
 
 
 class PickPlaceEnv(EnvBase):
@@ -28,13 +36,14 @@ class PickPlaceEnv(EnvBase):
         * ``bin_depth``, float32 ``[N, W_B, D_B]``: height above the bin's floor, 0 where empty.
         * ``tote_depth``, float32 ``[N, W_T, D_T]``: remaining height, ``H_T - height``.
         * ``tote_height``, int64 ``[N, 1]``: ``H_T`` of the running episode.
+        * further terms, see ``observation``.
         * ``action_mask``, bool ``[N, N_a]``: True where and only where the action would succeed.
-        * ``outcome_mask``, bool ``[N, Q * W_T * D_T]``, only with ``masks`` naming it: the distinct footprints
+        * ``footprint_mask``, bool ``[N, Q * W_T * D_T]``, only with ``masks`` naming it: the distinct footprints
           ``(parity, x, y)`` that some action reaches.
         * ``occupancy``, float32 ``[N, 1]``: volume placed / volume of the tote.
 
     Rewards:
-        The volume placed, in cells, float32 ``[N, 1]``; 0 for a failed action.
+        The volume placed, in cells times height units, float32 ``[N, 1]``; 0 for a failed action.
 
     Starting state:
         An empty tote of the height given as ``tote_height`` (int64 ``[N, 1]``) in the TensorDict handed to ``reset``,
@@ -45,55 +54,54 @@ class PickPlaceEnv(EnvBase):
         ``truncated`` when a recorded item stream has ended. ``failure``, int64 ``[N, 1]``, is a :class:`Failure`.
 
     Args:
-        bin_size, tote_size, effector_size, rotations, pick_rule, min_support, strict_support: see
-            :class:`pickplace.task.geometry.Rules`.
         items: an :class:`~pickplace.task.items.ItemDistribution`; by default the paper's four kinds.
         num_envs: ``N``.
         seed: seed of the item stream.
         device: where the tensors live.
         stream: family of item streams, ``"train"``, ``"validation"`` or ``"test"``; they never meet.
-        masks: which masks to emit, any of ``"action"`` and ``"outcome"``.
+        masks: which masks to emit, any of ``"action"`` and ``"footprint"``.
+        observation: what the agent sees, :class:`~pickplace.task.observation.Term` by key; by default the three depth
+            terms above, which are always among them.
         first_episode: number of the episode that slot 0 plays first; slot ``i`` plays ``first_episode + i``.
         episode_stride: after an episode a slot plays the one that comes this much later; by default ``num_envs``.
+        **settings: sizes and options of the robot cell, see :class:`~pickplace.task.cell.CellSpec`.
 
     Raises:
         ValueError: for impossible settings, among them a kind of item that has no feasible action on the empty tote
             for some position in the bin.
     """
 
+    #: Settings beside the named arguments, for configs.
+    settings = CELL_SETTINGS
+
     def __init__(
         self,
-        bin_size=(5, 5, 1),
-        tote_size=(6, 6, 5),
-        effector_size=(3, 3),
-        rotations: int = 4,
         items: ItemDistribution | None = None,
-        pick_rule: str = "contain",
-        min_support: float = 0.5,
-        strict_support: bool = False,
         num_envs: int = 128,
         seed: int = 0,
         device="cpu",
         stream: str = "train",
         masks: tuple[str, ...] = ("action",),
+        observation: Mapping[str, Term] | None = None,
         first_episode: int = 0,
         episode_stride: int | None = None,
+        **settings,
     ):
-        rules = Rules(bin_size, tote_size, effector_size, rotations, pick_rule, min_support, strict_support)
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
-            raise ValueError(f"num_envs={num_envs!r}: expected a whole number >= 1.")
+        cell = cell_from_settings(settings)
+        whole_number("num_envs", num_envs)
         check_seed(seed)
         if stream not in STREAMS:
             raise ValueError(f"stream={stream!r}: expected one of {', '.join(STREAMS)}.")
-        if not set(masks) <= {"action", "outcome"}:
-            raise ValueError(f"masks={masks!r}: expected any of 'action', 'outcome'.")
+        if not set(masks) <= set(MASKS):
+            raise ValueError(f"masks={masks!r}: expected any of {', '.join(map(repr, MASKS))}.")
         items = Kinds(PAPER_KINDS) if items is None else items
         if not isinstance(items, ItemDistribution):
             raise ValueError(f"items={items!r}: expected an ItemDistribution, such as pickplace.task.items.Kinds.")
-        check_items(rules, items)
-        rules = replace(rules, longest_side=int(items.sizes[:, :2].max()))
+        check_items(cell, items)
         super().__init__(device=device, batch_size=[num_envs])
-        self.rules, self.items, self.stream, self.masks = rules, items, stream, tuple(masks)
+        self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
+        self.items, self.stream, self.masks = items, stream, tuple(masks)
+        self.terms = check_terms(observation)
         self.min_tote_height = int(items.sizes[:, 2].max())
         self.first_episode, self.episode_stride = first_episode, episode_stride or num_envs
         self._make_specs()
@@ -102,41 +110,36 @@ class PickPlaceEnv(EnvBase):
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
 
         # All run-time state, in buffers, so that state_dict() has it.
-        self.register_buffer("heights", zeros(*rules.tote_size[:2], dtype=torch.int32))
-        self.register_buffer("tote_height", zeros() + rules.tote_size[2])
+        self.register_buffer("heights", zeros(*cell.tote_size[:2], dtype=torch.int32))
+        self.register_buffer("tote_height", zeros() + cell.tote_size[2])
         self.register_buffer("item", zeros(5))  # x, y, w, d, h
         self.register_buffer("volume", zeros())
         self.register_buffer("steps", zeros())
         self.register_buffer("episode", zeros())
         self.register_buffer("item_seed", torch.tensor(0, device=self.device))
         self.register_buffer("feasible", zeros(dtype=torch.bool))
-        sizes = {"action": rules.num_actions, "outcome": rules.num_outcomes}
         for name in self.masks:
-            self.register_buffer(f"{name}_mask", zeros(sizes[name], dtype=torch.bool))
+            size = self.observation_spec[f"{name}_mask"].shape[1:]
+            self.register_buffer(f"{name}_mask", zeros(*size, dtype=torch.bool))
         self._starts: dict[tuple, tuple[Tensor, ...]] = {}  # the masks of empty totes, see `_masks_of_empty_totes`
         self.set_seed(seed)
 
     def _make_specs(self):
-        rules, n, device = self.rules, self.num_envs, self.device
-        w_b, d_b, _ = rules.bin_size
-        w_t, d_t, h_t = rules.tote_size
-        tallest = int(self.items.sizes[:, 2].max())
-        tote_height = Bounded(self.min_tote_height, h_t, (n, 1), dtype=torch.int64, device=device)
-        observation = {
-            "bin_depth": Bounded(0, tallest, (n, w_b, d_b), dtype=torch.float32, device=device),
-            "tote_depth": Bounded(0, h_t, (n, w_t, d_t), dtype=torch.float32, device=device),
-            "tote_height": tote_height,
-            "occupancy": Bounded(0, 1, (n, 1), dtype=torch.float32, device=device),
-            "failure": Categorical(len(Failure), (n, 1), dtype=torch.int64, device=device),
-        }
-        if "action" in self.masks:
-            observation["action_mask"] = Binary(rules.num_actions, (n, rules.num_actions), device, torch.bool)
-        if "outcome" in self.masks:
-            observation["outcome_mask"] = Binary(rules.num_outcomes, (n, rules.num_outcomes), device, torch.bool)
+        cell, n, device = self.cell, self.num_envs, self.device
+        observation: dict = {}
+        for key, term in self.terms.items():
+            low, high, shape, dtype = term.bounds(cell, self.min_tote_height)
+            observation[key] = Bounded(low, high, (n, *shape), dtype=dtype, device=device)
+        observation["occupancy"] = Bounded(0, 1, (n, 1), dtype=torch.float32, device=device)
+        observation["failure"] = Categorical(len(Failure), (n, 1), dtype=torch.int64, device=device)
+        sizes = {"action": cell.num_actions, "footprint": cell.num_footprints}
+        for name in self.masks:
+            observation[f"{name}_mask"] = Binary(sizes[name], (n, sizes[name]), device, torch.bool)
         self.observation_spec = Composite(observation, shape=(n,), device=device)
         # Declared as state too, so that reset() is handed the height that a curriculum writes.
-        self.state_spec = Composite({"tote_height": tote_height.clone()}, shape=(n,), device=device)
-        self.action_spec = Categorical(rules.num_actions, (n,), dtype=torch.int64, device=device)
+        height = observation["tote_height"].clone()
+        self.state_spec = Composite({"tote_height": height}, shape=(n,), device=device)
+        self.action_spec = Categorical(cell.num_actions, (n,), dtype=torch.int64, device=device)
         self.reward_spec = Unbounded((n, 1), dtype=torch.float32, device=device)
         flag = Categorical(2, (n, 1), dtype=torch.bool, device=device)
         self.done_spec = Composite(
@@ -150,11 +153,11 @@ class PickPlaceEnv(EnvBase):
 
     # ------------------------------------------------------------------ EnvBase
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
-        """As ``EnvBase.reset``, without further arguments: ``set_seed`` begins another item stream. The rows that a
-        partial reset leaves alone come back as they are.
+        """Reset all problems, or those of ``_reset``; the others come back as they are.
 
-        TorchRL would fill those rows with zeros where ``tensordict`` has only ``_reset``, and copy every mask cell by
-        cell where it has more; but all that an agent sees of them is still here.
+        There are no other arguments: ``set_seed`` begins another item stream. TorchRL would fill the other rows with
+        zeros where ``tensordict`` has only ``_reset``, and copy every mask cell by cell where it has more; but all that
+        an agent sees of them is still here.
         """
         if tensordict is None or "_reset" not in tensordict:
             return super().reset(tensordict, **kwargs)
@@ -182,12 +185,12 @@ class PickPlaceEnv(EnvBase):
             rows = tensordict.get("_reset", rows).reshape(self.num_envs)
             height = tensordict.get("tote_height", None)
         if height is None:
-            height = torch.full_like(self.tote_height, self.rules.tote_size[2])
+            height = torch.full_like(self.tote_height, self.cell.tote_size[2])
         height = height.reshape(self.num_envs)
         if not torch.can_cast(height.dtype, torch.int64):
             raise ValueError(f"tote_height={height[0].item()} ({height.dtype}): expected whole cells, as integers.")
         height = height.to(torch.int64)
-        low, high = self.min_tote_height, self.rules.tote_size[2]
+        low, high = self.min_tote_height, self.cell.tote_size[2]
         if bool((rows & ((height < low) | (height > high))).any()):
             bad = height[rows & ((height < low) | (height > high))][0].item()
             raise ValueError(f"tote_height={bad}: expected between {low} (the tallest item) and {high} (tote_size[2]).")
@@ -206,13 +209,12 @@ class PickPlaceEnv(EnvBase):
         action = tensordict["action"].reshape(self.num_envs)
         if not torch.can_cast(action.dtype, torch.int64):
             raise ValueError(f"action={action[0].item()} ({action.dtype}): expected whole numbers, as integers.")
-        if bool(((action < 0) | (action >= self.rules.num_actions)).any()):
-            bad = action[(action < 0) | (action >= self.rules.num_actions)][0].item()
-            raise ValueError(f"action={bad}: expected between 0 and {self.rules.num_actions - 1} (N_a - 1).")
-        item = self.current_item
-        step = self.rules.apply(self.heights, self.tote_height, item, action)
+        if bool(((action < 0) | (action >= self.cell.num_actions)).any()):
+            bad = action[(action < 0) | (action >= self.cell.num_actions)][0].item()
+            raise ValueError(f"action={bad}: expected between 0 and {self.cell.num_actions - 1} (N_a - 1).")
+        step = apply(self.cell, self.state, action)
         done = step.failure == 0
-        gained = torch.where(done, item.w * item.d * item.h, 0)
+        gained = torch.where(done, self.current_item.volume, 0)
         self.heights.copy_(step.heights)
         self.volume.add_(gained)
         self.steps.add_(done)
@@ -243,10 +245,20 @@ class PickPlaceEnv(EnvBase):
         """The item that lies in each bin."""
         return Item(*self.item.unbind(-1))
 
+    @property
+    def state(self) -> State:
+        """The state of all problems."""
+        return State(self.heights, self.tote_height, self.current_item)
+
+    @property
+    def exact_occupancy(self) -> Tensor:
+        """The volume placed / the volume of the tote, float64 ``[N]``."""
+        return self.volume.double() / (self.tote_height * self.cell.num_places)
+
     def _arriving(self) -> Item:
         """The item at each slot's (episode, step)."""
         seed = self.item_seed.expand_as(self.episode)
-        return self.items.sample(self.stream, seed, self.episode, self.steps, self.rules.bin_size)
+        return self.items.sample(self.stream, seed, self.episode, self.steps, self.cell.bin_size)
 
     def _update_masks(self, rows: Tensor, empty: bool = False):
         """Recompute the masks of the problems in ``rows``, bool ``[N]``; the others' states did not change.
@@ -265,25 +277,23 @@ class PickPlaceEnv(EnvBase):
             self._store(f"{name}_mask", index, masks[name])
 
     def _masks_of(self, heights: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
-        """The masks that are emitted, or ``outcome``, bool ``[M, ...]``, of problems ``[M, ...]``."""
-        rules = self.rules
-        placements = rules.placements(heights, tote_height, Item(*item.unbind(-1)))
-        make = {"action": rules.action_mask, "outcome": lambda p: rules.outcome_mask(p).flatten(1)}
-        return {name: make[name](placements) for name in self.masks or ("outcome",)}
+        """Return the masks that are emitted, or ``footprint``, bool ``[M, ...]``, of problems ``[M, ...]``."""
+        maps = placing_maps(self.cell, State(heights, tote_height, Item(*item.unbind(-1))))
+        return {name: MASKS[name](self.cell, maps) for name in self.masks or ("footprint",)}
 
     def _masks_of_empty_totes(self, heights: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
-        """As :meth:`_masks_of`; episodes begin in few ways, so what was computed is kept."""
+        """Return the same as :meth:`_masks_of`; episodes begin in few ways, so what was computed is kept."""
         keys = [tuple(key) for key in torch.cat([item, tote_height[:, None]], 1).tolist()]
         if unseen := {key: row for row, key in enumerate(keys) if key not in self._starts}:
             rows = torch.tensor(list(unseen.values()))
             masks = self._masks_of(heights[rows], tote_height[rows], item[rows])
-            if len(self._starts) * sum(mask.shape[1] for mask in masks.values()) > STARTS_BYTES:
+            if len(self._starts) * sum(mask.shape[1] for mask in masks.values()) > CACHE_BYTES:
                 self._starts = {key: self._starts[key] for key in keys if key in self._starts}
             # Copies, since a view would keep all of its batch in memory.
             parts = zip(*([row.clone() for row in mask] for mask in masks.values()), strict=True)
             self._starts.update(zip(unseen, parts, strict=True))
         columns = zip(*(self._starts[key] for key in keys), strict=True)
-        return dict(zip(self.masks or ("outcome",), map(torch.stack, columns), strict=True))
+        return dict(zip(self.masks or ("footprint",), map(torch.stack, columns), strict=True))
 
     def _store(self, name: str, index: Tensor | slice, values: Tensor):
         """Keep a mask in a tensor of its own: the last one has been handed out with an observation."""
@@ -292,26 +302,21 @@ class PickPlaceEnv(EnvBase):
         setattr(self, name, values)
 
     def _observation(self) -> TensorDictBase:
-        """What the agent sees, with ``failure`` 0."""
-        capacity = self.tote_height * self.rules.num_places
-        observation = {
-            "bin_depth": self.rules.bin_depth(self.current_item),
-            "tote_depth": (self.tote_height[:, None, None] - self.heights).float(),
-            "tote_height": self.tote_height[:, None].clone(),
-            "occupancy": (self.volume.double() / capacity).float()[:, None],
-            "failure": torch.zeros_like(self.tote_height)[:, None],
-        }
+        """Return what the agent sees, with ``failure`` 0."""
+        observation = observe(self.terms, self.cell, self.state)
+        observation["occupancy"] = self.exact_occupancy.float()[:, None]
+        observation["failure"] = torch.zeros_like(self.tote_height)[:, None]
         for name in self.masks:
             observation[f"{name}_mask"] = getattr(self, f"{name}_mask")  # never written to again, see `_store`
-        return TensorDict(observation, batch_size=self.batch_size, device=self.device)
+        return observation
 
 
 def _any(mask: Tensor) -> Tensor:
-    """``mask.any(1)`` of a bool ``[N, M]``; on a CPU the maximum of bytes is vectorised, and far faster."""
+    """Return ``mask.any(1)`` of a bool ``[N, M]``; on a CPU the maximum of bytes is vectorised, and far faster."""
     return mask.view(torch.uint8).amax(1) > 0
 
 
-def check_items(rules: Rules, items: ItemDistribution) -> None:
+def check_items(cell: CellSpec, items: ItemDistribution) -> None:
     """Refuse items that could make a fresh episode impossible.
 
     Every kind needs a feasible action on the empty tote for every position in the bin. The full tote height decides:
@@ -320,28 +325,28 @@ def check_items(rules: Rules, items: ItemDistribution) -> None:
     Raises:
         ValueError: naming the kind, the position and the tote height.
     """
-    w_b, d_b, _ = rules.bin_size
-    height = rules.tote_size[2]
+    w_b, d_b, _ = cell.bin_size
+    height = cell.tote_size[2]
     # (x, y, w, d, h) -> the first kind like it: the rows of a long recording repeat themselves
     problems: dict[tuple[int, ...], int] = {}
     for kind, (w, d, h) in enumerate(items.sizes.tolist()):
-        for (room_w, room_d), what in (((w_b, d_b), "bin_size"), (rules.effector_size, "effector_size")):
-            if (w > room_w or d > room_d) and (what == "bin_size" or rules.pick_rule == "contain"):
-                raise ValueError(f"{items.label(kind)} does not fit {what}: expected at most {room_w}x{room_d} cells.")
+        for (grid_w, grid_d), what in (((w_b, d_b), "bin_size"), (cell.effector_size, "effector_size")):
+            if (w > grid_w or d > grid_d) and (what == "bin_size" or cell.pick_rule == "contain"):
+                raise ValueError(f"{items.label(kind)} does not fit {what}: expected at most {grid_w}x{grid_d} cells.")
         if h > height:
             raise ValueError(f"{items.label(kind)} is higher than the tote: expected at most tote_size[2]={height}.")
-        for x, y in items.corners(kind, rules.bin_size):
+        for x, y in items.corners(kind, cell.bin_size):
             if x + w > w_b or y + d > d_b:
                 raise ValueError(f"{items.label(kind)} at x={x}, y={y} leaves the bin: expected it inside {w_b}x{d_b}.")
             problems.setdefault((x, y, w, d, h), kind)
     for chunk in torch.tensor([(*item, kind) for item, kind in problems.items()]).split(1024):
         item = Item(*chunk[:, :5].unbind(-1))
-        empty = torch.zeros(len(chunk), *rules.tote_size[:2], dtype=torch.int32)
-        placements = rules.placements(empty, torch.full((len(chunk),), height), item)
-        feasible = rules.outcome_mask(placements).flatten(1).any(1)
+        empty = torch.zeros(len(chunk), *cell.tote_size[:2], dtype=torch.int32)
+        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), item))
+        feasible = footprint_mask(cell, maps).flatten(1).any(1)
         if not feasible.all():
             x, y, *_, kind = chunk[~feasible][0].tolist()
             raise ValueError(
                 f"{items.label(kind)} at x={x}, y={y} in the bin has no feasible action on the empty tote of height "
-                f"{height} ({rules.describe()}): expected every item to fit somewhere."
+                f"{height} ({cell.describe()}): expected every item to fit somewhere."
             )

@@ -18,15 +18,19 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
-from pickplace.planners.policy import PolicyPlanner, planner_parts
+from pickplace.planners.base import BatchPlanner, plain_settings, planner_parts
+from pickplace.planners.policy import PolicyPlanner
 from pickplace.runs import checkpoint
 from pickplace.runs import hydra_app as config
 from pickplace.runs.allowlist import own_modules, trusted
 from pickplace.runs.registry import build
-from pickplace.task.geometry import Failure, Item
+from pickplace.task.cell import CELL_SETTINGS
+from pickplace.task.feasibility import num_feasible, placing_maps
+from pickplace.task.state import Failure
 from pickplace.training.imitation import taught_by
 from pickplace.views.figures import evaluation_table
-from pickplace.views.replay import Recording, animation, observe, page, picture
+from pickplace.views.recording import Recording, record_moves
+from pickplace.views.replay import animation, page, picture
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +89,7 @@ def play(
         if parts and until is not None and time.process_time() > until:
             break
         env = make_env(first, min(batch_size, episodes - first))
-        rules, count = env.rules, env.num_envs
+        cell, count = env.cell, env.num_envs
         observation = env.reset()
         running = torch.ones(count, dtype=torch.bool, device=env.device)
         occupancy = torch.zeros(count, dtype=torch.float64, device=env.device)
@@ -95,22 +99,20 @@ def play(
         totes = enumerate(env.tote_height.tolist())
         recorded = {slot: Recording(first + slot, height) for slot, height in totes if first + slot in record}
         while running.any():
-            item, heights = env.current_item, env.heights.clone()
-            placements = rules.placements(env.heights, env.tote_height, item)
-            feasible += float((rules.num_feasible(placements) / rules.num_actions)[running].sum())
+            state = env.state._replace(heights=env.heights.clone())
+            feasible += float((num_feasible(cell, placing_maps(cell, state)) / cell.num_actions)[running].sum())
             decisions += int(running.sum())
             start = time.perf_counter()
             action = planner.decide(observation)
             seconds += time.perf_counter() - start
             if rows := [slot for slot in recorded if running[slot]]:
-                seen = Item(*(part[rows] for part in item))
-                moves = observe(rules, planner, observation[rows], heights[rows], seen, action[rows])
+                moves = record_moves(cell, planner, observation[rows], state.rows(rows), action[rows])
                 for row, move in zip(rows, moves, strict=True):
                     recorded[row].moves.append(move)
             after = env.step(observation.set("action", action))["next"]
             done = after["done"][:, 0]
             ends = running & done
-            reached = env.volume.double() / (env.tote_height * rules.num_places)
+            reached = env.exact_occupancy
             occupancy = torch.where(ends, reached, occupancy)
             placed_items = torch.where(ends, env.steps, placed_items)
             failure = torch.where(ends, after["failure"][:, 0], failure)
@@ -244,7 +246,7 @@ def read_comparison(path: Path, expected: dict) -> dict:
             ours, theirs = ({k: v for k, v in items.items() if k != unsaid} for items in (ours, theirs))
         if ours != theirs:
             raise ValueError(f"compare={str(path)!r}: its {key} is {other.get(key)!r}, expected {expected[key]!r}.")
-    for key in ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "min_support", "strict_support"):
+    for key in CELL_SETTINGS:
         if expected["env"][key] != other["env"].get(key):
             raise ValueError(
                 f"compare={str(path)!r}: env.{key}={other['env'].get(key)}, expected {expected['env'][key]}."
@@ -318,8 +320,7 @@ def prepare(cfg: DictConfig) -> tuple:
         raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
     own_modules(cfg.trust)
     config.use_machine(cfg)
-    settings = {key: value for key, value in resolved(cfg.planner).items() if key != "_target_"}
-    facts: dict[str, Any] = {"planner_settings": settings, "checkpoint": None}
+    facts: dict[str, Any] = {"planner_settings": plain_settings(cfg.planner), "checkpoint": None}
     trained = None
     if cfg.checkpoint is not None:
         folder = checkpoint.locate(str(cfg.checkpoint))
@@ -351,9 +352,10 @@ def prepare(cfg: DictConfig) -> tuple:
             stream=ev.stream, seed=ev.seed, first_episode=first,
         )  # fmt: skip
 
-    parts = planner_parts(cfg.planner, make_env(0, 1).rules, items, trained)
+    probe = make_env(0, 1)
+    parts = planner_parts(cfg.planner, probe.cell, items, probe.terms, trained)
     planner = build("planner", cfg.planner, **parts)
-    if not isinstance(getattr(planner, "name", None), str):  # told now, not after all episodes have been played
+    if not isinstance(planner, BatchPlanner) or not isinstance(planner.name, str):  # now, not after all episodes
         raise ValueError(f"planner: {type(planner).__name__} has no name; expected an attribute name, a string.")
     if isinstance(planner, PolicyPlanner):
         masked = planner.candidates == "all" or planner.policy.excludes or False
@@ -378,18 +380,18 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
     if not isinstance(gif, bool):
         raise ValueError(f"evaluation.gif={gif}: expected true or false.")
     make_env, planner, facts = prepare(cfg)
-    rules = make_env(0, 1).rules
+    cell = make_env(0, 1).cell
     other = None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), episodes_of(cfg))
     result, episodes = evaluate(cfg, make_env, planner, facts, record=range(max(replay, 1)))
     if other:
         result["paired_difference"] = paired_difference(result, other)
     (run_dir / "evaluation.json").write_text(json.dumps(result, indent=1, default=plain))
-    picture(episodes.recordings[0], rules, run_dir / "tote.png")
+    picture(episodes.recordings[0], cell, run_dir / "tote.png")
     if replay:
         title = f"{cfg.checkpoint or planner.name}, {ev.stream} stream, seed {ev.seed}"
-        (run_dir / "replay.html").write_text(page(episodes.recordings, rules, title), encoding="utf-8")
+        (run_dir / "replay.html").write_text(page(episodes.recordings, cell, title), encoding="utf-8")
     if gif:
-        animation(episodes.recordings[0], rules, run_dir / "replay.gif")
+        animation(episodes.recordings[0], cell, run_dir / "replay.gif")
     table = evaluation_table(result)
     (run_dir / "evaluation.md").write_text(table)
     log.info("\n%s", table)

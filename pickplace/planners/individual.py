@@ -1,10 +1,15 @@
-"""Individual planning, what the paper compares with: where to pick is decided first, and without the tote."""
+"""Individual planning by heuristics: the pick is decided first, and without a look at the tote."""
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
-from pickplace.task.geometry import FAR, Item, Rules
+from pickplace.policies.base import Observation
+from pickplace.task.cell import CellSpec
+from pickplace.task.checks import one_of
+from pickplace.task.feasibility import PlacingMaps, action_footprints, action_mask, placing_maps
+from pickplace.task.grasps import heuristic_pick, select_pick, split_footprint
+from pickplace.task.maps import FAR
+from pickplace.task.state import State
 
 CANDIDATES = ("corners", "cells")
 
@@ -18,51 +23,48 @@ class IndividualHeuristic:
     fails.
 
     Args:
-        rules: the task's sizes.
+        cell: the sizes.
         candidates: ``"corners"``, or ``"cells"`` for every footprint.
     """
 
     name = "individual_heuristic"
 
-    def __init__(self, rules: Rules, candidates: str = "corners"):
-        if candidates not in CANDIDATES:
-            raise ValueError(f"planner.candidates={candidates!r}: expected 'corners' or 'cells'.")
-        self.rules, self.candidates = rules, candidates
+    def __init__(self, cell: CellSpec, candidates: str = "corners"):
+        self.cell, self.candidates = cell, one_of("planner.candidates", candidates, CANDIDATES)
 
-    def decide(self, observation: TensorDictBase) -> Tensor:
-        rules, tote_height = self.rules, observation["tote_height"].reshape(-1)
-        placements = rules.placements_from_depth(observation["bin_depth"], observation["tote_depth"], tote_height)
-        item = placements.item
-        pick = rules.heuristic_pick(item)
-        outcome = rules.at_pick(rules.action_outcomes(item), pick)
-        succeeds = rules.at_pick(rules.action_mask(placements), pick)
-        allowed = outcome >= 0
+    def decide(self, observation: Observation) -> Tensor:
+        """Return flat actions, int64 ``[N]``."""
+        cell, state = self.cell, State.from_observation(observation)
+        maps = placing_maps(cell, state)
+        pick = heuristic_pick(cell, state.item)
+        footprint = select_pick(cell, action_footprints(cell, state.item), pick)
+        succeeds = select_pick(cell, action_mask(cell, maps), pick)
+        allowed = footprint >= 0
         if self.candidates == "corners":
-            heights = (tote_height[:, None, None] - observation["tote_depth"]).int()
-            corners = corner_footprints(rules, heights, placements.top, item).flatten(1)
-            allowed &= corners.gather(1, outcome.clamp(min=0))
-        tote_w, tote_d, _ = rules.tote_size
-        top = placements.top.flatten(1).gather(1, outcome.clamp(min=0)).long()
-        x, y = outcome // tote_d % tote_w, outcome % tote_d
+            corners = corner_footprints(cell, state.heights, maps).flatten(1)
+            allowed &= corners.gather(1, footprint.clamp(min=0))
+        tote_w, tote_d, _ = cell.tote_size
+        top = maps.top.flatten(1).gather(1, footprint.clamp(min=0)).long()
+        _, x, y = split_footprint(cell.tote_size, footprint)
         order = (top * tote_d + y) * tote_w + x
         # Those that succeed, in order; then those that fail, in order; ties by the lowest flat index.
         order = torch.where(allowed, order + FAR * ~(succeeds & allowed) * tote_w * tote_d, FAR**2)
-        return pick * outcome.shape[1] + order.argmin(1)
+        return pick * footprint.shape[1] + order.argmin(1)
 
 
-def corner_footprints(rules: Rules, heights: Tensor, top: Tensor, item: Item) -> Tensor:
-    """Which footprints lie in a corner of a maximal free rectangle of their level, bool ``[N, Q, W_T, D_T]``.
+def corner_footprints(cell: CellSpec, heights: Tensor, maps: PlacingMaps) -> Tensor:
+    """Return which footprints lie in a corner of a maximal free rectangle of their level, bool ``[N, Q, W_T, D_T]``.
 
-    Free on a level are the cells that are not higher than it; a footprint's level is that of what it rests on.
+    Free on a level are the cells that are not higher than it; a footprint's level is the height on which it rests.
 
     Args:
         heights: int32 ``[N, W_T, D_T]``.
-        top: of :class:`~pickplace.task.geometry.Placements`; footprints that cannot rest are in no corner.
-        item: what is placed.
+        maps: of this state; footprints on which the item cannot rest are in no corner.
     """
+    top, item = maps.top, maps.item
     found = torch.zeros_like(top, dtype=torch.bool)
     level = top - item.h[:, None, None, None]
-    sizes = ((item.w, item.d), (item.d, item.w))[: rules.parities]
+    sizes = ((item.w, item.d), (item.d, item.w))[: cell.parities]
     for z in level[top >= 0].unique().tolist():
         free = heights <= z
         for parity, (w, d) in enumerate(sizes):
@@ -79,7 +81,7 @@ def corner_footprints(rules: Rules, heights: Tensor, top: Tensor, item: Item) ->
 
 
 def _least_corners(free: Tensor, w: Tensor, d: Tensor) -> Tensor:
-    """Cells at which some maximal rectangle of free cells, at least ``w x d``, begins, bool ``[N, W, D]``."""
+    """Return the cells at which a maximal rectangle of free cells, at least ``w x d``, begins, bool ``[N, W, D]``."""
     tote_w, tote_d = free.shape[1:]
     # How many cells are free from each one on along x.
     run = torch.zeros_like(free, dtype=torch.int64)
@@ -109,7 +111,7 @@ def _least_corners(free: Tensor, w: Tensor, d: Tensor) -> Tensor:
 
 
 def _shift(maps: Tensor, axis: int, by: Tensor) -> Tensor:
-    """Move what is in maps ``[N, W, D]`` towards 0 along an axis, by a number of cells for each; zeros come in."""
+    """Return maps ``[N, W, D]`` shifted towards 0 along an axis, by a number of cells for each; zeros come in."""
     size = maps.shape[axis]
     cell = torch.arange(size, device=maps.device).view(*[-1 if a == axis else 1 for a in range(3)])
     source = (cell + by[:, None, None]).expand_as(maps)

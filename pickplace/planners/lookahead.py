@@ -1,17 +1,20 @@
 """Search on top of a trained policy."""
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pickplace.policies.actors import MASKED, OutcomePolicy
-from pickplace.task.geometry import Rules
-from pickplace.task.items import ItemDistribution, check_seed, imagined
+from pickplace.policies.base import MASKED, Observation
+from pickplace.task.cell import CellSpec
+from pickplace.task.checks import number, whole_number
+from pickplace.task.feasibility import PlacingMaps, first_action_reaching, footprint_mask, placing_maps
+from pickplace.task.items import ItemDistribution, check_seed, search_items
+from pickplace.task.observation import STANDARD_TERMS, observe
+from pickplace.task.state import State
+from pickplace.task.transition import put_down
 
 
 class Lookahead:
-    """Plays the policy's likeliest choices out, and departs from the policy only when that surely pays.
+    """Plays out the policy's most probable choices, and departs from the policy only where a gain is certain enough.
 
     Each candidate is followed by the policy itself, on the same imagined item streams as the others (common random
     numbers), so that their difference is known far better than their values. More streams are spent where candidates
@@ -22,11 +25,12 @@ class Lookahead:
     from the stream that is played.
 
     Args:
-        rules: the task's sizes.
+        cell: the sizes.
         policy: an ``fcn_grasp`` policy that was trained with a mask.
         items: the item distribution; of a recorded stream, its sizes, equally likely.
         candidates: how many of the policy's most probable choices are played out.
-        critic: the value of a state, ``(bin_depth, tote_depth) -> [N, 1]``, in cells; None: there is none.
+        critic: the value of a state, a function from observations to ``[N, 1]``, in volume; None: there is none.
+        terms: of the observation, by key.
         horizon: items after which the critic judges the state; None, or without a critic: played out to the end.
         samples: imagined streams in the first round, each later round doubles them; and of what is played to the end.
         rounds: the greatest number of rounds.
@@ -35,13 +39,15 @@ class Lookahead:
     """
 
     name = "lookahead"
+    needs = ("policy", "critic", "items", "terms")
 
     def __init__(
         self,
-        rules: Rules,
+        cell: CellSpec,
         policy: torch.nn.Module,
         items: ItemDistribution,
         critic=None,
+        terms=STANDARD_TERMS,
         horizon: int | None = 2,
         candidates: int = 4,
         samples: int = 32,
@@ -49,43 +55,36 @@ class Lookahead:
         confidence: float = 2.0,
         seed: int = 0,
     ):
-        whole = {"candidates": (candidates, 1), "samples": (samples, 2), "rounds": (rounds, 1)}
-        whole |= {"horizon": (horizon, 1)} if horizon is not None else {}
-        for key, (value, least) in whole.items():
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise ValueError(f"planner.{key}={value!r}: expected a whole number >= {least}.")
-        if not isinstance(confidence, (int, float)) or isinstance(confidence, bool) or not confidence >= 0:
-            raise ValueError(f"planner.confidence={confidence!r}: expected a number >= 0.")
-        if not isinstance(policy, OutcomePolicy):
+        for key, value, least in (("candidates", candidates, 1), ("samples", samples, 2), ("rounds", rounds, 1)):
+            whole_number(f"planner.{key}", value, least)
+        if horizon is not None:
+            whole_number("planner.horizon", horizon)
+        number("planner.confidence", confidence)
+        if not getattr(policy, "ranks_footprints", False):
             raise ValueError("planner=lookahead: expected a checkpoint of model=fcn_grasp, trained with a mask.")
-        self.rules, self.policy, self.critic = rules, policy, critic
+        self.cell, self.policy, self.critic, self.terms = cell, policy, critic, terms
         self.horizon = horizon if critic is not None else None
-        self.items = imagined(items)
+        self.items = search_items(items)
         self.candidates, self.samples, self.rounds, self.confidence = candidates, samples, rounds, confidence
         self.seed, self._decisions = check_seed(seed, "planner.seed"), 0
 
     @torch.no_grad()
-    def decide(self, observation: TensorDictBase) -> Tensor:
-        rules, policy = self.rules, self.policy
-        bin_depth, tote_depth = observation["bin_depth"], observation["tote_depth"]
-        tote_height = observation["tote_height"].reshape(-1)
-        heights = (tote_height[:, None, None] - tote_depth).int()
-        placements = rules.placements(heights, tote_height, rules.read_item(bin_depth))
-        logits = policy(bin_depth, tote_depth, rules.outcome_mask(placements).flatten(1))
-        value, choice = torch.sort(
-            logits, dim=1, descending=True, stable=True
-        )  # of equals the first, as the policy itself plays
+    def decide(self, observation: Observation) -> Tensor:
+        """Return flat actions, int64 ``[N]``."""
+        state = State.from_observation(observation)
+        maps = placing_maps(self.cell, state)
+        logits = self.policy.footprint_logits(observation, footprint_mask(self.cell, maps).flatten(1))
+        # Of equals the first, as the policy itself plays.
+        value, choice = torch.sort(logits, dim=1, descending=True, stable=True)
         value, choice = value[:, : self.candidates], choice[:, : self.candidates]
-        best = self._best(heights, tote_height, placements, choice, value > MASKED / 2)
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            outcome = choice.gather(1, best[:, None])[:, 0]
-            return policy.to_action(outcome, bin_depth, tote_depth, tote_height).clamp(min=0)
+        best = self._best(state, maps, choice, value > MASKED / 2)
+        return first_action_reaching(self.cell, maps, choice.gather(1, best[:, None])[:, 0])
 
-    def _best(self, heights, tote_height, placements, choice, open_: Tensor) -> Tensor:
-        """Which candidate to play, int64 ``[N]``.
+    def _best(self, state: State, maps: PlacingMaps, choice: Tensor, open_: Tensor) -> Tensor:
+        """Return which candidate to play, int64 ``[N]``.
 
         Args:
-            choice: int64 ``[N, M]``, outcomes; the policy's own is the first.
+            choice: int64 ``[N, M]``, footprints; the policy's own choice is the first.
             open_: bool ``[N, M]``, which may be played.
         """
         total = torch.zeros(choice.shape, dtype=torch.float64, device=choice.device)  # of the differences to the first
@@ -97,8 +96,8 @@ class Lookahead:
             row, column = open_.nonzero(as_tuple=True)
             if len(row) == 0:
                 break
-            after = self.rules.put_down(heights[row], placements.rows(row), choice[row, column])
-            volume = self._play_out(after, tote_height[row], row, streams, self.horizon)  # [rows, streams]
+            after = put_down(self.cell, state.heights[row], maps.rows(row), choice[row, column])
+            volume = self._play_out(after, state.tote_height[row], row, streams, self.horizon)  # [rows, streams]
             first = volume[(column == 0).nonzero()[:, 0]]  # one for each problem that is open
             problem = torch.unique_consecutive(row, return_inverse=True)[1]
             difference = volume - first[problem]
@@ -114,33 +113,34 @@ class Lookahead:
             streams *= 2
         surely = (count > 0) & (mean > self.confidence * error) & (mean > 0)
         best = torch.where(surely, mean, 0.0).argmax(1)
-        return best if self.horizon is None else self._confirm(best, heights, tote_height, placements, choice)
+        return best if self.horizon is None else self._confirm(best, state, maps, choice)
 
-    def _confirm(self, best: Tensor, heights, tote_height, placements, choice) -> Tensor:
-        """``best``, int64 ``[N]``, without the departures that do not gain when played out to the end, with no critic.
+    def _confirm(self, best: Tensor, state: State, maps: PlacingMaps, choice: Tensor) -> Tensor:
+        """Return ``best``, int64 ``[N]``, without the departures that gain nothing when played out to the end.
 
-        Two standard errors guard against the items' noise, not against the critic's own error, which outweighs what
-        candidates differ by where the policy fills nearly all.
+        Two standard errors guard against the items' noise, not against the critic's own error. Where the policy fills
+        nearly all, that error is larger than the difference between candidates.
         """
         row = best.nonzero()[:, 0]
         if len(row) == 0:
             return best
         both = row.repeat_interleave(2)  # the policy's own choice and the candidate, on the same items
         column = torch.stack([torch.zeros_like(row), best[row]], 1).flatten()
-        after = self.rules.put_down(heights[both], placements.rows(both), choice[both, column])
-        volume = self._play_out(after, tote_height[both], both, self.samples, None).mean(1)
+        after = put_down(self.cell, state.heights[both], maps.rows(both), choice[both, column])
+        volume = self._play_out(after, state.tote_height[both], both, self.samples, None).mean(1)
         gain = volume[1::2] - volume[::2]
         return best.index_put((row,), torch.where(gain > 0, best[row], 0))
 
     def _play_out(self, heights: Tensor, tote_height: Tensor, problem: Tensor, streams: int, horizon) -> Tensor:
-        """Volume that the policy goes on to place, float64 ``[M, streams]``.
+        """Return the volume that the policy goes on to place, float64 ``[M, streams]``.
 
         Args:
             heights: int32 ``[M, W_T, D_T]``.
             problem: int64 ``[M]``; equal ones meet equal items.
             horizon: items after which the critic judges the state; None: played out to the end.
         """
-        rules, items = self.rules, self.items
+        cell, policy = self.cell, self.policy
+        keys = [*policy.in_keys, *getattr(self.critic, "in_keys", ("bin_depth", "tote_depth"))]
         self._decisions += 1
         heights, tote_height, problem = (x.repeat_interleave(streams, 0) for x in (heights, tote_height, problem))
         stream = torch.arange(len(heights), device=heights.device) % streams
@@ -150,21 +150,20 @@ class Lookahead:
         row = torch.arange(len(heights), device=heights.device)
         step = 0
         while len(row):
-            item = items.sample("train", seed[row], stream[row], torch.full_like(row, step), rules.bin_size)
-            placements = rules.placements(heights, tote_height[row], item)
-            mask = rules.outcome_mask(placements).flatten(1)
+            item = self.items.sample("train", seed[row], stream[row], torch.full_like(row, step), cell.bin_size)
+            maps = placing_maps(cell, State(heights, tote_height[row], item))
+            mask = footprint_mask(cell, maps).flatten(1)
             going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]
             if len(going) < len(row):
-                row, heights, mask, placements = row[going], heights[going], mask[going], placements.rows(going)
-                item = placements.item
+                row, heights, mask, maps = row[going], heights[going], mask[going], maps.rows(going)
+                item = maps.item
             if len(row) == 0:
                 break
-            bin_depth, tote_depth = rules.bin_depth(item), (tote_height[row, None, None] - heights).float()
+            observation = observe(self.terms, cell, State(heights, tote_height[row], item), keys)
             if step == horizon:
-                volume[row] += self.critic(bin_depth, tote_depth)[:, 0].double()
+                volume[row] += self.critic(observation)[:, 0].double()
                 break
-            outcome = self.policy(bin_depth, tote_depth, mask).argmax(1)
-            heights = rules.put_down(heights, placements, outcome)
-            volume[row] += (item.w * item.d * item.h).double()
+            heights = put_down(cell, heights, maps, policy.footprint_logits(observation, mask).argmax(1))
+            volume[row] += item.volume.double()
             step += 1
         return volume.view(-1, streams)

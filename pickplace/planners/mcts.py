@@ -1,15 +1,19 @@
-"""Monte-Carlo tree search, which the paper compares with."""
+"""Monte-Carlo tree search, with which the paper compares."""
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
-from pickplace.task.geometry import Item, Rules
-from pickplace.task.items import ItemDistribution, check_seed, imagined
+from pickplace.policies.base import Observation
+from pickplace.task.cell import CellSpec
+from pickplace.task.checks import flag, number, whole_number
+from pickplace.task.feasibility import first_action_reaching, footprint_mask, placing_maps
+from pickplace.task.items import ItemDistribution, check_seed, search_items
+from pickplace.task.observation import STANDARD_TERMS
+from pickplace.task.state import Item, State
+from pickplace.task.transition import apply, put_down
 
 
 @dataclass(eq=False)
@@ -46,7 +50,7 @@ class MCTS:
     their returns.
 
     Args:
-        rules: the task's sizes.
+        cell: the sizes.
         items: the item distribution; of a recorded stream, its sizes, equally likely.
         simulations: for each decision.
         mask: search among the distinct footprints that some action reaches; False: among all ``N_a`` flat actions,
@@ -58,10 +62,11 @@ class MCTS:
     """
 
     name = "mcts"
+    needs = ("items",)
 
     def __init__(
         self,
-        rules: Rules,
+        cell: CellSpec,
         items: ItemDistribution,
         simulations: int = 5000,
         mask: bool = False,
@@ -70,27 +75,22 @@ class MCTS:
         wave: int = 256,
         seed: int = 0,
     ):
-        for key, value, least in (("simulations", simulations, 1), ("wave", wave, 1)):
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise ValueError(f"planner.{key}={value!r}: expected a whole number >= {least}.")
-        for key, number, most in (("exploration", exploration, math.inf), ("widening", widening, 1)):
-            if not isinstance(number, (int, float)) or isinstance(number, bool) or not 0 <= number <= most:
-                raise ValueError(f"planner.{key}={number!r}: expected a number >= 0{' and <= 1' if most == 1 else ''}.")
-        if not isinstance(mask, bool):
-            raise ValueError(f"planner.mask={mask!r}: expected true or false.")
-        self.rules, self.items, self.simulations, self.mask = rules, imagined(items), simulations, mask
+        whole_number("planner.simulations", simulations)
+        whole_number("planner.wave", wave)
+        number("planner.exploration", exploration)
+        number("planner.widening", widening, most=1)
+        flag("planner.mask", mask)
+        self.cell, self.items, self.simulations, self.mask = cell, search_items(items), simulations, mask
         self.exploration, self.widening, self.wave = exploration, widening, wave
         self.seed = check_seed(seed, "planner.seed")
         self._random = np.random.default_rng(seed)
         self._sampled, self._depths, self._walks = 0, 0, 0
 
-    def decide(self, observation: TensorDictBase) -> Tensor:
-        """Flat actions, int64 ``[N]``."""
-        rules, device = self.rules, observation["tote_depth"].device
-        tote_height = observation["tote_height"].reshape(-1).cpu()
-        heights = (tote_height[:, None, None] - observation["tote_depth"].cpu()).int()
-        item = rules.read_item(observation["bin_depth"].cpu())
-        roots = self._nodes(heights, tote_height, item)
+    def decide(self, observation: Observation) -> Tensor:
+        """Return flat actions, int64 ``[N]``."""
+        cell, device = self.cell, observation["tote_depth"].device
+        state = State.from_observation({key: observation[key].cpu() for key in STANDARD_TERMS})
+        roots, tote_height = self._nodes(state), state.tote_height
         each = max(1, self.wave // len(roots))
         for done in range(0, self.simulations, each):
             walks = [
@@ -102,18 +102,17 @@ class MCTS:
         best = [max(root.edges.values(), key=lambda edge: (edge.visits, edge.total), default=None) for root in roots]
         chosen = torch.tensor([0 if edge is None else edge.action for edge in best])
         if self.mask:
-            reaching = rules.actions_reaching(rules.placements(heights, tote_height, item), chosen)
-            chosen = torch.where(reaching >= 0, reaching, rules.num_actions).amin(1).clamp(max=rules.num_actions - 1)
+            chosen = first_action_reaching(cell, placing_maps(cell, state), chosen)
         return chosen.to(device)
 
     def statistics(self) -> dict[str, float]:
-        """The mean number of actions on a walk down the tree, over all searches so far."""
+        """Return the mean number of actions on a walk down the tree, over all searches so far."""
         return {"mean_tree_depth": self._depths / max(self._walks, 1)}
 
     def _walk_down(self, root: _Node) -> tuple[list[_Edge], bool]:
-        """The edges from the root on, each of which counts the visit; and whether the last bin's item fits nowhere.
+        """Return the edges from the root on, which count the visit; and whether the last bin's item fits nowhere.
 
-        If it does not, the walk ends with an action whose outcome, or whose next bin, must be found out.
+        If it does not, the walk ends with an action whose effect, or whose next bin, must be found out.
         """
         node, path = root, []
         while (edge := self._choose(node)) is not None:
@@ -127,12 +126,12 @@ class MCTS:
         return path, edge is None
 
     def _choose(self, node: _Node) -> _Edge | None:
-        """An action that was not tried, if there is one, else the most promising by UCB1; None if there is none."""
+        """Return an action that was not tried, if any, else the most promising by UCB1; None if there is none."""
         action = None
         if node.untried:
             action = node.untried.pop()
-        elif node.untried is None and len(node.edges) < self.rules.num_actions:
-            while (action := int(self._random.integers(self.rules.num_actions))) in node.edges:
+        elif node.untried is None and len(node.edges) < self.cell.num_actions:
+            while (action := int(self._random.integers(self.cell.num_actions))) in node.edges:
                 pass
         if action is not None:
             return node.edges.setdefault(action, _Edge(node, action))
@@ -147,13 +146,13 @@ class MCTS:
         """Carry out the last actions, sample the bins after them, play out, and add the returns to the edges.
 
         Args:
-            walks: which problem, and what :meth:`_walk_down` found.
+            walks: the problem's number, and the result of :meth:`_walk_down`.
             tote_height: int64 ``[N]``, of the problems.
         """
         walks = [walk for walk in walks if walk[1]]
         last = [(problem, path[-1]) for problem, path, over in walks if not over and not path[-1].failed]
         self._carry_out([(problem, edge) for problem, edge in last if edge.heights is None], tote_height)
-        going = {  # the walks that go on, and what they leave in the tote
+        going = {  # the walks that go on, and the heights that they leave
             number: path[-1].heights
             for number, (_, path, over) in enumerate(walks)
             if not over and path[-1].heights is not None
@@ -162,68 +161,69 @@ class MCTS:
         if going:
             height = tote_height[[walks[number][0] for number in going]]
             heights = torch.stack(list(going.values()))
-            nodes = self._nodes(heights, height, self._arriving(len(going)))
+            arrived = State(heights, height, self._arriving(len(going)))
+            nodes = self._nodes(arrived)
             for number, node in zip(going, nodes, strict=True):
                 walks[number][1][-1].bins.append(node)
-            items = Item(*torch.stack([node.item for node in nodes]).unbind(1))
-            returns[list(going)] = self._play_out(heights, height, items)
+            returns[list(going)] = self._play_out(arrived)
         for (problem, path, _), volume in zip(walks, returns.tolist(), strict=True):
             for edge in reversed(path):
                 volume += edge.volume
-                edge.total += volume / float(tote_height[problem] * self.rules.num_places)
+                edge.total += volume / float(tote_height[problem] * self.cell.num_places)
 
     def _carry_out(self, tried: list[tuple[int, _Edge]], tote_height: Tensor) -> None:
-        """Find out what actions leave in the tote."""
+        """Find out the heights that actions leave in the tote."""
         if not tried:
             return
-        rules, height = self.rules, tote_height[[problem for problem, _ in tried]]
+        cell, height = self.cell, tote_height[[problem for problem, _ in tried]]
         heights = torch.stack([edge.node.heights for _, edge in tried])
         item = Item(*torch.stack([edge.node.item for _, edge in tried]).unbind(1))
+        state = State(heights, height, item)
         action = torch.tensor([edge.action for _, edge in tried])
         if self.mask:
-            after = rules.put_down(heights, rules.placements(heights, height, item), action)
+            after = put_down(cell, heights, placing_maps(cell, state), action)
             failed = [False] * len(tried)
         else:
-            step = rules.apply(heights, height, item, action)
+            step = apply(cell, state, action)
             after, failed = step.heights, (step.failure > 0).tolist()
-        for (_, edge), left, bad, volume in zip(tried, after, failed, (item.w * item.d * item.h).tolist(), strict=True):
+        for (_, edge), left, bad, volume in zip(tried, after, failed, item.volume.tolist(), strict=True):
             edge.failed = bad
             if not bad:
                 edge.heights, edge.volume = left, volume
 
-    def _nodes(self, heights: Tensor, tote_height: Tensor, item: Item) -> list[_Node]:
-        """New nodes, with the actions to try."""
-        untried = [None] * len(heights)
+    def _nodes(self, state: State) -> list[_Node]:
+        """Return new nodes, with the actions to try."""
+        untried = [None] * len(state.heights)
         if self.mask:
-            rules = self.rules
-            mask = rules.outcome_mask(rules.placements(heights, tote_height, item)).flatten(1).numpy()
+            mask = footprint_mask(self.cell, placing_maps(self.cell, state)).flatten(1).numpy()
             untried = [self._random.permutation(row.nonzero()[0]).tolist() for row in mask]
-        return [_Node(*parts) for parts in zip(heights, torch.stack(item, 1), untried, strict=True)]
+        return [_Node(*parts) for parts in zip(state.heights, torch.stack(state.item, 1), untried, strict=True)]
 
     def _arriving(self, count: int) -> Item:
-        """Bins from the item distribution, each drawn once."""
+        """Return bins from the item distribution, each drawn once."""
         number = torch.arange(self._sampled, self._sampled + count)
         self._sampled += count
         seed = torch.full_like(number, self.seed)
-        return self.items.sample("train", seed, number, torch.zeros_like(number), self.rules.bin_size)
+        return self.items.sample("train", seed, number, torch.zeros_like(number), self.cell.bin_size)
 
-    def _play_out(self, heights: Tensor, tote_height: Tensor, item: Item) -> Tensor:
-        """Volume placed by uniformly random actions until one fails or nothing can be done, float64 ``[M]``."""
-        rules, volume, row = self.rules, torch.zeros(len(heights), dtype=torch.float64), torch.arange(len(heights))
+    def _play_out(self, state: State) -> Tensor:
+        """Return the volume that uniformly random actions place until the episode ends, float64 ``[M]``."""
+        cell, count = self.cell, len(state.heights)
+        volume, row = torch.zeros(count, dtype=torch.float64), torch.arange(count)
         while True:
+            heights, tote_height, item = state
             if self.mask:
-                placements = rules.placements(heights, tote_height, item)
-                mask = rules.outcome_mask(placements).flatten(1)
+                maps = placing_maps(cell, state)
+                mask = footprint_mask(cell, maps).flatten(1)
                 draw = torch.from_numpy(self._random.random(mask.shape, dtype=np.float32))
                 going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]
-                outcome = torch.where(mask, draw, -1.0).argmax(1)
-                heights = rules.put_down(heights, placements, outcome)
+                heights = put_down(cell, heights, maps, torch.where(mask, draw, -1.0).argmax(1))
             else:
-                action = torch.from_numpy(self._random.integers(rules.num_actions, size=len(heights)))
-                step = rules.apply(heights, tote_height, item, action)
+                action = torch.from_numpy(self._random.integers(cell.num_actions, size=len(heights)))
+                step = apply(cell, state, action)
                 heights, going = step.heights, (step.failure == 0).nonzero()[:, 0]
-            row, heights, tote_height = row[going], heights[going], tote_height[going]
-            volume[row] += (item.w * item.d * item.h)[going].double()
+            row = row[going]
+            volume[row] += item.volume[going].double()
             if len(row) == 0:
                 return volume
-            item = self._arriving(len(row))
+            state = State(heights[going], tote_height[going], self._arriving(len(row)))

@@ -8,23 +8,30 @@ seen from above.
 
 import os
 import reprlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Literal, cast
 
 import numpy as np
 import torch
 from omegaconf import OmegaConf
-from tensordict import TensorDict
 from torch import Tensor
 
-from pickplace.planners.policy import PolicyPlanner, restore_policy
-from pickplace.policies.actors import Policy
+from pickplace.planners.policy import PolicyPlanner
+from pickplace.policies.base import Policy
+from pickplace.policies.restore import restore_policy
 from pickplace.runs import checkpoint
 from pickplace.runs import hydra_app as config
 from pickplace.runs.allowlist import trusted
 from pickplace.runs.registry import build
-from pickplace.task.geometry import Failure, Item, Rules
+from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings, reference_cell
+from pickplace.task.checks import is_whole
+from pickplace.task.feasibility import action_footprints, action_mask, footprint_mask, placing_maps
+from pickplace.task.grasps import split_action
+from pickplace.task.maps import FAR
+from pickplace.task.observation import Term, check_terms, observe
+from pickplace.task.state import Failure, State, heights_from_depth, item_from_depth
+from pickplace.task.transition import Step, apply
 
 #: Beyond the tolerance, in cells: three cells of 0.05 m are not exactly 0.15 m in binary fractions.
 ROUNDING = 1e-6
@@ -77,7 +84,7 @@ class Plan:
     reasons: dict[str, int] | None  #: if stuck or impossible: how many of all flat actions fail for which reason
 
     def as_dict(self) -> dict:
-        """The plan as plain values, ready for JSON."""
+        """Return the plan as plain values, ready for JSON."""
         return asdict(self)
 
 
@@ -85,28 +92,36 @@ class Planner:
     """Plans picks and places for a robot cell with a trained policy.
 
     Args:
-        rules: the cell's sizes and rules.
-        policy: a policy of :mod:`pickplace.policies.actors` made for these rules.
-        candidates: as in :class:`~pickplace.planners.PolicyPlanner`: ``"all"``, or ``K``.
+        cell: the cell's sizes and options.
+        policy: a policy made for this cell.
+        candidates: as in :class:`~pickplace.planners.policy.PolicyPlanner`: ``"all"``, or ``K``.
+        terms: of the observation, by key; None: the standard ones.
     """
 
-    def __init__(self, rules: Rules, policy: Policy, candidates: int | Literal["all"] = "all"):
-        self.rules, self._planner = rules, PolicyPlanner(rules, policy, candidates)
+    def __init__(
+        self,
+        cell: CellSpec,
+        policy: Policy,
+        candidates: int | Literal["all"] = "all",
+        terms: Mapping[str, Term] | None = None,
+    ):
+        self.cell, self.terms = cell, check_terms(terms)
+        self._planner = PolicyPlanner(cell, policy, candidates)
 
     @classmethod
     def load(
         cls, path, candidates: int | Literal["all"] = "all", device: str = "cpu", trust: Sequence[str] = (), **sizes
     ) -> "Planner":
-        """A planner from a checkpoint.
+        """Return a planner from a checkpoint.
 
         Args:
             path: a run folder, a checkpoint, or ``pretrained/<name>``.
             candidates: ``"all"``, or ``K``: how many of the most probable actions are tried.
             device: where to compute, ``"cpu"`` or ``"cuda"``.
             trust: modules of your own that the checkpoint's config may make classes of, beside pickplace's own.
-            **sizes: what differs from the training's settings, such as ``tote_size=(30, 30, 10)``; see
-                :class:`~pickplace.task.geometry.Rules`. The policy serves any bin and tote, and if it was trained
-                with a mask any end effector.
+            **sizes: settings that differ from the training's, such as ``tote_size=(30, 30, 10)``; see
+                :class:`~pickplace.task.cell.CellSpec`. The policy serves any bin and tote, and if it was trained with a
+                mask any end effector.
 
         Raises:
             ValueError: for a checkpoint that cannot be used, or bad sizes.
@@ -115,17 +130,16 @@ class Planner:
             raise ValueError(f"path={path!r}: expected a run folder, a checkpoint, or pretrained/<name>.")
         state, facts = checkpoint.read(checkpoint.locate(path))
         cfg = trusted(facts["config"], trust)
-        known = {field.name for field in fields(Rules)}
-        if unknown := sorted(set(sizes) - known):
-            raise ValueError(f"{unknown[0]}={sizes[unknown[0]]!r}: expected one of {', '.join(sorted(known))}.")
+        if unknown := sorted(set(sizes) - set(CELL_SETTINGS) - {"longest_side", "limits"}):
+            raise ValueError(f"{unknown[0]}={sizes[unknown[0]]!r}: expected one of {', '.join(CELL_SETTINGS)}.")
         env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
-        trained = {key: value for key, value in env.items() if key in known}
-        rules = Rules(**{**trained, **sizes})
-        if rules.pick_rule == "overlap" and rules.longest_side is None:  # then the number of grasps depends on it
+        cell = cell_from_settings({**{key: env[key] for key in CELL_SETTINGS if key in env}, **sizes})
+        if cell.pick_rule == "overlap" and cell.longest_side is None:  # then the number of grasps depends on it
             longest = int(build("items", cfg["items"]).sizes[:, :2].max())
-            rules = replace(rules, longest_side=longest)
-        policy = restore_policy(cfg, rules, state["policy"], env)
-        return cls(rules, policy.to(config.usable_device(device)), candidates)
+            cell = replace(cell, longest_side=longest)
+        policy = restore_policy(cfg, cell, state["policy"], env)
+        terms = {str(key): build(f"env.observation.{key}", node) for key, node in cfg.env.observation.items()}
+        return cls(cell, policy.to(config.usable_device(device)), candidates, terms)
 
     @torch.inference_mode()
     def plan(
@@ -137,14 +151,15 @@ class Planner:
         tolerance: float = 0.25,
         alternatives: int = 10,
     ) -> Plan:
-        """Where to pick, where to place and how to turn the one item in the bin.
+        """Return where to pick, where to place and how to turn the one item in the bin.
 
         Args:
             bin_depth: ``[W_B, D_B]``, height above the bin's floor in each cell, 0 where empty; numpy, torch or lists.
             tote_depth: ``[W_T, D_T]``, remaining height in each cell: from the surface up to the rim.
-            tote_height: height of the tote's rim above its floor; None: the one of ``rules.tote_size``.
-            cell_size: side of a cell in metres, if the maps and ``tote_height`` are in metres; None: they are in cells.
-            tolerance: how far, in cells, a measured height may be from a whole number of cells; below 0.5.
+            tote_height: height of the tote's rim above its floor; None: the one of ``cell.tote_size``.
+            cell_size: side of a cell in metres, if the maps and ``tote_height`` are in metres; None: they are in height
+                units of the cell.
+            tolerance: how far, in height units, a measured height may be from a whole number of them; below 0.5.
             alternatives: how many of the most probable choices to report, and the chosen one if it is further down;
                 0 is fastest. Where nothing is feasible it takes longest: all actions are simulated for the reasons.
 
@@ -152,111 +167,102 @@ class Planner:
             DepthMapError: for a map of another shape or type, a value that is not finite, out of range or too far from
                 a whole number of cells, no item, or something in the bin that is not one cuboid; it names the cell.
         """
-        rules, unit = self.rules, 1.0
-        if cell_size is not None:
-            unit = _number("cell_size", cell_size, "a length in metres, 1e-6 to 1e6", lambda v: 1e-6 <= v <= 1e6)
+        lengths = _Lengths(self.cell, cell_size)
         tolerance = _number("tolerance", tolerance, "a number of cells >= 0 and < 0.5", lambda v: 0 <= v < 0.5)
-        if isinstance(alternatives, bool) or not isinstance(alternatives, (int, np.integer)) or alternatives < 0:
+        if not is_whole(alternatives) or alternatives < 0:
             raise DepthMapError(f"alternatives={reprlib.repr(alternatives)}: expected a whole number >= 0.")
-        height = rules.tote_size[2]
-        if tote_height is not None:
-            wanted = f"a whole number of cells, 1 to {2**20 - 1}, within {tolerance:g}" + ", in metres" * (unit != 1.0)
-
-            def good(length):  # the range first: far beyond it nothing can be rounded
-                cells = length / unit
-                return 0.5 < cells < 2**20 - 0.5 and abs(cells - round(cells)) <= tolerance + ROUNDING
-
-            height = round(_number("tote_height", tote_height, wanted, good) / unit)
-        bin_map = _snap("bin_depth", bin_depth, rules.bin_size[:2], unit, tolerance, 2**20)
-        tote_map = _snap("tote_depth", tote_depth, rules.tote_size[:2], unit, tolerance, height)
-        _refuse_other_than_one_cuboid(bin_map)
-        if (
-            rules.pick_rule == "overlap"
-            and max((bin_map > 0).sum(0).max(), (bin_map > 0).sum(1).max()) > rules.max_side
-        ):
-            raise DepthMapError(
-                f"bin_depth: the item is longer than any in training, expected at most {rules.max_side}."
-            )
-
-        device = next(self._planner.policy.parameters()).device
-        observation = TensorDict(
-            {
-                "bin_depth": bin_map.float()[None],
-                "tote_depth": tote_map.float()[None],
-                "tote_height": torch.tensor([[height]]),
-            },
-            batch_size=[1],
-            device=device,
-        )
-        heights = (height - tote_map)[None].int().to(device)
-        item = rules.read_item(observation["bin_depth"])
-        at = torch.tensor([height], device=device)
-        action, reasons = None, None  # an action that succeeds; why none does
-        if _any_feasible(rules, heights, at, item):
-            status = "rejected"
-            decided = self._planner.decide(observation)
-            step = rules.apply(heights, at, item, decided)
-            if int(step.failure[0]) == 0:
-                action, status = decided, "ok"
-        else:
-            status = "stuck" if _any_feasible(rules, torch.zeros_like(heights), at, item) else "impossible"
-            reasons = self._reasons(heights, at, item)
-
-        capacity = height * rules.num_places
-        before = int(heights.sum()) / capacity
-        volume = int(item.w * item.d * item.h)
+        state = self._read_state(bin_depth, tote_depth, tote_height, lengths, tolerance)
+        observation = observe(self.terms, self.cell, state)
+        status, action, step, reasons = self._decide(observation, state)
+        height = int(state.tote_height)
+        capacity = height * self.cell.num_places
+        before = int(state.heights.sum()) / capacity
         plan = Plan(
             status=status,
-            item={key: int(value) for key, value in item._asdict().items()},
+            item={key: int(value) for key, value in state.item._asdict().items()},
             pick=None,
             place=None,
             rotation_degrees=None,
             drop_height=None,
             action=None,
             occupancy_before=before,
-            occupancy_after=before if action is None else before + volume / capacity,
-            alternatives=self._alternatives(observation, heights, at, item, action, alternatives),
+            occupancy_after=before if action is None else before + int(state.item.volume) / capacity,
+            alternatives=self._alternatives(observation, state, action, alternatives),
             reasons=reasons,
         )
-        if action is None:
-            return plan
-        x_bin, y_bin, x_tote, y_tote, rotation = (int(part) for part in rules.split_action(action))
-        ee_w, ee_d = rules.effector_size
-        turned_w, turned_d, ref_x, ref_y = rules.effectors[rotation % 2]
+        return plan if action is None or step is None else self._add_poses(plan, action, step, lengths)
+
+    def _read_state(self, bin_depth, tote_depth, tote_height, lengths: "_Lengths", tolerance: float) -> State:
+        """Return the state that measured maps show; arguments and errors as of :meth:`plan`."""
+        cell, unit = self.cell, lengths.height_unit
+        height = cell.tote_size[2]
+        if tote_height is not None:
+            wanted = f"a whole number of cells, 1 to {FAR - 1}, within {tolerance:g}" + ", in metres" * lengths.metric
+
+            def is_good(length):  # the range first: far beyond it nothing can be rounded
+                units = length / unit
+                return 0.5 < units < FAR - 0.5 and abs(units - round(units)) <= tolerance + ROUNDING
+
+            height = round(_number("tote_height", tote_height, wanted, is_good) / unit)
+        bin_map = _snap("bin_depth", bin_depth, cell.bin_size[:2], unit, tolerance, FAR)
+        tote_map = _snap("tote_depth", tote_depth, cell.tote_size[:2], unit, tolerance, height)
+        _refuse_other_than_one_cuboid(bin_map)
+        longest = max((bin_map > 0).sum(0).max(), (bin_map > 0).sum(1).max())
+        if cell.pick_rule == "overlap" and longest > cell.max_side:
+            raise DepthMapError(
+                f"bin_depth: the item is longer than any in training, expected at most {cell.max_side}."
+            )
+        device = next(self._planner.policy.parameters()).device
+        rim = torch.tensor([height], device=device)
+        item = item_from_depth(bin_map.float()[None].to(device))
+        return State(heights_from_depth(tote_map[None].to(device), rim), rim, item)
+
+    def _decide(self, observation, state: State) -> tuple[str, Tensor | None, Step | None, dict[str, int] | None]:
+        """Return the status, an action that succeeds with its effect, and the reasons why nothing does."""
+        if _any_feasible(self.cell, state):
+            decided = self._planner.decide(observation)
+            step = apply(self.cell, state, decided)
+            return ("ok", decided, step, None) if int(step.failure[0]) == 0 else ("rejected", None, None, None)
+        empty = state._replace(heights=torch.zeros_like(state.heights))
+        status = "stuck" if _any_feasible(self.cell, empty) else "impossible"
+        return status, None, None, self._reasons(state)
+
+    def _add_poses(self, plan: Plan, action: Tensor, step: Step, lengths: "_Lengths") -> Plan:
+        """Return the plan with the poses of a successful action."""
+        x_bin, y_bin, x_tote, y_tote, rotation = (int(part) for part in split_action(self.cell, action))
+        ee_w, ee_d = self.cell.effector_size
+        turned = self.cell.effectors[rotation % 2]
         top = int(step.top[0])
-
-        def length(cells: float) -> float:
-            return round(cells * unit, 9)  # without the tail of binary fractions
-
         # The centre comes from the rectangle, not from the reference cell, which is off by half a cell on even sides.
-        left, front = x_bin - (ee_w - 1) // 2, y_bin - (ee_d - 1) // 2
-        pick = length(left + ee_w / 2), length(front + ee_d / 2), length(plan.item["h"])
-        place = length(x_tote - ref_x + turned_w / 2), length(y_tote - ref_y + turned_d / 2), length(top)
+        left, front = x_bin - reference_cell(ee_w), y_bin - reference_cell(ee_d)
+        pick = lengths.across(left + ee_w / 2), lengths.across(front + ee_d / 2), lengths.up(plan.item["h"])
+        x, y = x_tote - turned.ref_x + turned.width / 2, y_tote - turned.ref_y + turned.depth / 2
+        place = lengths.across(x), lengths.across(y), lengths.up(top)
         return replace(
             plan,
             pick=Pose((x_bin, y_bin), pick),
             place=Pose((x_tote, y_tote), place),
             rotation_degrees=90 * rotation,
-            drop_height=length(top - plan.item["h"]),
+            drop_height=lengths.up(top - plan.item["h"]),
             action=int(action),
         )
 
-    def _alternatives(self, observation, heights, tote_height, item, chosen, count) -> list[Alternative]:
-        """The most probable choices, in the order in which the planner prefers them."""
+    def _alternatives(self, observation, state: State, chosen: Tensor | None, count: int) -> list[Alternative]:
+        """Return the most probable choices, in the order in which the planner prefers them."""
         if count == 0:
             return []
-        rules, planner = self.rules, self._planner
-        log_probs = planner.policy.action_log_probs(observation["bin_depth"], observation["tote_depth"])[0]
-        if planner.candidates == "all" and planner.policy.choice_key == "outcome":
-            actions, probability = self._footprints(log_probs, heights, tote_height, item, chosen, count)
+        cell, planner = self.cell, self._planner
+        log_probs = planner.policy.action_log_probs(observation)[0]
+        if planner.candidates == "all" and planner.policy.ranks_footprints:
+            actions, probability = self._footprints(log_probs, state, chosen, count)
         else:
-            tried = rules.num_actions if planner.candidates == "all" else min(planner.candidates, rules.num_actions)
-            actions = log_probs.topk(tried).indices[:count]  # the same call as the planner's: ties fall alike
+            tried = cell.num_actions if planner.candidates == "all" else min(planner.candidates, cell.num_actions)
+            actions = log_probs.topk(tried).indices[:count]  # the same call as the planner's, so that ties agree
             if chosen is not None and not (actions == chosen).any():
                 actions = torch.cat([actions, chosen])
             probability = log_probs[actions].exp()
-        failure = self._simulate(heights, tote_height, item, actions)
-        columns = [column.tolist() for column in rules.split_action(actions)]
+        failure = self._simulate(state, actions)
+        columns = [column.tolist() for column in split_action(cell, actions)]
         return [
             Alternative(
                 action=action,
@@ -272,52 +278,67 @@ class Planner:
             )
         ]
 
-    def _footprints(self, log_probs, heights, tote_height, item, chosen, count) -> tuple[Tensor, Tensor]:
-        """An action for each of the most probable footprints in the tote, and the footprint's probability.
+    def _footprints(self, log_probs: Tensor, state: State, chosen: Tensor | None, count: int) -> tuple[Tensor, Tensor]:
+        """Return an action for each of the most probable footprints, and the footprint's probability.
 
         Many actions leave the same footprint, and the policy does not tell them apart. A footprint is shown by the
         chosen action, by its first feasible one, or by its first one if all fail.
         """
-        rules = self.rules
-        outcome = rules.action_outcomes(item)[0]  # [N_a]
-        feasible = rules.action_mask(rules.placements(heights, tote_height, item))[0]
-        lands = outcome >= 0
-        total = log_probs.new_zeros(rules.num_outcomes)
-        total.scatter_add_(0, outcome[lands], log_probs[lands].exp())
-        reachable = torch.zeros_like(total, dtype=torch.bool).index_fill_(0, outcome[lands], True)
+        cell = self.cell
+        footprint = action_footprints(cell, state.item)[0]  # [N_a]
+        feasible = action_mask(cell, placing_maps(cell, state))[0]
+        lands = footprint >= 0
+        total = log_probs.new_zeros(cell.num_footprints)
+        total.scatter_add_(0, footprint[lands], log_probs[lands].exp())
+        reachable = torch.zeros_like(total, dtype=torch.bool).index_fill_(0, footprint[lands], True)
         ranked = torch.where(reachable, total, -1).argsort(descending=True, stable=True)[: int(reachable.sum())][:count]
-        if chosen is not None and not (ranked == outcome[chosen]).any():
-            ranked = torch.cat([ranked, outcome[chosen]])
+        if chosen is not None and not (ranked == footprint[chosen]).any():
+            ranked = torch.cat([ranked, footprint[chosen]])
         preference = feasible.int()
         if chosen is not None:
             preference[chosen] = 2
-        shown = [torch.where(outcome == footprint, preference, -1).argmax() for footprint in ranked]
+        shown = [torch.where(footprint == wanted, preference, -1).argmax() for wanted in ranked]
         return torch.stack(shown) if shown else ranked, total[ranked]
 
-    def _simulate(self, heights, tote_height, item, actions) -> Tensor:
-        """Failure codes of many actions in one state, int64 ``[A]``."""
-        codes = []
-        for part in actions.split(4096):  # a few thousand at a time, for the memory's sake
-            count = len(part)
-            many = Item(*(value.expand(count) for value in item))
-            step = self.rules.apply(heights.expand(count, -1, -1), tote_height.expand(count), many, part)
-            codes.append(step.failure)
-        return torch.cat(codes)
+    def _simulate(self, state: State, actions: Tensor) -> Tensor:
+        """Return the failure codes of many actions in one state, int64 ``[A]``."""
+        parts = actions.split(4096)  # a few thousand at a time, for the memory's sake
+        return torch.cat([apply(self.cell, state.repeat(len(part)), part).failure for part in parts])
 
-    def _reasons(self, heights, tote_height, item) -> dict[str, int]:
-        """How many of all flat actions fail for which reason."""
-        codes = self._simulate(heights, tote_height, item, torch.arange(self.rules.num_actions, device=heights.device))
+    def _reasons(self, state: State) -> dict[str, int]:
+        """Return how many of all flat actions fail for which reason."""
+        codes = self._simulate(state, torch.arange(self.cell.num_actions, device=state.heights.device))
         counts = codes.bincount(minlength=len(Failure)).tolist()
         return {failure.name.lower(): counts[failure] for failure in Failure if counts[failure]}
 
 
-def _any_feasible(rules: Rules, heights: Tensor, tote_height: Tensor, item: Item) -> bool:
-    """Can anything be done with the item in this tote?"""
-    return bool(rules.outcome_mask(rules.placements(heights, tote_height, item)).any())
+class _Lengths:
+    """Conversion of cells and height units to the lengths of a plan: metres if ``cell_size`` is given."""
+
+    def __init__(self, cell: CellSpec, cell_size: float | None):
+        self.metric = cell_size is not None
+        self.cell_size = 1.0
+        if cell_size is not None:
+            wanted = "a length in metres, 1e-6 to 1e6"
+            self.cell_size = _number("cell_size", cell_size, wanted, lambda v: 1e-6 <= v <= 1e6)
+        self.height_unit = self.cell_size * (cell.height_unit if self.metric else 1.0)
+
+    def across(self, cells: float) -> float:
+        """Return a length along x or y."""
+        return round(cells * self.cell_size, 9)  # without the tail of binary fractions
+
+    def up(self, units: float) -> float:
+        """Return a height."""
+        return round(units * self.height_unit, 9)
+
+
+def _any_feasible(cell: CellSpec, state: State) -> bool:
+    """Return whether anything can be done with the item in this tote."""
+    return bool(footprint_mask(cell, placing_maps(cell, state)).any())
 
 
 def _number(name: str, value, wanted: str, good) -> float:
-    """A finite number for which ``good`` holds."""
+    """Return a finite number for which ``good`` holds."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -328,7 +349,7 @@ def _number(name: str, value, wanted: str, good) -> float:
 
 
 def _snap(name: str, values, grid: tuple[int, int], unit: float, tolerance: float, highest: int) -> Tensor:
-    """A measured map as whole cells, int64 ``grid``, each value between 0 and ``highest``."""
+    """Return a measured map in whole height units, int64 ``grid``, each value between 0 and ``highest``."""
     try:
         if isinstance(values, Tensor):
             values = values.detach().cpu()
@@ -360,10 +381,10 @@ def _snap(name: str, values, grid: tuple[int, int], unit: float, tolerance: floa
 
 
 def _refuse_other_than_one_cuboid(bin_map: Tensor) -> None:
-    """The bin must show one cuboid: its bounding box filled at one height."""
+    """Refuse a bin that does not show one cuboid: its bounding box filled at one height."""
     if not (bin_map > 0).any():
         raise DepthMapError("bin_depth: got no cell above 0, expected one item.")
-    x, y, w, d, h = (int(value) for value in Rules.read_item(bin_map[None].float()))
+    x, y, w, d, h = (int(value) for value in item_from_depth(bin_map[None].float()))
     box = bin_map[x : x + w, y : y + d]
     if (box != h).any():
         i, j = (box != h).nonzero()[0].tolist()

@@ -14,3 +14,10 @@ def build(place: str, node: DictConfig, **kwargs):
         **kwargs: arguments handed over as they are.
     """
     return hydra_app.instantiate(node, **kwargs)
+
+
+def find(place: str, node: DictConfig):
+    """Return the class or function that a config node names."""
+    import hydra
+
+    return hydra.utils.get_object(node._target_)

@@ -8,32 +8,31 @@ import csv
 import io
 import math
 from itertools import product
-from numbers import Integral
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from pickplace.task.geometry import Item
+from pickplace.task.checks import flag, is_whole
+from pickplace.task.state import Item
 
 #: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
 STREAMS = ("train", "validation", "test")
-MOST_SEEDS = 2**62  # the hash of one family's seed is that of another's only where the seeds lie further apart
+MAX_SEED = 2**62  # beyond it, seeds of two families could meet
+
+#: The kinds of items in the paper, (w, d, h).
+PAPER_KINDS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1))
 
 
 def check_seed(seed: int, key: str = "seed") -> int:
-    """The seed, if it is one.
-
-    Raises:
-        ValueError: naming the ``key``, if it is not.
-    """
-    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= seed < MOST_SEEDS:
+    """Return the seed, or raise a ``ValueError`` that names the ``key`` if it is none."""
+    if not is_whole(seed) or not 0 <= seed < MAX_SEED:
         raise ValueError(f"{key}={seed!r}: expected a whole number >= 0 and < 2**62.")
     return int(seed)
 
 
 def _mix(x: Tensor) -> Tensor:
-    """Scramble int64 counters (the finalizer of MurmurHash3, Appleby 2011)."""
+    """Return int64 counters scrambled (the finalizer of MurmurHash3, Appleby 2011)."""
     for factor in (-0x00AE502812AA7333, -0x3B314601E57A13AD):
         x = x ^ ((x >> 33) & 0x7FFFFFFF)
         x = x * factor
@@ -41,7 +40,7 @@ def _mix(x: Tensor) -> Tensor:
 
 
 def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, count: int) -> Tensor:
-    """Uniform numbers in [0, 1) from the item's address, float64 ``[count, N]``: the same address, the same numbers."""
+    """Return uniform numbers in [0, 1), float64 ``[count, N]``, that depend on the item's address alone."""
     family = STREAMS.index(stream) + 1
     key = seed
     for part in (family, episode, step):
@@ -51,12 +50,12 @@ def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, cou
 
 
 def _is_length(value) -> bool:
-    """Is it a positive whole number of cells that fits the tensors?"""
-    return isinstance(value, Integral) and not isinstance(value, bool) and 1 <= int(value) < 2**31
+    """Return whether a value is a positive whole number that fits the tensors."""
+    return is_whole(value) and 1 <= int(value) < 2**31
 
 
 class ItemDistribution:
-    """What an item distribution offers to the environment.
+    """Base class of item distributions.
 
     Attributes:
         sizes: int64 ``[K, 3]``, every size ``(w, d, h)`` that may arrive, in cells.
@@ -69,7 +68,7 @@ class ItemDistribution:
     varies: bool = True
 
     def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size) -> Item:
-        """The ``step``-th item (from 0) of each ``episode``, int64 ``[N]``; size 0 after the last one."""
+        """Return the ``step``-th item (from 0) of each ``episode``, int64 ``[N]``; size 0 after the last one."""
         kind, across, along = hashed_uniform(stream, seed, episode, step, 3)
         w, d, h = self.sizes.to(step.device)[self._index(kind, step)].unbind(-1)
         x = (across * (bin_size[0] - w + 1)).long()
@@ -77,16 +76,16 @@ class ItemDistribution:
         return Item(x, y, w, d, h)
 
     def _index(self, uniform: Tensor, step: Tensor) -> Tensor:
-        """Which row of ``sizes`` arrives, int64 ``[N]``."""
+        """Return which row of ``sizes`` arrives, int64 ``[N]``."""
         raise NotImplementedError
 
     def corners(self, kind: int, bin_size) -> list[tuple[int, int]]:
-        """Every bin position ``(x, y)`` at which kind number ``kind`` may arrive."""
+        """Return every bin position ``(x, y)`` at which kind number ``kind`` may arrive."""
         w, d, _ = self.sizes[kind].tolist()
         return list(product(range(bin_size[0] - w + 1), range(bin_size[1] - d + 1)))
 
     def label(self, kind: int) -> str:
-        """What to call kind number ``kind`` in a message."""
+        """Return the name of kind number ``kind`` for a message."""
         return "item {}x{}x{}".format(*self.sizes[kind].tolist())
 
 
@@ -123,8 +122,8 @@ class Kinds(ItemDistribution):
         return torch.searchsorted(self._edges.to(uniform.device), uniform, right=True)
 
 
-#: What is still read of a list of items, and how many kinds there may be: more would fill the memory.
-MOST_TEXT, MOST_KINDS = 100_000_000, 100_000
+#: Greatest length of a recorded file, in characters, and number of kinds: more would fill the memory.
+MAX_TEXT, MAX_KINDS = 100_000_000, 100_000
 
 
 class Uniform(Kinds):
@@ -143,8 +142,8 @@ class Uniform(Kinds):
                     f"items.{name}={limits!r}: expected [least, greatest], whole cells with 1 <= least <= greatest."
                 )
         count = math.prod(high - low + 1 for low, high in ranges.values())
-        if count > MOST_KINDS:
-            raise ValueError(f"items: the ranges have {count:,} kinds of items; expected at most {MOST_KINDS:,}.")
+        if count > MAX_KINDS:
+            raise ValueError(f"items: the ranges have {count:,} kinds of items; expected at most {MAX_KINDS:,}.")
         super().__init__(list(product(*(range(low, high + 1) for low, high in ranges.values()))))
 
 
@@ -161,16 +160,15 @@ class Recorded(ItemDistribution):
     """
 
     def __init__(self, path, loop=False):
-        if not isinstance(loop, bool):
-            raise ValueError(f"items.loop={loop!r}: expected true or false.")
+        flag("items.loop", loop)
         self.path = Path(str(path))
         if not self.path.is_file():
             raise ValueError(f"items.path={str(path)!r}: no such file; expected a CSV with columns w,d,h (and x,y).")
         try:
             with self.path.open(newline="", encoding="utf-8-sig") as file:
-                text = file.read(MOST_TEXT + 1)
-                if len(text) > MOST_TEXT:
-                    raise ValueError(f"items.path={str(path)!r}: longer than {MOST_TEXT:,} characters.")
+                text = file.read(MAX_TEXT + 1)
+                if len(text) > MAX_TEXT:
+                    raise ValueError(f"items.path={str(path)!r}: longer than {MAX_TEXT:,} characters.")
                 reader = csv.reader(io.StringIO(text, newline=""))
                 table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
         except (UnicodeDecodeError, csv.Error) as error:
@@ -221,6 +219,6 @@ class Recorded(ItemDistribution):
         return f"{self.path}, line {self._lines[kind]}: " + super().label(kind)
 
 
-def imagined(items: ItemDistribution) -> ItemDistribution:
-    """What a search samples items from: of a recorded stream, which it must not look up, its sizes, equally likely."""
+def search_items(items: ItemDistribution) -> ItemDistribution:
+    """Return the distribution that a search samples from: of a recorded stream only its sizes, equally likely."""
     return Kinds(items.sizes.tolist()) if isinstance(items, Recorded) else items

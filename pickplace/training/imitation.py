@@ -1,5 +1,6 @@
 """Warm start: a policy imitates a planner before it learns from reward."""
 
+from collections.abc import Mapping
 from enum import Enum
 
 import torch
@@ -8,13 +9,16 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pickplace.planners.policy import planner_parts
-from pickplace.policies.actors import Policy
+from pickplace.planners.base import planner_parts
+from pickplace.policies.base import Policy
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import trusted
 from pickplace.runs.registry import build
-from pickplace.task.geometry import Rules
+from pickplace.task.cell import CellSpec
 from pickplace.task.items import ItemDistribution
+from pickplace.task.observation import Term
+from pickplace.task.state import State
+from pickplace.task.transition import apply
 
 
 class Phase(Enum):
@@ -34,9 +38,10 @@ class WarmStart:
 
     Args:
         cfg: the config group ``warm_start``.
-        policy: a policy of :mod:`pickplace.policies.actors`.
-        rules: the task's sizes.
+        policy: a policy.
+        cell: the sizes.
         items: for a teacher that imagines some.
+        terms: of the observation, by key.
         seed: of a teacher that draws.
         trust: modules beside pickplace's own whose classes the config of a teacher's checkpoint may make.
 
@@ -44,13 +49,22 @@ class WarmStart:
         ValueError: naming the key, for numbers that make no sense and for a teacher that lacks its checkpoint.
     """
 
-    def __init__(self, cfg: DictConfig, policy: Policy, rules: Rules, items: ItemDistribution, seed: int, trust=()):
+    def __init__(
+        self,
+        cfg: DictConfig,
+        policy: Policy,
+        cell: CellSpec,
+        items: ItemDistribution,
+        terms: Mapping[str, Term],
+        seed: int,
+        trust=(),
+    ):
         for key in ("frames", "critic_frames"):
             if not isinstance(cfg[key], int) or isinstance(cfg[key], bool) or cfg[key] < 0:
                 raise ValueError(f"warm_start.{key}={cfg[key]}: expected a whole number >= 0.")
         if cfg.frames and cfg.teacher is None:
             raise ValueError(f"warm_start.frames={cfg.frames}: nobody to imitate; expected warm_start=<planner>.")
-        self.policy, self.rules, self.seed = policy, rules, seed
+        self.policy, self.cell, self.seed = policy, cell, seed
         self.teacher, self.frames, self.critic_frames = cfg.teacher, cfg.frames, cfg.critic_frames
         self._parts: dict = {}  # of the teacher
         if self.frames:
@@ -60,7 +74,7 @@ class WarmStart:
                 theirs = trusted(saved["config"], trust)
                 trained = (theirs, state, OmegaConf.to_container(theirs.env, resolve=True))
             try:
-                self._parts = planner_parts(cfg.teacher, rules, items, trained)
+                self._parts = planner_parts(cfg.teacher, cell, items, terms, trained)
             except ValueError as error:
                 raise ValueError(f"warm_start.{error}") from error
 
@@ -81,15 +95,13 @@ class WarmStart:
         draws = {"seed": self.seed + iteration} if "seed" in self.teacher else {}
         teacher = build("warm_start.teacher", self.teacher, **self._parts, **draws)
         action = teacher.decide(data)
-        bin_depth, tote_depth, tote_height = data["bin_depth"], data["tote_depth"], data["tote_height"][:, 0]
-        heights = (tote_height[:, None, None] - tote_depth).int()
-        item = self.rules.read_item(bin_depth)
-        wanted = self.rules.apply(heights, tote_height, item, action)
-        choice = self.policy.to_choice(action, bin_depth, tote_depth, tote_height)
-        choice = torch.where(wanted.failure == 0, choice, 0)  # any that there is
+        state = State.from_observation(data)
+        wanted = apply(self.cell, state, action)
+        choice = self.policy.to_choice(action, data)
+        choice = torch.where(wanted.failure == 0, choice, 0)  # any choice will do
         # A policy with a pick of its own may not reach the same footprint.
-        action = self.policy.to_action(choice, bin_depth, tote_depth, tote_height).clamp(min=0)
-        reached = self.rules.apply(heights, tote_height, item, action)
+        action = self.policy.to_action(choice, data).clamp(min=0)
+        reached = apply(self.cell, state, action)
         same = (reached.footprint == wanted.footprint).all(1) & (reached.failure == 0) & (wanted.failure == 0)
         return torch.where(same, choice, -1)
 
@@ -97,7 +109,7 @@ class WarmStart:
 def imitation_loss(policy: Policy, data: TensorDictBase) -> tuple[Tensor, Tensor]:
     """Mean cross-entropy against the teacher's ``taught`` choices, and the share of them that is the likeliest."""
     taught = data["taught"]
-    logits = policy(*(data[key] for key in policy.in_keys))
+    logits = policy.logits(data)
     known = (taught >= 0).sum().clamp(min=1)
     agreed = (logits.argmax(-1) == taught).sum() / known
     return F.cross_entropy(logits, taught, ignore_index=-1, reduction="sum") / known, agreed

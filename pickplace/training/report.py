@@ -12,21 +12,21 @@ from omegaconf import DictConfig, OmegaConf
 
 from pickplace.runs.hydra_app import begun_with, changed_since, own_configs
 from pickplace.runs.loggers import read_csv
-from pickplace.task.geometry import Rules
+from pickplace.task.cell import CellSpec
 from pickplace.views.figures import failure_mix
 from pickplace.views.replay import ASSETS, page
 
 REPORT = "report.html"
 
 
-def write_report(run_dir: Path, cfg: DictConfig, episodes, rules: Rules, facts: dict) -> None:
+def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts: dict) -> None:
     """Write ``report.html``: curves, tables, the worst and the best episode, and how to make the run again.
 
     Args:
         run_dir: the run folder, with ``metrics.csv`` and ``learning_curve.png``.
         cfg: the composed config.
         episodes: the last validation, an :class:`pickplace.evaluation.evaluate.Episodes` with recordings.
-        rules: the task's sizes.
+        cell: the sizes.
         facts: versions and commit.
     """
     rows = read_csv(run_dir / "metrics.csv")
@@ -34,19 +34,19 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, rules: Rules, facts: 
     failure_mix(run_dir / "metrics.csv", failures)
     best = max((row for row in rows if "eval/occupancy" in row), key=lambda row: row["eval/occupancy"])
     ordered = sorted(episodes.recordings, key=lambda recording: recording.occupancy)
-    sizes = "x".join(map(str, rules.tote_size))
+    sizes = "x".join(map(str, cell.tote_size))
     policy = str(cfg.model.actor._target_).rpartition(".")[2]
     count, mean = len(episodes.occupancy), float(episodes.occupancy.mean())
     tiles = [
         (f"{best['eval/occupancy']:.4f}", f"best validation, after {best['frames']:,} frames (checkpoints/best)"),
         (f"{mean:.4f}", f"last validation, {count} episodes at full height"),
         (f"{float(episodes.occupancy.min()):.4f}", "its worst episode"),
-        (f"{int(rows[-1]['curriculum/level'])} of {rules.tote_size[2]}", "tote height reached"),
+        (f"{int(rows[-1]['curriculum/level'])} of {cell.tote_size[2]}", "tote height reached"),
     ]
     parts = {
         "title": escape(f"Training {policy} for a {sizes} tote"),
         "subtitle": escape(
-            f"R={rules.rotations}, {rows[-1]['frames']:,} frames, seed {cfg.seed}, "
+            f"R={cell.rotations}, {rows[-1]['frames']:,} frames, seed {cfg.seed}, "
             f"mask in training: {'yes' if cfg.algo.mask_infeasible else 'no'}, K={cfg.planner.candidates}"
         ),
         "tiles": "".join(f"<div><b>{value}</b><span>{text}</span></div>" for value, text in tiles),
@@ -56,7 +56,7 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, rules: Rules, facts: 
         "command": escape(_command(run_dir, cfg)),
         "config": escape(OmegaConf.to_yaml(cfg, resolve=True)),
         "versions": escape("\n".join(f"{name}: {value}" for name, value in facts.items())),
-        "replay": escape(page(ordered, rules, f"{cfg.evaluation.stream} stream, seed {cfg.evaluation.seed}")),
+        "replay": escape(page(ordered, cell, f"{cfg.evaluation.stream} stream, seed {cfg.evaluation.seed}")),
     }
     html = (ASSETS / "report.html").read_text(encoding="utf-8")
     # In one pass, so that nothing in the content is taken for a mark.

@@ -20,7 +20,7 @@ from torchrl.objectives import A2CLoss, ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from pickplace.evaluation.evaluate import Episodes, commit, confidence95, play, versions
-from pickplace.policies.actors import Policy, as_actor, as_collection_policy, check_sizes
+from pickplace.policies.base import Policy, as_actor, as_collection_policy, as_critic
 from pickplace.runs import checkpoint
 from pickplace.runs import hydra_app as config
 from pickplace.runs.allowlist import own_modules, saved_form, trust_needed, trusted
@@ -37,7 +37,7 @@ from pickplace.runs.resume import (
     resumed_config,
     saying_what_is_safe,
 )
-from pickplace.task.geometry import Failure
+from pickplace.task.state import Failure
 from pickplace.task.items import check_seed
 from pickplace.training.collectors import rng_state, set_rng_state, watched
 from pickplace.training.curriculum import Curriculum, push_level
@@ -87,22 +87,22 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     items = build("items", cfg["items"])
     build_env = partial(build, "env", cfg.env, items=items, device=cfg.device)
     probe = build_env(num_envs=1, masks=())
-    rules = probe.rules
+    cell = probe.cell
     state, facts, safe = resume or ({}, {}, None)  # safe: the checkpoint that was read or written last
 
     def restored(what: str, make):
         return (checkpoint.restore(make, state.get(what, {}), what) if resume else make()).to(device)
 
-    make_policy = partial(build, "model.actor", cfg.model.actor, rules=rules, mask_infeasible=algo.mask_infeasible)
+    make_policy = partial(build, "model.actor", cfg.model.actor, cell=cell, mask_infeasible=algo.mask_infeasible)
     policy: Policy = restored("policy", make_policy)
-    for warning in check_sizes(policy, rules):
+    for warning in policy.check_sizes():
         log.warning(warning)
-    planner = build("planner", cfg.planner, rules=rules, policy=policy)  # the one that validates
-    warm_start = WarmStart(cfg.warm_start, policy, rules, items, cfg.seed, cfg.trust)
-    make_critic = partial(build, "model.critic", cfg.model.critic, rules=rules)
-    critic = restored("critic", lambda: ValueOperator(make_critic(), ["bin_depth", "tote_depth"]))
+    planner = build("planner", cfg.planner, cell=cell, policy=policy)  # the one that validates
+    warm_start = WarmStart(cfg.warm_start, policy, cell, items, probe.terms, cfg.seed, cfg.trust)
+    make_critic = partial(build, "model.critic", cfg.model.critic, cell=cell)
+    critic = restored("critic", lambda: as_critic(make_critic()))
     curriculum: Curriculum = build("curriculum", cfg.curriculum)
-    curriculum.setup(probe.min_tote_height, rules.tote_size[2], cfg.total_frames)
+    curriculum.setup(probe.min_tote_height, cell.tote_size[2], cfg.total_frames)
     frames, iteration, best, latest = (facts.get(k, d) for k, d in COUNTERS.items())
     if resume:
         curriculum.load_state_dict(facts["curriculum"])
@@ -252,7 +252,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             episodes = episodes or validate(cfg, build_env, planner)
             extremes = {int(episodes.occupancy.argmin()), int(episodes.occupancy.argmax())}
             replayed = validate(cfg, build_env, planner, record=extremes)
-            write_report(run_dir, cfg, replayed, rules, versions() | {"commit": commit()})
+            write_report(run_dir, cfg, replayed, cell, versions() | {"commit": commit()})
     log.info("run folder: %s", run_dir)
     if stop.requested and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise KeyboardInterrupt
@@ -285,7 +285,7 @@ def check_settings(cfg: DictConfig) -> None:
     for key in ("algo.mask_infeasible", "algo.normalize_advantage"):
         if not isinstance(value := OmegaConf.select(cfg, key), bool):
             raise ValueError(f"{key}={value}: expected true or false.")
-    if cfg.planner._target_ != "pickplace.planners.PolicyPlanner":
+    if cfg.planner._target_ != "pickplace.planners.policy.PolicyPlanner":
         raise ValueError(
             f"planner._target_={cfg.planner._target_}: training validates its policy; expected planner=policy."
         )

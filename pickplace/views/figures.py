@@ -132,12 +132,12 @@ def failure_mix(metrics: Path, path) -> None:
     figure.savefig(path, dpi=120, format=None if isinstance(path, Path) else "png")
 
 
-def draw_scene(recording, rules, colours, moves: int | None = None):
+def draw_scene(recording, cell, colours, moves: int | None = None):
     """Draw the tote of a recorded episode, beside its height map.
 
     Args:
-        recording: a :class:`pickplace.views.replay.Recording`.
-        rules: the task's sizes.
+        recording: a :class:`pickplace.views.recording.Recording`.
+        cell: the sizes.
         colours: of the kinds of items, see :func:`item_colours`.
         moves: how many moves have been made; None: all, and the caption says how the episode ended.
 
@@ -146,10 +146,10 @@ def draw_scene(recording, rules, colours, moves: int | None = None):
     """
     done = recording.moves if moves is None else recording.moves[:moves]
     boxes = recording.boxes[: sum(not move.failure for move in done)]
-    heights = np.zeros(rules.tote_size[:2], dtype=int)
+    heights = np.zeros(cell.tote_size[:2], dtype=int)
     for x, y, z, w, d, h in boxes:
         heights[x : x + w, y : y + d] = z + h
-    size = (*rules.tote_size[:2], recording.tote_height)
+    size = (*cell.tote_size[:2], recording.tote_height)
     figure = figure_of(12, 6)
     solid, plan = figure.subplots(1, 2, width_ratios=[1.2, 1])
     _draw_boxes(solid, boxes, colours, size)
@@ -158,7 +158,7 @@ def draw_scene(recording, rules, colours, moves: int | None = None):
     share = np.floor(10 * share + 1e-9) / 10  # never rounded up: 100% is full
     caption = f"{'x'.join(map(str, size))} tote, {share:.1f}% full, {len(boxes)} items placed"
     if len(done) == len(recording.moves) and recording.ending is not None:
-        caption += f". {recording.describe_ending(rules.num_places)}"
+        caption += f". {recording.describe_ending(cell.num_places)}"
     figure.suptitle(caption, color=INK, fontsize="x-large")
     return figure
 

@@ -24,15 +24,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pickplace.policies.networks.depth import clip_depth, pad_depth
+from pickplace.task.checks import one_of, whole_number
 
 BIN_PADDING, TOTE_PADDING = -1.0, 0.0
 DTYPES = ("float32", "bfloat16")
-
-
-def check_width(name: str, value) -> None:
-    """Refuse a layer's width that is none."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise ValueError(f"{name}={value!r}: expected a whole number >= 1.")
 
 
 class Conv4dParameters(nn.Module):
@@ -87,9 +82,8 @@ class Conv4dPolicy(nn.Module):
         chunk_bytes: int = 64 * 2**20,
     ):
         super().__init__()
-        check_width("model.actor.filters", filters)
-        if compute_dtype not in DTYPES:
-            raise ValueError(f"model.actor.compute_dtype={compute_dtype!r}: expected one of {', '.join(DTYPES)}.")
+        whole_number("model.actor.filters", filters)
+        one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
         self.rotations = rotations
         self.filters = filters
         self.bin_clip = bin_clip
@@ -244,8 +238,8 @@ class Conv4dCritic(nn.Module):
         depth_scale: float = 5.0,
     ):
         super().__init__()
-        check_width("model.critic.filters", filters)
-        check_width("model.critic.hidden", hidden)
+        whole_number("model.critic.filters", filters)
+        whole_number("model.critic.hidden", hidden)
         self.bin_size = tuple(bin_size)[:2]
         self.tote_size = tuple(tote_size)[:2]
         self.bin_clip = bin_clip

@@ -1,21 +1,22 @@
-"""Value networks, which share nothing with the policies. Acting needs none; ``planner=lookahead`` asks one."""
+"""Value networks. They share nothing with the policies; acting needs none, but ``planner=lookahead`` asks one."""
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.policies.networks.conv4d import Conv4dCritic, check_width
+from pickplace.policies.networks.conv4d import Conv4dCritic
 from pickplace.policies.networks.depth import depth_levels, item_code, one_hot
-from pickplace.policies.networks.footprint_fcn import check_dtype, matrix_dtype
-from pickplace.task.geometry import Rules
+from pickplace.policies.networks.footprint_fcn import DTYPES, matrix_dtype
+from pickplace.task.cell import CellSpec
+from pickplace.task.checks import odd_number, one_of, whole_number
 
 
 class PooledCritic(nn.Module):
-    """The critic beside ``fcn_grasp``: what each column of the tote will yet hold, judged from around it, and summed.
+    """The critic beside ``fcn_grasp``: the volume that each column of the tote will still take, summed.
 
     A convolution over the one-hot clipped tote (a cell outside it is in no plane), the item's size added, then ``1x1``
-    layers that say for each cell which share of its unclipped room will be filled, and how much more or less. The sum
-    over the cells is the value, so that one set of weights serves any tote.
+    layers that estimate for each cell which share of its unclipped depth will be filled, and a correction. The sum over
+    the cells is the value, so that one set of weights serves any tote.
 
     Args:
         filters: width of the convolution.
@@ -40,13 +41,12 @@ class PooledCritic(nn.Module):
         compute_dtype: str = "auto",
     ):
         super().__init__()
-        if not isinstance(receptive_field, int) or receptive_field < 1 or receptive_field % 2 == 0:
-            raise ValueError(f"model.critic.receptive_field={receptive_field!r}: expected an odd number >= 1.")
+        odd_number("model.critic.receptive_field", receptive_field)
         widths = {"filters": filters, "hidden": hidden, "tote_clip": tote_clip}
         for key, value in {**widths, "depth_range": depth_range, "item_range": item_range}.items():
-            check_width(f"model.critic.{key}", value)
+            whole_number(f"model.critic.{key}", value)
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
-        self.compute_dtype = check_dtype("model.critic.compute_dtype", compute_dtype)
+        self.compute_dtype = one_of("model.critic.compute_dtype", compute_dtype, DTYPES)
         self.around = nn.Conv2d(depth_range, filters, receptive_field, padding=receptive_field // 2)
         self.item = nn.Linear(3 * item_range, filters, bias=False)
         self.room = nn.Parameter(torch.zeros(filters))
@@ -72,11 +72,11 @@ class PooledCritic(nn.Module):
         return value.view(*batch, 1)
 
 
-def pooled_critic(rules: Rules, **network) -> PooledCritic:
-    """The critic beside ``fcn_grasp``, for any sizes (config ``model=fcn_grasp``)."""
+def pooled_critic(cell: CellSpec, **network) -> PooledCritic:
+    """Return the critic beside ``fcn_grasp``, for any sizes (config ``model=fcn_grasp``)."""
     return PooledCritic(**network)
 
 
-def conv4d_critic(rules: Rules, **network) -> Conv4dCritic:
-    """The critic beside ``fcn4d``, for these sizes (config ``model=fcn4d``)."""
-    return Conv4dCritic(rules.bin_size, rules.tote_size, **network)
+def conv4d_critic(cell: CellSpec, **network) -> Conv4dCritic:
+    """Return the critic beside ``fcn4d``, for these sizes (config ``model=fcn4d``)."""
+    return Conv4dCritic(cell.bin_size, cell.tote_size, **network)

@@ -1,10 +1,10 @@
-"""Depth maps as the networks see them: clipped to a fixed range, then padded (fcn4d) or one-hot (fcn_grasp)."""
+"""Preparation of depth maps for the networks: clipping, then padding (fcn4d) or one-hot codes (fcn_grasp)."""
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pickplace.task.geometry import Rules
+from pickplace.task.state import item_from_depth
 
 
 def clip_depth(depth: Tensor, limit: float | None, floor: float | None = None) -> Tensor:
@@ -37,19 +37,19 @@ def pad_depth(depth: Tensor, cells: int, value: float) -> Tensor:
 
 
 def depth_levels(tote_depth: Tensor, tote_clip: int, depth_range: int) -> Tensor:
-    """Clipped depths (eq. 4) counted from ``tote_clip`` downwards, uint8 in ``[0, depth_range)``, same shape."""
+    """Return clipped depths (eq. 4) counted from ``tote_clip`` downwards, uint8 in ``[0, depth_range)``, same shape."""
     return (tote_clip - clip_depth(tote_depth, tote_clip)).clamp(0, depth_range - 1).to(torch.uint8)
 
 
 def one_hot(levels: Tensor, count: int) -> Tensor:
-    """Planes of uint8 levels, bool ``[N, M]`` to ``[N, count * M]``, plane by plane; other levels are in no plane."""
+    """Return planes of uint8 levels: ``[N, M]`` to bool ``[N, count * M]``; a greater level is in no plane."""
     plane = torch.arange(count, dtype=torch.uint8, device=levels.device)
     return (levels[:, None] == plane[:, None]).flatten(1)
 
 
 def item_code(bin_depth: Tensor, item_range: int) -> Tensor:
-    """The item's width, depth and height as one-hot codes, bool ``[N, 3 * item_range]``."""
-    item = Rules.read_item(bin_depth)
+    """Return the item's width, depth and height as one-hot codes, bool ``[N, 3 * item_range]``."""
+    item = item_from_depth(bin_depth)
     size = torch.stack([item.w, item.d, item.h], -1).clamp(1, item_range)
     step = torch.arange(1, item_range + 1, device=size.device)
     return (size[..., None] == step).flatten(1)

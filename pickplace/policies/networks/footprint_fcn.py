@@ -4,9 +4,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.policies.networks.conv4d import check_width
 from pickplace.policies.networks.depth import clip_depth
-from pickplace.task.geometry import Rules
+from pickplace.task.checks import number, odd_number, one_of, whole_number
+from pickplace.task.grasps import split_footprint
+from pickplace.task.state import item_from_depth
+
+DTYPES = ("auto", "float32", "bfloat16")
+OUTSIDE = -1000  # the depth of a cell that is not in the tote
+FAR_DOWN = 10_000  # deeper than any tote
 
 #: What the rows of a bf16 product are rounded up to, beyond how many: one is prepared and kept for each number of rows,
 #: which takes time and memory. A single decision has few, and is not slowed down.
@@ -20,7 +25,7 @@ class FootprintFcn(nn.Module):
     as matrix products over the patches around the footprints that are asked for. A patch is centred on its footprint
     and turned with it, so that an item that is turned is seen as one that is not. Its cells are one-hot: around the
     footprint, the height above the top that the item would have; under it, the depth of the hole that it would close;
-    nothing outside the tote. After the patch come the item's width, depth and height, the room above its top (too
+    nothing outside the tote. After the patch come the item's width, depth and height, the headroom above its top (too
     little, none, or how much), and how far above the deepest place of the tote it rests (the clipped depth of
     eq. 4), one-hot each.
 
@@ -31,8 +36,8 @@ class FootprintFcn(nn.Module):
         hidden: width of the 1x1 layer before the output.
         tote_clip: ``H_1_max`` of eq. 4, in whole cells.
         depth_range: number of clipped depths told apart.
-        rooms: number of rooms above the top told apart: too little, none, 1, 2, ... cells; None: ``depth_range``. Few
-            serve totes that are higher than those in training.
+        headroom_bins: number of headrooms told apart: too little, none, 1, 2, ...; None: ``depth_range``. Few serve
+            totes that are higher than those in training.
         reach: heights around a footprint are told apart up to so many cells above and below the item's top.
         item_range: sides and heights from this one on look alike.
         head_std: standard deviation of the last layer's initial weights.
@@ -52,23 +57,21 @@ class FootprintFcn(nn.Module):
         item_range: int = 3,
         head_std: float = 0.01,
         compute_dtype: str = "auto",
-        rooms: int | None = None,
+        headroom_bins: int | None = None,
     ):
         super().__init__()
-        if not isinstance(receptive_field, int) or receptive_field < 3 or receptive_field % 2 == 0:
-            raise ValueError(f"model.actor.receptive_field={receptive_field!r}: expected an odd number >= 3.")
+        odd_number("model.actor.receptive_field", receptive_field, least=3)
         sizes = {"filters": filters, "hidden": hidden, "depth_range": depth_range, "item_range": item_range}
-        sizes["rooms"] = rooms = depth_range if rooms is None else rooms
+        sizes["headroom_bins"] = headroom_bins = depth_range if headroom_bins is None else headroom_bins
         for key, value in {**sizes, "tote_clip": tote_clip, "reach": reach, "out_channels": out_channels}.items():
-            check_width(f"model.actor.{key}", value)
-        if not isinstance(head_std, (int, float)) or head_std < 0:
-            raise ValueError(f"model.actor.head_std={head_std!r}: expected a number >= 0.")
+            whole_number(f"model.actor.{key}", value)
+        number("model.actor.head_std", head_std)
         self.receptive_field, self.reach = receptive_field, reach
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
-        self.rooms = rooms
-        self.compute_dtype = check_dtype("model.actor.compute_dtype", compute_dtype)
+        self.headroom_bins = headroom_bins
+        self.compute_dtype = one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
         self.planes = max(
-            3 * reach + 2, depth_range, item_range, rooms
+            3 * reach + 2, depth_range, item_range, headroom_bins
         )  # around: -reach .. reach; under: holes 0 .. reach
         self.patch = nn.Linear(self.planes * (receptive_field**2 + 5), filters)
         self.hidden = nn.Linear(filters, hidden)
@@ -77,7 +80,7 @@ class FootprintFcn(nn.Module):
         nn.init.zeros_(self.head.bias)
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor, parities: int) -> Tensor:
-        """Scores of all footprints, float32 ``[N, parities, W_T, D_T, out_channels]``, be they in the tote or not.
+        """Return scores of all footprints, float32 ``[N, parities, W_T, D_T, out_channels]``, in the tote or not.
 
         Args:
             bin_depth, tote_depth: ``[N, W_B, D_B]``, ``[N, W_T, D_T]``.
@@ -88,35 +91,36 @@ class FootprintFcn(nn.Module):
         out = self.at(bin_depth, tote_depth, index // count, index % count)
         return out.view(len(tote_depth), parities, *tote_depth.shape[1:], -1)
 
-    def at(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, outcome: Tensor) -> Tensor:
-        """The scores of some footprints only, float32 ``[M, out_channels]``.
+    def at(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, footprint: Tensor) -> Tensor:
+        """Return the scores of some footprints only, float32 ``[M, out_channels]``.
 
         Args:
             row: int64 ``[M]``, which problem.
-            outcome: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
+            footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
         """
         dtype, count = matrix_dtype(self.compute_dtype, tote_depth.device.type), len(row)
         lower = dtype != torch.float32
         if lower:
             padding = next((-count % step for beyond, step in PADDED_ROWS if count > beyond), 0)
-            row, outcome = (F.pad(index, (0, padding)) for index in (row, outcome))
-        x = self._inputs(bin_depth, tote_depth, row, outcome, dtype)
+            row, footprint = (F.pad(index, (0, padding)) for index in (row, footprint))
+        x = self._inputs(bin_depth, tote_depth, row, footprint, dtype)
         with torch.autocast(tote_depth.device.type, dtype, enabled=lower):
             x = F.relu(self.hidden(F.relu(self.patch(x))))
         return self.head(x.float())[:count]  # in full: scores that differ a little must not be rounded to a tie
 
-    def _inputs(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, outcome: Tensor, dtype) -> Tensor:
-        """What the first layer sees of some footprints, ``[M, inputs]``: one-hot, cell by cell, then the five codes."""
+    def _inputs(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, footprint: Tensor, dtype) -> Tensor:
+        """Return the input of the first layer, ``[M, inputs]``: one-hot, cell by cell, then the five codes."""
         side, reach = self.receptive_field, self.reach
         _, wide, long = tote_depth.shape
-        item = Rules.read_item(bin_depth)
-        turned = outcome >= wide * long
+        item = item_from_depth(bin_depth)
+        parity, x, y = split_footprint((wide, long), footprint)
+        turned = parity == 1
         # Patches begin some cells before their footprint along the item's own axes, to have it in their middle.
         before_w, before_d = (side // 2 - (size - 1) // 2 for size in (item.w[row], item.d[row]))
         margin = side + max(bin_depth.shape[1:])
         stride = long + 2 * margin
-        x = outcome // long % wide + margin - torch.where(turned, before_d, before_w)
-        y = outcome % long + margin - torch.where(turned, before_w, before_d)
+        x = x + margin - torch.where(turned, before_d, before_w)
+        y = y + margin - torch.where(turned, before_w, before_d)
         tap = torch.arange(side, device=row.device)
         steps = torch.stack([tap[:, None] * stride + tap, tap[:, None] + tap * stride]).flatten(1)
         # Depths as small whole numbers: comparing a row of them is what takes the time.
@@ -127,19 +131,23 @@ class FootprintFcn(nn.Module):
         seen = depth.flatten()[steps[turned.long()] + corner[:, None]]  # [M, side * side]
         under = self._under(bin_depth.shape[1:], row.device)[item.w[row], item.d[row]]
         rest = torch.where(under, seen, FAR_DOWN).amin(1)  # depth of what the item rests on
-        room = rest - item.h[row].to(torch.int16)  # above its top
-        around = (room[:, None] - seen).clamp_(-reach, reach).add_(reach)
+        headroom = rest - item.h[row].to(torch.int16)  # above its top
+        around = (headroom[:, None] - seen).clamp_(-reach, reach).add_(reach)
         hole = (seen - rest[:, None]).clamp_(0, reach).add_(2 * reach + 1)
         level = torch.where(under, hole, around).masked_fill_(seen == OUTSIDE, self.planes)
 
         sizes = [(size - 1).clamp(0, self.item_range - 1)[row].to(torch.int16) for size in (item.w, item.d, item.h)]
-        codes = [*sizes, (room + 1).clamp(0, self.rooms - 1), (deepest - rest).clamp(0, self.depth_range - 1)]
+        codes = [
+            *sizes,
+            (headroom + 1).clamp(0, self.headroom_bins - 1),
+            (deepest - rest).clamp(0, self.depth_range - 1),
+        ]
         level = torch.cat([level, torch.stack(codes, 1)], 1)
         planes = torch.eye(self.planes + 1, self.planes, dtype=dtype, device=row.device)
         return F.embedding(level.int(), planes).flatten(1)
 
     def _under(self, bin_size, device: torch.device) -> Tensor:
-        """Which cells of a patch lie under an item of ``w x d``, bool ``[W_B + 1, D_B + 1, side * side]``."""
+        """Return which cells of a patch lie under an item of ``w x d``, bool ``[W_B + 1, D_B + 1, side * side]``."""
         side, maps = self.receptive_field, []
         tap = torch.arange(side, device=device)
         for longest in bin_size:
@@ -149,26 +157,11 @@ class FootprintFcn(nn.Module):
         return (maps[0][:, None, :, None] & maps[1][None, :, None]).flatten(2)
 
 
-def check_dtype(key: str, name: str) -> str:
-    """The name, if it is one that :func:`matrix_dtype` knows.
-
-    Raises:
-        ValueError: if it is not, naming the key.
-    """
-    if name not in ("auto", "float32", "bfloat16"):
-        raise ValueError(f"{key}={name!r}: expected 'auto', 'float32' or 'bfloat16'.")
-    return name
-
-
 def matrix_dtype(name: str, device: str) -> torch.dtype:
-    """What matrix products are computed in on a type of device; for ``"auto"`` what is fastest there."""
+    """Return the type of matrix products on a type of device; for ``"auto"`` the fastest one there."""
     if name != "auto":
         return getattr(torch, name)
     if device == "cuda":
         return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
     able = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
     return torch.bfloat16 if any(able.get(key) for key in ("amx_bf16", "avx512_bf16", "bf16")) else torch.float32
-
-
-OUTSIDE = -1000  # the depth of a cell that is not in the tote
-FAR_DOWN = 10_000  # deeper than any tote

@@ -1,0 +1,73 @@
+"""The protocol of planners, and what they are made of."""
+
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
+
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from pickplace.policies.base import Observation
+from pickplace.policies.restore import restore_critic, restore_policy
+from pickplace.runs.registry import find
+from pickplace.task.cell import CellSpec
+from pickplace.task.items import ItemDistribution
+from pickplace.task.observation import Term
+
+
+@runtime_checkable
+class BatchPlanner(Protocol):
+    """Decides where to pick, where to place and how to turn, for ``N`` problems at once.
+
+    A planner is made as ``Planner(cell, ...)``. A class attribute ``needs`` names further arguments that pickplace
+    hands over: ``"items"`` (the item distribution), ``"terms"`` (of the observation), ``"policy"`` and ``"critic"`` (of
+    the checkpoint). An optional method ``statistics() -> dict`` adds figures to an evaluation, and
+    ``heat_map(observation) -> [N, W_T, D_T]`` a picture to a replay.
+
+    Attributes:
+        name: its name in tables and in ``evaluation.json``.
+    """
+
+    name: str
+
+    def decide(self, observation: Observation) -> Tensor:
+        """Return flat actions, int64 ``[N]``."""
+        ...
+
+
+def planner_parts(
+    planner: DictConfig,
+    cell: CellSpec,
+    items: ItemDistribution,
+    terms: Mapping[str, Term],
+    trained: tuple[DictConfig, dict, dict] | None = None,
+) -> dict[str, Any]:
+    """Return the arguments of a config's planner beside its settings.
+
+    Args:
+        planner: a config of the group ``planner``.
+        cell: the sizes.
+        items: for a search to imagine.
+        terms: of the observation.
+        trained: for a planner that follows a policy: the checkpoint's config with any overrides on top, its tensors,
+            and the group ``env`` in training; None: there is no checkpoint.
+
+    Raises:
+        ValueError: for a planner that needs a checkpoint without one, or with one that does not serve these sizes.
+    """
+    needs = getattr(find("planner", planner), "needs", ())
+    parts: dict[str, Any] = {"cell": cell}
+    parts |= {key: value for key, value in {"items": items, "terms": terms}.items() if key in needs}
+    if "policy" in needs:
+        if trained is None:
+            raise ValueError(f"checkpoint=null: planner={planner._target_} needs a checkpoint; expected a run folder.")
+        cfg, state, env = trained
+        parts["policy"] = restore_policy(cfg, cell, state["policy"], env).to(cfg.device)
+        if "critic" in needs:
+            parts["critic"] = restore_critic(cfg, cell, state, env)
+    return parts
+
+
+def plain_settings(node: DictConfig) -> dict[str, Any]:
+    """Return a planner's settings as plain values, without its name in the registry."""
+    settings = OmegaConf.to_container(node, resolve=True)
+    return {str(key): value for key, value in settings.items() if key != "_target_"}  # type: ignore[union-attr]

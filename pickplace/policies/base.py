@@ -1,0 +1,189 @@
+"""The abstract policy, and how TorchRL sees it.
+
+A policy chooses among *choices*: flat actions, or classes of flat actions that it has no reason to tell apart. The
+probability of a choice is spread evenly over the flat actions of its class, so that PPO's ratio and entropy are those
+of the choice.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from torch import Tensor
+from torch.distributions import Categorical
+from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.modules import ValueOperator
+
+from pickplace.task.cell import CellSpec
+from pickplace.task.feasibility import action_mask, placing_maps
+from pickplace.task.maps import FAR
+from pickplace.task.observation import STANDARD_TERMS
+from pickplace.task.state import State
+
+#: The logit of what must not be chosen, far below what a network may score: its probability is exactly 0 in float32.
+#: The rest of float32's range is left for differences from the greatest logit.
+MASKED = -1e38
+
+#: An observation ``[N]``: a TensorDict, or a dict of its entries.
+Observation = TensorDictBase | Mapping[str, Tensor]
+
+
+class Policy(TensorDictModuleBase, ABC):
+    """A distribution over choices, given an observation; as a module it writes ``logits`` ``[N, choices]``.
+
+    Args:
+        cell: the sizes.
+
+    Attributes:
+        choice_key: name of the choice in the TensorDict.
+        in_keys: entries of the observation that :meth:`logits` reads.
+        masks: masks that the environment must emit for training it, of ``"action"`` and ``"footprint"``.
+        excludes: what :meth:`action_log_probs` gives probability 0 by construction; None if nothing.
+        ranks_footprints: whether it chooses among all footprints, by ``footprint_logits(observation, mask)``.
+        needs_sizes: whether it cannot learn where :meth:`check_sizes` finds fault.
+    """
+
+    choice_key: str
+    masks: tuple[str, ...] = ()
+    excludes: str | None = None
+    ranks_footprints = False
+    needs_sizes = False
+    network: torch.nn.Module
+
+    def __init__(self, cell: CellSpec):
+        super().__init__()
+        self.cell = cell
+        self.in_keys, self.out_keys = ["bin_depth", "tote_depth"], ["logits"]
+
+    @abstractmethod
+    def logits(self, observation: Observation) -> Tensor:
+        """Return a logit for each choice, float32 ``[N, choices]``."""
+
+    @abstractmethod
+    def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
+        """Return a flat action of each choice's class, int64 ``[N]``; drawn evenly when exploring, else the lowest."""
+
+    @abstractmethod
+    def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
+        """Return the class of each flat action, int64 ``[N]``; the action must succeed."""
+
+    @abstractmethod
+    def action_log_probs(self, observation: Observation) -> Tensor:
+        """Return the distribution over flat actions, ``[N, N_a]``, without any mask."""
+
+    def forward(self, observation: TensorDictBase) -> TensorDictBase:
+        """Write ``logits`` into the observation."""
+        return observation.set("logits", self.logits(observation))
+
+    def best_feasible(self, observation: Observation) -> Tensor:
+        """Return the most probable feasible action, int64 ``[N]``.
+
+        If a policy has probability for none of the feasible ones, its most probable action is returned, and fails.
+        """
+        score = self.action_log_probs(observation)
+        feasible = action_mask(self.cell, placing_maps(self.cell, State.from_observation(observation)))
+        return torch.where(feasible, score, score - FAR).argmax(1)
+
+    def act(self, choice: Tensor, *values: Tensor) -> Tensor:
+        """Return :meth:`to_action` for the entries :attr:`act_keys` of an observation, in that order."""
+        return self.to_action(choice, dict(zip(self.act_keys, values, strict=True)))
+
+    @property
+    def act_keys(self) -> list[str]:
+        """Entries that turning a choice into an action may read."""
+        return list(dict.fromkeys([*STANDARD_TERMS, *self.in_keys]))
+
+    def check_sizes(self) -> list[str]:
+        """Check the paper's conditions on sizes in training: eq. 2 on the items, eq. 3 on the bin and the tote.
+
+        Returns:
+            A sentence for each condition that is not met; the policy can be trained all the same.
+
+        Raises:
+            ValueError: for a policy that cannot learn then.
+        """
+        field = getattr(self.network, "receptive_field", None)
+        if field is None:
+            return []
+        side, found = self.cell.longest_side or self.cell.max_side, []
+        if side > field / 2 + 1:
+            most = f"{field / 2 + 1:g}"
+            found.append(
+                f"items: the longest side is {side}, expected at most {most} (receptive field {field}, eq. 2)."
+            )
+        for key, size in (("bin_size", self.cell.bin_size), ("tote_size", self.cell.tote_size)):
+            if min(size[:2]) < field:
+                found.append(
+                    f"env.{key}={list(size)}: expected sides of at least {field} (receptive field {field}, eq. 3)."
+                )
+        if found and self.needs_sizes:
+            raise ValueError(" ".join(found))
+        return found
+
+
+class Choice(Categorical):
+    """A categorical distribution over choices, without the checks that dominate a small PPO update."""
+
+    def __init__(self, logits: Tensor):
+        super().__init__(logits=logits, validate_args=False)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The most probable choice."""
+        return self.logits.argmax(-1)
+
+    def sample(self, sample_shape=()):
+        """Sample by the inverse of the distribution function, with one uniform number a row."""
+        if sample_shape:
+            return super().sample(sample_shape)
+        edges = self.probs.double().cumsum(-1)
+        uniform = torch.rand(edges.shape[:-1], dtype=torch.float64, device=edges.device) * edges[..., -1]
+        return torch.searchsorted(edges, uniform[..., None], right=True)[..., 0].clamp(max=edges.shape[-1] - 1)
+
+
+def pick_one(candidates: Tensor) -> Tensor:
+    """Return an entry >= 0 of each row of int64 ``[N, M]``, -1 if none: drawn when exploring, else the lowest."""
+    if exploration_type() == ExplorationType.RANDOM:
+        draw = torch.rand(candidates.shape, device=candidates.device)
+        index = torch.where(candidates >= 0, draw, -1.0).argmax(1, keepdim=True)
+    else:
+        highest = torch.iinfo(candidates.dtype).max
+        index = torch.where(candidates >= 0, candidates, highest).argmin(1, keepdim=True)
+    return candidates.gather(1, index)[:, 0]
+
+
+def as_critic(critic: torch.nn.Module) -> ValueOperator:
+    """Return a value network as TorchRL wants it; it reads the entries of the observation in its ``in_keys``."""
+    return ValueOperator(critic, list(getattr(critic, "in_keys", ("bin_depth", "tote_depth"))))
+
+
+def as_actor(policy: Policy) -> ProbabilisticTensorDictSequential:
+    """Return the policy as TorchRL's losses want it: observation -> ``logits`` -> a choice and its log-probability."""
+    return ProbabilisticTensorDictSequential(
+        policy,
+        ProbabilisticTensorDictModule(
+            in_keys=["logits"],
+            out_keys=[policy.choice_key],
+            distribution_class=Choice,
+            default_interaction_type=ExplorationType.RANDOM,
+            return_log_prob=True,
+            log_prob_key="log_prob",
+        ),
+    )
+
+
+def as_collection_policy(policy: Policy) -> TensorDictSequential:
+    """Return the policy as the collector runs it: choice, log-probability and flat action; logits are dropped."""
+    choose = as_actor(policy)
+    if policy.choice_key == "action":
+        return TensorDictSequential(choose, selected_out_keys=["action", "log_prob"])
+    act = TensorDictModule(policy.act, in_keys=[policy.choice_key, *policy.act_keys], out_keys=["action"])
+    return TensorDictSequential(choose, act, selected_out_keys=[policy.choice_key, "log_prob", "action"])

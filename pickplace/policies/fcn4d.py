@@ -1,0 +1,87 @@
+"""The paper's policy over all flat actions, and the "typical" network that it is compared with."""
+
+import torch
+from torch import Tensor, nn
+
+from pickplace.policies.base import MASKED, Observation, Policy
+from pickplace.policies.networks.conv4d import Conv4dPolicy
+from pickplace.task.cell import CellSpec
+from pickplace.task.feasibility import action_mask, placing_maps
+from pickplace.task.state import State
+
+
+class ActionPolicy(Policy):
+    """Chooses among all ``N_a`` flat actions (config ``model=fcn4d``; Sec. III of the paper).
+
+    Args:
+        cell: the sizes.
+        mask_infeasible: choose among feasible actions only (the paper does not).
+        network: arguments of :class:`~pickplace.policies.networks.conv4d.Conv4dPolicy`.
+    """
+
+    choice_key = "action"
+    needs_sizes = True
+
+    def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
+        super().__init__(cell)
+        self.mask_infeasible = mask_infeasible
+        if mask_infeasible:
+            self.masks = ("action",)
+            self.in_keys = [*self.in_keys, "action_mask"]
+        self.network = Conv4dPolicy(4, **network)  # of which the first R count: the weights serve fewer rotations too
+
+    def scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
+        """Return logits ``[N, N_a]``, of the actions that a mask allows if there is one."""
+        bin_depth, tote_depth, rotations = observation["bin_depth"], observation["tote_depth"], self.cell.rotations
+        if mask is None:
+            return self.network(bin_depth, tote_depth).unflatten(1, (-1, 4))[..., :rotations].flatten(1)
+        # Pick cells from which nothing can be picked need no logits: most of them, and most of the arithmetic.
+        by_pick = mask.unflatten(1, (self.cell.num_picks, -1))
+        row, pick = by_pick.any(2).nonzero(as_tuple=True)
+        needed = self.network(bin_depth[row], tote_depth[row], pick).unflatten(1, (-1, 4))[..., :rotations].flatten(1)
+        logits = needed.new_full(by_pick.shape, MASKED).index_put((row, pick), needed)
+        return torch.where(mask, logits.flatten(1), MASKED)
+
+    def logits(self, observation: Observation) -> Tensor:
+        return self.scores(observation, observation["action_mask"] if self.mask_infeasible else None)
+
+    def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
+        return choice
+
+    def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
+        return action
+
+    def action_log_probs(self, observation: Observation) -> Tensor:
+        return self.scores(observation).log_softmax(-1)
+
+    def best_feasible(self, observation: Observation) -> Tensor:
+        feasible = action_mask(self.cell, placing_maps(self.cell, State.from_observation(observation)))
+        return self.scores(observation, feasible).argmax(1)
+
+
+class TypicalPolicy(ActionPolicy):
+    """``fcn4d`` with one fully connected layer over all logits (config ``model=typical``; Sec. IV of the paper).
+
+    The layer is a square of side ``N_a``, so that it is tied to the sizes that it is trained at, and its memory grows
+    with the fourth power of the tote's side: 50 MB at ``6x6``, 400 MB at ``10x10``, 32 GB at ``30x30`` with ``R=4``.
+
+    Args: as :class:`ActionPolicy`.
+
+    Raises:
+        ValueError: for a layer that memory does not hold.
+    """
+
+    def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
+        super().__init__(cell, mask_infeasible, **network)
+        try:
+            self.join = nn.Linear(cell.num_actions, cell.num_actions)
+        except RuntimeError as error:  # torch raises this when memory is short
+            size = 4 * cell.num_actions**2 / 1e9
+            raise ValueError(
+                f"model=typical: its last layer has {cell.num_actions:,}^2 weights, {size:.1f} GB, which memory does "
+                "not hold; expected a smaller env.tote_size or env.bin_size."
+            ) from error
+
+    def scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
+        logits = self.join(super().scores(observation))
+        return logits if mask is None else torch.where(mask, logits, MASKED)

@@ -1,0 +1,187 @@
+"""The default policy: 2D convolutions over the tote around each footprint, as the item there would see it."""
+
+import torch
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from pickplace.policies.base import MASKED, Observation, Policy, pick_one
+from pickplace.policies.networks.footprint_fcn import FootprintFcn
+from pickplace.task.cell import CellSpec
+from pickplace.task.feasibility import (
+    action_footprints,
+    actions_reaching,
+    first_action_reaching,
+    footprint_mask,
+    placing_maps,
+)
+from pickplace.task.grasps import class_index, footprint_index, is_outside, join_action, pick_classes
+from pickplace.task.state import State, item_from_depth
+from pickplace.task.transition import apply
+
+
+def count_ways(cell: CellSpec, footprint: Tensor, allowed: Tensor) -> Tensor:
+    """Return how many of the allowed actions, bool ``[N, M]``, leave each footprint, int64 ``[N, Q * W_T * D_T]``.
+
+    Args:
+        footprint: int64 ``[N, M]``, the footprint that each action leaves, or -1.
+    """
+    ways = footprint.new_zeros(len(footprint), cell.num_footprints + 1)
+    return ways.scatter_add_(1, footprint + 1, allowed.long())[:, 1:]
+
+
+class FootprintPolicy(Policy):
+    """``fcn_grasp`` with a mask: chooses among the distinct footprints that some action reaches.
+
+    A success leaves a tote that depends on the footprint alone; the grasp only decides whether it can be reached, and
+    the mask knows that.
+
+    Args:
+        cell: the sizes.
+        network: arguments of :class:`~pickplace.policies.networks.footprint_fcn.FootprintFcn`.
+    """
+
+    choice_key = "footprint"
+    masks: tuple[str, ...] = ("footprint",)
+    excludes: str | None = "failed picks and footprints outside the tote"
+    ranks_footprints = True
+
+    def __init__(self, cell: CellSpec, **network):
+        super().__init__(cell)
+        self.in_keys = [*self.in_keys, "footprint_mask"]
+        self.network = FootprintFcn(**network)
+
+    def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
+        """Return logits of the footprints that a mask ``[N, Q * W_T * D_T]`` allows; the others are not computed."""
+        row, footprint = mask.nonzero(as_tuple=True)
+        scores = self.network.at(observation["bin_depth"], observation["tote_depth"], row, footprint)
+        return scores.new_full(mask.shape, MASKED).index_put((row, footprint), scores[:, 0])
+
+    def logits(self, observation: Observation) -> Tensor:
+        return self.footprint_logits(observation, observation["footprint_mask"])
+
+    def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
+        maps = placing_maps(self.cell, State.from_observation(observation))
+        return pick_one(actions_reaching(self.cell, maps, choice))
+
+    def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
+        state = State.from_observation(observation)
+        x, y, w, _ = apply(self.cell, state, action).footprint.unbind(-1)
+        turned = (w != state.item.w).long()  # a square item is the same either way
+        return footprint_index(self.cell.tote_size, turned, x, y)
+
+    def action_log_probs(self, observation: Observation) -> Tensor:
+        """Return the distribution over flat actions ``[N, N_a]``.
+
+        An action whose pick misses, or whose item leaves the tote, has no footprint, so probability 0.
+        """
+        bin_depth, tote_depth = observation["bin_depth"], observation["tote_depth"]
+        footprint = action_footprints(self.cell, item_from_depth(bin_depth))
+        ways = count_ways(self.cell, footprint, footprint >= 0)
+        logits = self.network(bin_depth, tote_depth, self.cell.parities).flatten(1)
+        logits = torch.where(ways > 0, logits, MASKED)
+        share = logits.log_softmax(-1) - ways.clamp(min=1).log()
+        return torch.where(footprint >= 0, share.gather(1, footprint.clamp(min=0)), MASKED)
+
+    def best_feasible(self, observation: Observation) -> Tensor:
+        maps = placing_maps(self.cell, State.from_observation(observation))
+        mask = footprint_mask(self.cell, maps).flatten(1)  # found without a look at the N_a actions one by one
+        choice = self.footprint_logits(observation, mask).argmax(1)
+        return first_action_reaching(self.cell, maps, choice)
+
+
+class GraspPolicy(Policy):
+    """``fcn_grasp`` without a mask: chooses among (grasp class, place cell), feasible or not, or to miss the item.
+
+    The grasp class says how the item lies under the rotated end effector. All picks that lift nothing are one more
+    choice, which the policy must learn to avoid, as it must learn walls, collisions and support.
+
+    Args:
+        cell: the sizes.
+        network: arguments of :class:`~pickplace.policies.networks.footprint_fcn.FootprintFcn`, which scores each
+            footprint once for every offset of the item under the end effector.
+    """
+
+    choice_key = "grasp"
+    scored: Tensor  # see `_scored`
+
+    def __init__(self, cell: CellSpec, **network):
+        super().__init__(cell)
+        self.classes = cell.parities * cell.num_offsets**2
+        self.network = FootprintFcn(cell.num_offsets**2, **network)
+        self.miss, self.outside = (nn.Parameter(torch.zeros(())) for _ in range(2))
+        self.register_buffer("scored", self._scored(), persistent=False)
+
+    def _scored(self) -> Tensor:
+        """Return where among the network's scores each (grasp class, place cell) is found, int64 ``[C, W_T * D_T]``.
+
+        The last score is that of every footprint whose corner is not in the tote.
+        """
+        (tote_w, tote_d, _), offsets, low = self.cell.tote_size, self.cell.num_offsets, self.cell.min_offset
+        step, x, y = torch.arange(offsets), torch.arange(tote_w), torch.arange(tote_d)
+        found = []
+        for parity, shape in enumerate(self.cell.effectors):
+            left = x[:, None] + (step[:, None, None, None] + low - shape.ref_x)  # [O, 1, W_T, 1]
+            front = y + (step[:, None, None] + low - shape.ref_y)  # [O, 1, D_T]
+            # The network sees a turned footprint along the item's own axes.
+            along, across = (step[:, None], step) if parity == 0 else (step, step[:, None])
+            channel = class_index(self.cell, 0, along, across)
+            inside = ~is_outside(left, 1, tote_w) & ~is_outside(front, 1, tote_d)
+            index = footprint_index(self.cell.tote_size, parity, left, front) * offsets**2 + channel[:, :, None, None]
+            last = self.cell.num_footprints * offsets**2
+            found.append(torch.where(inside, index, last).flatten(2).flatten(0, 1))
+        return torch.cat(found)
+
+    def class_scores(self, observation: Observation) -> Tensor:
+        """Return a logit for every (grasp class, place cell), ``[N, C, W_T * D_T]``."""
+        scores = self.network(observation["bin_depth"], observation["tote_depth"], self.cell.parities).flatten(1)
+        return torch.cat([scores, self.outside.expand(len(scores), 1)], 1)[:, self.scored]
+
+    def _choices(self, observation: Observation) -> tuple[Tensor, Tensor, Tensor]:
+        """Return per choice a logit for each of its flat actions, and how many these are; and each pick's class."""
+        maps, places = self.class_scores(observation), self.cell.num_places
+        logits = torch.cat([maps.flatten(1), self.miss.expand(len(maps), 1)], 1)
+        picks = pick_classes(self.cell, item_from_depth(observation["bin_depth"]))
+        missing = (picks < 0).sum((1, 2)) * places
+        counts = maps.new_zeros(len(maps), maps.shape[1] + 1).scatter_add_(
+            1, picks.flatten(1) + 1, torch.ones_like(picks, dtype=maps.dtype).flatten(1)
+        )
+        ways = torch.cat([counts[:, 1:].repeat_interleave(places, 1), missing[:, None]], 1)
+        return logits, ways, picks
+
+    def logits(self, observation: Observation) -> Tensor:
+        logits, ways, _ = self._choices(observation)
+        return torch.where(ways > 0, logits + ways.clamp(min=1).log(), MASKED)
+
+    def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
+        cell, places = self.cell, self.cell.num_places
+        missed = choice == self.classes * places
+        wanted = torch.where(missed, -1, choice // places)
+        classes = pick_classes(cell, item_from_depth(observation["bin_depth"])).flatten(1)
+        pairs = classes == wanted[:, None]  # [N, P * R]
+        pair = pick_one(torch.where(pairs, torch.arange(pairs.shape[1], device=choice.device), -1))
+        anywhere = torch.zeros_like(choice)
+        if exploration_type() == ExplorationType.RANDOM:
+            anywhere = torch.randint(places, choice.shape, device=choice.device)
+        place = torch.where(missed, anywhere, choice % places)
+        return join_action(cell, pair // cell.rotations, place, pair % cell.rotations)
+
+    def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
+        places, rotations = self.cell.num_places, self.cell.rotations
+        pick, place, rotation = action // (places * rotations), action // rotations % places, action % rotations
+        classes = pick_classes(self.cell, item_from_depth(observation["bin_depth"]))
+        grasp = classes[torch.arange(len(action), device=action.device), pick, rotation]
+        return torch.where(grasp < 0, self.classes * places, grasp * places + place)
+
+    def action_log_probs(self, observation: Observation) -> Tensor:
+        logits, ways, picks = self._choices(observation)
+        total = torch.where(ways > 0, logits + ways.clamp(min=1).log(), MASKED).logsumexp(1, keepdim=True)
+        maps = (logits - total)[:, :-1].unflatten(1, (-1, self.cell.num_places))
+        missed = (logits - total)[:, -1:, None].expand(-1, 1, self.cell.num_places)
+        rows = torch.cat([missed, maps], 1)  # row 0 is a miss
+        batch = torch.arange(len(rows), device=rows.device)[:, None, None]
+        return rows[batch, picks + 1].transpose(2, 3).flatten(1)  # [N, P, R, places] -> [N, N_a]
+
+
+def fcn_grasp(cell: CellSpec, mask_infeasible: bool, **network) -> FootprintPolicy | GraspPolicy:
+    """Return the default policy (config ``model=fcn_grasp``): over footprints with a mask, over grasps without."""
+    return (FootprintPolicy if mask_infeasible else GraspPolicy)(cell, **network)

@@ -1,0 +1,155 @@
+"""Individual planning: the pick is heuristic and does not look at the tote; a policy chooses place and rotation."""
+
+from abc import abstractmethod
+
+import torch
+from torch import Tensor
+
+from pickplace.policies.base import MASKED, Observation, Policy, pick_one
+from pickplace.policies.fcn4d import ActionPolicy
+from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy, count_ways
+from pickplace.task.cell import CellSpec
+from pickplace.task.feasibility import action_footprints, action_mask, placing_maps
+from pickplace.task.grasps import heuristic_pick, pick_classes, select_pick
+from pickplace.task.state import State, item_from_depth
+
+EXCLUDES = "every pick but the heuristic one"
+
+
+def spread_over_actions(cell: CellSpec, log_probs: Tensor, pick: Tensor) -> Tensor:
+    """Return ``[N, W_T * D_T * R]`` with the pick cells ``[N]`` as ``[N, N_a]``, minus infinity for other picks."""
+    number = torch.arange(log_probs.shape[1], device=pick.device)
+    out = log_probs.new_full((len(log_probs), cell.num_actions), -torch.inf)
+    return out.scatter_(1, pick[:, None] * len(number) + number, log_probs)
+
+
+class PlaceRotationPolicy(Policy):
+    """Chooses place and rotation with the heuristic pick; subclasses score them.
+
+    With a mask, a state in which nothing can be placed with the heuristic pick is left unmasked: the policy fails then,
+    as it must.
+    """
+
+    choice_key = "place_rotation"
+    excludes: str | None = EXCLUDES
+
+    @abstractmethod
+    def place_scores(self, observation: Observation, pick: Tensor) -> Tensor:
+        """Return a logit for each place and rotation with the pick cells ``[N]``, ``[N, W_T * D_T * R]``."""
+
+    def _pick(self, observation: Observation) -> Tensor:
+        return heuristic_pick(self.cell, item_from_depth(observation["bin_depth"]))
+
+    def logits(self, observation: Observation) -> Tensor:
+        pick = self._pick(observation)
+        logits = self.place_scores(observation, pick)
+        if "action_mask" not in self.in_keys:
+            return logits
+        allowed = select_pick(self.cell, observation["action_mask"], pick)
+        return torch.where(allowed | ~allowed.any(1, keepdim=True), logits, MASKED)
+
+    def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
+        return self._pick(observation) * self.cell.num_places * self.cell.rotations + choice
+
+    def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
+        """Return place and rotation, whatever the pick."""
+        return action % (self.cell.num_places * self.cell.rotations)
+
+    def action_log_probs(self, observation: Observation) -> Tensor:
+        """Return the distribution over flat actions; minus infinity for every pick but the heuristic one."""
+        pick = self._pick(observation)
+        return spread_over_actions(self.cell, self.place_scores(observation, pick).log_softmax(-1), pick)
+
+    best_feasible = Policy.best_feasible
+
+
+class IndividualRlPolicy(PlaceRotationPolicy, ActionPolicy):
+    """``individual_rl``, with which the paper compares: only place and rotation are learnt (Sec. IV).
+
+    The network is that of ``fcn4d``; its features after the last ``3x3x3x3`` convolution are selected at the pick cell,
+    so that nothing else of them is computed.
+
+    Args: as :class:`~pickplace.policies.fcn4d.ActionPolicy`.
+    """
+
+    def place_scores(self, observation: Observation, pick: Tensor) -> Tensor:
+        logits = self.network(observation["bin_depth"], observation["tote_depth"], pick).unflatten(1, (-1, 4))
+        return logits[..., : self.cell.rotations].flatten(1)
+
+
+class IndividualGraspPolicy(PlaceRotationPolicy, GraspPolicy):
+    """``individual_grasp`` without a mask: the network of ``fcn_grasp`` scores where the heuristic pick can place.
+
+    Args: as :class:`~pickplace.policies.fcn_grasp.GraspPolicy`.
+    """
+
+    def place_scores(self, observation: Observation, pick: Tensor) -> Tensor:
+        row = torch.arange(len(pick), device=pick.device)[:, None]
+        classes = pick_classes(self.cell, item_from_depth(observation["bin_depth"]))[row[:, 0], pick]  # [N, R]
+        return self.class_scores(observation)[row, classes].transpose(1, 2).flatten(1)
+
+
+class IndividualFootprintPolicy(FootprintPolicy):
+    """``individual_grasp`` with a mask: chooses among the distinct footprints that the heuristic pick reaches.
+
+    In a state in which none of them is feasible it chooses among them all, and fails, as it must.
+
+    Args: as :class:`~pickplace.policies.fcn_grasp.FootprintPolicy`.
+    """
+
+    masks = ("action",)
+    excludes = EXCLUDES
+    ranks_footprints = False
+
+    def __init__(self, cell: CellSpec, **network):
+        super().__init__(cell, **network)
+        self.in_keys = ["bin_depth", "tote_depth", "action_mask"]
+
+    def _reached(self, observation: Observation, mask: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the pick cell, int64 ``[N]``; the footprint of each place and rotation with it, int64
+        ``[N, W_T * D_T * R]``, -1 outside the tote; and which of them to choose among, bool."""
+        item = item_from_depth(observation["bin_depth"])
+        pick = heuristic_pick(self.cell, item)
+        footprint = select_pick(self.cell, action_footprints(self.cell, item), pick)
+        if mask is None:
+            return pick, footprint, footprint >= 0
+        allowed = select_pick(self.cell, mask, pick)
+        return pick, footprint, torch.where(allowed.any(1, keepdim=True), allowed, footprint >= 0)
+
+    def _masked_logits(self, observation: Observation, mask: Tensor) -> Tensor:
+        _, footprint, allowed = self._reached(observation, mask)
+        return self.footprint_logits(observation, count_ways(self.cell, footprint, allowed) > 0)
+
+    def logits(self, observation: Observation) -> Tensor:
+        return self._masked_logits(observation, observation["action_mask"])
+
+    def _feasible(self, observation: Observation) -> Tensor:
+        return action_mask(self.cell, placing_maps(self.cell, State.from_observation(observation)))
+
+    def _action(self, choice: Tensor, observation: Observation, mask: Tensor) -> Tensor:
+        pick, footprint, allowed = self._reached(observation, mask)
+        number = torch.arange(footprint.shape[1], device=choice.device)
+        place_rotation = pick_one(torch.where(allowed & (footprint == choice[:, None]), number, -1))
+        return pick * len(number) + place_rotation.clamp(min=0)
+
+    def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
+        return self._action(choice, observation, self._feasible(observation))
+
+    def best_feasible(self, observation: Observation) -> Tensor:
+        mask = self._feasible(observation)
+        return self._action(self._masked_logits(observation, mask).argmax(1), observation, mask)
+
+    def action_log_probs(self, observation: Observation) -> Tensor:
+        """Return the distribution over flat actions; minus infinity for other picks, and outside the tote."""
+        pick, footprint, allowed = self._reached(observation)
+        ways = count_ways(self.cell, footprint, allowed)
+        share = self.footprint_logits(observation, ways > 0).log_softmax(-1) - ways.clamp(min=1).log()
+        score = torch.where(allowed, share.gather(1, footprint.clamp(min=0)), -torch.inf)
+        return spread_over_actions(self.cell, score, pick)
+
+
+def individual_grasp(
+    cell: CellSpec, mask_infeasible: bool, **network
+) -> IndividualFootprintPolicy | IndividualGraspPolicy:
+    """Return individual planning with the network of ``fcn_grasp`` (config ``model=individual_grasp``)."""
+    return (IndividualFootprintPolicy if mask_infeasible else IndividualGraspPolicy)(cell, **network)

@@ -1,0 +1,187 @@
+"""The robot cell: every size and option of bin, tote and end effector, stated once and checked once."""
+
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import NamedTuple
+
+from torch import Tensor
+
+from pickplace.task.checks import flag, is_number, is_whole, one_of, whole_number
+from pickplace.task.maps import FAR
+
+PICK_RULES = ("contain", "overlap")
+
+
+def reference_cell(side):
+    """Return the end effector's reference cell along a side, counted from its minimum corner; an int or a tensor."""
+    return (side - 1) // 2
+
+
+class EffectorShape(NamedTuple):
+    """The end effector as it is turned: its sides and its reference cell, in cells."""
+
+    width: int
+    depth: int
+    ref_x: int
+    ref_y: int
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the robot may do, as tables; masks and the single step read the same ones.
+
+    Attributes:
+        pick_ok: bool ``[P]``, whether the robot reaches each pick cell.
+        lowest_top, highest_top: int ``[R, W_T, D_T]``, the range in which the item's top, where the suction face is,
+            must be for each rotation and place cell; in height units. An empty range forbids the place cell.
+    """
+
+    pick_ok: Tensor
+    lowest_top: Tensor
+    highest_top: Tensor
+
+    def check(self, cell: "CellSpec") -> None:
+        """Refuse tables of another shape than the cell's, with a ``ValueError`` that names the table."""
+        places = (cell.rotations, *cell.tote_size[:2])
+        shapes = {"pick_ok": (cell.num_picks,), "lowest_top": places, "highest_top": places}
+        for name, shape in shapes.items():
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"limits.{name}: got shape {list(found)}, expected {list(shape)}.")
+
+    def on(self, device) -> "Limits":
+        """Return the tables on a device."""
+        return Limits(*(getattr(self, item.name).to(device) for item in fields(self)))
+
+
+@dataclass(frozen=True)
+class CellSpec:
+    """Sizes and options of a robot cell.
+
+    Lengths along x and y are in cells. Heights are whole numbers of a height unit, which is a cell unless
+    ``height_unit`` says otherwise.
+
+    Args:
+        bin_size: ``(W_B, D_B, H_B)``, grid of the bin and height of its walls.
+        tote_size: ``(W_T, D_T, H_T)``; an episode's tote height may be lower than ``H_T``.
+        effector_size: ``(W_E, D_E)`` of the flat suction rectangle.
+        rotations: ``R``, the number of quarter turns to choose from, 1 to 4.
+        pick_rule: ``"contain"`` (the end effector covers the whole item) or ``"overlap"`` (one shared cell is enough).
+        min_support: least share of the footprint that must rest on the highest cells below it.
+        strict_support: require more than ``min_support`` instead of at least.
+        height_unit: length of a height unit, in sides of a cell. The rules only count units; what converts heights to
+            lengths (the robot's planner, the replay page) multiplies by it.
+        longest_side: longest side of any item, where it is known; saves time only.
+        limits: what the robot may do, see :class:`Limits`; None: everything.
+
+    Raises:
+        ValueError: naming the argument, the value received and what was expected.
+    """
+
+    bin_size: tuple[int, int, int] = (5, 5, 1)
+    tote_size: tuple[int, int, int] = (6, 6, 5)
+    effector_size: tuple[int, int] = (3, 3)
+    rotations: int = 4
+    pick_rule: str = "contain"
+    min_support: float = 0.5
+    strict_support: bool = False
+    height_unit: float = 1.0
+    longest_side: int | None = field(default=None, metadata={"derived": True})
+    limits: Limits | None = field(default=None, compare=False, metadata={"derived": True})
+
+    def __post_init__(self):
+        object.__setattr__(self, "bin_size", _sizes("bin_size", self.bin_size, 3))
+        object.__setattr__(self, "tote_size", _sizes("tote_size", self.tote_size, 3))
+        object.__setattr__(self, "effector_size", _sizes("effector_size", self.effector_size, 2))
+        if not is_whole(self.rotations) or not 1 <= self.rotations <= 4:
+            raise ValueError(f"rotations={self.rotations!r}: expected 1, 2, 3 or 4 (quarter turns to choose from).")
+        one_of("pick_rule", self.pick_rule, PICK_RULES)
+        if not isinstance(self.min_support, (int, float)) or not 0 <= self.min_support <= 1:
+            raise ValueError(f"min_support={self.min_support!r}: expected a share between 0 and 1.")
+        flag("strict_support", self.strict_support)
+        if not is_number(self.height_unit) or not 1e-3 <= self.height_unit <= 1e3:
+            raise ValueError(f"height_unit={self.height_unit!r}: expected sides of a cell, 0.001 to 1000.")
+        if self.longest_side is not None:
+            whole_number("longest_side", self.longest_side)
+        if self.limits is not None:
+            self.limits.check(self)
+
+    @property
+    def num_picks(self) -> int:
+        """``P``, the number of pick cells."""
+        return self.bin_size[0] * self.bin_size[1]
+
+    @property
+    def num_places(self) -> int:
+        """The number of place cells, ``W_T * D_T``."""
+        return self.tote_size[0] * self.tote_size[1]
+
+    @property
+    def num_actions(self) -> int:
+        """``N_a``, the number of flat actions."""
+        return self.num_picks * self.num_places * self.rotations
+
+    @property
+    def parities(self) -> int:
+        """``Q``: 1 if items are never turned, else 2; parity 1 turns footprint and end effector by 90 degrees."""
+        return 1 if self.rotations == 1 else 2
+
+    @property
+    def num_footprints(self) -> int:
+        """The number of footprints ``(parity, x, y)``; what an action leaves in the tote is one of them."""
+        return self.parities * self.num_places
+
+    @cached_property
+    def max_side(self) -> int:
+        """``S``: the longest item side that fits the bin and, where it must be contained, the end effector."""
+        limits = self.effector_size if self.pick_rule == "contain" else self.bin_size[:2]
+        longest = max(min(a, b) for a, b in zip(limits, self.bin_size[:2], strict=True))
+        return longest if self.longest_side is None else min(longest, self.longest_side)
+
+    @cached_property
+    def min_offset(self) -> int:
+        """The lowest offset of an item under the end effector along either axis."""
+        return 0 if self.pick_rule == "contain" else 1 - self.max_side
+
+    @cached_property
+    def num_offsets(self) -> int:
+        """``O``: how many offsets there are along one axis."""
+        return max(self.effector_size) - self.min_offset
+
+    @cached_property
+    def effectors(self) -> tuple[EffectorShape, ...]:
+        """The end effector's shape for each parity."""
+        w, d = self.effector_size
+        shapes = ((w, d), (d, w))[: self.parities]
+        return tuple(EffectorShape(a, b, reference_cell(a), reference_cell(b)) for a, b in shapes)
+
+    def describe(self) -> str:
+        """Return the sizes in one short line, for messages."""
+        bin_size, tote_size, effector_size = (
+            "x".join(map(str, size)) for size in (self.bin_size, self.tote_size, self.effector_size)
+        )
+        return f"bin {bin_size}, tote {tote_size}, end effector {effector_size}, R={self.rotations}"
+
+
+#: The settings of a cell, by the names that configs, checkpoints and evaluations use.
+CELL_SETTINGS = tuple(item.name for item in fields(CellSpec) if not item.metadata.get("derived"))
+
+
+def cell_from_settings(settings: dict) -> CellSpec:
+    """Return the cell of settings by name, such as a config's; raises ``ValueError`` for a name that there is not."""
+    known = {item.name for item in fields(CellSpec)}
+    if unknown := [name for name in settings if name not in known]:
+        raise ValueError(f"{unknown[0]}={settings[unknown[0]]!r}: expected one of {', '.join(CELL_SETTINGS)}.")
+    return CellSpec(**settings)
+
+
+def _sizes(name: str, value, count: int) -> tuple[int, ...]:
+    """Return ``value`` as a tuple of ``count`` positive ints."""
+    try:
+        sizes = tuple(int(v) for v in value)
+        exact = all(int(v) == v and not isinstance(v, bool) for v in value)
+    except (TypeError, ValueError):
+        sizes, exact = (), False
+    if not exact or len(sizes) != count or min(sizes) < 1 or max(sizes) >= FAR:
+        raise ValueError(f"{name}={value!r}: expected {count} positive whole numbers of cells, below {FAR}.")
+    return sizes

@@ -1,0 +1,228 @@
+"""Masks: which actions succeed, and which footprints some action reaches.
+
+Symbols used in shapes: ``N`` problems, ``P`` pick cells, ``R`` rotations, ``Q`` parities of a rotation, ``K`` offsets
+of the item under the end effector, ``T`` turns and ``T * K`` grasp classes (see :mod:`pickplace.task.grasps`).
+
+Two ideas keep the joint feasibility of all ``N_a = P * W_T * D_T * R`` actions cheap. The bin matters only through the
+grasp class. And the end effector collides if and only if the highest thing under it, the rim counting as a wall around
+the tote, is higher than the item's top: one maximum over its rectangle decides.
+"""
+
+from functools import reduce
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pickplace.task.cell import CellSpec
+from pickplace.task.grasps import (
+    all_grasps,
+    available_offsets,
+    footprint_index,
+    is_clear,
+    is_outside,
+    join_action,
+    num_turns,
+    pick_blocks,
+    split_footprint,
+)
+from pickplace.task.maps import FAR, NEVER, surround, windows
+from pickplace.task.placing import clearance, is_within_reach, resting_top
+from pickplace.task.state import Item, State
+
+
+class PlacingMaps(NamedTuple):
+    """Everything that decides which actions succeed in a state."""
+
+    top: Tensor  # int32 [N, Q, W_T, D_T]: height of the item's top with its footprint's min corner there, or NEVER
+    clearance: Tensor  # int32 [N, Q, W_T, D_T]: highest thing under the end effector with its reference cell there
+    item: Item  # what is picked
+
+    def rows(self, index: Tensor) -> "PlacingMaps":
+        """Return the maps of some problems, by their numbers, which may come up more than once."""
+        return PlacingMaps(self.top[index], self.clearance[index], self.item.rows(index))
+
+
+def placing_maps(cell: CellSpec, state: State) -> PlacingMaps:
+    """Return everything that decides which actions succeed: see :class:`PlacingMaps`."""
+    return PlacingMaps(resting_top(cell, state), clearance(cell, state), state.item)
+
+
+def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
+    """Return whether placing succeeds, per grasp class and place cell, bool ``[T * K, W_T * D_T, N]``, batch last."""
+    low, count = cell.min_offset, cell.num_offsets
+    tote_w, tote_d, _ = cell.tote_size
+    limits = None if cell.limits is None else cell.limits.on(maps.top.device)
+    mask = maps.top.new_empty(num_turns(cell), count, count, tote_w, tote_d, len(maps.top), dtype=torch.bool)
+    for number in range(num_turns(cell)):
+        parity = number % cell.parities
+        _, _, ref_x, ref_y = cell.effectors[parity]
+        # With the reference cell at p and the item at offset o, the footprint begins at p - ref + o.
+        pad = (ref_x - low, low + count - 1 - ref_x, ref_y - low, low + count - 1 - ref_y)
+        top = windows(surround(maps.top[:, parity].permute(1, 2, 0), pad, NEVER), count)
+        is_clear(top, maps.clearance[:, parity].permute(1, 2, 0), out=mask[number])
+        if limits is not None:
+            lowest, highest = limits.lowest_top[number, ..., None], limits.highest_top[number, ..., None]
+            mask[number] &= is_within_reach(lowest, highest, top)
+    return mask.flatten(3, 4).flatten(0, 2)
+
+
+def num_feasible(cell: CellSpec, maps: PlacingMaps) -> Tensor:
+    """Return how many flat actions succeed, int64 ``[N]``, without listing them."""
+    available, classes = available_offsets(cell, maps.item)
+    places = class_mask(cell, maps).sum(1)  # [T * K, N]
+    return reduce(torch.add, [(places.gather(0, turned) * available).sum(0) for turned in classes])
+
+
+def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
+    """Return exactly the flat actions that succeed, bool ``[N, N_a]``."""
+    places, batch, rotations = cell.num_places, len(maps.top), cell.rotations
+    available, classes = available_offsets(cell, maps.item)
+    by_class = class_mask(cell, maps)
+    num_classes = len(by_class)
+    by_class = by_class.permute(2, 0, 1).reshape(-1, places).view(torch.uint8)  # [N * T * K, places]
+    # The flags of all rotations side by side in one number, so that a pick cell's whole block is copied at once:
+    # blocks [N * K + 1, places], of which the last, for picks that fail, is empty.
+    packed, slots = {1: (torch.uint8, 1), 2: (torch.int16, 2)}.get(rotations, (torch.int32, 4))
+    flags = torch.eye(slots, dtype=torch.uint8).view(packed)[:, 0].tolist()
+    count = len(available)
+    first = torch.arange(batch, device=by_class.device)
+    blocks = by_class.new_zeros(batch * count + 1, places, dtype=packed)
+    for bit, turned in zip(flags, classes, strict=False):
+        row = (turned + first * num_classes).t().reshape(-1)
+        blocks[:-1].add_(by_class.index_select(0, row).to(packed), alpha=bit)
+    # Which block each pick cell has.
+    block = pick_blocks(cell, maps.item)
+    usable = torch.cat([available.t(), available.new_zeros(batch, 1)], 1)
+    block = torch.where(usable.gather(1, block), block + first[:, None] * count, batch * count)
+    mask = blocks.index_select(0, block.flatten()).view(torch.bool)
+    mask = mask.view(batch, cell.num_picks, places, slots)
+    return mask[..., :rotations].reshape(batch, cell.num_actions)
+
+
+def footprint_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
+    """Return the footprints that some action reaches, bool ``[N, Q, W_T, D_T]`` by parity and minimum corner.
+
+    A square footprint is the same in both parities; it is listed under parity 0 only, so that distinct entries leave
+    distinct totes.
+    """
+    batch, count, turns = len(maps.top), cell.num_offsets, num_turns(cell)
+    available, classes = available_offsets(cell, maps.item)
+    # Each class that some pick has; the last row takes what is not available.
+    grasped = available.new_zeros(turns * count**2 + 1, batch)
+    grasped.scatter_(0, torch.where(available, classes, len(grasped) - 1).flatten(0, 1), True)
+    grasped = grasped[:-1].view(turns, count, count, 1, 1, batch)
+    reached = available.new_empty(cell.parities, *cell.tote_size[:2], batch)
+    for parity in range(cell.parities):
+        if cell.limits is None:
+            is_clear(
+                maps.top[:, parity].permute(1, 2, 0), _least_clearance(cell, maps, parity, grasped), out=reached[parity]
+            )
+        else:
+            reached[parity] = _reached_within_limits(cell, maps, parity, grasped)
+    if cell.parities == 2:
+        square = maps.item.w == maps.item.d
+        reached[0] |= square & reached[1]
+        reached[1] &= ~square
+    return reached.permute(3, 0, 1, 2).contiguous()
+
+
+def _footprint_margins(cell: CellSpec, parity: int) -> tuple[int, int, int, int]:
+    """Return margins after which window ``(i, j)`` of a map over place cells belongs to offset ``O - 1 - (i, j)``.
+
+    The footprint at f is reached with offset o if the reference cell is at f + ref - o.
+    """
+    _, _, ref_x, ref_y = cell.effectors[parity]
+    low, high = cell.min_offset, cell.min_offset + cell.num_offsets - 1
+    return high - ref_x, ref_x - low, high - ref_y, ref_y - low
+
+
+def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Tensor) -> Tensor:
+    """Return the least clearance with which any grasp reaches each footprint, ``[W_T, D_T, N]``; FAR if none does."""
+    (tote_w, tote_d, _), count = cell.tote_size, cell.num_offsets
+    clear = surround(maps.clearance[:, parity].permute(1, 2, 0), _footprint_margins(cell, parity), FAR)
+    usable = (
+        torch.where(grasped[parity, count - 1 - i, count - 1 - j], clear[i : i + tote_w, j : j + tote_d], FAR)
+        for i in range(count)
+        for j in range(count)
+    )
+    return reduce(torch.minimum, usable)
+
+
+def _reached_within_limits(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Tensor) -> Tensor:
+    """Return the footprints that some grasp of this parity reaches, bool ``[W_T, D_T, N]``, under the limits."""
+    (tote_w, tote_d, _), count, margins = cell.tote_size, cell.num_offsets, _footprint_margins(cell, parity)
+    limits = cell.limits.on(maps.top.device)  # type: ignore[union-attr]
+    top = maps.top[:, parity].permute(1, 2, 0)
+    clear = surround(maps.clearance[:, parity].permute(1, 2, 0), margins, FAR)
+    reached = torch.zeros_like(top, dtype=torch.bool)
+    for rotation in range(parity, cell.rotations, 2):
+        lowest = surround(limits.lowest_top[rotation, ..., None], margins, FAR)
+        highest = surround(limits.highest_top[rotation, ..., None], margins, NEVER)
+        for i in range(count):
+            for j in range(count):
+                here = slice(i, i + tote_w), slice(j, j + tote_d)
+                good = is_clear(top, clear[here]) & is_within_reach(lowest[here], highest[here], top)
+                reached |= good & grasped[rotation, count - 1 - i, count - 1 - j]
+    return reached
+
+
+def actions_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Tensor:
+    """Return all successful flat actions that leave the item in a given footprint.
+
+    Args:
+        footprint: int64 ``[N]``, index ``(parity * W_T + x) * D_T + y``.
+
+    Returns:
+        int64 ``[N, P * R]``: for each pick cell and rotation the flat action, or -1 if it does not succeed.
+    """
+    tote_w, tote_d, _ = cell.tote_size
+    device = footprint.device
+    lifted, offset = all_grasps(cell, maps.item)
+    rotation = torch.arange(cell.rotations, device=device)
+    parity = rotation % 2
+    refs = torch.tensor([shape[2:] for shape in cell.effectors], device=device)[parity]  # [R, 2]
+    turned, x, y = split_footprint(cell.tote_size, footprint)
+    place_x, place_y = (torch.stack([x, y], -1)[:, None, None] + refs - offset).unbind(-1)  # [N, P, R]
+    in_tote = ~is_outside(place_x, 1, tote_w) & ~is_outside(place_y, 1, tote_d)
+    place = place_x.clamp(0, tote_w - 1) * tote_d + place_y.clamp(0, tote_d - 1)
+    clear = maps.clearance.flatten(1).gather(1, (parity * cell.num_places + place).flatten(1)).view_as(place)
+    top = maps.top.flatten(1).gather(1, footprint[:, None])[..., None]
+    same = (maps.item.w == maps.item.d)[:, None, None] | (parity == turned[:, None, None])
+    good = in_tote & same & is_clear(top, clear) & lifted[..., None]
+    if cell.limits is not None:
+        limits, number = cell.limits.on(device), rotation * cell.num_places + place
+        good &= is_within_reach(limits.lowest_top.flatten()[number], limits.highest_top.flatten()[number], top)
+    pick = torch.arange(cell.num_picks, device=device)[:, None]
+    return torch.where(good, join_action(cell, pick, place, rotation), -1).flatten(1)
+
+
+def first_action_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Tensor:
+    """Return the lowest flat action that leaves the item in a footprint, int64 ``[N]``; the last action if none does.
+
+    Args: as :func:`actions_reaching`.
+    """
+    actions = actions_reaching(cell, maps, footprint)
+    return torch.where(actions >= 0, actions, cell.num_actions - 1).amin(1)
+
+
+def action_footprints(cell: CellSpec, item: Item) -> Tensor:
+    """Return the footprint that each flat action would leave if nothing collided, int64 ``[N, N_a]``.
+
+    It is an index as in :func:`actions_reaching`, with a square footprint under parity 0; -1 where the pick fails or
+    the footprint leaves the tote.
+    """
+    tote_w, tote_d, _ = cell.tote_size
+    lifted, offset = all_grasps(cell, item)
+    device = offset.device
+    turned = torch.arange(cell.rotations, device=device) % 2  # [R]
+    refs = torch.tensor([shape[2:] for shape in cell.effectors], device=device)[turned]  # [R, 2]
+    corner = (offset - refs)[:, :, None, None]  # [N, P, 1, 1, R, 2]
+    x = corner[..., 0] + torch.arange(tote_w, device=device)[:, None, None]
+    y = corner[..., 1] + torch.arange(tote_d, device=device)[:, None]
+    w = torch.where(turned == 1, item.d[:, None], item.w[:, None])[:, None, None, None]  # [N, 1, 1, 1, R]
+    d = torch.where(turned == 1, item.w[:, None], item.d[:, None])[:, None, None, None]
+    inside = ~is_outside(x, w, tote_w) & ~is_outside(y, d, tote_d)
+    parity = (turned * (item.w != item.d)[:, None])[:, None, None, None]
+    footprint = footprint_index(cell.tote_size, parity, x, y)
+    return torch.where(inside & lifted[..., None, None, None], footprint, -1).flatten(1)

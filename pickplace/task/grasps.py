@@ -1,0 +1,211 @@
+"""Picking: which pick cells lift the item, and how it then lies under the turned end effector.
+
+The bin matters for the tote only through the *grasp class*: the turn and the item's offset under the end effector. Many
+pick cells and rotations share one, which keeps the masks over all actions cheap. ``O`` offsets are possible along one
+axis, ``K = O * O`` in all. Without limits on the robot a turn is a parity; with limits it is a rotation.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pickplace.task.cell import CellSpec, reference_cell
+from pickplace.task.maps import FAR
+from pickplace.task.state import Failure, Item
+
+
+# ---------------------------------------------------------------------- the checks of a pick, one function each
+def is_gripped(pick_rule: str, near: Tensor, back: Tensor, side: int) -> Tensor:
+    """Return whether the end effector grips the item, along one axis.
+
+    Args:
+        pick_rule: ``"contain"`` or ``"overlap"``, see :class:`~pickplace.task.cell.CellSpec`.
+        near: from the end effector's minimum edge to the item's, in cells; negative if the item begins before it.
+        back: from the item's maximum edge to the end effector's.
+        side: of the end effector.
+    """
+    return torch.minimum(near, back) >= 0 if pick_rule == "contain" else torch.maximum(near, back) < side
+
+
+def is_outside(corner: Tensor, side: Tensor | int, grid: int) -> Tensor:
+    """Return whether something of a length leaves the grid, along one axis."""
+    return (corner < 0) | (corner > grid - side)
+
+
+def is_clear(face: Tensor, obstacle: Tensor | int, out: Tensor | None = None) -> Tensor:
+    """Return whether the end effector passes an obstacle: one that is exactly level does not collide.
+
+    Args:
+        face: height of the suction face, which is the height of the item's top.
+        obstacle: height of a wall, or of what lies under the end effector.
+    """
+    return torch.ge(face, obstacle, out=out)
+
+
+def turn(near_x: Tensor, near_y: Tensor, back_x: Tensor, back_y: Tensor) -> tuple[tuple[Tensor, Tensor], ...]:
+    """Return the item's offset ``(x, y)`` under the end effector for each rotation ``0..3`` (table in the README).
+
+    Args:
+        near_x, near_y: the offset before turning.
+        back_x, back_y: from the item's maximum corner to the end effector's, before turning.
+    """
+    return (near_x, near_y), (back_y, near_x), (back_x, back_y), (near_y, back_x)
+
+
+class Grasp(NamedTuple):
+    """What a pick does to the item; the fields have the common shape of the pick's coordinates and the item."""
+
+    misses: Tensor
+    collides: Tensor
+    unreachable: Tensor | None  # None: the robot has no limits
+    near_x: Tensor
+    near_y: Tensor
+    back_x: Tensor
+    back_y: Tensor
+
+    @property
+    def succeeds(self) -> Tensor:
+        """Whether the pick lifts the item."""
+        good = ~self.misses & ~self.collides
+        return good if self.unreachable is None else good & ~self.unreachable
+
+
+def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor) -> Grasp:
+    """Return what picks at cells ``(x, y)`` do.
+
+    Args:
+        item: parts ``[N]``; the batch is the last axis.
+        x, y: tensors that broadcast with ``[..., N]``.
+    """
+    (bin_w, bin_d, wall), (ee_w, ee_d) = cell.bin_size, cell.effector_size
+    left, front = x - reference_cell(ee_w), y - reference_cell(ee_d)  # the end effector's minimum corner
+    near_x, near_y = item.x - left, item.y - front
+    back_x, back_y = ee_w - item.w - near_x, ee_d - item.d - near_y
+    gripped = is_gripped(cell.pick_rule, near_x, back_x, ee_w) & is_gripped(cell.pick_rule, near_y, back_y, ee_d)
+    leaves_bin = is_outside(left, ee_w, bin_w) | is_outside(front, ee_d, bin_d)
+    # The only thing in a bin is its item, which is never higher than its own top: just the walls can be hit.
+    collides = leaves_bin & ~is_clear(item.h, wall)
+    unreachable = None
+    if cell.limits is not None:
+        pick = (x.clamp(0, bin_w - 1) * bin_d + y.clamp(0, bin_d - 1)).expand_as(gripped)
+        unreachable = ~cell.limits.on(pick.device).pick_ok[pick]
+    return Grasp(~(gripped & (item.w > 0)), collides, unreachable, near_x, near_y, back_x, back_y)
+
+
+# ---------------------------------------------------------------------- flat indices
+def split_action(cell: CellSpec, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return the flat action as ``(x_B, y_B, x_T, y_T, r)``, int64 of the action's shape each."""
+    pick, rest = action // (cell.num_places * cell.rotations), action % (cell.num_places * cell.rotations)
+    place, rotation = rest // cell.rotations, rest % cell.rotations
+    bin_d, tote_d = cell.bin_size[1], cell.tote_size[1]
+    return pick // bin_d, pick % bin_d, place // tote_d, place % tote_d, rotation
+
+
+def join_action(cell: CellSpec, pick: Tensor, place: Tensor, rotation: Tensor) -> Tensor:
+    """Return the flat action of a pick cell, a place cell (flat each) and a rotation."""
+    return (pick * cell.num_places + place) * cell.rotations + rotation
+
+
+def footprint_index(tote_size: Sequence[int], parity: Tensor | int, x: Tensor, y: Tensor) -> Tensor:
+    """Return the index ``(parity * W_T + x) * D_T + y`` of a footprint with its minimum corner at ``(x, y)``."""
+    tote_w, tote_d = tote_size[:2]
+    return (parity * tote_w + x) * tote_d + y
+
+
+def split_footprint(tote_size: Sequence[int], footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return parity, x and y of a footprint: the inverse of :func:`footprint_index`."""
+    tote_w, tote_d = tote_size[:2]
+    return footprint // (tote_w * tote_d), footprint // tote_d % tote_w, footprint % tote_d
+
+
+def turned_size(item: Item, odd: Tensor) -> tuple[Tensor, Tensor]:
+    """Return width and depth of the item's footprint where it is turned by 90 degrees (``odd``) or not."""
+    return torch.where(odd, item.d, item.w), torch.where(odd, item.w, item.d)
+
+
+# ---------------------------------------------------------------------- all picks at once
+def all_grasps(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:
+    """Return what each pick cell does: whether it lifts the item, bool ``[N, P]``, and the item's offset.
+
+    The offset, int64 ``[N, P, R, 2]``, is the item's minimum corner in the frame of the turned end effector.
+    """
+    number = torch.arange(cell.num_picks, device=item.x.device)[:, None]
+    found = grasp(cell, item, number // cell.bin_size[1], number % cell.bin_size[1])  # [P, N]
+    pairs = turn(found.near_x, found.near_y, found.back_x, found.back_y)[: cell.rotations]
+    offset = torch.stack([torch.stack(pair, -1) for pair in pairs], 2)  # [P, N, R, 2]
+    return found.succeeds.t(), offset.transpose(0, 1)
+
+
+def heuristic_pick(cell: CellSpec, item: Item) -> Tensor:
+    """Return the pick cell of individual planning, which does not look at the tote, int64 ``[N]``.
+
+    It has the least offset ``ox + oy``, then ``oy``, among the picks that succeed: the item lies in the end effector's
+    corner where possible.
+    """
+    succeeds, offset = all_grasps(cell, item)
+    ox, oy = offset[:, :, 0].unbind(-1)  # before turning, [N, P]
+    return torch.where(succeeds, (ox + oy) * FAR + oy, FAR**2).argmin(1)
+
+
+def select_pick(cell: CellSpec, actions: Tensor, pick: Tensor) -> Tensor:
+    """Return the part of values of all actions ``[N, N_a]`` at the pick cells ``[N]``: ``[N, W_T * D_T * R]``."""
+    return actions.unflatten(1, (cell.num_picks, -1))[torch.arange(len(pick), device=pick.device), pick]
+
+
+# ---------------------------------------------------------------------- grasp classes
+def num_turns(cell: CellSpec) -> int:
+    """Return how many turns are told apart: parities, or rotations where limits may forbid one and not its like."""
+    return cell.parities if cell.limits is None else cell.rotations
+
+
+def class_index(cell: CellSpec, turns: Tensor | int, step_x: Tensor, step_y: Tensor) -> Tensor:
+    """Return the grasp class of a turn and an offset, counted from :attr:`CellSpec.min_offset` on."""
+    return (turns * cell.num_offsets + step_x) * cell.num_offsets + step_y
+
+
+def pick_classes(cell: CellSpec, item: Item) -> Tensor:
+    """Return the grasp class of every pick cell and rotation, int64 ``[N, P, R]``; -1 if the pick fails."""
+    succeeds, offset = all_grasps(cell, item)
+    step = (offset - cell.min_offset).clamp(0, cell.num_offsets - 1)
+    turns = torch.arange(cell.rotations, device=offset.device) % cell.parities
+    return torch.where(succeeds[..., None], class_index(cell, turns, step[..., 0], step[..., 1]), -1)
+
+
+def available_offsets(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:
+    """Return which offsets a pick can have, and which grasp classes they become by turning.
+
+    Returns:
+        bool ``[K, N]``: some pick cell, the only one, lifts the item with this offset under the end effector before
+        turning; int64 ``[R, K, N]``: the class that this offset becomes by each rotation, clamped into range.
+    """
+    (bin_w, bin_d, _), (ee_w, ee_d), count = cell.bin_size, cell.effector_size, cell.num_offsets
+    here = torch.arange(count, device=item.x.device)[:, None]
+    step = here + cell.min_offset  # [O, 1]
+    x, y = item.x - step + reference_cell(ee_w), item.y - step + reference_cell(ee_d)  # the pick cell, [O, N]
+    found = grasp(cell, item, x[:, None], y)
+    in_bin = ~is_outside(x, 1, bin_w)[:, None] & ~is_outside(y, 1, bin_d)
+    back_x, back_y = (
+        (back - cell.min_offset).clamp(0, count - 1) for back in (found.back_x, found.back_y)
+    )  # [O, 1, N], [O, N]
+    turned = [
+        class_index(cell, rotation % num_turns(cell), step_x, step_y).expand(count, count, len(item.x))
+        for rotation, (step_x, step_y) in enumerate(turn(here[:, None], here, back_x, back_y)[: cell.rotations])
+    ]
+    return (found.succeeds & in_bin).flatten(0, 1), torch.stack(turned).flatten(1, 2)
+
+
+def pick_blocks(cell: CellSpec, item: Item) -> Tensor:
+    """Return the number of each pick cell's offset, int64 ``[N, P]``; ``K`` where the item is not under it at all."""
+    (_, bin_d, _), (ee_w, ee_d), count = cell.bin_size, cell.effector_size, cell.num_offsets
+    number = torch.arange(cell.num_picks, device=item.x.device)
+    x = item.x[:, None] - (number // bin_d - reference_cell(ee_w)) - cell.min_offset
+    y = item.y[:, None] - (number % bin_d - reference_cell(ee_d)) - cell.min_offset
+    inside = ~is_outside(x, 1, count) & ~is_outside(y, 1, count)
+    return torch.where(inside, class_index(cell, 0, x, y), count * count)
+
+
+def failure_of(found: Grasp) -> Tensor:
+    """Return the failure code of picks, 0 where they succeed; reach is judged after all other checks."""
+    return torch.where(found.misses, int(Failure.PICK_MISS), found.collides * int(Failure.BIN_COLLISION))

@@ -1,0 +1,64 @@
+"""Operations on height maps of many problems.
+
+Maps are kept with the batch last in memory, ``[W, D, N]``: what is done to them is shifting, and then every inner loop
+runs over the problems instead of over a row of a few cells.
+"""
+
+import torch
+from torch import Tensor
+
+FAR = 1 << 20  # higher than any wall: stands for a cell that nothing may occupy
+NEVER = -1  # the "top" of a footprint on which the item cannot rest; no clearance is that low
+
+
+def surround(maps: Tensor, margins: tuple[int, int, int, int], value) -> Tensor:
+    """Return maps ``[W, D, N]`` with margins (before and after along x, then y) of a value, or of one per problem."""
+    x0, x1, y0, y1 = margins
+    wide, deep, batch = maps.shape
+    out = maps.new_empty(wide + x0 + x1, deep + y0 + y1, batch)
+    if isinstance(value, Tensor):
+        out.copy_(value.expand_as(out))
+    else:
+        out.fill_(value)
+    out[x0 : x0 + wide, y0 : y0 + deep] = maps
+    return out
+
+
+def windows(maps: Tensor, count: int) -> Tensor:
+    """Return all shifts of maps ``[W + count - 1, D + count - 1, N]`` by up to ``count - 1`` cells.
+
+    The result is a view, ``[count, count, W, D, N]``.
+    """
+    return maps.unfold(0, count, 1).unfold(1, count, 1).permute(3, 4, 0, 1, 2)
+
+
+def rectangle(grid: tuple[int, int], x: Tensor, y: Tensor, w: Tensor, d: Tensor) -> Tensor:
+    """Return the cells of a grid inside the rectangle of size ``(w, d)`` at ``(x, y)``, bool ``[*grid, N]``."""
+    column = torch.arange(grid[0], device=x.device)[:, None]
+    row = torch.arange(grid[1], device=x.device)[:, None]
+    in_x = (column >= x) & (column < x + w)
+    in_y = (row >= y) & (row < y + d)
+    return in_x[:, None] & in_y
+
+
+def patches(heights: Tensor, x: Tensor, y: Tensor, side: int, outside: int) -> Tensor:
+    """Return a square of cells of each height map, ``[side, side, N]``.
+
+    Args:
+        heights: ``[N, W, D]``.
+        x, y: int64 ``[N]``, the square's minimum corner, which may lie outside the map.
+        side: of the square, in cells.
+        outside: the value of cells outside the map.
+    """
+    _, wide, deep = heights.shape
+    step = torch.arange(side, device=x.device)
+    column, row = x + step[:, None], y + step[:, None]  # [side, N]
+    inside = ((column >= 0) & (column < wide))[:, None] & ((row >= 0) & (row < deep))
+    index = column.clamp(0, wide - 1)[:, None] * deep + row.clamp(0, deep - 1)
+    cells = heights.reshape(len(heights), -1).t().gather(0, index.flatten(0, 1)).view_as(index)
+    return cells.where(inside, outside)
+
+
+def is_under(w: Tensor, d: Tensor, side: int) -> list[Tensor]:
+    """Return for each cell of a square, row by row, whether a ``w x d`` rectangle at its minimum corner covers it."""
+    return [(i < w) & (j < d) for i in range(side) for j in range(side)]

@@ -1,0 +1,128 @@
+"""What an agent sees: a list of terms. A new channel is one term, and one line in the config of the environment.
+
+The environment, Gymnasium, the robot's planner and search all ask this list; policies and critics read the entries that
+they name in ``in_keys``.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from pickplace.task.cell import CellSpec
+from pickplace.task.state import State, bin_depth_from_item, depth_from_heights
+
+
+class Bounds(NamedTuple):
+    """The range, shape and type of one problem's entry."""
+
+    low: float
+    high: float
+    shape: tuple[int, ...]
+    dtype: torch.dtype = torch.float32
+
+
+class Term(ABC):
+    """One entry of the observation; the name under which it is listed is its key."""
+
+    @abstractmethod
+    def bounds(self, cell: CellSpec, tallest: int) -> Bounds:
+        """Return what values this entry may take.
+
+        Args:
+            cell: the sizes.
+            tallest: height of the highest item that may arrive.
+        """
+
+    @abstractmethod
+    def value(self, cell: CellSpec, state: State) -> Tensor:
+        """Return this entry for the states of ``N`` problems, ``[N, *shape]``, in a tensor of its own."""
+
+
+class BinDepth(Term):
+    """Height above the bin's floor, float32 ``[N, W_B, D_B]``, 0 where empty; height units."""
+
+    def bounds(self, cell, tallest):
+        return Bounds(0, tallest, cell.bin_size[:2])
+
+    def value(self, cell, state):
+        return bin_depth_from_item(state.item, cell.bin_size)
+
+
+class ToteDepth(Term):
+    """Remaining height up to the rim, ``H_T - height``, float32 ``[N, W_T, D_T]``; height units."""
+
+    def bounds(self, cell, tallest):
+        return Bounds(0, cell.tote_size[2], cell.tote_size[:2])
+
+    def value(self, cell, state):
+        return depth_from_heights(state.heights, state.tote_height)
+
+
+class ToteHeight(Term):
+    """Height ``H_T`` of the episode's tote, int64 ``[N, 1]``; height units."""
+
+    def bounds(self, cell, tallest):
+        return Bounds(tallest, cell.tote_size[2], (1,), torch.int64)
+
+    def value(self, cell, state):
+        return state.tote_height[:, None].clone()
+
+
+#: What every observation holds; the whole state can be read from it, see :meth:`State.from_observation`.
+STANDARD_TERMS: Mapping[str, Term] = {
+    "bin_depth": BinDepth(),
+    "tote_depth": ToteDepth(),
+    "tote_height": ToteHeight(),
+}
+
+#: Keys of the environment's that no term may have.
+RESERVED = (
+    "action",
+    "action_mask",
+    "footprint_mask",
+    "occupancy",
+    "failure",
+    "reward",
+    "done",
+    "terminated",
+    "truncated",
+)
+
+
+def check_terms(terms: Mapping[str, Term] | None) -> dict[str, Term]:
+    """Return the terms of an observation, the standard ones first; None gives those alone.
+
+    Raises:
+        ValueError: naming the key, for something else than a term, a key that is taken, or a standard term that lacks.
+    """
+    if terms is None:
+        return dict(STANDARD_TERMS)
+    for key, term in terms.items():
+        if not isinstance(term, Term):
+            raise ValueError(
+                f"observation.{key}={term!r}: expected a Term, such as pickplace.task.observation.ToteDepth."
+            )
+        if key in RESERVED or not key.isidentifier():
+            raise ValueError(f"observation.{key}: expected another name; the environment uses {', '.join(RESERVED)}.")
+    for key, term in STANDARD_TERMS.items():
+        if type(terms.get(key)) is not type(term):
+            raise ValueError(
+                f"observation.{key}={terms.get(key)!r}: expected {type(term).__name__}, which is always there."
+            )
+    return {key: terms[key] for key in (*STANDARD_TERMS, *(key for key in terms if key not in STANDARD_TERMS))}
+
+
+def observe(terms: Mapping[str, Term], cell: CellSpec, state: State, keys: Collection[str] | None = None) -> TensorDict:
+    """Return what an agent sees in the states of ``N`` problems, ``batch_size=[N]``.
+
+    Args:
+        terms: the entries by key.
+        keys: the entries that are needed; None: all.
+    """
+    wanted = {key: term for key, term in terms.items() if keys is None or key in keys}
+    count, device = len(state.heights), state.heights.device
+    return TensorDict({key: term.value(cell, state) for key, term in wanted.items()}, batch_size=[count], device=device)

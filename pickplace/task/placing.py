@@ -1,0 +1,81 @@
+"""Placing: how high an item rests on a footprint, whether it is stable there, and what the end effector must clear."""
+
+from collections.abc import Sequence
+from functools import reduce
+
+import torch
+from torch import Tensor
+
+from pickplace.task.cell import CellSpec
+from pickplace.task.maps import FAR, NEVER, is_under, surround, windows
+from pickplace.task.state import State
+
+
+# ---------------------------------------------------------------------- the checks of a placement, one function each
+def rest(cells: Sequence[Tensor], under: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Return the height on which an item comes to rest, and how many cells below it have that height.
+
+    Loops over cells, so that the inner loops run over whole maps, which is fast.
+
+    Args:
+        cells: for each cell of a square at the footprint's minimum corner its height, int32, all of one shape.
+        under: whether the item covers that cell, bool, broadcastable.
+    """
+    z = torch.full((), NEVER, dtype=cells[0].dtype, device=cells[0].device)
+    for height, used in zip(cells, under, strict=True):
+        z = torch.maximum(z, torch.where(used, height, NEVER))
+    level = torch.zeros_like(z)
+    for height, used in zip(cells, under, strict=True):
+        level += (height == z) & used
+    return z, level
+
+
+def is_supported(cell: CellSpec, level: Tensor, area: Tensor) -> Tensor:
+    """Return whether ``level`` supporting cells under a footprint of ``area`` cells keep the item stable."""
+    share = level.double() / area
+    return share > cell.min_support if cell.strict_support else share >= cell.min_support
+
+
+def overflows(top: Tensor, tote_height: Tensor) -> Tensor:
+    """Return whether an item's top passes the rim."""
+    return top > tote_height
+
+
+def is_within_reach(lowest: Tensor, highest: Tensor, top: Tensor) -> Tensor:
+    """Return whether the robot may bring an item's top to that height, see :class:`~pickplace.task.cell.Limits`."""
+    return (lowest <= top) & (top <= highest)
+
+
+# ---------------------------------------------------------------------- maps
+def resting_top(cell: CellSpec, state: State) -> Tensor:
+    """Return the height of the item's top for every footprint, int32 ``[N, Q, W_T, D_T]``.
+
+    It is ``NEVER`` where the item cannot rest: the footprint leaves the tote, the top passes the rim, or the support is
+    too small.
+    """
+    side, item = cell.max_side, state.item
+    padded = surround(state.heights.permute(1, 2, 0), (0, side - 1, 0, side - 1), FAR)
+    w, d = (torch.stack(pair)[: cell.parities] for pair in ((item.w, item.d), (item.d, item.w)))
+    w, d = w[:, None, None], d[:, None, None]  # [Q, 1, 1, N]
+    z, level = rest(windows(padded, side).flatten(0, 1).unbind(0), is_under(w, d, side))
+    top = z + item.h.to(z.dtype)
+    good = is_supported(cell, level, w * d) & ~overflows(top, state.tote_height) & (item.h > 0)
+    return torch.where(good, top, NEVER).permute(3, 0, 1, 2)
+
+
+def clearance(cell: CellSpec, state: State) -> Tensor:
+    """Return the least top at which the end effector hits nothing, per place cell, int32 ``[N, Q, W_T, D_T]``.
+
+    That is the highest tote cell under the end effector; where it leaves the tote, the rim.
+    """
+    (tote_w, tote_d, _), heights = cell.tote_size, state.heights
+    maps = heights.new_empty(cell.parities, tote_w, tote_d, len(heights))
+    rim = state.tote_height.to(heights.dtype)
+    for parity, shape in enumerate(cell.effectors):
+        after_x, after_y = shape.width - 1 - shape.ref_x, shape.depth - 1 - shape.ref_y
+        walled = surround(heights.permute(1, 2, 0), (shape.ref_x, after_x, shape.ref_y, after_y), rim)
+        # The maximum over a rectangle is a maximum along one axis, then along the other.
+        for axis, size, grid in ((0, shape.width, tote_w), (1, shape.depth, tote_d)):
+            walled = reduce(torch.maximum, [walled.narrow(axis, i, grid) for i in range(size)])
+        maps[parity] = walled
+    return maps.permute(3, 0, 1, 2)

@@ -1,0 +1,113 @@
+"""The state of a problem: the item in the bin, the heights in the tote, and why an episode ended."""
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from pickplace.task.maps import rectangle
+
+
+class Failure(IntEnum):
+    """The reason why an episode ended; 1 to 6 in the order of the checks.
+
+    Attributes:
+        sentence: the reason for a reader who does not know the rules.
+        label: the same in a word or two.
+    """
+
+    sentence: str
+    label: str
+
+    def __new__(cls, code: int, sentence: str, label: str):
+        member = int.__new__(cls, code)
+        member._value_ = code
+        member.sentence, member.label = sentence, label
+        return member
+
+    NONE = 0, "The item stream is over.", "stream over"
+    PICK_MISS = 1, "The gripper does not cover the item.", "missed the item"
+    BIN_COLLISION = 2, "The gripper would hit the bin's wall.", "hit the bin"
+    TOTE_COLLISION = 3, "The gripper or the item would hit the tote's wall.", "hit the tote"
+    OVERFLOW = 4, "The item would stick out of the tote.", "too high"
+    ITEM_COLLISION = 5, "The gripper would hit an item in the tote.", "hit an item"
+    UNSTABLE = 6, "The item would not rest stably.", "unstable"
+    STUCK = 7, "This item fits nowhere any more.", "no place left"
+    OUT_OF_REACH = 8, "The robot does not reach this pick or this place.", "out of reach"
+
+
+class Item(NamedTuple):
+    """One item per problem, lying in its bin: minimum corner ``(x, y)`` and size ``(w, d, h)``, int64 ``[N]`` each.
+
+    ``h`` is in height units, the rest in cells. An empty bin has size ``(0, 0, 0)``.
+    """
+
+    x: Tensor
+    y: Tensor
+    w: Tensor
+    d: Tensor
+    h: Tensor
+
+    @property
+    def volume(self) -> Tensor:
+        """The item's volume, in cells times height units, int64 ``[N]``."""
+        return self.w * self.d * self.h
+
+    def rows(self, index) -> "Item":
+        """Return the items of some problems."""
+        return Item(*(part[index] for part in self))
+
+
+class State(NamedTuple):
+    """Everything that the rules need to know of ``N`` problems."""
+
+    heights: Tensor  # int32 [N, W_T, D_T]: height of the surface in the tote
+    tote_height: Tensor  # int64 [N]: height of the episode's tote, H_T
+    item: Item  # what lies in the bin
+
+    @classmethod
+    def from_observation(cls, observation: TensorDictBase) -> "State":
+        """Return the state that ``bin_depth``, ``tote_depth`` and ``tote_height`` of an observation ``[N]`` show."""
+        tote_height = observation["tote_height"].reshape(-1)
+        heights = heights_from_depth(observation["tote_depth"], tote_height)
+        return cls(heights, tote_height, item_from_depth(observation["bin_depth"]))
+
+    def rows(self, index) -> "State":
+        """Return the state of some problems, by their numbers, which may come up more than once."""
+        return State(self.heights[index], self.tote_height[index], self.item.rows(index))
+
+    def repeat(self, count: int) -> "State":
+        """Return each problem ``count`` times, one copy after the other."""
+        return self.rows(torch.arange(len(self.heights), device=self.heights.device).repeat_interleave(count))
+
+
+def depth_from_heights(heights: Tensor, tote_height: Tensor) -> Tensor:
+    """Return the remaining depth ``H_T - height`` of each cell, float32 ``[N, W_T, D_T]``."""
+    return (tote_height[:, None, None] - heights).float()
+
+
+def heights_from_depth(tote_depth: Tensor, tote_height: Tensor) -> Tensor:
+    """Return the heights, int32 ``[N, W_T, D_T]``: the inverse of :func:`depth_from_heights`."""
+    return (tote_height[:, None, None] - tote_depth).int()
+
+
+def bin_depth_from_item(item: Item, bin_size: tuple[int, ...]) -> Tensor:
+    """Return the height above the bin's floor, float32 ``[N, W_B, D_B]``: the item's height under it, else 0."""
+    inside = rectangle(bin_size[:2], item.x, item.y, item.w, item.d)
+    return (inside * item.h.float()).permute(2, 0, 1).contiguous()
+
+
+def item_from_depth(bin_depth: Tensor) -> Item:
+    """Return the item that a bin's depth map ``[N, W_B, D_B]`` shows: the bounding box of its non-zero cells."""
+    filled = bin_depth > 0
+    columns, rows = filled.any(2), filled.any(1)  # [N, W_B], [N, D_B]
+    # argmax of a 0/1 map is its first 1: where the item begins.
+    return Item(
+        x=columns.int().argmax(1),
+        y=rows.int().argmax(1),
+        w=columns.sum(1),
+        d=rows.sum(1),
+        h=bin_depth.amax((1, 2)).long(),
+    )

@@ -1,0 +1,85 @@
+"""One step: what an action does to a state, with the checks in the order of the rules."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pickplace.task.cell import CellSpec, reference_cell
+from pickplace.task.feasibility import PlacingMaps
+from pickplace.task.grasps import grasp, is_clear, is_outside, split_action, split_footprint, turn, turned_size
+from pickplace.task.maps import FAR, is_under, patches, rectangle
+from pickplace.task.placing import is_supported, is_within_reach, overflows, rest
+from pickplace.task.state import Failure, State
+
+
+class Step(NamedTuple):
+    """The effect of one action."""
+
+    heights: Tensor  # int32 [N, W_T, D_T]
+    failure: Tensor  # int64 [N]
+    top: Tensor  # int64 [N]: height of the item's top, meaningful without failure
+    footprint: Tensor  # int64 [N, 4]: x, y, w, d of the footprint in the tote
+
+
+def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
+    """Try one action per problem.
+
+    Args:
+        action: int64 ``[N]``, the flat index, in ``[0, N_a)``.
+    """
+    (heights, tote_height, item), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.effector_size
+    x_bin, y_bin, x_tote, y_tote, rotation = split_action(cell, action)
+    odd = rotation % 2 == 1
+
+    # Picking and turning.
+    picked = grasp(cell, item, x_bin, y_bin)
+    turned = turn(picked.near_x, picked.near_y, picked.back_x, picked.back_y)[: cell.rotations]
+    offset = torch.stack([torch.stack(pair) for pair in turned]).gather(0, rotation.expand(1, 2, -1))[0]  # [2, N]
+    w, d = turned_size(item, odd)
+    wide, deep = torch.where(odd, ee_d, ee_w), torch.where(odd, ee_w, ee_d)  # the turned end effector
+    left, front = x_tote - reference_cell(wide), y_tote - reference_cell(deep)  # its min corner in the tote
+    x, y = left + offset[0], front + offset[1]
+
+    # Placing.
+    side = cell.max_side
+    z, level = rest(patches(heights, x, y, side, FAR).flatten(0, 1).unbind(0), is_under(w, d, side))
+    top = z.long() + item.h
+    reach = max(ee_w, ee_d)
+    below = patches(heights, left, front, reach, 0).flatten(0, 1)
+    highest = torch.where(torch.stack(is_under(wide, deep, reach)), below, 0).amax(0)
+    item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)
+    effector_leaves = is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d)
+
+    checks = [  # from the last to the first, so that the first failure has the last word
+        (Failure.UNSTABLE, ~is_supported(cell, level, w * d)),
+        (Failure.ITEM_COLLISION, ~is_clear(top, highest)),
+        (Failure.OVERFLOW, overflows(top, tote_height)),
+        (Failure.TOTE_COLLISION, item_leaves | (effector_leaves & ~is_clear(top, tote_height))),
+        (Failure.BIN_COLLISION, picked.collides),
+        (Failure.PICK_MISS, picked.misses),
+    ]
+    if cell.limits is not None:
+        limits, number = cell.limits.on(action.device), (rotation * tote_w + x_tote) * tote_d + y_tote
+        lowest, highest_top = limits.lowest_top.flatten()[number], limits.highest_top.flatten()[number]
+        checks.insert(0, (Failure.OUT_OF_REACH, picked.unreachable | ~is_within_reach(lowest, highest_top, top)))
+    failure = torch.zeros_like(action)
+    for kind, failed in checks:
+        failure = torch.where(failed, int(kind), failure)
+    placed = rectangle((tote_w, tote_d), x, y, w, d) & (failure == 0)
+    after = torch.where(placed, top.to(heights.dtype), heights.permute(1, 2, 0))
+    return Step(after.permute(2, 0, 1).contiguous(), failure, top, torch.stack([x, y, w, d], -1))
+
+
+def put_down(cell: CellSpec, heights: Tensor, maps: PlacingMaps, footprint: Tensor) -> Tensor:
+    """Return the tote after a success that leaves the item in a given footprint, int32 ``[N, W_T, D_T]``.
+
+    Args:
+        heights: int32 ``[N, W_T, D_T]``, of which ``maps`` were made.
+        footprint: int64 ``[N]``, index ``(parity * W_T + x) * D_T + y``, one that some action reaches.
+    """
+    parity, x, y = split_footprint(cell.tote_size, footprint)
+    w, d = turned_size(maps.item, parity == 1)
+    inside = rectangle(cell.tote_size[:2], x, y, w, d)
+    top = maps.top.flatten(1).gather(1, footprint[:, None])[:, 0]
+    return torch.where(inside, top, heights.permute(1, 2, 0)).permute(2, 0, 1).contiguous()

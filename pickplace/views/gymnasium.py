@@ -1,0 +1,102 @@
+"""The Gymnasium environment with pictures: what ``gymnasium.make("pickplace/PickPlace-v0")`` makes."""
+
+import os
+import sys
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from pickplace.envs.gymnasium import PickPlaceGymEnv
+from pickplace.task.state import Failure, bin_depth_from_item
+from pickplace.views.figures import draw_scene, item_colours
+from pickplace.views.recording import Recording, record_moves
+
+
+class RenderedPickPlaceEnv(PickPlaceGymEnv):
+    """:class:`~pickplace.envs.gymnasium.PickPlaceGymEnv` with rendering.
+
+    Args:
+        items: an item distribution, or a list of ``(w, d, h)``.
+        render_mode: ``"rgb_array"``, ``"human"`` (a window) or None.
+        **settings: as of :class:`~pickplace.envs.torchrl.PickPlaceEnv`.
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 4}
+
+    def __init__(self, items=None, render_mode: str | None = None, **settings):
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode={render_mode!r}: expected 'rgb_array', 'human' or None.")
+        super().__init__(items, **settings)
+        self.render_mode = render_mode
+        self._recording: Recording | None = None  # of the running episode
+        self._window: tuple | None = None  # the figure and the image in it
+        sizes = self._env.items.sizes.tolist()
+        self._colours = item_colours([(0, 0, 0, *size) for size in sizes]) if render_mode else {}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        result = super().reset(seed=seed, options=options)
+        if self.render_mode:
+            self._recording = Recording(int(self._env.episode[0]), int(self._env.tote_height[0]))
+        self._update_window()
+        return result
+
+    def step(self, action):
+        if self._recording is not None and self.action_space.contains(action):
+            env, actions = self._env, torch.as_tensor([int(action)], device=self._env.device)
+            observation = TensorDict({"tote_height": env.tote_height[:, None].clone()}, [1], device=env.device)
+            self._recording.moves += record_moves(env.cell, None, observation, env.state, actions)
+        result = super().step(action)
+        _, _, terminated, truncated, info = result
+        if self._recording is not None and (terminated or truncated):
+            self._recording.ending = Failure[info["failure"].upper()]
+        self._update_window()
+        return result
+
+    def render(self) -> np.ndarray | None:
+        if self.render_mode == "rgb_array":
+            return self._picture()
+        return None  # the window is kept up to date
+
+    def _picture(self) -> np.ndarray:
+        """Return a picture of the tote in 3D, its height map and the bin, uint8 ``[600, 1200, 3]``."""
+        if self._recording is None:
+            raise gymnasium.error.ResetNeeded("render() before reset().")
+        cell, item = self._env.cell, self._env.current_item
+        scene = draw_scene(self._recording, cell, self._colours)
+        inset = scene.add_axes((0.01, 0.04, 0.09, 0.18))
+        bin_depth = bin_depth_from_item(item, cell.bin_size)
+        inset.imshow(bin_depth[0].cpu().numpy().T, origin="lower", cmap="YlOrBr", vmin=0)
+        inset.set_title("bin", fontsize="medium")
+        inset.set_xticks([])
+        inset.set_yticks([])
+        scene.set_dpi(100)
+        scene.canvas.draw()
+        return np.asarray(scene.canvas.buffer_rgba())[..., :3].copy()
+
+    def _update_window(self) -> None:
+        """Bring the window up to date, in mode ``human``."""
+        if self.render_mode != "human":
+            return
+        display = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        if not display:
+            gymnasium.logger.warn("render_mode='human': there is no display, so no window is shown; try 'rgb_array'.")
+            return
+        from matplotlib import pyplot
+
+        if self._window is None:
+            figure = pyplot.figure("pickplace", figsize=(12, 6))
+            axes = figure.add_axes((0, 0, 1, 1))
+            axes.set_axis_off()
+            self._window = figure, axes.imshow(self._picture())
+        self._window[1].set_data(self._picture())
+        pyplot.pause(1 / self.metadata["render_fps"])
+
+    def close(self) -> None:
+        if self._window is not None:
+            from matplotlib import pyplot
+
+            pyplot.close(self._window[0])
+            self._window = None

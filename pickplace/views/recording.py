@@ -1,0 +1,90 @@
+"""Recorded episodes, move by move."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from pickplace.task.cell import CellSpec, reference_cell
+from pickplace.task.grasps import split_action
+from pickplace.task.state import Failure, State
+from pickplace.task.transition import apply
+
+FULL = "The tote is full."
+
+
+@dataclass
+class Move:
+    """One decision and its effect; in cells and height units."""
+
+    item: tuple[int, ...]  # x, y, w, d, h in the bin
+    pick: tuple[int, int]  # min corner of the end effector in the bin
+    place: tuple[int, int]  # min corner of the turned end effector in the tote
+    rotation: int  # quarter turns, counter-clockwise seen from above
+    footprint: tuple[int, ...]  # x, y, w, d in the tote
+    z: int  # height of the item's underside once it rests
+    failure: Failure
+    heat: np.ndarray | None = None  # uint8 [W_T, D_T]: the policy's preference for each place cell, 255 the highest
+
+
+@dataclass
+class Recording:
+    """One episode, move by move."""
+
+    episode: int  # its number in the stream
+    tote_height: int
+    moves: list[Move] = field(default_factory=list)
+    ending: Failure | None = None  # None while it goes on; NONE when a recorded stream is over
+    waiting: tuple[int, ...] | None = None  # the item that arrived last and fits nowhere, as `Move.item`
+    occupancy: float = 0.0
+
+    @property
+    def boxes(self) -> list[tuple[int, ...]]:
+        """The items placed, ``(x, y, z, w, d, h)`` each, in order."""
+        good = [move for move in self.moves if not move.failure]
+        return [(*move.footprint[:2], move.z, *move.footprint[2:], move.item[4]) for move in good]
+
+    def describe_ending(self, num_places: int) -> str:
+        """Return why the episode ended, in a sentence; empty while it goes on."""
+        if self.ending is None:
+            return ""
+        volume = sum(w * d * h for *_, w, d, h in self.boxes)
+        full = self.ending == Failure.STUCK and volume == num_places * self.tote_height
+        return FULL if full else self.ending.sentence
+
+
+def record_moves(cell: CellSpec, planner, observation: TensorDictBase, state: State, action: Tensor) -> list[Move]:
+    """Return the moves that the given decisions make, one for each row.
+
+    Args:
+        cell: the sizes.
+        planner: the planner that decided; if it has a ``heat_map`` it is asked for it.
+        observation: what the planner saw, ``[N]``.
+        state: the states before the moves.
+        action: int64 ``[N]``.
+    """
+    step = apply(cell, state, action)
+    x_bin, y_bin, x_tote, y_tote, rotation = (part.tolist() for part in split_action(cell, action))
+    heat = planner.heat_map(observation) if hasattr(planner, "heat_map") else None
+    if heat is not None:
+        heat = (255 * heat / heat.amax((1, 2), keepdim=True).clamp(min=1e-30)).round().byte().cpu().numpy()
+    ref_x, ref_y = (reference_cell(side) for side in cell.effector_size)
+    items = torch.stack(state.item, -1).tolist()
+    moves = []
+    for row in range(len(action)):
+        shape = cell.effectors[rotation[row] % 2]
+        moves.append(
+            Move(
+                item=tuple(items[row]),
+                pick=(x_bin[row] - ref_x, y_bin[row] - ref_y),
+                place=(x_tote[row] - shape.ref_x, y_tote[row] - shape.ref_y),
+                rotation=rotation[row],
+                footprint=tuple(step.footprint[row].tolist()),
+                z=int(step.top[row]) - items[row][4],
+                failure=Failure(int(step.failure[row])),
+                heat=None if heat is None else heat[row],
+            )
+        )
+    return moves
