@@ -22,16 +22,18 @@ def policy_line(policy: str, found: list[claims.Finding]) -> str:
     for word in dict.fromkeys(("yes", "no", "undecided", *(finding.verdict for finding in found))):
         these = [finding for finding in found if finding.verdict == word]
         single = sum(1 in finding.seeds for finding in these) if word in ("yes", "no") else 0
-        counts += [f"{len(these)} {word}" + f" ({single} with one seed)" * bool(single)] if these else []
-    values = sorted({f"{finding.mean:+.3f}" for finding in found if finding.seeds}, key=float)
-    seeds = sorted({count for finding in found for count in finding.seeds})
-    values, seeds = (" to ".join(map(str, dict.fromkeys([*part[:1], *part[-1:]]))) for part in (values, seeds))
-    return f"{policy}: {', '.join(counts)}; {values}; seeds: {seeds}"
+        counts += [f"{len(these)} {word}" + f" ({single} one-seed)" * bool(single)] if these else []
+    means = [finding.mean for finding in found if finding.seeds]
+    seeds = [count for finding in found for count in finding.seeds]
+    if not means:
+        return f"{policy}: {', '.join(counts)}"
+    ends = "..".join(dict.fromkeys(f"{mean:+.4f}" for mean in (min(means), max(means))))
+    return f"{policy}: {', '.join(counts)}; {ends}; {'-'.join(map(str, sorted({min(seeds), max(seeds)})))}"
 
 
 def claims_table(results: dict, differences: dict, beyond: bool) -> list[str]:
     """Return the lines of the table of claims."""
-    lines = ["| claim | verdict | comparisons; differences; training seeds | remark |", "|---|---|---|---|"]
+    lines = ["| claim | verdict | comparisons; differences; seeds | remark |", "|---|---|---|---|"]
     for claim in claims.read():
         if claim.get("beyond_the_paper", False) is beyond:
             found = {
@@ -48,11 +50,11 @@ def occupancy_table(columns: list[str], rows: dict[str, str], results: dict, giv
     """Return the lines of a table of mean occupancies: cells in whose names ``{}`` stands for the column."""
     lines = [f"| method | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|"]
     for name, values in (given or {}).items():
-        lines.append(f"| {name} | {' | '.join(f'{value:.3f}' for value in values)} |")
+        lines.append(f"| {name} | {' | '.join(f'{value:.4f}' for value in values)} |")
     for method, name in rows.items():
         found = [figures.pooled([name.format(column)], results) for column in columns]
         marks = [cell and "°" * (cell["episodes"] < claims.FEW) + "†" * cell["untrained"] for cell in found]
-        values = [f"{cell['mean']:.3f}{mark}" if cell else "" for cell, mark in zip(found, marks, strict=True)]
+        values = [f"{cell['mean']:.4f}{mark}" if cell else "" for cell, mark in zip(found, marks, strict=True)]
         k = name.partition("-K")[2]
         lines.append(f"| {figures.STYLE[method][0]}{f', K={k}' if k else ''} | {' | '.join(values)} |")
     return lines

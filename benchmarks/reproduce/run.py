@@ -9,6 +9,7 @@ import csv
 import json
 import logging
 import os
+import platform
 import re
 import resource
 import subprocess
@@ -35,11 +36,7 @@ def folder_of(cell: Cell) -> Path:
 
 
 def execute(cell: Cell, overrides: list[str]) -> dict:
-    """Run the command of a cell; return ``cpu_seconds`` and, if it was cut short or had no memory, why.
-
-    Raises:
-        Failed: if it ended with another error.
-    """
+    """Run the command of a cell; return ``cpu_seconds`` and why it was cut short; raise Failed for other errors."""
     script, log = cell.command.endswith(".py"), OUTPUTS / "logs" / f"{cell.name}.log"
     program = table.ROOT / "benchmarks" / cell.command if script else Path(sys.executable).parent / cell.command
     command = [*[sys.executable] * script, str(program), *overrides]
@@ -85,8 +82,10 @@ def train(cell: Cell) -> str:
     (folder / "cost.json").write_text(json.dumps(cost))
     curve = metrics(folder, "eval/occupancy")
     points = [{"training": cell.name, "frames": frames, "occupancy": round(value, 5)} for frames, value in curve]
+    before = [row for row in table.read("learning_curves").values() if row["training"] == cell.name]
     table.update("learning_curves", points, drop=lambda row: row["training"] == cell.name)
-    forget_differences(cell.name)
+    if points != before:
+        forget_differences(cell.name)
     return f"{cost['cpu_seconds']:.0f} s"
 
 
@@ -126,15 +125,18 @@ def evaluate(cell: Cell, trainings: dict[str, Cell]) -> str:
         cost = execute(cell, overrides)
     result = {"batch_size": int(words.get("evaluation.batch_size", 128)), **read_json(path)} if path.is_file() else cost
     more |= {"cpu_seconds": cost.get("cpu_seconds"), "processor": processor()}
-    table.update("results", [row := table.result_row(cell.name, result, **more)])
-    forget_differences(cell.name)
+    row, before = table.result_row(cell.name, result, **more), table.read("results").get(cell.name, {})
+    table.update("results", [row])
+    if [row.get(key) for key in ("mean", "episodes")] != [before.get(key) for key in ("mean", "episodes")]:
+        forget_differences(cell.name)
     return f"{row['mean']:.4f}, {row['episodes']} episodes" if "mean" in row else row["attempted"]
 
 
 def processor() -> str:
     """Return the model name of the processor, on which timings and trainings depend."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").is_file() else []
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+    path = Path("/proc/cpuinfo")
+    found = re.search(r"model name\s*: (.*)", path.read_text()) if path.is_file() else None
+    return found[1] if found else platform.machine()
 
 
 def forget_differences(name: str) -> None:
