@@ -69,12 +69,12 @@ bench: $(STAMP)  ## run the benchmarks on a quiet machine (half an hour), and wr
 		$(BIN)/python benchmarks/$$part.py || exit 1; \
 	done
 
-reproduce: $(STAMP)  ## compute what is missing of the paper's comparison (days; ARGS="--figure candidates --jobs 2")
-	$(BIN)/pip install --quiet --disable-pip-version-check 'py3dbp>=1.1,<2' 'rectpack>=0.2,<1' || echo "placement-only packers: not to be had"
+reproduce: $(STAMP)  ## compute the cells of the paper's comparison that have no row (ARGS="--match '^joint_dbl' --again")
+	$(BIN)/pip install --quiet --disable-pip-version-check 'py3dbp>=1.1,<2' 'rectpack>=0.2,<1' || echo "placement-only packers: not available"
 	$(BIN)/python benchmarks/reproduce/run.py $(ARGS)
 	$(BIN)/python benchmarks/reproduce/results.py
 
-results: $(STAMP)  ## draw the comparison's figures, and write docs/results.md
+results: $(STAMP)  ## draw the figures and write the tables of docs/results.md
 	$(BIN)/python benchmarks/reproduce/results.py
 
 docs: $(STAMP)  ## write docs/reference.md, and build the site of docs/ in outputs/site
