@@ -14,7 +14,9 @@ import torch
 
 from pickplace import PickPlaceEnv
 from pickplace.evaluation.evaluate import commit, confidence95
-from pickplace.task.geometry import NEVER
+from pickplace.task.feasibility import footprint_mask, placing_maps
+from pickplace.task.maps import NEVER
+from pickplace.task.state import State
 
 
 def py3dbp(size, turns: bool):
@@ -54,25 +56,25 @@ def rectpack(size, turns: bool):
 
 def replay(env: PickPlaceEnv, packer) -> tuple[list[str], float, float]:
     """Return what became of each placement, the planned occupancy, and the occupancy before the first failure."""
-    rules, outcomes, filled, executed = env.rules, [], 0, None
-    volume = rules.tote_size[0] * rules.tote_size[1] * rules.tote_size[2]
+    cell, outcomes, filled, executed = env.cell, [], 0, None
+    volume = cell.num_places * cell.tote_size[2]
     env.reset()
-    place, heights, tote_height = packer(rules.tote_size, rules.rotations > 1), env.heights.clone(), env.tote_height
+    place, heights, tote_height = packer(cell.tote_size, cell.rotations > 1), env.heights.clone(), env.tote_height
     for step in range(volume):
         address = [torch.tensor([value]) for value in (0, env.first_episode, step)]
-        item = env.items.sample("test", *address, rules.bin_size)
+        item = env.items.sample("test", *address, cell.bin_size)
         w, d, h = (int(part) for part in (item.w, item.d, item.h))
         if (planned := place(w, d, h)) is None:
             break
         x, y, z, wide, deep = planned
         turned, under = int((wide, deep) != (w, d)), heights[0, x : x + wide, y : y + deep]
-        placements = rules.placements(heights, tote_height, item)
+        maps = placing_maps(cell, State(heights, tote_height, item))
         if int(under.max()) != z:
             outcome = "rests_elsewhere"
-        elif placements.top[0, turned, x, y] == NEVER:  # it fits, so its support is too small
+        elif maps.top[0, turned, x, y] == NEVER:  # it fits, so its support is too small
             outcome = "unstable"
         else:
-            outcome = "executed" if rules.outcome_mask(placements)[0, turned, x, y] else "effector_collides"
+            outcome = "executed" if footprint_mask(cell, maps)[0, turned, x, y] else "effector_collides"
         executed = filled / volume if outcome != "executed" and executed is None else executed
         outcomes.append(outcome)
         filled += w * d * h
@@ -99,7 +101,7 @@ def main() -> None:
     every = [outcome for outcomes, _, _ in played for outcome in outcomes]
     result = {
         "planner": settings["packer"],
-        "env": {"bin_size": list(env.rules.bin_size), **cell},
+        "env": {"bin_size": list(env.cell.bin_size), **cell},
         "items": {"kinds": None},
         "stream": "test",
         "seed": 0,
