@@ -101,7 +101,10 @@ def test_a_worker_s_death_that_torchrl_sees_first_is_told(deaf):
         worker.start()
     for _ in workers:
         assert ready.acquire(timeout=240)
-    with pytest.raises(WorkerDied, match=r"1 of 2 has died \(exit code -9\)"), watch_workers(SimpleNamespace(procs=workers)):
+    with (
+        pytest.raises(WorkerDied, match=r"1 of 2 has died \(exit code -9\)"),
+        watch_workers(SimpleNamespace(procs=workers)),
+    ):
         try:
             raise queue.Empty
         except queue.Empty:

@@ -101,7 +101,8 @@ def resume_run(overrides: list[str]) -> float:
     with claim(run_dir):  # before reading what another process may be writing
         state, facts = checkpoint.read(folder)
         cfg = resumed_config(place, facts, [item for item in overrides if not item.startswith("resume=")])
-        handlers = [logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log")]
+        log_file = run_dir / "train.log"
+        handlers: list[logging.Handler] = [logging.StreamHandler(sys.stdout), logging.FileHandler(log_file)]
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
         (run_dir / hydra_app.FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")

@@ -66,6 +66,7 @@ class Trainer:
         self.device = use_machine(cfg)
         torch.manual_seed(cfg.seed)
         self.resumed = resume is not None
+        self.safe_folder: Path | None
         self.state, self.facts, self.safe_folder = resume or ({}, {}, None)
         self.frames, self.iteration, self.best, self.latest = (
             self.facts.get(key, default) for key, default in COUNTERS.items()
