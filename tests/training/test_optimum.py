@@ -50,8 +50,8 @@ def test_no_planner_exceeds_the_optimum(planner, rotations):
 
 def test_fcn_grasp_comes_within_1_percent(tmp_path):
     overrides = [
-        "experiment=quick", "env.tote_size=[4,4,1]", "curriculum=none", "total_frames=40_960", "algo.minibatch_size=256",
-        "model.actor.filters=32", "model.actor.hidden=32", "evaluation.episodes=8", "threads=1", "logger=none",
+        "experiment=quick", "env.tote_size=[4,4,1]", "curriculum=none", "total_frames=40_960", "threads=1",
+        "algo.minibatch_size=256", "model.actor.filters=32", "model.actor.hidden=32", "logger=none",
     ]  # fmt: skip
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         cfg = compose("train", overrides)
