@@ -7,8 +7,8 @@ from tensordict import TensorDict
 
 from pickplace import PickPlaceEnv
 from pickplace.task.items import MOST_SEEDS, STREAMS, Kinds, Recorded, Uniform, hashed_uniform
-from pickplace.training import train
-from pickplace.training.train import make_losses
+from pickplace.training import trainer
+from pickplace.training.ppo import make_losses
 
 
 def numbers(stream="train", seed=0, episode=0, count=50_000):
@@ -206,7 +206,7 @@ def test_a_learner_expects_nothing_after_the_end_of_a_recording(smoke, tmp_path,
         advantage, loss = make_losses(*args)
         return lambda batch: batches.append(advantage(batch).clone()), loss
 
-    monkeypatch.setattr(train, "make_losses", recording)
+    monkeypatch.setattr(trainer, "make_losses", recording)
     stream(tmp_path, "w,d,h\n1,1,1\n2,1,1\n")
     smoke(tmp_path / "run", "items=recorded", f"items.path={tmp_path}/items.csv", "env.tote_size=[5,5,1]")
     ended = torch.cat([batch["next", "truncated"].flatten() for batch in batches])

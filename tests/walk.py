@@ -174,8 +174,6 @@ def contributor(walk: Walk) -> None:
     )
     walk.edit(package, '"IndividualHeuristic", "JointDBL"', '"Corner", "IndividualHeuristic", "JointDBL"')
     walk.edit("pickplace/trust.py", '    "IndividualHeuristic",\n', '    "Corner",\n    "IndividualHeuristic",\n')
-    teacher = (walk.clone / "conf/warm_start/joint_dbl.yaml").read_text()
-    walk.write("conf/warm_start/corner.yaml", teacher.replace("joint_dbl", "corner"))
     walk.run("make format")
     walk.run("python docs/reference.py")
     walk.run("git add --all")
