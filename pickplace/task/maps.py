@@ -53,7 +53,7 @@ def squares(heights: Tensor, x: Tensor, y: Tensor, side: int) -> Tensor:
     step = torch.arange(side, device=x.device)[:, None]
     column, row = (x + step).clamp_(0, wide - 1), (y + step).clamp_(0, deep - 1)  # [side, N]
     index = (column * deep)[:, None] + row
-    return heights.reshape(len(heights), -1).t().gather(0, index.flatten(0, 1))
+    return heights.flatten(1).t().gather(0, index.flatten(0, 1))
 
 
 def is_under(w: Tensor, d: Tensor, side: int) -> Tensor:
