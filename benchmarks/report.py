@@ -9,7 +9,7 @@ PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 HEAD = """# Performance
 
 Written by `make bench` from `benchmarks/results/`. Times are medians, with the 10th to 90th percentile in brackets.
-Peers run in turn with ours, on a machine that does nothing else.
+Peers run in turn with ours, on an idle machine.
 """
 
 
@@ -46,8 +46,8 @@ def learning(result: dict) -> str:
         rows.append([name, *cells, f"{occupancy:.3f}", f"{seconds:.0f} s, {frames:,} frames"])
     return section(
         "Time until the tote is packed well",
-        "`experiment=quick` at `6x6x5`, `R=4`, on all cores, from the start of the process. A validation every 50,000 "
-        "frames plays 128 episodes. Settings of the peer: `benchmarks/learning.py`.",
+        "`experiment=quick` at `6x6x5`, `R=4`, on all cores, from the start of the process. Every 50,000 "
+        "frames 128 episodes are played for validation. Settings of the peer: `benchmarks/learning.py`.",
         table(f"method | {' | '.join(f'until {mark}' for mark in marks)} | last occupancy | after", rows),
     )
 
@@ -129,8 +129,8 @@ def decision(result: dict) -> str:
     )
     return section(
         "One decision",
-        "Milliseconds, batch 1, `R=4`, feasibility and candidates included. From the first to the last tote the area "
-        f"grows {result['area grows by']:.0f} times, the time as the last column says.",
+        "Milliseconds, batch 1, `R=4`, feasibility and candidates included. *Growth*: from the first to the last tote, "
+        f"whose area grows {result['area grows by']:.0f} times.",
         table(f"policy | {' | '.join(totes)} | growth", rows),
     )
 
