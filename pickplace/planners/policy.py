@@ -82,11 +82,11 @@ class PolicyPlanner:
         return score.view(len(score), rules.num_picks, *rules.tote_size[:2], rules.rotations).amax((1, 4))
 
 
-#: Planners that follow a checkpoint's policy, by their names.
-NEEDS_POLICY = {"pickplace.planners.PolicyPlanner": "policy", "pickplace.planners.Lookahead": "lookahead"}
+#: Planners that follow a checkpoint's policy, by their short names.
+NEEDS_POLICY = ("policy", "lookahead")
 
 #: Planners that imagine items.
-NEEDS_ITEMS = ("pickplace.planners.Lookahead", "pickplace.planners.MCTS")
+NEEDS_ITEMS = ("lookahead", "mcts")
 
 
 def planner_parts(planner: DictConfig, rules: Rules, items: ItemDistribution, trained: tuple | None = None) -> dict:
@@ -107,11 +107,10 @@ def planner_parts(planner: DictConfig, rules: Rules, items: ItemDistribution, tr
         parts["items"] = items
     if planner._target_ in NEEDS_POLICY:
         if trained is None:
-            name = NEEDS_POLICY[planner._target_]
-            raise ValueError(f"checkpoint=null: planner={name} needs a checkpoint; expected a run folder.")
+            raise ValueError(f"checkpoint=null: planner={planner._target_} needs a checkpoint; expected a run folder.")
         cfg, state, env = trained
         parts["policy"] = restore_policy(cfg, rules, state["policy"], env).to(cfg.device)
-        if NEEDS_POLICY[planner._target_] == "lookahead":
+        if planner._target_ == "lookahead":
             parts["critic"] = restore_critic(cfg, rules, state, env["tote_size"])
     return parts
 

@@ -21,8 +21,8 @@ from torch import Tensor
 from pickplace.planners.policy import PolicyPlanner, restore_policy
 from pickplace.policies.actors import Policy
 from pickplace.runs import checkpoint
-from pickplace.runs import hydra_app as config
-from pickplace.runs.allowlist import trusted
+from pickplace.runs.allowlist import trusted_config
+from pickplace.runs.machine import usable_device
 from pickplace.runs.registry import build
 from pickplace.task.geometry import Failure, Item, Rules
 
@@ -114,7 +114,7 @@ class Planner:
         if not isinstance(path, (str, os.PathLike)):
             raise ValueError(f"path={path!r}: expected a run folder, a checkpoint, or pretrained/<name>.")
         state, facts = checkpoint.read(checkpoint.locate(path))
-        cfg = trusted(facts["config"], trust)
+        cfg = trusted_config(facts["config"], trust)
         known = {field.name for field in fields(Rules)}
         if unknown := sorted(set(sizes) - known):
             raise ValueError(f"{unknown[0]}={sizes[unknown[0]]!r}: expected one of {', '.join(sorted(known))}.")
@@ -125,7 +125,7 @@ class Planner:
             longest = int(build("items", cfg["items"]).sizes[:, :2].max())
             rules = replace(rules, longest_side=longest)
         policy = restore_policy(cfg, rules, state["policy"], env)
-        return cls(rules, policy.to(config.usable_device(device)), candidates)
+        return cls(rules, policy.to(usable_device(device)), candidates)
 
     @torch.inference_mode()
     def plan(

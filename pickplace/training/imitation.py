@@ -11,7 +11,7 @@ from torch import Tensor
 from pickplace.planners.policy import planner_parts
 from pickplace.policies.actors import Policy
 from pickplace.runs import checkpoint
-from pickplace.runs.allowlist import trusted
+from pickplace.runs.allowlist import trusted_config
 from pickplace.runs.registry import build
 from pickplace.task.geometry import Rules
 from pickplace.task.items import ItemDistribution
@@ -57,7 +57,7 @@ class WarmStart:
             trained = None
             if cfg.checkpoint is not None:
                 state, saved = checkpoint.read(checkpoint.locate(str(cfg.checkpoint)))
-                theirs = trusted(saved["config"], trust)
+                theirs = trusted_config(saved["config"], trust)
                 trained = (theirs, state, OmegaConf.to_container(theirs.env, resolve=True))
             try:
                 self._parts = planner_parts(cfg.teacher, rules, items, trained)
@@ -101,9 +101,3 @@ def imitation_loss(policy: Policy, data: TensorDictBase) -> tuple[Tensor, Tensor
     known = (taught >= 0).sum().clamp(min=1)
     agreed = (logits.argmax(-1) == taught).sum() / known
     return F.cross_entropy(logits, taught, ignore_index=-1, reduction="sum") / known, agreed
-
-
-def taught_by(cfg: dict) -> str | None:
-    """The name of the planner that a run of this saved config imitated first, or None."""
-    start = cfg.get("warm_start") or {}
-    return start["teacher"]["_target_"].rpartition(".")[2] if start.get("frames") else None

@@ -12,7 +12,9 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from pickplace.runs.checkpoint import read_facts
-from pickplace.runs.hydra_app import FAILURE, SweepCallback, begun_with, claimed, one_sentence
+from pickplace.runs.errors import one_sentence
+from pickplace.runs.folder import FAILURE, is_claimed, noted_overrides
+from pickplace.runs.hydra_app import SweepCallback
 from pickplace.runs.loggers import read_csv
 
 log = logging.getLogger(__name__)
@@ -73,7 +75,7 @@ class Run:
 
 def read_run(folder: Path) -> Run:
     """Read a run folder, whatever state the run was left in."""
-    run = Run(folder.name, dict(word.lstrip("+").partition("=")[::2] for word in begun_with(folder)))
+    run = Run(folder.name, dict(word.lstrip("+").partition("=")[::2] for word in noted_overrides(folder)))
     facts = read_facts(folder, "last")
     if (folder / "metrics.csv").is_file():
         rows = read_csv(folder / "metrics.csv")
@@ -85,7 +87,7 @@ def read_run(folder: Path) -> Run:
             run.validations = [{"frames": run.frames, **{f"eval/{key}": value for key, value in latest.items()}}]
     if (folder / FAILURE).is_file():
         run.status, run.error = "failed", (folder / FAILURE).read_text().strip()
-    elif claimed(folder):
+    elif is_claimed(folder):
         run.status = "running"
     else:
         # By the checkpoint's config, if there is one: a resumed run may be given more frames.

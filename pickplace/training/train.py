@@ -19,23 +19,25 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import A2CLoss, ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from pickplace.evaluation.evaluate import Episodes, commit, confidence95, play, versions
+from pickplace.evaluation.evaluate import Episodes, confidence95, play
 from pickplace.policies.actors import Policy, as_actor, as_collection_policy, check_sizes
 from pickplace.runs import checkpoint
-from pickplace.runs import hydra_app as config
-from pickplace.runs.allowlist import own_modules, saved_form, trust_needed, trusted
+from pickplace.runs.allowlist import own_modules
+from pickplace.runs.errors import one_sentence
+from pickplace.runs.folder import FAILURE, claim, refuse_links
+from pickplace.runs.hydra_app import command
+from pickplace.runs.machine import use_machine
+from pickplace.runs.provenance import commit, versions
 from pickplace.runs.registry import build
 from pickplace.runs.resume import (
-    AT_HOME,
     COUNTERS,
     StopRequest,
-    begun_already,
-    best_of_another_course,
-    claim,
+    checkpoint_config,
+    checkpoint_hint,
+    interrupted_run,
     load_optimizer,
-    refuse_links,
     resumed_config,
-    saying_what_is_safe,
+    stale_best_frames,
 )
 from pickplace.task.geometry import Failure
 from pickplace.task.items import check_seed
@@ -64,7 +66,7 @@ def train(cfg: DictConfig, run_dir: Path) -> float:
     if cfg.resume is not None:
         raise ValueError(f"resume={cfg.resume}: expected as resume=<run folder> on the command line, without a +.")
     with claim(run_dir):
-        return run(cfg, run_dir, begun_already(cfg, run_dir))
+        return run(cfg, run_dir, interrupted_run(cfg, run_dir))
 
 
 def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None = None) -> float:
@@ -72,15 +74,15 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
 
     Args:
         cfg, run_dir: as of :func:`train`.
-        resume: state and facts of the checkpoint to continue from, as :func:`pickplace.runs.checkpoint.read` gives them,
-            and its folder.
+        resume: state and facts of the checkpoint to continue from, as :func:`pickplace.runs.checkpoint.read` gives
+            them, and its folder.
 
     Returns:
         As :func:`train`.
     """
     check_settings(cfg)
-    settled_config, again = loadable(cfg)
-    algo, device = cfg.algo, config.use_machine(cfg)
+    settled_config, again = checkpoint_config(cfg)
+    algo, device = cfg.algo, use_machine(cfg)
     torch.manual_seed(cfg.seed)
 
     # What is trained, and where it acts.
@@ -106,7 +108,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     frames, iteration, best, latest = (facts.get(k, d) for k, d in COUNTERS.items())
     if resume:
         curriculum.load_state_dict(facts["curriculum"])
-        if (later := best_of_another_course(run_dir, frames, settled_config)) is not None:
+        if (later := stale_best_frames(run_dir, frames, settled_config)) is not None:
             best = COUNTERS["best"]
             log.warning(
                 "checkpoints/best, of frame %s, is of an earlier course of this run; the next validation replaces it",
@@ -163,10 +165,10 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             load_optimizer(optimizer, state.get("optimizer", {}))
             with watched(collector):
                 mine = collector.state_dict()
-                collector.load_state_dict(checkpoint.fitting(state.get("collector"), mine, "collector"))
+                collector.load_state_dict(checkpoint.matching_state(state.get("collector"), mine, "collector"))
                 push_level(collector, curriculum.level)
             # Last: everything above may have drawn.
-            set_rng_state(checkpoint.fitting(state, rng_state(device), "random generator"), device)
+            set_rng_state(checkpoint.matching_state(state, rng_state(device), "random generator"), device)
         settings = OmegaConf.to_container(cfg, resolve=True)
         logger = build("logger", cfg.logger, folder=run_dir, frames=frames, settings=settings)
         stop, started, first_frames = StopRequest(), time.perf_counter(), frames
@@ -175,7 +177,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         cleanup.callback(logger.close)
         left = max(cfg.total_frames - frames, 0)
         log.info("%s frames to train, at tote height %d of %d", f"{left:,}", curriculum.level, curriculum.end)
-        cleanup.enter_context(saying_what_is_safe(lambda: safe, again))
+        cleanup.enter_context(checkpoint_hint(lambda: safe, again))
         cleanup.enter_context(watched(collector))
         batches = iter(collector)
         while frames < cfg.total_frames and not stop.requested:
@@ -235,8 +237,8 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             save("last")
 
     if stop.requested:  # a sweep ends here too, instead of going on to its next job
-        command = f"pickplace-train resume={shlex.quote(str(run_dir))}{again}"
-        log.info("stopped at %s frames; continue with: %s", f"{frames:,}", command)
+        resuming = f"pickplace-train resume={shlex.quote(str(run_dir))}{again}"
+        log.info("stopped at %s frames; continue with: %s", f"{frames:,}", resuming)
     elif curriculum.level < curriculum.end:
         log.info(
             "the tote grew to height %d of %d only, so the policy was trained on no higher one; "
@@ -285,7 +287,7 @@ def check_settings(cfg: DictConfig) -> None:
     for key in ("algo.mask_infeasible", "algo.normalize_advantage"):
         if not isinstance(value := OmegaConf.select(cfg, key), bool):
             raise ValueError(f"{key}={value}: expected true or false.")
-    if cfg.planner._target_ != "pickplace.planners.PolicyPlanner":
+    if cfg.planner._target_ != "policy":
         raise ValueError(
             f"planner._target_={cfg.planner._target_}: training validates its policy; expected planner=policy."
         )
@@ -309,22 +311,6 @@ def check_settings(cfg: DictConfig) -> None:
             "algo.normalize_advantage=True: a batch of one frame (env.num_envs x algo.rollout_length) has no variance; "
             "expected more frames, or false."
         )
-
-
-def loadable(cfg: DictConfig) -> tuple[dict, str]:
-    """The config as checkpoints hold it, and what has to be said to resume one, such as `` trust=[...]``; or nothing.
-
-    What could be saved but never be loaded is told now, not after hours.
-    """
-    content = saved_form(cfg)
-    own = trust_needed(OmegaConf.to_container(cfg, resolve=True))
-    try:
-        trusted(content, own)
-    except ValueError as error:
-        log.warning("checkpoints of this run will not be loaded again: %s", error)
-    said = {key: OmegaConf.select(cfg, key) for key in AT_HOME}
-    words = [f" {key}={value}" for key, value in said.items() if value not in AT_HOME[key]]
-    return content, "".join([f" trust=[{','.join(own)}]" if own else "", *words])
 
 
 def make_losses(algo: DictConfig, policy: Policy, critic: ValueOperator) -> tuple[GAE, A2CLoss | ClipPPOLoss]:
@@ -495,7 +481,7 @@ def resume_run(overrides: list[str]) -> float:
         log_file = run_dir / "train.log"
         handlers: list[logging.Handler] = [logging.StreamHandler(sys.stdout), logging.FileHandler(log_file)]
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
-        (run_dir / config.FAILURE).unlink(missing_ok=True)  # of the sweep that it was part of
+        (run_dir / FAILURE).unlink(missing_ok=True)  # of the sweep that it was part of
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
         return run(cfg, run_dir, (state, facts, folder))
 
@@ -504,12 +490,12 @@ def main() -> None:
     """Entry point of ``pickplace-train``."""
     overrides = [item for item in sys.argv[1:] if not item.startswith("-")]
     if any(item.startswith("resume=") and item not in ("resume=", "resume=null") for item in overrides):
-        with config.one_sentence():
+        with one_sentence():
             if len(overrides) < len(sys.argv) - 1:
                 raise ValueError("resume=...: expected only key=value overrides beside it, no flags such as -m.")
             resume_run(overrides)
     else:
-        config.command("train", train)
+        command("train", train)
 
 
 if __name__ == "__main__":
