@@ -14,7 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from test_resume import ITERATION, SETTINGS, assert_same
+from commands import ITERATION, SETTINGS, assert_same
 
 from pickplace.runs.loggers import read_csv
 from pickplace.training import train

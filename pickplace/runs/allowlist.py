@@ -94,9 +94,10 @@ def refuse_foreign_targets(node, trust: Collection[str] = (), place: str = "", i
     if isinstance(node, dict) and "_target_" in node:
         target = node["_target_"]
         is_own = _is_defined_by(target, trust)
-        allowed = [*names_at(place), *(qualified_names() if in_own else ())]
-        if not is_own and target not in allowed:
-            expected = f"one of {', '.join(allowed)}" if allowed else "none in this place"
+        names = names_at(place)
+        if not is_own and target not in [*names, *(qualified_names() if in_own else ())]:
+            expected = f"one of {', '.join(names)}" if names else "none in this place"
+            expected = "a name with its place, such as items/kinds" if in_own else expected
             raise refusal(f"{place}._target_", target, expected + _advice(_module(target), trust))
         in_own = in_own or is_own
     for key, value in children(node):

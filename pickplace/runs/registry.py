@@ -146,17 +146,18 @@ def find(place: str, target) -> Callable:
     raise ValueError(f"{place}._target_={target}: there is no such class or function{reason}; {hint}")
 
 
-def accepted_arguments(function: Callable) -> set[str] | None:
+def accepted_arguments(function: Callable) -> list[str] | None:
     """Return the keywords that a class or function takes, or None if it takes any.
 
     One with ``**keywords`` takes any, unless its attribute ``settings``, a tuple of names, says which ones they are.
     """
-    constructor = function.__init__ if inspect.isclass(function) else function  # a metaclass hides the arguments
-    try:
-        parameters = inspect.signature(constructor).parameters.values()
+    has_init = inspect.isclass(function) and function.__init__ is not object.__init__
+    try:  # of __init__ itself, since a metaclass may hide its arguments
+        parameters = inspect.signature(function.__init__ if has_init else function).parameters.values()
     except (TypeError, ValueError):  # a function written in C
         return None
-    names = {each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)}
+    named = [each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)]
+    names = [name for name in named if name != "self"]
     if all(each.kind != each.VAR_KEYWORD for each in parameters):
-        return names - {"self"}
-    return names - {"self"} | {*function.settings} if hasattr(function, "settings") else None
+        return names
+    return [*names, *function.settings] if hasattr(function, "settings") else None
