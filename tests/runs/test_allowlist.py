@@ -61,8 +61,8 @@ def mine(tmp_path, monkeypatch):
     "target",
     [
         "os.system", "pickplace.runs.checkpoint.shutil.rmtree", "builtins.eval", "pickplace", None, 5,
-        "pickplace.evaluation.export.export", "pickplace.runs.checkpoint.write", "${planner._target_}", ["os.system"], "",
-        "pickplace.task.items.Kinds", "joint_dbl", "items/kinds",
+        "pickplace.evaluation.export.export", "pickplace.runs.checkpoint.write", "${planner._target_}", ["os.system"],
+        "", "pickplace.task.items.Kinds", "joint_dbl", "items/kinds",
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("place", ["env", "model.actor", "curriculum.advance", "collector"])

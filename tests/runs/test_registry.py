@@ -1,5 +1,6 @@
 """Every class that a config file names is in the registry, and is made of that file's settings."""
 
+import itertools
 import re
 
 import pytest
@@ -25,35 +26,34 @@ def test_every_config_file_names_what_is_in_the_registry():
     used = set()
     for path in conf_dir().rglob("*.yaml"):
         group = path.parent.relative_to(conf_dir()).as_posix().replace("/", ".").removeprefix("experiment")
-        for part, node in [("", OmegaConf.load(path)), *OmegaConf.load(path).items()]:
-            target = node.get("_target_") if OmegaConf.is_dict(node) else None
+        content = OmegaConf.to_container(OmegaConf.load(path))
+        for part, node in [("", content), *content.items()]:
+            target = node.get("_target_") if isinstance(node, dict) else None
             if target:
                 place = ".".join(filter(None, (group, part)))
                 assert target in names_at(place), path
                 used.add((place, target))
     unused = {(place, name) for place, names in REGISTRY.items() for name in names} - used
     assert {place for place, _ in unused} <= {"warm_start.teacher"}  # which takes the files of planner
-    dotted = [
-        line for path in conf_dir().rglob("*.yaml") for line in re.findall("_target_: pickplace.*", path.read_text())
-    ]
-    assert len(dotted) == 3  # Hydra's callbacks
+    text = "".join(path.read_text() for path in conf_dir().rglob("*.yaml"))
+    assert len(re.findall("_target_: pickplace", text)) == 3  # Hydra's callbacks
 
 
 @pytest.mark.parametrize(
     ("place", "node", "words"),
     [
-        ("planner", {"_target_": "joint_dlb"}, "planner._target_=joint_dlb: there is no such .* did you mean 'joint_dbl'"),
-        ("planner", {"_target_": "greedy"}, "expected one of policy, lookahead, .* or the dotted path of a class of your"),
+        ("planner", {"_target_": "joint_dlb"}, "planner._target_=joint_dlb: .* did you mean 'joint_dbl'"),
+        ("planner", {"_target_": "greedy"}, "expected one of policy, lookahead, .* or the dotted path"),
         ("planner", {"_target_": "nowhere.Net"}, "No module named 'nowhere'"),
         ("planner", {"_target_": "os.nothing"}, "no attribute 'nothing'"),
         ("planner", {"_target_": None}, "planner._target_=None: there is no such"),
         ("planner", {"_target_": ["joint_dbl"]}, "there is no such"),
-        ("planner", {"_target_": "random", "sed": 1}, "planner.sed: there is no key 'sed' in planner; did you mean 'seed'"),
+        ("planner", {"_target_": "random", "sed": 1}, "planner.sed: there is no key .* did you mean 'seed'"),
         ("planner", {"_target_": "random", "seed": "one"}, "planner.seed='one': expected a whole number"),
         ("items", {"_target_": "kinds"}, "items._target_=kinds: .*missing 1 required positional argument: 'kinds'"),
-        ("curriculum", {"_target_": "curriculum", "advance": {"_target_": "frames", "foo": 1}}, "curriculum.advance.foo:"),
+        ("curriculum", {"_target_": "curriculum", "advance": {"_target_": "frames", "x": 1}}, "curriculum.advance.x: "),
         ("items", {"_target_": "test_registry.Wrapped", "base": {"_target_": "kinds"}}, "items.base._target_=kinds"),
-        ("items", {"_target_": "test_registry.open_settings", "b": 1}, "items.b: there is no key 'b'.*expected one of a"),
+        ("items", {"_target_": "test_registry.open_settings", "b": 1}, "items.b: there.*expected one of first, a"),
     ],
 )  # fmt: skip
 def test_a_wrong_name_or_setting_is_one_sentence(place, node, words):
@@ -86,10 +86,10 @@ def test_a_class_of_the_user_s_and_the_parts_within_it():
 
 
 def test_accepted_arguments():
-    assert accepted_arguments(Wrapped) == {"base", "factor"}
-    assert accepted_arguments(open_settings) == {"first", "a"}
+    assert accepted_arguments(Wrapped) == ["base", "factor"]
+    assert accepted_arguments(open_settings) == ["first", "a"]
     assert accepted_arguments(lambda **settings: None) is None
-    assert accepted_arguments(type("Plain", (), {})) == set()
+    assert accepted_arguments(type("Plain", (), {})) == []
     assert "rotations" in accepted_arguments(PickPlaceEnv)
 
 
@@ -120,15 +120,16 @@ def test_every_model(name):
 @pytest.mark.parametrize("name", options("curriculum"))
 def test_every_curriculum_and_every_exchange_of_its_parts(name):
     assert isinstance(build("curriculum", composed(f"curriculum={name}").curriculum), Curriculum)
-    for part in ("advance", "sample"):
-        for choice in options(f"curriculum/{part}"):
-            cfg = composed(f"curriculum={name}", f"curriculum/{part}={choice}")
-            build("curriculum", cfg.curriculum).setup(1, 5, 10**9)
+    for advance, sample in zip(
+        options("curriculum/advance"), itertools.cycle(options("curriculum/sample")), strict=False
+    ):
+        cfg = composed(f"curriculum={name}", f"curriculum/advance={advance}", f"curriculum/sample={sample}")
+        build("curriculum", cfg.curriculum).setup(1, 5, 10**9)
 
 
 @pytest.mark.parametrize("name", options("planner"))
 def test_every_planner(name):
-    env = PickPlaceEnv(num_envs=3)
+    env = PickPlaceEnv(num_envs=3, tote_size=(6, 6, 2))
     quick = {"mcts": ["planner.simulations=20"], "lookahead": ["planner.samples=2", "planner.rounds=1"]}
     cfg, kwargs = composed(f"planner={name}", *quick.get(name, []), name="evaluate"), {}
     if name in ("mcts", "lookahead"):
