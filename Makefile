@@ -43,7 +43,7 @@ test: $(STAMP)  ## run the test suite (minutes), in as many processes as there a
 test-extras: export OMP_NUM_THREADS ?= 1
 test-extras: $(STAMP)  ## install every optional extra (a gigabyte), and run the tests that need them
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,wandb,mlflow,optuna,joblib,submitit,ray]'
-	$(BIN)/python -m pytest -q tests/test_scale.py $(ARGS)
+	$(BIN)/python -m pytest -q tests/runs/test_loggers.py tests/training/test_sweep.py tests/training/test_ray.py $(ARGS)
 
 test-slow: export OMP_NUM_THREADS ?= 2
 test-slow: $(STAMP)  ## run the long checks (an hour)

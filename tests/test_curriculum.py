@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
@@ -17,6 +16,7 @@ from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from pickplace import PickPlaceEnv
+from pickplace.runs.registry import build
 from pickplace.training.curriculum import (
     Advance,
     Current,
@@ -601,7 +601,7 @@ def test_push_level_reaches_every_process(kind):
 def load(*overrides):
     """The curriculum that these overrides compose."""
     with initialize_config_dir(str(CONF), version_base=None):
-        return instantiate(compose(overrides=[f"+{overrides[0]}", *overrides[1:]]).curriculum)
+        return build("curriculum", compose(overrides=[f"+{overrides[0]}", *overrides[1:]]).curriculum)
 
 
 def test_there_are_the_promised_compositions():
@@ -675,14 +675,14 @@ def test_a_users_curriculum_is_one_file(tmp_path):
     (tmp_path / "curriculum").mkdir()
     (tmp_path / "curriculum" / "mine.yaml").write_text(
         "defaults: [{advance: plateau}, {sample: uniform}, _self_]\n"
-        "_target_: pickplace.training.curriculum.Curriculum\n"
+        "_target_: curriculum\n"
         "start_height: 2\n"
         "advance: {patience: 7}\n"
     )
     with initialize_config_dir(str(CONF), version_base=None):
         overrides = [f"hydra.searchpath=[file://{tmp_path}]", "+curriculum=mine"]
         config = compose(overrides=overrides, return_hydra_config=False)
-    curriculum = instantiate(config.curriculum)
+    curriculum = build("curriculum", config.curriculum)
     curriculum.setup(1, 5, 100)
     assert (curriculum.level, curriculum.advance.patience) == (2, 7)
     assert isinstance(curriculum.sample, Uniform)

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 import torch
-from test_resume import assert_same
+from commands import assert_same
 
 from pickplace import Planner
 from pickplace.evaluation import evaluate

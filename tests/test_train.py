@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from test_config import composed
-from test_faults import slots
+from commands import composed
 from torch import nn
 from torchrl.collectors import RandomPolicy
 from torchrl.modules import ValueOperator
@@ -163,6 +162,10 @@ def test_the_slots_of_all_workers_share_the_episodes_of_a_stream():
             env.reset()
             played += env.base_env.episode.tolist()
     assert sorted(played) == list(range(12))
+
+
+def slots(first, count):
+    return TransformedEnv(PickPlaceEnv(num_envs=count, first_episode=first))
 
 
 def test_each_worker_has_slots_of_its_own():

@@ -10,8 +10,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from pickplace import PickPlaceEnv
 from pickplace.planners import JointDBL, RandomFeasible
 from pickplace.policies import actors
+from pickplace.runs.provenance import imitated_planner
 from pickplace.task import items
-from pickplace.training.imitation import Phase, WarmStart, imitation_loss, taught_by
+from pickplace.training.imitation import Phase, WarmStart, imitation_loss
 
 MODELS = {
     "outcome": lambda rules: actors.fcn_grasp(rules, mask_infeasible=True, filters=8, hidden=8),
@@ -23,9 +24,9 @@ MODELS = {
 }
 
 
-def config(teacher="JointDBL", frames=100, critic_frames=50, checkpoint=None, **teacher_settings):
+def config(teacher="joint_dbl", frames=100, critic_frames=50, checkpoint=None, **teacher_settings):
     """A config of the group warm_start."""
-    teacher = teacher and {"_target_": f"pickplace.planners.{teacher}", **teacher_settings}
+    teacher = teacher and {"_target_": teacher, **teacher_settings}
     return OmegaConf.create(
         {"teacher": teacher, "checkpoint": checkpoint, "frames": frames, "critic_frames": critic_frames}
     )
@@ -93,7 +94,7 @@ def test_what_is_taught_can_be_done_and_is_what_the_teacher_does(model):
 
 def test_a_teacher_that_fails_teaches_nothing():
     env, td = random_states(64, 1)
-    taught = WarmStart(config("UniformRandom", seed=0), MODELS["flat"](env.rules), env.rules, env.items, 0).ask(td, 0)
+    taught = WarmStart(config("uniform", seed=0), MODELS["flat"](env.rules), env.rules, env.items, 0).ask(td, 0)
     assert (taught >= 0).sum() < 16  # few of all actions are feasible
     chosen = td["action_mask"].gather(1, taught.clamp(min=0)[:, None])[:, 0]
     assert torch.equal(chosen & (taught >= 0), taught >= 0)
@@ -101,7 +102,7 @@ def test_a_teacher_that_fails_teaches_nothing():
 
 def test_a_teacher_that_draws_begins_anew_with_each_iteration():
     env, td = random_states(32, 2)
-    start = WarmStart(config("RandomFeasible", seed=0), MODELS["flat"](env.rules), env.rules, env.items, 7)
+    start = WarmStart(config("random", seed=0), MODELS["flat"](env.rules), env.rules, env.items, 7)
     assert torch.equal(start.ask(td, 3), start.ask(td, 3))
     assert not torch.equal(start.ask(td, 3), start.ask(td, 4))
 
@@ -145,7 +146,7 @@ def test_phases_follow_each_other():
 
 def test_a_trained_policy_teaches():
     env, td = random_states(32, 5)
-    cfg = config("PolicyPlanner", checkpoint="pretrained/r4", candidates="all")
+    cfg = config("policy", checkpoint="pretrained/r4", candidates="all")
     start = WarmStart(cfg, MODELS["grasp"](env.rules), env.rules, env.items, 0)
     assert (start.ask(td, 0) >= 0).all()
 
@@ -156,8 +157,8 @@ def test_a_trained_policy_teaches():
         (config(frames=-1), "warm_start.frames=-1: expected a whole number >= 0"),
         (config(critic_frames=1.5), "warm_start.critic_frames=1.5: expected a whole number >= 0"),
         (config(None), "warm_start.frames=100: nobody to imitate"),
-        (config("PolicyPlanner", candidates="all"), "warm_start.checkpoint=null: planner=policy needs a checkpoint"),
-        (config("PolicyPlanner", checkpoint="nowhere", candidates="all"), "nowhere"),
+        (config("policy", candidates="all"), "warm_start.checkpoint=null: planner=policy needs a checkpoint"),
+        (config("policy", checkpoint="nowhere", candidates="all"), "nowhere"),
     ],
 )
 def test_bad_settings_are_refused(cfg, message):
@@ -167,6 +168,6 @@ def test_bad_settings_are_refused(cfg, message):
 
 
 def test_results_say_who_taught():
-    assert taught_by({"warm_start": OmegaConf.to_container(config())}) == "JointDBL"
-    assert taught_by({"warm_start": OmegaConf.to_container(config(None, 0, 0))}) is None
-    assert taught_by({}) is None  # a run of before there were warm starts
+    assert imitated_planner({"warm_start": OmegaConf.to_container(config())}) == "joint_dbl"
+    assert imitated_planner({"warm_start": OmegaConf.to_container(config(None, 0, 0))}) is None
+    assert imitated_planner({}) is None  # a run of before there were warm starts

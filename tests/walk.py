@@ -181,7 +181,7 @@ def contributor(walk: Walk) -> None:
     walk.run("git add --all")
     walk.run("git -c user.name=New -c user.email=new@example.org commit --quiet -m 'Planner corner'", "the hooks")
     walk.run("make lint")
-    walk.run("make test ARGS='tests/test_config.py tests/test_docs.py -k \"corner or reference or comment\"'")
+    walk.run("make test ARGS='tests/runs/test_registry.py tests/test_docs.py -k \"corner or reference or comment\"'")
     walk.run("pickplace-evaluate planner=corner " + SMALL["pickplace-evaluate"])
 
 
