@@ -7,6 +7,7 @@ of the choice.
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -33,7 +34,7 @@ from pickplace.task.state import State
 MASKED = -1e38
 
 #: An observation ``[N]``: a TensorDict, or a dict of its entries.
-Observation = TensorDictBase | Mapping[str, Tensor]
+Observation: TypeAlias = TensorDictBase | Mapping[str, Tensor]
 
 
 class Policy(TensorDictModuleBase, ABC):

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from enum import Enum
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -74,7 +75,7 @@ class WarmStart:
         if cfg.checkpoint is not None:
             state, facts = checkpoint.read(checkpoint.locate(str(cfg.checkpoint)))
             trained_cfg = trusted_config(facts["config"], trust)
-            trained = (trained_cfg, state, OmegaConf.to_container(trained_cfg.env, resolve=True))
+            trained = (trained_cfg, state, cast(dict, OmegaConf.to_container(trained_cfg.env, resolve=True)))
         try:
             return planner_parts(cfg.teacher, self.cell, items, terms, trained)
         except ValueError as error:
