@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from hypothesis import strategies as st
 from oracle import SUCCESS, Oracle, Rules, cells
+from torchrl.envs.utils import step_mdp
 
 from pickplace import CellSpec, Item, PickPlaceEnv, State
 from pickplace.planners.heuristics import RandomFeasible
@@ -118,3 +119,14 @@ def footprint_by_hand(cell: CellSpec, item, found) -> int:
     """Return the footprint index of an entry of :func:`results_by_hand`; ``item`` is ``(x, y, w, d, h)``."""
     _, y, x, w, d = found
     return (((w, d) != tuple(item[2:4])) * cell.tote_size[0] + x) * cell.tote_size[1] + y
+
+
+@torch.no_grad()
+def occupancies(planner, env: PickPlaceEnv) -> torch.Tensor:
+    """Return the occupancy that a planner reaches in one episode of each slot, float64 ``[N]``."""
+    observation, running = env.reset(), torch.ones(env.num_envs, dtype=torch.bool)
+    while running.any():  # what has ended fails again and again, which changes nothing
+        after = env.step(observation.set("action", planner.decide(observation)))["next"]
+        running &= ~after["done"][:, 0]
+        observation = step_mdp(observation)
+    return env.exact_occupancy
