@@ -124,9 +124,13 @@ def footprint_by_hand(cell: CellSpec, item, found) -> int:
 @torch.no_grad()
 def occupancies(planner, env: PickPlaceEnv) -> torch.Tensor:
     """Return the occupancy that a planner reaches in one episode of each slot, float64 ``[N]``."""
-    observation, running = env.reset(), torch.ones(env.num_envs, dtype=torch.bool)
-    while running.any():  # what has ended fails again and again, which changes nothing
-        after = env.step(observation.set("action", planner.decide(observation)))["next"]
-        running &= ~after["done"][:, 0]
+    observation, reached = env.reset(), torch.zeros(env.num_envs, dtype=torch.float64)
+    running = torch.arange(env.num_envs)
+    while len(running):  # what has ended plays on, uncounted
+        action = torch.zeros(env.num_envs, dtype=torch.int64)
+        action[running] = planner.decide(observation[running])
+        after = env.step(observation.set("action", action))["next"]
+        reached[running] = env.exact_occupancy[running]
+        running = running[~after["done"][running, 0]]
         observation = step_mdp(observation)
-    return env.exact_occupancy
+    return reached
