@@ -1,4 +1,4 @@
-"""What lets the same files read well on a code host and as a site: pages from the top level, and links out of docs/."""
+"""Hooks of mkdocs, so that the same files serve a code host and the site: top-level pages, and links out of docs/."""
 
 import os
 import re
@@ -9,13 +9,13 @@ from mkdocs.structure.files import File
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {"README.md": "overview.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
-STYLE = ".md-typeset td code {word-break: normal}\n"  # keys are not broken in two
-FETCHED = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
+STYLE = ".md-typeset td code {word-break: normal}\n"  # keep keys on one line
+REMOTE_ASSET = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
 
 
 def on_files(files, config):
-    """Add the pages that lie beside docs/."""
+    """Add the top-level pages and the style sheet."""
     for source, name in PAGES.items():
         files.append(File.generated(config, name, abs_src_path=str(ROOT / source)))
     files.append(File.generated(config, "site.css", content=STYLE))
@@ -23,7 +23,7 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Point links at the site's pages; what is no part of the site keeps its words and loses its link."""
+    """Point links at pages of the site; links to other files become plain text."""
     place = {name: source for source, name in PAGES.items()}.get(page.file.src_uri)
     folder = ROOT if place else ROOT / "docs" / Path(page.file.src_uri).parent
 
@@ -34,23 +34,23 @@ def on_page_markdown(markdown, page, config, files):
         path, _, anchor = target.partition("#")
         file = Path(os.path.normpath(folder / path))
         if not file.exists():
-            return match[0]  # mkdocs complains
+            return match[0]  # mkdocs reports it
         inside = os.path.relpath(file, ROOT / "docs")
         name = PAGES.get(os.path.relpath(file, ROOT), inside)
         if files.get_file_from_path(name) is None:
             return words
         return f"{image}[{words}]({os.path.relpath(name, Path(page.file.src_uri).parent)}{'#' * bool(anchor)}{anchor})"
 
-    parts = re.split(r"(^```.*?^```$)", markdown, flags=re.MULTILINE | re.DOTALL)  # code stays as it is
+    parts = re.split(r"(^```.*?^```$)", markdown, flags=re.MULTILINE | re.DOTALL)  # do not change code
     return "".join(part if part.startswith("```") else LINK.sub(point, part) for part in parts)
 
 
 def on_page_content(html, **kwargs):
-    """Docstrings name things as ``:class:`Name```."""
+    """Show the ``:class:`Name``` of docstrings as code."""
     return re.sub(r":(?:class|func|meth|mod|attr):<code>~?([\w.]+)</code>", r"<code>\1</code>", html)
 
 
 def on_post_page(output, page, config):
-    """A reader without the internet sees the same."""
-    if found := FETCHED.search(output):
-        raise PluginError(f"{page.file.src_uri}: expected nothing from elsewhere, got {found[0]}")
+    """Refuse pages that load anything from another host."""
+    if found := REMOTE_ASSET.search(output):
+        raise PluginError(f"{page.file.src_uri}: expected no asset of another host, got {found[0]}")

@@ -1,7 +1,7 @@
-"""What TorchRL's collector adds to a vector step, on one core: python benchmarks/collector.py
+"""Time that TorchRL's collector adds to a vector step, on one core: python benchmarks/collector.py
 
-The same environment and the same random choice among feasible actions, once in a raw loop and once through the
-collector of ``collector=single``, turn by turn. The collector also keeps every frame, mask included, for the learner.
+The same environment and the same random choice among feasible actions run once in a plain loop and once through the
+collector of ``collector=single``, in turn. The collector also keeps every frame with its mask for the learner.
 """
 
 import time
@@ -11,41 +11,42 @@ from common import save, spread, use_one_core
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
 
-from pickplace import PickPlaceEnv
+from pickplace import PickPlaceEnv, State
+from pickplace.task.feasibility import actions_reaching, placing_maps
 from pickplace.training.collectors import single
 from pickplace.training.curriculum import Current, Curriculum, NoAdvance
 
 BATCHES = (256, 1024)
-MASKS = (("action",), ("outcome",))
 STEPS, REPEATS = 16, 20
 
 
 def choose(mask: torch.Tensor) -> torch.Tensor:
-    """One feasible entry of each row: the highest of as many random bytes as there are entries, masked."""
+    """Return a feasible entry of each row: the highest of as many random bytes as there are entries, masked."""
     draw = torch.randint(1, 256, mask.shape, dtype=torch.uint8)
     return (draw * mask).argmax(1)
 
 
-def measure(batch: int, masks: tuple[str, ...]) -> dict:
-    """Milliseconds a vector step of both loops."""
+def measure(batch: int, mask: str) -> dict:
+    """Return the times of a vector step in both loops, with the ``action`` or the ``footprint`` mask."""
     curriculum = Curriculum(NoAdvance(), Current())
 
     def make(first_episode: int = 0, num_envs: int = batch) -> TransformedEnv:
-        env = PickPlaceEnv(num_envs=num_envs, masks=masks, first_episode=first_episode)
-        curriculum.setup(env.min_tote_height, env.rules.tote_size[2], 1)
+        env = PickPlaceEnv(num_envs=num_envs, masks=(mask,), first_episode=first_episode)
+        curriculum.setup(env.min_tote_height, env.cell.tote_size[2], 1)
         return TransformedEnv(env, Compose(curriculum.transform()))
 
     env = make()
-    reach = env.base_env.rules.actions_reaching
+    cell = env.base_env.cell
+    keys = [f"{mask}_mask", "bin_depth", "tote_depth", "tote_height"]
 
-    def act(mask, bin_depth, tote_depth, tote_height):
-        choice = choose(mask)
-        if masks == ("action",):
+    def act(*values):
+        observation = dict(zip(keys, values, strict=True))
+        choice = choose(observation[f"{mask}_mask"])
+        if mask == "action":
             return choice
-        rules = env.base_env.rules
-        return reach(rules.placements_from_depth(bin_depth, tote_depth, tote_height), choice).amax(1)
+        maps = placing_maps(cell, State.from_observation(observation))
+        return actions_reaching(cell, maps, choice).amax(1)
 
-    keys = [f"{masks[0]}_mask", "bin_depth", "tote_depth", "tote_height"]
     policy = TensorDictModule(act, in_keys=keys, out_keys=["action"])
     collector = single(make, policy, batch, STEPS, seed=0)
     batches, state = iter(collector), env.reset()
@@ -54,11 +55,11 @@ def measure(batch: int, masks: tuple[str, ...]) -> dict:
         start = time.perf_counter()
         for _ in range(STEPS):
             _, state = env.step_and_maybe_reset(policy(state))
-        raw = time.perf_counter()
+        middle = time.perf_counter()
         next(batches)
         end = time.perf_counter()
-        for name, passed in (("raw loop", raw - start), ("collector", end - raw)):
-            times[name].append(passed / STEPS * 1e3)
+        times["raw loop"].append((middle - start) / STEPS * 1e3)
+        times["collector"].append((end - middle) / STEPS * 1e3)
     collector.shutdown()
     row = {name: spread(values[2:]) for name, values in times.items()}
     row["added ms"] = row["collector"]["ms"] - row["raw loop"]["ms"]
@@ -68,8 +69,8 @@ def measure(batch: int, masks: tuple[str, ...]) -> dict:
 def main() -> None:
     use_one_core()
     torch.manual_seed(0)
-    rows = {f"{batch}, {masks[0]} mask": measure(batch, masks) for masks in MASKS for batch in BATCHES}
-    save("collector", {"rows": rows})
+    masks = ("action", "footprint")
+    save("collector", {"rows": {f"{batch}, {mask} mask": measure(batch, mask) for mask in masks for batch in BATCHES}})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What the benchmarks share: one core, interleaved timing, medians and spread, and where the figures go."""
+"""Shared by the benchmarks: one core, interleaved timing, medians with percentiles, and where results are written."""
 
 import json
 import os
@@ -8,6 +8,8 @@ import sys
 import time
 from pathlib import Path
 
+import torch
+
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -15,18 +17,21 @@ def use_one_core() -> None:
     """Pin this process to one core and torch to one thread, so that every library has the same machine."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    import torch
-
     torch.set_num_threads(1)
 
 
+def console_command(name: str) -> str:
+    """Return the path of a command that this environment's packages install, such as ``pickplace-train``."""
+    return str(Path(sys.executable).with_name(name))
+
+
 def interleave(functions: dict, repeats: int, warmup: int = 2) -> dict[str, dict[str, float]]:
-    """Time functions in turn, so that a noisy moment hits all of them alike.
+    """Time functions in turn, so that a noisy moment affects all of them.
 
     Args:
         functions: name -> function without arguments, which returns when its work is done.
-        repeats: how often each is timed.
-        warmup: untimed calls before.
+        repeats: number of timed calls of each.
+        warmup: number of untimed calls before.
 
     Returns:
         name -> ``{"ms": median, "low": 10th percentile, "high": 90th percentile, "repeats": n}``.
@@ -44,28 +49,22 @@ def interleave(functions: dict, repeats: int, warmup: int = 2) -> dict[str, dict
 
 
 def spread(values: list[float]) -> dict[str, float]:
-    """Median and the 10th and 90th percentile of times in milliseconds."""
+    """Return the median and the 10th and 90th percentile of times in milliseconds."""
     ordered = sorted(values)
-    pick = [ordered[round(share * (len(ordered) - 1))] for share in (0.1, 0.9)]
-    return {"ms": statistics.median(ordered), "low": pick[0], "high": pick[1], "repeats": len(ordered)}
+    low, high = (ordered[round(share * (len(ordered) - 1))] for share in (0.1, 0.9))
+    return {"ms": statistics.median(ordered), "low": low, "high": high, "repeats": len(ordered)}
 
 
 def machine() -> dict:
-    """What the figures were measured on."""
-    import torch
-
-    model = platform.processor() or platform.machine()
+    """Return the processor, its threads and the versions of a measurement."""
     info = Path("/proc/cpuinfo")
-    if info.is_file():
-        model = next(
-            (line.split(":")[1].strip() for line in info.read_text().splitlines() if "model name" in line), model
-        )
-    bf16 = torch.backends.cpu.get_cpu_capability() if hasattr(torch.backends.cpu, "get_cpu_capability") else "unknown"
+    lines = info.read_text().splitlines() if info.is_file() else []
+    models = [line.split(":")[1].strip() for line in lines if "model name" in line]
     return {
-        "cpu": model,
+        "cpu": models[0] if models else platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
-        "capability": bf16,
+        "capability": torch.backends.cpu.get_cpu_capability(),
         "torch": torch.__version__,
         "python": platform.python_version(),
     }

@@ -1,9 +1,9 @@
-"""The paper's network: forward (and backward) of `fcn4d` against a naive 4D convolution, on one core.
+"""Forward and backward time of the paper's network, ``fcn4d``, against a naive 4D convolution, on one core.
 
 python benchmarks/conv4d.py
 
-Naive: the bin's and the tote's map broadcast to a 4D input of two channels, and each 4D convolution as a sum of
-``conv3d`` over the taps of its first axis, in fp32. Every variant gives the same logits (checked here, and in the
+The naive version broadcasts both maps to a 4D input of two channels and computes each 4D convolution as a sum of
+``conv3d`` over the taps of its first axis, in float32. Every variant gives the same logits (checked here and in the
 tests).
 """
 
@@ -13,15 +13,15 @@ import torch
 import torch.nn.functional as F
 from common import interleave, save, use_one_core
 
-from pickplace import PickPlaceEnv, Rules
-from pickplace.policies.actors import FlatPolicy
+from pickplace import CellSpec, PickPlaceEnv
+from pickplace.policies.fcn4d import ActionPolicy
 from pickplace.policies.networks.depth import clip_depth, pad_depth
 
 CASES = {"5x5 bin, 6x6 tote, batch 64": ((6, 6, 5), 64, 5), "5x5 bin, 30x30 tote, batch 1": ((30, 30, 5), 1, 5)}
 
 
 def conv4d(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
-    """A 4D convolution without padding: ``[N, C, A, B, X, Y]`` with ``[O, C, k, k, k, k]``."""
+    """Return a 4D convolution without padding, of ``[N, C, A, B, X, Y]`` with ``[O, C, k, k, k, k]``."""
     kernel, rows = weight.shape[2], x.shape[2] - weight.shape[2] + 1
     planes = []
     for row in range(rows):
@@ -31,7 +31,7 @@ def conv4d(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor) -> torch.T
 
 
 def naive(network, bin_depth: torch.Tensor, tote_depth: torch.Tensor) -> torch.Tensor:
-    """All logits ``[N, P * places * 4]``, as the paper writes the network down."""
+    """Return all logits ``[N, P * places * 4]``, computed as the paper describes the network."""
     bins = pad_depth(clip_depth(bin_depth, network.bin_clip), 2, -1.0)
     totes = pad_depth(clip_depth(tote_depth, network.tote_clip), 2, 0.0)
     size = (len(bins), *bins.shape[1:], *totes.shape[1:])
@@ -42,34 +42,30 @@ def naive(network, bin_depth: torch.Tensor, tote_depth: torch.Tensor) -> torch.T
 
 
 def matrix_product(dtype: torch.dtype, size: int = 2048):
-    """A large square matrix product, the yardstick for what this machine can do, and its arithmetic operations."""
+    """Return a large square matrix product, the reference for this machine's speed, and its arithmetic operations."""
     a, b = (torch.randn(size, size).to(dtype) for _ in range(2))
     return lambda: a @ b, 2 * size**3
 
 
-def operations(rules: Rules, filters: int, picks: float) -> float:
-    """Arithmetic operations of one state's logits, the broadcast first layer left out: the second layer and the head.
+def operations(cell: CellSpec, filters: int, picks: float) -> float:
+    """Return the arithmetic operations of one state's logits in the second layer and the head.
 
     Args:
-        picks: how many pick cells are computed.
+        picks: number of pick cells that are computed.
     """
-    return 2 * picks * rules.num_places * filters * (filters * 3**4 + 4)
+    return 2 * picks * cell.num_places * filters * (filters * 3**4 + 4)
 
 
 def states(tote_size, batch: int):
-    """Observations from the middle of episodes of random feasible actions."""
+    """Return a cell and observations from the middle of episodes of random feasible actions."""
     env = PickPlaceEnv(tote_size=tote_size, num_envs=batch)
     state = env.rollout(12, break_when_any_done=False)[:, -1]["next"]
-    return env.rules, state["bin_depth"], state["tote_depth"], state["action_mask"]
+    return env.cell, state
 
 
-def peak(policies: dict, bins, totes, mask) -> dict[str, float]:
-    """MiB held at the worst moment of one forward pass, beyond the inputs and weights."""
+def peak_memory(calls: dict) -> dict[str, float]:
+    """Return the peak MiB of one forward pass of each call, beyond the inputs and weights."""
     found = {}
-    calls = {"naive": lambda: naive(policies["float32"].network, bins, totes)}
-    for dtype, policy in policies.items():
-        calls[f"all actions, {dtype}"] = partial(policy, bins, totes)
-        calls[f"masked, {dtype}"] = partial(policy, bins, totes, mask)
     for name, call in calls.items():
         with torch.no_grad(), torch.profiler.profile(profile_memory=True) as profile:
             call()
@@ -83,15 +79,16 @@ def peak(policies: dict, bins, totes, mask) -> dict[str, float]:
 
 
 def measure(tote_size, batch: int, repeats: int) -> dict:
-    """Times and memory of one case."""
-    rules, bins, totes, mask = states(tote_size, batch)
-    policies = {dtype: FlatPolicy(rules, True, compute_dtype=dtype) for dtype in ("float32", "bfloat16")}
+    """Return the times and the memory of one case."""
+    cell, state = states(tote_size, batch)
+    mask = state["action_mask"]
+    policies = {dtype: ActionPolicy(cell, True, compute_dtype=dtype) for dtype in ("float32", "bfloat16")}
     policies["bfloat16"].load_state_dict(policies["float32"].state_dict())
     network = policies["float32"].network
-    forward = {"naive": lambda: naive(network, bins, totes)}
+    calls = {"naive": partial(naive, network, state["bin_depth"], state["tote_depth"])}
     for dtype, policy in policies.items():
-        forward[f"all actions, {dtype}"] = partial(policy, bins, totes)
-        forward[f"masked, {dtype}"] = partial(policy, bins, totes, mask)
+        calls[f"all actions, {dtype}"] = partial(policy.scores, state)
+        calls[f"masked, {dtype}"] = partial(policy.scores, state, mask)
 
     def learn(call):
         for policy in policies.values():
@@ -99,24 +96,24 @@ def measure(tote_size, batch: int, repeats: int) -> dict:
         call().logsumexp(1).sum().backward()
 
     products = {dtype: matrix_product(getattr(torch, dtype)) for dtype in policies}
-    forward |= {f"matrix product, {dtype}": call for dtype, (call, _) in products.items()}
+    products_by_name = {f"matrix product, {dtype}": call for dtype, (call, _) in products.items()}
     with torch.no_grad():
-        assert torch.allclose(forward["naive"](), forward["all actions, float32"](), atol=1e-4)
-        row = {"forward": interleave(forward, repeats, warmup=1)}
-    both = {name: partial(learn, call) for name, call in forward.items() if not name.startswith(("all", "matrix"))}
+        assert torch.allclose(calls["naive"](), calls["all actions, float32"](), atol=1e-4)
+        row = {"forward": interleave(calls | products_by_name, repeats, warmup=1)}
+    both = {name: partial(learn, call) for name, call in calls.items() if not name.startswith("all")}
     row["forward and backward"] = interleave(both, repeats, warmup=1)
-    for part in ("forward", "forward and backward"):
-        for figures in row[part].values():
-            figures["ratio"] = row[part]["naive"]["ms"] / figures["ms"]
-    picks = float(mask.unflatten(1, (rules.num_picks, -1)).any(2).sum(1).double().mean())
+    for times in list(row.values()):
+        for figures in times.values():
+            figures["ratio"] = times["naive"]["ms"] / figures["ms"]
+    picks = float(mask.unflatten(1, (cell.num_picks, -1)).any(2).sum(1).double().mean())
     for dtype, (_, work) in products.items():
         reference = work / row["forward"].pop(f"matrix product, {dtype}")["ms"]  # operations a millisecond
         row[f"GFLOPS of a matrix product, {dtype}"] = reference / 1e6
-        for name, count in (("all actions", rules.num_picks), ("masked", picks)):
+        for name, count in (("all actions", cell.num_picks), ("masked", picks)):
             figures = row["forward"][f"{name}, {dtype}"]
-            done = batch * operations(rules, network.filters, count) / figures["ms"]
+            done = batch * operations(cell, network.filters, count) / figures["ms"]
             figures["share of matrix product"] = done / reference
-    row["peak MiB, forward"] = peak(policies, bins, totes, mask)
+    row["peak MiB, forward"] = peak_memory(calls)
     row["pick cells that allow something"] = round(picks, 2)
     return row
 

@@ -1,30 +1,35 @@
-"""Time of one decision, mask and candidates included, on one core: python benchmarks/decision.py
+"""Time of one decision, feasibility and candidates included, on one core: python benchmarks/decision.py
 
 Batch 1, ``R=4``, states from the middle of episodes; networks as in the configs, with fresh weights.
 """
+
+from functools import partial
 
 import torch
 from common import interleave, save, use_one_core
 
 from pickplace import PickPlaceEnv
-from pickplace.planners import PolicyPlanner
-from pickplace.policies.actors import fcn4d, fcn_grasp
+from pickplace.planners.policy import PolicyPlanner
+from pickplace.policies.fcn4d import ActionPolicy
+from pickplace.policies.fcn_grasp import FootprintPolicy
 
 TOTES = ((6, 6, 5), (10, 10, 10), (30, 30, 10))
-POLICIES = {"fcn_grasp": (fcn_grasp, {}), "fcn4d": (fcn4d, {"compute_dtype": "bfloat16"})}
+POLICIES = {
+    "fcn_grasp": FootprintPolicy,
+    "fcn4d": partial(ActionPolicy, mask_infeasible=True, compute_dtype="bfloat16"),
+}
 CANDIDATES = (10, "all")
 
 
 def deciders(tote_size) -> dict:
-    """Each policy and number of candidates, as a function that decides once."""
+    """Return a function that decides once, for each policy and number of candidates."""
     env = PickPlaceEnv(tote_size=tote_size, num_envs=1)
     state = env.rollout(tote_size[0] ** 2 // 2, break_when_any_done=False)[:, -1]["next"]
     calls = {}
-    for name, (make, network) in POLICIES.items():
-        policy = make(env.rules, True, **network).eval()
+    for name, make in POLICIES.items():
+        policy = make(env.cell).eval()
         for candidates in CANDIDATES:
-            planner = PolicyPlanner(env.rules, policy, candidates)
-            calls[f"{name}, K={candidates}"] = lambda planner=planner: planner.decide(state)
+            calls[f"{name}, K={candidates}"] = partial(PolicyPlanner(env.cell, policy, candidates).decide, state)
     return calls
 
 
@@ -35,7 +40,7 @@ def main() -> None:
     flat = {(tote, name): call for tote, each in calls.items() for name, call in each.items()}
     times = interleave(flat, repeats=40)
     rows = {name: {tote: times[tote, name] for tote in calls} for name in next(iter(calls.values()))}
-    first, last = ("x".join(map(str, tote)) for tote in (TOTES[0], TOTES[-1]))
+    first, *_, last = calls
     for row in rows.values():
         row["growth"] = row[last]["ms"] / row[first]["ms"]
     area = TOTES[-1][0] * TOTES[-1][1] / (TOTES[0][0] * TOTES[0][1])

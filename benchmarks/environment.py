@@ -2,9 +2,9 @@
 
 python benchmarks/environment.py    (the peer: pip install jumanji; without it, it is skipped)
 
-Both environments are natively batched, step random feasible actions and reset by themselves; choosing the actions is
-not timed. Jumanji's task is another one (items of any size are placed in empty maximal spaces, no end effector), so the
-ratio says how far our environment is from what the field is used to, not which packs better.
+Both environments are natively batched, take random feasible actions and reset by themselves; choosing the actions is
+not timed. Jumanji's task differs (items of any size go into empty maximal spaces, and there is no end effector), so the
+ratio compares the cost of a step, not the quality of a packing.
 """
 
 import os
@@ -18,18 +18,18 @@ import torch  # noqa: E402
 from common import save, spread, use_one_core  # noqa: E402
 
 from pickplace import PickPlaceEnv  # noqa: E402
-from pickplace.planners import RandomFeasible  # noqa: E402
+from pickplace.planners.heuristics import RandomFeasible  # noqa: E402
 
 BATCHES = (64, 256, 1024)
 STEPS = 100
 
 
 class Ours:
-    """`PickPlaceEnv` through ``step_and_maybe_reset``."""
+    """``PickPlaceEnv`` through ``step_and_maybe_reset``."""
 
     def __init__(self, batch: int):
         self.env = PickPlaceEnv(num_envs=batch)
-        self.planner = RandomFeasible(self.env.rules)
+        self.planner = RandomFeasible(self.env.cell)
         self.state = self.env.reset()
 
     def time_step(self) -> float:

@@ -1,13 +1,13 @@
-"""Wall-clock until a policy packs well at 6x6x5, R=4: ours against sb3-contrib's MaskablePPO.
+"""Wall-clock time until a policy packs well at 6x6x5, R=4: ours against sb3-contrib's MaskablePPO.
 
 python benchmarks/learning.py [seeds ...]    (the peer: pip install sb3-contrib; without it, it is skipped)
 
-Ours: ``experiment=quick`` as a user starts it, one seed after the other on all cores. The clock starts with the
-process, so that imports and validations count; the first validation at or above a mark decides.
+Ours is ``experiment=quick``, one seed after the other on all cores. The clock starts with the process, so imports and
+validations count. The time to a mark is that of the first validation at or above it.
 
-The peer: MaskablePPO with its CNN policy on our Gymnasium environment (`PickPlaceVectorEnv`, 128 slots at once, which
-is faster for it than many single ones), the depth maps as a two-channel image through 3x3 convolutions, since its
-default CNN wants 36x36 pixels. It runs for ten times what we need to 0.95; its validations are not on its clock.
+The peer is MaskablePPO with its CNN policy on our Gymnasium environment (``PickPlaceVectorEnv``, 128 slots, which is
+faster for it than many single environments). The depth maps are a two-channel image through 3x3 convolutions, since its
+default CNN needs 36x36 pixels. It gets ten times the time that we need to 0.95, validations not counted.
 """
 
 import re
@@ -20,8 +20,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from common import save
+from common import console_command, save
 from torch import nn
+
+from pickplace.runs.loggers import read_csv
 
 MARKS = (0.95, 0.975)
 EPISODES = 128
@@ -29,9 +31,13 @@ SLOTS = 128
 
 
 def ours(seed: int, whole: bool) -> dict:
-    """One run of ``experiment=quick``, to its end or to the last mark: its validations, how its time was spent."""
+    """Return the validations and the median batch of one run of ``experiment=quick``.
+
+    Args:
+        whole: run to the end; else only until the last mark is reached.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "pickplace.training.train", "experiment=quick", f"seed={seed}"]
+        command = [console_command("pickplace-train"), "experiment=quick", f"seed={seed}"]
         command += ["evaluation_interval=50_000", f"hydra.run.dir={folder}"]
         started, curve = time.perf_counter(), []
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -42,26 +48,27 @@ def ours(seed: int, whole: bool) -> dict:
                     if not whole and None not in reached(curve).values():
                         process.terminate()  # it finishes its batch and saves
         seconds = time.perf_counter() - started
-        rows = [line.split(",") for line in (Path(folder) / "metrics.csv").read_text().splitlines()]
-    columns = {name: [float(row[i]) for row in rows[1:]] for i, name in enumerate(rows[0]) if name.startswith("time/")}
-    spent = {name.removeprefix("time/"): float(np.median(values)) for name, values in columns.items()}
+        rows = read_csv(Path(folder) / "metrics.csv")
+    times = {
+        key.removeprefix("time/"): float(np.median([row[key] for row in rows])) for key in rows[0] if "time/" in key
+    }
     return {
         "seed": seed,
         "seconds": seconds,
         "whole": whole,
         "curve": curve,
         "reached": reached(curve),
-        "median batch": spent,
+        "median batch": times,
     }
 
 
 def reached(curve: list) -> dict:
-    """Seconds until each mark, or None."""
+    """Return the seconds until each mark, or None."""
     return {str(mark): next((seconds for seconds, _, value in curve if value >= mark), None) for mark in MARKS}
 
 
 def peer(seconds: float) -> dict | None:
-    """MaskablePPO for so many seconds of training."""
+    """Train MaskablePPO for some seconds and return its validations; None if it is not installed."""
     try:
         import sb3_contrib
         from gymnasium import spaces
@@ -74,7 +81,7 @@ def peer(seconds: float) -> dict | None:
     from pickplace.envs.gymnasium import PickPlaceVectorEnv
 
     class Slots(VecEnv):
-        """`PickPlaceVectorEnv` as stable-baselines3 wants it, the two maps as one image."""
+        """``PickPlaceVectorEnv`` with the interface of stable-baselines3, the two maps as one image."""
 
         def __init__(self, count: int, stream: str):
             self.env = PickPlaceVectorEnv(count, autoreset_mode="SameStep", stream=stream)
@@ -132,7 +139,7 @@ def peer(seconds: float) -> dict | None:
             return self.layers(image)
 
     def validate(model) -> float:
-        """The mean occupancy of the first episodes of the validation stream."""
+        """Return the mean occupancy of the first episodes of the validation stream."""
         world, total = Slots(EPISODES, "validation"), np.full(EPISODES, np.nan)
         image = world.reset()
         while np.isnan(total).any():
@@ -143,7 +150,7 @@ def peer(seconds: float) -> dict | None:
         return float(total.mean())
 
     class Clock(BaseCallback):
-        """Validates every 30 seconds of training, and stops in time."""
+        """Validates every 30 seconds of training, and stops when the time is over."""
 
         def __init__(self):
             super().__init__()

@@ -1,22 +1,20 @@
-"""How long a user waits for an import or for --help: python benchmarks/startup.py"""
+"""Time of an import and of ``--help``, from the start of the process: python benchmarks/startup.py"""
 
 import subprocess
 import sys
-from pathlib import Path
+from functools import partial
 
-from common import interleave, save
+from common import console_command, interleave, save
 
 COMMANDS = {
     "import pickplace": [sys.executable, "-c", "import pickplace"],
-    "pickplace-train --help": [str(Path(sys.executable).with_name("pickplace-train")), "--help"],
+    "pickplace-train --help": [console_command("pickplace-train"), "--help"],
 }
 
 
 def main() -> None:
-    calls = {
-        name: lambda command=command: subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        for name, command in COMMANDS.items()
-    }
+    run = partial(subprocess.run, check=True, stdout=subprocess.DEVNULL)
+    calls = {name: partial(run, command) for name, command in COMMANDS.items()}
     save("startup", {"rows": interleave(calls, repeats=10)})
 
 

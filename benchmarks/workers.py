@@ -1,19 +1,18 @@
-"""What worker processes buy a whole training on this machine: python benchmarks/workers.py
+"""Time of a training batch, with and without worker processes: python benchmarks/workers.py
 
-``collector=single`` and ``multi_sync`` train turn by turn; a batch is collected and learnt from.
+``collector=single`` and ``multi_sync`` train in turn. A batch's time is that of collecting it and learning from it.
 """
 
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
-from common import save, spread
+from common import console_command, save, spread
 
 from pickplace.runs.loggers import read_csv
 
 FRAMES, REPEATS = 65_536, 3
-NEVER = ["evaluation_interval=1_000_000_000", "evaluation.episodes=1", "evaluation.batch_size=1"]
+NO_EVALUATION = ["evaluation_interval=1_000_000_000", "evaluation.episodes=1", "evaluation.batch_size=1"]
 CASES = {
     "`quick`, all cores": ["experiment=quick"],
     "`quick`, one thread a process": ["experiment=quick", "threads=1"],
@@ -23,9 +22,9 @@ COLLECTORS = {"single": ["collector=single"], "multi_sync, 2 workers": ["collect
 
 
 def batches(overrides: list[str]) -> list[float]:
-    """Milliseconds that each batch of a training took, without the first ones, which warm up."""
+    """Return the milliseconds of each batch of a training, without the first four, which warm up."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "pickplace.training.train", *overrides, *NEVER]
+        command = [console_command("pickplace-train"), *overrides, *NO_EVALUATION]
         command += [f"total_frames={FRAMES}", f"hydra.run.dir={folder}/run"]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         rows = read_csv(Path(folder) / "run" / "metrics.csv")

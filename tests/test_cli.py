@@ -27,7 +27,7 @@ BAD = [
     ("train", ["algo.gama=0.9"], ["algo.gama", "'gamma'"]),
     ("train", ["+algo.gama=0.9"], ["algo.gama", "'gamma'"]),
     ("train", ["+env.foo=1"], ["PickPlaceEnv", "'foo'"]),
-    ("train", ["+curriculum.advance.foo=1"], ["pickplace.training.curriculum.Threshold", "foo"]),
+    ("train", ["+curriculum.advance.foo=1"], ["Threshold", "foo"]),
     ("train", ["-m", "algo.gama=0.9,1"], ["algo.gama", "'gamma'"]),
     ("train", ["-m", "env.rotations=5,6"], ["rotations=5", "1, 2, 3 or 4"]),
     ("train", ["-m", "curriculum=none,mien"], ["curriculum/mien", "adaptive"]),

@@ -14,7 +14,8 @@ from pickplace.runs.loggers import read_csv
 from pickplace.runs.registry import build
 from pickplace.task.items import ItemDistribution
 from pickplace.training.curriculum import Curriculum
-from pickplace.training.train import make_losses, train
+from pickplace.training.ppo import make_losses
+from pickplace.training.train import train
 
 CONF = config.conf_dir()
 TINY = [
@@ -129,7 +130,8 @@ def test_any_planner_can_be_imitated(name, tmp_path):
     }
     follows = ["warm_start.checkpoint=pretrained/r4"] if name in ("policy", "lookahead") else []
     phases = [f"warm_start.{key}=16" for key in ("frames", "critic_frames")] if name != "none" else []
-    overrides = [f"warm_start={name}", *settings.get(name, []), *follows, *phases, *TINY]
+    teacher = ["warm_start=imitate", f"planner@warm_start.teacher={name}"] if name != "none" else ["warm_start=none"]
+    overrides = [*teacher, *settings.get(name, []), *follows, *phases, *TINY]
     cfg = composed("curriculum=none", *overrides, "total_frames=48")
     assert 0 <= train(cfg, tmp_path) <= 1
     rows = read_csv(tmp_path / "metrics.csv")

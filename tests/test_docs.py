@@ -257,7 +257,13 @@ def test_a_module_is_trusted_by_who_loads_a_run_and_by_nobody_else(run, monkeypa
 
 def test_a_teacher_of_a_trusted_module(run, capsys):
     teacher = run("train", "own_model", "model=mlp", "model.actor.hidden=8", *TRAINING)
-    taught = ["warm_start=policy", f"warm_start.checkpoint={teacher}", "warm_start.frames=64", *TRAINING]
+    taught = [
+        "warm_start=imitate",
+        "planner@warm_start.teacher=policy",
+        f"warm_start.checkpoint={teacher}",
+        "warm_start.frames=64",
+        *TRAINING,
+    ]
     with pytest.raises(SystemExit):
         run("train", "own_model", *taught, folder="refused")
     assert "if own_model is yours, say trust=own_model" in capsys.readouterr().err

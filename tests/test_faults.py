@@ -28,7 +28,7 @@ from pickplace.runs import hydra_app as config
 from pickplace.runs.hydra_app import WorkerDied
 from pickplace.runs.resume import claim, saying_what_is_safe
 from pickplace.training import collectors as collector
-from pickplace.training.collectors import ignore_signals, watched
+from pickplace.training.collectors import ignore_signals, watch_workers
 from pickplace.training.train import main as train_main
 from pickplace.training.train import resume_run
 
@@ -76,7 +76,7 @@ def test_a_worker_s_death_is_told_until_it_is_heard():
     """A logger or a finalizer swallows what is raised while it runs."""
     worker = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600,))
     worker.start()
-    with pytest.raises(WorkerDied, match="1 of 1 has died"), watched(SimpleNamespace(procs=[worker])):
+    with pytest.raises(WorkerDied, match="1 of 1 has died"), watch_workers(SimpleNamespace(procs=[worker])):
         worker.kill()
         with suppress(WorkerDied):
             time.sleep(60)
@@ -101,7 +101,10 @@ def test_a_worker_s_death_that_torchrl_sees_first_is_told(deaf):
         worker.start()
     for _ in workers:
         assert ready.acquire(timeout=240)
-    with pytest.raises(WorkerDied, match=r"1 of 2 has died \(exit code -9\)"), watched(SimpleNamespace(procs=workers)):
+    with (
+        pytest.raises(WorkerDied, match=r"1 of 2 has died \(exit code -9\)"),
+        watch_workers(SimpleNamespace(procs=workers)),
+    ):
         try:
             raise queue.Empty
         except queue.Empty:

@@ -15,8 +15,8 @@ from omegaconf import OmegaConf
 
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
-from pickplace.training import train as train_module
 from pickplace.training.train import resume_run, train
+from pickplace.training.trainer import Trainer
 
 ITERATION = 8 * 16  # frames: env.num_envs * algo.rollout_length of experiment=smoke
 SETTINGS = [
@@ -25,7 +25,8 @@ SETTINGS = [
     "curriculum=mixture",  # its sampler draws, so the generators matter
     "curriculum.advance.occupancy=0.3",
     "curriculum.advance.window=10",
-    "warm_start=random",  # a teacher that draws
+    "warm_start=imitate",
+    "planner@warm_start.teacher=random",  # a teacher that draws
     f"warm_start.frames={6 * ITERATION}",
     f"warm_start.critic_frames={3 * ITERATION}",
     f"total_frames={24 * ITERATION}",
@@ -221,13 +222,13 @@ def test_a_best_that_the_run_never_had_is_replaced(changed, smoke, tmp_path, mon
     assert facts["frames"] == 768  # so that no validation follows at once
     checkpoint.write(run_dir / "checkpoints/previous", state, {**facts, "best": 0.99})
     checkpoint.write(run_dir / "checkpoints/best", state, {**facts, "frames": 896, "best": 0.995})
-    validate = train_module.validate
+    validate = Trainer.validate
 
     def watched(*args, **kwargs):
         before.append(checkpoint.read(run_dir / "checkpoints/best")[1]["frames"])
         return validate(*args, **kwargs)
 
-    monkeypatch.setattr(train_module, "validate", watched)
+    monkeypatch.setattr(Trainer, "validate", watched)
     resume_run([f"resume={run_dir}/checkpoints/previous", *changed])
     best = checkpoint.read(run_dir / "checkpoints/best")[1]
     validated = {row["frames"]: row.get("eval/occupancy") for row in read_csv(run_dir / "metrics.csv")}

@@ -21,7 +21,7 @@ from pickplace.runs.allowlist import (
     trusted,
 )
 from pickplace.runs.resume import refuse_links, resumed_config
-from pickplace.training.train import loadable
+from pickplace.training.settings import checkpoint_config
 
 SHIPPED = config.PACKAGE / "pretrained" / "r4"
 
@@ -287,7 +287,7 @@ def test_a_checkpoint_reaches_other_machines_only_if_the_user_says_so_again(key,
     with pytest.raises(ValueError, match=f"{key}={value}: the checkpoint would reach out .* or {key}={harmless}"):
         resumed_config("run", facts, [])
     assert OmegaConf.select(resumed_config("run", facts, [f"{key}={harmless}"]), key) != value
-    _, again = loadable(OmegaConf.create(content))  # what a stopped run prints is enough
+    _, again = checkpoint_config(OmegaConf.create(content))  # what a stopped run prints is enough
     assert OmegaConf.select(resumed_config("run", facts, again.split()), key) == value
 
 

@@ -1,113 +1,65 @@
-"""What the comparison consists of: trainings and evaluations, read from the yaml files beside this one.
+"""The cells of the comparison, read from ``definitions.yaml``: a name and the overrides of one command each."""
 
-Each entry of a file stands for one cell for every combination of its ``grid``. A cell is one command; its name says
-what varies, so that two figures that need the same cell share it.
-"""
-
-import itertools
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import yaml
 
-HERE = Path(__file__).parent
-
-#: Axes of a grid: how a value is labelled, and the override that it stands for, if any.
-AXES = {
-    "R": ("R{}", "env.rotations={}"),
-    "tote": ("{}", "env.tote_size=[{}]"),
-    "K": ("K{}", "planner.candidates={}"),
-    "seed": ("s{}", "seed={}"),
-    "items": ("{}", "items={}"),
-    "env": ("{}", "env={}"),
-    "simulations": ("{}sim", "planner.simulations={}"),
-    "samples": ("{}samples", "planner.samples={}"),
-    "mask": ("mask_{}", "planner.mask={}"),
-}
+DEFINITIONS = Path(__file__).with_name("definitions.yaml")
+#: The override that an axis sets. Of `method` there is none: it only stands in names.
+AXES = {"R": "env.rotations", "tote": "env.tote_size", "K": "planner.candidates", "seed": "seed", "items": "items"}
+AXES |= {"env": "env", "planner": "planner", "packer": "packer", "mask": "planner.mask", "method": ""}
+AXES |= {"simulations": "planner.simulations", "samples": "planner.samples"}
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One command to run.
-
-    Attributes:
-        name: unique; also the name of its result.
-        kind: ``train``, ``evaluate`` or ``placement_only``.
-        overrides: what follows the command.
-        method: as figures call it.
-        axes: values of the grid, by axis.
-        training: the training whose checkpoint it evaluates, or None.
-        minutes: its budget, CPU time of one core.
-    """
+    """One command of the comparison: its name, program, arguments, training (of an evaluation) and time limit."""
 
     name: str
-    kind: str
+    command: str
     overrides: tuple[str, ...]
-    method: str
-    axes: tuple[tuple[str, object], ...]
     training: str | None = None
     minutes: float = 60
 
 
-def expand(entry: dict, kind: str) -> list[Cell]:
-    """The cells of an entry of a yaml file.
-
-    Args:
-        entry: ``method``; ``set``, overrides as one line; ``grid``, lists of values by axis; ``minutes``, the budget
-            of each cell, 60 by default; and, for evaluations, ``training``: the name of one, in which ``{axis}`` stands
-            for the grid's value.
+def expand(entry: dict, command: str) -> list[Cell]:
+    """Return the cells of one entry of ``definitions.yaml``.
 
     Raises:
-        ValueError: for a key or an axis that there is not.
+        ValueError: for an unknown key.
     """
-    known = {"method", "set", "grid", "training", "kind", "minutes"}
-    if unknown := set(entry) - known:
-        raise ValueError(f"{sorted(unknown)[0]}: expected one of {', '.join(sorted(known))}.")
-    kind, grid = entry.get("kind", kind), entry.get("grid", {})
-    if unknown := set(grid) - set(AXES):
-        raise ValueError(f"grid.{sorted(unknown)[0]}: expected one of {', '.join(AXES)}.")
-    cells = []
-    for values in itertools.product(*grid.values()):
-        axes = dict(zip(grid, values, strict=True))
-        labels, overrides = [entry["method"]], entry.get("set", "").split()
-        for axis, value in axes.items():
-            label, override = AXES[axis]
-            labels.append(label.format(value))
-            if axis == "seed" and kind != "train":
-                continue  # of the training; every method meets the same episodes
-            overrides.append(override.format(str(value).replace("x", ",") if axis == "tote" else value))
-        training = entry["training"].format(**axes) if "training" in entry else None
-        name, minutes = "-".join(labels), entry.get("minutes", Cell.minutes)
-        cells.append(Cell(name, kind, tuple(overrides), entry["method"], tuple(axes.items()), training, minutes))
+    if unknown := set(entry) - {*AXES, "name", "set", "training", "minutes"}:
+        raise ValueError(f"{entry.get('name')}: unknown key {sorted(unknown)[0]!r}, expected one of {sorted(AXES)}.")
+    axes, cells = {key: values for key, values in entry.items() if isinstance(values, list)}, []
+    for values in product(*axes.values()):
+        point = dict(zip(axes, values, strict=True))
+        set_ = {axis: f"[{value.replace('x', ',')}]" if axis == "tote" else value for axis, value in point.items()}
+        if command == "pickplace-evaluate":  # all play the same episodes: the seed is that of the training
+            set_.pop("seed", None)
+        overrides = [f"{AXES[axis]}={value}" for axis, value in set_.items() if AXES[axis]]
+        overrides += entry.get("set", "").split()
+        training = entry["training"].format(**point) if "training" in entry else None
+        program = "placement_only.py" if "packer" in point else command
+        cells.append(Cell(entry["name"].format(**point), program, tuple(overrides), training, entry.get("minutes", 60)))
     return cells
 
 
-def read() -> tuple[dict[str, Cell], dict[str, list[Cell]]]:
-    """Trainings by name, and for each figure, by the name of its file, its evaluations.
+def read(path: Path = DEFINITIONS) -> tuple[dict[str, Cell], dict[str, Cell]]:
+    """Return the trainings and the evaluations, both by name.
 
     Raises:
-        ValueError: for two cells of one name that are not the same, an evaluation of a training that there is not, or a
-            training that nobody needs.
+        ValueError: for two different cells of one name, or an evaluation of an unknown training.
     """
-    trainings = {}
-    for entry in yaml.safe_load((HERE / "trainings.yaml").read_text()):
-        for cell in expand(entry, "train"):
-            if cell.name in trainings:
-                raise ValueError(f"trainings.yaml: {cell.name} stands there twice.")
-            trainings[cell.name] = cell
-    figures, seen = {}, {}
-    for path in sorted(HERE.glob("*.yaml")):
-        if path.name == "trainings.yaml":
-            continue
-        figures[path.stem] = [cell for entry in yaml.safe_load(path.read_text()) for cell in expand(entry, "evaluate")]
-        for cell in figures[path.stem]:
-            if seen.setdefault(cell.name, cell) != cell:
-                raise ValueError(f"{path.name}: {cell.name} is another cell elsewhere; rename its method.")
+    definitions, trainings, evaluations = yaml.safe_load(path.read_text()), {}, {}
+    for key, program, cells in (
+        ("trainings", "pickplace-train", trainings),
+        ("evaluations", "pickplace-evaluate", evaluations),
+    ):
+        for cell in (cell for entry in definitions[key] for cell in expand(entry, program)):
+            if cells.setdefault(cell.name, cell) != cell:
+                raise ValueError(f"{cell.name}: defined twice, differently.")
             if cell.training is not None and cell.training not in trainings:
-                raise ValueError(f"{path.name}: {cell.name} needs {cell.training}, which trainings.yaml lacks.")
-    needed = {cell.training for part in figures.values() for cell in part}
-    if idle := sorted(set(trainings) - needed):
-        raise ValueError(f"trainings.yaml: {idle[0]} is needed by no figure.")
-    if both := sorted(set(trainings) & set(seen)):
-        raise ValueError(f"{both[0]}: a training and an evaluation have this name; rename one.")
-    return trainings, figures
+                raise ValueError(f"{cell.name}: unknown training {cell.training!r}.")
+    return trainings, evaluations

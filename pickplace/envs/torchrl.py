@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -308,7 +308,7 @@ class PickPlaceEnv(EnvBase):
         observation["failure"] = torch.zeros_like(self.tote_height)[:, None]
         for name in self.masks:
             observation[f"{name}_mask"] = getattr(self, f"{name}_mask")  # never written to again, see `_store`
-        return observation
+        return TensorDict(observation, batch_size=self.batch_size, device=self.device)
 
 
 def _any(mask: Tensor) -> Tensor:

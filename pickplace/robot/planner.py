@@ -15,6 +15,7 @@ from typing import Literal, cast
 import numpy as np
 import torch
 from omegaconf import OmegaConf
+from tensordict import TensorDict
 from torch import Tensor
 
 from pickplace.planners.policy import PolicyPlanner
@@ -172,7 +173,7 @@ class Planner:
         if not is_whole(alternatives) or alternatives < 0:
             raise DepthMapError(f"alternatives={reprlib.repr(alternatives)}: expected a whole number >= 0.")
         state = self._read_state(bin_depth, tote_depth, tote_height, lengths, tolerance)
-        observation = observe(self.terms, self.cell, state)
+        observation = TensorDict(observe(self.terms, self.cell, state), [1], device=state.heights.device)
         status, action, step, reasons = self._decide(observation, state)
         height = int(state.tote_height)
         capacity = height * self.cell.num_places

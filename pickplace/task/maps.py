@@ -41,24 +41,25 @@ def rectangle(grid: tuple[int, int], x: Tensor, y: Tensor, w: Tensor, d: Tensor)
     return in_x[:, None] & in_y
 
 
-def patches(heights: Tensor, x: Tensor, y: Tensor, side: int, outside: int) -> Tensor:
-    """Return a square of cells of each height map, ``[side, side, N]``.
+def squares(heights: Tensor, x: Tensor, y: Tensor, side: int) -> Tensor:
+    """Return a square of cells of each height map, ``[side * side, N]``, row by row.
 
     Args:
         heights: ``[N, W, D]``.
-        x, y: int64 ``[N]``, the square's minimum corner, which may lie outside the map.
+        x, y: int64 ``[N]``, the square's minimum corner. Cells outside the map get the height of the nearest cell.
         side: of the square, in cells.
-        outside: the value of cells outside the map.
     """
     _, wide, deep = heights.shape
-    step = torch.arange(side, device=x.device)
-    column, row = x + step[:, None], y + step[:, None]  # [side, N]
-    inside = ((column >= 0) & (column < wide))[:, None] & ((row >= 0) & (row < deep))
-    index = column.clamp(0, wide - 1)[:, None] * deep + row.clamp(0, deep - 1)
-    cells = heights.reshape(len(heights), -1).t().gather(0, index.flatten(0, 1)).view_as(index)
-    return cells.where(inside, outside)
+    step = torch.arange(side, device=x.device)[:, None]
+    column, row = (x + step).clamp_(0, wide - 1), (y + step).clamp_(0, deep - 1)  # [side, N]
+    index = (column * deep)[:, None] + row
+    return heights.flatten(1).t().gather(0, index.flatten(0, 1))
 
 
-def is_under(w: Tensor, d: Tensor, side: int) -> list[Tensor]:
-    """Return for each cell of a square, row by row, whether a ``w x d`` rectangle at its minimum corner covers it."""
-    return [(i < w) & (j < d) for i in range(side) for j in range(side)]
+def is_under(w: Tensor, d: Tensor, side: int) -> Tensor:
+    """Return for each cell of a square, row by row, whether a ``w x d`` rectangle at its minimum corner covers it.
+
+    The result is bool, ``[side * side, *shape of w]``.
+    """
+    step = torch.arange(side, device=w.device).view(-1, *[1] * w.dim())
+    return ((step < w)[:, None] & (step < d)).flatten(0, 1)

@@ -9,7 +9,6 @@ from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
 from pickplace.task.cell import CellSpec
@@ -116,13 +115,13 @@ def check_terms(terms: Mapping[str, Term] | None) -> dict[str, Term]:
     return {key: terms[key] for key in (*STANDARD_TERMS, *(key for key in terms if key not in STANDARD_TERMS))}
 
 
-def observe(terms: Mapping[str, Term], cell: CellSpec, state: State, keys: Collection[str] | None = None) -> TensorDict:
-    """Return what an agent sees in the states of ``N`` problems, ``batch_size=[N]``.
+def observe(
+    terms: Mapping[str, Term], cell: CellSpec, state: State, keys: Collection[str] | None = None
+) -> dict[str, Tensor]:
+    """Return what an agent sees in the states of ``N`` problems: each entry, ``[N, ...]``, by its key.
 
     Args:
         terms: the entries by key.
         keys: the entries that are needed; None: all.
     """
-    wanted = {key: term for key, term in terms.items() if keys is None or key in keys}
-    count, device = len(state.heights), state.heights.device
-    return TensorDict({key: term.value(cell, state) for key, term in wanted.items()}, batch_size=[count], device=device)
+    return {key: term.value(cell, state) for key, term in terms.items() if keys is None or key in keys}

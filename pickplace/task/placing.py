@@ -57,7 +57,7 @@ def resting_top(cell: CellSpec, state: State) -> Tensor:
     padded = surround(state.heights.permute(1, 2, 0), (0, side - 1, 0, side - 1), FAR)
     w, d = (torch.stack(pair)[: cell.parities] for pair in ((item.w, item.d), (item.d, item.w)))
     w, d = w[:, None, None], d[:, None, None]  # [Q, 1, 1, N]
-    z, level = rest(windows(padded, side).flatten(0, 1).unbind(0), is_under(w, d, side))
+    z, level = rest(windows(padded, side).flatten(0, 1).unbind(0), is_under(w, d, side).unbind(0))
     top = z + item.h.to(z.dtype)
     good = is_supported(cell, level, w * d) & ~overflows(top, state.tote_height) & (item.h > 0)
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2)

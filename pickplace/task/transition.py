@@ -8,7 +8,7 @@ from torch import Tensor
 from pickplace.task.cell import CellSpec, reference_cell
 from pickplace.task.feasibility import PlacingMaps
 from pickplace.task.grasps import grasp, is_clear, is_outside, split_action, split_footprint, turn, turned_size
-from pickplace.task.maps import FAR, is_under, patches, rectangle
+from pickplace.task.maps import is_under, rectangle, squares
 from pickplace.task.placing import is_supported, is_within_reach, overflows, rest
 from pickplace.task.state import Failure, State
 
@@ -42,12 +42,11 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     x, y = left + offset[0], front + offset[1]
 
     # Placing.
-    side = cell.max_side
-    z, level = rest(patches(heights, x, y, side, FAR).flatten(0, 1).unbind(0), is_under(w, d, side))
+    # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
+    side, reach = cell.max_side, max(ee_w, ee_d)
+    z, level = rest(squares(heights, x, y, side).unbind(0), is_under(w, d, side).unbind(0))
     top = z.long() + item.h
-    reach = max(ee_w, ee_d)
-    below = patches(heights, left, front, reach, 0).flatten(0, 1)
-    highest = torch.where(torch.stack(is_under(wide, deep, reach)), below, 0).amax(0)
+    highest = torch.where(is_under(wide, deep, reach), squares(heights, left, front, reach), 0).amax(0)
     item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)
     effector_leaves = is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d)
 

@@ -1,4 +1,4 @@
-"""Collectors whose state can be saved and restored exactly. The one place that touches private names of TorchRL."""
+"""Collectors whose state is saved and restored exactly. The only module that uses private names of TorchRL."""
 
 import signal
 import sys
@@ -18,17 +18,20 @@ from pickplace.runs.hydra_app import WorkerDied, missing_extra
 
 
 class ResumableCollector(Collector):
-    """A ``Collector`` whose ``state_dict`` also holds the base environment, the carried TensorDict and the process's
-    random generator; TorchRL 0.14.1 saves the transforms, the policy and the counters only.
+    """A ``Collector`` that resumes bit for bit, in this process or as the worker of a multi-process collector.
 
-    With it a killed run resumes bit for bit, directly and as the worker of a multi-process collector.
+    Its ``state_dict`` also holds the base environment, the carried TensorDict and the process's random generator;
+    TorchRL 0.14.1 saves only the transforms, the policy and the counters.
     """
 
     def start(self, item_seed: int, rng_seed: int | None = None) -> None:
-        """Begin the item stream ``item_seed`` with fresh episodes.
+        """Begin the item stream ``item_seed`` with new episodes.
 
-        Making a collector steps its environment, so the streams begin here and not at construction. A worker process
-        also gets a seed for its own generator.
+        Constructing a collector steps its environment, so the streams begin here and not at construction.
+
+        Args:
+            item_seed: seed of the item stream.
+            rng_seed: seed of the process's own generator, for a worker process.
         """
         if rng_seed is not None:
             torch.manual_seed(rng_seed)
@@ -36,7 +39,7 @@ class ResumableCollector(Collector):
         self.reset()
 
     def _setup_compact_obs(self, compact_obs: bool) -> None:
-        """Keep every mask once, where it was acted upon, and not as what came next as well; nobody learns from that."""
+        """Store each mask only where it was acted on, not again under ``next``, where nothing reads it."""
         super()._setup_compact_obs(compact_obs)
         if not compact_obs:
             masks = [key for key in self.env.observation_spec.keys() if key.endswith("_mask")]  # noqa: SIM118
@@ -46,7 +49,7 @@ class ResumableCollector(Collector):
         return OrderedDict(
             environment=dict(self.env.base_env.state_dict()),
             transforms=dict(self.env.transform.state_dict()),
-            # What the next step reads. Trajectory numbers, in "collector", are drawn from a pool that workers share.
+            # What the next step reads; not "collector", whose trajectory numbers come from a pool that workers share.
             carried=self._carrier.select(*self.env.observation_spec.keys(), *self.env.done_keys).clone().to_dict(),
             counters={"frames": torch.tensor(self._frames), "iterations": torch.tensor(self._iter)},
             **rng_state(self.env.device),
@@ -55,7 +58,7 @@ class ResumableCollector(Collector):
     def load_state_dict(self, state_dict, **kwargs) -> None:
         self.env.base_env.load_state_dict(state_dict["environment"])
         self.env.transform.load_state_dict(state_dict["transforms"])
-        # The carrier has no device of its own, so that tensors would stay where they were loaded.
+        # The carrier has no device, so tensors would stay on the device on which they were loaded.
         carried = TensorDict(state_dict["carried"], batch_size=self.env.batch_size, device=self.env.device)
         self._carrier.update(carried)
         self._frames = int(state_dict["counters"]["frames"])
@@ -64,36 +67,40 @@ class ResumableCollector(Collector):
 
 
 class ResumableRayCollector(RayCollector):
-    """A ``RayCollector`` of `ResumableCollector` actors: their state by worker, as a multi-process collector gives it,
-    one batch ``[num_envs, rollout_length]``, and an error in one sentence when an actor is gone."""
+    """A ``RayCollector`` of :class:`ResumableCollector` actors.
+
+    Like ``MultiSyncCollector`` it has a state per worker and batches ``[num_envs, rollout_length]``; a dead actor
+    raises :class:`WorkerDied`.
+    """
 
     def iterator(self):
-        with self._watched():
+        with self._worker_errors():
             for batch in super().iterator():
                 yield batch.flatten(0, 1)  # TorchRL 0.14.1 stacks: [workers, share, rollout_length]
 
     def update_policy_weights_(self, weights: TensorDict) -> None:
-        # Through Ray's own store, to each worker's `Collector`. TorchRL's weight synchronisation opens connections
-        # of its own, for which one more process has to start within 60 s: more than a busy machine gives.
+        # Sent through Ray's object store. TorchRL's weight synchronisation opens its own connections, for which
+        # another process must start within 60 s, which fails on a busy machine.
         import ray
 
         reference = ray.put(weights)
         self.map_fn("update_policy_weights_", [(reference,)] * self.num_collectors)
 
     def map_fn(self, *args, **kwargs) -> list:
-        with self._watched():
+        with self._worker_errors():
             return super().map_fn(*args, **kwargs)
 
     def state_dict(self) -> OrderedDict:
-        with self._watched():
+        with self._worker_errors():
             return OrderedDict((f"worker{worker}", state) for worker, state in enumerate(super().state_dict()))
 
     def load_state_dict(self, state_dict, **kwargs) -> None:
-        with self._watched():
+        with self._worker_errors():
             super().load_state_dict([state_dict[f"worker{worker}"] for worker in range(self.num_collectors)])
 
     @contextmanager
-    def _watched(self):
+    def _worker_errors(self):
+        """Raise Ray's error for a dead actor as :class:`WorkerDied`."""
         from ray.exceptions import RayActorError
 
         try:
@@ -103,73 +110,76 @@ class ResumableRayCollector(RayCollector):
 
 
 def rng_state(device: torch.device) -> dict[str, torch.Tensor]:
-    """The state of the global generators that a process on this device draws from."""
+    """Return the state of the global random generators of a process on this device."""
     state = {"rng": torch.get_rng_state()}
     return state | {"cuda_rng": torch.cuda.get_rng_state(device)} if device.type == "cuda" else state
 
 
 def set_rng_state(state: dict, device: torch.device) -> None:
-    """Restore what :func:`rng_state` returned; one that was saved on another device has the CPU's generator only.
+    """Restore the state that :func:`rng_state` returned; a state saved on a CPU leaves the GPU's generator alone.
 
     Raises:
-        CheckpointError: if no generator is ever in that state.
+        CheckpointError: if the state is not valid.
     """
     try:
         torch.set_rng_state(state["rng"].cpu())
         if device.type == "cuda" and "cuda_rng" in state:
             torch.cuda.set_rng_state(state["cuda_rng"].cpu(), device)
     except RuntimeError as error:
-        raise CheckpointError("The checkpoint's random generator is of no use: it is in no valid state.") from error
+        raise CheckpointError("The checkpoint's random generator is of no use: its state is not valid.") from error
 
 
 def ignore_signals() -> None:
-    """Leave Ctrl-C and SIGTERM, which terminals and schedulers send to workers too, to the main process: it finishes
-    the batch, saves, and closes the workers."""
+    """Ignore Ctrl-C and SIGTERM in a worker process.
+
+    Terminals and schedulers send them to workers too; the main process finishes the batch, saves, and closes the
+    workers.
+    """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
 
 
 @contextmanager
-def watched(collector):
-    """While inside, a worker process that dies raises an error in the main thread at once, whatever it waits for.
+def watch_workers(collector):
+    """Raise an error in the main thread as soon as a worker process dies, whatever the main thread waits for.
 
-    TorchRL 0.14.1 looks after its workers between waits only. It ends them by a signal that ours ignore, then closes
-    them: an error while they run, and a closed one tells nothing more.
+    TorchRL 0.14.1 checks its workers only between waits. It ends them by a signal that ours ignore, then closes them;
+    only an open worker that has ended is an error.
 
     Raises:
-        WorkerDied: saying which worker died, and how; the other ones are killed.
+        WorkerDied: naming the worker and its exit code; the other workers are killed.
     """
     workers = getattr(collector, "procs", [])
 
-    def open_ones() -> list:
+    def open_workers() -> list:
         return [worker for worker in workers if not worker._closed]
 
-    def look(signum=None, _=None):
+    def check(signum=None, _=None):
         dead = [number for number, worker in enumerate(workers) if not worker._closed and not worker.is_alive()]
-        if dead:  # first of all one that was killed: others may have ended because of it
+        if dead:  # name a killed worker first: others may have ended because of it
             number = min(dead, key=lambda number: workers[number].exitcode == 0)
             code = workers[number].exitcode
-            # Loggers and finalizers swallow what is raised while they run, so it is said again until we have left.
-            again = threading.Timer(0.5, signal.pthread_kill, (threading.main_thread().ident, signal.SIGCHLD))
-            again.daemon = True
-            again.start()
+            # Loggers and finalizers swallow an error raised while they run, so repeat it until this context ends.
+            repeat = threading.Timer(0.5, signal.pthread_kill, (threading.main_thread().ident, signal.SIGCHLD))
+            repeat.daemon = True
+            repeat.start()
             if signum and sys.exc_info()[1]:
-                return  # an error is on its way out, maybe of this death: do not break in on its cleaning up
+                return  # another error, perhaps of this death, is being handled: do not interrupt its cleanup
             raise WorkerDied(f"collector worker {number + 1} of {len(workers)} has died (exit code {code}).")
 
-    previous = signal.signal(signal.SIGCHLD, look)
+    previous = signal.signal(signal.SIGCHLD, check)
     try:
         try:
-            look()
+            check()
             yield
         except (OSError, EOFError, RuntimeError, ValueError):
-            for worker in open_ones():  # a broken pipe may tell of a death before the signal does
+            for worker in open_workers():  # a broken pipe may be noticed before the signal of the death
                 worker.join(0.5)
-            look()
+            check()
             raise
     except WorkerDied:
         signal.signal(signal.SIGCHLD, previous)
-        for worker in open_ones():
+        for worker in open_workers():
             worker.kill()
             worker.join()
         raise
@@ -178,12 +188,12 @@ def watched(collector):
 
 
 def single(make_env, policy, num_envs: int, rollout_length: int, seed: int) -> Collector:
-    """One batch of environments in this process (config ``collector=single``).
+    """Make a collector of one batch of environments in this process (config ``collector=single``).
 
     Args:
-        make_env: ``make_env(first_episode, num_envs)`` builds an environment for a share of the slots.
+        make_env: ``make_env(first_episode, num_envs)`` makes an environment for a share of the slots.
         policy: the collection policy, reading and writing TensorDicts.
-        num_envs: number of environment slots, over all processes.
+        num_envs: number of environment slots over all processes.
         rollout_length: steps of each slot in a batch.
         seed: seed of the item stream.
     """
@@ -191,16 +201,16 @@ def single(make_env, policy, num_envs: int, rollout_length: int, seed: int) -> C
         make_env(0, num_envs),
         policy,
         frames_per_batch=num_envs * rollout_length,
-        total_frames=-1,  # the training loop decides; a limit here would close the environment at the last batch
-        track_traj_ids=False,  # nobody reads them, and they cost 15%
+        total_frames=-1,  # the training loop ends itself; a limit would close the environment at the last batch
+        track_traj_ids=False,  # nothing reads them, and they cost 15%
         trust_policy=True,
-        auto_register_policy_transforms=False,  # the policy needs none; saying so silences a warning
+        auto_register_policy_transforms=False,  # the policy needs none; the explicit value silences a warning
     )
     return _started(collector, [(seed,)])
 
 
 def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, workers: int = 2) -> MultiSyncCollector:
-    """Worker processes, each with its share of the slots (config ``collector=multi_sync``).
+    """Make a collector of worker processes, each with its share of the slots (config ``collector=multi_sync``).
 
     Args: as :func:`single`, and ``workers``, the number of processes; it must divide ``num_envs``.
     """
@@ -223,14 +233,13 @@ def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, 
 def ray(
     make_env, policy, num_envs: int, rollout_length: int, seed: int, workers: int = 2, address: str = "local"
 ) -> ResumableRayCollector:
-    """Worker processes of a Ray cluster, each with its share of the slots (config ``collector=ray``); needs the extra
-    ``pickplace[ray]``.
+    """Make a collector of worker processes in a Ray cluster (config ``collector=ray``, extra ``pickplace[ray]``).
 
-    Args: as :func:`multi_sync`, and ``address``: ``local`` starts a Ray of this run's own, ``auto`` or ``host:port``
+    Args: as :func:`multi_sync`, and ``address``: ``local`` starts a new Ray on this machine, ``auto`` or ``host:port``
         joins a cluster.
 
     Raises:
-        ValueError: without the extra, with a policy on a GPU, or workers that do not divide the slots.
+        ValueError: without the extra, with a policy on a GPU, or if the workers do not divide the slots.
     """
     try:
         import ray  # noqa: F401
@@ -239,8 +248,8 @@ def ray(
     if any(parameter.is_cuda for parameter in policy.parameters()):
         raise ValueError("collector=ray: its workers have no GPU; expected device=cpu, or collector=single.")
     share = _share(num_envs, workers)
-    # A Ray of our own has room for the workers, however few cores there are; a cluster knows what it has.
-    room = {"num_cpus": workers} if address == "local" else {}
+    # A new Ray gets a core per worker, however few this machine has; a cluster states its own number.
+    resources = {"num_cpus": workers} if address == "local" else {}
     collector = ResumableRayCollector(
         [partial(make_env, worker * share, share) for worker in range(workers)],
         policy,
@@ -255,15 +264,16 @@ def ray(
         weight_sync_schemes={},
         remote_configs={"num_cpus": 1, "num_gpus": 0},
         ray_init_config={
-            "address": address, "include_dashboard": False, "logging_level": "warning", "log_to_driver": False, **room
+            "address": address, "include_dashboard": False, "logging_level": "warning", "log_to_driver": False,
+            **resources,
         },
     )  # fmt: skip
-    collector._weight_sync_initialized = True  # silences a warning on the scheme that there is none of
+    collector._weight_sync_initialized = True  # silences a warning about the missing scheme
     return _started(collector, _seeds(seed, workers))
 
 
 def _started(collector, seeds: Sequence[tuple[int, ...]]):
-    """The collector with each worker's streams begun, or nothing left of it: a process would wait for its workers."""
+    """Begin each worker's streams and return the collector; on an error shut it down, or the process would not end."""
     try:
         collector.map_fn("start", seeds)
     except BaseException:
@@ -273,13 +283,15 @@ def _started(collector, seeds: Sequence[tuple[int, ...]]):
 
 
 def _share(num_envs: int, workers: int) -> int:
-    """How many of the slots each worker has."""
+    """Number of slots of each worker."""
     if not isinstance(workers, int) or workers < 1 or num_envs % workers:
         raise ValueError(f"collector.workers={workers}: expected a divisor of env.num_envs={num_envs}.")
     return num_envs // workers
 
 
 def _seeds(seed: int, workers: int) -> list[tuple[int, int]]:
-    """Each worker's item stream and generator: all draw the same items, and actions of their own; large odd steps keep
-    the generators apart from those of ``seed + 1``."""
+    """Seeds of each worker: of the item stream, the same for all, and of its own generator, which draws its actions.
+
+    The large odd step keeps the generators apart from those of ``seed + 1``.
+    """
     return [(seed, (seed * 1_000_003 + worker + 1) % 2**63) for worker in range(workers)]

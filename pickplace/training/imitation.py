@@ -15,6 +15,7 @@ from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import trusted
 from pickplace.runs.registry import build
 from pickplace.task.cell import CellSpec
+from pickplace.task.checks import whole_number
 from pickplace.task.items import ItemDistribution
 from pickplace.task.observation import Term
 from pickplace.task.state import State
@@ -22,31 +23,31 @@ from pickplace.task.transition import apply
 
 
 class Phase(Enum):
-    """What a policy learns from."""
+    """The phases of a training: what the policy learns from."""
 
-    IMITATION = "imitation"  # the teacher's choices; the critic learns the values of the policy meanwhile
-    CRITIC = "critic"  # nothing: the critic learns the values of the policy as imitation left it
+    IMITATION = "imitation"  # the teacher's choices; the critic learns the policy's values meanwhile
+    CRITIC = "critic"  # nothing: only the critic learns, the values of the imitating policy
     REWARD = "reward"
 
 
 class WarmStart:
-    """Imitation of a planner, then the critic alone, then reward.
+    """Imitation of a planner, then training of the critic alone, then reward.
 
-    The policy itself acts from the first frame on and its teacher is asked in the states that come up (DAgger, Ross et
-    al. 2011), so that it learns what to do where its own mistakes lead, and the critic learns the values of the policy
-    that it will serve.
+    The policy itself acts from the first frame on, and the teacher is asked in the states that it reaches (DAgger, Ross
+    et al. 2011). So the policy learns how to continue after its own mistakes, and the critic learns the values of the
+    policy that it will serve.
 
     Args:
         cfg: the config group ``warm_start``.
-        policy: a policy.
+        policy: the policy that is trained.
         cell: the sizes.
-        items: for a teacher that imagines some.
+        items: the item distribution, for a teacher that samples items.
         terms: of the observation, by key.
-        seed: of a teacher that draws.
-        trust: modules beside pickplace's own whose classes the config of a teacher's checkpoint may make.
+        seed: seed of a teacher that draws.
+        trust: modules of the user whose classes the config of the teacher's checkpoint may name.
 
     Raises:
-        ValueError: naming the key, for numbers that make no sense and for a teacher that lacks its checkpoint.
+        ValueError: naming the key, for a bad number or a teacher without its checkpoint.
     """
 
     def __init__(
@@ -60,37 +61,38 @@ class WarmStart:
         trust=(),
     ):
         for key in ("frames", "critic_frames"):
-            if not isinstance(cfg[key], int) or isinstance(cfg[key], bool) or cfg[key] < 0:
-                raise ValueError(f"warm_start.{key}={cfg[key]}: expected a whole number >= 0.")
+            whole_number(f"warm_start.{key}", cfg[key], 0)
         if cfg.frames and cfg.teacher is None:
-            raise ValueError(f"warm_start.frames={cfg.frames}: nobody to imitate; expected warm_start=<planner>.")
+            raise ValueError(f"warm_start.frames={cfg.frames}: there is no teacher; expected warm_start=imitate.")
         self.policy, self.cell, self.seed = policy, cell, seed
         self.teacher, self.frames, self.critic_frames = cfg.teacher, cfg.frames, cfg.critic_frames
-        self._parts: dict = {}  # of the teacher
-        if self.frames:
-            trained = None
-            if cfg.checkpoint is not None:
-                state, saved = checkpoint.read(checkpoint.locate(str(cfg.checkpoint)))
-                theirs = trusted(saved["config"], trust)
-                trained = (theirs, state, OmegaConf.to_container(theirs.env, resolve=True))
-            try:
-                self._parts = planner_parts(cfg.teacher, cell, items, terms, trained)
-            except ValueError as error:
-                raise ValueError(f"warm_start.{error}") from error
+        self._parts = self._teacher_parts(cfg, items, terms, trust) if self.frames else {}
+
+    def _teacher_parts(self, cfg: DictConfig, items: ItemDistribution, terms: Mapping[str, Term], trust) -> dict:
+        """Return the teacher's arguments beside its settings, such as the policy of its checkpoint."""
+        trained = None
+        if cfg.checkpoint is not None:
+            state, facts = checkpoint.read(checkpoint.locate(str(cfg.checkpoint)))
+            trained_cfg = trusted(facts["config"], trust)
+            trained = (trained_cfg, state, OmegaConf.to_container(trained_cfg.env, resolve=True))
+        try:
+            return planner_parts(cfg.teacher, self.cell, items, terms, trained)
+        except ValueError as error:
+            raise ValueError(f"warm_start.{error}") from error
 
     def phase(self, frames: int) -> Phase:
-        """What the batch after ``frames`` frames of the run is for."""
+        """Return the phase of the batch that begins after ``frames`` frames of the run."""
         if frames < self.frames:
             return Phase.IMITATION
         return Phase.CRITIC if frames < self.frames + self.critic_frames else Phase.REWARD
 
     @torch.no_grad()
     def ask(self, data: TensorDictBase, iteration: int) -> Tensor:
-        """The teacher's choices, int64 ``[B]``; -1 where what it wants fails, or cannot be done by this policy.
+        """Return the teacher's choices, int64 ``[B]``; -1 where its action fails or this policy cannot choose it.
 
         Args:
             data: observations ``[B]``.
-            iteration: of the run. A teacher that draws begins anew with each, so that a resumed run is the same.
+            iteration: the run's batch number; it seeds a teacher that draws, so that a resumed run is the same.
         """
         draws = {"seed": self.seed + iteration} if "seed" in self.teacher else {}
         teacher = build("warm_start.teacher", self.teacher, **self._parts, **draws)
@@ -107,7 +109,8 @@ class WarmStart:
 
 
 def imitation_loss(policy: Policy, data: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """Mean cross-entropy against the teacher's ``taught`` choices, and the share of them that is the likeliest."""
+    """Return the mean cross-entropy against the teacher's choices ``taught``, and the share of these that the policy
+    finds most probable."""
     taught = data["taught"]
     logits = policy.logits(data)
     known = (taught >= 0).sum().clamp(min=1)
@@ -116,6 +119,6 @@ def imitation_loss(policy: Policy, data: TensorDictBase) -> tuple[Tensor, Tensor
 
 
 def taught_by(cfg: dict) -> str | None:
-    """The name of the planner that a run of this saved config imitated first, or None."""
+    """Return the name of the planner that a run with this saved config imitated, or None."""
     start = cfg.get("warm_start") or {}
     return start["teacher"]["_target_"].rpartition(".")[2] if start.get("frames") else None

@@ -1,4 +1,4 @@
-"""``report.html``: what a training run did, on one page."""
+"""``report.html``: a training run on one page."""
 
 import base64
 import io
@@ -20,7 +20,7 @@ REPORT = "report.html"
 
 
 def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts: dict) -> None:
-    """Write ``report.html``: curves, tables, the worst and the best episode, and how to make the run again.
+    """Write ``report.html``: curves, tables, the worst and the best episode, and the command that repeats the run.
 
     Args:
         run_dir: the run folder, with ``metrics.csv`` and ``learning_curve.png``.
@@ -28,6 +28,9 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
         episodes: the last validation, an :class:`pickplace.evaluation.evaluate.Episodes` with recordings.
         cell: the sizes.
         facts: versions and commit.
+
+    Raises:
+        OSError: naming the report, if it cannot be written.
     """
     rows = read_csv(run_dir / "metrics.csv")
     failures = io.BytesIO()
@@ -52,31 +55,33 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
         "tiles": "".join(f"<div><b>{value}</b><span>{text}</span></div>" for value, text in tiles),
         "curve": base64.b64encode((run_dir / "learning_curve.png").read_bytes()).decode(),
         "failures": base64.b64encode(failures.getvalue()).decode(),
-        "tables": _validations(rows) + _levels(rows),
+        "tables": validation_table(rows) + level_table(rows),
         "command": escape(_command(run_dir, cfg)),
         "config": escape(OmegaConf.to_yaml(cfg, resolve=True)),
         "versions": escape("\n".join(f"{name}: {value}" for name, value in facts.items())),
         "replay": escape(page(ordered, cell, f"{cfg.evaluation.stream} stream, seed {cfg.evaluation.seed}")),
     }
     html = (ASSETS / "report.html").read_text(encoding="utf-8")
-    # In one pass, so that nothing in the content is taken for a mark.
+    # In one pass, so that no content is taken for a placeholder.
     html = re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], html)
-    fresh = run_dir / f".{REPORT}.new"
+    unfinished = run_dir / f".{REPORT}.new"
     try:
-        fresh.write_text(html, encoding="utf-8")
-        fresh.replace(run_dir / REPORT)
+        unfinished.write_text(html, encoding="utf-8")
+        unfinished.replace(run_dir / REPORT)
     except OSError as error:
-        fresh.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
         raise OSError(error.errno, error.strerror, str(run_dir / REPORT)) from error
 
 
 def _table(head: tuple, rows: list[tuple]) -> str:
+    """An HTML table."""
     cells = "".join(f"<th>{name}</th>" for name in head)
     lines = ["".join(f"<td>{value}</td>" for value in row) for row in rows]
     return f"<table><tr>{cells}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
 
-def _validations(rows: list[dict]) -> str:
+def validation_table(rows: list[dict]) -> str:
+    """An HTML table of some 12 of the validations, and the last one."""
     found = [
         (
             f"{row['frames']:,}",
@@ -87,12 +92,13 @@ def _validations(rows: list[dict]) -> str:
         for row in rows
         if "eval/occupancy" in row
     ]
-    step = max(1, len(found) // 12)  # a long run has many; these and the last one tell the story
+    step = max(1, len(found) // 12)
     return _table(("frames", "validation", "95% interval", "tote height in training"), found[:-1:step] + found[-1:])
 
 
-def _levels(rows: list[dict]) -> str:
-    """Mean training occupancy at each tote height, over the last batches in which an episode of it ended."""
+def level_table(rows: list[dict]) -> str:
+    """An HTML table of the training occupancy at each tote height, a mean over the last 20 batches in which an episode
+    of that height ended."""
     heights = sorted({int(key.rpartition("_")[2]) for row in rows for key in row if "curriculum/occupancy_at_" in key})
     lines = []
     for height in heights:
@@ -104,7 +110,7 @@ def _levels(rows: list[dict]) -> str:
 
 
 def _command(run_dir: Path, cfg: DictConfig) -> str:
-    """The command that began the run, and what was changed when it was resumed."""
+    """The command that began the run, and the values that were changed when it was resumed."""
     command = " ".join(["pickplace-train", *map(shlex.quote, [*own_configs(run_dir), *begun_with(run_dir)])])
     changed = changed_since(run_dir, cfg)
     return f"{command}\n\nChanged when it was resumed: {', '.join(changed)}" if changed else command

@@ -2,8 +2,8 @@
 
 import torch
 
-from pickplace.training import train
-from pickplace.training.train import make_losses
+from pickplace.training import trainer
+from pickplace.training.ppo import make_losses
 
 
 def test_a_learner_expects_nothing_after_the_end_of_a_recording(smoke, tmp_path, monkeypatch):
@@ -14,7 +14,7 @@ def test_a_learner_expects_nothing_after_the_end_of_a_recording(smoke, tmp_path,
         advantage, loss = make_losses(*args)
         return lambda batch: batches.append(advantage(batch).clone()), loss
 
-    monkeypatch.setattr(train, "make_losses", recording)
+    monkeypatch.setattr(trainer, "make_losses", recording)
     (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
     smoke(tmp_path / "run", "items=recorded", f"items.path={tmp_path}/items.csv", "env.tote_size=[5,5,1]")
     ended = torch.cat([batch["next", "truncated"].flatten() for batch in batches])

@@ -1,0 +1,228 @@
+"""Advance rules: when the level changes."""
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from pickplace.training.curriculum.checks import fraction, whole_number
+
+TOLERANCE = 1e-6  # occupancies arrive as float32, in which 0.9 is slightly below 0.9
+
+
+@dataclass
+class Tally:
+    """What an advance rule decides on: the level, and counts since it began.
+
+    Attributes:
+        level: the tote height trained at now, in cells.
+        window: final occupancies of the latest episodes that were played at the level.
+        frames: frames of the whole run.
+        level_start: the run's frames when the level began.
+        episodes: episodes finished at the level.
+    """
+
+    level: int
+    window: deque
+    frames: int = 0
+    level_start: int = 0
+    episodes: int = 0
+
+    @property
+    def level_frames(self) -> int:
+        """Frames since the level began."""
+        return self.frames - self.level_start
+
+    @property
+    def mean(self) -> float:
+        """Mean occupancy of the window; fsum rounds once, so the order of the episodes has no effect."""
+        return math.fsum(self.window) / len(self.window) if self.window else 0.0
+
+
+class Advance:
+    """Base class of advance rules. A subclass overrides :meth:`update`, and other methods where needed.
+
+    Attributes:
+        window: number of latest episodes at the level that the tally keeps.
+        state_keys: names of the attributes that are the rule's own state, saved in checkpoints; each is a finite
+            number after :meth:`setup`.
+        start, end: the first and the last height, set by :meth:`setup`.
+    """
+
+    window = 100
+    state_keys: tuple[str, ...] = ()
+
+    def setup(self, start: int, end: int, total_frames: int) -> int:
+        """Store the first and the last height and use the run's budget in frames; return the first level."""
+        self.start, self.end = start, end
+        return start
+
+    def update(self, tally: Tally) -> tuple[int, dict]:
+        """Return the level from now on, and further numbers to log, by name; called after each batch.
+
+        A level beyond the first or the last height is replaced by that height.
+        """
+        raise NotImplementedError
+
+    def least_frames(self, batch: int) -> float:
+        """Lower bound of the frames before the last height is reached; infinite if it never is.
+
+        Args:
+            batch: frames between two decisions.
+        """
+        return 0
+
+
+class NoAdvance(Advance):
+    """No curriculum: the last height from the first frame on."""
+
+    def setup(self, start, end, total_frames):
+        super().setup(start, end, total_frames)
+        return end
+
+    def update(self, tally):
+        return tally.level, {}
+
+
+class Frames(Advance):
+    """One level up every ``frames_per_level`` frames of the run: the paper's rule, with 5 million.
+
+    Args:
+        frames_per_level: frames; None divides ``total_frames`` evenly among the levels.
+    """
+
+    def __init__(self, frames_per_level: int | None = None):
+        if frames_per_level is not None:
+            frames_per_level = whole_number("curriculum.advance.frames_per_level", frames_per_level)
+        self.frames_per_level = frames_per_level
+
+    def setup(self, start, end, total_frames):
+        self.share = self.frames_per_level or max(1, total_frames // (end - start + 1))
+        return super().setup(start, end, total_frames)
+
+    def update(self, tally):
+        # Never down: a run resumed with a larger budget may have more frames per level.
+        due = self.start + tally.frames // self.share > tally.level
+        return tally.level + due, {}
+
+    def least_frames(self, batch):
+        return (self.end - self.start) * max(self.share, batch)
+
+
+class Threshold(Advance):
+    """One level up when the mean occupancy of a window of episodes at the level reaches a value.
+
+    Args:
+        occupancy: the mean occupancy that promotes, in [0, 1].
+        window: number of latest episodes that count; with fewer at this level, occupancy has no effect.
+        max_frames_per_level: promote after this many frames at a level, whatever the occupancy; None: never.
+        demote_below: go one level down when the mean is below this occupancy; None: never.
+    """
+
+    def __init__(
+        self,
+        occupancy: float,
+        window: int,
+        max_frames_per_level: int | None = None,
+        demote_below: float | None = None,
+    ):
+        self.occupancy = fraction("curriculum.advance.occupancy", occupancy)
+        self.window = whole_number("curriculum.advance.window", window)
+        self.max_frames = math.inf
+        if max_frames_per_level is not None:
+            self.max_frames = whole_number("curriculum.advance.max_frames_per_level", max_frames_per_level)
+        self.demote_below = 0.0
+        if demote_below is not None:
+            self.demote_below = fraction("curriculum.advance.demote_below", demote_below)
+            if self.demote_below >= self.occupancy:
+                raise ValueError(f"curriculum.advance.demote_below={demote_below}: expected < {occupancy=}.")
+
+    def update(self, tally):
+        full = len(tally.window) == self.window
+        reached = full and tally.mean >= self.occupancy - TOLERANCE
+        if reached or tally.level_frames >= self.max_frames:
+            return tally.level + 1, {}
+        if full and tally.mean < self.demote_below - TOLERANCE:
+            return tally.level - 1, {}
+        return tally.level, {}
+
+    def least_frames(self, batch):  # an episode takes at least one frame
+        return (self.end - self.start) * max(min(self.window, self.max_frames), batch)
+
+
+class Plateau(Advance):
+    """One level up when the mean occupancy at the level stops improving.
+
+    Args:
+        window: episodes in a window; windows do not overlap; each is compared with the level's best so far.
+        patience: promote after this many windows in a row without an improvement.
+        min_improvement: least increase in mean occupancy that is an improvement, in [0, 1].
+    """
+
+    state_keys = ("best", "stale", "compared")
+
+    def __init__(self, window: int, patience: int, min_improvement: float = 0.01):
+        self.window = whole_number("curriculum.advance.window", window)
+        self.patience = whole_number("curriculum.advance.patience", patience)
+        self.min_improvement = fraction("curriculum.advance.min_improvement", min_improvement)
+
+    def setup(self, start, end, total_frames):
+        self._clear()
+        return super().setup(start, end, total_frames)
+
+    def _clear(self):
+        self.best, self.stale = 0.0, 0  # the best window's mean, and the number of windows since
+        self.compared = 0  # the tally's episodes at the latest comparison
+
+    def update(self, tally):
+        if tally.episodes - self.compared >= self.window:
+            self.compared, improvement = tally.episodes, tally.mean - self.best
+            if improvement > 0 and improvement >= self.min_improvement - TOLERANCE:
+                self.best, self.stale = tally.mean, 0
+            else:
+                self.stale += 1
+        logs = {"best_occupancy": self.best, "stale_windows": self.stale}
+        if self.stale < self.patience or tally.level == self.end:
+            return tally.level, logs
+        self._clear()
+        return tally.level + 1, logs
+
+    def least_frames(self, batch):  # an episode takes at least one frame
+        return (self.end - self.start) * self.patience * max(self.window, batch)
+
+
+class Staged(Advance):
+    """The level from a list of stages.
+
+    Args:
+        stages: ``{frames, height}`` each: from that frame of the run on, the level is that height; None is the last
+            height. ``frames`` ascend. Before the first stage the level is the first height.
+    """
+
+    def __init__(self, stages):
+        self.stages, least = [], 0
+        if not isinstance(stages, Sequence) or isinstance(stages, str):
+            raise ValueError(f"curriculum.advance.stages={stages!r}: expected a list of {{frames: F, height: H}}.")
+        for stage in stages:
+            if not isinstance(stage, Mapping) or set(stage) != {"frames", "height"}:
+                raise ValueError(f"curriculum.advance.stages: got {stage!r}, expected {{frames: F, height: H}}.")
+            frames = whole_number("curriculum.advance.stages: frames", stage["frames"], least)
+            self.stages.append((frames, stage["height"]))
+            least = frames + 1
+        if not self.stages:
+            raise ValueError("curriculum.advance.stages=[]: expected at least one {frames: F, height: H}.")
+
+    def setup(self, start, end, total_frames):
+        super().setup(start, end, total_frames)
+        key = "curriculum.advance.stages: height"
+        self.plan = [(f, end if h is None else whole_number(key, h, start, end)) for f, h in self.stages]
+        return self._height_at(0)
+
+    def _height_at(self, frames: int) -> int:
+        return ([self.start] + [height for first, height in self.plan if first <= frames])[-1]
+
+    def update(self, tally):
+        return self._height_at(tally.frames), {}
+
+    def least_frames(self, batch):
+        return min((f for f in (0, *dict(self.plan)) if self._height_at(f) == self.end), default=math.inf)

@@ -1,0 +1,178 @@
+"""The curriculum of a run: its level, its counts, and what a checkpoint stores of them."""
+
+import math
+import reprlib
+from collections import deque
+from numbers import Integral, Real
+
+from torch import Tensor
+
+from pickplace.training.curriculum.advance import Advance, Tally
+from pickplace.training.curriculum.checks import fraction, is_finite_number, whole_number
+from pickplace.training.curriculum.transform import ToteHeightCurriculum
+
+
+class Curriculum:
+    """The level of a run, moved by an advance rule after each batch.
+
+    Args:
+        advance: an :class:`Advance` rule.
+        sample: a height sampler, see :mod:`pickplace.training.curriculum.sample`.
+        start_height: the first level and the least height drawn, in cells; None is the greatest item height.
+        end_height: the last level, in cells; None is the tote's full height, ``tote_size[2]``.
+    """
+
+    def __init__(self, advance: Advance, sample, start_height: int | None = None, end_height: int | None = None):
+        if not isinstance(advance, Advance):
+            raise ValueError(f"curriculum.advance={advance!r}: expected a rule, such as curriculum/advance=threshold.")
+        if not callable(sample):
+            raise ValueError(f"curriculum.sample={sample!r}: expected a sampler, such as curriculum/sample=recent.")
+        self.advance, self.sample = advance, sample
+        self.start_height, self.end_height = start_height, end_height
+
+    def setup(self, min_height: int, max_height: int, total_frames: int) -> None:
+        """Set the heights and the budget of a run, and begin at the first level.
+
+        Args:
+            min_height: the greatest item height, in cells.
+            max_height: the tote's full height, in cells.
+            total_frames: the run's budget, in frames.
+
+        Raises:
+            ValueError: naming the setting that does not fit these numbers.
+        """
+        end = max_height if self.end_height is None else self.end_height
+        self.end = whole_number("curriculum.end_height", end, min_height, max_height)
+        self.full_height = max_height
+        start = min_height if self.start_height is None else self.start_height
+        self.start = whole_number("curriculum.start_height", start, min_height, self.end)
+        first = self.advance.setup(self.start, self.end, whole_number("total_frames", total_frames))
+        self.tally = Tally(self._clamped(first), deque(maxlen=self.advance.window))
+        self._rule_state()  # raises here, not at the first checkpoint
+
+    @property
+    def level(self) -> int:
+        """The tote height trained at now, in cells."""
+        return self.tally.level
+
+    def transform(self) -> ToteHeightCurriculum:
+        """Return a transform for one collector process, at the present level."""
+        return ToteHeightCurriculum(self.level, self.sample, self.start)
+
+    def check_budget(self, total_frames: int, batch: int = 1) -> str | None:
+        """Return a warning if full height cannot be trained within ``total_frames``, else None.
+
+        Args:
+            total_frames: the run's budget.
+            batch: frames of a batch; the level moves only after a batch.
+        """
+        if self.end < self.full_height:
+            return (
+                f"curriculum.end_height={self.end}: nothing is trained at the full height, {self.full_height}, "
+                "at which validation and evaluation play."
+            )
+        least = self.advance.least_frames(batch)
+        if least < total_frames:
+            return None
+        expected = f"more than {least} frames" if least < math.inf else "a stage of that height"
+        return (
+            f"total_frames={total_frames}: the curriculum ({type(self.advance).__name__}, from height "
+            f"{self.start}) cannot train at its last height {self.end}; expected {expected}."
+        )
+
+    def update(self, heights: Tensor, occupancy: Tensor, frames: int) -> dict:
+        """Count a batch's finished episodes and move the level.
+
+        Args:
+            heights: their tote heights, int ``[E]``; E may be 0.
+            occupancy: their final occupancies, float ``[E]``.
+            frames: frames of the whole run, this batch included.
+
+        Returns:
+            Metrics to log: ``curriculum/level`` (from now on), ``/progress`` (0 at the first height, 1 at the last),
+            ``/frames_at_level``, ``/episodes`` and ``/occupancy`` (number and windowed mean at the level; no mean
+            without an episode), ``/occupancy_at_<height>`` (means of this batch), and the rule's own. Counts are
+            those that the rule decided on; a change of level clears them afterwards.
+        """
+        tally, heights, occupancy = self.tally, heights.reshape(-1), occupancy.reshape(-1).double()
+        at_level = occupancy[heights == tally.level].tolist()
+        tally.frames, tally.episodes = frames, tally.episodes + len(at_level)
+        tally.window.extend(at_level)
+        level, logs = self._ask_rule()
+        logs |= {"level": level, "frames_at_level": tally.level_frames, "episodes": tally.episodes}
+        logs["progress"] = (level - self.start) / (self.end - self.start) if self.end > self.start else 1.0
+        if tally.window:
+            logs["occupancy"] = tally.mean
+        for height in heights.unique().tolist():
+            logs[f"occupancy_at_{height}"] = occupancy[heights == height].mean().item()
+        if level != tally.level:
+            self.tally = Tally(level, deque(maxlen=self.advance.window), frames, level_start=frames)
+        return {f"curriculum/{key}": value for key, value in logs.items()}
+
+    def _ask_rule(self) -> tuple[int, dict]:
+        """Return the rule's next level and logs, checked: the rule may be a user's own."""
+        answer = self.advance.update(self.tally)
+        if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], dict):
+            raise ValueError(
+                f"{self._rule_name}: update returned {reprlib.repr(answer)}; expected (level, {{name: number}})."
+            )
+        level, logs = self._clamped(answer[0]), {**answer[1]}
+        self._rule_state()
+        for name, value in logs.items():
+            if not isinstance(value, Real):
+                raise ValueError(f"{self._rule_name}: it logs {name}={reprlib.repr(value)}; expected a number.")
+        return level, logs
+
+    @property
+    def _rule_name(self) -> str:
+        return f"curriculum.advance: {type(self.advance).__name__}"
+
+    def _clamped(self, level) -> int:
+        """Return a rule's level, limited to the first and the last height."""
+        if isinstance(level, bool) or not isinstance(level, Integral):
+            raise ValueError(f"{self._rule_name}: its level is {reprlib.repr(level)}; expected a whole number.")
+        return min(max(int(level), self.start), self.end)
+
+    def _rule_state(self) -> dict:
+        """Return the rule's own state; raise if a checkpoint could not store it."""
+        state = {key: getattr(self.advance, key, None) for key in self.advance.state_keys}
+        for name, value in state.items():
+            if not is_finite_number(value):
+                raise ValueError(
+                    f"{self._rule_name}: its state has {name}={reprlib.repr(value)}; expected a finite Python number."
+                )
+        return state
+
+    def state_dict(self) -> dict:
+        """Return level, counts and the rule's own state as plain JSON types; JSON stores floats exactly."""
+        return vars(self.tally) | {"window": list(self.tally.window), "advance": self._rule_state()}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Continue from a :meth:`state_dict`; call it after :meth:`setup`.
+
+        Raises:
+            ValueError: for the state of another advance rule, a level outside the heights, or no such state.
+        """
+        rule = state.get("advance") if isinstance(state, dict) else None
+        if not isinstance(rule, dict) or set(state) != {*vars(self.tally), "advance"}:
+            raise ValueError(
+                f"The checkpoint's curriculum is {reprlib.repr(state)}; expected the state that a training saved."
+            )
+        if set(rule) != set(self.advance.state_keys):
+            raise ValueError(
+                f"curriculum.advance={type(self.advance).__name__}: the checkpoint has the state "
+                f"{sorted(rule)}, expected {sorted(self.advance.state_keys)}; resume with the run's own rule."
+            )
+        key = "curriculum {} of the checkpoint".format
+        level = whole_number(key("level"), state["level"], self.start, self.end)
+        counts = {name: whole_number(key(name), state[name], 0) for name in ("frames", "level_start", "episodes")}
+        if not isinstance(state["window"], list):
+            raise ValueError(
+                f"{key('window')}={reprlib.repr(state['window'])}: expected a list of numbers between 0 and 1."
+            )
+        window = deque((fraction(key("window"), value) for value in state["window"]), self.advance.window)
+        for name, value in rule.items():
+            if not is_finite_number(value):
+                raise ValueError(f"{key(name)}={value!r}: expected a number.")
+        self.tally = Tally(level, window, **counts)
+        vars(self.advance).update(rule)

@@ -1,0 +1,41 @@
+"""Height samplers: the tote heights of new episodes, given the level.
+
+A sampler is called as ``sampler(level, min_height, count)`` and returns heights, int64 ``[count]``.
+"""
+
+import torch
+from torch import Tensor
+
+from pickplace.training.curriculum.checks import fraction
+
+
+class Current:
+    """Height sampler: every episode plays at the level."""
+
+    def __call__(self, level: int, min_height: int, count: int) -> Tensor:
+        """Return heights for ``count`` episodes, int64 ``[count]``."""
+        return torch.full((count,), level, dtype=torch.int64)
+
+
+class Uniform:
+    """Height sampler: uniform from the least height to the level, drawn from torch's global generator."""
+
+    def __call__(self, level: int, min_height: int, count: int) -> Tensor:
+        """Return heights for ``count`` episodes, int64 ``[count]``."""
+        return torch.randint(min_height, level + 1, (count,))
+
+
+class Recent:
+    """Height sampler: the level, and a share of episodes at earlier heights to prevent forgetting.
+
+    Args:
+        share: probability in [0, 1] of an earlier height, drawn uniformly from torch's global generator.
+    """
+
+    def __init__(self, share: float = 0.25):
+        self.share = fraction("curriculum.sample.share", share)
+
+    def __call__(self, level: int, min_height: int, count: int) -> Tensor:
+        """Return heights for ``count`` episodes, int64 ``[count]``."""
+        earlier = torch.randint(min_height, max(level, min_height + 1), (count,))
+        return torch.where(torch.rand(count) < self.share, earlier, level)

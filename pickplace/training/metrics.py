@@ -1,0 +1,43 @@
+"""What a training logs of a batch and of a validation, and its progress line."""
+
+from tensordict import TensorDictBase
+
+from pickplace.evaluation.evaluate import Episodes, confidence95
+from pickplace.task.state import Failure
+from pickplace.training.curriculum import Curriculum
+
+
+def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
+    """Mean reward, and of the episodes that ended in the batch: number, mean occupancy and shares of failures."""
+    metrics = {"train/reward": batch["next", "reward"].mean().item()}
+    done = batch["next", "done"]
+    ended = int(done.sum())
+    metrics["train/episodes"] = ended
+    if ended:
+        metrics["train/occupancy"] = batch["next", "occupancy"][done].mean().item()
+        reasons = batch["next", "failure"][done]
+        for failure in Failure:
+            metrics[f"train/failure_{failure.name.lower()}"] = (reasons == failure).float().mean().item()
+    return metrics
+
+
+def validation_metrics(episodes: Episodes) -> dict[str, float]:
+    """Mean occupancy of a validation and its 95% interval."""
+    low, high = confidence95(episodes.occupancy)
+    return {"occupancy": float(episodes.occupancy.mean()), "ci95_low": low, "ci95_high": high}
+
+
+def has_passed(before: int, now: int, interval: int) -> bool:
+    """Return whether a multiple of ``interval`` lies in ``(before, now]``; it works for any batch size."""
+    return before // interval != now // interval
+
+
+def progress_line(frames: int, total: int, speed: float, curriculum: Curriculum, metrics: dict) -> str:
+    """Frames, speed, level, occupancy and remaining time, as one line."""
+    left = int(max(total - frames, 0) / speed)  # the last batch is collected whole
+    occupancy = metrics.get("train/occupancy", float("nan"))
+    return (
+        f"{frames / total:4.0%} {frames:>11,} frames | {speed:6,.0f}/s | "
+        f"tote height {curriculum.level}/{curriculum.end} | occupancy {occupancy:.3f} | "
+        f"{left // 60}:{left % 60:02d} to go"
+    )

@@ -1,0 +1,123 @@
+"""PPO and A2C: advantages, loss, learning rate and the epochs over one batch."""
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.modules import ValueOperator
+from torchrl.objectives import A2CLoss, ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from pickplace.policies.base import Policy, as_actor
+from pickplace.training.imitation import Phase, imitation_loss
+
+#: Logged diagnostics, by their names in the loss's output.
+DIAGNOSTICS = {
+    "loss_objective": "loss_objective",
+    "loss_critic": "loss_critic",
+    "entropy": "entropy",
+    "kl_approx": "approx_kl",
+    "clip_fraction": "clip_fraction",
+    "explained_variance": "explained_variance",
+    "loss_imitation": "loss_imitation",
+    "agreement": "agreement",
+}
+
+
+def make_losses(algo: DictConfig, policy: Policy, critic: ValueOperator) -> tuple[GAE, A2CLoss | ClipPPOLoss]:
+    """Make the advantage estimator and the loss that ``algo.loss`` names."""
+    common = {"entropy_coeff": algo.entropy_coeff, "critic_coeff": algo.critic_coeff, "loss_critic_type": "l2"}
+    if algo.loss == "ppo":
+        clip = {"clip_epsilon": algo.clip_epsilon, "normalize_advantage": algo.normalize_advantage}
+        loss = ClipPPOLoss(as_actor(policy), critic, **clip, **common)
+    else:
+        loss = A2CLoss(as_actor(policy), critic, **common)
+    loss.set_keys(action=policy.choice_key, sample_log_prob="log_prob")
+    # A2CLoss does not normalise advantages itself.
+    average = algo.loss == "a2c" and algo.normalize_advantage
+    advantage = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=critic, average_gae=average, deactivate_vmap=True)
+    return advantage, loss
+
+
+def learning_rate(algo: DictConfig, frames: int, total_frames: int) -> float:
+    """Learning rate of the batch that ends at ``frames``.
+
+    It is ``algo.lr``; with ``algo.lr_decay_start`` it falls linearly over the last part of the run, to 0 in the last
+    batch.
+
+    Args:
+        frames: frames of the run, this batch included.
+        total_frames: the run's budget.
+    """
+    if algo.lr_decay_start is None:
+        return algo.lr
+    left = (1 - frames / total_frames) / max(1 - algo.lr_decay_start, 1e-9)
+    return algo.lr * min(max(left, 0.0), 1.0)
+
+
+@torch.no_grad()
+def add_advantages(batch: TensorDictBase, advantage: GAE, reward_scale: float) -> None:
+    """Scale the rewards of a batch ``[N, T]`` in place and write ``advantage`` and ``value_target`` into it."""
+    batch["next", "reward"] = batch["next", "reward"] * reward_scale
+    batch["next", "terminated"] |= is_bin_empty(batch["next"])
+    advantage(batch)
+
+
+def is_bin_empty(state: TensorDictBase) -> Tensor:
+    """Whether no item has arrived because a recorded stream has ended, bool ``[..., 1]``.
+
+    The environment reports that as a truncation. But no reward can follow and no action is taken in that state, so the
+    critic would never learn the value with which GAE continues a truncated episode.
+    """
+    return state["bin_depth"].flatten(-2).amax(-1, keepdim=True) == 0
+
+
+def update(loss, optimizer, data: TensorDictBase, algo: DictConfig, policy, phase=Phase.REWARD) -> dict[str, float]:
+    """Train for ``algo.epochs`` epochs of shuffled minibatches over one batch of frames ``[B]``.
+
+    In phase ``REWARD`` the loss is TorchRL's; in ``CRITIC`` its critic part alone; in ``IMITATION`` that part and the
+    imitation of ``data["taught"]``.
+
+    Returns:
+        Mean diagnostics, ``train/...``.
+
+    Raises:
+        FloatingPointError: if the loss or its gradient is not finite.
+    """
+    totals: dict[str, Tensor | float] = {}
+    steps = 0
+    for _ in range(algo.epochs):
+        for index in torch.randperm(len(data), device=data.device).split(algo.minibatch_size):
+            part = data[index]
+            losses = loss(part)
+            total = losses["loss_critic"]
+            if phase == Phase.REWARD:
+                total = losses["loss_objective"] + total + losses["loss_entropy"]
+            elif phase == Phase.IMITATION:
+                losses["loss_imitation"], losses["agreement"] = imitation_loss(policy, part)
+                total = total + losses["loss_imitation"]
+            optimizer.zero_grad(set_to_none=True)
+            total.backward()
+            norm = torch.nn.utils.clip_grad_norm_(loss.parameters(), algo.max_grad_norm)
+            if not torch.isfinite(norm + total.detach()):
+                parts = {key: value.detach() for key, value in losses.items() if key.startswith("loss_")}
+                raise FloatingPointError(f"the loss or its gradient is not finite: {value_ranges({**parts, **part})}.")
+            optimizer.step()
+            steps += 1
+            present = set(losses.keys())
+            diagnostics = {name: losses[key].detach() for key, name in DIAGNOSTICS.items() if key in present}
+            for name, value in {**diagnostics, "grad_norm": norm}.items():
+                totals[name] = totals.get(name, 0.0) + value
+    return {f"train/{name}": float(value) / steps for name, value in totals.items()}
+
+
+def value_ranges(values) -> str:
+    """Least and greatest value of each floating-point tensor and its number of non-finite values, as one line."""
+    words = []
+    for name, value in values.items():
+        if value.is_floating_point():
+            finite = value[value.isfinite()]
+            text = f"{finite.min():.3g} to {finite.max():.3g}" if len(finite) else "no number"
+            bad = value.numel() - len(finite)
+            words.append(f"{name} {text}" + f" ({bad} of {value.numel()} not finite)" * bool(bad))
+    return "; ".join(words)

@@ -1,0 +1,308 @@
+"""The parts of a training run, its counters, and what a checkpoint stores of them."""
+
+import logging
+import shlex
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import Compose, TransformedEnv
+
+from pickplace.evaluation.evaluate import Episodes, commit, play, versions
+from pickplace.policies.base import Policy, as_collection_policy, as_critic
+from pickplace.runs import checkpoint
+from pickplace.runs.hydra_app import use_machine
+from pickplace.runs.registry import build
+from pickplace.runs.resume import (
+    COUNTERS,
+    StopRequest,
+    best_of_another_course,
+    load_optimizer,
+    saying_what_is_safe,
+)
+from pickplace.training.collectors import rng_state, set_rng_state, watch_workers
+from pickplace.training.curriculum import Curriculum, push_level
+from pickplace.training.imitation import Phase, WarmStart
+from pickplace.training.metrics import has_passed, progress_line, validation_metrics
+from pickplace.training.ppo import add_advantages, learning_rate, make_losses, update
+from pickplace.training.report import REPORT, write_report
+from pickplace.training.settings import check_settings, checkpoint_config
+from pickplace.views.figures import learning_curve
+
+log = logging.getLogger(__name__)
+
+
+class Trainer:
+    """The parts and counters of one training run; :func:`pickplace.training.train.run` is the loop over them.
+
+    Args:
+        cfg: the composed config, see ``conf/train.yaml``.
+        run_dir: folder for checkpoints, metrics and figures.
+        resume: state, facts and folder of the checkpoint to continue from; None begins a new run.
+
+    Attributes:
+        frames: environment steps so far.
+        iteration: batches so far.
+        best: best validation occupancy so far; -1 before the first validation.
+        latest: metrics of the latest validation.
+        episodes: episodes of the latest validation of this process, or None.
+        safe_folder: the checkpoint that was read or written last, or None.
+
+    Raises:
+        ValueError: for settings that make no sense.
+    """
+
+    def __init__(self, cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None = None):
+        check_settings(cfg)
+        self.cfg, self.algo, self.run_dir = cfg, cfg.algo, run_dir
+        self.saved_config, self.resume_overrides = checkpoint_config(cfg)
+        self.device = use_machine(cfg)
+        torch.manual_seed(cfg.seed)
+        self.resumed = resume is not None
+        self.safe_folder: Path | None
+        self.state, self.facts, self.safe_folder = resume or ({}, {}, None)
+        self.frames, self.iteration, self.best, self.latest = (
+            self.facts.get(key, default) for key, default in COUNTERS.items()
+        )
+        self.episodes: Episodes | None = None
+        # The order of these fixes the random draws of a seed.
+        self._make_models()
+        self._make_curriculum()
+        self._make_learner()
+
+    def _make_models(self) -> None:
+        """Make the items, the policy, the planner that validates it, the warm start and the critic."""
+        cfg = self.cfg
+        self.items = build("items", cfg["items"])
+        self.build_env = partial(build, "env", cfg.env, items=self.items, device=cfg.device)
+        probe = self.build_env(num_envs=1, masks=())
+        self.cell, self.terms, self.min_tote_height = probe.cell, probe.terms, probe.min_tote_height
+        make_actor = partial(
+            build, "model.actor", cfg.model.actor, cell=self.cell, mask_infeasible=self.algo.mask_infeasible
+        )
+        self.policy: Policy = self._restored("policy", make_actor)
+        for warning in self.policy.check_sizes():
+            log.warning(warning)
+        self.planner = build("planner", cfg.planner, cell=self.cell, policy=self.policy)
+        self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, self.items, self.terms, cfg.seed, cfg.trust)
+        make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
+        self.critic = self._restored("critic", lambda: as_critic(make_critic()))
+
+    def _restored(self, key: str, make) -> Any:
+        """Make a module, with the checkpoint's weights if the run is resumed."""
+        module = checkpoint.restore(make, self.state.get(key, {}), key) if self.resumed else make()
+        return module.to(self.device)
+
+    def _make_curriculum(self) -> None:
+        """Make the curriculum, and warn of a budget that is too small and of a best checkpoint that is stale."""
+        cfg = self.cfg
+        self.curriculum: Curriculum = build("curriculum", cfg.curriculum)
+        self.curriculum.setup(self.min_tote_height, self.cell.tote_size[2], cfg.total_frames)
+        if self.resumed:
+            self.curriculum.load_state_dict(self.facts["curriculum"])
+            stale = best_of_another_course(self.run_dir, self.frames, self.saved_config)
+            if stale is not None:
+                self.best = COUNTERS["best"]
+                log.warning(
+                    "checkpoints/best is of frame %s and of other settings; the next validation replaces it",
+                    f"{stale:,}",
+                )
+        batch_frames = cfg.env.num_envs * self.algo.rollout_length
+        if shortage := self.curriculum.check_budget(cfg.total_frames, batch_frames):
+            log.warning(shortage)
+        if learning_rate(self.algo, batch_frames, cfg.total_frames) == 0 < self.algo.lr:
+            log.warning(
+                "total_frames=%d: the only batch has learning rate 0 (algo.lr_decay_start); nothing is learnt",
+                cfg.total_frames,
+            )
+
+    def _make_learner(self) -> None:
+        """Make TorchRL's parts: advantage, loss, optimizer and collector."""
+        cfg, algo = self.cfg, self.algo
+        env_config = OmegaConf.to_container(cfg.env, resolve=True)
+        make_env = partial(
+            training_env, env_config, self.items, cfg.device, self.policy.masks, cfg.env.num_envs, self.curriculum
+        )
+        self.acting = as_collection_policy(self.policy)
+        self.advantage, self.loss = make_losses(algo, self.policy, self.critic)
+        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=algo.lr, eps=1e-5)
+        self.collector = build(
+            "collector",
+            cfg.collector,
+            make_env=make_env,
+            policy=self.acting,
+            num_envs=cfg.env.num_envs,
+            rollout_length=algo.rollout_length,
+            seed=cfg.seed,
+        )
+
+    @contextmanager
+    def running(self) -> Iterator[StopRequest]:
+        """Prepare everything for the loop, and close it afterwards, however the loop ends.
+
+        Restores the checkpoint, opens the logger, takes over Ctrl-C and SIGTERM, and watches the workers.
+
+        Returns:
+            The request to stop, as the value of the ``with`` statement.
+        """
+        cfg = self.cfg
+        with ExitStack() as cleanup:
+            cleanup.callback(self.collector.shutdown)
+            if self.resumed:
+                self._restore_state()
+            settings = OmegaConf.to_container(cfg, resolve=True)
+            self.logger = build("logger", cfg.logger, folder=self.run_dir, frames=self.frames, settings=settings)
+            stop, self.start_time, self.start_frames = StopRequest(), time.perf_counter(), self.frames
+            is_last = self.safe_folder is None or "last" in self.safe_folder.name
+            self.last_saved = self.frames if is_last else None  # frames of checkpoints/last
+            cleanup.callback(stop.restore)
+            cleanup.callback(self.logger.close)
+            log.info(
+                "%s frames to train, at tote height %d of %d",
+                f"{max(cfg.total_frames - self.frames, 0):,}",
+                self.curriculum.level,
+                self.curriculum.end,
+            )
+            cleanup.enter_context(saying_what_is_safe(lambda: self.safe_folder, self.resume_overrides))
+            cleanup.enter_context(watch_workers(self.collector))
+            yield stop
+
+    def _restore_state(self) -> None:
+        """Restore optimizer, collector and random generators from the checkpoint."""
+        load_optimizer(self.optimizer, self.state.get("optimizer", {}))
+        with watch_workers(self.collector):
+            own = self.collector.state_dict()
+            self.collector.load_state_dict(checkpoint.fitting(self.state.get("collector"), own, "collector"))
+            push_level(self.collector, self.curriculum.level)
+        # Last: everything above may have drawn.
+        set_rng_state(checkpoint.fitting(self.state, rng_state(self.device), "random generator"), self.device)
+
+    def push_weights(self) -> None:
+        """Send the newest weights to the collector's processes."""
+        self.collector.update_policy_weights_(TensorDict.from_module(self.acting).data)
+
+    def advance_curriculum(self, batch: TensorDictBase) -> dict:
+        """Move the curriculum by the episodes that finished in the batch; return its metrics."""
+        done = batch["next", "done"][..., 0]
+        heights, occupancy = (batch["next", key][done][:, 0] for key in ("tote_height", "occupancy"))
+        level = self.curriculum.level
+        metrics = self.curriculum.update(heights, occupancy, self.frames)
+        if self.curriculum.level != level:
+            push_level(self.collector, self.curriculum.level)
+            log.info("%s frames: tote height %d -> %d", f"{self.frames:,}", level, self.curriculum.level)
+        return metrics
+
+    def learn(self, batch: TensorDictBase, phase: Phase) -> dict:
+        """Train on a batch ``[N, T]``: advantages and the teacher's choices once, then epochs of minibatches."""
+        add_advantages(batch, self.advantage, self.algo.reward_scale)
+        rate = learning_rate(self.algo, self.frames, self.cfg.total_frames)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        seen = {*self.policy.in_keys, *self.critic.in_keys}
+        data = batch.select(*seen, self.policy.choice_key, "log_prob", "advantage", "value_target").reshape(-1)
+        if phase == Phase.IMITATION:
+            data["taught"] = self.warm_start.ask(batch.reshape(-1), self.iteration)
+        metrics = update(self.loss, self.optimizer, data, self.algo, self.policy, phase)
+        return {**metrics, "train/lr": rate}
+
+    def validate(self, record=()) -> Episodes:
+        """Play the validation stream at full height, and record the episodes of these numbers."""
+        evaluation = self.cfg.evaluation
+
+        def make_env(first, count):
+            stream = {"stream": evaluation.stream, "seed": evaluation.seed, "first_episode": first}
+            return self.build_env(num_envs=count, masks=(), **stream)
+
+        return play(make_env, self.planner, evaluation.episodes, evaluation.batch_size, record)
+
+    def finish_batch(self, metrics: dict, before: int) -> None:
+        """Validate, log, save and print progress where their intervals ended between ``before`` and now."""
+        cfg, frames = self.cfg, self.frames
+        if frames >= cfg.total_frames or has_passed(before, frames, cfg.evaluation_interval):
+            self.episodes = self.validate()
+            self.latest = validation_metrics(self.episodes)
+            metrics |= {f"eval/{key}": value for key, value in self.latest.items()}
+            log.info("%s frames: validation occupancy %.4f", f"{frames:,}", self.latest["occupancy"])
+        self.logger.log(metrics, frames)
+        # After the row was logged, which a run resumed from this checkpoint needs.
+        if "eval/occupancy" in metrics and self.latest["occupancy"] > self.best:
+            self.best = self.latest["occupancy"]
+            self.save("best")
+        if has_passed(before, frames, cfg.checkpoint_interval):
+            self.save("last")
+        if has_passed(before, frames, cfg.progress_interval):
+            speed = (frames - self.start_frames) / (time.perf_counter() - self.start_time)
+            log.info(progress_line(frames, cfg.total_frames, speed, self.curriculum, metrics))
+
+    def save(self, name: str) -> None:
+        """Write the checkpoint ``checkpoints/<name>``; a ``last`` keeps the one before it as ``previous``."""
+        state = {
+            "policy": self.policy.state_dict(),
+            "critic": self.critic.state_dict(),
+            "optimizer": self.optimizer.state_dict()["state"],
+            "collector": self.collector.state_dict(),
+            **rng_state(self.device),
+        }
+        counters = (self.frames, self.iteration, self.best, self.latest)
+        facts = {
+            **dict(zip(COUNTERS, counters, strict=True)),
+            "curriculum": self.curriculum.state_dict(),
+            "config": self.saved_config,
+            "versions": versions(),
+            "commit": commit(),
+        }
+        folder = self.run_dir / "checkpoints" / name
+        checkpoint.write(folder, state, facts, checkpoint.PREVIOUS if name == "last" else None)
+        self.safe_folder = folder
+        if name == "last":
+            self.last_saved = self.frames
+
+    def log_ending(self, stopped: bool) -> None:
+        """Log how a stopped run is continued, or that the curriculum did not reach its last height."""
+        level, end = self.curriculum.level, self.curriculum.end
+        if stopped:
+            command = f"pickplace-train resume={shlex.quote(str(self.run_dir))}{self.resume_overrides}"
+            log.info("stopped at %s frames; continue with: %s", f"{self.frames:,}", command)
+        elif level < end:
+            log.info(
+                "the tote grew to height %d of %d only, so the policy was not trained above it; "
+                "train longer, or let a level end sooner (curriculum.advance, see docs/curriculum.md)",
+                level,
+                end,
+            )
+
+    def write_report(self) -> None:
+        """Draw the learning curve; for a complete run also write ``report.html``, unless it is up to date."""
+        run_dir = self.run_dir
+        if not (run_dir / "metrics.csv").is_file():
+            return
+        learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
+        up_to_date = self.episodes is None and (run_dir / REPORT).is_file()  # nothing was trained since
+        if self.frames >= self.cfg.total_frames and not up_to_date:
+            log.info("writing the report")
+            episodes = self.episodes or self.validate()
+            extremes = {int(episodes.occupancy.argmin()), int(episodes.occupancy.argmax())}
+            replayed = self.validate(record=extremes)
+            write_report(run_dir, self.cfg, replayed, self.cell, versions() | {"commit": commit()})
+
+
+def training_env(env_config, items, device, masks, total_envs, curriculum, first_episode, num_envs) -> TransformedEnv:
+    """Make the environment of one collector process: slots ``first_episode ..`` of ``total_envs``, under the
+    curriculum."""
+    env = build(
+        "env",
+        OmegaConf.create(env_config),
+        items=items,
+        device=device,
+        masks=masks,
+        num_envs=num_envs,
+        first_episode=first_episode,
+        episode_stride=total_envs,
+    )
+    return TransformedEnv(env, Compose(curriculum.transform()))

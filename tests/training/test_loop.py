@@ -1,0 +1,208 @@
+"""Training: advantages by hand, what each loss and step consists of, and the wiring of stream, slots and curriculum."""
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from torch import nn
+from torchrl.modules import ValueOperator
+
+from pickplace import PickPlaceEnv
+from pickplace.evaluation.evaluate import play
+from pickplace.planners import JointDBL
+from pickplace.policies.actors import as_collection_policy, fcn_grasp
+from pickplace.policies.networks.critics import PooledCritic
+from pickplace.runs import checkpoint
+from pickplace.runs.hydra_app import conf_dir
+from pickplace.runs.loggers import read_csv
+from pickplace.runs.registry import build
+from pickplace.training import trainer
+from pickplace.training.curriculum import Current, Curriculum, NoAdvance
+from pickplace.training.imitation import Phase, imitation_loss
+from pickplace.training.metrics import episode_metrics, has_passed
+from pickplace.training.ppo import add_advantages, learning_rate, make_losses, update
+from pickplace.training.trainer import Trainer, training_env
+
+OBSERVED = ["bin_depth", "tote_depth"]  # by a critic
+
+
+def composed(*overrides):
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return compose("train", list(overrides))
+
+
+class MeanDepthCritic(nn.Module):
+    """A value that is computed by hand: a tenth of the mean tote depth."""
+
+    def __init__(self):
+        super().__init__()
+        self.scale = nn.Parameter(torch.tensor(0.1))
+
+    def forward(self, bin_depth, tote_depth):
+        return self.scale * tote_depth.mean((-2, -1))[..., None]
+
+
+@pytest.fixture(scope="module")
+def collected():
+    """Policy and batch [8, 6] of a small tote."""
+    torch.manual_seed(0)
+    env = PickPlaceEnv(num_envs=8, masks=("outcome",), tote_size=(4, 4, 1))
+    policy = fcn_grasp(env.rules, True, filters=8, hidden=8, head_std=1.0, compute_dtype="float32")
+    with torch.no_grad():
+        return policy, env.rollout(6, as_collection_policy(policy), break_when_any_done=False)
+
+
+# ---------------------------------------------------------------- advantages, losses, steps
+
+
+def test_advantages_by_hand(collected):
+    policy, batch = collected[0], collected[1].clone()
+    cfg = composed("algo.gamma=0.9", "algo.lmbda=0.5").algo
+    advantage, _ = make_losses(cfg, policy, ValueOperator(MeanDepthCritic(), OBSERVED))
+    add_advantages(batch, advantage, 0.25)
+    value, following = (0.1 * depth.mean((-2, -1)) for depth in (batch["tote_depth"], batch["next", "tote_depth"]))
+    reward, goes_on = 0.25 * collected[1]["next", "reward"][..., 0], ~batch["next", "done"][..., 0]
+    assert 0 < goes_on.sum() < goes_on.numel()
+    expected, later = torch.zeros_like(value), torch.zeros(8)
+    for step in reversed(range(6)):
+        surprise = reward[:, step] + 0.9 * following[:, step] * goes_on[:, step] - value[:, step]
+        later = surprise + 0.9 * 0.5 * later * goes_on[:, step]
+        expected[:, step] = later
+    torch.testing.assert_close(batch["advantage"][..., 0], expected)
+    torch.testing.assert_close(batch["value_target"][..., 0], expected + value)
+
+
+@pytest.mark.parametrize("algo", ["ppo", "a2c"])
+def test_losses_are_weighted_as_the_config_says(collected, algo):
+    policy, data = collected[0], collected[1].reshape(-1)
+    cfg = composed(f"algo={algo}", "algo.entropy_coeff=0.3", "algo.critic_coeff=0.05").algo
+    advantage, loss = make_losses(cfg, policy, ValueOperator(MeanDepthCritic(), OBSERVED))
+    with torch.no_grad():
+        advantage(data)
+        losses, value = loss(data), 0.1 * data["tote_depth"].mean((-2, -1))[..., None]
+    torch.testing.assert_close(losses["loss_entropy"], -0.3 * losses["entropy"])
+    torch.testing.assert_close(losses["loss_critic"], 0.05 * (value - data["value_target"]).square().mean())
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+@pytest.mark.parametrize("algo", ["ppo", "a2c"])
+def test_advantages_are_normalised_where_the_config_says_so(collected, algo, wanted):
+    """Then twice the reward has the same gradient for the policy, otherwise twice the gradient."""
+    policy, critic, data = collected[0], MeanDepthCritic(), collected[1].clone()
+    critic.scale.data.zero_()
+    cfg = composed(f"algo={algo}", f"algo.normalize_advantage={wanted}").algo
+    advantage, loss = make_losses(cfg, policy, ValueOperator(critic, OBSERVED))
+    gradients = []
+    for _ in range(2):
+        with torch.no_grad():
+            advantage(data)
+        policy.zero_grad()
+        loss(data.reshape(-1))["loss_objective"].backward()
+        gradients.append(torch.cat([part.grad.flatten() for part in loss.parameters() if part.grad is not None]))
+        data["next", "reward"] = 2 * data["next", "reward"]
+    torch.testing.assert_close(gradients[1], gradients[0] * (1 if wanted else 2), rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("limit", [1e-3, 1e9])
+@pytest.mark.parametrize("phase", Phase)
+def test_a_step_follows_what_its_phase_learns_from(phase, limit):
+    """The policy from reward or its teacher, the critic always; no further than the greatest norm of a gradient."""
+    env = PickPlaceEnv(num_envs=8, masks=("outcome",), tote_size=(4, 4, 1))
+    policy = fcn_grasp(env.rules, True, filters=8, hidden=8, head_std=1.0, compute_dtype="float32")
+    critic = ValueOperator(PooledCritic(filters=8, hidden=8, compute_dtype="float32"), OBSERVED)
+    settings = ["algo.entropy_coeff=0.3", "algo.epochs=1", "algo.minibatch_size=64"]
+    cfg = composed(*settings, f"algo.max_grad_norm={limit}").algo
+    advantage, loss = make_losses(cfg, policy, critic)
+    with torch.no_grad():
+        data = env.rollout(6, as_collection_policy(policy), break_when_any_done=False).reshape(-1)
+        advantage(data)
+    data["taught"] = data["outcome"]
+    losses = loss(data)
+    total = {
+        Phase.REWARD: losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"],
+        Phase.CRITIC: losses["loss_critic"],
+        Phase.IMITATION: losses["loss_critic"] + imitation_loss(policy, data)[0],
+    }[phase]
+    before = [parameter.detach().clone() for parameter in loss.parameters()]
+    gradients = torch.autograd.grad(total, list(loss.parameters()), allow_unused=True)
+    gradients = [torch.zeros_like(b) if g is None else g for b, g in zip(before, gradients, strict=True)]
+    norm = torch.cat([g.flatten() for g in gradients]).norm()
+    step = 1 / min(limit, norm.item())  # so that the parameters move by 1, whatever the limit
+    update(loss, torch.optim.SGD(loss.parameters(), lr=step), data, cfg, policy, phase)
+    for parameter, old, gradient in zip(loss.parameters(), before, gradients, strict=True):
+        moved = gradient * step * min(1, limit / norm)
+        torch.testing.assert_close(old - parameter.detach(), moved, rtol=1e-2, atol=1e-5)
+
+
+def test_the_learning_rate_falls_linearly_over_the_last_part():
+    algo = composed("algo.lr=0.2", "algo.lr_decay_start=0.75").algo
+    rates = [learning_rate(algo, frames, 1000) for frames in (0, 750, 875, 1000, 1100)]
+    assert rates == pytest.approx([0.2, 0.2, 0.1, 0, 0])
+    assert learning_rate(composed("algo.lr=0.2", "algo.lr_decay_start=null").algo, 1000, 1000) == 0.2
+
+
+# ---------------------------------------------------------------- the loop
+
+
+def test_intervals_fire_for_any_batch_size():
+    fired = [now for now in range(30, 301, 30) if has_passed(now - 30, now, 100)]
+    assert fired == [120, 210, 300]
+
+
+def test_a_run_counts_logs_scales_and_saves(smoke, tmp_path, monkeypatch):
+    """The curriculum counts the batch at hand, ``best`` is the best validation, only the learner's rewards scale."""
+    occupancies, rows = iter([0.5, 0.8, 0.6, 0.7, 0.1]), []
+    interval = {"ci95_low": 0.0, "ci95_high": 1.0}
+    monkeypatch.setattr(trainer, "validation_metrics", lambda _: {"occupancy": next(occupancies), **interval})
+    levels = ["curriculum=paper", "curriculum.advance.frames_per_level=256", "env.tote_size=[4,4,3]"]
+    quick = ["algo.minibatch_size=128", "evaluation.episodes=1", "evaluation_interval=128"]
+    for scale, frames, final in ((0.5, 512, 0.7), (5, 128, 0.1)):
+        overrides = [*levels, *quick, f"algo.reward_scale={scale}", f"total_frames={frames}"]
+        assert smoke(tmp_path / str(scale), *overrides) == final
+        rows.append(read_csv(tmp_path / str(scale) / "metrics.csv"))
+    low, high = rows
+    assert [(row["frames"], row["curriculum/level"]) for row in low] == [(128, 1), (256, 2), (384, 2), (512, 3)]
+    best, last = (checkpoint.read(tmp_path / "0.5" / "checkpoints" / name)[1] for name in ("best", "last"))
+    assert (best["frames"], best["best"], last["frames"], last["best"]) == (256, 0.8, 512, 0.8)
+    assert low[0]["train/reward"] == high[0]["train/reward"] > 0
+    # At first the critic's values are near 0: its error is the return, squared.
+    assert high[0]["train/loss_critic"] / low[0]["train/loss_critic"] == pytest.approx(100, rel=0.3)
+
+
+def test_metrics_are_of_the_episodes_that_ended(collected):
+    batch = collected[1]
+    done = batch["next", "done"][..., 0]
+    metrics = episode_metrics(batch)
+    assert metrics["train/episodes"] == done.sum() > 0
+    assert metrics["train/occupancy"] == pytest.approx(batch["next", "occupancy"][done].mean().item())
+    assert sum(value for key, value in metrics.items() if "failure_" in key) == pytest.approx(1)
+
+
+def test_the_slots_of_all_workers_share_the_episodes_of_a_stream():
+    """Each episode is played once, by one of them."""
+    curriculum = Curriculum(NoAdvance(), Current())
+    curriculum.setup(1, 2, 100)
+    cfg = composed("env.tote_size=[4,4,2]")
+    env_config, items = {k: v for k, v in cfg.env.items() if k != "num_envs"}, build("items", cfg["items"])
+    played = []
+    for first in (0, 2):
+        env = training_env(env_config, items, "cpu", ("outcome",), 4, curriculum, first_episode=first, num_envs=2)
+        env.set_seed(0)
+        for _ in range(3):
+            env.reset()
+            played += env.base_env.episode.tolist()
+    assert sorted(played) == list(range(12))
+
+
+def test_validation_plays_its_own_stream_at_full_height(tmp_path):
+    settings = ["env.tote_size=[4,4,2]", "evaluation.seed=3", "seed=5", "evaluation.episodes=6", "threads=1"]
+    training = Trainer(composed("experiment=smoke", *settings), tmp_path)
+
+    def make_env(first, count):
+        stream = {"stream": "validation", "seed": 3, "first_episode": first}
+        return PickPlaceEnv(tote_size=(4, 4, 2), num_envs=count, masks=(), **stream)
+
+    training.planner = JointDBL(make_env(0, 1).rules)
+    found = training.validate()
+    training.collector.shutdown()
+    assert torch.equal(found.occupancy, play(make_env, training.planner, 6, 6).occupancy)
+    assert (found.tote_height == 2).all()
