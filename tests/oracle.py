@@ -1,4 +1,4 @@
-"""A slow, plain-Python reading of the task's rules, cell by cell: what the environment is compared with.
+"""A slow, plain-Python implementation of the task's rules, cell by cell, to compare the package with.
 
 It shares no code with the package and uses nothing but lists and integers. Sizes are in cells, grids are
 lists of columns (`grid[x][y]`), and a flat action is
@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import product
 
-SUCCESS, PICK_MISS, BIN_COLLISION, TOTE_COLLISION, OVERFLOW, ITEM_COLLISION, UNSTABLE, STUCK = range(8)
+SUCCESS, PICK_MISS, BIN_COLLISION, TOTE_COLLISION, OVERFLOW, ITEM_COLLISION, UNSTABLE, STUCK, OUT_OF_REACH = range(9)
 
 Pair = tuple[int, int]
 Triple = tuple[int, int, int]
@@ -29,6 +29,9 @@ class Rules:
     pick_rule: str = "contain"
     min_support: float = 0.5
     strict_support: bool = False
+    pick_ok: list[bool] | None = None  # for each pick cell; None: no limits on the robot
+    lowest_top: list[Grid] | None = None  # for each rotation and place cell
+    highest_top: list[Grid] | None = None
 
     @property
     def num_actions(self) -> int:
@@ -64,7 +67,7 @@ def rotate(r: int, effector: Pair, offset: Pair, size: Pair) -> tuple[Pair, Pair
 
 
 def corner_for(reference_at: Pair, size: Pair) -> Pair:
-    """Where the corner of an effector of this size is when its reference cell is at `reference_at`."""
+    """The minimum corner of an effector of this size whose reference cell is at `reference_at`."""
     return reference_at[0] - (size[0] - 1) // 2, reference_at[1] - (size[1] - 1) // 2
 
 
@@ -153,6 +156,11 @@ class Oracle:
         support = sum(heights[x][y] == z for x, y in footprint) / len(footprint)
         if support <= rules.min_support if rules.strict_support else support < rules.min_support:
             return UNSTABLE, None
+
+        if rules.pick_ok is not None:
+            lowest, highest = (table[r][place[0]][place[1]] for table in (rules.lowest_top, rules.highest_top))
+            if not rules.pick_ok[pick[0] * rules.bin_size[1] + pick[1]] or top < lowest or top > highest:
+                return OUT_OF_REACH, None
 
         after = [column[:] for column in heights]
         for x, y in footprint:

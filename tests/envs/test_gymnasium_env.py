@@ -1,0 +1,237 @@
+"""The Gymnasium environments: other projects' checkers, and the batched environment underneath."""
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from pickplace import PickPlaceEnv
+from pickplace.task.items import Kinds, Recorded
+
+ID = "pickplace/PickPlace-v0"
+SMALL = {"tote_size": (4, 5, 2), "items": [(1, 1, 1), (2, 1, 1), (2, 2, 1)]}
+
+
+def make(**kwargs):
+    return gymnasium.make(ID, **{**SMALL, **kwargs})
+
+
+def vector(**kwargs):
+    return gymnasium.make_vec(ID, **{"num_envs": 2, **SMALL, **kwargs}).unwrapped
+
+
+def feasible(masks, generator):
+    """Return a feasible action of each row, drawn evenly."""
+    return np.array([generator.choice(np.flatnonzero(mask)) if mask.any() else 0 for mask in masks])
+
+
+def assert_equal(a, b, keys=None):
+    if keys is None:
+        assert a.keys() == b.keys()
+    for key in keys or a:
+        assert a[key].dtype == b[key].dtype and np.array_equal(a[key], b[key]), key
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"bin_size": (4, 6, 2), "effector_size": (2, 3), "rotations": 3}])
+def test_gymnasium_checker(kwargs):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make(**kwargs).unwrapped, skip_render_check=True)
+
+
+def test_stable_baselines_checker():
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs stable-baselines3")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", ".*unconventional shape.*")  # depth maps are neither vectors nor RGB images
+        checker.check_env(make().unwrapped)
+
+
+def test_maskable_ppo_runs():
+    contrib = pytest.importorskip("sb3_contrib", reason="needs sb3-contrib")
+    model = contrib.MaskablePPO("MultiInputPolicy", make(), n_steps=32, batch_size=32, n_epochs=1, seed=0)
+    assert model.learn(64).num_timesteps == 64
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 2**31), st.integers(1, 3), st.sampled_from([1, 2]))
+def test_single_against_the_batched_environment(seed, slots, height):
+    """Episode ``e`` of a seed is slot ``e`` of the environment underneath, in all that an agent gets."""
+    below = PickPlaceEnv(tote_size=(4, 5, 2), items=Kinds(SMALL["items"]), num_envs=slots, seed=seed)
+    states = below.reset(TensorDict({"tote_height": torch.full((slots, 1), height)}, [slots]))
+    env, generator, histories = make(), np.random.default_rng(seed), []
+    for slot in range(slots):
+        observation, info = env.reset(seed=seed if slot == 0 else None, options={"tote_height": height})
+        history = [(observation, info, None)]
+        for _ in range(4):
+            masks = env.get_wrapper_attr("action_masks")()
+            assert np.array_equal(masks, info["action_mask"])
+            action = feasible([masks], generator)[0]
+            observation, *rest, info = env.step(action)
+            history.append((observation, info, (action, *rest)))
+            if rest[1]:
+                break
+        histories.append(history)
+    for step in range(5):
+        actions = torch.zeros(slots, dtype=torch.int64)
+        for slot, history in enumerate(histories):
+            if step < len(history):
+                observation, info, taken = history[step]
+                assert_equal(observation, {key: states[key][slot].numpy() for key in below.terms})
+                assert np.array_equal(info["action_mask"], states["action_mask"][slot].numpy())
+                assert info["occupancy"] == pytest.approx(float(states["occupancy"][slot]))
+                if taken:
+                    assert taken[1:] == (states["reward"][slot].item(), states["terminated"][slot].item(), False)
+            if step + 1 < len(history):
+                actions[slot] = int(history[step + 1][2][0])
+        states = below.step(TensorDict({"action": actions}, [slots]))["next"]
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_vector_environment_against_gymnasiums_own(mode):
+    """Slot ``i`` plays what a single environment plays as episodes ``i``, ``i + N``, ...; resets as SyncVectorEnv's."""
+    count, seed = 3, 5
+    slots = [lambda slot=slot: make(first_episode=slot, episode_stride=count) for slot in range(count)]
+    theirs, ours = SyncVectorEnv(slots, autoreset_mode=mode), vector(num_envs=count, autoreset_mode=mode)
+    assert ours.metadata["autoreset_mode"] == mode
+    assert ours.observation_space == theirs.observation_space and ours.action_space == theirs.action_space
+    expected, their_info = theirs.reset(seed=[seed] * count)
+    observation, info = ours.reset(seed=seed)
+    assert_equal(observation, expected)
+    generator, endings = np.random.default_rng(0), 0
+    for step in range(40):
+        assert np.array_equal(ours.action_masks(), info["action_mask"])
+        actions = feasible(info["action_mask"], generator)
+        if step % 7 == 6:
+            actions[0] = 0  # most likely fails
+        expected, *their_rest, their_info = theirs.step(actions)
+        observation, *rest, info = ours.step(actions)
+        assert_equal(observation, expected)
+        assert_equal(dict(enumerate(rest)), dict(enumerate(their_rest)))
+        assert info.keys() == their_info.keys()
+        for key in ("occupancy", "failure", "action_mask", "_occupancy"):
+            assert np.array_equal(info[key], their_info[key]), key
+        ended = rest[1] | rest[2]
+        endings += ended.sum()
+        if mode == AutoresetMode.SAME_STEP and ended.any():
+            assert np.array_equal(info["_final_obs"], their_info["_final_obs"])
+            for i in np.flatnonzero(ended):
+                assert_equal(info["final_obs"][i], their_info["final_obs"][i])
+            for key in ("occupancy", "failure", "action_mask", "_failure"):
+                assert np.array_equal(info["final_info"][key], their_info["final_info"][key]), key
+        if mode == AutoresetMode.DISABLED and ended.any():
+            with pytest.raises(gymnasium.error.ResetNeeded):
+                ours.step(actions)
+            expected, _ = theirs.reset(options={"reset_mask": ended})
+            observation, fresh = ours.reset(options={"reset_mask": ended})
+            assert_equal(observation, expected)
+            assert np.array_equal(fresh["_failure"], ended)
+            info["action_mask"] = ours.action_masks()
+    assert endings > 5
+
+
+def test_seeds_and_tote_heights():
+    env = make()
+    assert_equal(*(env.reset(seed=3)[0] for _ in range(2)))
+    streams = [[env.reset(seed=seed)[0], *(env.reset()[0] for _ in range(9))] for seed in (3, 4)]
+    assert not np.array_equal(*([observation["bin_depth"] for observation in stream] for stream in streams))
+    low, _ = env.reset(options={"tote_height": 1})
+    assert low["tote_height"] == [1] and (low["tote_depth"] == 1).all()
+    assert env.reset()[0]["tote_height"] == [2]
+    unseeded = {tuple(make().reset()[0]["bin_depth"].flatten()) for _ in range(12)}
+    assert len(unseeded) > 1  # without a seed, a fresh environment is not always the same
+    heights, _ = vector().reset(seed=0, options={"tote_height": np.array([1, 2])})
+    assert heights["tote_height"].tolist() == [[1], [2]]
+
+
+def test_observations_are_copies():
+    env = make()
+    observation, info = env.reset(seed=0)
+    kept, mask = {key: value.copy() for key, value in observation.items()}, info["action_mask"].copy()
+    env.step(int(np.flatnonzero(mask)[0]))
+    assert_equal(observation, kept)
+    assert np.array_equal(info["action_mask"], mask)
+    observation["tote_depth"][:] = 99
+    assert env.reset(seed=0)[0]["tote_depth"].max() == 2
+
+
+def test_a_recorded_stream_truncates(tmp_path):
+    (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
+    env = make(items=Recorded(tmp_path / "items.csv"))
+    _, info = env.reset(seed=0)
+    for expected in (False, True):
+        _, _, terminated, truncated, info = env.step(int(np.flatnonzero(info["action_mask"])[0]))
+        assert (terminated, truncated) == (False, expected)
+
+
+def test_a_step_that_resets_hides_what_its_action_would_have_done(tmp_path):
+    """After a failure the environment underneath plays action 0, which may place a recorded stream's last item."""
+    (tmp_path / "items.csv").write_text("w,d,h,x,y\n1,1,1,0,0\n1,1,1,0,0\n")
+    env = vector(tote_size=(4, 5, 1), items=Recorded(tmp_path / "items.csv"))
+    _, info = env.reset(seed=0)
+    _, _, *flags, info = env.step(np.array([np.flatnonzero(mask)[-1] for mask in info["action_mask"]]))
+    assert info["action_mask"][:, 0].all() and not np.any(flags)
+    _, _, terminated, truncated, _ = env.step(np.array([np.flatnonzero(~mask)[0] for mask in info["action_mask"]]))
+    assert terminated.all() and not truncated.any()
+    observation, reward, *flags, info = env.step(np.zeros(2, dtype=np.int64))
+    assert not np.any(flags) and not reward.any() and (observation["tote_depth"] == 1).all()
+    assert info["failure"].tolist() == ["none"] * 2
+
+
+def test_async_vectorisation():
+    env = gymnasium.make_vec(ID, num_envs=2, vectorization_mode="async", **SMALL)
+    _, info = env.reset(seed=1)
+    observation, reward, *_ = env.step(feasible(info["action_mask"], np.random.default_rng(0)))
+    assert observation["bin_depth"].shape == (2, 5, 5) and (reward > 0).all()
+    env.close()
+
+
+def step(env, action):
+    env.reset(seed=0)
+    env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("act", "message"),
+    [
+        (lambda: make(masks=()), "masks=.*expected no such argument"),
+        (lambda: make(seed=5), r"seed=5: expected no such argument; reset\(seed=...\)"),
+        (lambda: vector(seed=5), "seed=5: expected no such argument"),
+        (lambda: make(tote_sizes=(1, 1, 1)), "tote_sizes"),
+        (lambda: make(rotations=7), "rotations=7"),
+        (lambda: make(items=[(9, 9, 9)]), "item 9x9x9"),
+        (lambda: make().reset(seed=2**63), "seed=.*expected a whole number"),
+        (lambda: vector().reset(seed=2**63), "seed=.*expected a whole number"),
+        (lambda: vector().reset(seed=[1, 2]), r"seed=\[1, 2\]"),
+        (lambda: make().reset(options={"tote_height": 3}), r"options\['tote_height'\]=3: expected a whole number"),
+        (lambda: make().reset(options={"tote_height": 1.5}), r"options\['tote_height'\]=1.5"),
+        (lambda: vector().reset(options={"tote_height": [1, 2, 2]}), r"\[1, 2, 2\]"),
+        (lambda: make().reset(options={"height": 1}), r"options\['height'\]: there is no such option"),
+        (lambda: vector().reset(options={"reset_mask": [True]}), "reset_mask"),
+        (
+            lambda: vector().reset(options={"reset_mask": np.array([True, False])}),
+            "reset_mask.* in the first reset: expected none",
+        ),
+        (lambda: make().unwrapped.step(0), "before reset"),
+        (lambda: vector().step(np.zeros(2, dtype=np.int64)), "before reset"),
+        (lambda: step(make().unwrapped, 10**9), "action=1000000000: expected"),
+        (lambda: step(make().unwrapped, 0.5), "action=0.5"),
+        *(
+            (lambda actions=actions: step(vector(), np.array(actions)), "actions=.*expected 2 whole numbers")
+            for actions in ([0, -1], [0], [0.0, 1.7])
+        ),
+        (lambda: vector(autoreset_mode="Never"), "autoreset_mode='Never'"),
+        (lambda: vector(render_mode="human"), "render_mode='human'"),
+    ],
+)
+def test_bad_input_is_refused_in_a_sentence(act, message):
+    with pytest.raises((ValueError, TypeError, gymnasium.error.Error), match=message) as caught:
+        act()
+    assert str(caught.value).count("\n") == 0

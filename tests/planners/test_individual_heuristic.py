@@ -1,0 +1,91 @@
+"""Individual planning by heuristics against brute force and the reference's figures."""
+
+import itertools
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from problems import late_state, occupancies
+
+from pickplace import CellSpec, Item, PickPlaceEnv, State
+from pickplace.planners.individual import IndividualHeuristic, corner_footprints
+from pickplace.task.feasibility import placing_maps
+from pickplace.task.grasps import heuristic_pick
+from pickplace.task.transition import apply
+
+
+def maximal_rectangles(free):
+    """Yield all ``(x, y, width, depth)`` of free cells of which no side can move outwards, by trying every one."""
+    wide, deep = len(free), len(free[0])
+
+    def is_free(x, y, w, d):
+        inside = x >= 0 and y >= 0 and x + w <= wide and y + d <= deep
+        return inside and all(free[i][j] for i in range(x, x + w) for j in range(y, y + d))
+
+    for x, y in itertools.product(range(wide), range(deep)):
+        for w, d in itertools.product(range(1, wide - x + 1), range(1, deep - y + 1)):
+            larger = ((x - 1, y, w + 1, d), (x, y - 1, w, d + 1), (x, y, w + 1, d), (x, y, w, d + 1))
+            if is_free(x, y, w, d) and not any(is_free(*each) for each in larger):
+                yield x, y, w, d
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 10**6), wide=st.integers(2, 6), deep=st.integers(2, 6), steps=st.integers(1, 4))
+def test_corners_of_maximal_rectangles(seed, wide, deep, steps):
+    generator = torch.Generator().manual_seed(seed)
+    cell = CellSpec(tote_size=(wide, deep, 6))
+    heights = torch.randint(steps, (3, wide, deep), generator=generator).int()
+    w, d, h = (torch.randint(1, 3, (3,), generator=generator) for _ in range(3))
+    maps = placing_maps(cell, State(heights, torch.full((3,), 6), Item(w * 0, w * 0, w, d, h)))
+    found = corner_footprints(cell, heights, maps)
+    for n in range(3):
+        free = {z: list(maximal_rectangles((heights[n] <= z).tolist())) for z in range(steps)}
+        for parity, (wide_, deep_) in enumerate(((int(w[n]), int(d[n])), (int(d[n]), int(w[n])))):
+            expected = torch.zeros(wide, deep, dtype=torch.bool)
+            for z, rectangles in free.items():
+                for x, y, a, b in rectangles:
+                    if a >= wide_ and b >= deep_:
+                        for i, j in itertools.product((x, x + a - wide_), (y, y + b - deep_)):
+                            expected[i, j] |= int(maps.top[n, parity, i, j]) == z + int(h[n])
+            assert torch.equal(found[n, parity], expected)
+
+
+@pytest.mark.parametrize(("rotations", "reference"), [(1, 0.569), (3, 0.922)])
+def test_every_cell_meets_the_reference(rotations, reference):
+    env = PickPlaceEnv(rotations=rotations, num_envs=250, masks=(), stream="test", seed=5)
+    occupancy = occupancies(IndividualHeuristic(env.cell, "cells"), env)
+    error = float(occupancy.std() / len(occupancy) ** 0.5)
+    assert abs(float(occupancy.mean()) - reference) < 3 * error + 0.0005
+
+
+@pytest.mark.parametrize("candidates", ["corners", "cells"])
+@pytest.mark.parametrize(("rotations", "tote"), [(1, (6, 6, 5)), (3, (5, 7, 3)), (4, (7, 5, 3))])
+def test_the_first_candidate_that_succeeds_is_played(candidates, rotations, tote):
+    """In the order (top, y, x, flat index); if all fail the first; and corners are fewer than cells."""
+    env, observation = late_state(7, rotations=rotations, tote_size=tote, num_envs=48, seed=1)
+    cell, state = env.cell, env.state
+    maps = placing_maps(cell, state)
+    top, corners, each = maps.top, corner_footprints(cell, state.heights, maps), cell.num_places * rotations
+    first = heuristic_pick(cell, state.item) * each
+    steps = [apply(cell, state, first + n) for n in range(each)]
+    failed, lies = (torch.stack([getattr(step, key) for step in steps], 1) for key in ("failure", "footprint"))
+    chosen = IndividualHeuristic(cell, candidates).decide(observation) - first
+    missed = 0
+    for row in range(48):
+        found = []
+        for n, (x, y, w, d) in enumerate(lies[row].tolist()):
+            if min(x, y) < 0 or x + w > tote[0] or y + d > tote[1]:
+                continue
+            parity = n % rotations % 2
+            if candidates == "cells" or corners[row, parity, x, y]:
+                found.append((failed[row, n].item() > 0, top[row, parity, x, y].item(), y, x, n))
+        if found:
+            assert chosen[row] == min(found)[-1]
+            missed += min(found)[0]
+    assert candidates == "cells" or missed > 0
+
+
+def test_bad_candidates_are_refused():
+    with pytest.raises(ValueError, match=r"planner.candidates='all': expected 'corners' or 'cells'"):
+        IndividualHeuristic(CellSpec(), "all")

@@ -1,0 +1,131 @@
+"""Search on top of a policy: fair comparisons, no peeking, and better than the policy alone."""
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from problems import occupancies
+
+from pickplace import CellSpec, PickPlaceEnv
+from pickplace.planners.lookahead import Lookahead
+from pickplace.planners.policy import PolicyPlanner
+from pickplace.policies.fcn_grasp import FootprintPolicy
+from pickplace.policies.restore import restore_critic
+from pickplace.runs import checkpoint
+from pickplace.task.items import Kinds, Recorded
+
+
+def untrained(cell):
+    torch.manual_seed(0)
+    return FootprintPolicy(cell, filters=8, hidden=8, head_std=1.0)
+
+
+def make_env(count=1, tote_size=(4, 4, 1), **settings):
+    return PickPlaceEnv(num_envs=count, stream="validation", masks=(), tote_size=tote_size, **settings)
+
+
+def search_of(env, critic=None, **settings):
+    return Lookahead(env.cell, untrained(env.cell), env.items, critic, **settings)
+
+
+def played_out(search, problem, streams, horizon=None):
+    """Return what the search expects of empty totes, ``[problems, streams]``."""
+    count = len(problem)
+    heights, rims = torch.zeros(count, 4, 4, dtype=torch.int32), torch.ones(count, dtype=torch.int64)
+    return search._play_out(heights, rims, torch.tensor(problem), streams, horizon)
+
+
+def test_equal_candidates_meet_equal_items_and_each_call_others():
+    search = search_of(make_env(3))
+    volume = played_out(search, [0, 0, 1, 2], 16)
+    assert volume.shape == (4, 16) and torch.equal(volume[0], volume[1])
+    assert not torch.equal(volume[0], volume[2]) and not torch.equal(volume[2], volume[3])
+    assert volume.unique().numel() > 2 and volume.max() <= 16
+    assert not torch.equal(played_out(search, [0, 0, 1, 2], 16)[0], volume[0])
+
+
+def test_the_horizon_adds_the_critics_value():
+    seen = []
+
+    def critic(observation):
+        seen.append(len(observation["tote_depth"]))
+        return torch.full((seen[-1], 1), 100.0)
+
+    volume = played_out(search_of(make_env(), critic, horizon=2), [0], 64, 2)
+    assert len(seen) == 1 and (volume >= 100).sum() == seen[0]
+    assert (volume[volume >= 100] <= 100 + 2 * 4).all()
+
+
+def gain_bounds(gain):
+    """Return mean -+ two standard errors."""
+    error = 2 * gain.std() / len(gain) ** 0.5
+    return gain.mean() - error, gain.mean() + error
+
+
+def test_it_is_better_than_its_policy_and_a_critic_that_errs_does_not_make_it_worse(monkeypatch):
+    def worst(observation):  # of any two states, the one with fewer columns full
+        return -100.0 * (observation["tote_depth"] == 0).flatten(1).sum(1, keepdim=True)
+
+    def pack(planner):
+        return occupancies(planner, make_env(32, (4, 4, 2)))
+
+    env, settings = make_env(1, (4, 4, 2)), {"candidates": 8, "samples": 16, "rounds": 1}
+    alone = pack(PolicyPlanner(env.cell, untrained(env.cell)))
+    assert gain_bounds(pack(search_of(env, **settings)) - alone)[0] > 0.1
+    assert gain_bounds(pack(search_of(env, worst, **settings)) - alone)[0] > 0
+    monkeypatch.setattr(Lookahead, "_confirm", lambda self, best, *state: best)
+    assert gain_bounds(pack(search_of(env, worst, **settings)) - alone)[1] < 0
+
+
+def test_with_no_doubt_allowed_it_is_its_policy():
+    env = make_env()
+    search = search_of(env, samples=16, rounds=1, confidence=1e9)
+    alone = PolicyPlanner(env.cell, untrained(env.cell))
+    assert torch.equal(*(occupancies(planner, make_env(8)) for planner in (search, alone)))
+
+
+def test_a_recorded_stream_is_not_looked_up(tmp_path):
+    (tmp_path / "items.csv").write_text("w,d,h\n" + "1,1,1\n2,1,1\n" * 4)
+    search = search_of(make_env(items=Recorded(tmp_path / "items.csv")))
+    assert isinstance(search.items, Kinds) and search.items.length is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"candidates": 0}, "planner.candidates=0: expected a whole number >= 1"),
+        ({"samples": 1}, "planner.samples=1: expected a whole number >= 2"),
+        ({"rounds": 1.5}, "planner.rounds=1.5"),
+        ({"horizon": 0}, "planner.horizon=0"),
+        ({"confidence": -1}, "planner.confidence=-1: expected a number >= 0"),
+        ({"seed": -1}, "planner.seed=-1"),
+        ({"policy": None}, "expected a checkpoint of model=fcn_grasp"),
+    ],
+)
+def test_bad_settings_are_refused(settings, words):
+    env = make_env()
+    with pytest.raises(ValueError, match=words):
+        Lookahead(**{"cell": env.cell, "policy": untrained(env.cell), "items": env.items, **settings})
+
+
+@pytest.mark.parametrize(("gain", "departs"), [(0.8, True), (0.6, False)])
+def test_a_candidate_must_win_by_standard_errors_of_its_mean(gain, departs, monkeypatch):
+    """Of 32 streams, each of which differs from the mean by 2: the standard error is 2 / sqrt(31), 0.36."""
+    env = make_env()
+    observation, search = env.reset(), search_of(env, candidates=2, samples=32, rounds=1, confidence=2.0)
+    noise = torch.tensor([2.0, -2.0], dtype=torch.float64).repeat(16)
+    monkeypatch.setattr(search, "_play_out", lambda *_: torch.stack([torch.zeros_like(noise), gain + noise]))
+    own = PolicyPlanner(env.cell, search.policy).decide(observation)
+    assert (search.decide(observation) != own).item() == departs
+
+
+def test_the_critic_of_a_checkpoint_judges_in_cells():
+    """Nearly all of an empty tote's 180 cells, a little less for the discount; near nothing in a full one."""
+    state, facts = checkpoint.read(checkpoint.locate("pretrained/r4"))
+    cfg = OmegaConf.create({**facts["config"], "device": "cpu"})
+    critic = restore_critic(cfg, CellSpec(), state, facts["config"]["env"])
+    bins = torch.zeros(1, 5, 5)
+    bins[0, 1:3, 2] = 1.0
+    empty, full = (
+        critic({"bin_depth": bins, "tote_depth": torch.full((1, 6, 6), depth)}).item() for depth in (5.0, 0.0)
+    )
+    assert 100 < empty < 185 and abs(full) < 10

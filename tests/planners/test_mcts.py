@@ -1,0 +1,142 @@
+"""Tree search: it approaches the exact optimum, it is a tree, and it never looks at the real stream."""
+
+import pytest
+import torch
+from problems import occupancies
+
+from pickplace import PickPlaceEnv
+from pickplace.planners.mcts import MCTS, _Edge, _Node
+from pickplace.task.feasibility import actions_reaching, placing_maps
+from pickplace.task.items import Kinds, Recorded
+
+OPTIMUM = 0.9456  # 4x4x1, R=4, by tests/dynamic_programming.py
+
+
+def make_env(count=1, **settings):
+    return PickPlaceEnv(num_envs=count, stream="validation", **{"tote_size": (4, 4, 1), "masks": (), **settings})
+
+
+def search_of(env, simulations, **settings):
+    return MCTS(env.cell, env.items, simulations, **{"mask": True, "wave": 512, **settings})
+
+
+def test_more_simulations_come_closer_to_the_optimum():
+    few, many = (search_of(make_env(), simulations) for simulations in (16, 200))
+    for search, low, high in ((few, 1, 1.5), (many, 1.5, 16)):
+        search.decide(make_env(32).reset())
+        assert low <= search.statistics()["mean_tree_depth"] < high
+    worse, better = (occupancies(search, make_env(32)) for search in (few, many))
+    noise = float(better.std() / 32**0.5)
+    assert worse.mean() < better.mean() - 0.02
+    assert OPTIMUM - 0.02 - 2 * noise < better.mean() < OPTIMUM + 3 * noise
+
+
+def searched(mask, simulations, rollouts=True):
+    """Return the root of the tree of one decision."""
+    env, roots = make_env(tote_size=(4, 4, 2)), []
+    search = search_of(env, simulations, mask=mask, wave=7)
+    make = search._nodes
+    search._nodes = lambda *args: roots.append(make(*args)) or roots[-1]
+    if not rollouts:
+        search._play_out = lambda state: torch.zeros(len(state.heights), dtype=torch.float64)
+    search.decide(env.reset())
+    return roots[0][0]
+
+
+def edges_of(root):
+    stack = [root]
+    while stack:
+        for edge in stack.pop().edges.values():
+            yield edge
+            stack += edge.bins
+
+
+@pytest.mark.parametrize("mask", [True, False])
+def test_visits_and_returns_add_up(mask):
+    root = searched(mask, 200)
+    assert sum(edge.visits for edge in root.edges.values()) == 200
+    edges = list(edges_of(root))
+    for edge in edges:
+        assert 0 <= edge.total <= edge.visits
+        assert len(edge.bins) <= edge.visits and (edge.failed <= (edge.total == 0))
+        inside = sum(child.visits for bin_ in edge.bins for child in bin_.edges.values())
+        assert inside <= edge.visits - len(edge.bins) or edge.failed  # the first visit to a bin plays it out
+    assert len(edges) > 10
+
+
+@pytest.mark.parametrize("mask", [True, False])
+def test_a_return_is_what_the_walk_places_and_its_rollout(mask):
+    edges = list(edges_of(searched(mask, 200, rollouts=False)))
+    for edge in edges:
+        below = sum(child.total for node in edge.bins for child in node.edges.values())
+        assert edge.total == pytest.approx(edge.visits * edge.volume / 32 + below)
+    assert any(edge.volume for edge in edges)
+
+
+def test_without_a_mask_it_tries_what_fails():
+    env = make_env(2)
+    search = search_of(env, 200, mask=False, wave=256)
+    action = search.decide(env.reset())
+    assert ((action >= 0) & (action < env.cell.num_actions)).all()
+    # With far fewer simulations than actions nothing is tried twice: the paper's setting is nearly a random choice.
+    assert search.statistics()["mean_tree_depth"] == 1
+
+
+def test_the_same_seed_is_the_same_search():
+    env = make_env(3)
+    observation = env.reset()
+    actions = [search_of(env, 50, seed=seed).decide(observation).tolist() for seed in (1, 1)]
+    assert actions[0] == actions[1]
+
+
+def test_a_recorded_stream_is_not_looked_up(tmp_path):
+    (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
+    env = make_env(items=Recorded(tmp_path / "items.csv"))
+    search = search_of(env, 20)
+    assert isinstance(search.items, Kinds) and search.items.length is None
+    search.decide(env.reset())
+
+
+def test_a_full_tote_has_nothing_to_search():
+    env = make_env()
+    observation = env.reset()
+    observation["tote_depth"] = torch.zeros_like(observation["tote_depth"])
+    assert search_of(env, 20).decide(observation).item() in range(env.cell.num_actions)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"simulations": 0}, "planner.simulations=0: expected a whole number >= 1"),
+        ({"wave": 1.5}, "planner.wave=1.5"),
+        ({"seed": -1}, "planner.seed=-1"),
+        ({"exploration": -1}, "planner.exploration=-1: expected a number >= 0"),
+        ({"widening": 2}, "planner.widening=2: expected a number >= 0 and <= 1"),
+        ({"mask": 1}, "planner.mask=1: expected true or false"),
+    ],
+)
+def test_bad_settings_are_refused(settings, words):
+    env = make_env()
+    with pytest.raises(ValueError, match=words):
+        MCTS(env.cell, env.items, **settings)
+
+
+def test_the_next_action_is_chosen_by_ucb1():
+    env = make_env()
+    node = _Node(torch.zeros(4, 4), torch.zeros(5), [])
+    node.edges = {n: _Edge(node, n, visits, visits * mean) for n, (visits, mean) in enumerate([(100, 0.6), (25, 0.45)])}
+    # sqrt(ln 125 / n) is 0.220 and 0.439
+    for weight, best in ((0, 0), (0.6, 0), (0.75, 1)):
+        assert search_of(env, 1, exploration=weight)._choose(node).action == best
+
+
+def test_the_most_visited_action_is_played():
+    """And not one that was lucky once."""
+    env = make_env(masks=("footprint",))
+    state = env.reset()
+    often, lucky = state["footprint_mask"][0].nonzero()[:2, 0].tolist()
+    search, root = search_of(env, 1), _Node(env.heights[0], env.item[0], [])
+    root.edges = {lucky: _Edge(root, lucky, 2, 1.9), often: _Edge(root, often, 90, 45.0)}
+    search._nodes, search._walk_down = lambda *_: [root], lambda _: ([], True)
+    reaching = actions_reaching(env.cell, placing_maps(env.cell, env.state), torch.tensor([often]))[0]
+    assert search.decide(state).item() == reaching[reaching >= 0].min()

@@ -1,0 +1,68 @@
+"""The planner that follows a policy: what K candidates are, and how the play of a policy is simulated."""
+
+import pytest
+import torch
+from problems import SETTINGS, random_states
+
+from pickplace import PickPlaceEnv
+from pickplace.planners.policy import PolicyPlanner
+from pickplace.policies.base import Policy
+
+
+class Fixed(Policy):
+    """A policy whose distribution over flat actions is given."""
+
+    choice_key = "action"
+
+    def __init__(self, cell, scores):
+        super().__init__(cell)
+        self.scores = scores
+
+    def logits(self, observation):
+        return self.scores.expand(len(observation["bin_depth"]), -1)
+
+    action_log_probs = logits
+
+    def to_action(self, choice, observation):
+        return choice
+
+    to_choice = to_action
+
+
+def test_candidates_are_tried_in_order_without_a_mask():
+    env = PickPlaceEnv(num_envs=1)
+    observation = env.reset()
+    good, bad = (mask.nonzero()[:, 0] for mask in (observation["action_mask"][0], ~observation["action_mask"][0]))
+    order = torch.stack([bad[0], bad[1], good[5], good[0], good[9]])
+    scores = torch.full((1, env.cell.num_actions), -100.0).index_put((torch.tensor(0), order), -torch.arange(5.0))
+    played = [
+        int(PolicyPlanner(env.cell, Fixed(env.cell, scores), candidates).decide(observation))
+        for candidates in (1, 2, 3, 5, env.cell.num_actions + 1, "all")
+    ]
+    # Not masked; of two neither succeeds, so that the most probable is played, and fails; then the first that succeeds.
+    assert played == [bad[0]] * 2 + [good[5]] * 4
+
+
+@pytest.mark.parametrize("candidates", [1, 4, 30, "all"])
+@pytest.mark.parametrize("options", SETTINGS)
+def test_candidates_of_each_problem(options, candidates):
+    for env, observation in random_states(steps=4, **options):
+        generator = torch.Generator().manual_seed(0)
+        scores = torch.randn(env.num_envs, env.cell.num_actions, generator=generator).log_softmax(1)
+        planner = PolicyPlanner(env.cell, Fixed(env.cell, scores), candidates)
+        chosen, heat = planner.decide(observation.exclude("action_mask")), planner.heat_map(observation)
+        for n in range(env.num_envs):
+            mask, ranked = observation["action_mask"][n], scores[n].argsort(descending=True).tolist()
+            tried = ranked if candidates == "all" else ranked[:candidates]
+            assert chosen[n] == next((action for action in tried if mask[action]), ranked[0])
+            # The picture: for each place cell the greatest probability, of what the planner would play.
+            shown = scores[n].exp() * mask if candidates == "all" else scores[n].exp()
+            tote_w, tote_d, _ = env.cell.tote_size
+            assert torch.equal(heat[n], shown.view(-1, tote_w, tote_d, env.cell.rotations).amax((0, 3)))
+
+
+@pytest.mark.parametrize("candidates", [0, -1, 1.5, True, "some"])
+def test_bad_candidates_are_refused(candidates):
+    env = PickPlaceEnv(num_envs=1)
+    with pytest.raises(ValueError, match=r"planner.candidates=.*expected 'all' or a whole number"):
+        PolicyPlanner(env.cell, None, candidates)

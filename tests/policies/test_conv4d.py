@@ -1,0 +1,226 @@
+"""The 4D convolutional policy against a naive 4D convolution, and the promises of its docstrings."""
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from pickplace import CellSpec
+from pickplace.policies.base import MASKED
+from pickplace.policies.fcn4d import ActionPolicy, TypicalPolicy
+from pickplace.policies.networks.conv4d import Conv4dCritic, Conv4dPolicy
+from pickplace.policies.networks.depth import clip_depth, pad_depth
+
+SIZES = [  # bin, tote, R, clips, floor
+    ((5, 5), (6, 6), 4, (1.0, 5.0), None),
+    ((3, 4), (5, 2), 1, (1.0, 3.0), -1.0),
+    ((2, 5), (3, 7), 3, (None, None), None),
+    ((1, 1), (4, 6), 2, (0.5, 2.5), -0.5),
+    ((6, 2), (1, 5), 2, (2.0, None), 0.0),
+]
+
+
+def assert_close(ours, expected, tolerance=1e-5):
+    torch.testing.assert_close(ours, expected, rtol=tolerance, atol=tolerance)
+
+
+def depths(bin_size, tote_size, batch=3, dtype=torch.float32):
+    """Return bin and tote maps with values on both sides of the clips."""
+    generator = torch.Generator().manual_seed(0)
+    bins = torch.randint(0, 4, (batch, *bin_size), generator=generator)
+    totes = torch.randint(0, 11, (batch, *tote_size), generator=generator)
+    return bins.to(dtype), totes.to(dtype)
+
+
+def network(rotations=2, filters=5, **options):
+    torch.manual_seed(0)
+    return Conv4dPolicy(rotations, filters, **{"head_std": None, **options})
+
+
+def convolve4d(x, weight, bias):
+    """Return a valid 4D convolution, a sum over the kernel's taps: ``[N, C, a, b, c, d]`` to ``[N, O, ...]``."""
+    sides = [n - k + 1 for n, k in zip(x.shape[2:], weight.shape[2:], strict=True)]
+    out = bias.view(1, -1, 1, 1, 1, 1)
+    for tap in itertools.product(*map(range, weight.shape[2:])):
+        window = x[(..., *(slice(t, t + side) for t, side in zip(tap, sides, strict=True)))]
+        out = out + torch.einsum("nc...,oc->no...", window, weight[(..., *tap)])
+    return out
+
+
+def naive_map(depth, limit, floor, padding):
+    rows = []
+    for one in depth:
+        if limit is not None and one.max() > limit:
+            one = one - (one.max() - limit)
+        if floor is not None:
+            one = torch.where(one < floor, torch.full_like(one, floor), one)
+        padded = torch.full([side + 4 for side in one.shape], padding, dtype=one.dtype)
+        padded[2:-2, 2:-2] = one
+        rows.append(padded)
+    return torch.stack(rows)
+
+
+def naive(model, bins, totes):
+    """Return logits and features by the paper's description, on an explicit two-channel 4D tensor."""
+    bins = naive_map(bins, model.bin_clip, model.floor, -1.0)[:, :, :, None, None]
+    totes = naive_map(totes, model.tote_clip, model.floor, 0.0)[:, None, None]
+    x = torch.stack(torch.broadcast_tensors(bins, totes), dim=1)
+    x = convolve4d(x, model.first.weight, model.first.bias).relu()
+    x = convolve4d(x, model.second.weight, model.second.bias).relu()
+    logits = convolve4d(x, model.head.weight, model.head.bias).movedim(1, -1)
+    return logits.flatten(1), x.movedim(1, -1).flatten(3, 4).flatten(1, 2)
+
+
+@pytest.mark.parametrize(("bin_size", "tote_size", "rotations", "clips", "floor"), SIZES)
+def test_equals_the_naive_4d_convolution(bin_size, tote_size, rotations, clips, floor):
+    model = network(rotations, bin_clip=clips[0], tote_clip=clips[1], floor=floor)
+    bins, totes = depths(bin_size, tote_size)
+    logits, features = naive(model, bins, totes)
+    assert logits.shape == (3, math.prod(bin_size) * math.prod(tote_size) * rotations)
+    assert_close(model(bins, totes), logits)
+    assert_close(model.features(bins, totes), features)
+
+
+def test_the_same_weights_serve_other_sizes():
+    model = network()
+    for sizes in [((5, 5), (6, 6)), ((5, 5), (11, 8)), ((4, 7), (3, 3))]:
+        maps = depths(*sizes, batch=1)
+        assert_close(model(*maps), naive(model, *maps)[0])
+
+
+def test_gradients_equal_the_naive_ones():
+    model = network(3).double()
+    maps = [m.requires_grad_() for m in depths((3, 4), (5, 3), dtype=torch.float64)]
+    inputs, output = [*maps, *model.parameters()], model(*maps)
+    direction = torch.randn(output.shape, generator=torch.Generator().manual_seed(1), dtype=output.dtype)
+    expected = torch.autograd.grad(naive(model, *maps)[0], inputs, direction)
+    for ours, wanted in zip(torch.autograd.grad(output, inputs, direction), expected, strict=True):
+        assert_close(ours, wanted, 1e-9)
+
+
+def test_bfloat16_is_close_and_keeps_float32_outside():
+    exact, rough = network(4, 16), network(4, 16, compute_dtype="bfloat16")
+    maps = depths((5, 5), (6, 6))
+    want, got = exact(*maps), rough(*maps)
+    assert got.dtype == rough.features(*maps).dtype == torch.float32
+    assert (got - want).abs().max() < 0.02 * want.abs().max()
+    for output in (want, got):
+        output.square().sum().backward()
+    for a, b in zip(rough.parameters(), exact.parameters(), strict=True):
+        assert a.grad.dtype == torch.float32 and (a.grad - b.grad).norm() < 0.05 * b.grad.norm()
+
+
+@pytest.mark.parametrize("chunk_bytes", [1, 60_000, 300_000])
+def test_chunks_change_nothing(chunk_bytes):
+    whole, pieces = network(), network(chunk_bytes=chunk_bytes)
+    maps = depths((4, 3), (5, 6), batch=7)
+    with torch.no_grad():
+        assert_close(pieces(*maps), whole(*maps))
+        assert_close(pieces.features(*maps), whole.features(*maps))
+
+
+def test_given_pick_cells_select_their_part():
+    model, maps = network(3), depths((4, 5), (3, 6), batch=4)
+    pick, each = torch.tensor([0, 7, 19, 11]), torch.arange(4)
+    assert_close(model(*maps, pick), model(*maps).unflatten(1, (20, -1))[each, pick])
+    assert_close(model.features(*maps, pick), model.features(*maps)[each, pick])
+
+
+def test_any_leading_dimensions_and_integer_depths():
+    model, critic = network(), Conv4dCritic((4, 3, 1), (5, 6, 5), filters=4, hidden=8)
+    bins, totes = depths((4, 3), (5, 6), batch=6, dtype=torch.int64)
+    flat, values = model(bins, totes), critic(bins, totes)
+    two = [m.unflatten(0, (2, 3)) for m in (bins, totes)]
+    assert_close(model(*two), flat.unflatten(0, (2, 3)))
+    assert_close(critic(*two), values.unflatten(0, (2, 3)))
+    assert_close(model(bins[0], totes[0]), flat[0])
+    assert_close(model(*two, torch.zeros(2, 3, dtype=torch.int64)).flatten(0, 1), flat[:, :60])
+    assert_close(model(bins[0], totes[0], torch.tensor(0)), flat[0, :60])
+    assert_close(critic(bins[0], totes[0]), values[0])
+
+
+def test_depth_clipping():
+    """It makes the tote's height irrelevant to the policy, but not to the critic."""
+    bins, totes = depths((5, 5), (6, 6))
+    totes[:, 0, 0] = 10.0  # an empty column
+    clipped, raw, critic = network(), network(tote_clip=None), Conv4dCritic((5, 5, 1), (6, 6, 5), filters=4, hidden=16)
+    assert_close(clipped(bins, totes + 20), clipped(bins, totes))
+    for sees in (raw, critic):
+        assert not torch.allclose(sees(bins, totes + 20), sees(bins, totes))
+    depth = torch.tensor([[[7.0, 3.0], [0.0, 6.5]], [[2.0, 1.0], [0.0, 5.0]]])
+    assert_close(clip_depth(depth, 5.0), torch.tensor([[[5.0, 1.0], [-2.0, 4.5]], [[2.0, 1.0], [0.0, 5.0]]]))
+    assert clip_depth(depth, 5.0, floor=-1.0).min() == -1
+    assert_close(clip_depth(depth, None), depth)
+    assert clip_depth(depth, None, floor=2.0).min() == 2
+    assert pad_depth(depth, 2, -1.0).shape == (2, 6, 6)
+
+
+def test_initialisation():
+    model, small = network(4, 64), network(4, 64, head_std=0.01)
+    bound = 1 / math.sqrt(64 * 81)
+    assert 0.99 * bound < model.second.weight.abs().max() <= bound and model.second.bias.abs().max() <= bound
+    assert model.first.weight.shape == (64, 2, 3, 3, 3, 3) and model.first.weight.abs().max() <= 1 / math.sqrt(2 * 81)
+    assert small.head.weight.std().item() == pytest.approx(0.01, rel=0.2) and not small.head.bias.any()
+    assert small(*depths((5, 5), (6, 6), batch=1)).softmax(-1).max() < 1.5 / 3600
+
+
+def test_the_critic_learns_and_refuses_other_sizes():
+    critic = Conv4dCritic((5, 5, 1), (6, 6, 5), filters=4, hidden=16)
+    bins, totes = depths((5, 5), (6, 6))
+    values = critic(bins, totes)
+    assert values.shape == (3, 1)
+    values.sum().backward()
+    assert all(parameter.grad is not None for parameter in critic.parameters())
+    with pytest.raises(ValueError, match="tote"):
+        critic(bins, depths((5, 5), (7, 6))[1])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: network(compute_dtype="float16"), "model.actor.compute_dtype='float16': expected 'float32' or"),
+        (lambda: network(filters=0), "model.actor.filters=0"),
+        (lambda: Conv4dCritic((5, 5), (6, 6), filters=0), "model.critic.filters=0"),
+        (lambda: Conv4dCritic((5, 5), (6, 6), hidden=1.5), "model.critic.hidden=1.5"),
+    ],
+)
+def test_bad_settings_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize("rotations", [1, 3, 4])
+@pytest.mark.parametrize("empty_row", [False, True])
+def test_a_masked_policy_computes_only_what_it_needs_and_the_same(rotations, empty_row):
+    """With a mask, pick cells that allow nothing are left out: values and gradients stay as with all of them."""
+    cell = CellSpec(bin_size=(4, 5, 1), tote_size=(5, 6, 3), rotations=rotations)
+    torch.manual_seed(0)
+    policy = ActionPolicy(cell, True, filters=6, head_std=0.3)
+    maps = {"bin_depth": torch.randint(0, 2, (7, 4, 5)).float(), "tote_depth": torch.randint(0, 4, (7, 5, 6)).float()}
+    mask, weights = torch.rand(7, cell.num_actions) < 0.01, torch.rand(7, cell.num_actions)
+    if empty_row:
+        mask[3] = False
+    logits, whole = policy.logits({**maps, "action_mask": mask}), policy.scores(maps)
+    assert_close(logits[mask], whole[mask])
+    assert (logits[~mask] == MASKED).all()
+    gradients = [
+        torch.autograd.grad((torch.where(mask, values, 0.0) * weights).sum(), list(policy.parameters()))
+        for values in (logits, whole)
+    ]
+    for ours, expected in zip(*gradients, strict=True):
+        assert_close(ours, expected, 1e-4)
+
+
+def test_typical_is_fcn4d_and_one_fully_connected_layer(monkeypatch):
+    policy = TypicalPolicy(CellSpec(bin_size=(3, 3, 1), tote_size=(4, 4, 2)), filters=8)
+    maps = torch.randint(0, 2, (5, 3, 3)).float(), torch.randint(0, 3, (5, 4, 4)).float()
+    wanted = policy.network(*maps) @ policy.join.weight.T + policy.join.bias
+    assert_close(policy.logits({"bin_depth": maps[0], "tote_depth": maps[1]}), wanted)
+
+    def refuse(*_):
+        raise RuntimeError("can't allocate memory")
+
+    monkeypatch.setattr(torch.nn, "Linear", refuse)
+    with pytest.raises(ValueError, match=r"90,000\^2 weights, 32.4 GB.* smaller env.tote_size"):
+        TypicalPolicy(CellSpec(tote_size=(30, 30, 5)), filters=8)

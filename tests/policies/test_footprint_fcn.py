@@ -1,0 +1,236 @@
+"""The network of ``fcn_grasp`` and its critic, against plain convolutions and by hand."""
+
+import itertools
+
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from problems import late_state
+
+from pickplace import CellSpec
+from pickplace.policies.base import MASKED, as_collection_policy
+from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy
+from pickplace.policies.networks.critics import PooledCritic
+from pickplace.policies.networks.footprint_fcn import FootprintFcn, matrix_dtype
+from pickplace.task.items import Kinds
+from pickplace.task.state import item_from_depth
+
+FLOAT = {"head_std": 1.0, "compute_dtype": "float32"}
+
+
+def random_maps(seed, batch, bin_size, tote_size):
+    """Return depth maps with one box in each bin."""
+    generator = torch.Generator().manual_seed(seed)
+    bins = torch.zeros(batch, *bin_size)
+    for one in bins:
+        x, y = (int(torch.randint(0, side, (), generator=generator)) for side in bin_size)
+        one[x : x + 2, y : y + 1 + x % 3] = float(torch.randint(1, 5, (), generator=generator))
+    return bins, torch.randint(0, 8, (batch, *tote_size), generator=generator).float()
+
+
+def by_hand(network, item, tote_depth, parity, x, y):
+    """Return the network's scores of one footprint of one problem, read cell by cell off the depth map."""
+    side, reach, (w, d, h) = network.receptive_field, network.reach, item
+    wide, long = tote_depth.shape
+
+    def depth(i, j):
+        """Return it at (i, j) along the item's own axes from the footprint's corner; None outside the tote."""
+        cell = (x + j, y + i) if parity else (x + i, y + j)
+        return int(tote_depth[cell]) if 0 <= cell[0] < wide and 0 <= cell[1] < long else None
+
+    first = [side // 2 - (size - 1) // 2 for size in (w, d)]
+    rest = min(depth(i, j) for i in range(w) for j in range(d))
+    ones = []  # in which plane each cell is
+    for i in range(-first[0], side - first[0]):
+        for j in range(-first[1], side - first[1]):
+            here = depth(i, j)
+            if here is None:
+                ones.append(None)
+            elif 0 <= i < w and 0 <= j < d:
+                ones.append(2 * reach + 1 + min(here - rest, reach))
+            else:
+                above = (rest - h) - here  # how far the cell is above the item's top
+                ones.append(max(-reach, min(above, reach)) + reach)
+    shift = max(int(tote_depth.max()) - network.tote_clip, 0)
+    clipped = network.tote_clip - (rest - shift)
+    ones += [min(size, network.item_range) - 1 for size in (w, d, h)]
+    counts = ((rest - h + 1, network.headroom_bins), (clipped, network.depth_range))
+    ones += [max(0, min(value, most - 1)) for value, most in counts]
+    weight, out = network.patch.weight.unflatten(1, (-1, network.planes)), network.patch.bias
+    for position, plane in enumerate(ones):
+        if plane is not None:
+            out = out + weight[:, position, plane]
+    return network.head(F.relu(network.hidden(F.relu(out))))
+
+
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 10**6),
+    field=st.sampled_from([3, 5, 7]),
+    tote=st.tuples(st.integers(3, 7), st.integers(3, 6)),
+    sizes=st.tuples(st.integers(1, 4), st.integers(1, 6), st.integers(1, 3), st.integers(1, 4)),
+    headroom_bins=st.sampled_from([None, 1, 3, 12]),
+)
+def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes, headroom_bins):
+    clip, levels, reach, items = sizes
+    torch.manual_seed(seed)
+    network = FootprintFcn(3, 8, field, 6, clip, levels, reach, items, headroom_bins=headroom_bins, **FLOAT)
+    bins, totes = random_maps(seed, 2, (4, 6), tote)
+    scores = network(bins, totes, 2)
+    assert scores.shape == (2, 2, *tote, 3)
+    item, found, expected = item_from_depth(bins), [], []
+    for n, parity in itertools.product(range(2), range(2)):
+        w, d, h = (int(part[n]) for part in item[2:])
+        wide, deep = (d, w) if parity else (w, d)
+        for x, y in itertools.product(range(tote[0] - wide + 1), range(tote[1] - deep + 1)):
+            expected.append(by_hand(network, (w, d, h), totes[n], parity, x, y))
+            found.append(scores[n, parity, x, y])
+    torch.testing.assert_close(torch.stack(found), torch.stack(expected), rtol=1e-4, atol=1e-4)
+
+
+def test_turning_the_whole_problem_turns_the_scores():
+    """What is seen does not depend on which way the tote is laid: a transposed problem has transposed scores."""
+    network, (bins, totes) = FootprintFcn(2, 8, 5, **FLOAT), random_maps(0, 8, (5, 5), (6, 4))
+    item, scores = item_from_depth(bins), network(bins, totes, 2)
+    across = network(bins, totes.transpose(1, 2).contiguous(), 2)
+    for n in range(8):
+        w, d = int(item.w[n]), int(item.d[n])
+        ours, theirs = scores[n, 0, : 7 - w, : 5 - d], across[n, 1, : 5 - d, : 7 - w]
+        torch.testing.assert_close(ours, theirs.transpose(0, 1))
+
+
+@pytest.mark.parametrize(("deep", "deeper"), [(8, 2), (100, 900_000)])
+def test_only_differences_count_far_from_the_rim(deep, deeper):
+    """More cells below everything change nothing but the headroom, which is told apart up to a limit only."""
+    network = FootprintFcn(1, 8, 5, tote_clip=2, depth_range=4, **FLOAT)
+    bins, totes = random_maps(1, 8, (5, 5), (6, 6))
+    inside = (slice(None), slice(None), slice(0, 4), slice(0, 4))
+    torch.testing.assert_close(network(bins, totes + deep, 2)[inside], network(bins, totes + deep + deeper, 2)[inside])
+
+
+@pytest.mark.parametrize("rotations", [1, 2, 4])
+def test_only_what_the_mask_allows_is_computed_and_it_is_the_same(rotations, monkeypatch):
+    env, state = late_state(tote_size=(7, 5, 3), rotations=rotations, masks=("action", "footprint"))
+    policy, mask = FootprintPolicy(env.cell, **FLOAT), state["footprint_mask"]
+    asked, at = [], policy.network.at
+    monkeypatch.setattr(policy.network, "at", lambda *args: asked.append(len(args[2])) or at(*args))
+    logits = policy.logits(state)
+    assert asked == [int(mask.sum())] and asked[0] < mask.numel()
+    everywhere = policy.network(state["bin_depth"], state["tote_depth"], env.cell.parities).flatten(1)
+    torch.testing.assert_close(logits, torch.where(mask, everywhere, MASKED))
+    logits.logsumexp(1).sum().backward()
+    assert all(parameter.grad is not None for parameter in policy.parameters())
+    assert (policy.footprint_logits(state, torch.zeros_like(mask)) == MASKED).all()
+
+
+@pytest.mark.parametrize("bias", [-1e30, -1e12, 1e30])
+def test_no_score_is_so_bad_that_what_the_mask_forbids_is_chosen(bias):
+    env, state = late_state(tote_size=(4, 4, 3), num_envs=64, masks=("action", "footprint"))
+    policy = FootprintPolicy(env.cell, **FLOAT)
+    policy.network.head.bias.data.fill_(bias)
+    chosen = as_collection_policy(policy)(state.clone())
+    assert state["action_mask"].gather(1, chosen["action"][:, None]).all()
+    assert chosen["log_prob"].isfinite().all()
+
+
+@pytest.mark.parametrize("effector", [(3, 3), (2, 3), (3, 1)])
+@pytest.mark.parametrize("rotations", [1, 4])
+def test_without_a_mask_every_grasp_has_the_score_of_its_footprint(rotations, effector):
+    """Choices of the unmasked policy against the network's scores, footprint by footprint and offset by offset."""
+    items = Kinds([[1, 1, 1]]) if effector == (3, 1) else None
+    sizes = {"tote_size": (4, 5, 2), "rotations": rotations, "effector_size": effector}
+    env, state = late_state(1, num_envs=3, items=items, **sizes)
+    policy, count = GraspPolicy(env.cell, filters=8, **FLOAT), env.cell.num_offsets
+    policy.outside.data.fill_(7.0)
+    logits = policy.class_scores(state).flatten(1)
+    scores = policy.network(state["bin_depth"], state["tote_depth"], env.cell.parities)
+    for parity, (_, _, ref_x, ref_y) in enumerate(env.cell.effectors):
+        for ox, oy, x, y in itertools.product(range(count), range(count), range(4), range(5)):
+            fx, fy = x - ref_x + ox, y - ref_y + oy
+            got = logits[:, ((parity * count + ox) * count + oy) * 20 + x * 5 + y]
+            if 0 <= fx < 4 and 0 <= fy < 5:
+                along, across = (oy, ox) if parity else (ox, oy)
+                torch.testing.assert_close(got, scores[:, parity, fx, fy, along * count + across])
+            else:
+                assert (got == 7.0).all()
+
+
+@pytest.mark.parametrize(("num_envs", "least", "most"), [(1, 1, 64), (40, 65, 4096), (300, 4097, 10**6)])
+def test_bfloat16_is_close_and_any_number_of_rows_will_do(num_envs, least, most):
+    env, state = late_state(4, num_envs=num_envs, masks=("action", "footprint"), seed=0)
+    torch.manual_seed(1)
+    exact = FootprintPolicy(env.cell, **FLOAT)
+    rough = FootprintPolicy(env.cell, **{**FLOAT, "compute_dtype": "bfloat16"})
+    rough.load_state_dict(exact.state_dict())
+    wanted, got = exact.logits(state), rough.logits(state)
+    count = int(state["footprint_mask"].sum())
+    assert least <= count <= most and count % 64 and got.dtype == torch.float32
+    assert (wanted - got).abs().max() < 0.05 * wanted[wanted > MASKED].std() + 0.05
+
+
+@pytest.mark.parametrize(("able", "expected"), [({"amx_bf16": True}, torch.bfloat16), ({}, torch.float32)])
+def test_the_fastest_type_of_matrix_products(able, expected, monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able, raising=False)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: not able)
+    assert matrix_dtype("auto", "cpu") == expected  # whatever a GPU beside it can do
+    assert matrix_dtype("auto", "cuda") != expected
+    assert matrix_dtype("float32", "cpu") == torch.float32
+
+
+@settings(max_examples=15)
+@given(
+    seed=st.integers(0, 10**6), field=st.sampled_from([1, 3, 5]), tote=st.tuples(st.integers(1, 6), st.integers(1, 6))
+)
+def test_the_critic_adds_up_what_each_column_will_hold(seed, field, tote):
+    generator = torch.Generator().manual_seed(seed)
+    critic = PooledCritic(4, field, 6, tote_clip=2, depth_range=4, item_range=3, compute_dtype="float32")
+    for parameter in critic.parameters():
+        parameter.requires_grad_(False).normal_(generator=generator)
+    bins, totes = random_maps(seed, 2, (4, 6), tote)
+    item, half = item_from_depth(bins), field // 2
+    for n in range(2):
+        shift, total = max(int(totes[n].max()) - 2, 0), 0.0
+        code = torch.zeros(9)
+        for part, size in enumerate((item.w[n], item.d[n], item.h[n])):
+            code[part * 3 + min(int(size), 3) - 1] = 1
+        for x, y in itertools.product(range(tote[0]), range(tote[1])):
+            room = float(totes[n, x, y]) / 5
+            out = critic.around.bias + critic.item(code) + room * critic.room
+            for i, j in itertools.product(range(-half, half + 1), repeat=2):
+                if 0 <= x + i < tote[0] and 0 <= y + j < tote[1]:
+                    level = max(0, min(2 - (int(totes[n, x + i, y + j]) - shift), 3))
+                    out = out + critic.around.weight[:, level, i + half, j + half]
+            share, more = critic.head(F.relu(critic.hidden(F.relu(out))))
+            total += (share * room + more / 5).item()
+        assert float(critic(bins, totes)[n]) == pytest.approx(total, rel=1e-4, abs=1e-4)
+
+
+def test_the_critic_takes_any_leading_dimensions():
+    (bins, totes), critic = random_maps(0, 6, (5, 5), (4, 3)), PooledCritic()
+    values = critic(bins, totes)
+    assert values.shape == (6, 1)
+    torch.testing.assert_close(critic(bins.view(2, 3, 5, 5), totes.view(2, 3, 4, 3)), values.view(2, 3, 1))
+
+
+@pytest.mark.parametrize("make", [FootprintFcn, PooledCritic])
+@pytest.mark.parametrize(
+    ("key", "values", "expected"),
+    [
+        *((key, (0, -1, 2.5, True, "4"), "a whole number >= 1") for key in ("filters", "hidden", "tote_clip")),
+        *((key, (0, 2.5), "a whole number >= 1") for key in ("depth_range", "item_range")),
+        ("receptive_field", (4, 0, 3.5), "an odd number"),
+        ("compute_dtype", ("half",), "'auto' or 'float32' or 'bfloat16'"),
+    ],
+)
+def test_bad_settings_are_refused(make, key, values, expected):
+    for value in values:
+        with pytest.raises(ValueError, match=rf"{key}={value!r}: expected {expected}"):
+            make(**{key: value})
+
+
+def test_bad_settings_of_the_actor_are_refused():
+    for key, value in (("reach", 0), ("headroom_bins", 0), ("head_std", -1), ("receptive_field", 1)):
+        with pytest.raises(ValueError, match=rf"model.actor.{key}={value}: expected"):
+            FootprintPolicy(CellSpec(), **{key: value})

@@ -1,0 +1,136 @@
+"""Random problems, as the package and as the plain-Python oracle see them; shared by the tests of several rooms."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from hypothesis import strategies as st
+from oracle import SUCCESS, Oracle, Rules, cells
+from torchrl.envs.utils import step_mdp
+
+from pickplace import CellSpec, Item, PickPlaceEnv, State
+from pickplace.planners.heuristics import RandomFeasible
+from pickplace.task.cell import Limits
+from pickplace.task.items import Uniform
+
+SIDES = st.integers(1, 4)
+
+
+class Case(NamedTuple):
+    """The state of one problem: height of the tote, heights ``[W_T, D_T]`` in it, and ``(x, y, w, d, h)`` in the bin."""
+
+    rim: int
+    heights: np.ndarray
+    item: tuple[int, int, int, int, int]
+
+
+def state_of(*cases: Case) -> State:
+    """Return cases as the state of a batch."""
+    heights = torch.from_numpy(np.stack([case.heights for case in cases])).int()
+    items = torch.tensor([case.item for case in cases])
+    return State(heights, torch.tensor([case.rim for case in cases]), Item(*items.unbind(1)))
+
+
+def oracle_of(cell: CellSpec, case: Case) -> Oracle:
+    """Return a case as the oracle sees it."""
+    tables = {} if cell.limits is None else {key: value.tolist() for key, value in vars(cell.limits).items()}
+    names = ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "min_support", "strict_support")
+    rules = Rules(**{name: getattr(cell, name) for name in names}, **tables)
+    return Oracle(rules, case.rim, case.item[2:], case.item[:2], case.heights.tolist())
+
+
+def random_limits(cell: CellSpec, seed: int) -> Limits:
+    """Return tables that forbid some of everything."""
+    random = np.random.default_rng(seed)
+    places = (cell.rotations, *cell.tote_size[:2])
+    lowest = random.integers(-1, 4, places)
+    highest = lowest + random.integers(-1, 5, places)  # an empty range at times
+    return Limits(torch.from_numpy(random.random(cell.num_picks) < 0.7), *map(torch.from_numpy, (lowest, highest)))
+
+
+@st.composite
+def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=st.just(False), count=1):
+    """Return a cell and ``count`` cases in it."""
+    effector = draw(effector_sides), draw(effector_sides)
+    bin_w, bin_d, tote_w, tote_d = (draw(st.integers(2, most)) for most in (5, 4, 5, 4))
+    rule = draw(st.sampled_from(["contain", "overlap"]))
+    cell = CellSpec(
+        (bin_w, bin_d, draw(st.integers(1, 3))), (tote_w, tote_d, 6), effector, draw(st.sampled_from(rotations)), rule,
+        draw(st.sampled_from([0.0, 0.5, 0.75, 1.0])), draw(st.booleans()),
+    )  # fmt: skip
+    if draw(limited):
+        cell = replace(cell, limits=random_limits(cell, draw(st.integers(0, 999))))
+    most = [min(pair) if rule == "contain" else pair[0] for pair in zip((bin_w, bin_d), effector, strict=True)]
+    cases = []
+    for _ in range(count):
+        w, d, h = draw(st.integers(1, most[0])), draw(st.integers(1, most[1])), draw(st.integers(1, 3))
+        item = draw(st.integers(0, bin_w - w)), draw(st.integers(0, bin_d - d)), w, d, h
+        rim = draw(st.integers(1, 6))
+        levels = draw(st.lists(st.integers(0, rim), min_size=1, max_size=3))
+        heights = np.random.default_rng(draw(st.integers(0, 999))).choice(levels, size=(tote_w, tote_d))
+        cases.append(Case(rim, heights, item))
+    return cell, cases
+
+
+#: Settings of environments of every shape.
+SETTINGS = [
+    {"num_envs": 4},
+    {"num_envs": 8, "rotations": 1},
+    {"num_envs": 8, "rotations": 2, "tote_size": (4, 3, 1)},
+    {"num_envs": 4, "tote_size": (7, 5, 4), "effector_size": (4, 2), "bin_size": (6, 4, 2), "rotations": 3},
+    {"num_envs": 4, "tote_size": (5, 6, 3), "effector_size": (2, 3), "pick_rule": "overlap", "rotations": 2},
+    {"num_envs": 4, "tote_size": (5, 5, 4), "items": Uniform((1, 2), (1, 3), (1, 2)), "strict_support": True},
+]
+
+
+def random_states(steps=8, **settings):
+    """Yield environments and their observations along random feasible play, with their exact action masks."""
+    env = PickPlaceEnv(**{"num_envs": 16, "seed": 3, **settings})
+    planner, observation = RandomFeasible(env.cell, seed=1), env.reset()
+    for step in range(steps):
+        if step:
+            _, observation = env.step_and_maybe_reset(observation.set("action", planner.decide(observation)))
+        yield env, observation
+
+
+def late_state(steps=8, **settings):
+    """Return an environment in the middle of random episodes, and its observation."""
+    return list(random_states(steps, **settings))[-1]
+
+
+def results_by_hand(env, observation, row: int) -> dict[int, tuple[int, int, int, int, int]]:
+    """Return every feasible flat action of a problem, in plain Python: ``{action: (top, y, x, w, d)}``, of where the
+    item comes to lie."""
+    case = Case(int(env.tote_height[row]), env.heights[row].numpy(), tuple(env.item[row].tolist()))
+    plain, found = oracle_of(env.cell, case), {}
+    for action in observation["action_mask"][row].nonzero()[:, 0].tolist():
+        failure, after = plain.try_action(action)
+        assert failure == SUCCESS
+        # What the item changed is its footprint, for it has a height and lands on top.
+        grid = cells((0, 0), env.cell.tote_size[:2])
+        changed = [(x, y) for x, y in grid if after[x][y] != plain.heights[x][y]]
+        (x, y), (x1, y1) = min(changed), max(changed)
+        found[action] = (after[x][y], y, x, x1 - x + 1, y1 - y + 1)
+    return found
+
+
+def footprint_by_hand(cell: CellSpec, item, found) -> int:
+    """Return the footprint index of an entry of :func:`results_by_hand`; ``item`` is ``(x, y, w, d, h)``."""
+    _, y, x, w, d = found
+    return (((w, d) != tuple(item[2:4])) * cell.tote_size[0] + x) * cell.tote_size[1] + y
+
+
+@torch.no_grad()
+def occupancies(planner, env: PickPlaceEnv) -> torch.Tensor:
+    """Return the occupancy that a planner reaches in one episode of each slot, float64 ``[N]``."""
+    observation, reached = env.reset(), torch.zeros(env.num_envs, dtype=torch.float64)
+    running = torch.arange(env.num_envs)
+    while len(running):  # what has ended plays on, uncounted
+        action = torch.zeros(env.num_envs, dtype=torch.int64)
+        action[running] = planner.decide(observation[running])
+        after = env.step(observation.set("action", action))["next"]
+        reached[running] = env.exact_occupancy[running]
+        running = running[~after["done"][running, 0]]
+        observation = step_mdp(observation)
+    return reached

@@ -1,0 +1,78 @@
+"""The robot cell: what it refuses, and the settings that configs may name."""
+
+import pytest
+import torch
+from problems import late_state
+
+from pickplace import CellSpec, PickPlaceEnv
+from pickplace.task.cell import CELL_SETTINGS, Limits, cell_from_settings, reference_cell
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"bin_size": (-5, 5, 1)}, r"bin_size=\(-5, 5, 1\): expected 3 positive whole numbers of cells"),
+        ({"tote_size": (6, 0, 5)}, r"tote_size=\(6, 0, 5\)"),
+        ({"tote_size": (6, 6)}, r"tote_size=\(6, 6\): expected 3"),
+        ({"tote_size": (6, 6, 2**20)}, "tote_size=.*below 1048576"),
+        ({"tote_size": 6}, "tote_size=6"),
+        ({"tote_size": (6, 6.5, 5)}, "tote_size="),
+        ({"tote_size": (6, True, 5)}, "tote_size="),
+        ({"effector_size": (3, -3)}, r"effector_size=\(3, -3\): expected 2"),
+        ({"effector_size": (3, 3, 1)}, r"effector_size=\(3, 3, 1\)"),
+        *(({"rotations": value}, f"rotations={value}: expected 1, 2, 3 or 4") for value in (0, 5, 4.0, True)),
+        ({"pick_rule": "grab"}, "pick_rule='grab': expected 'contain' or 'overlap'"),
+        *(({"min_support": value}, f"min_support={value!r}: expected a share") for value in (1.5, -0.1, "half")),
+        ({"min_support": float("nan")}, "min_support=nan"),
+        ({"strict_support": 1}, "strict_support=1: expected true or false"),
+        *(({"height_unit": value}, f"height_unit={value!r}: expected sides") for value in (0, -1, 1e-4, 2000, "1")),
+        ({"height_unit": float("inf")}, "height_unit=inf"),
+        ({"height_unit": True}, "height_unit=True"),
+        ({"longest_side": 0}, "longest_side=0: expected a whole number >= 1"),
+        ({"tote_sizes": (6, 6, 5)}, r"tote_sizes=\(6, 6, 5\): expected one of bin_size, tote_size, .*, height_unit"),
+    ],
+)
+def test_impossible_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        cell_from_settings(settings)
+
+
+def test_every_setting_reaches_the_cell_of_the_environment():
+    given = dict(
+        bin_size=[4, 6, 2], tote_size=[5, 7, 6], effector_size=[2, 4], rotations=3, pick_rule="overlap",
+        min_support=0.25, strict_support=True, height_unit=0.5,
+    )  # fmt: skip
+    assert tuple(given) == CELL_SETTINGS
+    cell = PickPlaceEnv(num_envs=1, **given).cell
+    for key, value in given.items():
+        assert getattr(cell, key) == (tuple(value) if isinstance(value, list) else value)
+    assert cell.longest_side == 2  # of the items
+    assert cell.describe() == "bin 4x6x2, tote 5x7x6, end effector 2x4, R=3"
+    assert (cell.num_picks, cell.num_places, cell.num_actions) == (24, 35, 2520)
+
+
+def test_counts_of_offsets_and_footprints():
+    assert [CellSpec(rotations=rotations).num_footprints for rotations in (1, 2, 3, 4)] == [36, 72, 72, 72]
+    contain, overlap = CellSpec(effector_size=(2, 4)), CellSpec(effector_size=(2, 4), pick_rule="overlap")
+    assert (contain.max_side, contain.min_offset, contain.num_offsets) == (4, 0, 4)
+    assert (overlap.max_side, overlap.min_offset, overlap.num_offsets) == (5, -4, 8)
+    assert CellSpec(longest_side=2, pick_rule="overlap").num_offsets == 4
+    assert contain.effectors == ((2, 4, 0, 1), (4, 2, 1, 0))
+    assert [reference_cell(side) for side in (1, 2, 3, 4, 5)] == [0, 0, 1, 1, 2]
+
+
+def test_the_height_unit_changes_no_rule():
+    """The rules count units; only what converts heights to lengths multiplies by it."""
+    plain, fine = (late_state(height_unit=unit)[1] for unit in (1.0, 0.25))
+    assert (plain == fine).all()
+
+
+@pytest.mark.parametrize("table", ["pick_ok", "lowest_top", "highest_top"])
+def test_a_table_of_another_shape_is_refused(table):
+    places = torch.zeros(2, 6, 7, dtype=torch.int32)
+    tables = {"pick_ok": torch.ones(20, dtype=torch.bool), "lowest_top": places, "highest_top": places + 5}
+    sizes = {"bin_size": (4, 5, 1), "tote_size": (6, 7, 5), "rotations": 2}
+    assert CellSpec(**sizes, limits=Limits(**tables)).limits.on("cpu").highest_top.equal(places + 5)
+    tables[table] = tables[table][:-1]
+    with pytest.raises(ValueError, match=rf"limits.{table}: got shape \[.*\], expected \["):
+        CellSpec(**sizes, limits=Limits(**tables))
