@@ -118,7 +118,7 @@ def everything() -> dict[tuple[str, str], ConfigFile]:
 
 
 def meaning(key: str, file: ConfigFile, files: dict) -> str:
-    """Return the comment of a setting: from the file, from the file that it builds on, or from any option of the group."""
+    """Return the comment of a setting: from its file, the file that it builds on, or any option of the group."""
     if key in file.settings and file.settings[key].comment:
         return file.settings[key].comment
     for base in file.bases:
