@@ -133,17 +133,17 @@ def small(line: str) -> str:
 
 def researcher(walk: Walk) -> None:
     """Wants another curriculum."""
-    walk.follow("README.md", "Two commands, and a look at it first")
+    walk.follow("README.md", "Try it")
     walk.expect("outputs/demo", EVALUATED)
     walk.expect("outputs/made", TRAINED)
-    walk.follow("README.md", "Your own curriculum")
+    walk.follow("README.md", "Train, resume, sweep")
     walk.follow("docs/curriculum.md")
-    header = next((walk.clone / "outputs/train").glob("*/metrics.csv")).read_text().splitlines()[0]
+    header = (walk.clone / "outputs/mine/metrics.csv").read_text().splitlines()[0]
     for metric in ("curriculum/level", "curriculum/progress", "curriculum/frames_at_level"):
         if metric not in header:
             raise Stumble(f"docs/curriculum.md: metrics.csv has no {metric}.")
-    if len(list((walk.clone / "outputs/sweep").glob("*/*/report.html"))) != 3:
-        raise Stumble("docs/curriculum.md: the sweep did not leave three runs.")
+    if len(list((walk.clone / "outputs/sweep").glob("*/*/report.html"))) != 12:
+        raise Stumble("README.md, docs/curriculum.md: the sweeps did not leave nine and three runs.")
 
 
 def engineer(walk: Walk) -> None:
@@ -161,28 +161,20 @@ def contributor(walk: Walk) -> None:
     """Brings a planner in, as CONTRIBUTING.md says."""
     walk.follow("CONTRIBUTING.md", "Set up")
     walk.follow("docs/extending.md")
-    tell(" CONTRIBUTING.md, Adding a planner")
+    tell(" CONTRIBUTING.md, Add a planner")
     example = walk.clone / "docs/examples/own_planner"
-    walk.write("pickplace/planners/corner.py", (example / "own_planner.py").read_text())
-    config = (example / "planner/corner.yaml").read_text()
-    walk.write("conf/planner/corner.yaml", config.replace("own_planner.Corner", "pickplace.planners.Corner"))
-    package = "pickplace/planners/__init__.py"
-    walk.edit(
-        package,
-        "from pickplace.planners.heuristics",
-        "from pickplace.planners.corner import Corner\nfrom pickplace.planners.heuristics",
-    )
-    walk.edit(package, '"IndividualHeuristic", "JointDBL"', '"Corner", "IndividualHeuristic", "JointDBL"')
-    walk.edit("pickplace/trust.py", '    "IndividualHeuristic",\n', '    "Corner",\n    "IndividualHeuristic",\n')
-    teacher = (walk.clone / "conf/warm_start/joint_dbl.yaml").read_text()
-    walk.write("conf/warm_start/corner.yaml", teacher.replace("joint_dbl", "corner"))
+    walk.write("pickplace/planners/soft_dbl.py", (example / "own_planner.py").read_text())
+    config = (example / "planner/soft_dbl.yaml").read_text()
+    walk.write("conf/planner/soft_dbl.yaml", config.replace("own_planner.SoftDBL", "soft_dbl"))
+    added = 'PLANNERS = {\n    "soft_dbl": "pickplace.planners.soft_dbl.SoftDBL",\n'
+    walk.edit("pickplace/runs/registry.py", "PLANNERS = {\n", added)
     walk.run("make format")
     walk.run("python docs/reference.py")
     walk.run("git add --all")
-    walk.run("git -c user.name=New -c user.email=new@example.org commit --quiet -m 'Planner corner'", "the hooks")
+    walk.run("git -c user.name=New -c user.email=new@example.org commit --quiet -m 'Add planner soft_dbl'", "the hooks")
     walk.run("make lint")
-    walk.run("make test ARGS='tests/test_config.py tests/test_docs.py -k \"corner or reference or comment\"'")
-    walk.run("pickplace-evaluate planner=corner " + SMALL["pickplace-evaluate"])
+    walk.run("make test ARGS='tests/test_config.py tests/test_docs.py -k \"soft_dbl or reference\"'")
+    walk.run("pickplace-evaluate planner=soft_dbl " + SMALL["pickplace-evaluate"])
 
 
 WALKERS = {walker.__name__: walker for walker in (researcher, engineer, contributor)}
