@@ -30,7 +30,11 @@ def test_masks_equal_the_step_and_the_oracle(problem):
     cell, cases = problem
     state, actions = state_of(*cases), torch.arange(cell.num_actions)
     maps = placing_maps(cell, state)
-    masks, footprints, reached = action_mask(cell, maps), action_footprints(cell, state.item), footprint_mask(cell, maps)
+    masks, footprints, reached = (
+        action_mask(cell, maps),
+        action_footprints(cell, state.item),
+        footprint_mask(cell, maps),
+    )
     assert torch.equal(num_feasible(cell, maps), masks.sum(1))
     for row, case in enumerate(cases):
         plain, mask = oracle_of(cell, case), masks[row]
@@ -62,11 +66,15 @@ def test_footprints_without_the_tote(problem):
     """Every action whose pick succeeds and whose item stays in the tote has a footprint, whatever lies there."""
     cell, cases = problem
     flat = state_of(*(case._replace(heights=case.heights * 0) for case in cases))
-    step = [apply(cell, flat.rows(torch.full((cell.num_actions,), row)), torch.arange(cell.num_actions)) for row in (0, 2)]
+    step = [
+        apply(cell, flat.rows(torch.full((cell.num_actions,), row)), torch.arange(cell.num_actions)) for row in (0, 2)
+    ]
     footprints = action_footprints(cell, flat.item)[[0, 2]]
     x, y, w, d = torch.stack([each.footprint for each in step]).unbind(-1)
     inside = (x >= 0) & (y >= 0) & (x + w <= cell.tote_size[0]) & (y + d <= cell.tote_size[1])
-    lifted = torch.stack([(each.failure != Failure.PICK_MISS) & (each.failure != Failure.BIN_COLLISION) for each in step])
+    lifted = torch.stack(
+        [(each.failure != Failure.PICK_MISS) & (each.failure != Failure.BIN_COLLISION) for each in step]
+    )
     assert torch.equal(footprints >= 0, inside & lifted)
 
 
