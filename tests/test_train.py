@@ -5,6 +5,7 @@ import torch
 from commands import composed
 from torch import nn
 from torchrl.collectors import RandomPolicy
+from torchrl.envs import TransformedEnv
 from torchrl.modules import ValueOperator
 
 from pickplace import PickPlaceEnv
