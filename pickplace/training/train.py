@@ -19,7 +19,9 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import A2CLoss, ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from pickplace.evaluation.evaluate import Episodes, commit, confidence95, play, versions
+from pickplace.evaluation.evaluate import commit, versions
+from pickplace.evaluation.play import Episodes, play
+from pickplace.evaluation.statistics import confidence95
 from pickplace.policies.base import Policy, as_actor, as_collection_policy, as_critic
 from pickplace.runs import checkpoint
 from pickplace.runs import hydra_app as config
