@@ -16,7 +16,6 @@ import pickplace
 from pickplace import PickPlaceEnv
 from pickplace.envs.gymnasium import KEYS
 from pickplace.task.items import Recorded
-from pickplace.views.figures import draw_scene
 
 ID = "pickplace/PickPlace-v0"
 SMALL = {"tote_size": (4, 5, 2), "items": [(1, 1, 1), (2, 1, 1), (2, 2, 1)]}
@@ -189,41 +188,6 @@ def test_a_recorded_stream_truncates(tmp_path):
     assert env.render().shape == (600, 1200, 3)
 
 
-def test_render():
-    env = make(render_mode="rgb_array")
-    _, info = env.reset(seed=0)
-    before = env.render()
-    env.step(int(np.flatnonzero(info["action_mask"])[0]))
-    after = env.render()
-    assert before.dtype == np.uint8 and before.shape == after.shape == (600, 1200, 3)
-    assert (before != after).any()
-
-
-def test_an_item_keeps_its_colour_through_an_episode(monkeypatch):
-    """Whatever is placed after it."""
-    seen = []
-    monkeypatch.setattr(
-        "pickplace.envs.gymnasium.draw_scene", lambda *given: (seen.append(given[2]), draw_scene(*given))[1]
-    )
-    env = make(items=[(2, 2, 1), (1, 1, 1)], render_mode="rgb_array")
-    _, info = env.reset(seed=0)
-    while info["action_mask"].any():
-        *_, info = env.step(int(np.flatnonzero(info["action_mask"])[0]))
-        env.render()
-    assert len(seen) > 2
-    assert len({str(colours) for colours in seen}) == 1 and set(seen[0]) == {(1, 1, 1), (2, 2, 1)}
-
-
-def test_human_mode_without_a_display_says_so(monkeypatch):
-    monkeypatch.setattr("sys.platform", "linux")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    env = make(render_mode="human")
-    with pytest.warns(UserWarning, match="there is no display"):
-        env.reset(seed=0)
-    env.close()
-
-
 def test_async_vectorisation():
     env = gymnasium.make_vec(ID, num_envs=2, vectorization_mode="async", **SMALL)
     observation, info = env.reset(seed=1)
@@ -287,28 +251,6 @@ def test_maskable_ppo_runs():
     model = contrib.MaskablePPO("MultiInputPolicy", make(), n_steps=64, batch_size=32, seed=0)
     model.learn(128)
     assert model.num_timesteps == 128
-
-
-def test_a_picture_shows_its_own_episode():
-    env = make(render_mode="rgb_array")
-    _, info = env.reset(seed=0)
-    empty = env.render()
-    env.step(int(np.flatnonzero(info["action_mask"])[0]))
-    assert (env.render() != empty).any()
-    env.reset(seed=0)
-    assert (env.render() == empty).all()
-
-
-def test_the_picture_of_the_bin_lies_as_the_map_of_the_tote(monkeypatch):
-    seen = []
-    monkeypatch.setattr(
-        "pickplace.envs.gymnasium.draw_scene", lambda *given: seen.append(draw_scene(*given)) or seen[-1]
-    )
-    env = make(bin_size=(3, 6, 1), render_mode="rgb_array")
-    observation, _ = env.reset(seed=0)
-    env.render()
-    image = seen[-1].axes[-1].images[0]
-    assert np.array_equal(image.get_array(), observation["bin_depth"].T) and image.origin == "lower"
 
 
 def test_a_step_that_resets_says_nothing_of_what_its_action_would_have_done(tmp_path):

@@ -49,7 +49,7 @@ def test_evaluation_json(evaluation, group, stream, seed):
     assert result["env"]["tote_size"] == [4, 5, 2] and result["env"]["rotations"] == 4
     occupancy = result["occupancy"]
     assert set(occupancy) == {"mean", "ci95", "min", "per_episode"}
-    assert 5 == sum(result["failures"].values()) and occupancy["min"] == min(occupancy["per_episode"])
+    assert sum(result["failures"].values()) == 5 and occupancy["min"] == min(occupancy["per_episode"])
     assert occupancy["mean"] == pytest.approx(sum(occupancy["per_episode"]) / 5)
     assert occupancy["ci95"][0] <= occupancy["mean"] <= occupancy["ci95"][1]
     assert set(result["failures"]) <= {failure.name.lower() for failure in Failure}
@@ -147,7 +147,9 @@ class Nameless(JointDBL):
 
 def test_own_planners_add_to_the_result(evaluation):
     arguments = [*JOINT, "evaluation.episodes=2", "trust=[test_evaluate]"]
-    code, err, result = evaluation(*arguments, "planner._target_=test_evaluate.Counting", "+planner.weights=[1,{a:2.5}]")
+    code, err, result = evaluation(
+        *arguments, "planner._target_=test_evaluate.Counting", "+planner.weights=[1,{a:2.5}]"
+    )
     assert code == 0, err
     assert result["planner_settings"]["weights"] == [1, {"a": 2.5}]
     assert (result["heaviest"], result["seen"], result["share"], result["device"]) == (2.5, [3, 4], 0.5, "cpu")

@@ -32,7 +32,7 @@ def test_every_episode_is_played_to_its_end_and_counted_once():
 
 
 class Fussy(JointDBL):
-    """Fails on purpose at items of 2x2 at one edge of the bin: its episodes last from one step to many, whatever plays beside them."""
+    """Fails on purpose at items of 2x2 at one edge of the bin: its episodes last from one step to many."""
 
     def decide(self, observation):
         state = State.from_observation(observation)
