@@ -1,46 +1,33 @@
 """The planner for a robot cell, against the oracle, plane geometry, and what a depth camera may deliver."""
 
-import io
 import json
-import sys
 from collections import Counter
 from math import cos, radians, sin
 
-import hydra
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
-from oracle import Oracle
-from oracle import Rules as OracleRules
+from oracle import Oracle, Rules
 from tensordict import TensorDict
+from untrained import untrained_policy, write_checkpoint
 
-from pickplace import DepthMapError, Failure, Planner, Rules
-from pickplace.planners import PolicyPlanner
-from pickplace.planners.policy import restore_policy
-from pickplace.policies.actors import fcn4d, fcn_grasp
-from pickplace.robot import json_lines as plan
+from pickplace import CellSpec, DepthMapError, Failure, Planner
+from pickplace.planners.policy import PolicyPlanner
+from pickplace.policies.fcn4d import ActionPolicy
+from pickplace.policies.restore import restore_policy
 from pickplace.runs import checkpoint
-from pickplace.runs import hydra_app as config
-from pickplace.runs.registry import build
 
 EMPTY = np.full((6, 6), 5)
 ITEM = np.zeros((5, 5), dtype=np.int64)
 ITEM[1:3, 2] = 1
 
 
-def make_planner(rules=None, candidates="all", mask=True, seed=0):
-    """A planner with an untrained policy that prefers some actions clearly."""
-    rules = rules or Rules()
-    torch.manual_seed(seed)
-    return Planner(rules, fcn_grasp(rules, mask, filters=8, hidden=8, head_std=1.0).eval(), candidates)
-
-
 @pytest.fixture(scope="module")
 def planner():
-    return make_planner()
+    return Planner(CellSpec(), untrained_policy(CellSpec()))
 
 
 @st.composite
@@ -49,7 +36,9 @@ def cells_and_states(draw):
     effector = draw(st.tuples(st.integers(1, 4), st.integers(1, 4)))
     bin_size = draw(st.tuples(st.integers(2, 5), st.integers(2, 5), st.integers(1, 2)))
     tote_size = draw(st.tuples(st.integers(3, 6), st.integers(3, 6), st.integers(2, 5)))
-    rules = Rules(bin_size, tote_size, effector, draw(st.integers(1, 4)), draw(st.sampled_from(["contain", "overlap"])))
+    cell = CellSpec(
+        bin_size, tote_size, effector, draw(st.integers(1, 4)), draw(st.sampled_from(["contain", "overlap"]))
+    )
     w, d = (draw(st.integers(1, min(3, side))) for side in bin_size[:2])
     h = draw(st.integers(1, 2))
     x, y = draw(st.integers(0, bin_size[0] - w)), draw(st.integers(0, bin_size[1] - d))
@@ -58,31 +47,28 @@ def cells_and_states(draw):
     heights = draw(st.lists(st.integers(0, tote_size[2]), min_size=2, max_size=2))
     seed = draw(st.integers(0, 1000))
     low = np.random.default_rng(seed).choice(heights, size=tote_size[:2])
-    return rules, bin_depth, tote_size[2] - low
+    return cell, bin_depth, tote_size[2] - low
 
 
-def oracle_of(rules, bin_depth, tote_depth, tote_height):
+def oracle_of(cell, bin_depth, tote_depth, tote_height):
     x, y = (int(index.min()) for index in bin_depth.nonzero())
     w, d = (int(index.max() - index.min()) + 1 for index in bin_depth.nonzero())
-    own = OracleRules(rules.bin_size, rules.tote_size, rules.effector_size, rules.rotations, rules.pick_rule)
+    rules = Rules(cell.bin_size, cell.tote_size, cell.effector_size, cell.rotations, cell.pick_rule)
     heights = (tote_height - tote_depth).tolist()
-    return Oracle(own, tote_height, (w, d, int(bin_depth.max())), (x, y), heights)
+    return Oracle(rules, tote_height, (w, d, int(bin_depth.max())), (x, y), heights)
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(cells_and_states(), st.sampled_from(["all", 1, 7]), st.booleans(), st.integers(0, 5))
-def test_plans_agree_with_the_oracle_and_with_plane_geometry(cell, candidates, mask, seed):
-    rules, bin_depth, tote_depth = cell
-    height = rules.tote_size[2]
-    planner = make_planner(rules, candidates, mask, seed)
+def test_plans_agree_with_the_oracle_and_with_plane_geometry(problem, candidates, mask, seed):
+    cell, bin_depth, tote_depth = problem
+    height = cell.tote_size[2]
+    policy = untrained_policy(cell, mask, seed)
+    planner = Planner(cell, policy, candidates)
     result = planner.plan(bin_depth, tote_depth, alternatives=6)
-    oracle = oracle_of(rules, bin_depth, tote_depth, height)
-    codes = [oracle.try_action(action)[0] for action in range(rules.num_actions)]
-    assert result.item == {
-        "x": oracle.position[0],
-        "y": oracle.position[1],
-        **dict(zip("wdh", oracle.item, strict=True)),
-    }
+    oracle = oracle_of(cell, bin_depth, tote_depth, height)
+    codes = [oracle.try_action(action)[0] for action in range(cell.num_actions)]
+    assert result.item == dict(zip("xywdh", (*oracle.position, *oracle.item), strict=True))
     assert result.occupancy_before == pytest.approx((height - tote_depth).sum() / tote_depth.size / height)
 
     # The same decision as the planner that evaluation uses.
@@ -90,10 +76,10 @@ def test_plans_agree_with_the_oracle_and_with_plane_geometry(cell, candidates, m
         {"bin_depth": torch.tensor(bin_depth)[None].float(), "tote_depth": torch.tensor(tote_depth)[None].float(),
          "tote_height": torch.tensor([[height]])}, [1],
     )  # fmt: skip
-    action = int(PolicyPlanner(rules, planner._planner.policy, candidates).decide(observation))
+    action = int(PolicyPlanner(cell, policy, candidates).decide(observation))
     feasible = 0 in codes
-    empty = oracle_of(rules, bin_depth, np.full_like(tote_depth, height), height)
-    elsewhere = any(empty.try_action(other)[0] == 0 for other in range(rules.num_actions))
+    empty = oracle_of(cell, bin_depth, np.full_like(tote_depth, height), height)
+    elsewhere = any(empty.try_action(other)[0] == 0 for other in range(cell.num_actions))
     nothing = "stuck" if elsewhere else "impossible"
     assert result.status == (nothing if not feasible else "ok" if codes[action] == 0 else "rejected")
     assert result.action == (action if result.status == "ok" else None)
@@ -137,17 +123,39 @@ def test_plans_agree_with_the_oracle_and_with_plane_geometry(cell, candidates, m
     assert result.occupancy_after == pytest.approx(result.occupancy_before + w * d * h / tote_depth.size / height)
 
 
-def test_metres_and_noise_within_the_tolerance_change_nothing(planner):
-    plain = planner.plan(ITEM, EMPTY)
+@pytest.mark.parametrize("height_unit", [1.0, 0.5])
+def test_every_length_is_in_metres(height_unit):
+    """Lengths along x and y are multiples of the cell's side, heights of the height unit."""
+    cell = CellSpec(height_unit=height_unit)
+    planner = Planner(cell, untrained_policy(cell))
+    low = EMPTY - 2  # something two units high lies everywhere
+    plain = planner.plan(ITEM, low)
     noise = np.random.default_rng(0).uniform(-0.24, 0.24, (2, 6, 6))
+    unit = 0.05 * height_unit
     metric = planner.plan(
-        (ITEM + noise[0, :5, :5]) * 0.05, torch.from_numpy((EMPTY + noise[1]) * 0.05), tote_height=0.251, cell_size=0.05
+        (ITEM + noise[0, :5, :5]) * unit, torch.from_numpy((low + noise[1]) * unit), 5.02 * unit, cell_size=0.05
     )
     assert metric.action == plain.action and metric.status == "ok"
-    assert metric.pick.center == pytest.approx([0.05 * value for value in plain.pick.center])
-    assert metric.place.center == pytest.approx([0.05 * value for value in plain.place.center])
-    assert metric.pick.cell == plain.pick.cell
+    assert plain.drop_height == 2 and metric.drop_height == pytest.approx(2 * unit)
+    for pose, other in ((plain.pick, metric.pick), (plain.place, metric.place)):
+        assert other.cell == pose.cell
+        assert other.center == pytest.approx(np.multiply(pose.center, [0.05, 0.05, unit]))
     assert json.loads(json.dumps(metric.as_dict()))["place"]["cell"] == list(metric.place.cell)
+    assert (metric.item["h"], metric.occupancy_before) == (1, pytest.approx(0.4))
+
+
+def test_errors_name_the_height_unit():
+    cell = CellSpec(height_unit=0.5)
+    planner = Planner(cell, untrained_policy(cell))
+    good = {"bin_depth": ITEM * 0.025, "tote_depth": EMPTY * 0.025, "cell_size": 0.05, "tolerance": 0.1}
+    for bad, message in (
+        ({"tote_depth": EMPTY * 0.025 + 0.01}, "got 5.4 height units (0.135 m), expected a whole number of height"),
+        ({"tote_height": 0.13}, "expected a whole number of height units, 1 to 1048575, within 0.1, in metres"),
+        ({"tote_depth": EMPTY * 0.05}, "got 10 height units (0.25 m), expected 0 to 5 height units"),
+    ):
+        with pytest.raises(DepthMapError) as caught:
+            planner.plan(**{**good, **bad})
+        assert message in str(caught.value)
 
 
 def test_only_rounding_goes_beyond_the_tolerance(planner):
@@ -163,7 +171,7 @@ def test_only_rounding_goes_beyond_the_tolerance(planner):
 def test_stuck_in_this_tote_or_in_any(planner):
     """A robot that is told to bring an empty tote must not be told so for ever."""
     full = planner.plan(ITEM, np.zeros((6, 6)))
-    assert full.status == "stuck" and sum(full.reasons.values()) == planner.rules.num_actions
+    assert full.status == "stuck" and sum(full.reasons.values()) == planner.cell.num_actions
     long = np.zeros((5, 5))
     long[:4, 1] = 1  # an end effector of 3x3 does not cover it
     assert planner.plan(long, EMPTY).status == planner.plan(long, np.zeros((6, 6))).status == "impossible"
@@ -190,9 +198,8 @@ def test_tote_height_of_the_moment(planner):
 
 
 def test_four_dimensional_policy_plans_too():
-    rules = Rules(rotations=3)
-    policy = fcn4d(rules, False, filters=4).eval()
-    result = Planner(rules, policy).plan(ITEM, EMPTY, alternatives=3)
+    cell = CellSpec(rotations=3)
+    result = Planner(cell, ActionPolicy(cell, filters=4).eval()).plan(ITEM, EMPTY, alternatives=3)
     assert result.status == "ok" and result.rotation_degrees in (0, 90, 180)
     assert len(result.alternatives) in (3, 4) and sum(other.chosen for other in result.alternatives) == 1
 
@@ -254,7 +261,7 @@ def test_bad_maps_are_refused_in_one_sentence(planner, given, message):
 
 def test_load(tmp_path):
     shipped = Planner.load("pretrained/r4", tote_size=(8, 7, 9), candidates=10)
-    assert shipped.rules.tote_size == (8, 7, 9) and shipped.rules.bin_size == (5, 5, 1)
+    assert shipped.cell.tote_size == (8, 7, 9) and shipped.cell.bin_size == (5, 5, 1)
     assert shipped.plan(ITEM, np.full((8, 7), 9)).status == "ok"
     for sizes, message in [
         ({"tote_sizes": 1}, "tote_sizes=1: expected one of bin_size"),
@@ -279,145 +286,16 @@ def test_a_policy_without_a_mask_serves_end_effectors_as_long_as_its_own():
     del state["policy"]["miss"]  # what is damaged is not said to be of another size
     cfg = OmegaConf.create(facts["config"])
     with pytest.raises(ValueError, match="policy.*miss"):
-        restore_policy(cfg, Rules(tote_size=(9, 9, 5)), state["policy"], {"rotations": 4, "tote_size": [6, 6, 5]})
-
-
-# ---------------------------------------------------------------------- pickplace-plan
-@pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    """Run ``pickplace-plan`` in this process, in an empty folder; returns exit code, standard output and error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments, lines=b""):
-        monkeypatch.setattr(sys, "argv", ["pickplace-plan", *map(str, arguments)])
-        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(lines)))
-        code = 0
-        try:
-            plan.main()
-        except SystemExit as exit:
-            code = exit.code or 0
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
-
-
-def test_command_plans_from_files(command, tmp_path):
-    np.save(tmp_path / "bin.npy", ITEM * 0.05)
-    np.save(tmp_path / "tote.npy", EMPTY * 0.05)
-    arguments = ["pretrained/r4", "--bin", "bin.npy", "--tote", "tote.npy", "--cell-size", 0.05, "--time"]
-    code, out, err = command(*arguments, "--candidates", 10, "--threads", 1)
-    result = json.loads(out)
-    assert code == 0 and result["status"] == "ok" and result["item"] == {"x": 1, "y": 2, "w": 2, "d": 1, "h": 1}
-    assert err.startswith("planned in ") and err.endswith(" ms\n")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["nowhere"], "nowhere"),
-        (
-            ["pretrained/none"],
-            "expected pretrained/fcn4d, pretrained/mixed, pretrained/r1, pretrained/r3, pretrained/r4, "
-            "pretrained/unmasked",
-        ),
-        (["pretrained/r4", "--bin", "bin.npy"], "--tote: no file"),
-        (["pretrained/r4", "--bin", "bin.npy", "--tote", "missing.npy"], "missing.npy: cannot be read"),
-        (["pretrained/r4", "--bin", "bin.npy", "--tote", "pickle.npy"], "pickle.npy: cannot be read"),
-        (["pretrained/r4", "--bin", "bin.npy", "--tote", "bin.npy"], "tote_depth: got shape [5, 5]"),
-        (["pretrained/r4", "--candidates", "some"], "candidates='some'"),
-        (["pretrained/r4", "--threads", "0"], "--threads=0"),
-        (["pretrained/r4", "--rotations", "7"], "rotations=7"),
-        (["pretrained/r4", "--device", "tpu"], "tpu"),
-    ],
-)
-def test_command_refuses_in_one_sentence(command, tmp_path, arguments, message):
-    np.save(tmp_path / "bin.npy", ITEM)
-    np.save(tmp_path / "pickle.npy", np.array([{}]), allow_pickle=True)
-    code, out, err = command(*arguments)
-    assert code == 2 and out == ""
-    assert err.startswith("error: ") and err.count("\n") == 1 and message in err
-
-
-def test_command_answers_json_lines_and_survives_bad_ones(command):
-    good = {"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist(), "alternatives": 0}
-    requests = [
-        json.dumps({"id": "a", **good}).encode(),
-        b"",
-        b"not json",
-        b"\xff\xfe",
-        b"[" * 100_000,
-        b"[1, 2]",
-        json.dumps({"id": 7, "tote_depth": good["tote_depth"]}).encode(),
-        json.dumps({"id": 8, **good, "tote": 1}).encode(),
-        json.dumps({"id": 9, **good, "bin_depth": [[0.0] * 5] * 5}).encode(),
-        json.dumps({"id": 10, **good, "tote_height": float("nan")}).encode(),
-        json.dumps({"id": 11, **good, "tote_depth": [[0] * 6] * 6}).encode(),
-        json.dumps({"id": {"b": 1}, **good}).encode(),
-    ]
-    code, out, err = command("pretrained/r4", lines=b"\n".join(requests))
-    replies = [json.loads(line) for line in out.splitlines()]
-    assert code == 0 and err == "" and len(replies) == len(requests) - 1
-    errors = [
-        None, "not JSON", "utf-8", "recursion", "got list", "bin_depth: missing", "there is no such key", "one item",
-        "NaN", None, None,
-    ]  # fmt: skip
-    for reply, expected in zip(replies, errors, strict=True):
-        assert ("error" in reply) == (expected is not None), reply
-        assert expected is None or expected in reply["error"]
-    assert [reply.get("id") for reply in replies] == ["a", None, None, None, None, 7, 8, 9, None, 11, {"b": 1}]
-    assert replies[-2]["status"] == "stuck" and sum(replies[-2]["reasons"].values()) == 3600
-    assert {**replies[0], "id": 0} == {**replies[-1], "id": 0} and replies[0]["status"] == "ok"
+        restore_policy(cfg, CellSpec(tote_size=(9, 9, 5)), state["policy"], {"rotations": 4, "tote_size": [6, 6, 5]})
 
 
 def test_load_of_a_policy_whose_grasps_depend_on_the_items(tmp_path):
     """With ``pick_rule=overlap`` and no mask the number of grasp classes follows from the longest item in training."""
-    overrides = ["experiment=smoke", "env.pick_rule=overlap", "algo.mask_infeasible=false", "env.tote_size=[5,5,2]"]
-    with hydra.initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
-        cfg = hydra.compose("train", overrides)
-    rules = Rules(tote_size=(5, 5, 2), pick_rule="overlap", longest_side=2)
-    policy = build("model.actor", cfg.model.actor, rules=rules, mask_infeasible=False)
-    facts = {"frames": 0, "config": OmegaConf.to_container(cfg), "commit": None}
-    checkpoint.write(tmp_path / "it", {"policy": policy.state_dict()}, facts)
-    loaded = Planner.load(tmp_path / "it")
+    cell = CellSpec(tote_size=(5, 5, 2), pick_rule="overlap", longest_side=2)
+    overrides = ["env.pick_rule=overlap", "algo.mask_infeasible=false", "env.tote_size=[5,5,2]"]
+    loaded = Planner.load(write_checkpoint(tmp_path / "it", cell, *overrides))
     assert loaded.plan(ITEM, np.full((5, 5), 2)).status == "ok"
-    with pytest.raises(DepthMapError, match="the item is longer than any in training, expected at most 2"):
+    with pytest.raises(
+        DepthMapError, match="the item is 3 cells long, longer than any in training; expected at most 2"
+    ):
         loaded.plan(changed(ITEM, (3, 2), 1), np.full((5, 5), 2))
-
-
-def test_every_length_is_in_metres(planner):
-    low = EMPTY - 2  # something two cells high lies everywhere
-    plain, metric = planner.plan(ITEM, low), planner.plan(ITEM * 0.05, low * 0.05, cell_size=0.05)
-    assert plain.drop_height == 2 and metric.drop_height == pytest.approx(0.1)
-    for pose, other in ((plain.pick, metric.pick), (plain.place, metric.place)):
-        assert other.cell == pose.cell and other.center == pytest.approx([0.05 * length for length in pose.center])
-
-
-def test_command_hands_every_option_on(command, tmp_path):
-    item = np.zeros((5, 4))
-    item[1:3, 2] = 1.1
-    np.save(tmp_path / "bin.npy", item)
-    np.save(tmp_path / "tote.npy", np.full((7, 6), 4.0))
-    arguments = ["pretrained/r4", "--bin", "bin.npy", "--tote", "tote.npy"]
-    arguments += ["--bin-size", 5, 4, 1, "--tote-size", 7, 6, 9, "--effector-size", 2, 2, "--rotations", 1]
-    code, out, err = command(*arguments, "--tote-height", 4, "--alternatives", 1)
-    assert code == 0, err
-    plan = json.loads(out)
-    assert plan["status"] == "ok" and plan["rotation_degrees"] == 0 and len(plan["alternatives"]) == 1
-    assert plan["occupancy_after"] == pytest.approx(2 / (7 * 6 * 4))
-    assert plan["pick"]["center"][:2] == pytest.approx([2, 2.5], abs=0.5)  # an effector of two cells covers both
-    assert "within 0.05" in command(*arguments, "--tote-height", 4, "--tolerance", 0.05)[2]
-
-
-def test_a_request_has_the_last_word(command):
-    """Over what the command line says for all."""
-    plain = {"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist()}
-    metric = {"bin_depth": (ITEM * 0.05).tolist(), "tote_depth": (EMPTY * 0.05).tolist(), "cell_size": 0.05}
-    low = {"bin_depth": ITEM.tolist(), "tote_depth": (EMPTY - 3).tolist(), "tote_height": 2, "alternatives": 2}
-    lines = "\n".join(json.dumps(request) for request in (plain, metric, low)).encode()
-    code, out, err = command("pretrained/r4", "--cell-size", 1, "--alternatives", 0, lines=lines)
-    replies = [json.loads(line) for line in out.splitlines()]
-    assert code == 0 and [reply.get("status") for reply in replies] == ["ok"] * 3, err
-    assert replies[1]["pick"]["center"] == pytest.approx([0.05 * length for length in replies[0]["pick"]["center"]])
-    assert replies[2]["occupancy_after"] == pytest.approx(2 / 72)
-    assert [bool(reply["alternatives"]) for reply in replies] == [False, False, True]
