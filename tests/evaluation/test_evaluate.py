@@ -7,17 +7,13 @@ import pytest
 import torch
 from untrained import write_checkpoint
 
-from pickplace import CellSpec, Failure, PickPlaceEnv
+from pickplace import CellSpec, PickPlaceEnv
 from pickplace.evaluation.play import play
 from pickplace.planners.heuristics import JointDBL
 from pickplace.views.tables import evaluation_table
 
 SMALL = ["env.tote_size=[4,4,2]", "evaluation.latency_decisions=0", "evaluation.replay=0"]
 JOINT = ["planner=joint_dbl", *SMALL]
-KEYS = {
-    "planner", "env", "items", "stream", "episodes", "seed", "occupancy", "items_placed", "failures",
-    "feasible_action_share", "latency_ms", "versions", "commit",
-}  # fmt: skip
 
 
 @pytest.fixture
@@ -33,27 +29,18 @@ def evaluation(run, tmp_path):
     return call
 
 
-@pytest.fixture(scope="module")
-def two_rotations(tmp_path_factory):
-    """A checkpoint with ``R = 2``."""
-    return write_checkpoint(tmp_path_factory.mktemp("two") / "it", CellSpec(rotations=2), "env.rotations=2")
-
-
 @pytest.mark.parametrize(("group", "stream", "seed"), [("default", "test", 7), ("validation", "validation", 3)])
 def test_evaluation_json(evaluation, group, stream, seed):
     settings = [f"evaluation={group}", f"evaluation.seed={seed}", "evaluation.episodes=5"]
     settings += ["evaluation.latency_decisions=3", "env.tote_size=[4,5,2]"]
     code, err, result = evaluation("planner=joint_dbl", *settings)
-    assert (code, err) == (0, "") and set(result) >= KEYS and set(result["env"]) >= {"height_unit", "observation"}
+    assert (code, err) == (0, "")
     assert (result["planner"], result["episodes"], result["seed"], result["stream"]) == ("joint_dbl", 5, seed, stream)
     assert result["env"]["tote_size"] == [4, 5, 2] and result["env"]["rotations"] == 4
-    occupancy = result["occupancy"]
-    assert set(occupancy) == {"mean", "ci95", "min", "per_episode"}
+    occupancy, latency = result["occupancy"], result["latency_ms"]
     assert sum(result["failures"].values()) == 5 and occupancy["min"] == min(occupancy["per_episode"])
     assert occupancy["mean"] == pytest.approx(sum(occupancy["per_episode"]) / 5)
     assert occupancy["ci95"][0] <= occupancy["mean"] <= occupancy["ci95"][1]
-    assert set(result["failures"]) <= {failure.name.lower() for failure in Failure}
-    latency = result["latency_ms"]
     assert 0 < latency["p50"] <= latency["p95"] and 0 < latency["cpu_p50"] < 60_000 and 0 < latency["cpu_mean"] < 60_000
     assert set(result["versions"]) >= {"pickplace", "torch", "torchrl", "tensordict", "python"}
 
@@ -64,15 +51,15 @@ def test_evaluation_json(evaluation, group, stream, seed):
     assert play(make_env, JointDBL(make_env(0, 1).cell), 5, 5).occupancy.tolist() == occupancy["per_episode"]
 
 
-def test_candidates(evaluation, two_rotations):
-    arguments = [f"checkpoint={two_rotations}", *SMALL, "env.tote_size=[5,5,2]", "evaluation.episodes=8"]
+def test_candidates(evaluation, tmp_path):
+    folder = write_checkpoint(tmp_path / "it", CellSpec(rotations=2), "env.rotations=2")
+    arguments = [f"checkpoint={folder}", *SMALL, "env.tote_size=[5,5,2]", "evaluation.episodes=8"]
     results = {}
     for candidates in ("1", "all"):
         code, err, results[candidates] = evaluation(*arguments, f"planner.candidates={candidates}")
         assert code == 0, err
     one, best = results["1"], results["all"]
-    assert set(one) >= KEYS | {"checkpoint", "trained", "mask_in_training", "mask_at_decision", "candidates"}
-    assert one["trained"]["frames"] == 256
+    assert one["trained"]["frames"] == 256 and one["latency_ms"] is None
     # With a mask in training it has never learnt to avoid what cannot be picked, and cannot choose it either.
     outside = "failed picks and footprints outside the tote"
     assert (one["candidates"], one["mask_in_training"], one["mask_at_decision"]) == (1, True, outside)
@@ -80,17 +67,9 @@ def test_candidates(evaluation, two_rotations):
     assert best["failures"] == {"stuck": 8}
     assert set(one["failures"]) != {"stuck"}  # not trained, without a mask: some actions fail
     assert one["occupancy"]["mean"] < best["occupancy"]["mean"]
-    assert one["latency_ms"] is None
     search = ["planner=lookahead", "planner.samples=2", "planner.rounds=1", "planner.candidates=2"]
     code, err, found = evaluation(*arguments, *search, "evaluation.episodes=1")
     assert code == 0 and (found["candidates"], found["mask_at_decision"]) == ("all", True), err
-
-
-def test_more_rotations_than_trained_are_refused(evaluation, two_rotations):
-    code, err, result = evaluation(f"checkpoint={two_rotations}", "env.rotations=4")
-    assert code == 2 and result is None
-    assert "env.rotations=4: the checkpoint was trained with 2" in err
-    assert err.startswith("error: ") and err.count("\n") == 1 and "Traceback" not in err
 
 
 def test_recorded_items_are_compared_by_content_and_not_by_path(evaluation, tmp_path):
@@ -106,13 +85,6 @@ def test_recorded_items_are_compared_by_content_and_not_by_path(evaluation, tmp_
     moved.write_text("w,d,h\n1,1,1\n2,2,1\n")
     code, err, _ = evaluation(*arguments)
     assert code == 2 and "its items is" in err
-
-
-@pytest.mark.parametrize("content", ["{", "{}", '{"occupancy": {"per_episode": [1]}, "env": 3}'])
-def test_a_file_that_is_no_evaluation_is_not_compared(evaluation, tmp_path, content):
-    (tmp_path / "other.json").write_text(content)
-    code, err, result = evaluation(*JOINT, f"compare={tmp_path / 'other.json'}")
-    assert code == 2 and result is None and "expected an evaluation.json" in err
 
 
 def test_items_of_a_checkpoint_and_other_ones(evaluation):

@@ -149,12 +149,10 @@ def test_a_full_tote_is_no_failure():
     assert full.describe_ending(4) == FULL != full.describe_ending(5)
 
 
-def test_picture_and_animation(tmp_path):
+def test_animation(tmp_path):
     from PIL import Image
 
     cell, result = record("paper", "joint_dbl")
-    replay.picture(result.recordings[0], cell, tmp_path / "tote.svg", moves=3)
-    assert (tmp_path / "tote.svg").stat().st_size > 10_000
     replay.animation(result.recordings[0], cell, tmp_path / "replay.gif", seconds=1, frames=4)
     with Image.open(tmp_path / "replay.gif") as image:
         assert image.n_frames == 4 and image.info["loop"] == 0
@@ -263,23 +261,16 @@ def test_page_of_very_many_moves(browser, tmp_path):
     assert state()["moves"] == 1500 and errors(browser) == []
 
 
-def test_page_shows_a_failure_in_place(browser, tmp_path):
-    cell, result = record("paper", "K=1")
+@pytest.mark.parametrize("planner", ["K=1", "uniform"])  # with a heat map, and without
+def test_page_shows_a_failure_in_place(browser, tmp_path, planner):
+    cell, result = record("paper", planner)
     failing = next(r for r in result.recordings if r.ending not in (Failure.STUCK, Failure.NONE))
     state = open_page(browser, written(tmp_path, [failing], cell), "#step=9999")
     assert state()["ending"] == failing.ending.sentence
     assert state()["shown"] == len(failing.boxes) == len(failing.moves) - 1
     assert browser.find_element("id", "ending").get_attribute("class") == "bad"
+    assert browser.find_element("id", "heat-label").is_displayed() == (planner == "K=1")
     assert errors(browser) == []
-
-
-def test_page_without_a_policy_or_any_success(browser, tmp_path):
-    cell, result = record("paper", "uniform")
-    state = open_page(browser, written(tmp_path, result.recordings, cell))
-    assert not browser.find_element("id", "heat-label").is_displayed()
-    browser.find_element("id", "play").click()
-    wait_until(browser, "replay.state().ending !== ''")
-    assert state()["moves"] == len(result.recordings[0].moves) and errors(browser) == []
 
 
 #: Notes the scene that is drawn, and where each square of the heat map lies.
