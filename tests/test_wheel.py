@@ -30,10 +30,10 @@ def wheel(tmp_path_factory):
 def test_wheel_holds_every_file(wheel):
     inside = set(zipfile.ZipFile(wheel).namelist())
     configs = {f"pickplace/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")}
-    package = {str(path.relative_to(ROOT)) for path in (ROOT / "pickplace").rglob("*") if path.is_file()}
-    assert configs and configs <= inside
-    assert {name for name in package if "__pycache__" not in name} <= inside
-    assert {"pickplace/py.typed", "pickplace/views/assets/replay.html", "pickplace/pretrained/r4/card.json"} <= inside
+    suffixes = (".py", ".html", ".min.js", ".json", ".safetensors", "py.typed")
+    package = {str(path.relative_to(ROOT)) for path in (ROOT / "pickplace").rglob("*") if path.name.endswith(suffixes)}
+    assert configs and configs <= inside and package <= inside
+    assert {"pickplace/py.typed", "pickplace/views/assets/replay.html", "pickplace/pretrained/r4/card.json"} <= package
 
 
 def test_commands_of_the_wheel_from_another_directory(wheel, tmp_path):

@@ -9,15 +9,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from omegaconf import OmegaConf
 from oracle import Oracle, Rules
 from untrained import untrained_policy, write_checkpoint
 
 from pickplace import CellSpec, DepthMapError, Failure, Item, Planner, State
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.fcn4d import ActionPolicy
-from pickplace.policies.restore import restore_policy
-from pickplace.runs import checkpoint
 from pickplace.task.observation import STANDARD_TERMS, observe
 
 EMPTY = np.full((6, 6), 5)
@@ -156,13 +153,6 @@ def test_maps_of_other_kinds(planner):
         assert planner.plan(make(ITEM), make(EMPTY)) == plain
 
 
-def test_tote_height_of_the_moment(planner):
-    low = planner.plan(ITEM, EMPTY - 3, tote_height=2)
-    assert low.occupancy_after == pytest.approx(2 / 72)
-    with pytest.raises(DepthMapError, match=r"tote_depth\[0, 0\]: got 5 cells, expected 0 to 2 cells"):
-        planner.plan(ITEM, EMPTY, tote_height=2)
-
-
 def test_four_dimensional_policy_plans_too():
     cell = CellSpec(rotations=3)
     result = Planner(cell, ActionPolicy(cell, filters=4).eval()).plan(ITEM, EMPTY, alternatives=3)
@@ -232,6 +222,8 @@ def test_load():
     shipped = Planner.load("pretrained/r4", tote_size=(8, 7, 9), candidates=10)
     assert shipped.cell.tote_size == (8, 7, 9) and shipped.cell.bin_size == (5, 5, 1)
     assert shipped.plan(ITEM, np.full((8, 7), 9)).status == "ok"
+    turned = Planner.load("pretrained/unmasked", effector_size=(2, 3), tote_size=(7, 8, 5))
+    assert turned.plan(ITEM, np.full((7, 8), 5)).status == "ok"  # without a mask, end effectors as long as its own
 
 
 @pytest.mark.parametrize(("path", "sizes", "message"), [
@@ -247,16 +239,6 @@ def test_load():
 def test_load_refuses(path, sizes, message):
     with pytest.raises(ValueError, match=message):
         Planner.load(path, **sizes)
-
-
-def test_a_policy_without_a_mask_serves_end_effectors_as_long_as_its_own():
-    turned = Planner.load("pretrained/unmasked", effector_size=(2, 3), tote_size=(7, 8, 5))
-    assert turned.plan(ITEM, np.full((7, 8), 5)).status == "ok"
-    state, facts = checkpoint.read(checkpoint.locate("pretrained/unmasked"))
-    del state["policy"]["miss"]  # what is damaged is not said to be of another size
-    cfg = OmegaConf.create(facts["config"])
-    with pytest.raises(ValueError, match="policy.*miss"):
-        restore_policy(cfg, CellSpec(tote_size=(9, 9, 5)), state["policy"], {"rotations": 4, "tote_size": [6, 6, 5]})
 
 
 def test_load_of_a_policy_whose_grasps_depend_on_the_items(tmp_path):

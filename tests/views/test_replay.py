@@ -54,24 +54,21 @@ def test_recordings_are_what_happened(cell, planner):
     assert [recording.episode for recording in result.recordings] == [0, 1, 2]
     for number, recording in enumerate(result.recordings):
         heights = np.zeros(cell.tote_size[:2], dtype=int)
-        for move in recording.moves:
-            x, y, w, d = move.footprint
-            ix, iy, iw, idp, h = move.item
-            if move.failure:
-                assert move is recording.moves[-1] and move.failure == recording.ending
-                continue
+        for move in recording.moves[: len(recording.boxes)]:
+            (x, y, w, d), (ix, iy, iw, idp, h) = move.footprint, move.item
+            odd = move.rotation % 2
+            assert not move.failure and (w, d) == ((idp, iw) if odd else (iw, idp))
             # The end effector covers the item in the bin, and after the turn in the tote.
             ee = cell.effector_size
-            turned = ee[::-1] if move.rotation % 2 else ee
-            assert (w, d) == ((idp, iw) if move.rotation % 2 else (iw, idp))
-            for low, high, at, size in (
-                ((ix, iy), (ix + iw, iy + idp), move.pick, ee), ((x, y), (x + w, y + d), move.place, turned)
+            for corner, size, at, reach in (
+                ((ix, iy), (iw, idp), move.pick, ee), ((x, y), (w, d), move.place, ee[::-1] if odd else ee)
             ):  # fmt: skip
-                assert all(a <= b for a, b in zip(at, low, strict=True))
-                assert all(b <= a + s for a, b, s in zip(at, high, size, strict=True))
+                assert all(at[i] <= corner[i] and corner[i] + size[i] <= at[i] + reach[i] for i in (0, 1))
             space = heights[x : x + w, y : y + d]
             assert space.max() == move.z
             space[:] = move.z + h
+        failed = recording.moves[len(recording.boxes) :]
+        assert [move.failure for move in failed] == [recording.ending] * (recording.waiting is None)
         assert (heights == result.final_heights[number].numpy()).all()
         volume = sum(w * d * h for *_, w, d, h in recording.boxes)
         assert volume / heights.size / recording.tote_height == pytest.approx(recording.occupancy)
