@@ -13,12 +13,12 @@ import time
 
 import numpy as np
 import torch
-from pickplace.policies.actors import fcn_grasp
-from pickplace.task.geometry import Item
 
 from pickplace import Planner, Rules
+from pickplace.policies.actors import fcn_grasp
 from pickplace.robot.json_lines import answer
 from pickplace.robot.planner import DepthMapError
+from pickplace.task.geometry import Item
 
 DEFAULTS = {"tote_height": None, "cell_size": None, "tolerance": 0.25, "alternatives": 3}
 ODD = [

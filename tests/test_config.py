@@ -4,10 +4,10 @@ import hydra
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from pickplace.policies.actors import as_collection_policy, fcn_grasp
 from torchrl.modules import ValueOperator
 
 from pickplace import PickPlaceEnv
+from pickplace.policies.actors import as_collection_policy, fcn_grasp
 from pickplace.policies.networks.critics import Conv4dCritic, PooledCritic
 from pickplace.runs import hydra_app as config
 from pickplace.runs.loggers import read_csv

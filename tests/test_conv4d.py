@@ -5,11 +5,11 @@ import math
 
 import pytest
 import torch
-from pickplace.policies.actors import MASKED, FlatPolicy, typical
-from pickplace.task.geometry import Rules
 
+from pickplace.policies.actors import MASKED, FlatPolicy, typical
 from pickplace.policies.networks.conv4d import Conv4dCritic, Conv4dPolicy
 from pickplace.policies.networks.depth import clip_depth, pad_depth
+from pickplace.task.geometry import Rules
 
 SIZES = [  # bin, tote, R, clips, floor
     ((5, 5), (6, 6), 4, (1.0, 5.0), None),

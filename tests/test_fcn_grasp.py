@@ -7,12 +7,12 @@ import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pickplace.policies.actors import MASKED, as_collection_policy, fcn_grasp
-from pickplace.task.geometry import Rules
 
 from pickplace import PickPlaceEnv
+from pickplace.policies.actors import MASKED, as_collection_policy, fcn_grasp
 from pickplace.policies.networks.critics import PooledCritic
 from pickplace.policies.networks.footprint_fcn import FootprintFcn, matrix_dtype
+from pickplace.task.geometry import Rules
 from pickplace.task.items import Kinds
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pickplace.task.geometry import Item
 
 from pickplace import Rules
+from pickplace.task.geometry import Item
 
 SIDES, ODD = st.integers(1, 4), st.sampled_from([1, 3])
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pickplace.policies.actors import fcn4d, fcn_grasp, individual_grasp, individual_rl
 
 from pickplace import Item, PickPlaceEnv, Rules
 from pickplace.evaluation.evaluate import play
 from pickplace.planners import IndividualHeuristic, PolicyPlanner, RandomFeasible
 from pickplace.planners.individual import corner_footprints
+from pickplace.policies.actors import fcn4d, fcn_grasp, individual_grasp, individual_rl
 
 
 def maximal_rectangles(free):

@@ -5,12 +5,12 @@ from functools import partial
 import pytest
 import torch
 from omegaconf import OmegaConf
-from pickplace.policies.actors import fcn_grasp
 
 from pickplace import PickPlaceEnv, Rules
 from pickplace.evaluation.evaluate import confidence95, play
 from pickplace.planners import Lookahead, PolicyPlanner
 from pickplace.planners.policy import restore_critic
+from pickplace.policies.actors import fcn_grasp
 from pickplace.runs import checkpoint
 from pickplace.task.items import Kinds, Recorded
 

@@ -3,7 +3,6 @@
 import oracle
 import pytest
 import torch
-from pickplace.policies.actors import FlatPolicy, GraspPolicy, OutcomePolicy, as_actor, as_collection_policy
 from scipy.stats import chisquare
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -11,6 +10,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from pickplace import PickPlaceEnv
 from pickplace.evaluation.evaluate import play
 from pickplace.planners import JointDBL, PolicyPlanner, RandomFeasible
+from pickplace.policies.actors import FlatPolicy, GraspPolicy, OutcomePolicy, as_actor, as_collection_policy
 from pickplace.task.items import Uniform
 
 # planner, tote, R, items, occupancy and its standard error, from an independent prototype of the rules. Where no error

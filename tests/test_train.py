@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from pickplace.policies.actors import as_collection_policy, fcn_grasp
 from test_config import composed
 from test_faults import slots
 from torch import nn
@@ -12,6 +11,7 @@ from torchrl.modules import ValueOperator
 from pickplace import PickPlaceEnv
 from pickplace.evaluation.evaluate import play
 from pickplace.planners import JointDBL
+from pickplace.policies.actors import as_collection_policy, fcn_grasp
 from pickplace.policies.networks.critics import PooledCritic
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
