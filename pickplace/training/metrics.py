@@ -2,7 +2,8 @@
 
 from tensordict import TensorDictBase
 
-from pickplace.evaluation.evaluate import Episodes, confidence95
+from pickplace.evaluation.play import Episodes
+from pickplace.evaluation.statistics import confidence95
 from pickplace.task.state import Failure
 from pickplace.training.curriculum import Curriculum
 
