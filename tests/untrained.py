@@ -4,7 +4,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from pickplace.evaluation.evaluate import commit, versions
+from pickplace.runs.provenance import commit, versions
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.fcn_grasp import fcn_grasp
 from pickplace.runs import checkpoint

@@ -293,8 +293,6 @@ class Planner:
 
     def _simulate(self, state: State, actions: Tensor) -> Tensor:
         """Return the failure codes of many actions in one state, int64 ``[A]``."""
-        if len(actions) == 0:  # an item that no action picks has no footprints
-            return actions
         parts = actions.split(4096)  # a few thousand at a time, to save memory
         return torch.cat([apply(self.cell, state.repeat(len(part)), part).failure for part in parts])
 

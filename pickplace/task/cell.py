@@ -28,7 +28,7 @@ class EffectorShape(NamedTuple):
 
 @dataclass(frozen=True)
 class Limits:
-    """What the robot may do, as tables; masks and the single step read the same ones.
+    """Limits on the robot, as tables; masks and the single step read the same ones.
 
     Attributes:
         pick_ok: bool ``[P]``, whether the robot reaches each pick cell.
@@ -72,7 +72,7 @@ class CellSpec:
         height_unit: length of a height unit, in sides of a cell. The rules only count units; what converts heights to
             lengths (the robot's planner, the replay page) multiplies by it.
         longest_side: longest side of any item, where it is known; saves time only.
-        limits: what the robot may do, see :class:`Limits`; None: everything.
+        limits: limits on the robot, see :class:`Limits`; None: there are none.
 
     Raises:
         ValueError: naming the argument, the value received and what was expected.

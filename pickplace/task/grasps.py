@@ -55,7 +55,7 @@ def turn(near_x: Tensor, near_y: Tensor, back_x: Tensor, back_y: Tensor) -> tupl
 
 
 class Grasp(NamedTuple):
-    """What a pick does to the item; the fields have the common shape of the pick's coordinates and the item."""
+    """Effect of a pick; the fields have the common shape of the pick's coordinates and the item."""
 
     misses: Tensor
     collides: Tensor
@@ -156,7 +156,7 @@ def select_pick(cell: CellSpec, actions: Tensor, pick: Tensor) -> Tensor:
 
 # ---------------------------------------------------------------------- grasp classes
 def num_turns(cell: CellSpec) -> int:
-    """Return how many turns are told apart: parities, or rotations where limits may forbid one and not its like."""
+    """Return the number of distinct turns: parities, or rotations where limits may forbid one of the same parity."""
     return cell.parities if cell.limits is None else cell.rotations
 
 

@@ -1,4 +1,4 @@
-"""What an agent sees: a list of terms. A new channel is one term, and one line in the config of the environment.
+"""Observations: a list of terms. A new channel is one term, and one line in the config of the environment.
 
 The environment, Gymnasium, the robot's planner and search all ask this list; policies and critics read the entries that
 they name in ``in_keys``.

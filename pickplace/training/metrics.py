@@ -1,4 +1,4 @@
-"""What a training logs of a batch and of a validation, and its progress line."""
+"""Metrics of a batch and of a validation, and the progress line."""
 
 from tensordict import TensorDictBase
 
