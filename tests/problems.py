@@ -14,11 +14,11 @@ from pickplace.planners.heuristics import RandomFeasible
 from pickplace.task.cell import Limits
 from pickplace.task.items import Uniform
 
-SIDES = st.integers(1, 4)
+SIDES, NEVER = st.integers(1, 4), st.just(False)
 
 
 class Case(NamedTuple):
-    """The state of one problem: height of the tote, heights ``[W_T, D_T]`` in it, and ``(x, y, w, d, h)`` in the bin."""
+    """The state of a problem: height of the tote, heights ``[W_T, D_T]`` in it, and ``(x, y, w, d, h)`` in the bin."""
 
     rim: int
     heights: np.ndarray
@@ -50,7 +50,7 @@ def random_limits(cell: CellSpec, seed: int) -> Limits:
 
 
 @st.composite
-def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=st.just(False), count=1):
+def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=NEVER, count=1):
     """Return a cell and ``count`` cases in it."""
     effector = draw(effector_sides), draw(effector_sides)
     bin_w, bin_d, tote_w, tote_d = (draw(st.integers(2, most)) for most in (5, 4, 5, 4))

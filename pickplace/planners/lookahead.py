@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from pickplace.policies.base import MASKED, Observation
+from pickplace.policies.fcn_grasp import FootprintPolicy
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import number, whole_number
 from pickplace.task.feasibility import PlacingMaps, first_action_reaching, footprint_mask, placing_maps
@@ -44,7 +45,7 @@ class Lookahead:
     def __init__(
         self,
         cell: CellSpec,
-        policy: torch.nn.Module,
+        policy: FootprintPolicy,
         items: ItemDistribution,
         critic=None,
         terms=STANDARD_TERMS,

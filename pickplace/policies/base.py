@@ -7,6 +7,7 @@ of the choice.
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -33,7 +34,7 @@ from pickplace.task.state import State
 MASKED = -1e38
 
 #: An observation ``[N]``: a TensorDict, or a dict of its entries.
-Observation = TensorDictBase | Mapping[str, Tensor]
+Observation: TypeAlias = TensorDictBase | Mapping[str, Tensor]
 
 
 class Policy(TensorDictModuleBase, ABC):
@@ -98,7 +99,7 @@ class Policy(TensorDictModuleBase, ABC):
 
     @property
     def act_keys(self) -> list[str]:
-        """Entries that turning a choice into an action may read."""
+        """Entries of the observation that :meth:`to_action` may read."""
         return list(dict.fromkeys([*STANDARD_TERMS, *self.in_keys]))
 
     def check_sizes(self) -> list[str]:

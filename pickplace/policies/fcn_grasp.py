@@ -44,6 +44,7 @@ class FootprintPolicy(Policy):
     masks: tuple[str, ...] = ("footprint",)
     excludes: str | None = "failed picks and footprints outside the tote"
     ranks_footprints = True
+    network: FootprintFcn
 
     def __init__(self, cell: CellSpec, **network):
         super().__init__(cell)

@@ -1,5 +1,6 @@
 """The state of a problem: the item in the bin, the heights in the tote, and why an episode ended."""
 
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from pickplace.task.maps import rectangle
 
 
 class Failure(IntEnum):
-    """The reason why an episode ended; 1 to 6 in the order of the checks.
+    """The reason why an episode ended. The checks run in the order 1 to 6, then ``OUT_OF_REACH``.
 
     Attributes:
         sentence: the reason for a reader who does not know the rules.
@@ -21,7 +22,7 @@ class Failure(IntEnum):
     sentence: str
     label: str
 
-    def __new__(cls, code: int, sentence: str, label: str):
+    def __new__(cls, code: int, sentence: str = "", label: str = ""):
         member = int.__new__(cls, code)
         member._value_ = code
         member.sentence, member.label = sentence, label
@@ -93,9 +94,9 @@ def heights_from_depth(tote_depth: Tensor, tote_height: Tensor) -> Tensor:
     return (tote_height[:, None, None] - tote_depth).int()
 
 
-def bin_depth_from_item(item: Item, bin_size: tuple[int, ...]) -> Tensor:
+def bin_depth_from_item(item: Item, bin_size: Sequence[int]) -> Tensor:
     """Return the height above the bin's floor, float32 ``[N, W_B, D_B]``: the item's height under it, else 0."""
-    inside = rectangle(bin_size[:2], item.x, item.y, item.w, item.d)
+    inside = rectangle((bin_size[0], bin_size[1]), item.x, item.y, item.w, item.d)
     return (inside * item.h.float()).permute(2, 0, 1).contiguous()
 
 

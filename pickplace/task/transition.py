@@ -1,4 +1,4 @@
-"""One step: what an action does to a state, with the checks in the order of the rules."""
+"""One step: the effect of an action on a state, with the checks in the order of the rules."""
 
 from typing import NamedTuple
 
@@ -58,7 +58,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
         (Failure.BIN_COLLISION, picked.collides),
         (Failure.PICK_MISS, picked.misses),
     ]
-    if cell.limits is not None:
+    if cell.limits is not None and picked.unreachable is not None:
         limits, number = cell.limits.on(action.device), (rotation * tote_w + x_tote) * tote_d + y_tote
         lowest, highest_top = limits.lowest_top.flatten()[number], limits.highest_top.flatten()[number]
         checks.insert(0, (Failure.OUT_OF_REACH, picked.unreachable | ~is_within_reach(lowest, highest_top, top)))
