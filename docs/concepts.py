@@ -1,6 +1,6 @@
 """Draws docs/concepts.svg, the drawing of docs/concepts.md: python docs/concepts.py
 
-What it shows is asked of the rules: both grips leave the same footprint, and one of them collides.
+The rules compute what it shows: both grips lead to the same footprint, and one of them collides.
 """
 
 from pathlib import Path
@@ -12,7 +12,9 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 
-from pickplace import Failure, Item, Rules
+from pickplace import CellSpec, Failure, Item, State
+from pickplace.task.grasps import join_action
+from pickplace.task.transition import apply
 
 INK, GREY, PAPER = "#263238", "#9aa3ab", "#eef1f3"
 ITEM, PLACED, BAD, GOOD = "#e69f00", "#a9d4ee", "#c2410c", "#2e7d32"
@@ -21,17 +23,18 @@ ITEM_AT, ITEM_SIZE = (1, 2), (2, 1, 1)  # where the item lies in the bin: x, y, 
 GRIPS = {1: ((2, 2), (2, ROW), BAD), 2: ((1, 2), (1, ROW), GOOD)}  # pick cell, place cell, colour
 
 
-def try_grip(rules: Rules, pick, place):
-    """What the rules say of one action without rotation: its failure, the item's top, and the footprint's corner."""
+def try_grip(cell: CellSpec, pick, place):
+    """Return the effect of one action without rotation: its failure, the item's top, and the footprint's corner."""
     heights = torch.tensor(PROFILE, dtype=torch.int32)[None, :, None].expand(1, 6, 6).contiguous()
     item = Item(*(torch.tensor([value]) for value in (*ITEM_AT, *ITEM_SIZE)))
-    cells = [torch.tensor([value]) for value in (*pick, *place, 0)]
-    step = rules.apply(heights, torch.tensor([HEIGHT]), item, rules.flat_action(*cells))
+    numbers = (x * side + y for (x, y), side in ((pick, cell.bin_size[1]), (place, cell.tote_size[1])))
+    action = join_action(cell, *(torch.tensor([number]) for number in (*numbers, 0)))
+    step = apply(cell, State(heights, torch.tensor([HEIGHT]), item), action)
     return Failure(int(step.failure)), int(step.top), step.footprint[0, :2].tolist()
 
 
 def frame(axes, title, x, y):
-    """Empty axes with a title."""
+    """Set up empty axes with a title."""
     axes.set_title(title, loc="left", fontsize=12, fontweight="bold", color=INK)
     axes.set_xlim(*x)
     axes.set_ylim(*y)
@@ -39,9 +42,9 @@ def frame(axes, title, x, y):
     axes.set_axis_off()
 
 
-def draw_bin(axes, rules):
+def draw_bin(axes, cell):
     frame(axes, "1  The bin, from above", (-0.4, 7.3), (-1.5, 5.4))
-    wide, deep, _ = rules.bin_size
+    wide, deep, _ = cell.bin_size
     for i in range(1, wide):
         axes.plot([i, i], [0, deep], color=GREY, lw=0.5, zorder=0)
         axes.plot([0, wide], [i, i], color=GREY, lw=0.5, zorder=0)
@@ -60,9 +63,9 @@ def draw_bin(axes, rules):
               va="top", fontsize=9.5)  # fmt: skip
 
 
-def draw_cut(axes, rules, number, title):
+def draw_cut(axes, cell, number, title):
     pick, place, colour = GRIPS[number]
-    failure, top, (left, _) = try_grip(rules, pick, place)
+    failure, top, (left, _) = try_grip(cell, pick, place)
     frame(axes, title, (-1.7, 7.6), (-1.5, 7.0))
     for i, height in enumerate(PROFILE):
         for z in range(height):
@@ -89,10 +92,10 @@ def draw_cut(axes, rules, number, title):
     return failure, (left, top)
 
 
-def draw_turns(axes, rules):
+def draw_turns(axes, cell):
     frame(axes, "3  Rotation, with the item", (-0.4, 9.6), (-3.6, 3.9))
     item = np.array([[0, 1], [2, 2]]) - 1.5  # corners relative to the centre: at one end, as in grip 1
-    for r in range(rules.rotations):
+    for r in range(cell.rotations):
         centre = np.array([1.6 + 4.2 * (r % 2), 1.9 - 3.75 * (r // 2)])
         angle = np.radians(90 * r)
         turned = item @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
@@ -142,18 +145,18 @@ def draw_levels(axes):
 
 
 def draw() -> Figure:
-    """The whole drawing."""
-    rules = Rules()
+    """Return the whole drawing."""
+    cell = CellSpec()
     figure = Figure(figsize=(13.5, 8.2), layout="constrained")
     FigureCanvasSVG(figure)
     upper, lower = figure.subfigures(2, 1, height_ratios=[1.05, 1])
     bin_axes, first, second = upper.subplots(1, 3, width_ratios=[7.7, 9.3, 9.3])
     turns, episode, levels = lower.subplots(1, 3, width_ratios=[9.0, 10.4, 10.4])
-    draw_bin(bin_axes, rules)
-    bad, rest = draw_cut(first, rules, 1, "2a  The tote, cut: grip 1")
-    good, same = draw_cut(second, rules, 2, "2b  Grip 2, the same footprint")
+    draw_bin(bin_axes, cell)
+    bad, rest = draw_cut(first, cell, 1, "2a  The tote, cut: grip 1")
+    good, same = draw_cut(second, cell, 2, "2b  Grip 2, the same footprint")
     assert (bad, good) == (Failure.ITEM_COLLISION, Failure.NONE) and rest == same
-    draw_turns(turns, rules)
+    draw_turns(turns, cell)
     draw_episode(episode)
     draw_levels(levels)
     return figure

@@ -1,4 +1,4 @@
-"""Writes docs/reference.md, the reference of all settings, from the comments in conf/: python docs/reference.py"""
+"""Write docs/reference.md, the reference of all settings, from the comments in conf/: python docs/reference.py"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,14 +15,14 @@ INTRODUCTION = """\
 <!-- Made by `python docs/reference.py` from the comments in conf/. Edit those. -->
 
 Every setting of `pickplace-train` and `pickplace-evaluate`, with its default. A setting is changed on the command line
-as `key=value`, such as `algo.lr=1e-3`. A group is chosen as `group=option`, such as `items=mixed`. Lengths are in
-cells, and *frames* are environment steps, summed over all slots.
+as `key=value`, such as `algo.lr=1e-3`, and a group as `group=option`, such as `items=mixed`. Lengths are in cells.
+*Frames* are environment steps, summed over all slots.
 """
 
 
 @dataclass
 class Setting:
-    """One key of a config file: its default as it is written there, and its comment."""
+    """One key of a config file: its default, as written in the file, and its comment."""
 
     default: str
     comment: str
@@ -30,7 +30,7 @@ class Setting:
 
 @dataclass
 class ConfigFile:
-    """What one yaml file says."""
+    """The content of one yaml file."""
 
     group: str  # "", "env", "curriculum/advance", ...
     name: str
@@ -41,7 +41,7 @@ class ConfigFile:
 
 
 def read(path: Path) -> ConfigFile:
-    """A config file with its comments."""
+    """Return a config file with its comments."""
     source = path.read_text()
     lines = source.splitlines()
     top = []
@@ -60,7 +60,7 @@ def read(path: Path) -> ConfigFile:
             }
         elif entry != "_self_":
             bases.append(entry)
-    top = [f"`{line}`." if line.startswith("python -m") else line for line in top]
+    top = [f"`{line}`." if line.startswith("pickplace-") else line for line in top]
     file = ConfigFile(group, path.stem, " ".join(top), bases, parts)
     prefix = "" if group in ("", "experiment") else group.replace("/", ".") + "."
     _collect(yaml.compose(source), lines, prefix, file.settings)
@@ -68,11 +68,14 @@ def read(path: Path) -> ConfigFile:
 
 
 def _collect(node, lines: list[str], prefix: str, settings: dict[str, Setting]) -> None:
-    """Add the keys of a yaml mapping; a mapping in one line is one mapping all the same."""
+    """Add the keys of a yaml mapping, and of the mappings in it."""
     for key, value in node.value:
         if key.value in ("defaults", "_target_") or (prefix == "" and key.value == "hydra"):
             continue
         if isinstance(value, yaml.MappingNode):
+            if _is_list_of_objects(value):  # such as env.observation
+                comment = lines[key.end_mark.line].partition("#")[2].strip()
+                settings[prefix + key.value] = Setting(", ".join(name.value for name, _ in value.value), comment)
             _collect(value, lines, f"{prefix}{key.value}.", settings)
             continue
         block = isinstance(value, yaml.SequenceNode) and not value.flow_style
@@ -93,13 +96,21 @@ def _collect(node, lines: list[str], prefix: str, settings: dict[str, Setting]) 
         settings[prefix + key.value] = Setting(default, " ".join(word.lstrip("# ") for word in words).strip())
 
 
+def _is_list_of_objects(node) -> bool:
+    """Return whether each value of a yaml mapping names what it makes, and has no settings."""
+    return all(
+        isinstance(value, yaml.MappingNode) and [key.value for key, _ in value.value] == ["_target_"]
+        for _, value in node.value
+    )
+
+
 def options(group: str) -> list[str]:
-    """The options of a group."""
+    """Return the options of a group."""
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
 
 
 def everything() -> dict[tuple[str, str], ConfigFile]:
-    """Every config file by group and name, the default option of each group first."""
+    """Return every config file by group and name, the default option of each group first."""
     files = [read(path) for path in sorted(CONF.rglob("*.yaml"))]
     chosen = {**read(CONF / "evaluate.yaml").parts, **read(CONF / "train.yaml").parts}
     files.sort(key=lambda file: (file.group, file.name != chosen.get(file.group)))
@@ -107,7 +118,7 @@ def everything() -> dict[tuple[str, str], ConfigFile]:
 
 
 def meaning(key: str, file: ConfigFile, files: dict) -> str:
-    """The comment of a setting: the file's own, or of the file that it builds on, or of any option of the group."""
+    """Return the comment of a setting: from its file, the file that it builds on, or any option of the group."""
     if key in file.settings and file.settings[key].comment:
         return file.settings[key].comment
     for base in file.bases:
@@ -120,7 +131,7 @@ def meaning(key: str, file: ConfigFile, files: dict) -> str:
 
 
 def table(file: ConfigFile, files: dict) -> list[str]:
-    """The settings of a file as a table."""
+    """Return the settings of a file as a table."""
     if not file.settings:
         return []
     rows = ["| key | default | meaning |", "|---|---|---|"]
@@ -131,7 +142,7 @@ def table(file: ConfigFile, files: dict) -> list[str]:
 
 
 def page() -> str:
-    """The whole page."""
+    """Return the whole page."""
     files = everything()
     out = [INTRODUCTION]
     for name, command in COMMANDS.items():

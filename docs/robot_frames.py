@@ -26,7 +26,7 @@ heights = np.array([
 HEIGHT = 5
 planner = Planner.load("pretrained/r4")
 plan = planner.plan(bin_depth, (HEIGHT - heights) * CELL, cell_size=CELL)
-turn, ee = plan.rotation_degrees, planner.rules.effector_size
+turn, ee = plan.rotation_degrees, planner.cell.effector_size
 x, y, w, d, h = (plan.item[key] for key in "xywdh")
 pick, place = np.array(plan.pick.center) / CELL, np.array(plan.place.center) / CELL
 quarter = turn // 90
@@ -67,11 +67,11 @@ def effector(axes, center, size, cell):
     axes.text(*(np.array(cell) + [0.5, 0.16]), f"cell ({cell[0]}, {cell[1]})", color=GRIPPER, ha="center", fontsize=8.5)
 
 
-plan_view(bin_axes, planner.rules.bin_size[:2], "bin, from above")
+plan_view(bin_axes, planner.cell.bin_size[:2], "bin, from above")
 bin_axes.add_patch(Rectangle((x, y), w, d, fc=ITEM, ec=INK, lw=1.2, zorder=2))
 effector(bin_axes, pick, ee, plan.pick.cell)
 
-plan_view(tote_axes, planner.rules.tote_size[:2], f"tote, from above: turned by {turn}° (counter-clockwise)")
+plan_view(tote_axes, planner.cell.tote_size[:2], f"tote, from above: turned by {turn}° (counter-clockwise)")
 for (i, j), height in np.ndenumerate(heights):
     shade = 1 - 0.08 * height
     tote_axes.add_patch(Rectangle((i, j), 1, 1, fc=(shade, shade, shade), ec="none", zorder=-1))

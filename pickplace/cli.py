@@ -2,7 +2,7 @@
 
 import sys
 
-from pickplace.runs import hydra_app as config
+from pickplace.runs.hydra_app import command
 
 ANSWERED_BY_HYDRA = {"--help", "-h", "--hydra-help", "--version"}
 
@@ -10,7 +10,7 @@ ANSWERED_BY_HYDRA = {"--help", "-h", "--hydra-help", "--version"}
 def train() -> None:
     """``pickplace-train``, see :mod:`pickplace.training.train`."""
     if ANSWERED_BY_HYDRA & set(sys.argv[1:]):
-        config.command("train", None)
+        command("train", None)
     else:
         from pickplace.training.train import main
 
@@ -20,7 +20,7 @@ def train() -> None:
 def evaluate() -> None:
     """``pickplace-evaluate``, see :mod:`pickplace.evaluation.evaluate`."""
     if ANSWERED_BY_HYDRA & set(sys.argv[1:]):
-        config.command("evaluate", None)
+        command("evaluate", None)
     else:
         from pickplace.evaluation.evaluate import main
 

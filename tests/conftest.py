@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_dir
 from hypothesis import HealthCheck, settings
 
 from pickplace.evaluation import evaluate
-from pickplace.runs import hydra_app as config
+from pickplace.runs.hydra_app import conf_dir
 from pickplace.training import train
 
 # A busy machine is no fault of the code.
@@ -43,7 +43,7 @@ def smoke():
     """Trains experiment=smoke in this process."""
 
     def run(run_dir, *overrides):
-        with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
+        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
             cfg = compose("train", ["experiment=smoke", "threads=1", *overrides])
         run_dir.mkdir(exist_ok=True)
         return train.train(cfg, run_dir)

@@ -3,8 +3,6 @@
 import hashlib
 import json
 import logging
-import platform
-import subprocess
 import time
 from collections import Counter
 from collections.abc import Collection
@@ -21,13 +19,14 @@ from torchrl.envs.utils import step_mdp
 from pickplace.planners.base import BatchPlanner, plain_settings, planner_parts
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.runs import checkpoint
-from pickplace.runs import hydra_app as config
-from pickplace.runs.allowlist import own_modules, trusted
+from pickplace.runs.allowlist import own_modules, trusted_config
+from pickplace.runs.hydra_app import apply_overrides, command
+from pickplace.runs.machine import use_machine
+from pickplace.runs.provenance import commit, imitated_planner, versions
 from pickplace.runs.registry import build
 from pickplace.task.cell import CELL_SETTINGS
 from pickplace.task.feasibility import num_feasible, placing_maps
 from pickplace.task.state import Failure
-from pickplace.training.imitation import taught_by
 from pickplace.views.figures import evaluation_table
 from pickplace.views.recording import Recording, record_moves
 from pickplace.views.replay import animation, page, picture
@@ -268,39 +267,6 @@ def paired_difference(result: dict, other: dict) -> dict:
     }
 
 
-def versions() -> dict[str, str]:
-    """What a result was computed with."""
-    import tensordict
-    import torchrl
-
-    import pickplace
-
-    return {
-        "pickplace": pickplace.__version__,
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "torchrl": torchrl.__version__,
-        "tensordict": tensordict.__version__,
-    }
-
-
-def commit() -> str | None:
-    """The commit of the checkout that the package runs from; None outside one. ``+``: altered, docs aside."""
-    root = config.PACKAGE.parent
-    if not (root / ".git").exists():
-        return None
-
-    def run(*arguments):
-        command = ["git", "-C", str(root), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
-
-    try:
-        altered = run("status", "--porcelain", "-uno", "--", ".", ":!docs").strip()
-        return run("rev-parse", "HEAD").strip() + ("+" if altered else "")
-    except (OSError, subprocess.CalledProcessError):
-        return None
-
-
 def prepare(cfg: DictConfig) -> tuple:
     """What a config evaluates (``conf/evaluate.yaml``): ``make_env(first_episode, num_envs)``, the planner, and facts.
 
@@ -319,16 +285,16 @@ def prepare(cfg: DictConfig) -> tuple:
     if "model" in cfg and cfg.checkpoint is None:
         raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
     own_modules(cfg.trust)
-    config.use_machine(cfg)
+    use_machine(cfg)
     facts: dict[str, Any] = {"planner_settings": plain_settings(cfg.planner), "checkpoint": None}
     trained = None
     if cfg.checkpoint is not None:
         folder = checkpoint.locate(str(cfg.checkpoint))
         state, saved = checkpoint.read(folder)
-        theirs = trusted(saved["config"], cfg.trust)
+        theirs = trusted_config(saved["config"], cfg.trust)
         groups = {key: OmegaConf.create(resolved(cfg[key])) for key in ("env", "items")}
         ours = [o for o in HydraConfig.get().overrides.task if o.lstrip("+~").split("=")[0].split(".")[0] in TRAINED]
-        merged = config.apply_overrides(theirs, ours, groups)
+        merged = apply_overrides(theirs, ours, groups)
         with open_dict(cfg):
             for group in TRAINED:  # resolved where they come from: here a reference could lead elsewhere
                 cfg[group] = resolved(merged[group])
@@ -337,7 +303,7 @@ def prepare(cfg: DictConfig) -> tuple:
             "checkpoint": str(folder),
             "trained": {"frames": saved["frames"], "seed": merged.seed, "commit": saved["commit"]},
             "mask_in_training": merged.algo.mask_infeasible,
-            "warm_start": taught_by(resolved(theirs)),
+            "warm_start": imitated_planner(resolved(theirs)),
         }
 
     ev, items = cfg.evaluation, build("items", cfg["items"])
@@ -405,7 +371,7 @@ TRAINED = ("env", "items", "model", "algo")
 
 def main() -> None:
     """Entry point of ``pickplace-evaluate``."""
-    config.command("evaluate", run, from_checkpoint=("model", "items"))
+    command("evaluate", run, from_checkpoint=("model", "items"))
 
 
 if __name__ == "__main__":

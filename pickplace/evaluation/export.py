@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 
 from pickplace.runs import checkpoint
-from pickplace.runs.hydra_app import one_sentence
+from pickplace.runs.errors import one_sentence
 
 CARD = "card.json"
 
@@ -47,7 +47,7 @@ def export(source, folder: Path, evaluations: list[Path]) -> None:
 
 def asks_critic(cfg: dict) -> bool:
     """Does ``planner=lookahead`` serve the policy of a checkpoint with this config?"""
-    return cfg["model"]["actor"]["_target_"].endswith(".fcn_grasp")
+    return cfg["model"]["actor"]["_target_"] == "fcn_grasp"
 
 
 def main() -> None:

@@ -54,7 +54,7 @@ def planner_parts(
     Raises:
         ValueError: for a planner that needs a checkpoint without one, or with one that does not serve these sizes.
     """
-    needs = getattr(find("planner", planner), "needs", ())
+    needs = getattr(find("planner", planner._target_), "needs", ())
     parts: dict[str, Any] = {"cell": cell}
     parts |= {key: value for key, value in {"items": items, "terms": terms}.items() if key in needs}
     if "policy" in needs:

@@ -51,11 +51,20 @@ class FootprintPolicy(Policy):
         self.in_keys = [*self.in_keys, "footprint_mask"]
         self.network = FootprintFcn(**network)
 
+    def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
+        """Return the scores of some footprints, float32 ``[M]``; a subclass may add what further terms tell.
+
+        Args:
+            row: int64 ``[M]``, index of the problem.
+            footprint: int64 ``[M]``, index ``(parity * W_T + x) * D_T + y``.
+        """
+        return self.network.at(observation["bin_depth"], observation["tote_depth"], row, footprint)[:, 0]
+
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
         """Return logits of the footprints that a mask ``[N, Q * W_T * D_T]`` allows; the others are not computed."""
         row, footprint = mask.nonzero(as_tuple=True)
-        scores = self.network.at(observation["bin_depth"], observation["tote_depth"], row, footprint)
-        return scores.new_full(mask.shape, MASKED).index_put((row, footprint), scores[:, 0])
+        scores = self.scores(observation, row, footprint)
+        return scores.new_full(mask.shape, MASKED).index_put((row, footprint), scores)
 
     def logits(self, observation: Observation) -> Tensor:
         return self.footprint_logits(observation, observation["footprint_mask"])
@@ -75,10 +84,10 @@ class FootprintPolicy(Policy):
 
         An action whose pick misses, or whose item leaves the tote, has no footprint, so probability 0.
         """
-        bin_depth, tote_depth = observation["bin_depth"], observation["tote_depth"]
-        footprint = action_footprints(self.cell, item_from_depth(bin_depth))
+        footprint = action_footprints(self.cell, item_from_depth(observation["bin_depth"]))
         ways = count_ways(self.cell, footprint, footprint >= 0)
-        logits = self.network(bin_depth, tote_depth, self.cell.parities).flatten(1)
+        index = torch.arange(ways.numel(), device=ways.device)
+        logits = self.scores(observation, index // ways.shape[1], index % ways.shape[1]).view(ways.shape)
         logits = torch.where(ways > 0, logits, MASKED)
         share = logits.log_softmax(-1) - ways.clamp(min=1).log()
         return torch.where(footprint >= 0, share.gather(1, footprint.clamp(min=0)), MASKED)

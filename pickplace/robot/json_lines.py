@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pickplace.runs.hydra_app import one_sentence
+from pickplace.runs.errors import one_sentence
 
 if TYPE_CHECKING:
     from pickplace.robot.planner import Planner

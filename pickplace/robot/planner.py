@@ -22,8 +22,8 @@ from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy
 from pickplace.policies.restore import restore_policy
 from pickplace.runs import checkpoint
-from pickplace.runs import hydra_app as config
-from pickplace.runs.allowlist import trusted
+from pickplace.runs.allowlist import trusted_config
+from pickplace.runs.machine import usable_device
 from pickplace.runs.registry import build
 from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings, reference_cell
 from pickplace.task.checks import is_whole
@@ -130,7 +130,7 @@ class Planner:
         if not isinstance(path, (str, os.PathLike)):
             raise ValueError(f"path={path!r}: expected a run folder, a checkpoint, or pretrained/<name>.")
         state, facts = checkpoint.read(checkpoint.locate(path))
-        cfg = trusted(facts["config"], trust)
+        cfg = trusted_config(facts["config"], trust)
         if unknown := sorted(set(sizes) - set(CELL_SETTINGS) - {"longest_side", "limits"}):
             raise ValueError(f"{unknown[0]}={sizes[unknown[0]]!r}: expected one of {', '.join(CELL_SETTINGS)}.")
         env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
@@ -140,7 +140,7 @@ class Planner:
             cell = replace(cell, longest_side=longest)
         policy = restore_policy(cfg, cell, state["policy"], env)
         terms = {str(key): build(f"env.observation.{key}", node) for key, node in cfg.env.observation.items()}
-        return cls(cell, policy.to(config.usable_device(device)), candidates, terms)
+        return cls(cell, policy.to(usable_device(device)), candidates, terms)
 
     @torch.inference_mode()
     def plan(

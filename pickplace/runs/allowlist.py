@@ -1,4 +1,4 @@
-"""What a checkpoint's config may make; it comes from others, and is data until it is known to be harmless."""
+"""The allowlist: what a checkpoint's config, which may come from a stranger, may make (docs/reliability.md)."""
 
 import importlib
 import inspect
@@ -11,17 +11,56 @@ from importlib.metadata import packages_distributions
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-TARGETS: dict = {}
+from pickplace.runs.references import children, refusal, refuse_interpolations
+from pickplace.runs.registry import names_at, qualified_names
 
-#: What nobody may call a module of his own: with the functions of these a config could do anything.
-THEIRS = {*sys.stdlib_module_names, "pickplace", "hydra", "numpy", "omegaconf", "tensordict", "torch", "torchrl"}
+#: Modules that are never a user's own: with their functions a config could do anything.
+RESERVED_MODULES = {"pickplace", "hydra", "numpy", "omegaconf", "tensordict", "torch", "torchrl"}
+RESERVED_MODULES |= sys.stdlib_module_names
 
-#: A reference to another key of the same config, and nothing else: what it leads to is checked as well.
-REFERENCE = re.compile(r"\$\{\.*[A-Za-z_]\w*(\.\w+)*\}")
+#: Keys that the config of every training has.
+REQUIRED_KEYS = ["env._target_", "env.rotations", "env.tote_size", "items._target_", "model.actor._target_"]
+REQUIRED_KEYS += ["algo.mask_infeasible", "seed"]
+
+#: Greatest accepted values of numbers that alone could take all memory, or start any number of processes.
+GREATEST = {f"env.{key}": 2_000 for key in ("bin_size", "tote_size", "effector_size")}
+GREATEST |= {"env.num_envs": 65_536, "collector.workers": 1_024}
+
+
+def trusted_config(content: dict, trust=()) -> DictConfig:
+    """Return a checkpoint's config, after checking that it is one of a training and makes nothing unexpected.
+
+    Args:
+        content: the config.
+        trust: modules whose classes it may make beside pickplace's own, see :func:`own_modules`.
+
+    Raises:
+        ValueError: naming the key that is missing, or refused.
+    """
+    own = own_modules(trust)
+    try:
+        refuse_interpolations(content)
+        refuse_foreign_targets(content, own)
+        cfg = OmegaConf.create(content)
+        refuse_foreign_targets(OmegaConf.to_container(cfg, resolve=True), own)
+        missing = [key for key in REQUIRED_KEYS if OmegaConf.select(cfg, key) is None]
+    except (OmegaConfBaseException, RecursionError, AttributeError, TypeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"The checkpoint's config cannot be read ({reason}).") from error
+    if missing:
+        raise ValueError(f"The checkpoint's config has no {missing[0]}; expected the config of a training.")
+    for key, greatest in GREATEST.items():
+        value = OmegaConf.select(cfg, key)
+        for number in value if isinstance(value, ListConfig) else [value]:
+            if isinstance(number, (int, float)) and number > greatest:
+                raise refusal(key, number, f"at most {greatest:,}")
+    if type(cfg.seed) is not int:
+        raise refusal("seed", cfg.seed, "a whole number")
+    return cfg
 
 
 def own_modules(trust) -> tuple[str, ...]:
-    """The modules that a user trusts, as ``trust=`` gives them: none, a name, or a list of names.
+    """Return the modules that a user trusts, given as ``trust=``: none, a name, or a list of names.
 
     Raises:
         ValueError: for anything but names of modules that may be the user's own.
@@ -29,195 +68,69 @@ def own_modules(trust) -> tuple[str, ...]:
     names = list(trust) if isinstance(trust, (list, tuple, ListConfig)) else [] if trust is None else [trust]
     for name in names:
         if not _may_be_own(name):
-            raise ValueError(
-                f"trust={reprlib.repr(name)}: expected names of modules of your own, such as trust=my_models."
-            )
+            value = reprlib.repr(name)
+            raise ValueError(f"trust={value}: expected names of modules of your own, such as trust=my_models.")
     return tuple(names)
 
 
 def _may_be_own(module) -> bool:
-    named = isinstance(module, str) and all(part.isidentifier() for part in module.split("."))
-    return named and module.partition(".")[0] not in THEIRS
+    is_name = isinstance(module, str) and all(part.isidentifier() for part in module.split("."))
+    return is_name and module.partition(".")[0] not in RESERVED_MODULES
 
 
-def refuse_foreign_targets(node, trust: Collection[str] = (), path: str = "", within: bool = False) -> None:
-    """Refuse a config that would make anything unexpected.
+def refuse_foreign_targets(node, trust: Collection[str] = (), place: str = "", in_own: bool = False) -> None:
+    """Refuse a config that would make anything but classes of the registry, each in its place, and a user's own.
 
     Args:
-        node: the config, or a part of it, with every reference resolved.
-        trust: modules beside pickplace's own, see :func:`own_modules`. What they define themselves may be made in any
-            place, and out of any of pickplace's own parts; to know what that is, they are imported.
-        path: where the part is.
-        within: is it a part of something that a trusted module defines?
+        node: the config, or a part of it.
+        trust: modules of the user. What they define may be made in any place, out of any of pickplace's classes; they
+            are imported to know what that is.
+        place: the place of the part in the config.
+        in_own: whether it is a part of something that a trusted module defines.
 
     Raises:
         ValueError: naming the ``_target_`` and its place.
     """
-    if isinstance(node, dict):
-        if "_target_" in node:
-            target = node["_target_"]
-            own = _defined_by(target, trust)
-            places = TARGETS.values() if within else [TARGETS.get(path, ())]
-            allowed = [f"pickplace.{name}" for names in places for name in names]
-            if not own and not str(target).startswith("pickplace."):
-                expected = f"one of {', '.join(allowed)}" if allowed else "none in this place"
-                expected += _advice(target, trust)
-                raise ValueError(f"{path}._target_={target!r}: the checkpoint is refused; expected {expected}.")
-            within = within or own
-        for key, value in node.items():
-            refuse_foreign_targets(value, trust, f"{path}.{key}" if path else str(key), within)
-    elif isinstance(node, list):
-        for index, value in enumerate(node):
-            refuse_foreign_targets(value, trust, f"{path}[{index}]", within)
+    if isinstance(node, dict) and "_target_" in node:
+        target = node["_target_"]
+        is_own = _is_defined_by(target, trust)
+        names = names_at(place)
+        if not is_own and target not in [*names, *(qualified_names() if in_own else ())]:
+            expected = f"one of {', '.join(names)}" if names else "none in this place"
+            expected = "a name with its place, such as items/kinds" if in_own else expected
+            raise refusal(f"{place}._target_", target, expected + _advice(_module(target), trust))
+        in_own = in_own or is_own
+    for key, value in children(node):
+        child = f"{place}[{key}]" if isinstance(node, list) else f"{place}.{key}" if place else str(key)
+        refuse_foreign_targets(value, trust, child, in_own)
 
 
-def _advice(target, trust: Collection[str]) -> str:
-    """How to trust a module that may be the user's own: one that is not installed as somebody's package."""
-    module = target.rpartition(".")[0] if isinstance(target, str) else ""
+def _module(target) -> str:
+    return target.rpartition(".")[0] if isinstance(target, str) else ""
+
+
+def _advice(module: str, trust: Collection[str]) -> str:
+    """Return how to trust a module that may be the user's own; an installed package is not."""
     if not _may_be_own(module) or module in trust or module.partition(".")[0] in packages_distributions():
         return ""
     return f"; if {module} is yours, say trust={module} (--trust {module} to pickplace-plan)"
 
 
-def _defined_by(target, trust: Collection[str]) -> bool:
-    """Does a trusted module, or a part of it, define that class or function, and not merely import it?
-
-    Raises:
-        ValueError: if the module cannot be imported.
-    """
-    module, _, name = target.rpartition(".") if isinstance(target, str) else ("", "", "")
-    if module not in trust or not re.fullmatch(r"[A-Za-z]\w*", name):
+def _is_defined_by(target, trust: Collection[str]) -> bool:
+    """Return whether a trusted module, or a part of it, defines that class or function, and not merely imports it."""
+    if (module := _module(target)) not in trust or not re.fullmatch(r"[A-Za-z]\w*", target[len(module) + 1 :]):
         return False
     try:
-        found = getattr(importlib.import_module(module), name, None)
+        found = getattr(importlib.import_module(module), target[len(module) + 1 :], None)
     except ImportError as error:
         raise ValueError(f"trust={module}: it cannot be imported ({error}); expected it on PYTHONPATH.") from error
     home = getattr(found, "__module__", None) or ""
     return (inspect.isclass(found) or inspect.isfunction(found)) and f"{home}.".startswith(f"{module}.")
 
 
-def refuse_interpolations(node, path: tuple = (), root=None) -> None:
-    """Refuse all interpolations but references to a value in the same config, before anything resolves them.
-
-    A resolver reads files and variables or makes nodes; a reference to a part, or to a reference, could copy parts into
-    parts until the memory is full.
-
-    Raises:
-        ValueError: naming the interpolation and its place.
-    """
-    root = node if root is None else root
-    if isinstance(node, (dict, list)):
-        for key, value in node.items() if isinstance(node, dict) else enumerate(node):
-            refuse_interpolations(value, (*path, key), root)
-    elif isinstance(node, str) and "${" in node:
-        place = f"{'.'.join(map(str, path))}={reprlib.repr(node)}: the checkpoint is refused; expected"
-        if not REFERENCE.fullmatch(node):
-            raise ValueError(f"{place} no resolver in its config.")
-        if not _leads_to_a_value(node, path, root):
-            raise ValueError(f"{place} a reference to a number, a short text or a short list of such.")
-
-
-def _leads_to_a_value(reference: str, path: tuple, root) -> bool:
-    """Does a reference at some place lead to a value that is none itself?"""
-    name = reference[2:-1].lstrip(".")
-    up = len(reference) - 3 - len(name)
-    found = root
-    for key in (*(path[:-up] if up else ()), *name.split(".")):
-        try:
-            found = found[int(key) if isinstance(found, list) else key] if isinstance(found, (dict, list)) else None
-        except (KeyError, IndexError, ValueError):
-            return False
-    values = found if isinstance(found, list) else [found]
-    return len(values) <= 100 and not any(
-        isinstance(value, (dict, list)) or (isinstance(value, str) and ("${" in value or len(value) > 1000))
-        for value in values
-    )
-
-
-def settled(raw, resolved, path: tuple = (), root=None):
-    """A config to be saved: references to values as they are, so that overrides reach both; all else resolved.
-
-    Args:
-        raw: a config's plain values, not resolved.
-        resolved: the same, resolved.
-        path: where they are in the config.
-        root: the whole config, not resolved.
-    """
-    root = raw if root is None else root
-    if isinstance(raw, dict):
-        kept = {key: settled(value, resolved[key], (*path, key), root) for key, value in raw.items()}
-        return kept | {"_target_": resolved["_target_"]} if "_target_" in raw else kept
-    if isinstance(raw, list):
-        pairs = enumerate(zip(raw, resolved, strict=True))
-        return [settled(*pair, (*path, index), root) for index, pair in pairs]
-    plain = isinstance(raw, str) and REFERENCE.fullmatch(raw) and _leads_to_a_value(raw, path, root)
-    return raw if plain else resolved
-
-
-def saved_form(cfg: DictConfig) -> dict:
-    """The config of a run as its checkpoints hold it; whoever loads one says anew what to trust."""
-    raw, resolved = (OmegaConf.to_container(cfg, resolve=resolve) for resolve in (False, True))
-    return {**settled(raw, resolved), "trust": []}
-
-
-def trust_needed(node, among: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """The modules that have to be trusted to load a run of this config, resolved, again."""
-    if isinstance(node, dict):
-        if isinstance(target := node.get("_target_"), str):
-            among = tuple({*among, target.rpartition(".")[0]})
-        node = list(node.values())
-    if isinstance(node, list):
-        for value in node:
-            among = trust_needed(value, among)
-    return tuple(sorted(module for module in among if _may_be_own(module)))
-
-
-#: What every config of a training has.
-TRAINED_WITH = (
-    "env._target_",
-    "env.rotations",
-    "env.tote_size",
-    "items._target_",
-    "model.actor._target_",
-    "algo.mask_infeasible",
-    "seed",
-)
-
-
-#: Where a large number alone would take all memory or start processes without end, the largest that is accepted.
-MOST = {
-    "env.bin_size": 2_000, "env.tote_size": 2_000, "env.effector_size": 2_000, "env.num_envs": 65_536,
-    "collector.workers": 1_024,
-}  # fmt: skip
-
-
-def trusted(content: dict, trust=()) -> DictConfig:
-    """A checkpoint's config, once it is known to be one of a training and to make nothing unexpected.
-
-    Args:
-        content: the config.
-        trust: modules beside pickplace's own whose classes it may make, see :func:`own_modules`.
-
-    Raises:
-        ValueError: naming what is missing, or what it would make.
-    """
-    own = own_modules(trust)
-    try:
-        refuse_interpolations(content)
-        refuse_foreign_targets(content, own)  # as it is written, and below as it is meant
-        cfg = OmegaConf.create(content)
-        refuse_foreign_targets(OmegaConf.to_container(cfg, resolve=True), own)
-        missing = [key for key in TRAINED_WITH if OmegaConf.select(cfg, key) is None]
-    except (OmegaConfBaseException, RecursionError, AttributeError, TypeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"The checkpoint's config cannot be read ({reason}).") from error
-    if missing:
-        raise ValueError(f"The checkpoint's config has no {missing[0]}; expected one that a training wrote.")
-    for key, most in MOST.items():
-        value = OmegaConf.select(cfg, key)
-        for number in value if isinstance(value, ListConfig) else [value]:
-            if isinstance(number, (int, float)) and number > most:
-                raise ValueError(f"{key}={reprlib.repr(number)}: the checkpoint is refused; expected at most {most:,}.")
-    if not isinstance(cfg.seed, int) or isinstance(cfg.seed, bool):
-        raise ValueError(f"seed={reprlib.repr(cfg.seed)}: the checkpoint is refused; expected a whole number.")
-    return cfg
+def modules_to_trust(node) -> tuple[str, ...]:
+    """Return the modules that a reader of this config, resolved, has to trust."""
+    modules = {module for _, value in children(node) for module in modules_to_trust(value)}
+    if isinstance(node, dict) and _may_be_own(module := _module(node.get("_target_"))):
+        modules.add(module)
+    return tuple(sorted(modules))

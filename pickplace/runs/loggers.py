@@ -1,6 +1,6 @@
-"""Where metrics go (config group ``logger``). Names: ``train/...``, ``eval/...``, ``curriculum/...``, ``time/...``.
+"""Loggers of metrics (config group ``logger``), named ``train/...``, ``eval/...``, ``curriculum/...`` and ``time/...``.
 
-Whatever is chosen, ``metrics.csv`` is written: reports, figures and sweeps read it.
+All but ``logger=none`` write ``metrics.csv``, which reports, figures and sweeps read.
 """
 
 import csv
@@ -9,21 +9,20 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pickplace.runs.hydra_app import missing_extra
+from pickplace.runs.errors import missing_extra
 
 if TYPE_CHECKING:
     from torchrl.record.loggers.common import Logger
 
 
 class CsvLogger:
-    """One table, ``metrics.csv``, a row for each batch and a column for each metric; the first column is ``frames``.
+    """A table, ``metrics.csv``: a row for each batch, a column ``frames``, and a column for each metric.
 
-    A new metric adds a column. After a resume the table goes on where the checkpoint left off: rows beyond it, which a
-    killed run may have left, are dropped.
+    A new metric adds a column. On resume, rows after the checkpoint, which a killed run may have left, are dropped.
 
     Args:
         folder: the run folder.
-        frames: frames already trained; 0 for a new run.
+        frames: frames trained so far; 0 for a new run.
         settings: the run's config, for backends that show it beside the curves.
     """
 
@@ -34,14 +33,14 @@ class CsvLogger:
         self._rewrite([row for row in earlier if row["frames"] <= frames])
 
     def _rewrite(self, rows):
-        """Begin the file anew, with columns for all that these rows hold."""
+        """Write the file with these rows, and columns for all their metrics."""
         self._columns += [key for key in dict.fromkeys(key for row in rows for key in row) if key not in self._columns]
-        fresh = self.path.with_name(".metrics.csv.new")
-        with fresh.open("w", newline="") as file:
+        new = self.path.with_name(".metrics.csv.new")
+        with new.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
             writer.writerows(rows)
-        fresh.replace(self.path)
+        new.replace(self.path)
         self._file = self.path.open("a", newline="")
         self._writer = csv.DictWriter(self._file, self._columns)
 
@@ -63,7 +62,7 @@ class CsvLogger:
             raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def close(self) -> None:
-        """Close the file; what a full disk did not take is lost."""
+        """Close the file; rows that a full disk did not take are lost."""
         with suppress(OSError):
             self._file.close()
 
@@ -77,7 +76,7 @@ class TensorboardLogger(CsvLogger):
         except ImportError as error:
             raise missing_extra("logger", "tensorboard") from error
         super().__init__(folder, frames)
-        # Events after the checkpoint that a run is resumed from are hidden by TensorBoard itself.
+        # purge_step: TensorBoard hides events after the checkpoint of a resumed run.
         self._events = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
 
     def log(self, metrics: dict[str, float], frames: int) -> None:
@@ -93,7 +92,7 @@ class TensorboardLogger(CsvLogger):
 
 
 class BackendLogger(CsvLogger):
-    """A logger of TorchRL's, made by subclasses as ``_backend``, beside the table. Args as `CsvLogger`."""
+    """A TorchRL logger beside the table; subclasses make it as ``_backend``. Args as `CsvLogger`."""
 
     _backend: "Logger"
 
@@ -106,11 +105,11 @@ class BackendLogger(CsvLogger):
 class WandbLogger(BackendLogger):
     """Weights & Biases, through TorchRL's logger; needs the extra ``pickplace[wandb]``.
 
-    The run's id is kept in the run folder, ``wandb_run_id``, so that a resumed run goes on under it.
+    A resumed run continues under the run's id, which the run folder keeps in ``wandb_run_id``.
 
     Args:
-        folder, frames, settings: as of `CsvLogger`.
-        project: the project to which the run belongs.
+        folder, frames, settings: as in `CsvLogger`.
+        project: the project of the run.
         offline: keep everything in the run folder; ``wandb sync`` sends it later.
     """
 
@@ -129,17 +128,17 @@ class WandbLogger(BackendLogger):
         from torchrl.record.loggers.wandb import WandbLogger as Backend
 
         super().__init__(folder, frames)
-        place = Path(folder) / "wandb_run_id"
+        id_file = Path(folder) / "wandb_run_id"
         self._backend = Backend(
             Path(folder).name,
             offline=offline,
             save_dir=str(folder),
-            id=_run_id(place, frames),
+            id=_run_id(id_file, frames),
             project=project,
-            log_env_packages=False,  # they hold paths of this machine; a checkpoint tells the versions that matter
+            log_env_packages=False,  # they hold paths of this machine; checkpoints hold the versions
             settings={"silent": offline, "console": "off"},
         )
-        place.write_text(self._backend.experiment.id)
+        id_file.write_text(self._backend.experiment.id)
         if settings:
             self._backend.log_hparams(settings)
 
@@ -152,12 +151,12 @@ class WandbLogger(BackendLogger):
 class MlflowLogger(BackendLogger):
     """MLflow, through TorchRL's logger; needs the extra ``pickplace[mlflow]``.
 
-    The run's id is kept in the run folder, ``mlflow_run_id``, so that a resumed run goes on under it.
+    A resumed run continues under the run's id, which the run folder keeps in ``mlflow_run_id``.
 
     Args:
-        folder, frames, settings: as of `CsvLogger`.
-        experiment: the experiment to which the run belongs.
-        uri: where MLflow keeps it, a database or a server; None: ``mlflow.db`` in the run folder.
+        folder, frames, settings: as in `CsvLogger`.
+        experiment: the experiment of the run.
+        uri: database or server; None: ``mlflow.db`` in the run folder.
     """
 
     def __init__(
@@ -176,22 +175,22 @@ class MlflowLogger(BackendLogger):
 
         super().__init__(folder, frames)
         folder = Path(folder).absolute()
-        place = folder / "mlflow_run_id"
+        id_file = folder / "mlflow_run_id"
         local = {} if uri else {"artifact_location": (folder / "mlflow_artifacts").as_uri()}
         before = os.environ.pop("MLFLOW_RUN_ID", None)
-        if run_id := _run_id(place, frames):
-            os.environ["MLFLOW_RUN_ID"] = run_id  # TorchRL's logger hands no id on; MLflow itself looks here
+        if run_id := _run_id(id_file, frames):
+            os.environ["MLFLOW_RUN_ID"] = run_id  # MLflow reads it; TorchRL's logger has no argument for it
         try:
             self._backend = Backend(experiment, uri or f"sqlite:///{folder / 'mlflow.db'}", **local)
         finally:
             os.environ.pop("MLFLOW_RUN_ID", None)
             if before is not None:
                 os.environ["MLFLOW_RUN_ID"] = before
-        place.write_text(self._backend.experiment.info.run_id)
+        id_file.write_text(self._backend.experiment.info.run_id)
         self._end_run = mlflow.end_run
         if not run_id:
             mlflow.set_tag("mlflow.runName", folder.name)
-            if settings:  # MLflow refuses other values later, and a resumed run may have some
+            if settings:  # in a new run only: MLflow refuses changed values, which a resumed run may have
                 self._backend.log_hparams(settings)
 
     def close(self) -> None:
@@ -201,7 +200,7 @@ class MlflowLogger(BackendLogger):
 
 
 class NoLogger:
-    """Keeps nothing. Args as `CsvLogger`."""
+    """A logger that keeps nothing. Args as `CsvLogger`."""
 
     def __init__(self, folder=None, frames: int = 0, settings: dict | None = None):
         pass
@@ -213,20 +212,20 @@ class NoLogger:
         """Nothing to close."""
 
 
-def _run_id(place: Path, frames: int) -> str | None:
-    """The id under which a resumed run goes on, if there is one."""
-    return place.read_text() if frames and place.is_file() else None
+def _run_id(id_file: Path, frames: int) -> str | None:
+    """Return the id of a resumed run, or None."""
+    return id_file.read_text() if frames and id_file.is_file() else None
 
 
 def read_csv(path) -> list[dict[str, float]]:
-    """The complete rows of a ``metrics.csv``; a metric that a row lacks is left out.
+    """Return the complete rows of a ``metrics.csv``; empty cells are left out.
 
     Raises:
-        ValueError: naming the file and the line, where something is no number.
+        ValueError: naming file and line, for a cell that is no number.
     """
     with Path(path).open(newline="") as file:
         text = file.read()
-    lines = text[: text.rfind("\n") + 1].splitlines()  # a killed run may have cut the last line short
+    lines = text[: text.rfind("\n") + 1].splitlines()  # a killed run may leave an incomplete last line
     rows = []
     for number, row in enumerate(csv.DictReader(lines), start=2):
         try:

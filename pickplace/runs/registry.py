@@ -1,23 +1,168 @@
-"""Short names of everything that a config or a checkpoint may name, and how it is made."""
+"""The registry: short names of all classes and functions that a config may name, and how they are called.
 
-from omegaconf import DictConfig
+``_target_`` in a config holds a short name (``_target_: joint_dbl``), or the dotted path of a class of the user's own
+(``_target_: own_planner.Nearest``). A short name belongs to a place in the config, such as ``planner`` or
+``curriculum.advance``. Parts of a user's own class that are in no such place say it before the name, with slashes:
+``_target_: items/kinds`` or ``_target_: curriculum/advance/frames``.
 
-from pickplace.runs import hydra_app
+To add an option, write one line into :data:`REGISTRY` and one file into ``conf/``.
+"""
+
+import inspect
+from collections.abc import Callable
+from difflib import get_close_matches
+from importlib import import_module
+
+from omegaconf import DictConfig, OmegaConf
+
+from pickplace.runs.errors import unknown_key
+
+PLANNERS = {
+    "policy": "pickplace.planners.policy.PolicyPlanner",
+    "lookahead": "pickplace.planners.lookahead.Lookahead",
+    "joint_dbl": "pickplace.planners.heuristics.JointDBL",
+    "corner": "pickplace.planners.heuristics.Corner",
+    "individual_heuristic": "pickplace.planners.individual.IndividualHeuristic",
+    "mcts": "pickplace.planners.mcts.MCTS",
+    "random": "pickplace.planners.heuristics.RandomFeasible",
+    "uniform": "pickplace.planners.heuristics.UniformRandom",
+}
+
+#: Place in the config -> short name -> dotted path. ``*`` stands for any one key.
+REGISTRY: dict[str, dict[str, str]] = {
+    "env": {"pick_place": "pickplace.envs.torchrl.PickPlaceEnv"},
+    "env.observation.*": {
+        "bin_depth": "pickplace.task.observation.BinDepth",
+        "tote_depth": "pickplace.task.observation.ToteDepth",
+        "tote_height": "pickplace.task.observation.ToteHeight",
+    },
+    "items": {
+        "kinds": "pickplace.task.items.Kinds",
+        "uniform": "pickplace.task.items.Uniform",
+        "recorded": "pickplace.task.items.Recorded",
+    },
+    "model.actor": {
+        "fcn_grasp": "pickplace.policies.fcn_grasp.fcn_grasp",
+        "fcn4d": "pickplace.policies.fcn4d.ActionPolicy",
+        "typical": "pickplace.policies.fcn4d.TypicalPolicy",
+        "individual_rl": "pickplace.policies.individual.IndividualRlPolicy",
+        "individual_grasp": "pickplace.policies.individual.individual_grasp",
+    },
+    "model.critic": {
+        "pooled": "pickplace.policies.networks.critics.pooled_critic",
+        "conv4d": "pickplace.policies.networks.critics.conv4d_critic",
+    },
+    "curriculum": {"curriculum": "pickplace.training.curriculum.Curriculum"},
+    "curriculum.advance": {
+        "none": "pickplace.training.curriculum.NoAdvance",
+        "frames": "pickplace.training.curriculum.Frames",
+        "threshold": "pickplace.training.curriculum.Threshold",
+        "plateau": "pickplace.training.curriculum.Plateau",
+        "staged": "pickplace.training.curriculum.Staged",
+    },
+    "curriculum.sample": {
+        "current": "pickplace.training.curriculum.Current",
+        "uniform": "pickplace.training.curriculum.Uniform",
+        "recent": "pickplace.training.curriculum.Recent",
+    },
+    "collector": {
+        "single": "pickplace.training.collectors.single",
+        "multi_sync": "pickplace.training.collectors.multi_sync",
+        "ray": "pickplace.training.collectors.ray",
+    },
+    "logger": {
+        "csv": "pickplace.runs.loggers.CsvLogger",
+        "tensorboard": "pickplace.runs.loggers.TensorboardLogger",
+        "wandb": "pickplace.runs.loggers.WandbLogger",
+        "mlflow": "pickplace.runs.loggers.MlflowLogger",
+        "none": "pickplace.runs.loggers.NoLogger",
+    },
+    "planner": PLANNERS,
+    "warm_start.teacher": PLANNERS,
+}
 
 
-def build(place: str, node: DictConfig, **kwargs):
-    """Make the object that a config node names.
+def build(place: str, node: DictConfig | dict, **kwargs):
+    """Make the object that a config node names, and before it the objects that nodes within it name.
 
     Args:
-        place: the node's place in the config, such as ``"planner"`` or ``"curriculum.advance"``.
+        place: the node's place in the config, such as ``"planner"`` or ``"model.actor"``.
         node: the settings, with a ``_target_``.
         **kwargs: arguments handed over as they are.
+
+    Raises:
+        ValueError: for an unknown ``_target_`` or setting, or an argument that is missing; and what the constructor
+            raises.
     """
-    return hydra_app.instantiate(node, **kwargs)
+    return _make(place, OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node, kwargs)
 
 
-def find(place: str, node: DictConfig):
-    """Return the class or function that a config node names."""
-    import hydra
+def _make(place: str, node, given: dict):
+    if isinstance(node, list):
+        return [_make(f"{place}[{index}]", value, {}) for index, value in enumerate(node)]
+    if not isinstance(node, dict):
+        return node
+    settings = {key: _make(f"{place}.{key}", value, {}) for key, value in node.items() if key != "_target_"}
+    if "_target_" not in node:
+        return settings
+    function = find(place, node["_target_"])
+    known = accepted_arguments(function)
+    if known is not None and (unknown := [key for key in settings if key not in known]):
+        free = dict.fromkeys(key for key in known if key not in given)
+        raise ValueError(unknown_key(f"{place}.{unknown[0]}", free, f"{place}."))
+    try:
+        return function(**{**settings, **given})
+    except TypeError as error:
+        raise ValueError(f"{place}._target_={node['_target_']}: {error}.") from error
 
-    return hydra.utils.get_object(node._target_)
+
+def names_at(place: str) -> dict[str, str]:
+    """Return the short names that a place of the config may hold, with their dotted paths."""
+    return REGISTRY.get(place) or REGISTRY.get(f"{place.rpartition('.')[0]}.*", {})
+
+
+def qualified_names() -> dict[str, str]:
+    """Return all names with their places, such as ``items/kinds``, with their dotted paths."""
+    return {
+        f"{place.removesuffix('.*').replace('.', '/')}/{name}": path
+        for place, names in REGISTRY.items()
+        for name, path in names.items()
+    }
+
+
+def find(place: str, target) -> Callable:
+    """Return the class or function that a ``_target_`` names.
+
+    Raises:
+        ValueError: if there is none, with the names that there are.
+    """
+    names = names_at(place)
+    path = {**qualified_names(), **names}.get(str(target), str(target))
+    module, _, name = path.rpartition(".")
+    reason = ""
+    try:
+        if callable(found := getattr(import_module(module), name) if module else None):
+            return found
+    except (ImportError, AttributeError, TypeError, ValueError) as error:  # the last two from ".a.b" and "..a"
+        reason = f" ({error})"
+    close = get_close_matches(path, names, 1)
+    known = f"one of {', '.join(names)}, or " if names else ""
+    hint = f"did you mean {close[0]!r}?" if close else f"expected {known}the dotted path of a class of your own."
+    raise ValueError(f"{place}._target_={target}: there is no such class or function{reason}; {hint}")
+
+
+def accepted_arguments(function: Callable) -> list[str] | None:
+    """Return the keywords that a class or function takes, or None if it takes any.
+
+    One with ``**keywords`` takes any, unless its attribute ``settings``, a tuple of names, says which ones they are.
+    """
+    has_init = inspect.isclass(function) and function.__init__ is not object.__init__
+    try:  # of __init__ itself, since a metaclass may hide its arguments
+        parameters = inspect.signature(function.__init__ if has_init else function).parameters.values()
+    except (TypeError, ValueError):  # a function written in C
+        return None
+    named = [each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)]
+    names = [name for name in named if name != "self"]
+    if all(each.kind != each.VAR_KEYWORD for each in parameters):
+        return names
+    return [*names, *function.settings] if hasattr(function, "settings") else None

@@ -1,69 +1,86 @@
-"""How a training is stopped and taken up again: signals, the run folder's lock, what a resumed run may change."""
+"""How a training is stopped and resumed: stop requests, the checkpoint to resume from, and what may change then."""
 
 import json
 import logging
 import os
 import reprlib
 import signal
+from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from filelock import FileLock, Timeout
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.runs import checkpoint
-from pickplace.runs import hydra_app as config
-from pickplace.runs.allowlist import own_modules, saved_form, trusted
+from pickplace.runs.allowlist import modules_to_trust, own_modules, trusted_config
+from pickplace.runs.errors import WorkerDied, sentence
+from pickplace.runs.folder import occupied, refuse_occupied
+from pickplace.runs.hydra_app import apply_overrides
+from pickplace.runs.references import saved_form
+from pickplace.task.cell import CELL_SETTINGS
 
 log = logging.getLogger(__name__)
 
-#: What a checkpoint counts, and how a run begins: frames, iterations, best validation occupancy, latest validation.
+#: Counters in a checkpoint, with their values in a new run: frames and batches trained, best validation occupancy, and
+#: the latest validation.
 COUNTERS = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
 
-#: What no checkpoint may reach by itself, only who resumes it: other machines, and databases elsewhere.
-AT_HOME = {"collector.address": ("local", None), "logger.uri": ("null", None), "logger.offline": ("true", True, None)}
+#: Settings that may leave the run folder or the machine, and their values that do not. The user must repeat others on
+#: resume.
+LOCAL_VALUES = {
+    "collector.address": ("local", None),
+    "logger.uri": ("null", None),
+    "logger.offline": ("true", True, None),
+}
 
-#: What the state of running episodes is tied to.
-RULES = ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "min_support", "strict_support")
-FIXED = ("seed", *(f"env.{key}" for key in RULES), "env.num_envs", "items", "algo.mask_infeasible", "collector.workers")
+#: Settings that a resumed run cannot change, since the state of its episodes depends on them.
+FIXED_KEYS = (
+    "seed", *(f"env.{key}" for key in CELL_SETTINGS), "env.num_envs", "items", "algo.mask_infeasible",
+    "collector.workers",
+)  # fmt: skip
+
+
+def checkpoint_config(cfg: DictConfig) -> tuple[dict, str]:
+    """Return the config as checkpoints hold it, and the words to repeat on resume, such as `` trust=[my_models]``.
+
+    A config that could be saved but not be loaded again causes a warning now, not after hours.
+    """
+    content = saved_form(cfg)
+    own = modules_to_trust(OmegaConf.to_container(cfg, resolve=True))
+    try:
+        trusted_config(content, own)
+    except ValueError as error:
+        log.warning("checkpoints of this run will not be loaded again: %s", error)
+    values = {key: OmegaConf.select(cfg, key) for key in LOCAL_VALUES}
+    words = [f" {key}={value}" for key, value in values.items() if value not in LOCAL_VALUES[key]]
+    return content, "".join([f" trust=[{','.join(own)}]" if own else "", *words])
 
 
 def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
-    """A checkpoint's config with overrides of values on top.
+    """Return a checkpoint's config with overrides of values on top.
+
+    Args:
+        place: what the user resumes, for messages.
+        facts: as :func:`pickplace.runs.checkpoint.read` returns them.
+        overrides: the command line without ``resume=``.
 
     Raises:
         ValueError: for a checkpoint that no training wrote, or a change that a resumed run cannot follow.
     """
-    if missing := [key for key in ("curriculum", *COUNTERS) if key not in facts]:
-        raise ValueError(f"resume={place}: the checkpoint has no {missing[0]!r}; expected one that a training wrote.")
-    told = f"resume={place}: the checkpoint's {{}} is {{}}; expected {{}} that a training wrote.".format
-    if not isinstance(facts["latest"], dict):
-        raise ValueError(told("latest", reprlib.repr(facts["latest"]), "a validation"))
-    for key, value in {"iteration": facts["iteration"], "best": facts["best"], **facts["latest"]}.items():
-        kind = int if key == "iteration" else (int, float)
-        if isinstance(value, bool) or not isinstance(value, kind) or not -(2**63) < value < 2**63:
-            raise ValueError(told(reprlib.repr(key)[1:-1], reprlib.repr(value), "a number"))
-    # Only who resumes a run says what to trust, never the checkpoint.
+    _check_counters(place, facts)
     given = OverridesParser.create().parse_overrides(overrides)
     trust = own_modules(next((word.value() for word in reversed(given) if word.key_or_group == "trust"), None))
-    saved = trusted(facts["config"], trust)
-    saved["trust"] = list(trust)
-    named = {word.key_or_group for word in given}
-    for key, harmless in AT_HOME.items():
-        value = OmegaConf.select(saved, key)
-        if value not in harmless and key not in named:
+    saved = trusted_config(facts["config"], trust)
+    saved["trust"] = list(trust)  # only the user says what to trust, never the checkpoint
+    _refuse_remote_values(saved, {word.key_or_group for word in given})
+    cfg = apply_overrides(saved, [str(word.input_line) for word in given if word.key_or_group != "trust"])
+    for key in FIXED_KEYS:
+        before, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
+        if before != now:
             raise ValueError(
-                f"{key}={value}: the checkpoint would reach out of this run's folder or this machine; expected that "
-                f"you say so again, {key}={value}, or {key}={harmless[0]}."
-            )
-    cfg = config.apply_overrides(saved, [str(word.input_line) for word in given if word.key_or_group != "trust"])
-    for key in FIXED:
-        was, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
-        if was != now:
-            raise ValueError(
-                f"{key}={now}: the run began with {was}, and a resumed run cannot change it; start a new one."
+                f"{key}={now}: the run began with {before}, and a resumed run cannot change it; start a new one."
             )
     if type(cfg.total_frames) is not int:
         raise ValueError(f"total_frames={cfg.total_frames}: expected a whole number >= 1 and < 2**63.")
@@ -74,39 +91,76 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     return cfg
 
 
-def begun_already(cfg: DictConfig, run_dir: Path) -> tuple[dict, dict, Path] | None:
-    """State, facts and folder of the checkpoint to go on from, if this very run was begun in its folder: a job of a
-    sweep that a scheduler has preempted, and starts again.
+def _check_counters(place: str, facts: dict) -> None:
+    if missing := [key for key in ("curriculum", *COUNTERS) if key not in facts]:
+        raise ValueError(f"resume={place}: the checkpoint has no {missing[0]!r}; expected one that a training wrote.")
+
+    def error(key: str, value, expected: str) -> ValueError:
+        words = f"the checkpoint's {reprlib.repr(key)[1:-1]} is {reprlib.repr(value)}"
+        return ValueError(f"resume={place}: {words}; expected {expected} that a training wrote.")
+
+    if not isinstance(facts["latest"], dict):
+        raise error("latest", facts["latest"], "a validation")
+    for key, value in {"iteration": facts["iteration"], "best": facts["best"], **facts["latest"]}.items():
+        kind = int if key == "iteration" else (int, float)
+        if isinstance(value, bool) or not isinstance(value, kind) or not -(2**63) < value < 2**63:
+            raise error(key, value, "a number")
+
+
+def _refuse_remote_values(saved: DictConfig, repeated: set[str]) -> None:
+    for key, local in LOCAL_VALUES.items():
+        value = OmegaConf.select(saved, key)
+        if value not in local and key not in repeated:
+            raise ValueError(
+                f"{key}={value}: the checkpoint would write outside this run's folder or this machine; expected "
+                f"{key}={value} again on the command line, or {key}={local[0]}."
+            )
+
+
+def interrupted_run(cfg: DictConfig, run_dir: Path) -> tuple[dict, dict, Path] | None:
+    """Return the checkpoint from which a run with this very config goes on in its folder, or None for a new run.
+
+    That is a job of a sweep that a scheduler stopped and starts again.
+
+    Returns:
+        The checkpoint's state, facts and folder.
 
     Raises:
-        Occupied: if it was another run.
+        OccupiedError: if the folder holds a run with another config.
     """
     try:
         folder = checkpoint.locate(run_dir, prefer="last")
         state, facts = checkpoint.read(folder)
     except checkpoint.CheckpointError:
-        config.refuse_occupied(run_dir)
+        refuse_occupied(run_dir)
         return None
-    if facts["config"] != json.loads(json.dumps(saved_form(cfg))) or "curriculum" not in facts:
-        raise config.Occupied(config.OCCUPIED.format(run_dir))
+    if facts["config"] != _as_json(saved_form(cfg)) or "curriculum" not in facts:
+        raise occupied(run_dir)
     log.info("going on with %s at %s frames", run_dir, f"{facts['frames']:,}")
     return state, facts, folder
 
 
-def best_of_another_course(run_dir: Path, frames: int, content: dict) -> int | None:
-    """The frames of a run's ``best`` if it may never come to it, going on from ``frames`` with other settings, or None.
+def stale_best_frames(run_dir: Path, frames: int, config: dict) -> int | None:
+    """Return the frames of a run's ``best`` if it is of later frames than ``frames`` and of another config, or None.
+
+    A run that goes on from ``frames`` with this config may never reach that policy.
 
     Args:
-        content: the settings from now on, in the form that checkpoints hold.
+        run_dir: the run folder.
+        frames: frames trained so far.
+        config: the settings from now on, in the form that checkpoints hold.
     """
     facts = checkpoint.read_facts(run_dir)
-    if not facts or facts["frames"] <= frames or facts["config"] == json.loads(json.dumps(content)):
-        return None
-    return facts["frames"]
+    is_stale = facts and facts["frames"] > frames and facts["config"] != _as_json(config)
+    return facts["frames"] if is_stale else None
+
+
+def _as_json(config: dict) -> dict:
+    return json.loads(json.dumps(config))
 
 
 def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
-    """Give Adam the moments of a checkpoint; parameters without a gradient so far have none.
+    """Load a checkpoint's moments into Adam; parameters without a gradient so far have none.
 
     Raises:
         CheckpointError: if they do not fit the parameters.
@@ -118,76 +172,46 @@ def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
         raise checkpoint.CheckpointError(
             f"The checkpoint's optimizer has {reprlib.repr(unknown[0])}; expected numbers below {len(parameters)}."
         )
-    mine = {n: {"step": torch.tensor(0.0), "exp_avg": p, "exp_avg_sq": p} for n, p in parameters.items() if n in state}
-    moments = checkpoint.fitting(state, mine, "optimizer")
+    own = {n: {"step": torch.tensor(0.0), "exp_avg": p, "exp_avg_sq": p} for n, p in parameters.items() if n in state}
+    moments = checkpoint.matching_state(state, own, "optimizer")
     optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
 
 
 class StopRequest:
-    """Ctrl-C and SIGTERM ask the loop to finish its batch and save; a second Ctrl-C ends the process at once."""
+    """Ctrl-C or SIGTERM: the loop finishes its batch and saves. A second Ctrl-C ends the process at once."""
 
     def __init__(self):
         self.requested = False
-        self._previous = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._previous = {number: signal.signal(number, self._request) for number in (signal.SIGINT, signal.SIGTERM)}
 
-    def _ask(self, number, frame):
+    def _request(self, number, frame):
         if self.requested:
             os._exit(130)
         self.requested = True
         log.info("stopping after this batch; press Ctrl-C again to stop at once")
 
     def restore(self) -> None:
-        """Give the signals back."""
+        """Restore the earlier signal handlers."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
 
-def refuse_links(run_dir: Path) -> None:
-    """Refuse a run folder, which may come from others, that would make a resumed run write somewhere else.
-
-    Raises:
-        ValueError: for a link, a pipe or a device in it, naming it.
-    """
-    for folder in (run_dir, run_dir / "checkpoints", run_dir / ".hydra"):
-        for entry in os.scandir(folder) if folder.is_dir() else ():
-            if entry.is_symlink() or not (entry.is_file() or entry.is_dir()):
-                raise ValueError(f"{entry.path}: a link or no regular file; expected only files and folders in a run.")
-
-
 @contextmanager
-def claim(run_dir: Path):
-    """Hold a run folder for this process, until the end of the block or of the process, however it ends.
-
-    Raises:
-        ValueError: if another process holds it.
-    """
-    lock = FileLock(Path(run_dir) / config.LOCK)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise config.Occupied(config.TAKEN.format(run_dir)) from None
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-@contextmanager
-def saying_what_is_safe(safe, trust: str = ""):
-    """Add to what ends a training the checkpoint, ``safe()``, from which it can be taken up.
+def checkpoint_hint(latest: Callable[[], Path | None], arguments: str = ""):
+    """Add to an error that ends a training the command that resumes it.
 
     Args:
-        safe: gives its folder, or None.
-        trust: what has to be said beside it, `` trust=[...]`` or nothing.
+        latest: returns the folder of the latest whole checkpoint, or None.
+        arguments: further words of that command, such as `` trust=[my_models]``.
     """
     try:
         yield
     except Exception as error:
         hint = "Nothing had been saved before."
-        if folder := safe():
-            # The same batch would lead to the same numbers.
-            other = " algo.lr=<a smaller one>" if isinstance(error, FloatingPointError) else ""
-            hint = f"What was saved before is whole: pickplace-train resume={folder}{trust}{other}"
-        kept = (FloatingPointError, config.WorkerDied, checkpoint.CheckpointError)
+        if folder := latest():
+            # With the same settings, the same batch would lead to the same numbers.
+            change = " algo.lr=<a smaller one>" if isinstance(error, FloatingPointError) else ""
+            hint = f"What was saved before is whole: pickplace-train resume={folder}{arguments}{change}"
+        kept = (FloatingPointError, WorkerDied, checkpoint.CheckpointError)
         kind = type(error) if isinstance(error, kept) else ValueError
-        raise kind(f"{config.sentence(error).rstrip('.')}. {hint}") from error
+        raise kind(f"{sentence(error).rstrip('.')}. {hint}") from error

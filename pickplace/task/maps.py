@@ -4,6 +4,8 @@ Maps are kept with the batch last in memory, ``[W, D, N]``: what is done to them
 runs over the problems instead of over a row of a few cells.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -32,7 +34,7 @@ def windows(maps: Tensor, count: int) -> Tensor:
     return maps.unfold(0, count, 1).unfold(1, count, 1).permute(3, 4, 0, 1, 2)
 
 
-def rectangle(grid: tuple[int, int], x: Tensor, y: Tensor, w: Tensor, d: Tensor) -> Tensor:
+def rectangle(grid: Sequence[int], x: Tensor, y: Tensor, w: Tensor, d: Tensor) -> Tensor:
     """Return the cells of a grid inside the rectangle of size ``(w, d)`` at ``(x, y)``, bool ``[*grid, N]``."""
     column = torch.arange(grid[0], device=x.device)[:, None]
     row = torch.arange(grid[1], device=x.device)[:, None]

@@ -12,31 +12,40 @@ from pickplace.task.maps import rectangle
 
 
 class Failure(IntEnum):
-    """The reason why an episode ended. The checks run in the order 1 to 6, then ``OUT_OF_REACH``.
+    """The reason why an episode ended; 1 to 6 in the order of the checks."""
 
-    Attributes:
-        sentence: the reason for a reader who does not know the rules.
-        label: the same in a word or two.
-    """
+    NONE = 0
+    PICK_MISS = 1
+    BIN_COLLISION = 2
+    TOTE_COLLISION = 3
+    OVERFLOW = 4
+    ITEM_COLLISION = 5
+    UNSTABLE = 6
+    STUCK = 7
+    OUT_OF_REACH = 8  # judged after 1 to 6
 
-    sentence: str
-    label: str
+    @property
+    def sentence(self) -> str:
+        """The reason for a reader who does not know the rules."""
+        return _WORDS[self][0]
 
-    def __new__(cls, code: int, sentence: str = "", label: str = ""):
-        member = int.__new__(cls, code)
-        member._value_ = code
-        member.sentence, member.label = sentence, label
-        return member
+    @property
+    def label(self) -> str:
+        """The reason in a word or two."""
+        return _WORDS[self][1]
 
-    NONE = 0, "The item stream is over.", "stream over"
-    PICK_MISS = 1, "The gripper does not cover the item.", "missed the item"
-    BIN_COLLISION = 2, "The gripper would hit the bin's wall.", "hit the bin"
-    TOTE_COLLISION = 3, "The gripper or the item would hit the tote's wall.", "hit the tote"
-    OVERFLOW = 4, "The item would stick out of the tote.", "too high"
-    ITEM_COLLISION = 5, "The gripper would hit an item in the tote.", "hit an item"
-    UNSTABLE = 6, "The item would not rest stably.", "unstable"
-    STUCK = 7, "This item fits nowhere any more.", "no place left"
-    OUT_OF_REACH = 8, "The robot does not reach this pick or this place.", "out of reach"
+
+_WORDS = {
+    Failure.NONE: ("The item stream is over.", "stream over"),
+    Failure.PICK_MISS: ("The gripper does not cover the item.", "missed the item"),
+    Failure.BIN_COLLISION: ("The gripper would hit the bin's wall.", "hit the bin"),
+    Failure.TOTE_COLLISION: ("The gripper or the item would hit the tote's wall.", "hit the tote"),
+    Failure.OVERFLOW: ("The item would stick out of the tote.", "too high"),
+    Failure.ITEM_COLLISION: ("The gripper would hit an item in the tote.", "hit an item"),
+    Failure.UNSTABLE: ("The item would not rest stably.", "unstable"),
+    Failure.STUCK: ("This item fits nowhere any more.", "no place left"),
+    Failure.OUT_OF_REACH: ("The robot does not reach this pick or this place.", "out of reach"),
+}
 
 
 class Item(NamedTuple):
@@ -96,7 +105,7 @@ def heights_from_depth(tote_depth: Tensor, tote_height: Tensor) -> Tensor:
 
 def bin_depth_from_item(item: Item, bin_size: Sequence[int]) -> Tensor:
     """Return the height above the bin's floor, float32 ``[N, W_B, D_B]``: the item's height under it, else 0."""
-    inside = rectangle((bin_size[0], bin_size[1]), item.x, item.y, item.w, item.d)
+    inside = rectangle(bin_size, item.x, item.y, item.w, item.d)
     return (inside * item.h.float()).permute(2, 0, 1).contiguous()
 
 

@@ -14,7 +14,7 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 
 from pickplace.runs.checkpoint import CheckpointError
-from pickplace.runs.hydra_app import WorkerDied, missing_extra
+from pickplace.runs.errors import WorkerDied, missing_extra
 
 
 class ResumableCollector(Collector):

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from enum import Enum
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -12,7 +13,7 @@ from torch import Tensor
 from pickplace.planners.base import planner_parts
 from pickplace.policies.base import Policy
 from pickplace.runs import checkpoint
-from pickplace.runs.allowlist import trusted
+from pickplace.runs.allowlist import trusted_config
 from pickplace.runs.registry import build
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import whole_number
@@ -73,8 +74,8 @@ class WarmStart:
         trained = None
         if cfg.checkpoint is not None:
             state, facts = checkpoint.read(checkpoint.locate(str(cfg.checkpoint)))
-            trained_cfg = trusted(facts["config"], trust)
-            trained = (trained_cfg, state, OmegaConf.to_container(trained_cfg.env, resolve=True))
+            trained_cfg = trusted_config(facts["config"], trust)
+            trained = (trained_cfg, state, cast(dict, OmegaConf.to_container(trained_cfg.env, resolve=True)))
         try:
             return planner_parts(cfg.teacher, self.cell, items, terms, trained)
         except ValueError as error:
@@ -116,9 +117,3 @@ def imitation_loss(policy: Policy, data: TensorDictBase) -> tuple[Tensor, Tensor
     known = (taught >= 0).sum().clamp(min=1)
     agreed = (logits.argmax(-1) == taught).sum() / known
     return F.cross_entropy(logits, taught, ignore_index=-1, reduction="sum") / known, agreed
-
-
-def taught_by(cfg: dict) -> str | None:
-    """Return the name of the planner that a run with this saved config imitated, or None."""
-    start = cfg.get("warm_start") or {}
-    return start["teacher"]["_target_"].rpartition(".")[2] if start.get("frames") else None

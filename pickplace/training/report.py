@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.runs.hydra_app import begun_with, changed_since, own_configs
+from pickplace.runs.folder import changed_values, noted_config_folders, noted_overrides
 from pickplace.runs.loggers import read_csv
 from pickplace.task.cell import CellSpec
 from pickplace.views.figures import failure_mix
@@ -111,6 +111,7 @@ def level_table(rows: list[dict]) -> str:
 
 def _command(run_dir: Path, cfg: DictConfig) -> str:
     """The command that began the run, and the values that were changed when it was resumed."""
-    command = " ".join(["pickplace-train", *map(shlex.quote, [*own_configs(run_dir), *begun_with(run_dir)])])
-    changed = changed_since(run_dir, cfg)
+    words = [*noted_config_folders(run_dir), *noted_overrides(run_dir)]
+    command = " ".join(["pickplace-train", *map(shlex.quote, words)])
+    changed = changed_values(run_dir, cfg)
     return f"{command}\n\nChanged when it was resumed: {', '.join(changed)}" if changed else command

@@ -1,4 +1,4 @@
-"""Checks of a training config before anything is built, and the form in which checkpoints store it."""
+"""Checks of a training config before anything is built."""
 
 import logging
 from collections.abc import Callable
@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.runs.allowlist import own_modules, saved_form, trust_needed, trusted
-from pickplace.runs.resume import AT_HOME
+from pickplace.runs.allowlist import own_modules
 from pickplace.task.items import check_seed
 
 log = logging.getLogger(__name__)
@@ -50,7 +49,7 @@ EXPECTED = {
     "algo.loss": Expectation(lambda value: value in ("a2c", "ppo"), "ppo or a2c"),
     **dict.fromkeys(("algo.mask_infeasible", "algo.normalize_advantage"), SWITCH),
     "planner._target_": Expectation(
-        lambda value: value == "pickplace.planners.policy.PolicyPlanner",
+        lambda value: value == "policy",
         "planner=policy, since training validates its own policy",
     ),
     "evaluation.stream": Expectation(
@@ -84,22 +83,3 @@ def check_settings(cfg: DictConfig) -> None:
             "algo.normalize_advantage=True: a batch of one frame (env.num_envs x algo.rollout_length) has no variance; "
             "expected more frames, or false."
         )
-
-
-def checkpoint_config(cfg: DictConfig) -> tuple[dict, str]:
-    """Return the config as checkpoints store it, and the overrides that the user must repeat to resume one.
-
-    A config that could be saved but not loaded is reported now, not after hours of training.
-
-    Returns:
-        The config, and words such as `` trust=[own_model]`` with a leading space, or an empty string.
-    """
-    content = saved_form(cfg)
-    modules = trust_needed(OmegaConf.to_container(cfg, resolve=True))
-    try:
-        trusted(content, modules)
-    except ValueError as error:
-        log.warning("checkpoints of this run cannot be loaded again: %s", error)
-    values = {key: OmegaConf.select(cfg, key) for key in AT_HOME}
-    words = [f" {key}={value}" for key, value in values.items() if value not in AT_HOME[key]]
-    return content, "".join([f" trust=[{','.join(modules)}]" if modules else "", *words])

@@ -12,7 +12,9 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from pickplace.runs.checkpoint import read_facts
-from pickplace.runs.hydra_app import FAILURE, SweepCallback, begun_with, claimed, one_sentence
+from pickplace.runs.errors import one_sentence
+from pickplace.runs.folder import FAILURE, is_claimed, noted_overrides
+from pickplace.runs.hydra_app import SweepCallback
 from pickplace.runs.loggers import read_csv
 from pickplace.views.figures import figure_of
 
@@ -64,7 +66,7 @@ class SweepRun:
 
 def read_run(folder: Path) -> SweepRun:
     """Read a run folder, in whatever state the run left it."""
-    run = SweepRun(folder.name, dict(word.lstrip("+").partition("=")[::2] for word in begun_with(folder)))
+    run = SweepRun(folder.name, dict(word.lstrip("+").partition("=")[::2] for word in noted_overrides(folder)))
     facts = read_facts(folder, "last")
     if (folder / "metrics.csv").is_file():
         rows = read_csv(folder / "metrics.csv")
@@ -76,7 +78,7 @@ def read_run(folder: Path) -> SweepRun:
             run.validations = [{"frames": run.frames, **{f"eval/{key}": value for key, value in latest.items()}}]
     if (folder / FAILURE).is_file():
         run.status, run.error = "failed", (folder / FAILURE).read_text().strip()
-    elif claimed(folder):
+    elif is_claimed(folder):
         run.status = "running"
     else:  # the checkpoint's config first: a resumed run may have a larger budget
         cfg = OmegaConf.create(facts["config"]) if facts else OmegaConf.load(folder / ".hydra" / "config.yaml")

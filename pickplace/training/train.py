@@ -9,8 +9,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from pickplace.runs import checkpoint, hydra_app
-from pickplace.runs.resume import begun_already, claim, refuse_links, resumed_config
+from pickplace.runs import checkpoint
+from pickplace.runs.errors import one_sentence
+from pickplace.runs.folder import FAILURE, claim, refuse_links
+from pickplace.runs.hydra_app import command
+from pickplace.runs.resume import interrupted_run, resumed_config
 from pickplace.training.metrics import episode_metrics
 from pickplace.training.trainer import Trainer
 
@@ -33,7 +36,7 @@ def train(cfg: DictConfig, run_dir: Path) -> float:
     if cfg.resume is not None:
         raise ValueError(f"resume={cfg.resume}: expected as resume=<run folder> on the command line, without a +.")
     with claim(run_dir):
-        return run(cfg, run_dir, begun_already(cfg, run_dir))
+        return run(cfg, run_dir, interrupted_run(cfg, run_dir))
 
 
 def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None = None) -> float:
@@ -104,7 +107,7 @@ def resume_run(overrides: list[str]) -> float:
         log_file = run_dir / "train.log"
         handlers: list[logging.Handler] = [logging.StreamHandler(sys.stdout), logging.FileHandler(log_file)]
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
-        (run_dir / hydra_app.FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
+        (run_dir / FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
         return run(cfg, run_dir, (state, facts, folder))
 
@@ -113,12 +116,12 @@ def main() -> None:
     """Entry point of ``pickplace-train``."""
     overrides = [item for item in sys.argv[1:] if not item.startswith("-")]
     if any(item.startswith("resume=") and item not in ("resume=", "resume=null") for item in overrides):
-        with hydra_app.one_sentence():
+        with one_sentence():
             if len(overrides) < len(sys.argv) - 1:
                 raise ValueError("resume=...: expected only key=value overrides beside it, no flags such as -m.")
             resume_run(overrides)
     else:
-        hydra_app.command("train", train)
+        command("train", train)
 
 
 if __name__ == "__main__":

@@ -14,17 +14,19 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
-from pickplace.evaluation.evaluate import Episodes, commit, play, versions
+from pickplace.evaluation.evaluate import Episodes, play
 from pickplace.policies.base import Policy, as_collection_policy, as_critic
 from pickplace.runs import checkpoint
-from pickplace.runs.hydra_app import use_machine
+from pickplace.runs.machine import use_machine
+from pickplace.runs.provenance import commit, versions
 from pickplace.runs.registry import build
 from pickplace.runs.resume import (
     COUNTERS,
     StopRequest,
-    best_of_another_course,
+    checkpoint_config,
+    checkpoint_hint,
     load_optimizer,
-    saying_what_is_safe,
+    stale_best_frames,
 )
 from pickplace.training.collectors import rng_state, set_rng_state, watch_workers
 from pickplace.training.curriculum import Curriculum, push_level
@@ -32,7 +34,7 @@ from pickplace.training.imitation import Phase, WarmStart
 from pickplace.training.metrics import has_passed, progress_line, validation_metrics
 from pickplace.training.ppo import add_advantages, learning_rate, make_losses, update
 from pickplace.training.report import REPORT, write_report
-from pickplace.training.settings import check_settings, checkpoint_config
+from pickplace.training.settings import check_settings
 from pickplace.views.figures import learning_curve
 
 log = logging.getLogger(__name__)
@@ -106,7 +108,7 @@ class Trainer:
         self.curriculum.setup(self.min_tote_height, self.cell.tote_size[2], cfg.total_frames)
         if self.resumed:
             self.curriculum.load_state_dict(self.facts["curriculum"])
-            stale = best_of_another_course(self.run_dir, self.frames, self.saved_config)
+            stale = stale_best_frames(self.run_dir, self.frames, self.saved_config)
             if stale is not None:
                 self.best = COUNTERS["best"]
                 log.warning(
@@ -169,7 +171,7 @@ class Trainer:
                 self.curriculum.level,
                 self.curriculum.end,
             )
-            cleanup.enter_context(saying_what_is_safe(lambda: self.safe_folder, self.resume_overrides))
+            cleanup.enter_context(checkpoint_hint(lambda: self.safe_folder, self.resume_overrides))
             cleanup.enter_context(watch_workers(self.collector))
             yield stop
 
@@ -178,10 +180,10 @@ class Trainer:
         load_optimizer(self.optimizer, self.state.get("optimizer", {}))
         with watch_workers(self.collector):
             own = self.collector.state_dict()
-            self.collector.load_state_dict(checkpoint.fitting(self.state.get("collector"), own, "collector"))
+            self.collector.load_state_dict(checkpoint.matching_state(self.state.get("collector"), own, "collector"))
             push_level(self.collector, self.curriculum.level)
         # Last: everything above may have drawn.
-        set_rng_state(checkpoint.fitting(self.state, rng_state(self.device), "random generator"), self.device)
+        set_rng_state(checkpoint.matching_state(self.state, rng_state(self.device), "random generator"), self.device)
 
     def push_weights(self) -> None:
         """Send the newest weights to the collector's processes."""

@@ -1,48 +1,46 @@
-"""A model of one's own: a fully connected policy over all flat actions."""
+"""A policy of your own: a fully connected network over all flat actions."""
 
 import torch
 from torch import nn
 
-from pickplace.policies.actors import MASKED
+from pickplace.policies.base import MASKED, Policy
 from pickplace.policies.networks.depth import clip_depth
 
 
-class Mlp(nn.Module):
+class Mlp(Policy):
     """Two fully connected layers from both depth maps to the logits of all ``N_a`` flat actions.
 
     Args:
-        rules: the task's sizes; :class:`pickplace.Rules`.
-        mask_infeasible: choose among feasible actions only.
+        cell: the sizes; pickplace passes them.
+        mask_infeasible: choose among feasible actions only; pickplace passes ``algo.mask_infeasible``.
         hidden: width of the hidden layer.
     """
 
-    choice_key = "action"  # it chooses among flat actions, not among classes of them
-    excludes = None  # no action has probability 0 by construction
+    choice_key = "action"  # the choices are the flat actions
 
-    def __init__(self, rules, mask_infeasible: bool, hidden: int = 64):
-        super().__init__()
+    def __init__(self, cell, mask_infeasible: bool, hidden: int = 64):
+        super().__init__(cell)
+        if mask_infeasible:
+            self.masks = ("action",)  # the environment must compute it
+            self.in_keys = [*self.in_keys, "action_mask"]  # and `logits` reads it
         self.mask_infeasible = mask_infeasible
-        self.masks = ("action",) if mask_infeasible else ()  # what the environment must emit
-        self.in_keys = ["bin_depth", "tote_depth", *["action_mask"] * mask_infeasible]  # what forward reads
-        cells = rules.num_picks + rules.num_places
-        self.network = nn.Sequential(nn.Linear(cells, hidden), nn.ReLU(), nn.Linear(hidden, rules.num_actions))
-        # It sees every cell. The check of eq. 2 and 3 asks for the side of a square, at most the shortest side.
-        self.network.receptive_field = min(*rules.bin_size[:2], *rules.tote_size[:2])
+        inputs = cell.num_picks + cell.num_places
+        self.network = nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, cell.num_actions))
 
-    def forward(self, bin_depth, tote_depth, action_mask=None):
-        """Logits, float32 ``[N, N_a]``."""
-        maps = torch.cat([bin_depth.flatten(1), clip_depth(tote_depth, 5).flatten(1)], 1)
-        logits = self.network(maps)
-        return logits if action_mask is None else torch.where(action_mask, logits, MASKED)
+    def scores(self, observation):
+        """Return a score for each flat action, float32 ``[N, N_a]``."""
+        maps = observation["bin_depth"], clip_depth(observation["tote_depth"], 5)
+        return self.network(torch.cat([depth.flatten(1) for depth in maps], 1))
 
-    def to_action(self, choice, *_):
-        """A flat action of the chosen class: here the choice itself."""
+    def logits(self, observation):
+        scores = self.scores(observation)
+        return torch.where(observation["action_mask"], scores, MASKED) if self.mask_infeasible else scores
+
+    def to_action(self, choice, observation):
         return choice
 
-    def to_choice(self, action, *_):
-        """The class of a flat action: here the action itself."""
+    def to_choice(self, action, observation):
         return action
 
-    def action_log_probs(self, bin_depth, tote_depth):
-        """Log-probabilities of all flat actions without any mask, ``[N, N_a]``."""
-        return self(bin_depth, tote_depth).log_softmax(-1)
+    def action_log_probs(self, observation):
+        return self.scores(observation).log_softmax(-1)

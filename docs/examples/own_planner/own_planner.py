@@ -1,31 +1,35 @@
-"""A planner of one's own: puts the item where its top stays low and near the tote's first corner."""
+"""A planner of your own: low placements, drawn at random."""
 
 import torch
 
+from pickplace.task.feasibility import first_action_reaching, footprint_mask, placing_maps
+from pickplace.task.state import State
 
-class Corner:
-    """Minimises ``height_weight * top + x + y`` of the footprint, over everything that is feasible.
+
+class SoftDBL:
+    """Draw a feasible footprint with probability ``softmax(-cost / temperature)``; deepest-bottom-left costs least.
+
+    The cost is the height of the item's top, and within a height the distance to the tote's first corner.
 
     Args:
-        rules: the task's sizes; :class:`pickplace.Rules`. Every planner gets them.
-        height_weight: what one cell of height counts against one cell of distance.
+        cell: the sizes; pickplace passes them.
+        temperature: height units; near 0 the cheapest footprint is almost always drawn.
+        seed: of the planner's own generator.
     """
 
-    name = "corner"  # in tables and in evaluation.json
+    name = "soft_dbl"  # shown in tables and in evaluation.json
 
-    def __init__(self, rules, height_weight: float = 10):
-        self.rules, self.height_weight = rules, height_weight
+    def __init__(self, cell, temperature: float = 0.05, seed: int = 0):
+        self.cell, self.temperature = cell, temperature
+        self.generator = torch.Generator().manual_seed(seed)
 
     def decide(self, observation):
-        """Flat actions, int64 ``[N]``, for the depth maps of ``N`` problems."""
-        rules = self.rules
-        maps = (observation[key] for key in ("bin_depth", "tote_depth", "tote_height"))
-        placements = rules.placements_from_depth(*maps)
-        feasible = rules.outcome_mask(placements)  # bool [N, Q, W_T, D_T]: footprints that some action reaches
-        tote_w, tote_d, _ = rules.tote_size
-        distance = torch.arange(tote_w)[:, None] + torch.arange(tote_d)
-        cost = self.height_weight * placements.top + distance.to(placements.top.device)
-        outcome = torch.where(feasible, cost, torch.inf).flatten(1).argmin(1)
-        # Several (pick, place, rotation) may lead to the same footprint: the one with the lowest flat index.
-        actions = rules.actions_reaching(placements, outcome)  # int64 [N, M], -1 where there is none
-        return torch.where(actions >= 0, actions, rules.num_actions - 1).amin(1)
+        """Return flat actions, int64 ``[N]``."""
+        cell, (wide, deep, _) = self.cell, self.cell.tote_size
+        maps = placing_maps(cell, State.from_observation(observation))
+        feasible = footprint_mask(cell, maps).flatten(1)  # bool [N, Q * W_T * D_T]: footprints that some action reaches
+        y, x = torch.arange(deep), torch.arange(wide)[:, None]
+        cost = (maps.top + (y * wide + x) / cell.num_places).flatten(1)  # [N, Q * W_T * D_T]
+        weight = torch.where(feasible, -cost / self.temperature, -torch.inf).softmax(1)
+        footprint = torch.multinomial(weight, 1, generator=self.generator)[:, 0]
+        return first_action_reaching(cell, maps, footprint)

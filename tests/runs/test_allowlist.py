@@ -1,39 +1,35 @@
-"""What a checkpoint's config may make: pickplace's own, each in its place, and what a user says he trusts."""
+"""What a checkpoint's config may make: pickplace's own classes, each in its place, and what a user trusts."""
 
+import copy
+import functools
+import itertools
 import json
 import os
-import subprocess
 import sys
 
 import pytest
-from hydra import compose, initialize_config_dir
+from commands import composed, options
 from omegaconf import OmegaConf
 
 from pickplace import Planner
 from pickplace.runs import checkpoint
-from pickplace.runs import hydra_app as config
 from pickplace.runs.allowlist import (
-    TRAINED_WITH,
+    REQUIRED_KEYS,
+    modules_to_trust,
     own_modules,
     refuse_foreign_targets,
-    saved_form,
-    trust_needed,
-    trusted,
+    trusted_config,
 )
-from pickplace.runs.resume import refuse_links, resumed_config
-from pickplace.training.settings import checkpoint_config
+from pickplace.runs.folder import refuse_links
+from pickplace.runs.references import saved_form
 
-SHIPPED = config.PACKAGE / "pretrained" / "r4"
-
-
-def composed(*overrides):
-    with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
-        return compose("train", list(overrides))
+SHIPPED = checkpoint.PRETRAINED / "r4"
+original = functools.cache(lambda: saved_form(composed("experiment=quick")))
 
 
 def changed(**values):
     """The config of a training with values put into it, by their places with ``__`` for the dots."""
-    content = saved_form(composed("experiment=quick"))
+    content = copy.deepcopy(original())
     for place, value in values.items():
         *parents, last = place.split("__")
         node = content
@@ -65,7 +61,8 @@ def mine(tmp_path, monkeypatch):
     "target",
     [
         "os.system", "pickplace.runs.checkpoint.shutil.rmtree", "builtins.eval", "pickplace", None, 5,
-        "pickplace.evaluation.export.export", "pickplace.runs.checkpoint.write", "${planner._target_}", ["os.system"], "",
+        "pickplace.evaluation.export.export", "pickplace.runs.checkpoint.write", "${planner._target_}", ["os.system"],
+        "", "pickplace.task.items.Kinds", "joint_dbl", "items/kinds",
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("place", ["env", "model.actor", "curriculum.advance", "collector"])
@@ -73,17 +70,18 @@ def test_foreign_targets_are_refused(target, place):
     node = {"_target_": target}
     for key in reversed(place.split(".")):
         node = {key: node}
-    with pytest.raises(ValueError, match="checkpoint is refused; expected one of pickplace"):
+    with pytest.raises(ValueError, match=rf"{place}\._target_=.*: the checkpoint is refused; expected one of \w+"):
         refuse_foreign_targets(node)
 
 
 @pytest.mark.parametrize(
     "node",
     [
-        {"model": {"actor": {"hidden": {"_target_": "pickplace.task.items.Kinds"}}}},
-        {"items": {"kinds": [[{"_target_": "pickplace.task.items.Kinds"}]]}},
-        {"_target_": "pickplace.task.items.Kinds"},
-        {"model": [{"_target_": "pickplace.policies.actors.fcn4d"}]},
+        {"model": {"actor": {"hidden": {"_target_": "kinds"}}}},
+        {"items": {"kinds": [[{"_target_": "kinds"}]]}},
+        {"_target_": "kinds"},
+        {"model": [{"_target_": "fcn4d"}]},
+        {"model": {"actor": {"hidden": {"_target_": "items/kinds"}}}},
     ],
 )
 def test_targets_in_other_places_are_refused(node):
@@ -93,52 +91,64 @@ def test_targets_in_other_places_are_refused(node):
 
 def test_our_own_configs_are_accepted():
     groups = ("env", "items", "model", "curriculum", "curriculum/advance", "curriculum/sample", "collector", "logger")
-    for group in (*groups, "warm_start"):
-        folder = config.conf_dir() / group
-        for path in folder.glob("*.yaml"):
-            values = ["items.path=items.csv"] if path.stem == "recorded" else []
-            cfg = composed(f"{group}={path.stem}", *values)
-            assert trusted(saved_form(cfg)).env == cfg.env
+    for names in itertools.zip_longest(*map(options, (*groups, "warm_start"))):
+        choices = [f"{group}={name}" for group, name in zip((*groups, "warm_start"), names, strict=True) if name]
+        values = ["items.path=items.csv"] if "items=recorded" in choices else []
+        cfg = composed(*choices, *values)
+        assert trusted_config(saved_form(cfg)).env == cfg.env
 
 
 EVIL = json.dumps({"_target_": "torch.load", "f": "evil.pt", "weights_only": False})
+FILTERS = "model__actor__filters"
 HIDDEN = {
-    "a resolver": {"model__actor__filters": "${oc.env:HOME}"},
+    "a resolver": {FILTERS: "${oc.env:HOME}"},
     "a resolver whose name is a reference": {"model__actor": "${${k}:${s}}", "k": "oc.create", "s": EVIL},
-    "one in a value": {"model__actor__filters": "${${k}:${s}}", "k": "oc.create", "s": EVIL},
+    "one in a value": {FILTERS: "${${k}:${s}}", "k": "oc.create", "s": EVIL},
     "one in text": {"items__path": "data/${oc.env:HOME}"},
     "a reference in text": {"items__path": "data/${seed}"},
     "an escaped reference": {"items__path": "\\${seed}"},
-    "a reference to what may be made elsewhere": {"model__actor__filters": "${logger}"},
-    "a reference to what may not be made": {"model__actor__filters": "${evil}", "evil": {"_target_": "os.system"}},
-    "a reference to a part": {"model__actor__filters": "${algo}"},
-    "a list of parts": {"model__actor__filters": "${parts}", "parts": [[1], [2]]},
+    "a reference to what may be made elsewhere": {FILTERS: "${logger}"},
+    "a reference to what may not be made": {FILTERS: "${evil}", "evil": {"_target_": "os.system"}},
+    "a reference to a part": {FILTERS: "${algo}"},
+    "a list of parts": {FILTERS: "${parts}", "parts": [[1], [2]]},
     "a reference as what is made": {"model__actor___target_": "${evil}", "evil": "os.system"},
-    "a reference to a reference": {"model__actor__filters": "${a}", "a": "${seed}"},
-    "a reference through a reference": {"model__actor__filters": "${a.seed}", "a": "${env}"},
-    "a long text": {"model__actor__filters": "${text}", "text": "x" * 1001},
-    "a long list": {"model__actor__filters": "${many}", "many": list(range(101))},
+    "a reference to a reference": {FILTERS: "${a}", "a": "${seed}"},
+    "a reference through a reference": {FILTERS: "${a.seed}", "a": "${env}"},
+    "a long text": {FILTERS: "${text}", "text": "x" * 1001},
+    "a long list": {FILTERS: "${many}", "many": list(range(101))},
     "copies of copies": {f"a{n}": {"x": f"${{a{n - 1}}}", "y": f"${{a{n - 1}}}"} for n in range(1, 60)} | {"a0": {}},
-    "a circle": {"model__actor__filters": "${model.actor.filters}"},
-    "nothing there": {"model__actor__filters": "${nowhere}"},
+    "a circle": {FILTERS: "${model.actor.filters}"},
+    "nothing there": {FILTERS: "${nowhere}"},
 }
 
 
 @pytest.mark.parametrize("name", HIDDEN)
 def test_what_interpolations_hide_is_refused(name):
-    with pytest.raises(ValueError, match="refused|cannot be read"):
-        trusted(changed(**HIDDEN[name]))
+    with pytest.raises(
+        ValueError, match="refused; expected (no interpolation but a reference to a number|one of fcn_grasp)"
+    ):
+        trusted_config(changed(**HIDDEN[name]))
+
+
+def test_references_that_double_at_every_step_are_refused_at_once():
+    """OmegaConf would follow 2^35 of them."""
+    steps = {"p0": "${Z}", "q0": "${Y}", "Z": {}, "Y": {}}
+    for i in range(1, 36):
+        steps |= {f"p{i}": f"${{q{i - 1}.x{i - 1}}}", f"q{i}": f"${{p{i - 1}.x{i - 1}}}"}
+    for i in range(35):
+        steps["Z"][f"x{i}"], steps["Y"][f"x{i}"] = f"${{q{i}}}", f"${{p{i}}}"
+    with pytest.raises(ValueError, match="expected no interpolation"):
+        trusted_config(changed(**steps, a="${p35}"))
 
 
 def test_references_to_values_follow_what_they_lead_to():
-    content = changed(model__actor__filters="${seed}", items__kinds="${algo.kinds}", algo__kinds=[1, 2], seed=32)
-    cfg = trusted(content)
+    cfg = trusted_config(changed(**{FILTERS: "${seed}"}, items__kinds="${algo.kinds}", algo__kinds=[1, 2], seed=32))
     assert cfg.model.actor.filters == 32 and cfg["items"].kinds == [1, 2]
 
 
 @pytest.mark.parametrize("command", ["load", "evaluate", "resume"])
-def test_a_checkpoint_that_hides_a_pickle_runs_nothing(command, tmp_path):
-    """With a whole checksum: nothing but its config is bad."""
+def test_a_checkpoint_that_hides_a_pickle_runs_nothing(command, run, tmp_path):
+    """With a right checksum: nothing but its config is bad."""
     folder = tmp_path / "run" / "checkpoints" / "last"
     folder.mkdir(parents=True)
     (folder / checkpoint.TENSORS).write_bytes((SHIPPED / checkpoint.TENSORS).read_bytes())
@@ -150,13 +160,12 @@ def test_a_checkpoint_that_hides_a_pickle_runs_nothing(command, tmp_path):
     facts |= {"curriculum": {}, "iteration": 1, "best": 0.5, "latest": {}}
     (folder / checkpoint.FACTS).write_text(json.dumps(facts))
     if command == "load":
-        with pytest.raises(ValueError, match="no resolver"):
+        with pytest.raises(ValueError, match="no interpolation"):
             Planner.load(folder)
     else:
-        module, key = {"evaluate": ("evaluation.evaluate", "checkpoint"), "resume": ("training.train", "resume")}[command]
-        words = [sys.executable, "-m", f"pickplace.{module}", f"{key}={folder}"]
-        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
-        assert done.returncode == 2 and "no resolver" in done.stderr
+        name, key = {"evaluate": ("evaluate", "checkpoint"), "resume": ("train", "resume")}[command]
+        code, _, err = run(name, f"{key}={folder}")
+        assert code == 2 and "no interpolation" in err
     assert not (tmp_path / "pwned").exists()
 
 
@@ -168,7 +177,7 @@ def test_a_checkpoint_that_hides_a_pickle_runs_nothing(command, tmp_path):
     ],
 )  # fmt: skip
 def test_what_a_trusted_module_defines_may_be_made_anywhere(target, trust, mine):
-    trusted(changed(model__actor___target_=target, model__actor__part={"_target_": target}), trust)
+    trusted_config(changed(model__actor___target_=target, model__actor__part={"_target_": target}), trust)
 
 
 @pytest.mark.parametrize(
@@ -181,19 +190,28 @@ def test_what_a_trusted_module_defines_may_be_made_anywhere(target, trust, mine)
 )  # fmt: skip
 def test_trust_goes_no_further_than_what_its_modules_define(target, mine):
     with pytest.raises(ValueError, match="checkpoint is refused"):
-        trusted(changed(model__actor___target_=target, evil="load"), ["mine", "mypkg"])
+        trusted_config(changed(model__actor___target_=target, evil="load"), ["mine", "mypkg"])
+
+
+def test_parts_of_pickplace_within_what_is_trusted(mine):
+    inner = {"_target_": "items/kinds", "kinds": [[1, 1, 1]]}
+    trusted_config(changed(items={"_target_": "mine.make", "base": inner}), ["mine"])
+    for target in ("os.system", "torch.load", "kinds", "item/kinds"):
+        with pytest.raises(ValueError, match=f"items.base._target_='{target}'.*such as items/kinds"):
+            trusted_config(changed(items={"_target_": "mine.make", "base": {"_target_": target}}), ["mine"])
 
 
 def test_a_trusted_module_that_is_not_there(mine):
     with pytest.raises(ValueError, match="trust=nowhere: it cannot be imported .*; expected it on PYTHONPATH"):
-        trusted(changed(model__actor___target_="nowhere.Net"), ["nowhere"])
+        trusted_config(changed(model__actor___target_="nowhere.Net"), ["nowhere"])
 
 
 def test_the_refusal_says_what_to_type():
     with pytest.raises(ValueError, match=r"if mypkg\.nets is yours, say trust=mypkg\.nets \(--trust mypkg\.nets to"):
-        trusted(changed(model__actor___target_="mypkg.nets.Net"))
-    with pytest.raises(ValueError, match=r"expected one of [^;]*\.$"):  # nobody should trust these
-        trusted(changed(model__actor___target_="os.system"))
+        trusted_config(changed(model__actor___target_="mypkg.nets.Net"))
+    for target in ("os.system", "sympy.sympify"):  # nobody should trust these
+        with pytest.raises(ValueError, match=r"expected one of [^;]*\.$"):
+            trusted_config(changed(model__actor___target_=target))
 
 
 @pytest.mark.parametrize(
@@ -207,14 +225,12 @@ def test_trust_in_what_is_nobodys_own_is_refused(trust):
 
 def test_names_of_modules():
     assert own_modules(None) == own_modules([]) == ()
-    assert own_modules("mine") == ("mine",) and own_modules(OmegaConf.create(["mine", "my.nets"])) == (
-        "mine",
-        "my.nets",
-    )
+    assert own_modules("mine") == ("mine",)
+    assert own_modules(OmegaConf.create(["mine", "my.nets"])) == ("mine", "my.nets")
 
 
 def test_what_is_saved(monkeypatch):
-    """References stay, resolvers are worked out, and trust is not handed on."""
+    """References stay, resolvers are resolved, and trust is not saved."""
     monkeypatch.setenv("DATA", "/data")
     path = "items.path='${oc.env:DATA}/items.csv'"
     cfg = composed("items=recorded", path, "total_frames=${seed}", "seed=7", "trust=[mine]", "+algo.part=${evaluation}")
@@ -222,37 +238,14 @@ def test_what_is_saved(monkeypatch):
     assert saved["items"]["path"] == "/data/items.csv" and saved["total_frames"] == "${seed}" and saved["trust"] == []
     assert saved["algo"]["part"]["stream"] == "validation"
     assert saved["model"]["critic"]["tote_clip"] == "${..actor.tote_clip}"
-    assert trusted(saved).total_frames == 7
+    assert trusted_config(saved).total_frames == 7
 
 
-def test_what_to_say_to_load_a_run_again():
-    assert trust_needed(saved_form(composed())) == ()
+def test_modules_to_trust():
+    assert modules_to_trust(original()) == ()
     changes = {"model__actor___target_": "my.nets.Net", "items___target_": "mine.Items"}
-    changes["algo__more"] = [{"_target_": "mine.Items"}, {"_target_": "torch.nn.ReLU"}]
-    assert trust_needed(changed(**changes)) == ("mine", "my.nets")
-
-
-def test_references_that_double_at_every_step_are_refused_at_once():
-    """OmegaConf would follow 2^35 of them."""
-    steps = {"p0": "${Z}", "q0": "${Y}", "Z": {}, "Y": {}}
-    for i in range(1, 36):
-        steps |= {f"p{i}": f"${{q{i - 1}.x{i - 1}}}", f"q{i}": f"${{p{i - 1}.x{i - 1}}}"}
-    for i in range(35):
-        steps["Z"][f"x{i}"], steps["Y"][f"x{i}"] = f"${{q{i}}}", f"${{p{i}}}"
-    with pytest.raises(ValueError, match="expected a reference to"):
-        trusted(changed(**steps, a="${p35}"))
-
-
-def test_parts_of_pickplace_within_what_is_trusted(mine):
-    inner = {"_target_": "pickplace.task.items.Kinds", "kinds": [[1, 1, 1]]}
-    trusted(changed(items={"_target_": "mine.make", "base": inner}), ["mine"])
-    with pytest.raises(ValueError, match="items.base._target_='os.system'"):
-        trusted(changed(items={"_target_": "mine.make", "base": {"_target_": "os.system"}}), ["mine"])
-
-
-def test_nobody_is_told_to_trust_an_installed_package():
-    with pytest.raises(ValueError, match=r"expected one of [^;]*\.$"):
-        trusted(changed(model__actor___target_="sympy.sympify"))
+    changes["algo__more"] = [{"_target_": "mine.Items"}, {"_target_": "torch.nn.ReLU"}, {"_target_": "items/kinds"}]
+    assert modules_to_trust(changed(**changes)) == ("mine", "my.nets")
 
 
 @pytest.mark.parametrize(
@@ -264,31 +257,25 @@ def test_nobody_is_told_to_trust_an_installed_package():
 )  # fmt: skip
 def test_numbers_that_would_take_all_memory_are_refused(place, value):
     with pytest.raises(ValueError, match=f"{place.replace('__', '.')}=.*: the checkpoint is refused; expected at most"):
-        trusted(changed(**{place: value}))
+        trusted_config(changed(**{place: value}))
 
 
 @pytest.mark.parametrize("seed", ["\x1b[31m", None, True, 1.5])
 def test_a_seed_is_a_whole_number(seed):
     with pytest.raises(ValueError, match="seed"):
-        trusted(changed(seed=seed))
+        trusted_config(changed(seed=seed))
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "harmless"),
-    [
-        ("collector.address", "ray://192.0.2.1:1", "local"),
-        ("logger.uri", "http://192.0.2.1", "null"),
-        ("logger.offline", False, "true"),
-    ],
-)
-def test_a_checkpoint_reaches_other_machines_only_if_the_user_says_so_again(key, value, harmless):
-    content = changed(**{key.replace(".", "__"): value})
-    facts = {"config": content, "curriculum": {}, "frames": 5, "iteration": 1, "best": 0.5, "latest": {}}
-    with pytest.raises(ValueError, match=f"{key}={value}: the checkpoint would reach out .* or {key}={harmless}"):
-        resumed_config("run", facts, [])
-    assert OmegaConf.select(resumed_config("run", facts, [f"{key}={harmless}"]), key) != value
-    _, again = checkpoint_config(OmegaConf.create(content))  # what a stopped run prints is enough
-    assert OmegaConf.select(resumed_config("run", facts, again.split()), key) == value
+@pytest.mark.parametrize("key", REQUIRED_KEYS)
+def test_a_config_that_no_training_wrote(key):
+    content = changed()
+    *parents, last = key.split(".")
+    node = content
+    for parent in parents:
+        node = node[parent]
+    del node[last]
+    with pytest.raises(ValueError, match=f"no {key}"):
+        trusted_config(content)
 
 
 @pytest.mark.parametrize(
@@ -305,27 +292,3 @@ def test_a_run_folder_with_links_is_not_resumed(name, tmp_path):
         (tmp_path / "run" / name).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(ValueError, match=f"{name}: a link or no regular file"):
         refuse_links(tmp_path / "run")
-
-
-def test_notes_of_a_run_are_read_as_they_stand(tmp_path, monkeypatch):
-    monkeypatch.setenv("MY_SECRET", "secret")
-    (tmp_path / ".hydra").mkdir()
-    (tmp_path / ".hydra" / "overrides.yaml").write_text("- seed=1\n- a='${oc.env:MY_SECRET}'\n- [nested]\n- 5\n")
-    assert config.begun_with(tmp_path) == ["seed=1", "a='${oc.env:MY_SECRET}'"]
-    assert config.begun_with(tmp_path / "nowhere") == []
-
-
-def test_errors_hold_nothing_that_a_terminal_obeys():
-    assert config.sentence(ValueError("bad \x1b[31m key\x07")) == "bad \\x1b[31m key\\x07"
-
-
-@pytest.mark.parametrize("key", TRAINED_WITH)
-def test_a_config_that_no_training_wrote(key):
-    content = changed()
-    *parents, last = key.split(".")
-    node = content
-    for parent in parents:
-        node = node[parent]
-    del node[last]
-    with pytest.raises(ValueError, match=f"no {key}"):
-        trusted(content)

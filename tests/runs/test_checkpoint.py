@@ -15,7 +15,6 @@ from safetensors.torch import save
 
 from pickplace.runs import checkpoint
 from pickplace.runs.checkpoint import CheckpointError
-from pickplace.runs.loggers import CsvLogger, read_csv
 
 leaves = st.one_of(
     st.integers(-(2**40), 2**40),
@@ -49,77 +48,83 @@ def test_round_trip(tree, tmp_path_factory):
     assert facts["frames"] == 3
 
 
+def write(folder, value=0.0, frames=1):
+    """Write a small checkpoint."""
+    checkpoint.write(folder, {"policy": {}, "x": torch.full((2,), value)}, {"frames": frames, "config": {}})
+    return folder
+
+
 def test_a_kill_between_the_renames_loses_nothing(tmp_path):
-    run = tmp_path / "run"
-    folder = run / "checkpoints" / "last"
-    checkpoint.write(folder, {"policy": {}, "x": torch.ones(2)}, {"frames": 1, "config": {}})
+    folder = write(tmp_path / "run" / "checkpoints" / "last")
     folder.rename(folder.with_name(".last.old"))  # killed right after this
-    found = checkpoint.locate(run, prefer="last")
-    assert checkpoint.read(found)[1]["frames"] == 1
-    checkpoint.write(folder, {"policy": {}, "x": torch.zeros(2)}, {"frames": 2, "config": {}})
-    assert checkpoint.read(checkpoint.locate(run, prefer="last"))[1]["frames"] == 2
+    assert checkpoint.read(checkpoint.locate(tmp_path / "run", prefer="last"))[1]["frames"] == 1
+    write(folder, frames=2)
+    assert checkpoint.read(checkpoint.locate(tmp_path / "run", prefer="last"))[1]["frames"] == 2
     assert [path.name for path in folder.parent.iterdir()] == ["last"]
 
 
-def test_a_kill_while_writing_leaves_the_old_one(tmp_path, monkeypatch):
-    folder = tmp_path / "last"
-    checkpoint.write(folder, {"policy": {}, "x": torch.ones(2)}, {"frames": 1, "config": {}})
+def test_a_full_disk_leaves_the_old_one(tmp_path, monkeypatch):
+    folder = write(tmp_path / "last")
 
     def full(*_):
         raise OSError("No space left on device")
 
     monkeypatch.setattr(checkpoint.os, "fsync", full)
     with pytest.raises(CheckpointError, match="cannot be written .No space left on device"):
-        checkpoint.write(folder, {"policy": {}, "x": torch.zeros(2)}, {"frames": 2, "config": {}})
+        write(folder, frames=2)
     assert [path.name for path in tmp_path.iterdir()] == ["last"]
     monkeypatch.undo()
     assert checkpoint.read(folder)[1]["frames"] == 1
-    checkpoint.write(folder, {"policy": {}, "x": torch.zeros(2)}, {"frames": 3, "config": {}})
+    write(folder, frames=3)
     assert [path.name for path in tmp_path.iterdir()] == ["last"]
 
 
 def test_locate_knows_runs_and_checkpoints(tmp_path):
-    checkpoint.write(tmp_path / "checkpoints" / "best", {}, {})
-    checkpoint.write(tmp_path / "checkpoints" / "last", {}, {})
+    saved = tmp_path / "checkpoints"
+    for name in ("best", "last", "previous"):
+        checkpoint.write(saved / name, {}, {})
     assert checkpoint.locate(tmp_path).name == "best"
     assert checkpoint.locate(tmp_path, prefer="last").name == "last"
-    assert checkpoint.locate(tmp_path / "checkpoints" / "last").name == "last"
+    assert checkpoint.locate(saved / "last").name == "last"
     with pytest.raises(CheckpointError, match="no checkpoint there"):
         checkpoint.locate(tmp_path / "elsewhere")
+    shutil.rmtree(saved / "last")
+    assert checkpoint.locate(tmp_path, prefer="last").name == "best"
+    shutil.rmtree(saved / "best")
+    with pytest.raises(CheckpointError, match="no best checkpoint there; expected checkpoint=.*/previous"):
+        checkpoint.locate(tmp_path)
 
 
 def test_a_reader_that_comes_between_the_files_reads_again(tmp_path, monkeypatch):
-    facts = {"frames": 1, "config": {}}
-    checkpoint.write(tmp_path / "last", {"policy": {"w": torch.zeros(3)}}, facts)
-    load, times = checkpoint.load, []
+    folder = write(tmp_path / "last")
+    load, calls = checkpoint.load, []
 
     def replaced(blob):
-        times.append(1)
-        if len(times) == 1:
-            checkpoint.write(tmp_path / "last", {"policy": {"w": torch.ones(3)}}, facts)
+        calls.append(1)
+        if len(calls) == 1:
+            write(folder, value=1.0, frames=2)
             raise ValueError("altered")
         return load(blob)
 
     monkeypatch.setattr(checkpoint, "load", replaced)
-    assert checkpoint.read(tmp_path / "last")[1]["frames"] == 1
+    assert checkpoint.read(folder)[1]["frames"] == 2
 
 
 def test_restore_names_what_does_not_fit():
     def make():
         return torch.nn.Linear(2, 3)
 
-    state = torch.nn.Linear(2, 3).state_dict()
+    state = make().state_dict()
     assert torch.equal(checkpoint.restore(make, state, "policy").weight, state["weight"])
-    with pytest.raises(CheckpointError, match=r"policy does not fit .* weight is float32 of shape \(4, 2\)"):
-        checkpoint.restore(make, torch.nn.Linear(2, 4).state_dict() | {"bias": torch.zeros(3)}, "policy")
-    with pytest.raises(CheckpointError, match="bias is missing"):
-        checkpoint.restore(make, {"weight": torch.zeros(3, 2)}, "policy")
-    with pytest.raises(CheckpointError, match="bias is int, expected float32"):
-        checkpoint.restore(make, {"weight": torch.zeros(3, 2), "bias": 3}, "policy")
-    with pytest.raises(CheckpointError, match="more is not expected"):
-        checkpoint.restore(make, {**state, "more": torch.zeros(1)}, "policy")
-    with pytest.raises(CheckpointError, match="policy is of no use: bias holds values.* not finite"):
-        checkpoint.restore(make, {**state, "bias": torch.full((3,), float("nan"))}, "policy")
+    for bad, words in (
+        ({"weight": torch.zeros(4, 2)}, r"policy does not fit .* weight is float32 of shape \(4, 2\)"),
+        ({"bias": None}, "bias is missing"),
+        ({"bias": 3}, "bias is int, expected float32"),
+        ({"more": torch.zeros(1)}, "more is not expected"),
+        ({"bias": torch.full((3,), float("nan"))}, "policy is of no use: bias holds values.* not finite"),
+    ):
+        with pytest.raises(CheckpointError, match=words):
+            checkpoint.restore(make, {**state, **bad}, "policy")
 
 
 def test_a_config_that_asks_for_more_memory_than_there_is_takes_none():
@@ -128,19 +133,12 @@ def test_a_config_that_asks_for_more_memory_than_there_is_takes_none():
 
 
 @pytest.mark.parametrize("name", [checkpoint.FACTS, checkpoint.TENSORS])
-def test_links_are_refused(tmp_path, name):
-    folder = tmp_path / "last"
-    checkpoint.write(folder, {"policy": {}}, {"frames": 1, "config": {}})
+def test_links_are_refused_and_a_pipe_does_not_block(tmp_path, name):
+    folder = write(tmp_path / "last")
     (folder / name).rename(tmp_path / name)
     (folder / name).symlink_to(tmp_path / name)
-    with pytest.raises(CheckpointError, match=f"{name} is a link"):
+    with pytest.raises(CheckpointError, match=f"^{folder}: {name} is a link or no file"):
         checkpoint.read(folder)
-
-
-@pytest.mark.parametrize("name", [checkpoint.FACTS, checkpoint.TENSORS])
-def test_a_pipe_is_not_waited_for(tmp_path, name):
-    folder = tmp_path / "last"
-    checkpoint.write(folder, {"policy": {}}, {"frames": 1, "config": {}})
     (folder / name).unlink()
     os.mkfifo(folder / name)
     with pytest.raises(CheckpointError, match=f"{name} is a link or no file"):
@@ -158,8 +156,7 @@ def test_a_pipe_is_not_waited_for(tmp_path, name):
     ],
 )
 def test_tensors_of_absurd_types_and_sizes(tmp_path, tensor):
-    folder = tmp_path / "last"
-    checkpoint.write(folder, {"policy": {}}, {"frames": 1, "config": {}})
+    folder = write(tmp_path / "last")
     header = json.dumps({"policy|x": tensor}).encode()
     blob = struct.pack("<Q", len(header)) + header + bytes(tensor["data_offsets"][1] % 64)
     facts = json.loads((folder / checkpoint.FACTS).read_text())
@@ -183,7 +180,7 @@ class Evil:
 @pytest.mark.parametrize("name", [checkpoint.TENSORS, checkpoint.FACTS, "state.pt", "checkpoint.pkl", ""])
 def test_a_pickle_is_never_run_whatever_its_name(tmp_path, name):
     folder, made = tmp_path / "run" / "checkpoints" / "last", tmp_path / "made"
-    checkpoint.write(folder, {"policy": {}}, {"frames": 1, "config": {}})
+    write(folder)
     blob = pickle.dumps(Evil(made))
     assert pickle.loads(blob) and made.unlink() is None  # it would
     if name == checkpoint.TENSORS:  # with the right checksum
@@ -246,31 +243,34 @@ def test_whatever_a_checkpoint_holds_it_is_read_or_refused(tmp_path_factory, fac
 
 @pytest.mark.parametrize("text", ["[" * 200_000, '{"a":' * 200_000, '{"frames": ' + "9" * 10_000 + "}", "\xff", ""])
 def test_facts_that_are_no_facts(tmp_path, text):
-    folder = tmp_path / "last"
-    checkpoint.write(folder, {"policy": {}}, {"frames": 1, "config": {}})
+    folder = write(tmp_path / "last")
     (folder / checkpoint.FACTS).write_bytes(text.encode("latin-1"))
     with pytest.raises(CheckpointError, match="cannot be read"):
         checkpoint.read(folder)
 
 
-@pytest.mark.parametrize("row", ["xyz,1", "1,xyz", ",2", "inf,1", "1,2,3"])
-def test_metrics_that_are_no_numbers(tmp_path, row):
-    (tmp_path / "metrics.csv").write_text(f"frames,a\n1,2\n{row}\n")
-    with pytest.raises(ValueError, match="metrics.csv, line 3: expected a number"):
-        read_csv(tmp_path / "metrics.csv")
-
-
-def test_metrics_survive_a_cut_line_and_a_resume(tmp_path):
-    logger = CsvLogger(tmp_path)
-    logger.log({"a": 1.0}, 10)
-    logger.log({"a": 2.0, "b": 5.0}, 20)
-    logger.log({"a": 3.0}, 30)
-    logger.close()
-    with (tmp_path / "metrics.csv").open("a") as file:
-        file.write("40,4.")
-    assert [row["frames"] for row in read_csv(tmp_path / "metrics.csv")] == [10, 20, 30]
-    logger = CsvLogger(tmp_path, frames=20)
-    logger.log({"a": 7.0}, 30)
-    logger.close()
-    rows = read_csv(tmp_path / "metrics.csv")
-    assert rows == [{"frames": 10, "a": 1.0}, {"frames": 20, "a": 2.0, "b": 5.0}, {"frames": 30, "a": 7.0}]
+@pytest.mark.parametrize(
+    "damage", ["truncate", "flip", "remove", "facts", "schema", "target", "state", "config", "frames", "no policy"]
+)
+def test_damaged_checkpoints_are_refused(run, tmp_path, damage):
+    folder = tmp_path / "copy"
+    shutil.copytree(checkpoint.PRETRAINED / "r4", folder)
+    tensors, facts = folder / checkpoint.TENSORS, folder / checkpoint.FACTS
+    blob, content = bytearray(tensors.read_bytes()), json.loads(facts.read_text())
+    if damage == "flip":
+        blob[len(blob) // 2] ^= 1
+    elif damage == "no policy":
+        blob = save({"other": torch.zeros(1)})
+        content["sha256"] = hashlib.sha256(blob).hexdigest()
+    elif damage == "target":
+        content["config"]["model"]["actor"]["_target_"] = "os.system"
+    elif damage in ("state", "frames"):
+        del content[damage]
+    content |= {"schema": {"schema": 99}, "config": {"config": []}}.get(damage, {})
+    tensors.write_bytes(blob[:-10] if damage == "truncate" else blob)
+    text = json.dumps(content)
+    facts.write_text(text[:-20] if damage == "facts" else text)
+    if damage == "remove":
+        tensors.unlink()
+    code, _, err = run("evaluate", f"checkpoint={folder}")
+    assert code == 2 and err.startswith("error: ") and err.count("\n") == 1

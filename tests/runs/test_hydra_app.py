@@ -1,33 +1,23 @@
 """The commands: bad input ends in one sentence, a code other than 0, and leaves nothing behind."""
 
-import hashlib
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-import torch
-from safetensors.torch import save
+from commands import composed
 
-from pickplace.runs import checkpoint
-
-
-@pytest.fixture(scope="module")
-def smoke_run(tmp_path_factory):
-    """A small finished run."""
-    run_dir = tmp_path_factory.mktemp("smoke") / "run"
-    command = [sys.executable, "-m", "pickplace.training.train", "experiment=smoke", f"hydra.run.dir={run_dir}"]
-    subprocess.run(command, check=True, capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    return run_dir
-
+import pickplace
+from pickplace.runs.errors import sentence
+from pickplace.runs.folder import noted_overrides
+from pickplace.runs.hydra_app import apply_overrides
 
 BAD = [
     ("train", ["algo.gama=0.9"], ["algo.gama", "'gamma'"]),
     ("train", ["+algo.gama=0.9"], ["algo.gama", "'gamma'"]),
-    ("train", ["+env.foo=1"], ["PickPlaceEnv", "'foo'"]),
-    ("train", ["+curriculum.advance.foo=1"], ["Threshold", "foo"]),
+    ("train", ["+env.foo=1"], ["env.foo", "no key 'foo'"]),
+    ("train", ["+curriculum.advance.foo=1"], ["curriculum.advance.foo", "occupancy"]),
     ("train", ["-m", "algo.gama=0.9,1"], ["algo.gama", "'gamma'"]),
     ("train", ["-m", "env.rotations=5,6"], ["rotations=5", "1, 2, 3 or 4"]),
     ("train", ["-m", "curriculum=none,mien"], ["curriculum/mien", "adaptive"]),
@@ -56,7 +46,7 @@ BAD = [
     ("train", ["algo.lr_decay_start=2"], ["algo.lr_decay_start=2", "between 0 and 1"]),
     ("train", ["algo.mask_infeasible=maybe"], ["algo.mask_infeasible=maybe", "true or false"]),
     ("train", ["evaluation.stream=test"], ["evaluation.stream=test", "validation"]),
-    ("train", ["planner=random"], ["RandomFeasible", "planner=policy"]),
+    ("train", ["planner=random"], ["planner._target_=random", "planner=policy"]),
     ("train", ["algo.loss=dqn"], ["algo.loss=dqn", "ppo or a2c"]),
     ("train", ["algo.lr=-1"], ["algo.lr=-1", ">= 0"]),
     ("train", ["algo.gamma=1.5"], ["algo.gamma=1.5", "<= 1"]),
@@ -69,7 +59,8 @@ BAD = [
     ("train", ["items=recorded", "items.path=nowhere.csv"], ["items.path='nowhere.csv'", "no such file"]),
     ("train", ["items=recorded"], ["items.path", "no value"]),
     ("train", ["model.actor.filters=-4"], ["model.actor.filters=-4", ">= 1"]),
-    ("train", ["model.actor._target_=os.system"], ["os.system"]),
+    ("train", ["model.actor._target_=os.system"], ["model.actor", "command"]),
+    ("train", ["model.actor._target_=fcn"], ["model.actor._target_=fcn", "'fcn4d'"]),
     ("train", ["trust=[os]"], ["trust='os'", "modules of your own"]),
     ("evaluate", ["planner=joint_dbl", "trust=5"], ["trust=5", "modules of your own"]),
     ("train", ["model.actor.receptive_field=4"], ["model.actor.receptive_field=4", "odd"]),
@@ -155,120 +146,17 @@ def test_full_error_shows_the_traceback(run, monkeypatch):
         run("train", "env.rotations=5")
 
 
-def test_checkpoint_for_fewer_rotations(run, smoke_run, tmp_path):
-    state, facts = checkpoint.read(smoke_run / "checkpoints" / "last")
-    facts["config"]["env"]["rotations"] = 2
-    del facts["schema"], facts["sha256"]
-    checkpoint.write(tmp_path / "two", state, facts)
-    code, _, err = run("evaluate", f"checkpoint={tmp_path / 'two'}", "env.rotations=4")
-    assert code == 2 and "env.rotations=4: the checkpoint was trained with 2" in err
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("env.rotations=1", "env.rotations=1: the run began with 4"),
-        ("env.tote_size=[5,5,1]", "the run began with [4, 4, 1]"),
-        ("env.num_envs=4", "env.num_envs=4: the run began with 8"),
-        ("env.effector_size=[2,3]", "the run began with [3, 3]"),
-        ("env.min_support=1.0", "env.min_support=1.0: the run began with 0.5"),
-        ("env.pick_rule=overlap", "the run began with contain"),
-        ("items.kinds=[[1,1,1]]", "items={"),
-        ("algo.mask_infeasible=false", "the run began with True"),
-        ("model.actor.filters=16", "does not fit"),
-        ("curriculum=paper", "cannot be exchanged"),
-        ("+algo.gama=0.9", "did you mean 'gamma'?"),
-        ("algo.lr=1,2", "one value"),
-        ("algo.lr", "<key>=<value>"),
-        ("~algo.lr", "<key>=<value>"),
-        ("total_frames=100", "total_frames=100: the run has trained 512 frames already; expected more"),
-    ],
-)
-def test_incompatible_resume_is_refused_and_changes_nothing(run, smoke_run, override, message):
-    files = {path: path.read_bytes() for path in smoke_run.rglob("*") if path.is_file() and path.suffix != ".log"}
-    code, _, err = run("train", f"resume={smoke_run}", "total_frames=1024", override)
-    assert code == 2
-    assert message in err and err.count("\n") == 1
-    assert files == {path: path.read_bytes() for path in files}
-
-
-@pytest.mark.parametrize(
-    "damage", ["truncate", "flip", "remove", "facts", "schema", "target", "state", "config", "frames", "no policy"]
-)
-def test_damaged_checkpoints_are_refused(run, smoke_run, tmp_path, damage):
-    folder = tmp_path / "copy"
-    folder.mkdir()
-    for name in (checkpoint.TENSORS, checkpoint.FACTS):
-        (folder / name).write_bytes((smoke_run / "checkpoints" / "last" / name).read_bytes())
-    tensors, facts = folder / checkpoint.TENSORS, folder / checkpoint.FACTS
-    if damage == "truncate":
-        tensors.write_bytes(tensors.read_bytes()[:-10])
-    elif damage == "flip":
-        blob = bytearray(tensors.read_bytes())
-        blob[len(blob) // 2] ^= 1
-        tensors.write_bytes(blob)
-    elif damage == "remove":
-        tensors.unlink()
-    elif damage == "facts":
-        facts.write_text(facts.read_text()[:-20])
-    else:
-        content = json.loads(facts.read_text())
-        if damage == "schema":
-            content["schema"] = 99
-        elif damage in ("state", "frames"):
-            del content[damage]
-        elif damage == "config":
-            content["config"] = []
-        elif damage == "no policy":
-            tensors = folder / checkpoint.TENSORS
-            tensors.write_bytes(save({"other": torch.zeros(1)}))
-            content["sha256"] = hashlib.sha256(tensors.read_bytes()).hexdigest()
-        else:
-            content["config"]["model"]["actor"]["_target_"] = "os.system"
-        facts.write_text(json.dumps(content))
-    code, _, err = run("evaluate", f"checkpoint={folder}")
-    assert code == 2 and err.startswith("error: ") and err.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "search", [["lookahead", "planner.samples=2", "planner.rounds=1"], ["mcts", "planner.simulations=8"]]
-)
-def test_evaluation_of_a_search(search, run, smoke_run, tmp_path):
-    arguments = [f"planner={search[0]}", *search[1:], f"checkpoint={smoke_run}", "evaluation.episodes=2"]
-    code, _, err = run("evaluate", *arguments, "evaluation.latency_decisions=0", "hydra.run.dir=result")
-    assert code == 0, err
-    result = json.loads((tmp_path / "result" / "evaluation.json").read_text())
-    assert result["planner"] == search[0] and 0 < result["occupancy"]["mean"] <= 1
-    wanted = dict(word.removeprefix("planner.").split("=") for word in search[1:])
-    assert {key: str(result["planner_settings"][key]) for key in wanted} == wanted
-    assert ("mean_tree_depth" in result) == (search[0] == "mcts")
-
-
-def test_evaluation_of_a_run(run, smoke_run, tmp_path):
-    arguments = [f"checkpoint={smoke_run}", "evaluation.episodes=6", "env.tote_size=[5,5,2]", "planner.candidates=10"]
-    arguments += ["model.actor.compute_dtype=bfloat16"]
-    code, out, err = run("evaluate", *arguments, "hydra.run.dir=result")
-    assert code == 0, err
-    assert "occupancy" in out
-    result = json.loads((tmp_path / "result" / "evaluation.json").read_text())
-    assert set(result) >= {
-        "planner", "env", "episodes", "seed", "occupancy", "items_placed", "failures", "feasible_action_share",
-        "latency_ms", "versions", "commit", "mask_in_training", "mask_at_decision", "candidates",
-    }  # fmt: skip
-    assert set(result["occupancy"]) == {"mean", "ci95", "min", "per_episode"}
-    assert len(result["occupancy"]["per_episode"]) == 6
-    assert result["env"]["tote_size"] == [5, 5, 2] and result["candidates"] == 10
-    assert result["mask_in_training"] is True and result["mask_at_decision"].startswith("failed picks")
-    assert {path.name for path in (tmp_path / "result").iterdir()} >= {"tote.png", "evaluation.md"}
-
-
-def test_a_tote_that_did_not_grow_is_told(run):
-    settings = ["experiment=smoke", "env.tote_size=[4,4,2]", "curriculum.start_height=1", "curriculum.advance.window=4"]
-    for needed, told in ((1.0, True), (0.0, False)):
-        threshold = [f"curriculum.advance.occupancy={needed}", f"hydra.run.dir={needed}"]
-        code, out, err = run("train", *settings, "curriculum=adaptive", *threshold)
-        assert code == 0, err
-        assert ("the tote grew to height 1 of 2 only" in out) == told
+@pytest.mark.parametrize("name", ["train", "evaluate"])
+def test_help_from_any_directory(name, tmp_path):
+    """Without a wait for torch."""
+    code = f"import sys; from pickplace.cli import {name}; {name}(); assert 'torch' not in sys.modules"
+    path = str(Path(pickplace.__file__).parents[1])
+    result = subprocess.run(
+        [sys.executable, "-c", code, "--help"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert "env: deep_bin, paper" in result.stdout
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_sweep_and_own_curriculum(run, tmp_path):
@@ -276,7 +164,7 @@ def test_sweep_and_own_curriculum(run, tmp_path):
     folder.mkdir(parents=True)
     (folder / "mine.yaml").write_text(
         "defaults:\n  - advance: threshold\n  - sample: recent\n  - _self_\n"
-        "_target_: pickplace.training.curriculum.Curriculum\nstart_height: 1\nend_height: null\n"
+        "_target_: curriculum\nstart_height: 1\nend_height: null\n"
         "advance: {occupancy: 0.1, window: 5}\n"
     )
     settings = ["experiment=smoke", "curriculum=mine", "env.tote_size=[4,4,2]", "hydra.sweep.dir=sweep"]
@@ -286,40 +174,38 @@ def test_sweep_and_own_curriculum(run, tmp_path):
         assert (tmp_path / "sweep" / job / "checkpoints" / "last").is_dir()
 
 
+def test_overrides_on_a_saved_config():
+    saved = composed("experiment=smoke")
+    changed = apply_overrides(saved, ["algo.gamma=0.9", "total_frames=99", "env.tote_size=[7,7,2]"])
+    assert (changed.algo.gamma, changed.total_frames, changed.env.tote_size) == (0.9, 99, [7, 7, 2])
+    assert saved.algo.gamma == 0.99
+    other = composed("items=tall")["items"]
+    swapped = apply_overrides(saved, ["items=tall", "items.height=[1,2]"], {"items": other})
+    assert swapped["items"].height == [1, 2]
+
+
 @pytest.mark.parametrize(
-    "command",
-    [[sys.executable, "-m", "pickplace.training.train"], [str(Path(sys.executable).with_name("pickplace-evaluate"))]],
-    ids=["module", "script"],
+    ("override", "message"),
+    [
+        ("algo.gama=0.9", "there is no key 'gama' in algo; did you mean 'gamma'?"),
+        ("curriculum=paper", "the checkpoint's config group 'curriculum' cannot be exchanged"),
+        ("curriculum/advance=frames", "cannot be exchanged"),
+        ("nothing.at.all=1", "there is no key 'nothing' in the config"),
+    ],
 )
-def test_help_from_any_directory(command, tmp_path):
-    result = subprocess.run([*command, "--help"], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert "env: deep_bin, paper" in result.stdout
-    assert list(tmp_path.iterdir()) == []
+def test_refused_overrides_on_a_saved_config(override, message):
+    with pytest.raises(ValueError) as error:
+        apply_overrides(composed("experiment=smoke"), [override])
+    assert message in str(error.value)
 
 
-def test_paired_difference(run, tmp_path):
-    settings = ["env.tote_size=[4,4,1]", "evaluation.episodes=20", "evaluation.latency_decisions=0"]
-    assert run("evaluate", "planner=random", *settings, "hydra.run.dir=a")[0] == 0
-    code, out, err = run("evaluate", "planner=joint_dbl", *settings, "hydra.run.dir=b", "compare=a/evaluation.json")
-    assert code == 0, err
-    a, b = (json.loads((tmp_path / name / "evaluation.json").read_text()) for name in "ab")
-    paired = b["paired_difference"]
-    assert paired["against"] == "random" and "minus random" in out
-    assert paired["mean"] == pytest.approx(b["occupancy"]["mean"] - a["occupancy"]["mean"])
-    assert paired["ci95"][0] < paired["mean"] < paired["ci95"][1]
-    code, _, err = run("evaluate", "planner=joint_dbl", *settings, "evaluation.seed=1", "compare=a/evaluation.json")
-    assert code == 2 and "its seed is 0, expected 1" in err
+def test_notes_of_a_run_are_read_unresolved(tmp_path, monkeypatch):
+    monkeypatch.setenv("MY_SECRET", "secret")
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / ".hydra" / "overrides.yaml").write_text("- seed=1\n- a='${oc.env:MY_SECRET}'\n- [nested]\n- 5\n")
+    assert noted_overrides(tmp_path) == ["seed=1", "a='${oc.env:MY_SECRET}'"]
+    assert noted_overrides(tmp_path / "nowhere") == []
 
 
-def test_only_the_same_episodes_are_compared(run):
-    settings = ["env.tote_size=[4,4,1]", "evaluation.episodes=2", "evaluation.latency_decisions=0", "planner=joint_dbl"]
-    assert run("evaluate", *settings, "hydra.run.dir=a")[0] == 0
-    for key, value in (
-        ("env.rotations", 2), ("env.effector_size", [2, 3]), ("env.bin_size", [5, 4, 1]), ("env.tote_size", [4, 5, 1]),
-        ("env.pick_rule", "overlap"), ("env.min_support", 0.25), ("env.strict_support", True),
-        ("evaluation.episodes", 3), ("evaluation.stream", "validation"), ("items", "mixed"),
-    ):  # fmt: skip
-        more = ["env.tote_size=[7,7,3]"] if key == "items" else []
-        code, _, err = run("evaluate", *settings, *more, f"{key}={value}".replace(" ", ""), "compare=a/evaluation.json")
-        wanted = key if key.startswith("env.") else f"its {key.removeprefix('evaluation.')} is"
-        assert code == 2 and wanted in err, (key, err)
+def test_errors_hold_nothing_that_controls_a_terminal():
+    assert sentence(ValueError("bad \x1b[31m key\x07")) == "bad \\x1b[31m key\\x07"

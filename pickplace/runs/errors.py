@@ -1,0 +1,93 @@
+"""Errors in one sentence, for a person in front of a terminal."""
+
+import errno
+import os
+import sys
+from contextlib import contextmanager
+from difflib import get_close_matches
+
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+
+class JobFailed(Exception):
+    """A run of a sweep failed; the message is one sentence. It crosses processes, which the error itself may not."""
+
+
+class WorkerDied(Exception):
+    """A collector worker process has died. Not an OSError: signal handling code elsewhere catches those."""
+
+
+#: Errors caused by the user or the machine. Any other may be a fault of the program, and its type is printed too.
+EXPECTED = (ValueError, OSError, FloatingPointError, JobFailed, WorkerDied, HydraException, OmegaConfBaseException)
+
+#: Config files of Hydra plugins, and the optional extras that bring them.
+EXTRAS = {"hydra/sweeper/optuna": "optuna", "hydra/launcher/joblib": "joblib", "hydra/launcher/submitit": "submitit"}
+
+
+@contextmanager
+def one_sentence():
+    """End the command with one sentence and exit code 2 on an error; ``HYDRA_FULL_ERROR=1`` shows the traceback."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:  # the reader of the output, such as head, has closed it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+    except Exception as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        sys.stderr.write(f"error: {sentence(error)}\n")
+        sys.exit(2)
+
+
+def sentence(error: Exception) -> str:
+    """Return an error as one line, without characters that control a terminal."""
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in _sentence(error))
+
+
+def _sentence(error: Exception) -> str:
+    if isinstance(error, OverrideParseException):
+        reasons = [line for line in error.message.splitlines() if not line.startswith(("Error parsing", "See https"))]
+        return f"{error.override!r}: expected <key>=<value> ({' '.join(reasons)})."
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        for start, extra in EXTRAS.items():
+            if error.missing_cfg_file.startswith(start):
+                return f"{error.missing_cfg_file}: {extra} is missing; pip install 'pickplace[{extra}]'."
+        if error.options:
+            return f"{error.missing_cfg_file}: there is no such config; expected one of {', '.join(error.options)}."
+    if isinstance(error, OSError) and error.filename and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"{error.filename}: {error.strerror}; expected a place where you may read and write."
+    if isinstance(error, EXPECTED):
+        noise = ("full_key", "object_type", "See https", "To append", "Config search path", "provider=")
+        lines = [line.strip() for line in str(error).splitlines()]
+        return " ".join(line for line in lines if line and not line.startswith(noise)) or type(error).__name__
+    return f"{type(error).__name__}: {' '.join(str(error).split())} (HYDRA_FULL_ERROR=1 shows where)"
+
+
+def missing_extra(group: str, extra: str) -> ValueError:
+    """Return the error for an option of a config group whose optional extra is not installed."""
+    return ValueError(f"{group}={extra}: {extra} is missing; pip install 'pickplace[{extra}]'.")
+
+
+def unknown_key(key: str, node: DictConfig | dict, prefix: str = "") -> str:
+    """Return a sentence on a key that is not in a config, with the keys that are.
+
+    Args:
+        key: the whole key, such as ``algo.gama``.
+        node: the config, or the part of it at ``prefix``.
+        prefix: place of the part, with a dot at its end.
+    """
+    *parents, leaf = key.removeprefix(prefix).split(".")
+    for parent in parents:
+        child = node.get(parent) if parent in node else None
+        if not isinstance(child, DictConfig):
+            leaf = parent
+            break
+        prefix, node = f"{prefix}{parent}.", child
+    known = [str(name) for name in node if name not in ("_target_", "hydra")]
+    close = get_close_matches(leaf, known, 1)
+    hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known) or 'none'}."
+    return f"{key}: there is no key {leaf!r} in {prefix[:-1] or 'the config'}; {hint}"

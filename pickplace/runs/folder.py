@@ -1,0 +1,158 @@
+"""Run folders: one process and one training in each, and Hydra's notes on the command that began it."""
+
+import logging
+import os
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+
+import yaml
+from filelock import FileLock, Timeout
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+LOCK = ".lock"  # held by the process that trains in the folder
+FAILURE = "failure.txt"  # the error of a failed run of a sweep
+
+
+class OccupiedError(ValueError):
+    """A run folder holds a training already, finished or running."""
+
+
+@contextmanager
+def claim(run_dir: Path):
+    """Hold a run folder for this process until the block or the process ends.
+
+    Raises:
+        OccupiedError: if another process holds it.
+    """
+    lock = FileLock(Path(run_dir) / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise OccupiedError(
+            f"{run_dir}: another process is training there; expected another run folder, or to wait for it."
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def refuse_claimed(run_dir: Path) -> None:
+    """Refuse a run folder in which another process trains.
+
+    Raises:
+        OccupiedError: naming the folder.
+    """
+    if (Path(run_dir) / LOCK).exists():
+        with claim(run_dir):
+            pass
+
+
+def is_claimed(run_dir: Path) -> bool:
+    """Return whether another process trains in a run folder."""
+    try:
+        refuse_claimed(run_dir)
+    except OccupiedError:
+        return True
+    return False
+
+
+def refuse_occupied(run_dir: Path) -> None:
+    """Refuse a folder for a new run if it holds a checkpoint: the files of two runs would be mixed.
+
+    Raises:
+        OccupiedError: naming the folder.
+    """
+    saved = run_dir / "checkpoints"
+    if saved.is_dir() and any(not entry.name.endswith(".new") for entry in saved.iterdir()):
+        raise occupied(run_dir)
+
+
+def occupied(run_dir: Path) -> OccupiedError:
+    """Return the error for a folder that holds another training."""
+    return OccupiedError(f"{run_dir}: there is a training already; expected another run folder, or resume={run_dir}.")
+
+
+def refuse_links(run_dir: Path) -> None:
+    """Refuse to resume in a run folder, which may come from others, that redirects what is written elsewhere.
+
+    Raises:
+        ValueError: for a link, a pipe or a device in it, naming it.
+    """
+    for folder in (run_dir, run_dir / "checkpoints", run_dir / ".hydra"):
+        for entry in os.scandir(folder) if folder.is_dir() else ():
+            if entry.is_symlink() or not (entry.is_file() or entry.is_dir()):
+                raise ValueError(f"{entry.path}: a link or no regular file; expected only files and folders in a run.")
+
+
+@contextmanager
+def remove_empty_folders():
+    """If the block fails, remove the folders of this run or sweep that hold nothing but Hydra's notes."""
+    try:
+        yield
+    except BaseException:
+        if HydraConfig.initialized():
+            _remove_empty_folders(HydraConfig.get())
+        raise
+
+
+def _remove_empty_folders(cfg) -> None:
+    notes = {".hydra", LOCK, FAILURE, f"{cfg.job.name}.log"}
+    logging.shutdown()
+
+    def is_empty(folder: Path) -> bool:
+        return folder.is_dir() and set(os.listdir(folder)) <= notes and not is_claimed(folder)
+
+    run_dir = None if OmegaConf.is_missing(cfg.runtime, "output_dir") else cfg.runtime.output_dir
+    if run_dir and is_empty(Path(run_dir)):
+        shutil.rmtree(run_dir, ignore_errors=True)
+    sweep = Path(cfg.sweep.dir) if cfg.mode == RunMode.MULTIRUN else None
+    if not sweep or not sweep.is_dir():
+        return
+    if all(is_empty(entry) for entry in sweep.iterdir() if entry.name != "multirun.yaml"):
+        shutil.rmtree(sweep, ignore_errors=True)
+
+
+def noted_overrides(run_dir: Path) -> list[str]:
+    """Return the overrides of the command that began a run; empty if Hydra noted none."""
+    words = _note(run_dir, "overrides.yaml")
+    return [word for word in words if isinstance(word, str)] if isinstance(words, list) else []
+
+
+def noted_config_folders(run_dir: Path) -> list[str]:
+    """Return the words of the command that began a run that name folders of config files."""
+    notes = _note(run_dir, "hydra.yaml")
+    try:
+        sources = notes["hydra"]["runtime"]["config_sources"]
+        folders = [source["path"] for source in sources if source["provider"] == "command-line"]
+        searchpath = [word for word in notes["hydra"]["overrides"]["hydra"] if "hydra.searchpath" in word]
+    except (KeyError, TypeError):
+        return []
+    return [*(word for folder in folders for word in ("--config-dir", folder)), *searchpath]
+
+
+def changed_values(run_dir: Path, cfg: DictConfig) -> list[str]:
+    """Return the values, as ``key=value``, in which a config differs from the one with which its run began."""
+    began = _note(run_dir, "config.yaml")
+    if not isinstance(began, dict):
+        return []
+
+    def leaves(node, path: str = "") -> dict:
+        if not isinstance(node, dict):
+            return {path.removeprefix("."): node}
+        return {key: value for name in node for key, value in leaves(node[name], f"{path}.{name}").items()}
+
+    try:
+        before, now = (leaves(OmegaConf.to_container(OmegaConf.create(c), resolve=True)) for c in (began, cfg))
+    except OmegaConfBaseException:  # a reference that leads nowhere any more
+        return []
+    return [f"{key}={value}" for key, value in now.items() if value != before.get(key)]
+
+
+def _note(run_dir: Path, name: str):
+    path = Path(run_dir) / ".hydra" / name
+    return yaml.safe_load(path.read_text()) if path.is_file() else None

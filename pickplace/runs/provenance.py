@@ -1,0 +1,48 @@
+"""Where a result comes from: versions, commit, and the planner that a policy imitated."""
+
+import platform
+import subprocess
+from pathlib import Path
+
+import tensordict
+import torch
+import torchrl
+
+import pickplace
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the software behind a result."""
+    return {
+        "pickplace": pickplace.__version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "torchrl": torchrl.__version__,
+        "tensordict": tensordict.__version__,
+    }
+
+
+def commit() -> str | None:
+    """Return the commit of the checkout that the package runs from, ``+`` if files outside docs/ are modified.
+
+    None without a checkout.
+    """
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+
+    def git(*arguments):
+        command = ["git", "-C", str(root), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    try:
+        modified = git("status", "--porcelain", "-uno", "--", ".", ":!docs").strip()
+        return git("rev-parse", "HEAD").strip() + ("+" if modified else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def imitated_planner(cfg: dict) -> str | None:
+    """Return the name of the planner that a run with this saved config imitated first, or None."""
+    warm_start = cfg.get("warm_start") or {}
+    return warm_start["teacher"]["_target_"] if warm_start.get("frames") else None

@@ -1,0 +1,76 @@
+"""Loggers: metrics survive a killed run, and every backend goes on after a resume."""
+
+import sys
+
+import pytest
+from commands import composed, options
+
+from pickplace.runs.loggers import CsvLogger, read_csv
+from pickplace.runs.registry import build
+from pickplace.training.train import resume_run
+
+
+@pytest.mark.parametrize("row", ["xyz,1", "1,xyz", ",2", "inf,1", "1,2,3"])
+def test_metrics_that_are_no_numbers(tmp_path, row):
+    (tmp_path / "metrics.csv").write_text(f"frames,a\n1,2\n{row}\n")
+    with pytest.raises(ValueError, match="metrics.csv, line 3: expected a number"):
+        read_csv(tmp_path / "metrics.csv")
+
+
+def test_metrics_survive_a_cut_line_and_a_resume(tmp_path):
+    logger = CsvLogger(tmp_path)
+    logger.log({"a": 1.0}, 10)
+    logger.log({"a": 2.0, "b": 5.0}, 20)
+    logger.log({"a": 3.0}, 30)
+    logger.close()
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write("40,4.")
+    assert [row["frames"] for row in read_csv(tmp_path / "metrics.csv")] == [10, 20, 30]
+    logger = CsvLogger(tmp_path, frames=20)
+    logger.log({"a": 7.0}, 30)
+    logger.close()
+    rows = read_csv(tmp_path / "metrics.csv")
+    assert rows == [{"frames": 10, "a": 1.0}, {"frames": 20, "a": 2.0, "b": 5.0}, {"frames": 30, "a": 7.0}]
+
+
+@pytest.mark.parametrize("name", options("logger"))
+def test_every_logger(name, tmp_path):
+    if name not in ("csv", "none"):
+        pytest.importorskip(name)
+    logger = build("logger", composed(f"logger={name}").logger, folder=tmp_path, frames=0)
+    logger.log({"train/occupancy": 0.5}, 10)
+    logger.close()
+    kept = read_csv(tmp_path / "metrics.csv") if name != "none" else []
+    assert kept == [{"frames": 10, "train/occupancy": 0.5}][: name != "none"]
+
+
+@pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])
+def test_a_missing_extra_is_one_sentence(smoke, name, tmp_path, monkeypatch):
+    for module in ("tensorboard", "wandb", "mlflow", "torch.utils.tensorboard"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ValueError, match=rf"^logger={name}: {name} is missing; pip install 'pickplace\[{name}\]'\.$"):
+        smoke(tmp_path / "run", f"logger={name}")
+    assert not (tmp_path / "run" / "metrics.csv").exists()
+
+
+@pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])
+def test_a_logger_goes_on_after_a_resume_beside_metrics_csv(smoke, name, tmp_path):
+    pytest.importorskip(name)
+    run_dir = tmp_path / "run"
+    smoke(run_dir, f"logger={name}", "total_frames=256")
+    ids = [(run_dir / f"{name}_run_id").read_text()] if name != "tensorboard" else []
+    resume_run([f"resume={run_dir}", "total_frames=512"])
+    rows = read_csv(run_dir / "metrics.csv")
+    assert [row["frames"] for row in rows] == [128, 256, 384, 512]
+    assert (run_dir / "report.html").is_file()
+    if ids:
+        assert (run_dir / f"{name}_run_id").read_text() == ids[0]
+    if name == "wandb":
+        folders = list((run_dir / "wandb").glob(f"offline-run-*-{ids[0]}"))
+        assert all((folder / f"run-{ids[0]}.wandb").stat().st_size > 1000 for folder in folders) and folders
+    if name == "mlflow":
+        import mlflow
+
+        history = mlflow.MlflowClient(f"sqlite:///{run_dir / 'mlflow.db'}").get_metric_history(ids[0], "train/reward")
+        assert [point.step for point in history] == [128, 256, 384, 512]
+        assert [point.value for point in history] == pytest.approx([row["train/reward"] for row in rows])

@@ -1,0 +1,150 @@
+"""Every class that a config file names is in the registry, and is made of that file's settings."""
+
+import itertools
+import re
+
+import pytest
+from commands import composed, options
+from omegaconf import OmegaConf
+
+from pickplace import PickPlaceEnv
+from pickplace.policies.networks.critics import Conv4dCritic, PooledCritic
+from pickplace.runs.hydra_app import conf_dir
+from pickplace.runs.registry import REGISTRY, accepted_arguments, build, find, names_at
+from pickplace.task.items import ItemDistribution
+from pickplace.training.curriculum import Curriculum
+
+
+@pytest.mark.parametrize("place", REGISTRY)
+def test_every_name_leads_to_a_class_or_function(place):
+    for name, path in REGISTRY[place].items():
+        found = find(place, name)
+        assert path.endswith(f".{found.__name__}") and found.__doc__
+
+
+def test_every_config_file_names_what_is_in_the_registry():
+    used = set()
+    for path in conf_dir().rglob("*.yaml"):
+        group = path.parent.relative_to(conf_dir()).as_posix().replace("/", ".").removeprefix("experiment")
+        content = OmegaConf.to_container(OmegaConf.load(path))
+        for part, node in [("", content), *content.items()]:
+            target = node.get("_target_") if isinstance(node, dict) else None
+            if target:
+                place = ".".join(filter(None, (group, part)))
+                assert target in names_at(place), path
+                used.add((place, target))
+    unused = {(place, name) for place, names in REGISTRY.items() for name in names} - used
+    assert {place for place, _ in unused} <= {"warm_start.teacher"}  # which takes the files of planner
+    text = "".join(path.read_text() for path in conf_dir().rglob("*.yaml"))
+    assert len(re.findall("_target_: pickplace", text)) == 3  # Hydra's callbacks
+
+
+@pytest.mark.parametrize(
+    ("place", "node", "words"),
+    [
+        ("planner", {"_target_": "joint_dlb"}, "planner._target_=joint_dlb: .* did you mean 'joint_dbl'"),
+        ("planner", {"_target_": "greedy"}, "expected one of policy, lookahead, .* or the dotted path"),
+        ("planner", {"_target_": "nowhere.Net"}, "No module named 'nowhere'"),
+        ("planner", {"_target_": "os.nothing"}, "no attribute 'nothing'"),
+        ("planner", {"_target_": None}, "planner._target_=None: there is no such"),
+        ("planner", {"_target_": ["joint_dbl"]}, "there is no such"),
+        ("planner", {"_target_": "random", "sed": 1}, "planner.sed: there is no key .* did you mean 'seed'"),
+        ("planner", {"_target_": "random", "seed": "one"}, "planner.seed='one': expected a whole number"),
+        ("items", {"_target_": "kinds"}, "items._target_=kinds: .*missing 1 required positional argument: 'kinds'"),
+        ("curriculum", {"_target_": "curriculum", "advance": {"_target_": "frames", "x": 1}}, "curriculum.advance.x: "),
+        ("items", {"_target_": "test_registry.Wrapped", "base": {"_target_": "kinds"}}, "items.base._target_=kinds"),
+        ("items", {"_target_": "test_registry.open_settings", "b": 1}, "items.b: there.*expected one of first, a"),
+    ],
+)  # fmt: skip
+def test_a_wrong_name_or_setting_is_one_sentence(place, node, words):
+    kwargs = {"rules": PickPlaceEnv(num_envs=1).rules} if place == "planner" else {}
+    with pytest.raises(ValueError, match=words) as caught:
+        build(place, OmegaConf.create(node), **kwargs)
+    assert "\n" not in str(caught.value)
+
+
+class Wrapped:
+    def __init__(self, base, factor=1):
+        self.base, self.factor = base, factor
+
+
+def open_settings(first=None, **settings):
+    return settings
+
+
+open_settings.settings = ("a",)
+
+
+def test_a_class_of_the_user_s_and_the_parts_within_it():
+    inner = {"_target_": "items/kinds", "kinds": [[1, 1, 1]]}
+    cfg = OmegaConf.create(
+        {"two": 2, "items": {"_target_": "test_registry.Wrapped", "base": inner, "factor": "${two}"}}
+    )
+    made = build("items", cfg["items"])
+    assert isinstance(made, Wrapped) and isinstance(made.base, ItemDistribution) and made.factor == 2
+    assert build("items", {"_target_": "test_registry.open_settings", "a": [{"b": 1}]}) == {"a": [{"b": 1}]}
+
+
+def test_accepted_arguments():
+    assert accepted_arguments(Wrapped) == ["base", "factor"]
+    assert accepted_arguments(open_settings) == ["first", "a"]
+    assert accepted_arguments(lambda **settings: None) is None
+    assert accepted_arguments(type("Plain", (), {})) == []
+    assert "rotations" in accepted_arguments(PickPlaceEnv)
+
+
+@pytest.mark.parametrize("name", options("env"))
+def test_every_env(name):
+    cfg = composed(f"env={name}")
+    env = build("env", cfg.env, items=build("items", cfg["items"]), num_envs=2)
+    assert isinstance(env, PickPlaceEnv)
+    assert env.reset()["action_mask"].any(1).all()
+
+
+@pytest.mark.parametrize("name", options("items"))
+def test_every_item_distribution(name, tmp_path):
+    (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
+    cfg = composed(f"items={name}", *([f"items.path={tmp_path}/items.csv"] if name == "recorded" else []))
+    assert isinstance(build("items", cfg["items"]), ItemDistribution)
+
+
+@pytest.mark.parametrize("name", options("model"))
+def test_every_model(name):
+    cfg, rules = composed(f"model={name}"), PickPlaceEnv(num_envs=1).rules
+    for masked in (True, False):
+        policy = build("model.actor", cfg.model.actor, rules=rules, mask_infeasible=masked)
+        assert policy.mask_infeasible is masked
+    assert isinstance(build("model.critic", cfg.model.critic, rules=rules), Conv4dCritic | PooledCritic)
+
+
+@pytest.mark.parametrize("name", options("curriculum"))
+def test_every_curriculum_and_every_exchange_of_its_parts(name):
+    assert isinstance(build("curriculum", composed(f"curriculum={name}").curriculum), Curriculum)
+    for advance, sample in zip(
+        options("curriculum/advance"), itertools.cycle(options("curriculum/sample")), strict=False
+    ):
+        cfg = composed(f"curriculum={name}", f"curriculum/advance={advance}", f"curriculum/sample={sample}")
+        build("curriculum", cfg.curriculum).setup(1, 5, 10**9)
+
+
+@pytest.mark.parametrize("name", options("planner"))
+def test_every_planner(name):
+    env = PickPlaceEnv(num_envs=3, tote_size=(6, 6, 2))
+    quick = {"mcts": ["planner.simulations=20"], "lookahead": ["planner.samples=2", "planner.rounds=1"]}
+    cfg, kwargs = composed(f"planner={name}", *quick.get(name, []), name="evaluate"), {}
+    if name in ("mcts", "lookahead"):
+        kwargs["items"] = env.items
+    if name in ("policy", "lookahead"):
+        model = composed().model.actor
+        kwargs["policy"] = build("model.actor", model, rules=env.rules, mask_infeasible=True)
+    observation = env.reset()
+    action = build("planner", cfg.planner, rules=env.rules, **kwargs).decide(observation)
+    assert ((action >= 0) & (action < env.rules.num_actions)).all()
+    if name not in ("uniform", "individual_heuristic", "mcts"):
+        assert observation["action_mask"].gather(1, action[:, None]).all()
+
+
+@pytest.mark.parametrize("group", ["algo", "collector", "evaluation"])
+def test_every_other_group(group):
+    for name in options(group):
+        assert composed(f"{group}={name}")[group]

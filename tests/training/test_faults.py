@@ -1,0 +1,203 @@
+"""Faults of shared machines: nothing is lost, and one sentence says what to do."""
+
+import csv
+import multiprocessing
+import os
+import queue
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from commands import FORKSERVER, Training
+from torchrl._utils import _check_for_faulty_process
+from torchrl.collectors import RandomPolicy
+from torchrl.envs import TransformedEnv
+
+from pickplace import PickPlaceEnv, Planner
+from pickplace.evaluation.evaluate import main as evaluate_main
+from pickplace.runs import checkpoint
+from pickplace.runs.errors import WorkerDied
+from pickplace.runs.hydra_app import conf_dir
+from pickplace.training import collectors as collector
+from pickplace.training.collectors import ignore_signals, watched
+from pickplace.training.train import main as train_main
+
+
+def test_a_dead_worker_ends_the_run_in_one_sentence(tmp_path):
+    run_dir = tmp_path / "run"
+    endless = ["experiment=smoke", "total_frames=10_000_000", "threads=1"]
+    training = Training(*endless, "collector=multi_sync", f"hydra.run.dir={run_dir}")
+    try:
+        training.wait_for_rows(run_dir, 4)
+        workers = ["pgrep", "-f", "-P", str(training.pid), "spawn_main"]
+        children = subprocess.run(workers, capture_output=True, text=True)
+        os.kill(int(children.stdout.split()[-1]), signal.SIGKILL)
+        code, _, error = training.end()
+    finally:
+        training.kill()
+    assert code == 2
+    sentence = error.strip().splitlines()[-1]
+    assert sentence.startswith("error: collector worker 2 of 2 has died (exit code -9). What was saved before")
+    assert f" is whole: pickplace-train resume={run_dir}/checkpoints/" in sentence
+    assert checkpoint.read(run_dir / "checkpoints" / "last")
+
+
+def slots(first: int, count: int) -> TransformedEnv:
+    return TransformedEnv(PickPlaceEnv(num_envs=count, first_episode=first))
+
+
+def test_workers_that_cannot_begin_are_ended():
+    """Left behind, they would keep the command from ending."""
+    before = set(multiprocessing.active_children())
+    policy = RandomPolicy(PickPlaceEnv(num_envs=2).action_spec)
+    with pytest.raises(ValueError, match="seed=-1"):
+        collector.multi_sync(slots, policy, num_envs=4, rollout_length=2, seed=-1, workers=1)
+    assert set(multiprocessing.active_children()) <= before
+
+
+@pytest.mark.parametrize("seed", [2**62 - 1, 20_000_000_000_000])
+def test_any_seed_is_one_for_the_workers(seed):
+    seeds = collector._seeds(seed, 3)
+    assert {item_seed for item_seed, _ in seeds} == {seed}
+    assert len({torch.Generator().manual_seed(own).initial_seed() for _, own in seeds}) == 3
+
+
+def test_a_worker_s_death_is_told_until_it_is_heard():
+    """A logger or a finalizer swallows what is raised while it runs."""
+    worker = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600,))
+    worker.start()
+    with pytest.raises(WorkerDied, match="1 of 1 has died"), watched(SimpleNamespace(procs=[worker])):
+        worker.kill()
+        with suppress(WorkerDied):
+            time.sleep(60)
+        time.sleep(60)
+    time.sleep(0.6)  # and not once we have left
+
+
+def work(deaf, ready):
+    if deaf:
+        ignore_signals()
+    ready.release()
+    time.sleep(60)
+
+
+@pytest.mark.parametrize("deaf", [True, False])
+def test_a_worker_s_death_that_torchrl_sees_first_is_told(deaf):
+    """Our signal handler keeps out of an error's handling, and TorchRL ends the other workers its own way."""
+    ready = FORKSERVER.Semaphore(0)
+    workers = [FORKSERVER.Process(target=work, args=(deaf, ready), daemon=True) for _ in range(2)]
+    for worker in workers:
+        worker.start()
+    for _ in workers:
+        assert ready.acquire(timeout=240)
+    with pytest.raises(WorkerDied, match=r"1 of 2 has died \(exit code -9\)"), watched(SimpleNamespace(procs=workers)):
+        try:
+            raise queue.Empty
+        except queue.Empty:
+            workers[0].kill()
+            workers[0].join()
+            _check_for_faulty_process(workers)
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_with_a_summary(smoke, tmp_path):
+    with pytest.raises(FloatingPointError) as caught:
+        smoke(tmp_path / "run", "algo.reward_scale=1e38")
+    message = str(caught.value)
+    assert message.startswith("the loss or its gradient is not finite: loss_")
+    assert "advantage" in message and "not finite)" in message
+    assert message.endswith("Nothing had been saved before.")
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_a_full_disk_ends_the_run_and_the_checkpoint_before_is_whole(smoke, tmp_path, monkeypatch):
+    run_dir, synced, fsync = tmp_path / "run", [], os.fsync
+
+    def full(number):
+        synced.append(number)
+        if len(synced) > 4:  # the third save: best and last of the first 256 frames went well
+            raise OSError(28, "No space left on device")
+        fsync(number)
+
+    monkeypatch.setattr(checkpoint.os, "fsync", full)
+    with pytest.raises(checkpoint.CheckpointError, match="cannot be written .*No space left.*resume=.*last$"):
+        smoke(run_dir, "total_frames=2048")
+    monkeypatch.undo()
+    assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 256
+    assert not [path for path in (run_dir / "checkpoints").iterdir() if path.name.startswith(".")]
+
+
+def test_a_full_disk_at_the_metrics_names_the_file_and_the_checkpoint(smoke, tmp_path, monkeypatch):
+    run_dir, write = tmp_path / "run", csv.DictWriter.writerow
+
+    def full(writer, row):
+        if isinstance(row["frames"], int) and row["frames"] > 300:
+            raise OSError(28, "No space left on device")
+        return write(writer, row)
+
+    monkeypatch.setattr(csv.DictWriter, "writerow", full)
+    words = rf"No space left on device: '{run_dir}/metrics.csv'. What was saved before is whole: .*resume={run_dir}/"
+    with pytest.raises(ValueError, match=words):
+        smoke(run_dir, "total_frames=2048")
+    assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 256
+
+
+@pytest.fixture(scope="module")
+def finished(smoke, tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("finished") / "run"
+    smoke(run_dir)
+    return run_dir
+
+
+@pytest.fixture
+def read_only(finished):
+    """A finished run in a folder where nothing can be written, not even by root."""
+    with tempfile.TemporaryDirectory() as base:  # pytest's own folders are closed to other users
+        run_dir = Path(base) / "run"
+        shutil.copytree(finished, run_dir)
+        for path in (Path(base), run_dir, *run_dir.rglob("*")):
+            path.chmod(0o555 if path.is_dir() else 0o444)
+        user = os.geteuid()
+        try:
+            if user == 0:
+                os.seteuid(65534)
+                if not all(
+                    os.access(place, os.R_OK | os.X_OK, effective_ids=True) for place in (conf_dir(), sys.prefix)
+                ):
+                    pytest.skip("another user cannot read the package, and root may write anywhere")
+            yield run_dir
+        finally:
+            os.seteuid(user)
+            for path in (Path(base), run_dir, *run_dir.rglob("*")):
+                path.chmod(0o755)
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments", "name"),
+    [
+        (train_main, ["resume={}", "total_frames=1280"], ".lock"),
+        (train_main, ["experiment=smoke", "hydra.run.dir={}"], "train.log"),
+        (train_main, ["experiment=smoke", "hydra.run.dir={}/below"], "below"),
+        (evaluate_main, ["planner=random", "hydra.run.dir={}"], "evaluate.log"),
+    ],
+)
+def test_a_read_only_run_folder_is_named(read_only, monkeypatch, capsys, main, arguments, name):
+    monkeypatch.setattr(sys, "argv", ["pickplace", *(word.format(read_only) for word in arguments)])
+    before = {path: path.read_bytes() for path in read_only.rglob("*") if path.is_file()}
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    expected = f"error: {read_only}/{name}: Permission denied; expected a place where you may read and write.\n"
+    assert capsys.readouterr().err == expected
+    assert before == {path: path.read_bytes() for path in read_only.rglob("*") if path.is_file()}
+
+
+def test_a_read_only_run_can_be_evaluated_from_elsewhere(read_only):
+    Planner.load(read_only)
