@@ -5,17 +5,9 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
-import torch
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from tensordict import TensorDict
 
 import pickplace
-from pickplace import PickPlaceEnv
-from pickplace.envs.gymnasium import KEYS
-from pickplace.task.items import Recorded
 from pickplace.views.figures import draw_scene
 
 ID = "pickplace/PickPlace-v0"
@@ -151,5 +143,3 @@ def test_the_picture_of_the_bin_lies_as_the_map_of_the_tote(monkeypatch):
     env.render()
     image = seen[-1].axes[-1].images[0]
     assert np.array_equal(image.get_array(), observation["bin_depth"].T) and image.origin == "lower"
-
-

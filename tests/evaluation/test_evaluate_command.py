@@ -4,8 +4,6 @@ import json
 
 import pytest
 
-from pickplace.runs import checkpoint
-
 
 @pytest.fixture(scope="module")
 def smoke_run(smoke, tmp_path_factory):
@@ -13,15 +11,6 @@ def smoke_run(smoke, tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("smoke") / "run"
     smoke(run_dir)
     return run_dir
-
-
-def test_checkpoint_for_fewer_rotations(run, smoke_run, tmp_path):
-    state, facts = checkpoint.read(smoke_run / "checkpoints" / "last")
-    facts["config"]["env"]["rotations"] = 2
-    del facts["schema"], facts["sha256"]
-    checkpoint.write(tmp_path / "two", state, facts)
-    code, _, err = run("evaluate", f"checkpoint={tmp_path / 'two'}", "env.rotations=4")
-    assert code == 2 and "env.rotations=4: the checkpoint was trained with 2" in err
 
 
 @pytest.mark.parametrize(

@@ -241,36 +241,34 @@ def test_whatever_a_checkpoint_holds_it_is_read_or_refused(tmp_path_factory, fac
     }
 
 
-@pytest.mark.parametrize("text", ["[" * 200_000, '{"a":' * 200_000, '{"frames": ' + "9" * 10_000 + "}", "\xff", ""])
-def test_facts_that_are_no_facts(tmp_path, text):
-    folder = write(tmp_path / "last")
-    (folder / checkpoint.FACTS).write_bytes(text.encode("latin-1"))
-    with pytest.raises(CheckpointError, match="cannot be read"):
-        checkpoint.read(folder)
-
-
 @pytest.mark.parametrize(
-    "damage", ["truncate", "flip", "remove", "facts", "schema", "target", "state", "config", "frames", "no policy"]
-)
-def test_damaged_checkpoints_are_refused(run, tmp_path, damage):
-    folder = tmp_path / "copy"
-    shutil.copytree(checkpoint.PRETRAINED / "r4", folder)
+    ("damage", "words"),
+    [
+        ("truncate", "truncated or altered"), ("flip", "truncated or altered"), ("remove", "cannot be read"),
+        ("text", "cannot be read"), ("schema", "schema 99, expected 1"), ("state", "lacks its state"),
+        ("config", "lacks its state, config"), ("frames", "config or frames"), ("policy", "has no policy"),
+        *((text, "cannot be read") for text in ("[" * 200_000, '{"a":' * 200_000, "9" * 10_000, "\xff", "")),
+    ],
+    ids=lambda value: str(value)[:10],
+)  # fmt: skip
+def test_damaged_checkpoints_are_refused(tmp_path, damage, words):
+    folder = shutil.copytree(checkpoint.PRETRAINED / "r4", tmp_path / "copy")
     tensors, facts = folder / checkpoint.TENSORS, folder / checkpoint.FACTS
     blob, content = bytearray(tensors.read_bytes()), json.loads(facts.read_text())
     if damage == "flip":
         blob[len(blob) // 2] ^= 1
-    elif damage == "no policy":
+    elif damage == "policy":
         blob = save({"other": torch.zeros(1)})
         content["sha256"] = hashlib.sha256(blob).hexdigest()
-    elif damage == "target":
-        content["config"]["model"]["actor"]["_target_"] = "os.system"
-    elif damage in ("state", "frames"):
-        del content[damage]
     content |= {"schema": {"schema": 99}, "config": {"config": []}}.get(damage, {})
-    tensors.write_bytes(blob[:-10] if damage == "truncate" else blob)
+    content.pop(damage if damage in ("state", "frames") else None, None)
     text = json.dumps(content)
-    facts.write_text(text[:-20] if damage == "facts" else text)
+    tensors.write_bytes(blob[:-10] if damage == "truncate" else blob)
+    if words == "cannot be read" and damage != "remove":
+        text = text[:-20] if damage == "text" else damage  # JSON without end, a number without end, not UTF-8
+    facts.write_bytes(text.encode("latin-1"))
     if damage == "remove":
         tensors.unlink()
-    code, _, err = run("evaluate", f"checkpoint={folder}")
-    assert code == 2 and err.startswith("error: ") and err.count("\n") == 1
+    with pytest.raises(CheckpointError, match=words) as caught:
+        checkpoint.read(folder)
+    assert "\n" not in str(caught.value)

@@ -57,7 +57,7 @@ def test_every_config_file_names_what_is_in_the_registry():
     ],
 )  # fmt: skip
 def test_a_wrong_name_or_setting_is_one_sentence(place, node, words):
-    kwargs = {"rules": PickPlaceEnv(num_envs=1).rules} if place == "planner" else {}
+    kwargs = {"cell": PickPlaceEnv(num_envs=1).cell} if place == "planner" else {}
     with pytest.raises(ValueError, match=words) as caught:
         build(place, OmegaConf.create(node), **kwargs)
     assert "\n" not in str(caught.value)
@@ -110,11 +110,11 @@ def test_every_item_distribution(name, tmp_path):
 
 @pytest.mark.parametrize("name", options("model"))
 def test_every_model(name):
-    cfg, rules = composed(f"model={name}"), PickPlaceEnv(num_envs=1).rules
+    cfg, cell = composed(f"model={name}"), PickPlaceEnv(num_envs=1).cell
     for masked in (True, False):
-        policy = build("model.actor", cfg.model.actor, rules=rules, mask_infeasible=masked)
+        policy = build("model.actor", cfg.model.actor, cell=cell, mask_infeasible=masked)
         assert policy.mask_infeasible is masked
-    assert isinstance(build("model.critic", cfg.model.critic, rules=rules), Conv4dCritic | PooledCritic)
+    assert isinstance(build("model.critic", cfg.model.critic, cell=cell), Conv4dCritic | PooledCritic)
 
 
 @pytest.mark.parametrize("name", options("curriculum"))
@@ -136,10 +136,10 @@ def test_every_planner(name):
         kwargs["items"] = env.items
     if name in ("policy", "lookahead"):
         model = composed().model.actor
-        kwargs["policy"] = build("model.actor", model, rules=env.rules, mask_infeasible=True)
+        kwargs["policy"] = build("model.actor", model, cell=env.cell, mask_infeasible=True)
     observation = env.reset()
-    action = build("planner", cfg.planner, rules=env.rules, **kwargs).decide(observation)
-    assert ((action >= 0) & (action < env.rules.num_actions)).all()
+    action = build("planner", cfg.planner, cell=env.cell, **kwargs).decide(observation)
+    assert ((action >= 0) & (action < env.cell.num_actions)).all()
     if name not in ("uniform", "individual_heuristic", "mcts"):
         assert observation["action_mask"].gather(1, action[:, None]).all()
 

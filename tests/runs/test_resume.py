@@ -236,7 +236,7 @@ NUMBERS = [None, "x", [], {}, float("nan"), 10**30]
         ("critic", None, "critic does not fit"),
         ("collector", None, "environment|heights is missing"),
         ("collector|rng", torch.zeros(3), "rng is float32"),
-        ("collector|carried|outcome_mask", None, "carried|outcome_mask is missing, expected bool"),
+        ("collector|carried|footprint_mask", None, "carried|footprint_mask is missing, expected bool"),
         ("collector|carried|tote_depth", torch.zeros(8, 4, 9), "tote_depth is float32 of shape (8, 4, 9)"),
         ("collector|environment|heights", torch.zeros(8, 4, 4), "of shape (8, 4, 4), expected int32"),
         ("collector|counters|frames", None, "counters|frames is missing"),
@@ -313,7 +313,7 @@ def test_one_process_trains_in_a_folder(tmp_path):
 
 def test_chaos_in_short():
     """``make chaos`` kills it a hundred times, with either collector."""
-    command = [sys.executable, str(Path(commands.__file__).with_name("chaos.py")), "4"]
+    command = [sys.executable, str(Path(commands.__file__).parent / "long" / "chaos.py"), "4"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     result = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert result.returncode == 0 and "killed 4 times" in result.stdout, result.stderr

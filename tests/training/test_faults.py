@@ -59,7 +59,7 @@ def test_workers_that_cannot_begin_are_ended():
     before = set(multiprocessing.active_children())
     policy = RandomPolicy(PickPlaceEnv(num_envs=2).action_spec)
     with pytest.raises(ValueError, match="seed=-1"):
-        collector.multi_sync(slots, policy, num_envs=4, rollout_length=2, seed=-1, workers=1)
+        collector.multi_sync(slots, policy, num_envs=4, rollout_length=2, seed=-1)
     assert set(multiprocessing.active_children()) <= before
 
 

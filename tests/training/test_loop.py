@@ -8,8 +8,9 @@ from torchrl.modules import ValueOperator
 
 from pickplace import PickPlaceEnv
 from pickplace.evaluation.evaluate import play
-from pickplace.planners import JointDBL
-from pickplace.policies.actors import as_collection_policy, fcn_grasp
+from pickplace.planners.heuristics import JointDBL
+from pickplace.policies.base import as_collection_policy
+from pickplace.policies.fcn_grasp import fcn_grasp
 from pickplace.policies.networks.critics import PooledCritic
 from pickplace.runs import checkpoint
 from pickplace.runs.hydra_app import conf_dir
@@ -45,8 +46,8 @@ class MeanDepthCritic(nn.Module):
 def collected():
     """Policy and batch [8, 6] of a small tote."""
     torch.manual_seed(0)
-    env = PickPlaceEnv(num_envs=8, masks=("outcome",), tote_size=(4, 4, 1))
-    policy = fcn_grasp(env.rules, True, filters=8, hidden=8, head_std=1.0, compute_dtype="float32")
+    env = PickPlaceEnv(num_envs=8, masks=("footprint",), tote_size=(4, 4, 1))
+    policy = fcn_grasp(env.cell, True, filters=8, hidden=8, head_std=1.0, compute_dtype="float32")
     with torch.no_grad():
         return policy, env.rollout(6, as_collection_policy(policy), break_when_any_done=False)
 
@@ -106,8 +107,8 @@ def test_advantages_are_normalised_where_the_config_says_so(collected, algo, wan
 @pytest.mark.parametrize("phase", Phase)
 def test_a_step_follows_what_its_phase_learns_from(phase, limit):
     """The policy from reward or its teacher, the critic always; no further than the greatest norm of a gradient."""
-    env = PickPlaceEnv(num_envs=8, masks=("outcome",), tote_size=(4, 4, 1))
-    policy = fcn_grasp(env.rules, True, filters=8, hidden=8, head_std=1.0, compute_dtype="float32")
+    env = PickPlaceEnv(num_envs=8, masks=("footprint",), tote_size=(4, 4, 1))
+    policy = fcn_grasp(env.cell, True, filters=8, hidden=8, head_std=1.0, compute_dtype="float32")
     critic = ValueOperator(PooledCritic(filters=8, hidden=8, compute_dtype="float32"), OBSERVED)
     settings = ["algo.entropy_coeff=0.3", "algo.epochs=1", "algo.minibatch_size=64"]
     cfg = composed(*settings, f"algo.max_grad_norm={limit}").algo
@@ -115,7 +116,7 @@ def test_a_step_follows_what_its_phase_learns_from(phase, limit):
     with torch.no_grad():
         data = env.rollout(6, as_collection_policy(policy), break_when_any_done=False).reshape(-1)
         advantage(data)
-    data["taught"] = data["outcome"]
+    data["taught"] = data["footprint"]
     losses = loss(data)
     total = {
         Phase.REWARD: losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"],
@@ -185,7 +186,7 @@ def test_the_slots_of_all_workers_share_the_episodes_of_a_stream():
     env_config, items = {k: v for k, v in cfg.env.items() if k != "num_envs"}, build("items", cfg["items"])
     played = []
     for first in (0, 2):
-        env = training_env(env_config, items, "cpu", ("outcome",), 4, curriculum, first_episode=first, num_envs=2)
+        env = training_env(env_config, items, "cpu", ("footprint",), 4, curriculum, first_episode=first, num_envs=2)
         env.set_seed(0)
         for _ in range(3):
             env.reset()
@@ -201,7 +202,7 @@ def test_validation_plays_its_own_stream_at_full_height(tmp_path):
         stream = {"stream": "validation", "seed": 3, "first_episode": first}
         return PickPlaceEnv(tote_size=(4, 4, 2), num_envs=count, masks=(), **stream)
 
-    training.planner = JointDBL(make_env(0, 1).rules)
+    training.planner = JointDBL(make_env(0, 1).cell)
     found = training.validate()
     training.collector.shutdown()
     assert torch.equal(found.occupancy, play(make_env, training.planner, 6, 6).occupancy)

@@ -8,7 +8,8 @@ from hydra import compose, initialize_config_dir
 
 from pickplace import PickPlaceEnv
 from pickplace.evaluation.evaluate import play
-from pickplace.planners import JointDBL, PolicyPlanner, RandomFeasible
+from pickplace.planners.heuristics import JointDBL, RandomFeasible
+from pickplace.planners.policy import PolicyPlanner
 from pickplace.runs import checkpoint
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.registry import build
@@ -36,7 +37,7 @@ def mean_occupancy(make_planner, rotations):
         stream = {"stream": "test", "first_episode": first}
         return PickPlaceEnv(tote_size=(4, 4, 1), rotations=rotations, num_envs=count, masks=(), **stream)
 
-    occupancy = play(make_env, make_planner(make_env(0, 1).rules), 2000, 1000).occupancy
+    occupancy = play(make_env, make_planner(make_env(0, 1).cell), 2000, 1000).occupancy
     noise = occupancy.std() / len(occupancy) ** 0.5
     assert occupancy.mean() < OPTIMA[4, 4, rotations] + 3 * noise
     return occupancy.mean()
@@ -58,8 +59,8 @@ def test_fcn_grasp_comes_within_1_percent(tmp_path):
     train(cfg, tmp_path)
     state, _ = checkpoint.read(tmp_path / "checkpoints" / "last")
 
-    def trained(rules):
-        make_policy = partial(build, "model.actor", cfg.model.actor, rules=rules, mask_infeasible=True)
-        return PolicyPlanner(rules, checkpoint.restore(make_policy, state["policy"], "policy"))
+    def trained(cell):
+        make_policy = partial(build, "model.actor", cfg.model.actor, cell=cell, mask_infeasible=True)
+        return PolicyPlanner(cell, checkpoint.restore(make_policy, state["policy"], "policy"))
 
     assert mean_occupancy(trained, 4) > 0.99 * OPTIMA[4, 4, 4]

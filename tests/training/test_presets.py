@@ -6,7 +6,8 @@ from commands import composed, options
 from torchrl.modules import ValueOperator
 
 from pickplace import PickPlaceEnv
-from pickplace.policies.actors import as_collection_policy, fcn_grasp
+from pickplace.policies.base import as_collection_policy
+from pickplace.policies.fcn_grasp import fcn_grasp
 from pickplace.policies.networks.critics import PooledCritic
 from pickplace.runs.loggers import read_csv
 from pickplace.training.train import make_losses, train
@@ -59,8 +60,8 @@ def test_a2c_trains_through_the_same_loop(tmp_path):
 
 def test_ppo_begins_where_a2c_is():
     """At the policy that collected the data the ratio is 1, and the clipped objective has the gradient of A2C's."""
-    env = PickPlaceEnv(num_envs=16, masks=("outcome",))
-    policy = fcn_grasp(env.rules, True, head_std=1.0)
+    env = PickPlaceEnv(num_envs=16, masks=("footprint",))
+    policy = fcn_grasp(env.cell, True, head_std=1.0)
     critic = ValueOperator(PooledCritic(), ["bin_depth", "tote_depth"])
     with torch.no_grad():
         data = env.rollout(4, as_collection_policy(policy), break_when_any_done=False).reshape(-1)
