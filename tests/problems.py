@@ -14,11 +14,11 @@ from pickplace.planners.heuristics import RandomFeasible
 from pickplace.task.cell import Limits
 from pickplace.task.items import Uniform
 
-SIDES = st.integers(1, 4)
+SIDES, NEVER = st.integers(1, 4), st.just(False)
 
 
 class Case(NamedTuple):
-    """The state of one problem: height of the tote, heights ``[W_T, D_T]`` in it, and ``(x, y, w, d, h)`` in the bin."""
+    """The state of a problem: height of the tote, heights ``[W_T, D_T]`` in it, and ``(x, y, w, d, h)`` in the bin."""
 
     rim: int
     heights: np.ndarray
@@ -50,24 +50,25 @@ def random_limits(cell: CellSpec, seed: int) -> Limits:
 
 
 @st.composite
-def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=st.just(False), count=1):
+def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=NEVER, count=1):
     """Return a cell and ``count`` cases in it."""
     effector = draw(effector_sides), draw(effector_sides)
-    bin_w, bin_d, tote_w, tote_d = (draw(st.integers(2, most)) for most in (5, 4, 5, 4))
+    bin_w, bin_d, tote_w, tote_d = (draw(st.integers(least, most)) for least, most in ((2, 5), (2, 4), (3, 5), (2, 4)))
     rule = draw(st.sampled_from(["contain", "overlap"]))
+    support, strict = draw(st.sampled_from([(0.5, False), (0.0, False), (0.75, True), (0.5, True), (1.0, False)]))
     cell = CellSpec(
-        (bin_w, bin_d, draw(st.integers(1, 3))), (tote_w, tote_d, 6), effector, draw(st.sampled_from(rotations)), rule,
-        draw(st.sampled_from([0.0, 0.5, 0.75, 1.0])), draw(st.booleans()),
+        (bin_w, bin_d, draw(st.sampled_from([1, 2, 1, 3]))), (tote_w, tote_d, 6), effector,
+        draw(st.sampled_from(rotations)), rule, support, strict,
     )  # fmt: skip
     if draw(limited):
         cell = replace(cell, limits=random_limits(cell, draw(st.integers(0, 999))))
     most = [min(pair) if rule == "contain" else pair[0] for pair in zip((bin_w, bin_d), effector, strict=True)]
     cases = []
     for _ in range(count):
-        w, d, h = draw(st.integers(1, most[0])), draw(st.integers(1, most[1])), draw(st.integers(1, 3))
+        w, d, h = (draw(st.integers(1, side)) for side in (*most, 3))
         item = draw(st.integers(0, bin_w - w)), draw(st.integers(0, bin_d - d)), w, d, h
-        rim = draw(st.integers(1, 6))
-        levels = draw(st.lists(st.integers(0, rim), min_size=1, max_size=3))
+        rim = draw(st.integers(2, 6))
+        levels = [0, *draw(st.lists(st.integers(0, rim), max_size=3))]
         heights = np.random.default_rng(draw(st.integers(0, 999))).choice(levels, size=(tote_w, tote_d))
         cases.append(Case(rim, heights, item))
     return cell, cases

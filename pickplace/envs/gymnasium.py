@@ -44,7 +44,7 @@ def _tote_heights(given, env: PickPlaceEnv) -> torch.Tensor:
     """Return ``options["tote_height"]``, a whole number or one per problem, as int64 ``[N, 1]``; None: full height."""
     low, high, count = env.min_tote_height, env.cell.tote_size[2], env.num_envs
     heights = np.asarray(high if given is None else given)
-    wanted = f"a whole number of cells between {low} (the tallest item) and {high} (tote_size[2])"
+    wanted = f"a whole number between {low} (the tallest item) and {high} (tote_size[2])"
     if heights.dtype.kind not in "iu" or heights.shape not in ((), (count,)):
         raise ValueError(
             f"options['tote_height']={given!r}: expected {wanted}" + f", or {count} of them." * (count > 1)
@@ -78,7 +78,8 @@ class PickPlaceGymEnv(gymnasium.Env):
     and what `observation=` adds (see `PickPlaceEnv`).
 
     ## Rewards
-    The volume placed, in cells; 0 for an action that fails. An episode's return is the volume packed.
+    The volume placed, in cells times height units; 0 for an action that fails. An episode's return is the volume
+    packed.
 
     ## Starting State
     An empty tote, and a bin with the first item of an episode. `reset(seed=s)` begins the item stream `s`; later resets

@@ -188,7 +188,7 @@ class PickPlaceEnv(EnvBase):
             height = torch.full_like(self.tote_height, self.cell.tote_size[2])
         height = height.reshape(self.num_envs)
         if not torch.can_cast(height.dtype, torch.int64):
-            raise ValueError(f"tote_height={height[0].item()} ({height.dtype}): expected whole cells, as integers.")
+            raise ValueError(f"tote_height={height[0].item()} ({height.dtype}): expected whole numbers, as integers.")
         height = height.to(torch.int64)
         low, high = self.min_tote_height, self.cell.tote_size[2]
         if bool((rows & ((height < low) | (height > high))).any()):

@@ -1,4 +1,4 @@
-"""The protocol of planners, and what they are made of."""
+"""The protocol of planners, and the arguments that they are made with."""
 
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable

@@ -172,7 +172,7 @@ class MCTS:
                 edge.total += volume / float(tote_height[problem] * self.cell.num_places)
 
     def _carry_out(self, tried: list[tuple[int, _Edge]], tote_height: Tensor) -> None:
-        """Find out the heights that actions leave in the tote."""
+        """Simulate actions, and keep on their edges what they leave in the tote."""
         if not tried:
             return
         cell, height = self.cell, tote_height[[problem for problem, _ in tried]]

@@ -99,7 +99,7 @@ class Policy(TensorDictModuleBase, ABC):
 
     @property
     def act_keys(self) -> list[str]:
-        """Entries that turning a choice into an action may read."""
+        """Entries of the observation that :meth:`to_action` may read."""
         return list(dict.fromkeys([*STANDARD_TERMS, *self.in_keys]))
 
     def check_sizes(self) -> list[str]:

@@ -26,8 +26,7 @@ def spread_over_actions(cell: CellSpec, log_probs: Tensor, pick: Tensor) -> Tens
 class PlaceRotationPolicy(Policy):
     """Chooses place and rotation with the heuristic pick; subclasses score them.
 
-    With a mask, a state in which nothing can be placed with the heuristic pick is left unmasked: the policy fails then,
-    as it must.
+    With a mask, a state in which nothing can be placed with the heuristic pick is left unmasked; the action then fails.
     """
 
     choice_key = "place_rotation"
@@ -60,7 +59,7 @@ class PlaceRotationPolicy(Policy):
         pick = self._pick(observation)
         return spread_over_actions(self.cell, self.place_scores(observation, pick).log_softmax(-1), pick)
 
-    best_feasible = Policy.best_feasible
+    best_feasible = Policy.best_feasible  # that of :class:`ActionPolicy` scores every pick
 
 
 class IndividualRlPolicy(PlaceRotationPolicy, ActionPolicy):
@@ -92,7 +91,7 @@ class IndividualGraspPolicy(PlaceRotationPolicy, GraspPolicy):
 class IndividualFootprintPolicy(FootprintPolicy):
     """``individual_grasp`` with a mask: chooses among the distinct footprints that the heuristic pick reaches.
 
-    In a state in which none of them is feasible it chooses among them all, and fails, as it must.
+    In a state in which none of them is feasible it chooses among them all; the action then fails.
 
     Args: as :class:`~pickplace.policies.fcn_grasp.FootprintPolicy`.
     """
@@ -106,8 +105,12 @@ class IndividualFootprintPolicy(FootprintPolicy):
         self.in_keys = ["bin_depth", "tote_depth", "action_mask"]
 
     def _reached(self, observation: Observation, mask: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the pick cell, int64 ``[N]``; the footprint of each place and rotation with it, int64
-        ``[N, W_T * D_T * R]``, -1 outside the tote; and which of them to choose among, bool."""
+        """Return the heuristic pick, the footprints that it leaves, and those to choose among.
+
+        Returns:
+            the pick cell, int64 ``[N]``; the footprint for each place and rotation, int64 ``[N, W_T * D_T * R]``, -1
+            outside the tote; bool of the same shape.
+        """
         item = item_from_depth(observation["bin_depth"])
         pick = heuristic_pick(self.cell, item)
         footprint = select_pick(self.cell, action_footprints(self.cell, item), pick)

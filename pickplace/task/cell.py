@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from pickplace.task.checks import flag, is_number, is_whole, one_of, whole_number
@@ -28,7 +29,7 @@ class EffectorShape(NamedTuple):
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits on the robot, as tables; masks and the single step read the same ones.
+    """Limits of the robot, as tables that masks and the single step read.
 
     Attributes:
         pick_ok: bool ``[P]``, whether the robot reaches each pick cell.
@@ -41,13 +42,17 @@ class Limits:
     highest_top: Tensor
 
     def check(self, cell: "CellSpec") -> None:
-        """Refuse tables of another shape than the cell's, with a ``ValueError`` that names the table."""
+        """Refuse tables of another shape or type than the cell needs, with a ``ValueError`` that names the table."""
         places = (cell.rotations, *cell.tote_size[:2])
         shapes = {"pick_ok": (cell.num_picks,), "lowest_top": places, "highest_top": places}
         for name, shape in shapes.items():
             found = tuple(getattr(self, name).shape)
             if found != shape:
                 raise ValueError(f"limits.{name}: got shape {list(found)}, expected {list(shape)}.")
+            dtype = getattr(self, name).dtype
+            if (dtype == torch.bool) != (name == "pick_ok") or dtype.is_floating_point:
+                expected = "bool" if name == "pick_ok" else "integers"
+                raise ValueError(f"limits.{name}: got {dtype}, expected {expected}.")
 
     def on(self, device) -> "Limits":
         """Return the tables on a device."""
@@ -72,7 +77,7 @@ class CellSpec:
         height_unit: length of a height unit, in sides of a cell. The rules only count units; what converts heights to
             lengths (the robot's planner, the replay page) multiplies by it.
         longest_side: longest side of any item, where it is known; saves time only.
-        limits: limits on the robot, see :class:`Limits`; None: there are none.
+        limits: of the robot, see :class:`Limits`; None: there are none.
 
     Raises:
         ValueError: naming the argument, the value received and what was expected.
@@ -96,7 +101,7 @@ class CellSpec:
         if not is_whole(self.rotations) or not 1 <= self.rotations <= 4:
             raise ValueError(f"rotations={self.rotations!r}: expected 1, 2, 3 or 4 (quarter turns to choose from).")
         one_of("pick_rule", self.pick_rule, PICK_RULES)
-        if not isinstance(self.min_support, (int, float)) or not 0 <= self.min_support <= 1:
+        if not is_number(self.min_support) or not 0 <= self.min_support <= 1:
             raise ValueError(f"min_support={self.min_support!r}: expected a share between 0 and 1.")
         flag("strict_support", self.strict_support)
         if not is_number(self.height_unit) or not 1e-3 <= self.height_unit <= 1e3:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pickplace.task.cell import CellSpec, reference_cell
 from pickplace.task.maps import FAR
-from pickplace.task.state import Failure, Item
+from pickplace.task.state import Item
 
 
 # ---------------------------------------------------------------------- the checks of a pick, one function each
@@ -55,7 +55,7 @@ def turn(near_x: Tensor, near_y: Tensor, back_x: Tensor, back_y: Tensor) -> tupl
 
 
 class Grasp(NamedTuple):
-    """Effect of a pick; the fields have the common shape of the pick's coordinates and the item."""
+    """The effect of a pick on the item; the fields have the common shape of the pick's coordinates and the item."""
 
     misses: Tensor
     collides: Tensor
@@ -156,12 +156,12 @@ def select_pick(cell: CellSpec, actions: Tensor, pick: Tensor) -> Tensor:
 
 # ---------------------------------------------------------------------- grasp classes
 def num_turns(cell: CellSpec) -> int:
-    """Return the number of distinct turns: parities, or rotations where limits may forbid one of the same parity."""
+    """Return how many turns are told apart: parities, or rotations where limits may forbid one and not its like."""
     return cell.parities if cell.limits is None else cell.rotations
 
 
 def class_index(cell: CellSpec, turns: Tensor | int, step_x: Tensor, step_y: Tensor) -> Tensor:
-    """Return the grasp class of a turn and an offset, counted from :attr:`CellSpec.min_offset` on."""
+    """Return the grasp class of a turn and an offset, counted from :attr:`CellSpec.min_offset`."""
     return (turns * cell.num_offsets + step_x) * cell.num_offsets + step_y
 
 
@@ -204,8 +204,3 @@ def pick_blocks(cell: CellSpec, item: Item) -> Tensor:
     y = item.y[:, None] - (number % bin_d - reference_cell(ee_d)) - cell.min_offset
     inside = ~is_outside(x, 1, count) & ~is_outside(y, 1, count)
     return torch.where(inside, class_index(cell, 0, x, y), count * count)
-
-
-def failure_of(found: Grasp) -> Tensor:
-    """Return the failure code of picks, 0 where they succeed; reach is judged after all other checks."""
-    return torch.where(found.misses, int(Failure.PICK_MISS), found.collides * int(Failure.BIN_COLLISION))

@@ -1,4 +1,4 @@
-"""Observations: a list of terms. A new channel is one term, and one line in the config of the environment.
+"""Observations: lists of terms. A new channel is one term, and one line in the config of the environment.
 
 The environment, Gymnasium, the robot's planner and search all ask this list; policies and critics read the entries that
 they name in ``in_keys``.
@@ -29,7 +29,7 @@ class Term(ABC):
 
     @abstractmethod
     def bounds(self, cell: CellSpec, tallest: int) -> Bounds:
-        """Return what values this entry may take.
+        """Return the values that this entry may take.
 
         Args:
             cell: the sizes.
@@ -78,7 +78,7 @@ STANDARD_TERMS: Mapping[str, Term] = {
     "tote_height": ToteHeight(),
 }
 
-#: Keys of the environment's that no term may have.
+#: Keys of the environment, the policies and the learner that no term may have.
 RESERVED = (
     "action",
     "action_mask",
@@ -89,6 +89,15 @@ RESERVED = (
     "done",
     "terminated",
     "truncated",
+    "next",
+    "footprint",
+    "grasp",
+    "place_rotation",
+    "logits",
+    "log_prob",
+    "advantage",
+    "state_value",
+    "value_target",
 )
 
 
@@ -106,7 +115,7 @@ def check_terms(terms: Mapping[str, Term] | None) -> dict[str, Term]:
                 f"observation.{key}={term!r}: expected a Term, such as pickplace.task.observation.ToteDepth."
             )
         if key in RESERVED or not key.isidentifier():
-            raise ValueError(f"observation.{key}: expected another name; the environment uses {', '.join(RESERVED)}.")
+            raise ValueError(f"observation.{key}: expected another name; taken are {', '.join(RESERVED)}.")
     for key, term in STANDARD_TERMS.items():
         if type(terms.get(key)) is not type(term):
             raise ValueError(

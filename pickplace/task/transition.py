@@ -1,4 +1,4 @@
-"""One step: what an action does to a state, with the checks in the order of the rules."""
+"""One step: the effect of an action on a state, with the checks in the order of the rules."""
 
 from typing import NamedTuple
 

@@ -172,7 +172,7 @@ def test_the_critic_learns_and_refuses_other_sizes():
     assert values.shape == (3, 1)
     values.sum().backward()
     assert all(parameter.grad is not None for parameter in critic.parameters())
-    with pytest.raises(ValueError, match="tote"):
+    with pytest.raises(ValueError, match=r"tote_depth: got \[7, 6\], expected \[6, 6\]"):
         critic(bins, depths((5, 5), (7, 6))[1])
 
 

@@ -157,11 +157,8 @@ def test_weights_serve_fewer_rotations_and_other_totes(kind):
 
 
 def test_the_papers_conditions_on_sizes():
-    good, wide, low = (
-        CellSpec(longest_side=3),
-        CellSpec(longest_side=4, bin_size=(6, 6, 1)),
-        CellSpec(tote_size=(6, 4, 5)),
-    )
+    good, low = CellSpec(longest_side=3), CellSpec(tote_size=(6, 4, 5))
+    wide = CellSpec(longest_side=4, bin_size=(6, 6, 1))
     for kind in (FootprintPolicy, ActionPolicy):
         assert small(kind, good).check_sizes() == []
     assert small(FootprintPolicy, wide).check_sizes() == [

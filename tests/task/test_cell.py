@@ -22,7 +22,7 @@ from pickplace.task.cell import CELL_SETTINGS, Limits, cell_from_settings, refer
         ({"effector_size": (3, 3, 1)}, r"effector_size=\(3, 3, 1\)"),
         *(({"rotations": value}, f"rotations={value}: expected 1, 2, 3 or 4") for value in (0, 5, 4.0, True)),
         ({"pick_rule": "grab"}, "pick_rule='grab': expected 'contain' or 'overlap'"),
-        *(({"min_support": value}, f"min_support={value!r}: expected a share") for value in (1.5, -0.1, "half")),
+        *(({"min_support": value}, f"min_support={value!r}: expected a share") for value in (1.5, -0.1, "half", True)),
         ({"min_support": float("nan")}, "min_support=nan"),
         ({"strict_support": 1}, "strict_support=1: expected true or false"),
         *(({"height_unit": value}, f"height_unit={value!r}: expected sides") for value in (0, -1, 1e-4, 2000, "1")),
@@ -38,10 +38,10 @@ def test_impossible_settings_are_refused(settings, message):
 
 
 def test_every_setting_reaches_the_cell_of_the_environment():
-    given = dict(
-        bin_size=[4, 6, 2], tote_size=[5, 7, 6], effector_size=[2, 4], rotations=3, pick_rule="overlap",
-        min_support=0.25, strict_support=True, height_unit=0.5,
-    )  # fmt: skip
+    given = {
+        "bin_size": [4, 6, 2], "tote_size": [5, 7, 6], "effector_size": [2, 4], "rotations": 3, "pick_rule": "overlap",
+        "min_support": 0.25, "strict_support": True, "height_unit": 0.5,
+    }  # fmt: skip
     assert tuple(given) == CELL_SETTINGS
     cell = PickPlaceEnv(num_envs=1, **given).cell
     for key, value in given.items():
@@ -68,11 +68,16 @@ def test_the_height_unit_changes_no_rule():
 
 
 @pytest.mark.parametrize("table", ["pick_ok", "lowest_top", "highest_top"])
-def test_a_table_of_another_shape_is_refused(table):
+def test_a_table_of_another_shape_or_type_is_refused(table):
     places = torch.zeros(2, 6, 7, dtype=torch.int32)
     tables = {"pick_ok": torch.ones(20, dtype=torch.bool), "lowest_top": places, "highest_top": places + 5}
     sizes = {"bin_size": (4, 5, 1), "tote_size": (6, 7, 5), "rotations": 2}
     assert CellSpec(**sizes, limits=Limits(**tables)).limits.on("cpu").highest_top.equal(places + 5)
-    tables[table] = tables[table][:-1]
-    with pytest.raises(ValueError, match=rf"limits.{table}: got shape \[.*\], expected \["):
-        CellSpec(**sizes, limits=Limits(**tables))
+    kind = "bool" if table == "pick_ok" else "integers"
+    for bad, words in (
+        (tables[table][:-1], r"got shape \[.*\], expected \["),
+        (tables[table].float(), f"got torch.float32, expected {kind}"),
+        (tables[table].int() if kind == "bool" else tables[table].bool(), f"got torch.*, expected {kind}"),
+    ):
+        with pytest.raises(ValueError, match=f"limits.{table}: {words}"):
+            CellSpec(**sizes, limits=Limits(**{**tables, table: bad}))

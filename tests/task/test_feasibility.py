@@ -30,11 +30,8 @@ def test_masks_equal_the_step_and_the_oracle(problem):
     cell, cases = problem
     state, actions = state_of(*cases), torch.arange(cell.num_actions)
     maps = placing_maps(cell, state)
-    masks, footprints, reached = (
-        action_mask(cell, maps),
-        action_footprints(cell, state.item),
-        footprint_mask(cell, maps),
-    )
+    masks, reached = action_mask(cell, maps), footprint_mask(cell, maps)
+    footprints = action_footprints(cell, state.item)
     assert torch.equal(num_feasible(cell, maps), masks.sum(1))
     for row, case in enumerate(cases):
         plain, mask = oracle_of(cell, case), masks[row]
@@ -66,16 +63,11 @@ def test_footprints_without_the_tote(problem):
     """Every action whose pick succeeds and whose item stays in the tote has a footprint, whatever lies there."""
     cell, cases = problem
     flat = state_of(*(case._replace(heights=case.heights * 0) for case in cases))
-    step = [
-        apply(cell, flat.rows(torch.full((cell.num_actions,), row)), torch.arange(cell.num_actions)) for row in (0, 2)
-    ]
-    footprints = action_footprints(cell, flat.item)[[0, 2]]
-    x, y, w, d = torch.stack([each.footprint for each in step]).unbind(-1)
+    step = apply(cell, flat.repeat(cell.num_actions), torch.arange(cell.num_actions).repeat(3))
+    x, y, w, d = step.footprint.unbind(-1)
     inside = (x >= 0) & (y >= 0) & (x + w <= cell.tote_size[0]) & (y + d <= cell.tote_size[1])
-    lifted = torch.stack(
-        [(each.failure != Failure.PICK_MISS) & (each.failure != Failure.BIN_COLLISION) for each in step]
-    )
-    assert torch.equal(footprints >= 0, inside & lifted)
+    lifted = (step.failure != Failure.PICK_MISS) & (step.failure != Failure.BIN_COLLISION)
+    assert torch.equal(action_footprints(cell, flat.item).flatten() >= 0, inside & lifted)
 
 
 def open_limits(cell):

@@ -68,7 +68,7 @@ def test_the_state_can_be_read_from_an_observation(options):
     ("terms", "message"),
     [
         ({**OWN, "middle": 3}, "observation.middle=3: expected a Term, such as"),
-        ({**OWN, "two words": Middle()}, "observation.two words: expected another name; the environment uses action,"),
+        ({**OWN, "two words": Middle()}, "observation.two words: expected another name; taken are action,"),
         *(({**OWN, key: Middle()}, f"observation.{key}: expected another name") for key in RESERVED),
         ({"middle": Middle()}, "observation.bin_depth=None: expected BinDepth, which is always there"),
         ({**STANDARD_TERMS, "tote_depth": Middle()}, "observation.tote_depth=<.*>: expected ToteDepth"),

@@ -99,7 +99,7 @@ class Conv4dPolicy(nn.Module):
             nn.init.zeros_(self.head.bias)
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor, pick: Tensor | None = None) -> Tensor:
-        """Logits in the flat order of actions: pick x, pick y, place x, place y, rotation.
+        """Return logits in the flat order of actions: pick x, pick y, place x, place y, rotation.
 
         Args:
             bin_depth: height above the bin's floor, ``[..., W_B, D_B]``.
@@ -113,7 +113,7 @@ class Conv4dPolicy(nn.Module):
         return self._compute(bin_depth, tote_depth, pick, self._logits).flatten(tote_depth.dim() - 2)
 
     def features(self, bin_depth: Tensor, tote_depth: Tensor, pick: Tensor | None = None) -> Tensor:
-        """Activations after the last ``3x3x3x3`` convolution's ReLU, float32. Arguments as in `forward`.
+        """Return activations after the last ``3x3x3x3`` convolution's ReLU, float32. Arguments as in `forward`.
 
         Returns:
             ``[..., W_B * D_B, W_T * D_T, filters]``, or ``[..., W_T * D_T, filters]`` for given pick cells.
@@ -150,7 +150,7 @@ class Conv4dPolicy(nn.Module):
         return pad_depth(clip_depth(depth, limit, self.floor), 2, padding)
 
     def _chunk_sizes(self, bins: Tensor, totes: Tensor) -> tuple[int, int]:
-        """How many states, and how many rows of pick cells of each, to compute at a time."""
+        """Return how many states, and how many rows of pick cells of each, to compute at a time."""
         states, rows = len(bins), bins.shape[1] - 4
         if torch.is_grad_enabled():
             return max(states, 1), rows
@@ -162,7 +162,7 @@ class Conv4dPolicy(nn.Module):
         return 1, max(1, self.chunk_bytes // row_bytes - 2)
 
     def _hidden(self, bins: Tensor, totes: Tensor) -> Tensor:
-        """Padded ``[N, W_B + 4, D_B + 4]``, ``[N, W_T + 4, D_T + 4]`` to ``[W_B, N, D_B, W_T, D_T, C]``."""
+        """Return the second layer's activations, ``[W_B, N, D_B, W_T, D_T, C]``, of padded maps ``[N, ...]``."""
         dtype = torch.bfloat16 if self.compute_dtype == "bfloat16" else bins.dtype
         bin_kernel = self.first.weight[:, 0].sum((3, 4))  # the bin's channel is equal under all place taps
         tote_kernel = self.first.weight[:, 1].sum((1, 2))
@@ -170,7 +170,7 @@ class Conv4dPolicy(nn.Module):
         from_tote = F.conv2d(totes[:, None], tote_kernel[:, None], self.first.bias)
         from_tote = from_tote.permute(0, 2, 3, 1).to(dtype).contiguous()  # [N, W_T + 2, D_T + 2, filters]
         if bins.shape[1:] == (5, 5):
-            return self._at_one_pick(from_bin.permute(0, 2, 3, 1).to(dtype).contiguous(), from_tote)
+            return self._convolve_one_pick(from_bin.permute(0, 2, 3, 1).to(dtype).contiguous(), from_tote)
         from_bin = from_bin.permute(2, 0, 3, 1).to(dtype).contiguous()  # [W_B + 2, N, D_B + 2, filters]
         # One axis after the other: the gradient is then summed over one at a time, which is six times as fast as both.
         from_tote = from_tote[:, None].expand(-1, from_bin.shape[2], -1, -1, -1)
@@ -187,8 +187,8 @@ class Conv4dPolicy(nn.Module):
         out = convolve(0, self.second.bias.to(dtype)).add_(convolve(1)).add_(convolve(2))
         return out.relu_().permute(0, 2, 3, 4, 1).unflatten(0, (rows, len(bins)))
 
-    def _at_one_pick(self, from_bin: Tensor, from_tote: Tensor) -> Tensor:
-        """The second layer where there is one pick cell: one 2D convolution, the pick's taps being more channels.
+    def _convolve_one_pick(self, from_bin: Tensor, from_tote: Tensor) -> Tensor:
+        """Return the second layer for one pick cell: a 2D convolution, with the pick's taps as further channels.
 
         Args:
             from_bin, from_tote: the first layer's parts, ``[N, 3, 3, filters]``, ``[N, W_T + 2, D_T + 2, filters]``.
@@ -257,11 +257,13 @@ class Conv4dCritic(nn.Module):
         return nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), nn.Flatten())
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
-        """Bin ``[..., W_B, D_B]`` and tote ``[..., W_T, D_T]`` depth to values ``[..., 1]``."""
+        """Return values ``[..., 1]`` of bin depth ``[..., W_B, D_B]`` and tote depth ``[..., W_T, D_T]``."""
         for name, depth, size in (("bin", bin_depth, self.bin_size), ("tote", tote_depth, self.tote_size)):
             got = tuple(depth.shape[-2:])
             if got != size:
-                raise ValueError(f"this critic was built for a {name} of {size}, not {got}")
+                raise ValueError(
+                    f"{name}_depth: got {list(got)}, expected {list(size)}, for which the critic was made."
+                )
         batch, dtype = tote_depth.shape[:-2], next(self.parameters()).dtype
         bins = bin_depth.to(dtype).reshape(-1, 1, *self.bin_size)
         totes = tote_depth.to(dtype).reshape(-1, 1, *self.tote_size)
