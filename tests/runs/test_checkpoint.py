@@ -38,7 +38,7 @@ def same(a, b):
     return type(a) is type(b) and a == b
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(tree=trees)
 def test_round_trip(tree, tmp_path_factory):
     folder = tmp_path_factory.mktemp("round") / "last"
@@ -54,6 +54,13 @@ def write(folder, value=0.0, frames=1):
     return folder
 
 
+def write_tensors(folder, blob):
+    """Replace a checkpoint's tensors by anything, with the right checksum."""
+    facts = json.loads((folder / checkpoint.FACTS).read_text())
+    (folder / checkpoint.TENSORS).write_bytes(blob)
+    (folder / checkpoint.FACTS).write_text(json.dumps({**facts, "sha256": hashlib.sha256(blob).hexdigest()}))
+
+
 def test_a_kill_between_the_renames_loses_nothing(tmp_path):
     folder = write(tmp_path / "run" / "checkpoints" / "last")
     folder.rename(folder.with_name(".last.old"))  # killed right after this
@@ -61,22 +68,6 @@ def test_a_kill_between_the_renames_loses_nothing(tmp_path):
     write(folder, frames=2)
     assert checkpoint.read(checkpoint.locate(tmp_path / "run", prefer="last"))[1]["frames"] == 2
     assert [path.name for path in folder.parent.iterdir()] == ["last"]
-
-
-def test_a_full_disk_leaves_the_old_one(tmp_path, monkeypatch):
-    folder = write(tmp_path / "last")
-
-    def full(*_):
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(checkpoint.os, "fsync", full)
-    with pytest.raises(CheckpointError, match="cannot be written .No space left on device"):
-        write(folder, frames=2)
-    assert [path.name for path in tmp_path.iterdir()] == ["last"]
-    monkeypatch.undo()
-    assert checkpoint.read(folder)[1]["frames"] == 1
-    write(folder, frames=3)
-    assert [path.name for path in tmp_path.iterdir()] == ["last"]
 
 
 def test_locate_knows_runs_and_checkpoints(tmp_path):
@@ -125,11 +116,8 @@ def test_restore_names_what_does_not_fit():
     ):
         with pytest.raises(CheckpointError, match=words):
             checkpoint.restore(make, {**state, **bad}, "policy")
-
-
-def test_a_config_that_asks_for_more_memory_than_there_is_takes_none():
-    with pytest.raises(CheckpointError, match="weight is .* of shape .3, 2., expected .* of shape .10000000000, 2."):
-        checkpoint.restore(lambda: torch.nn.Linear(2, 10**10), torch.nn.Linear(2, 3).state_dict(), "policy")
+    with pytest.raises(CheckpointError, match="of shape .3, 2., expected .* of shape .10000000000, 2."):
+        checkpoint.restore(lambda: torch.nn.Linear(2, 10**10), state, "policy")  # takes no memory
 
 
 @pytest.mark.parametrize("name", [checkpoint.FACTS, checkpoint.TENSORS])
@@ -158,10 +146,7 @@ def test_links_are_refused_and_a_pipe_does_not_block(tmp_path, name):
 def test_tensors_of_absurd_types_and_sizes(tmp_path, tensor):
     folder = write(tmp_path / "last")
     header = json.dumps({"policy|x": tensor}).encode()
-    blob = struct.pack("<Q", len(header)) + header + bytes(tensor["data_offsets"][1] % 64)
-    facts = json.loads((folder / checkpoint.FACTS).read_text())
-    (folder / checkpoint.TENSORS).write_bytes(blob)
-    (folder / checkpoint.FACTS).write_text(json.dumps({**facts, "sha256": hashlib.sha256(blob).hexdigest()}))
+    write_tensors(folder, struct.pack("<Q", len(header)) + header + bytes(tensor["data_offsets"][1] % 64))
     with pytest.raises(CheckpointError, match="cannot be read") as caught:
         checkpoint.read(folder)
     assert "\n" not in str(caught.value)
@@ -177,27 +162,23 @@ class Evil:
         return open, (str(self.path), "w")
 
 
-@pytest.mark.parametrize("name", [checkpoint.TENSORS, checkpoint.FACTS, "state.pt", "checkpoint.pkl", ""])
+@pytest.mark.parametrize("name", [checkpoint.TENSORS, checkpoint.FACTS, "state.pt", ""])
 def test_a_pickle_is_never_run_whatever_its_name(tmp_path, name):
-    folder, made = tmp_path / "run" / "checkpoints" / "last", tmp_path / "made"
-    write(folder)
+    folder, made = write(tmp_path / "run" / "checkpoints" / "last"), tmp_path / "made"
     blob = pickle.dumps(Evil(made))
     assert pickle.loads(blob) and made.unlink() is None  # it would
-    if name == checkpoint.TENSORS:  # with the right checksum
-        facts = json.loads((folder / checkpoint.FACTS).read_text())
-        facts["sha256"] = hashlib.sha256(blob).hexdigest()
-        (folder / checkpoint.FACTS).write_text(json.dumps(facts))
-    if name:
+    if name == checkpoint.TENSORS:
+        write_tensors(folder, blob)
+    elif name:
         (folder / name).write_bytes(blob)
     else:
         shutil.rmtree(folder)
         folder.write_bytes(blob)
-    if name in (checkpoint.TENSORS, checkpoint.FACTS, ""):
-        with pytest.raises(CheckpointError) as caught:
-            checkpoint.read(checkpoint.locate(folder))
-        assert "\n" not in str(caught.value)
-    else:
+    if name == "state.pt":
         checkpoint.read(checkpoint.locate(folder))
+    else:
+        with pytest.raises(CheckpointError):
+            checkpoint.read(checkpoint.locate(folder))
     assert not made.exists()
 
 
@@ -211,7 +192,7 @@ plain = st.recursive(
 )
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(
     st.dictionaries(st.sampled_from(["state", "config", "frames", "schema", "policy", "best"]), plain),
     st.dictionaries(paths, st.builds(torch.zeros, st.just(2)), max_size=4),
@@ -233,12 +214,7 @@ def test_whatever_a_checkpoint_holds_it_is_read_or_refused(tmp_path_factory, fac
         assert isinstance(state["policy"], dict) and isinstance(facts["config"], dict) and facts["frames"] >= 0
     except CheckpointError as error:
         assert "\n" not in str(error)
-    assert {path.name for path in folder.parent.parent.rglob("*")} == {
-        "checkpoints",
-        "last",
-        checkpoint.FACTS,
-        checkpoint.TENSORS,
-    }
+    assert {path.name for path in folder.parent.rglob("*")} == {"last", checkpoint.FACTS, checkpoint.TENSORS}
 
 
 @pytest.mark.parametrize(
