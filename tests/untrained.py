@@ -1,14 +1,13 @@
 """Untrained policies, which prefer some actions clearly, and checkpoints of them."""
 
 import torch
-from hydra import compose, initialize_config_dir
+from commands import composed
 from omegaconf import OmegaConf
 
-from pickplace.runs.provenance import commit, versions
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.fcn_grasp import fcn_grasp
 from pickplace.runs import checkpoint
-from pickplace.runs.hydra_app import conf_dir
+from pickplace.runs.provenance import commit, versions
 from pickplace.runs.registry import build
 
 
@@ -25,8 +24,7 @@ def untrained_planner(cell, candidates="all"):
 
 def write_checkpoint(folder, cell, *overrides):
     """Write a checkpoint of ``experiment=smoke`` with an untrained policy for a cell; return the folder."""
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = compose("train", ["experiment=smoke", "model.actor.head_std=1.0", *overrides])
+    cfg = composed("experiment=smoke", "model.actor.head_std=1.0", *overrides)
     torch.manual_seed(0)
     policy = build("model.actor", cfg.model.actor, cell=cell, mask_infeasible=cfg.algo.mask_infeasible)
     facts = {"frames": 256, "config": OmegaConf.to_container(cfg), "versions": versions(), "commit": commit()}

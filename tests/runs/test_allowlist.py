@@ -37,7 +37,7 @@ def changed(**values):
 def mine(tmp_path, monkeypatch):
     """A module and a package of a user's, ``mine`` and ``mypkg``, which import things that must not be called."""
     files = {
-        "mine.py": "import os\nfrom torch import load\nfrom os import system\nclass Net: ...\ndef make(): ...\nVALUE = 5\n",
+        "mine.py": "import os\nfrom torch import load\nfrom os import system\nclass Net: ...\ndef make(): ...\nV = 5\n",
         "mypkg/__init__.py": "from mypkg.nets import Net\n",
         "mypkg/nets.py": "from torch import load\nclass Net: ...\n",
         "mypkg/__main__.py": "raise SystemExit('it was run')\n",
@@ -114,17 +114,6 @@ def test_what_interpolations_hide_is_refused(name):
         trusted_config(changed(**HIDDEN[name]))
 
 
-def test_references_that_double_at_every_step_are_refused_at_once():
-    """OmegaConf would follow 2^35 of them."""
-    steps = {"p0": "${Z}", "q0": "${Y}", "Z": {}, "Y": {}}
-    for i in range(1, 36):
-        steps |= {f"p{i}": f"${{q{i - 1}.x{i - 1}}}", f"q{i}": f"${{p{i - 1}.x{i - 1}}}"}
-    for i in range(35):
-        steps["Z"][f"x{i}"], steps["Y"][f"x{i}"] = f"${{q{i}}}", f"${{p{i}}}"
-    with pytest.raises(ValueError, match="expected no interpolation"):
-        trusted_config(changed(**steps, a="${p35}"))
-
-
 def test_references_to_values_follow_what_they_lead_to():
     cfg = trusted_config(changed(**{FILTERS: "${seed}"}, items__kinds="${algo.kinds}", algo__kinds=[1, 2], seed=32))
     assert cfg.model.actor.filters == 32 and cfg["items"].kinds == [1, 2]
@@ -155,7 +144,12 @@ def test_a_checkpoint_that_hides_a_pickle_runs_nothing(command, run, tmp_path):
 
 @pytest.mark.parametrize(
     ("target", "trust"),
-    [("mine.Net", ["mine"]), ("mine.make", "mine"), ("mypkg.nets.Net", ["mine", "mypkg.nets"]), ("mypkg.Net", ["mypkg"])],
+    [
+        ("mine.Net", ["mine"]),
+        ("mine.make", "mine"),
+        ("mypkg.nets.Net", ["mine", "mypkg.nets"]),
+        ("mypkg.Net", ["mypkg"]),
+    ],
 )
 def test_what_a_trusted_module_defines_may_be_made_anywhere(target, trust, mine):
     trusted_config(changed(model__actor___target_=target, model__actor__part={"_target_": target}), trust)
@@ -164,7 +158,7 @@ def test_what_a_trusted_module_defines_may_be_made_anywhere(target, trust, mine)
 @pytest.mark.parametrize(
     "target",
     [
-        "mine.os.system", "mine.system", "mine.load", "mine.VALUE", "mine", "mine.", "mine. Net",
+        "mine.os.system", "mine.system", "mine.load", "mine.V", "mine", "mine.", "mine. Net",
         "mine..Net", "mine.Missing", "mine.__setattr__", "mine.${evil}", "mines.Net", "mypkg.nets.Net",
         "mypkg.nets", "mypkg.__main__", "mypkg.nets.load", "os.system", "torch.load", "", None, 5, ["mine.Net"],
     ],
@@ -213,6 +207,8 @@ def test_what_is_saved(monkeypatch):
 
 
 def test_modules_to_trust():
+    assert own_modules(None) == own_modules([]) == ()
+    assert own_modules("mine") == ("mine",) and own_modules(OmegaConf.create(["mine", "a.b"])) == ("mine", "a.b")
     assert modules_to_trust(original()) == ()
     changes = {"model__actor___target_": "my.nets.Net", "items___target_": "mine.Items"}
     changes["algo__more"] = [{"_target_": "mine.Items"}, {"_target_": "torch.nn.ReLU"}, {"_target_": "items/kinds"}]
@@ -221,11 +217,8 @@ def test_modules_to_trust():
 
 @pytest.mark.parametrize(
     ("place", "value"),
-    [
-        ("env__bin_size", [10**6, 10**6, 1]), ("env__tote_size", [6, 6, 10**6]), ("env__effector_size", [1e9, 3]),
-        ("env__num_envs", 10**9), ("collector__workers", 4096),
-    ],
-)  # fmt: skip
+    [("env__tote_size", [6, 6, 10**6]), ("env__effector_size", [1e9, 3]), ("collector__workers", 4096)],
+)
 def test_numbers_that_would_take_all_memory_are_refused(place, value):
     with pytest.raises(ValueError, match=f"{place.replace('__', '.')}=.*: the checkpoint is refused; expected at most"):
         trusted_config(changed(**{place: value}))

@@ -17,13 +17,9 @@ from pickplace.runs import checkpoint
 from pickplace.runs.checkpoint import CheckpointError
 
 leaves = st.one_of(
-    st.integers(-(2**40), 2**40),
-    st.floats(allow_nan=False),
-    st.booleans(),
-    st.none(),
-    st.lists(st.floats(-10, 10, width=32), max_size=4).map(lambda x: torch.tensor(x)),
-    st.integers(-9, 9).map(torch.tensor),
-)
+    st.integers(-(2**40), 2**40), st.floats(allow_nan=False), st.booleans(), st.none(),
+    st.lists(st.floats(-10, 10, width=32), max_size=4).map(torch.tensor), st.integers(-9, 9).map(torch.tensor),
+)  # fmt: skip
 keys = st.one_of(st.integers(0, 99), st.text("abc.xyz", min_size=1, max_size=5))
 trees = st.dictionaries(
     keys, st.recursive(leaves, lambda c: st.dictionaries(keys, c, min_size=1, max_size=3)), max_size=4

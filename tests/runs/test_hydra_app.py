@@ -93,19 +93,14 @@ def test_bad_input_is_one_sentence(run, tmp_path, command, words, expected):
     assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} <= folders
 
 
-def test_csv_with_a_bad_row(run, tmp_path):
+def test_bad_files_are_named(run, tmp_path):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "typo.yaml").write_text("# @package _global_\nalgo: {gama: 0.9}\n")
     (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n1,x,1\n")
     code, _, err = run("train", "items=recorded", "items.path=items.csv")
-    assert code == 2
-    assert "items.csv, line 3" in err and "'1,x,1'" in err
-
-
-def test_a_preset_with_a_misspelt_key(run, tmp_path):
-    (tmp_path / "mine" / "experiment").mkdir(parents=True)
-    (tmp_path / "mine" / "experiment" / "typo.yaml").write_text("# @package _global_\nalgo: {gama: 0.9}\n")
-    code, _, err = run("train", "--config-dir", "mine", "experiment=typo")
-    assert code == 2
-    assert "algo.gama: there is no key 'gama' in algo; did you mean 'gamma'?" in err
+    assert code == 2 and "items.csv, line 3" in err and "'1,x,1'" in err
+    code, _, err = run("train", "--config-dir", ".", "experiment=typo")
+    assert code == 2 and "algo.gama: there is no key 'gama' in algo; did you mean 'gamma'?" in err
 
 
 def test_a_failure_leaves_earlier_results_in_the_folder(run, tmp_path):

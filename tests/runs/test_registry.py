@@ -8,8 +8,6 @@ from commands import composed, options
 from omegaconf import OmegaConf
 
 from pickplace import PickPlaceEnv
-from pickplace.policies.base import Policy
-from pickplace.policies.networks.critics import Conv4dCritic, PooledCritic
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.registry import REGISTRY, accepted_arguments, build, find, names_at
 from pickplace.task.items import ItemDistribution
@@ -111,14 +109,6 @@ def test_every_item_distribution(name, tmp_path):
     assert isinstance(build("items", cfg["items"]), ItemDistribution)
 
 
-@pytest.mark.parametrize("name", options("model"))
-def test_every_model(name):
-    cfg, cell = composed(f"model={name}"), PickPlaceEnv(num_envs=1).cell
-    for masked in (True, False):
-        assert isinstance(build("model.actor", cfg.model.actor, cell=cell, mask_infeasible=masked), Policy)
-    assert isinstance(build("model.critic", cfg.model.critic, cell=cell), Conv4dCritic | PooledCritic)
-
-
 def test_every_curriculum_and_every_exchange_of_its_parts():
     """Every advance rule and every sampler, with some curriculum each."""
     parts = [options("curriculum/advance"), options("curriculum/sample"), options("curriculum")]
@@ -128,20 +118,3 @@ def test_every_curriculum_and_every_exchange_of_its_parts():
         build("curriculum", cfg.curriculum).setup(1, 5, 10**9)
     for name in options("curriculum"):
         assert isinstance(build("curriculum", composed(f"curriculum={name}").curriculum), Curriculum)
-
-
-@pytest.mark.parametrize("name", options("planner"))
-def test_every_planner(name):
-    env = PickPlaceEnv(num_envs=3, tote_size=(6, 6, 2))
-    quick = {"mcts": ["planner.simulations=20"], "lookahead": ["planner.samples=2", "planner.rounds=1"]}
-    cfg, kwargs = composed(f"planner={name}", *quick.get(name, []), name="evaluate"), {}
-    if name in ("mcts", "lookahead"):
-        kwargs["items"] = env.items
-    if name in ("policy", "lookahead"):
-        model = composed().model.actor
-        kwargs["policy"] = build("model.actor", model, cell=env.cell, mask_infeasible=True)
-    observation = env.reset()
-    action = build("planner", cfg.planner, cell=env.cell, **kwargs).decide(observation)
-    assert ((action >= 0) & (action < env.cell.num_actions)).all()
-    if name not in ("uniform", "individual_heuristic", "mcts"):
-        assert observation["action_mask"].gather(1, action[:, None]).all()

@@ -59,11 +59,11 @@ def test_workers_that_cannot_begin_are_ended():
     assert set(multiprocessing.active_children()) <= before
 
 
-@pytest.mark.parametrize("seed", [2**62 - 1, 20_000_000_000_000])
-def test_any_seed_is_one_for_the_workers(seed):
-    seeds = collectors._seeds(seed, 3)
-    assert {item_seed for item_seed, _ in seeds} == {seed}
-    assert len({torch.Generator().manual_seed(own).initial_seed() for _, own in seeds}) == 3
+def test_any_seed_is_one_for_the_workers():
+    for seed in (2**62 - 1, 20_000_000_000_000):
+        seeds = collectors._seeds(seed, 3)
+        assert {item_seed for item_seed, _ in seeds} == {seed}
+        assert len({torch.Generator().manual_seed(own).initial_seed() for _, own in seeds}) == 3
 
 
 def test_a_worker_s_death_is_told_until_it_is_heard():
@@ -173,7 +173,4 @@ def test_a_read_only_run_folder_is_named(read_only, monkeypatch, capsys, main, a
     expected = f"error: {read_only}/{name}: Permission denied; expected a place where you may read and write.\n"
     assert capsys.readouterr().err == expected
     assert before == {path: path.read_bytes() for path in read_only.rglob("*") if path.is_file()}
-
-
-def test_a_read_only_run_can_be_evaluated_from_elsewhere(read_only):
     Planner.load(read_only)

@@ -44,9 +44,8 @@ def drawing_policy():
 
 def ray_collector():
     def build(first_episode, num_envs):
-        return TransformedEnv(
-            PickPlaceEnv(tote_size=(4, 4, 5), num_envs=num_envs), Compose(ToteHeightCurriculum(3, Current(), 1))
-        )
+        env = PickPlaceEnv(tote_size=(4, 4, 5), num_envs=num_envs)
+        return TransformedEnv(env, Compose(ToteHeightCurriculum(3, Current(), 1)))
 
     return collectors.ray(build, drawing_policy(), num_envs=4, rollout_length=6, seed=0)
 

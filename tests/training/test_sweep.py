@@ -86,12 +86,12 @@ def test_a_run_that_fails_leaves_the_others_alone(run, tmp_path):
 
 @pytest.mark.parametrize(
     ("choice", "extra"),
-    [("hydra/sweeper=optuna", "optuna"), ("hydra/launcher=joblib", "joblib"), ("hydra/launcher=submitit_slurm", "submitit")],
+    [("sweeper=optuna", "optuna"), ("launcher=joblib", "joblib"), ("launcher=submitit_slurm", "submitit")],
 )
 def test_a_missing_plugin_is_one_sentence(choice, extra, run):
     if any(any(Path(place).glob(f"hydra_plugins/hydra_{extra}*")) for place in sys.path):
         pytest.skip("it is installed")
-    code, _, err = run("train", "-m", *SMOKE, choice)
+    code, _, err = run("train", "-m", *SMOKE, f"hydra/{choice}")
     assert code == 2 and err.strip().endswith(f"{extra} is missing; pip install 'pickplace[{extra}]'.")
 
 
