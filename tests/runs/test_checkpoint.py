@@ -130,39 +130,23 @@ def test_links_are_refused_and_a_pipe_does_not_block(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    "tensor",
-    [
-        {"dtype": "F4", "shape": [2], "data_offsets": [0, 1]},
-        {"dtype": "F8_E8M0", "shape": [1], "data_offsets": [0, 1]},
-        {"dtype": "F32", "shape": [0, 2**63], "data_offsets": [0, 0]},
-        {"dtype": "F32", "shape": [2**62, 2**62], "data_offsets": [0, 8]},
-        {"dtype": "F32", "shape": [2], "data_offsets": [0, 2**40]},
-    ],
+    ("dtype", "shape", "size"),
+    [("F4", [2], 1), ("F8_E8M0", [1], 1), ("F32", [0, 2**63], 0), ("F32", [2**62, 2**62], 8), ("F32", [2], 2**40)],
 )
-def test_tensors_of_absurd_types_and_sizes(tmp_path, tensor):
+def test_tensors_of_absurd_types_and_sizes(tmp_path, dtype, shape, size):
     folder = write(tmp_path / "last")
-    header = json.dumps({"policy|x": tensor}).encode()
-    write_tensors(folder, struct.pack("<Q", len(header)) + header + bytes(tensor["data_offsets"][1] % 64))
+    header = json.dumps({"policy|x": {"dtype": dtype, "shape": shape, "data_offsets": [0, size]}}).encode()
+    write_tensors(folder, struct.pack("<Q", len(header)) + header + bytes(size % 64))
     with pytest.raises(CheckpointError, match="cannot be read") as caught:
         checkpoint.read(folder)
     assert "\n" not in str(caught.value)
 
 
-class Evil:
-    """Unpickling it makes a file."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), "w")
-
-
 @pytest.mark.parametrize("name", [checkpoint.TENSORS, checkpoint.FACTS, "state.pt", ""])
 def test_a_pickle_is_never_run_whatever_its_name(tmp_path, name):
     folder, made = write(tmp_path / "run" / "checkpoints" / "last"), tmp_path / "made"
-    blob = pickle.dumps(Evil(made))
-    assert pickle.loads(blob) and made.unlink() is None  # it would
+    blob = f"cos\nsystem\n(S'touch {made}'\ntR.".encode()
+    assert pickle.loads(blob) == 0 and made.unlink() is None  # it would
     if name == checkpoint.TENSORS:
         write_tensors(folder, blob)
     elif name:
@@ -214,33 +198,18 @@ def test_whatever_a_checkpoint_holds_it_is_read_or_refused(tmp_path_factory, fac
 
 
 @pytest.mark.parametrize(
-    ("damage", "words"),
+    ("change", "words"),
     [
-        ("truncate", "truncated or altered"), ("flip", "truncated or altered"), ("remove", "cannot be read"),
-        ("text", "cannot be read"), ("schema", "schema 99, expected 1"), ("state", "lacks its state"),
-        ("config", "lacks its state, config"), ("frames", "config or frames"), ("policy", "has no policy"),
-        *((text, "cannot be read") for text in ("[" * 200_000, '{"a":' * 200_000, "9" * 10_000, "\xff", "")),
+        ({"schema": 99}, "schema 99"), ({"state": None}, "lacks its state"), ({"sha256": "0"}, "or altered"),
+        ({"config": []}, "lacks its state, config"), ({"frames": None}, "config or frames"),
+        *((text, "cannot be read") for text in (b"[" * 200_000, b'{"a":' * 200_000, b"9" * 10_000, b"\xff", b"")),
     ],
     ids=lambda value: str(value)[:10],
 )  # fmt: skip
-def test_damaged_checkpoints_are_refused(tmp_path, damage, words):
-    folder = shutil.copytree(checkpoint.PRETRAINED / "r4", tmp_path / "copy")
-    tensors, facts = folder / checkpoint.TENSORS, folder / checkpoint.FACTS
-    blob, content = bytearray(tensors.read_bytes()), json.loads(facts.read_text())
-    if damage == "flip":
-        blob[len(blob) // 2] ^= 1
-    elif damage == "policy":
-        blob = save({"other": torch.zeros(1)})
-        content["sha256"] = hashlib.sha256(blob).hexdigest()
-    content |= {"schema": {"schema": 99}, "config": {"config": []}}.get(damage, {})
-    content.pop(damage if damage in ("state", "frames") else None, None)
-    text = json.dumps(content)
-    tensors.write_bytes(blob[:-10] if damage == "truncate" else blob)
-    if words == "cannot be read" and damage != "remove":
-        text = text[:-20] if damage == "text" else damage  # JSON without end, a number without end, not UTF-8
-    facts.write_bytes(text.encode("latin-1"))
-    if damage == "remove":
-        tensors.unlink()
+def test_damaged_facts_are_refused(tmp_path, change, words):
+    facts = write(tmp_path / "last") / checkpoint.FACTS
+    whole = json.loads(facts.read_text())
+    facts.write_bytes(change if isinstance(change, bytes) else json.dumps({**whole, **change}).encode())
     with pytest.raises(CheckpointError, match=words) as caught:
-        checkpoint.read(folder)
+        checkpoint.read(facts.parent)
     assert "\n" not in str(caught.value)

@@ -18,35 +18,27 @@ BAD = [
     # keys and values that Hydra or the config does not know
     ("train", "algo.gama=0.9", ["algo.gama", "'gamma'"]),
     ("train", "+env.foo=1", ["env.foo", "no key 'foo'"]),
-    ("train", "+curriculum.advance.foo=1", ["curriculum.advance.foo", "occupancy"]),
     ("train", "algo.gama=0.9 --help", ["algo.gama", "'gamma'"]),
     ("train", "--config-dir nowhere", ["nowhere"]),
-    ("train", "algo=null", ["algo=null"]),
     ("train", "env.tote_size=[6,6", ["'env.tote_size=[6,6'", "<key>=<value>"]),
     ("train", "seed=1,2", ["seed=1,2", "--multirun"]),
     ("train", "curriculum=null", ["curriculum=null", "adaptive", "paper"]),
     ("train", "curriculum.advance=foo", ["curriculum.advance='foo'", "curriculum/advance=threshold"]),
-    ("train", "model.critic=null", ["model.critic=None", "_target_"]),
     ("train", "model.actor._target_=fcn", ["model.actor._target_=fcn", "'fcn4d'"]),
     ("train", "model.actor._target_=os.system", ["model.actor", "command"]),
     ("train", "trust=[os]", ["trust='os'", "modules of your own"]),
     ("train", "planner=random", ["planner._target_=random", "planner=policy"]),
     # sweeps, before their first run
     ("train", "-m algo.gama=0.9,1", ["algo.gama", "'gamma'"]),
-    ("train", "-m env.rotations=5,6", ["rotations=5", "1, 2, 3 or 4"]),
     ("train", "-m curriculum=none,mien", ["curriculum/mien", "adaptive"]),
     # cells, items, models and curricula
     ("train", "env.tote_size=[6,6,-5]", ["tote_size=[6, 6, -5]", "positive whole numbers"]),
-    ("train", "env.pick_rule=contains", ["pick_rule='contains'", "'overlap'"]),
     ("train", "env.tote_size=[5,5,3000000000]", ["3000000000", "below 1048576"]),
-    ("train", "items.kinds=[[9,9,1]]", ["item 9x9x1", "bin_size"]),
     ("train", "items.kinds=[[1,1,9]]", ["item 1x1x9", "tote_size[2]=5"]),
     ("train", "items=recorded items.path=nowhere.csv", ["items.path='nowhere.csv'", "no such file"]),
     ("train", "items=recorded", ["items.path", "no value"]),
-    ("train", "model.actor.compute_dtype=float8", ["float8", "bfloat16"]),
     ("train", "model=fcn4d env.tote_size=[4,4,1]", ["tote_size=[4, 4, 1]", "eq. 3"]),
     ("train", "curriculum.start_height=9", ["start_height=9"]),
-    ("train", "curriculum/advance=staged curriculum.advance.stages=5", ["stages=5", "a list of"]),
     ("train", "collector=multi_sync collector.workers=3", ["collector.workers=3", "divisor"]),
     ("train", "algo=a2c env.num_envs=1 algo.rollout_length=1", ["algo.normalize_advantage=True", "one frame"]),
     # resume
@@ -57,15 +49,11 @@ BAD = [
     ("evaluate", "", ["checkpoint=null", "run folder"]),
     ("evaluate", "checkpoint=nowhere", ["nowhere'", "run folder"]),
     ("evaluate", "planner=joint_dbl model.actor.filters=8", ["model", "checkpoint=<run folder>"]),
-    ("evaluate", "planner=joint_dbl planner.seed=1", ["planner.seed", "no key"]),
-    ("evaluate", "planner=mcts planner.seed=99999999999999999999", ["planner.seed=9", "2**62"]),
     ("evaluate", "planner=joint_dbl compare=nowhere.json", ["compare='nowhere.json'", "evaluation.json"]),
     ("evaluate", "planner=joint_dbl items.widht=1", ["items.widht", "no key 'widht'", "'weights'"]),
     ("evaluate", "checkpoint=pretrained/mixed items.kinds=[[1,1,1]]", ["items.kinds", "width, depth, height"]),
     ("evaluate", "planner=joint_dbl evaluation.stream=exam", ["evaluation.stream='exam'", "'validation'"]),
     ("evaluate", "planner=joint_dbl evaluation.latency_decisions=x", ["latency_decisions='x'", ">= 0"]),
-    ("evaluate", "planner=joint_dbl evaluation.episodes=0", ["evaluation.episodes=0", ">= 1"]),
-    ("evaluate", "planner=joint_dbl evaluation.gif=1", ["evaluation.gif=1", "true or false"]),
     # ranges, and overrides that the sentence repeats
     *(("train", word, [word, ">= 1"]) for word in ("env.num_envs=0", "threads=0", "model.critic.hidden=-1")),
     *(("train", word, [word, ">= 0"]) for word in ("algo.lr=fast", "algo.lr=-1", "algo.lr=inf")),
@@ -73,7 +61,6 @@ BAD = [
     *(("train", word, [word, "cpu"]) for word in ("device=tpu", "device=meta")),
     ("train", "algo.lr_decay_start=true", ["algo.lr_decay_start=True", "between 0 and 1"]),
     ("train", "total_frames=many", ["total_frames=many", "whole number"]),
-    ("train", "evaluation.seed=-1", ["evaluation.seed=-1", "2**62"]),
     ("train", "algo.loss=dqn", ["algo.loss=dqn", "ppo or a2c"]),
     ("train", "algo.mask_infeasible=maybe", ["algo.mask_infeasible=maybe", "true or false"]),
     ("train", "evaluation.stream=test", ["evaluation.stream=test", "validation"]),
@@ -137,20 +124,6 @@ def test_overrides_on_a_saved_config():
     other = composed("items=tall")["items"]
     swapped = apply_overrides(saved, ["items=tall", "items.height=[1,2]"], {"items": other})
     assert swapped["items"].height == [1, 2]
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("algo.gama=0.9", "there is no key 'gama' in algo; did you mean 'gamma'?"),
-        ("curriculum=paper", "the checkpoint's config group 'curriculum' cannot be exchanged"),
-        ("curriculum/advance=frames", "cannot be exchanged"),
-    ],
-)
-def test_refused_overrides_on_a_saved_config(override, message):
-    with pytest.raises(ValueError) as error:
-        apply_overrides(composed("experiment=smoke"), [override])
-    assert message in str(error.value)
 
 
 def test_notes_of_a_run_are_read_unresolved(tmp_path, monkeypatch):

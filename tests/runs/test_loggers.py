@@ -3,10 +3,8 @@
 import sys
 
 import pytest
-from commands import composed, options
 
 from pickplace.runs.loggers import CsvLogger, read_csv
-from pickplace.runs.registry import build
 from pickplace.training.train import resume_run
 
 
@@ -31,17 +29,6 @@ def test_metrics_survive_a_cut_line_and_a_resume(tmp_path):
     logger.close()
     rows = read_csv(tmp_path / "metrics.csv")
     assert rows == [{"frames": 10, "a": 1.0}, {"frames": 20, "a": 2.0, "b": 5.0}, {"frames": 30, "a": 7.0}]
-
-
-@pytest.mark.parametrize("name", options("logger"))
-def test_every_logger(name, tmp_path):
-    if name not in ("csv", "none"):
-        pytest.importorskip(name)
-    logger = build("logger", composed(f"logger={name}").logger, folder=tmp_path, frames=0)
-    logger.log({"train/occupancy": 0.5}, 10)
-    logger.close()
-    kept = read_csv(tmp_path / "metrics.csv") if name != "none" else []
-    assert kept == [{"frames": 10, "train/occupancy": 0.5}][: name != "none"]
 
 
 @pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])

@@ -95,18 +95,15 @@ def test_accepted_arguments():
     assert "rotations" in accepted_arguments(PickPlaceEnv)
 
 
-@pytest.mark.parametrize("name", options("env"))
-def test_every_env(name):
-    cfg = composed(f"env={name}")
-    env = build("env", cfg.env, items=build("items", cfg["items"]), num_envs=2)
-    assert isinstance(env, PickPlaceEnv) and env.reset()["action_mask"].any(1).all()
-
-
-@pytest.mark.parametrize("name", options("items"))
-def test_every_item_distribution(name, tmp_path):
+def test_every_env_and_item_distribution(tmp_path):
     (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
-    cfg = composed(f"items={name}", *([f"items.path={tmp_path}/items.csv"] if name == "recorded" else []))
-    assert isinstance(build("items", cfg["items"]), ItemDistribution)
+    for name in options("items"):
+        words = [f"items.path={tmp_path}/items.csv"] if name == "recorded" else []
+        assert isinstance(build("items", composed(f"items={name}", *words)["items"]), ItemDistribution)
+    for name in options("env"):
+        cfg = composed(f"env={name}")
+        env = build("env", cfg.env, items=build("items", cfg["items"]), num_envs=2)
+        assert isinstance(env, PickPlaceEnv) and env.reset()["action_mask"].any(1).all()
 
 
 def test_every_curriculum_and_every_exchange_of_its_parts():

@@ -29,19 +29,15 @@ from pickplace.training.collectors import ignore_signals, watch_workers
 from pickplace.training.train import main as train_main
 
 
-@pytest.fixture
-def spawn():
-    """Make workers children of this process, which hears of their death; conftest.py makes them the forkserver's."""
-    multiprocessing.set_start_method("spawn", force=True)
-    yield
-    multiprocessing.set_start_method("forkserver", force=True)
-
-
-def test_a_dead_worker_ends_the_run_in_one_sentence(smoke, tmp_path, spawn):
+def test_a_dead_worker_ends_the_run_in_one_sentence(smoke, tmp_path):
     run_dir = tmp_path / "run"
     words = rf"^collector worker 2 of 2 has died \(exit code -9\). .* is whole: .* resume={run_dir}/checkpoints/last$"
-    with after_batch(3, lambda trainer: trainer.collector.procs[1].kill()), pytest.raises(WorkerDied, match=words):
-        smoke(run_dir, "collector=multi_sync", "total_frames=2048")
+    multiprocessing.set_start_method("spawn", force=True)  # this process hears of the death of its own children only
+    try:
+        with after_batch(3, lambda trainer: trainer.collector.procs[1].kill()), pytest.raises(WorkerDied, match=words):
+            smoke(run_dir, "collector=multi_sync", "total_frames=2048")
+    finally:
+        multiprocessing.set_start_method("forkserver", force=True)
     assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 256
     assert not multiprocessing.active_children()
 
