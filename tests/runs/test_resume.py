@@ -252,3 +252,10 @@ def test_the_user_repeats_settings_that_leave_the_machine(key, value, local):
     assert OmegaConf.select(resumed_config("run", facts, [f"{key}={local}"]), key) != value
     _, words = checkpoint_config(OmegaConf.create(config))  # the words that a stopped run prints are enough
     assert OmegaConf.select(resumed_config("run", facts, words.split()), key) == value
+
+
+def test_only_the_user_says_what_to_trust():
+    config = {**saved_form(composed("experiment=quick")), "trust": ["evil"]}
+    facts = {"config": config, "curriculum": {}, "frames": 5, "iteration": 1, "best": 0.5, "latest": {}}
+    assert resumed_config("run", facts, []).trust == []
+    assert resumed_config("run", facts, ["trust=[mine]"]).trust == ["mine"]
