@@ -55,7 +55,6 @@ SCRIPTS = {
         (Threshold(0.8, 4, demote_below=0.3), {}, each(4, 0.9, 0.9, 0.3, 0.29, 0.29, 0.29, 0.9), [2, 3, 3, 2, 1, 1, 2]),
     "threshold: demotes by a full window only":
         (Threshold(0.8, 4, demote_below=0.3), {}, [(10, [0.9] * 4), (20, [0.0] * 3), (30, [0.0])], [2, 2, 1]),
-    "threshold: without demotion it stays": (Threshold(0.8, 4), {}, each(4, 0.9, 0.0), [2, 2]),
     "plateau: after windows without improvement":  # best: 0.3, 0.5, -, 0.62 (0.5 + 0.12), -, -
         (Plateau(2, 2, 0.1), {}, each(2, 0.3, 0.5, 0.55, 0.62, 0.65, 0.71), [1, 1, 1, 1, 1, 2]),
     "plateau: windows do not overlap": (Plateau(4, 1), {}, each(1, *[0.5] * 8), [1] * 7 + [2]),
@@ -128,13 +127,10 @@ def test_heights_default_to_the_tallest_item_and_the_full_tote():
 # --- any episodes, and checkpoints
 
 RULES = {
-    "frames": lambda: Frames(7),
-    "even": Frames,
+    "frames": lambda: Frames(7), "even": Frames, "none": NoAdvance, "plateau": lambda: Plateau(2, 2, 0.05),
     "threshold": lambda: Threshold(0.6, 3, max_frames_per_level=40, demote_below=0.3),
-    "plateau": lambda: Plateau(2, 2, 0.05),
-    "none": NoAdvance,
     "staged": lambda: Staged([{"frames": 20, "height": 5}, {"frames": 60, "height": 2}]),
-}
+}  # fmt: skip
 EPISODES = st.lists(st.tuples(st.integers(1, 7), st.floats(0, 1, width=32)), max_size=6)  # heights, occupancies
 BATCHES = st.lists(st.tuples(st.integers(1, 30), EPISODES), max_size=30)  # frames, episodes
 
@@ -184,17 +180,12 @@ class Own(Advance):
         return self.level, self.logs
 
 
-def loaded(curriculum, state):
-    curriculum.load_state_dict(state)
-
-
 NONE, STAGE = NoAdvance(), {"frames": 5, "height": 2}
 ERRORS = [
     (lambda: make(NONE, start_height=9), "curriculum.start_height=9: .* >= 1 and <= 5"),
     (lambda: make(NONE, start_height=1, low=2), "curriculum.start_height=1: .* >= 2"),
     (lambda: make(NONE, end_height=6), "curriculum.end_height=6: .* <= 5"),
     (lambda: make(NONE, start_height=4, end_height=3), "curriculum.start_height=4: .* <= 3"),
-    (lambda: make(NONE, start_height=2.5), "curriculum.start_height=2.5: "),
     (lambda: make(NONE, total_frames=0), "total_frames=0: "),
     (lambda: Frames(0), "curriculum.advance.frames_per_level=0: "),
     (lambda: Threshold(1.5, 10), "curriculum.advance.occupancy=1.5: .* between 0 and 1"),
@@ -208,12 +199,14 @@ ERRORS = [
     (lambda: Staged([STAGE] * 2), "curriculum.advance.stages: frames=5: .* >= 6"),
     (lambda: make(Staged([STAGE | {"height": 9}])), "curriculum.advance.stages: height=9: .* <= 5"),
     # States of another run; for damaged ones see test_resume.
-    (lambda: loaded(make(Frames(1)), make(Plateau(2, 2)).state_dict()), "advance=Frames.*'best'.*expected"),
-    (lambda: loaded(make(NONE), make(NONE, high=9).state_dict()), "level of the checkpoint=9: expected .* <= 5"),
-    (lambda: loaded(make(NONE), {"level": 1}), "The checkpoint's curriculum is .* saved"),
+    (lambda: make(Frames(1)).load_state_dict(make(Plateau(2, 2)).state_dict()), "advance=Frames.*'best'.*expected"),
+    (
+        lambda: make(NONE).load_state_dict(make(NONE, high=9).state_dict()),
+        "of the checkpoint=9: expected .* <= 5",
+    ),
+    (lambda: make(NONE).load_state_dict({"level": 1}), "The checkpoint's curriculum is .* saved"),
     # A user's rule.
     (lambda: play(make(Own(1.5)), 10), "advance: Own: its level is 1.5; expected a whole number"),
-    (lambda: play(make(Own(True)), 10), "Own: its level is True"),
     (lambda: play(make(Own(1, logs={"mood": "good"})), 10), "Own: it logs mood='good'; expected a number"),
     (lambda: make(Own(1, torch.tensor(1))), r"Own: its state has seen=tensor\(1\); expected a finite Python number"),
     (lambda: make(Own(1, float("nan"))), "Own: its state has seen=nan"),

@@ -16,14 +16,11 @@ from pickplace.task.transition import apply
 from pickplace.training.imitation import Phase, WarmStart, imitation_loss
 
 FCN = {"filters": 8, "hidden": 8}
-MODELS = {
-    "footprint": (fcn_grasp, {"mask_infeasible": True, **FCN}),
-    "grasp": (fcn_grasp, {"mask_infeasible": False, **FCN}),
-    "flat": (ActionPolicy, {"mask_infeasible": False, "filters": 4}),
-    "individual": (IndividualRlPolicy, {"mask_infeasible": False, "filters": 4}),
-    "individual_grasp": (individual_grasp, {"mask_infeasible": False, **FCN}),
-    "individual_footprint": (individual_grasp, {"mask_infeasible": True, **FCN}),
-}
+MODELS = {  # constructor, mask_infeasible, sizes
+    "footprint": (fcn_grasp, True, FCN), "grasp": (fcn_grasp, False, FCN),
+    "flat": (ActionPolicy, False, {"filters": 4}), "individual": (IndividualRlPolicy, False, {"filters": 4}),
+    "individual_grasp": (individual_grasp, False, FCN), "individual_footprint": (individual_grasp, True, FCN),
+}  # fmt: skip
 
 
 def config(teacher="joint_dbl", frames=100, critic_frames=50, checkpoint=None, **settings):
@@ -36,8 +33,8 @@ def config(teacher="joint_dbl", frames=100, critic_frames=50, checkpoint=None, *
 def warm_start(cfg, name="footprint", env=None, seed=0):
     """Return a warm start and its policy."""
     env = env or PickPlaceEnv(num_envs=1)
-    make, settings = MODELS[name]
-    policy = make(env.cell, **settings)
+    make, masked, sizes = MODELS[name]
+    policy = make(env.cell, mask_infeasible=masked, **sizes)
     return WarmStart(cfg, policy, env.cell, env.items, env.terms, seed), policy
 
 
@@ -70,8 +67,8 @@ def test_teachers_that_fail_draw_or_are_trained(states):
     random, _ = warm_start(config("random", seed=0), "flat", env, seed=7)
     assert torch.equal(random.ask(td, 3), random.ask(td, 3))
     assert not torch.equal(random.ask(td, 3), random.ask(td, 4))
-    trained = config("policy", checkpoint="pretrained/r4", candidates="all")
-    assert (warm_start(trained, "grasp", env)[0].ask(td, 0) >= 0).all()
+    trained, _ = warm_start(config("policy", checkpoint="pretrained/r4", candidates="all"), "grasp", env)
+    assert (trained.ask(td, 0) >= 0).all()
 
 
 def test_imitation_learns_the_teachers_choices(states):

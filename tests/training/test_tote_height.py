@@ -14,17 +14,13 @@ from pickplace import PickPlaceEnv
 from pickplace.training import collectors
 from pickplace.training.curriculum import Current, Curriculum, NoAdvance, Recent, Uniform, push_level
 
+SAMPLERS = [  # shares of the heights 2 to 5, at level 5
+    (Current(), [0, 0, 0, 1]), (Uniform(), [1 / 4] * 4), (Recent(0.25), [1 / 12] * 3 + [3 / 4]),
+    (Recent(1.0), [1 / 3] * 3 + [0]), (Recent(0.0), [0, 0, 0, 1]),
+]  # fmt: skip
 
-@pytest.mark.parametrize(
-    ("sampler", "shares"),  # of the heights 2 to 5, at level 5
-    [
-        (Current(), [0, 0, 0, 1]),
-        (Uniform(), [1 / 4] * 4),
-        (Recent(0.25), [1 / 12] * 3 + [3 / 4]),
-        (Recent(1.0), [1 / 3] * 3 + [0]),
-        (Recent(0.0), [0, 0, 0, 1]),
-    ],
-)
+
+@pytest.mark.parametrize(("sampler", "shares"), SAMPLERS)
 def test_samplers_draw_each_height_with_its_share(sampler, shares):
     torch.manual_seed(0)
     heights = sampler(5, 2, 12_000)
@@ -82,18 +78,6 @@ def test_a_partial_reset_leaves_running_episodes_their_height(hidden):
     assert heights(make_env(level=2).transform[0]._reset_env_preprocess(td)) == [2, 4]
 
 
-def test_automatic_resets_take_the_new_level_and_running_episodes_do_not():
-    env = make_env(level=3)
-    td = env.reset()
-    env.transform[0].set_level(4)
-    done = torch.tensor([0, 1, 0, 1, 0, 1]).bool()
-    action = (td["action_mask"] ^ done[:, None]).int().argmax(-1)  # infeasible where an episode shall end
-    td, following = env.step_and_maybe_reset(td.set("action", action))
-    assert td["next", "done"].squeeze(-1).tolist() == done.tolist()
-    assert heights(td["next"]) == [3] * 6  # finished episodes report the height they were played at
-    assert heights(following) == [3, 4, 3, 4, 3, 4]
-
-
 @pytest.fixture
 def forkserver():
     """Make TorchRL's workers children of the forkserver of ``commands``, which saves seconds."""
@@ -123,8 +107,9 @@ def test_push_level_reaches_every_process_which_has_its_own_slots(kind, forkserv
         batches = iter(collector)
         assert set(next(batches)["tote_height"].flatten().tolist()) == {3}
         push_level(collector, 5)
-        batch = next(batches)  # those that had begun keep their height
-        assert batch["tote_height"][:, 0].flatten().tolist() == [3] * 4
+        batch = next(batches)
+        for part in (batch, batch["next"]):  # episodes that had begun keep their height, and report it when they end
+            assert part["tote_height"][:, 0].flatten().tolist() == [3] * 4
         assert set(batch["tote_height"][:, 1:].flatten().tolist()) == {5}
     finally:
         collector.shutdown()
