@@ -21,9 +21,12 @@ def make(**settings):
 def scenes(monkeypatch):
     """The arguments and the figure of each scene that is drawn."""
     drawn = []
-    monkeypatch.setattr(
-        module, "draw_scene", lambda *given: drawn.append((*given, draw_scene(*given))) or drawn[-1][-1]
-    )
+
+    def draw(*given):
+        drawn.append((*given, draw_scene(*given)))
+        return drawn[-1][-1]
+
+    monkeypatch.setattr(module, "draw_scene", draw)
     return drawn
 
 
