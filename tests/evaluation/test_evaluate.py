@@ -5,11 +5,14 @@ import json
 import numpy
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 from untrained import write_checkpoint
 
 from pickplace import CellSpec, PickPlaceEnv
+from pickplace.evaluation.evaluate import episode_settings, read_comparison
 from pickplace.evaluation.play import play
 from pickplace.planners.heuristics import JointDBL
+from pickplace.runs.hydra_app import conf_dir
 from pickplace.views.tables import evaluation_table
 
 SMALL = ["env.tote_size=[4,4,2]", "evaluation.latency_decisions=0", "evaluation.replay=0"]
@@ -92,18 +95,22 @@ def test_paired_difference(evaluation):
     assert paired["ci95"][0] < paired["mean"] < paired["ci95"][1]
 
 
-def test_only_the_same_episodes_are_compared(evaluation):
-    settings = [*JOINT, "evaluation.episodes=2"]
-    compare = f"compare={evaluation(*settings)['path']}"
-    for word in (
-        "env.rotations=2", "env.effector_size=[2,3]", "env.bin_size=[5,4,1]", "env.tote_size=[4,5,1]",
-        "env.pick_rule=overlap", "env.min_support=0.25", "env.strict_support=true",
-        "evaluation.seed=1", "evaluation.episodes=3", "evaluation.stream=validation", "items=mixed",
-    ):  # fmt: skip
-        key = word.partition("=")[0]
-        more = ["env.tote_size=[7,7,3]"] if key == "items" else []
-        wanted = key if key.startswith("env.") else f"its {key.removeprefix('evaluation.')} is"
-        evaluation(*settings, *more, word, compare, refused=wanted)
+@pytest.mark.parametrize("word", [
+    "env.rotations=2", "env.effector_size=[2,3]", "env.bin_size=[5,4,1]", "env.tote_size=[4,5,1]",
+    "env.pick_rule=overlap", "env.min_support=0.25", "env.strict_support=true",
+    "evaluation.seed=1", "evaluation.episodes=3", "evaluation.stream=validation", "items=mixed",
+])  # fmt: skip
+def test_only_the_same_episodes_are_compared(word, tmp_path):
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        ours, theirs = (episode_settings(compose("evaluate", words)) for words in ([], [word]))
+    path = tmp_path / "evaluation.json"
+    path.write_text(json.dumps({**ours, "occupancy": {"per_episode": [0.5]}}))
+    read_comparison(path, ours)
+    key = word.partition("=")[0]
+    with pytest.raises(
+        ValueError, match=key if key.startswith("env.") else f"its {key.removeprefix('evaluation.')} is"
+    ):
+        read_comparison(path, theirs)
 
 
 def test_recorded_items_are_compared_by_content_and_not_by_path(evaluation, tmp_path):
@@ -115,7 +122,7 @@ def test_recorded_items_are_compared_by_content_and_not_by_path(evaluation, tmp_
     arguments += [f"items.path={table.rename(moved)}"]
     assert evaluation(*arguments, f"compare={first['path']}")["paired_difference"]["mean"] == 0
     moved.write_text("w,d,h,x,y\n2,1,1,0,3\n2,1,1,0,3\n")
-    evaluation(*arguments, f"compare={first['path']}", refused="its items is")
+    evaluation(*arguments, f"compare={first['path']}", refused="its items is")  # the command, too
     result = evaluation(*arguments)
     assert result["same_items"] and ", all of the same items" in evaluation_table(result)
 

@@ -140,7 +140,6 @@ TWO_ITEMS = changed(ITEM, (4, 4), 1)
 BAD = [
     ({"bin_depth": ITEM[:4]}, "bin_depth: got shape [4, 5], expected [5, 5]"),
     ({"bin_depth": [[1, 2], [3]]}, "bin_depth: expected an array of 5x5 numbers"),
-    ({"bin_depth": ITEM.astype(str)}, "bin_depth: got values of type"),
     ({"bin_depth": ITEM.astype(bool)}, "bin_depth: got values of type bool"),
     ({"bin_depth": np.zeros((5, 5))}, "bin_depth: got no cell above 0, expected one item"),
     ({"bin_depth": TWO_ITEMS}, "bin_depth[1, 3]: got 0 cells, expected 1: one cuboid"),
@@ -156,7 +155,6 @@ BAD = [
     ({"cell_size": "5cm"}, "cell_size='5cm': expected a length"),
     ({"cell_size": 1e-320}, "cell_size=1e-320: expected a length in metres, 1e-6 to 1e6"),
     ({"tote_height": 0}, "tote_height=0: expected a whole number of cells, 1 to 1048575"),
-    ({"tote_height": 4.5}, "tote_height=4.5"),
     ({"tote_height": 10**400}, "tote_height=1000"),
     ({"tolerance": 0.5}, "tolerance=0.5: expected a number of cells >= 0 and < 0.5"),
     ({"alternatives": -1}, "alternatives=-1: expected a whole number >= 0"),
@@ -169,7 +167,9 @@ HALVES = [
     ({"tote_depth": EMPTY * 0.05}, "got 10 height units (0.25 m), expected 0 to 5 height units"),
     ({"tote_height": 0.13}, "expected a whole number of height units, 1 to 1048575, within 0.1, in metres"),
 ]
-CASES = [(1.0, given, message) for given, message in BAD] + [(0.5, METRES | given, message) for given, message in HALVES]
+CASES = [(1.0, given, message) for given, message in BAD] + [
+    (0.5, METRES | given, message) for given, message in HALVES
+]
 
 
 @pytest.mark.parametrize(("unit", "given", "message"), CASES)
