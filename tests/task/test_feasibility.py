@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import SUCCESS, UNSTABLE
-from problems import SETTINGS, footprint_by_hand, oracle_of, problems, random_states, results_by_hand, state_of
+from problems import oracle_of, problems, state_of
 
 from pickplace import CellSpec, Failure, Item, State
 from pickplace.task.cell import Limits
@@ -128,19 +128,6 @@ def test_support_is_compared_exactly_in_float64(width, length, shift):
         cell = CellSpec((width, 1, 1), (length, 1, 2), (width, 1), 1, "contain", min_support, strict)
         assert apply(cell, state, action).failure.item() == expected, (min_support, strict)
         assert action_mask(cell, placing_maps(cell, state))[0, action].item() == (expected == SUCCESS)
-
-
-@pytest.mark.parametrize("options", SETTINGS)
-def test_footprints_are_the_distinct_results_of_the_feasible_actions(options):
-    """The masks that the environment emits along whole episodes, against the oracle."""
-    for env, observation in random_states(masks=("action", "footprint"), **options):
-        for row in range(env.num_envs):
-            item = env.item[row].tolist()
-            by_hand = {
-                action: footprint_by_hand(env.cell, item, found)
-                for action, found in results_by_hand(env, observation, row).items()
-            }
-            assert set(observation["footprint_mask"][row].nonzero()[:, 0].tolist()) == set(by_hand.values())
 
 
 @pytest.mark.parametrize("wall", [1, 2])
