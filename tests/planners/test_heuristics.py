@@ -9,7 +9,7 @@ from pickplace import PickPlaceEnv
 from pickplace.planners.heuristics import Corner, JointDBL, RandomFeasible, UniformRandom
 from pickplace.task.items import Uniform
 
-# Planner and items, then tote, R, occupancy and its standard error, from an independent prototype of the rules. Where no
+# Planner and items; tote, R, occupancy and its standard error, from an independent prototype of the rules. Where no
 # error is known (None): that of 100 episodes, as those of joint_dbl with mixed items are, and of rounding to 0.01.
 PAPER, MIXED = None, Uniform((1, 3), (1, 3), (1, 3))
 REFERENCE = {
