@@ -13,7 +13,8 @@ from pathlib import Path
 import torch
 
 from pickplace import PickPlaceEnv
-from pickplace.evaluation.evaluate import commit, confidence95
+from pickplace.evaluation.statistics import confidence95
+from pickplace.runs.provenance import commit
 from pickplace.task.feasibility import footprint_mask, placing_maps
 from pickplace.task.maps import NEVER
 from pickplace.task.state import State

@@ -1,14 +1,15 @@
-"""Entry points of the commands that Hydra runs; what Hydra answers by itself does not wait for torch to load."""
+"""Entry points of the commands; ``--help`` is answered without waiting for torch."""
 
 import sys
 
 from pickplace.runs.hydra_app import command
 
+#: Flags that Hydra answers by itself.
 ANSWERED_BY_HYDRA = {"--help", "-h", "--hydra-help", "--version"}
 
 
 def train() -> None:
-    """``pickplace-train``, see :mod:`pickplace.training.train`."""
+    """Entry point of ``pickplace-train``, see :mod:`pickplace.training.train`."""
     if ANSWERED_BY_HYDRA & set(sys.argv[1:]):
         command("train", None)
     else:
@@ -18,10 +19,17 @@ def train() -> None:
 
 
 def evaluate() -> None:
-    """``pickplace-evaluate``, see :mod:`pickplace.evaluation.evaluate`."""
+    """Entry point of ``pickplace-evaluate``, see :mod:`pickplace.evaluation.evaluate`."""
     if ANSWERED_BY_HYDRA & set(sys.argv[1:]):
         command("evaluate", None)
     else:
         from pickplace.evaluation.evaluate import main
 
         main()
+
+
+def plan() -> None:
+    """Entry point of ``pickplace-plan``, see :mod:`pickplace.robot.json_lines`."""
+    from pickplace.robot.json_lines import main
+
+    main()

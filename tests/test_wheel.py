@@ -1,9 +1,10 @@
-"""The wheel holds the config files and works from any directory, without the checkout."""
+"""The wheel holds the package and its config files, and its commands work from any directory, without the checkout."""
 
 import os
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -26,22 +27,26 @@ def wheel(tmp_path_factory):
     return next(folder.glob("*.whl"))
 
 
-def test_wheel_holds_every_config_file(wheel):
+def test_wheel_holds_every_file(wheel):
     inside = set(zipfile.ZipFile(wheel).namelist())
-    expected = {f"pickplace/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")}
-    assert expected and expected <= inside
-    assert {"pickplace/py.typed", "pickplace/models/conv4d.py", "pickplace/planners/policy.py"} <= inside
-    assert {"pickplace/assets/replay.html", "pickplace/assets/three.min.js"} <= inside
-    assert {f"pickplace/pretrained/r4/{name}" for name in ("card.json", "state.json", "state.safetensors")} <= inside
+    configs = {f"pickplace/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")}
+    suffixes = (".py", ".html", ".min.js", ".json", ".safetensors", "py.typed")
+    package = {str(path.relative_to(ROOT)) for path in (ROOT / "pickplace").rglob("*") if path.name.endswith(suffixes)}
+    assert configs and configs <= inside and package <= inside
+    assert {"pickplace/py.typed", "pickplace/views/assets/replay.html", "pickplace/pretrained/r4/card.json"} <= package
 
 
-def test_wheel_trains_from_another_directory(wheel, tmp_path):
+def test_commands_of_the_wheel_from_another_directory(wheel, tmp_path):
+    """All are in pickplace.cli, which imports no torch by itself, and a training runs to its end."""
     site = tmp_path / "site"
     zipfile.ZipFile(wheel).extractall(site)
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert scripts == {f"pickplace-{name}": f"pickplace.cli:{name}" for name in ("train", "evaluate", "plan")}
     code = (
-        f"import sys; sys.path.insert(0, {str(site)!r}); import pickplace.runs.hydra_app as c; "
-        f"assert str(c.conf_dir()).startswith({str(site)!r}), c.conf_dir(); import pickplace.training.train as t; "
-        "sys.argv = ['pickplace-train', 'experiment=smoke', 'hydra.run.dir=run']; t.main()"
+        f"import sys; sys.path.insert(0, {str(site)!r}); import pickplace.cli as cli; "
+        f"assert cli.__file__.startswith({str(site)!r}), cli.__file__; assert 'torch' not in sys.modules; "
+        f"assert callable(cli.evaluate) and callable(cli.plan); "
+        "sys.argv = ['pickplace-train', 'experiment=smoke', 'total_frames=128', 'hydra.run.dir=run']; cli.train()"
     )
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)

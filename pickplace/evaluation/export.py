@@ -1,4 +1,4 @@
-"""Turns a training checkpoint into weights that the package ships: ``pretrained/<name>``, with a card.
+"""Export of a training's checkpoint as weights that the package ships: ``pretrained/<name>``, with a card.
 
 ``python -m pickplace.evaluation.export outputs/cpu pickplace/pretrained/r4 outputs/evaluation/evaluation.json ...``
 """
@@ -6,9 +6,16 @@
 import argparse
 import json
 from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
 
 from pickplace.runs import checkpoint
+from pickplace.runs.allowlist import trusted_config
 from pickplace.runs.errors import one_sentence
+from pickplace.runs.registry import build
+from pickplace.task.cell import CELL_SETTINGS, cell_from_settings
 
 CARD = "card.json"
 
@@ -30,32 +37,37 @@ def export(source, folder: Path, evaluations: list[Path]) -> None:
     for path in evaluations:
         try:
             result = json.loads(Path(path).read_text())
-            theirs = result["trained"]
+            found = result["trained"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: expected an evaluation.json of a trained policy ({error}).") from error
-        if theirs != trained:
-            raise ValueError(f"{path}: it evaluates a policy of {theirs}, expected {trained}.")
+        if found != trained:
+            raise ValueError(f"{path}: it evaluates a policy of {found}, expected {trained}.")
         results.append({**result, "checkpoint": f"pretrained/{folder.name}"})
+    networks = ("policy", "critic") if critic_serves_any_tote(trusted_config(facts["config"])) else ("policy",)
     kept = {key: facts[key] for key in ("frames", "config", "versions", "commit")}
-    # What lookahead may ask is kept; fcn4d's critic is tied to one tote, and larger than the policy.
-    networks = ("policy", "critic") if asks_critic(facts["config"]) else ("policy",)
     checkpoint.write(folder, {key: state[key] for key in networks}, kept)
     card = {"name": f"pretrained/{folder.name}", "trained": trained, "versions": facts["versions"]}
     card |= {"config": facts["config"], "evaluations": results}
     (folder / CARD).write_text(json.dumps(card, indent=1) + "\n")
 
 
-def asks_critic(cfg: dict) -> bool:
-    """Does ``planner=lookahead`` serve the policy of a checkpoint with this config?"""
-    return cfg["model"]["actor"]["_target_"] == "fcn_grasp"
+def critic_serves_any_tote(cfg: DictConfig) -> bool:
+    """Return whether the critic of a checkpoint's config is of use for other totes, such as to ``planner=lookahead``.
+
+    Another one is tied to the tote of the training, and larger than the policy.
+    """
+    env: Any = OmegaConf.to_container(cfg.env, resolve=True)
+    cell = cell_from_settings({key: env[key] for key in CELL_SETTINGS if key in env})
+    with torch.device("meta"):
+        return getattr(build("model.critic", cfg.model.critic, cell=cell), "any_size", False)
 
 
 def main() -> None:
     """Entry point of ``python -m pickplace.evaluation.export``."""
     options = argparse.ArgumentParser(
         prog="python -m pickplace.evaluation.export",
-        description="Turns a training checkpoint into weights that the package ships, with a card that says how they "
-        "were trained and what they reach: card.json, from each evaluation.json. What only training needs is left out.",
+        description="Write a training's checkpoint as weights that the package ships, with a card (card.json) that "
+        "holds the config of the training and the evaluations. What only training needs is left out.",
     )
     options.add_argument("checkpoint", help="a run folder or a checkpoint")
     options.add_argument("folder", type=Path, help="where the weights go, pickplace/pretrained/<name>")

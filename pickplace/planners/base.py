@@ -20,8 +20,11 @@ class BatchPlanner(Protocol):
 
     A planner is made as ``Planner(cell, ...)``. A class attribute ``needs`` names further arguments that pickplace
     hands over: ``"items"`` (the item distribution), ``"terms"`` (of the observation), ``"policy"`` and ``"critic"`` (of
-    the checkpoint). An optional method ``statistics() -> dict`` adds figures to an evaluation, and
-    ``heat_map(observation) -> [N, W_T, D_T]`` a picture to a replay.
+    the checkpoint).
+
+    Optional methods: ``evaluation_facts() -> dict`` describes the planner in ``evaluation.json`` (of a policy:
+    ``candidates`` and ``mask_at_decision``), ``statistics() -> dict`` adds figures to it after the episodes, and
+    ``heat_map(observation) -> [N, W_T, D_T]`` adds a picture to a replay.
 
     Attributes:
         name: its name in tables and in ``evaluation.json``.

@@ -81,6 +81,10 @@ class Lookahead:
         best = self._best(state, maps, choice, value > MASKED / 2)
         return first_action_reaching(self.cell, maps, choice.gather(1, best[:, None])[:, 0])
 
+    def evaluation_facts(self) -> dict:
+        """Return the same facts as of a policy's planner: the best of all feasible actions is played."""
+        return {"candidates": "all", "mask_at_decision": True}
+
     def _best(self, state: State, maps: PlacingMaps, choice: Tensor, open_: Tensor) -> Tensor:
         """Return which candidate to play, int64 ``[N]``.
 

@@ -45,6 +45,11 @@ class PolicyPlanner:
         first = succeeds.int().argmax(1, keepdim=True)  # 0, the most probable, if none
         return tried.gather(1, first)[:, 0]
 
+    def evaluation_facts(self) -> dict:
+        """Return ``K`` and the mask with which actions are chosen: True, False, or what the policy never chooses."""
+        mask = self.candidates == "all" or self.policy.excludes or False
+        return {"candidates": self.candidates, "mask_at_decision": mask}
+
     @torch.no_grad()
     def heat_map(self, observation: Observation) -> Tensor:
         """Return the policy's greatest probability over picks and rotations for each place cell, ``[N, W_T, D_T]``.

@@ -13,8 +13,8 @@ from pickplace.runs.errors import one_sentence
 if TYPE_CHECKING:
     from pickplace.robot.planner import Planner
 
-#: What a request may hold; ``id`` comes back as it is.
-REQUEST = ("id", "bin_depth", "tote_depth", "tote_height", "cell_size", "tolerance", "alternatives")
+#: Keys of a request; ``id`` comes back as it is.
+REQUEST_KEYS = ("id", "bin_depth", "tote_depth", "tote_height", "cell_size", "tolerance", "alternatives")
 
 
 def main() -> None:
@@ -24,55 +24,45 @@ def main() -> None:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     options = argparse.ArgumentParser(
         prog="pickplace-plan",
-        description="Where to pick, where to place and how to turn. With --bin and --tote: one plan, as JSON. Without: "
-        'reads a request a line from standard input, {"bin_depth": [[...]], "tote_depth": [[...]]}, and answers each '
-        "with a plan in one line; a bad line is answered with an error, and the process goes on.",
+        description="Plan one pick and one place. With --bin and --tote: one plan, as JSON. Without them: read one "
+        'request a line from standard input, {"bin_depth": [[...]], "tote_depth": [[...]]}, and answer each with a '
+        "plan in one line; a bad request is answered with an error, and the process goes on.",
         epilog="Maps, frames of reference and errors: docs/robot.md",
     )
-    options.add_argument("checkpoint", help="a run folder, a checkpoint, or pretrained/<name>")
-    options.add_argument("--bin", metavar="NPY", help="depth map [W_B, D_B]: height above the bin's floor")
-    options.add_argument("--tote", metavar="NPY", help="depth map [W_T, D_T]: remaining height, from surface to rim")
-    options.add_argument(
-        "--tote-height", type=float, metavar="H", help="height of the tote's rim; default: that of --tote-size"
-    )
-    options.add_argument(
-        "--cell-size", type=float, metavar="M", help="side of a cell in metres, if the maps are in metres"
-    )
-    options.add_argument(
-        "--tolerance",
-        type=float,
-        metavar="T",
-        default=0.25,
-        help="heights are off by at most so many cells (default %(default)s)",
-    )
-    options.add_argument(
-        "--candidates", metavar="K", default="all", help="K most probable actions are tried, or all (the default)"
-    )
-    options.add_argument(
-        "--alternatives", type=int, metavar="N", default=10, help="best choices that are reported (default %(default)s)"
-    )
-    options.add_argument("--bin-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
-    options.add_argument("--tote-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
-    options.add_argument("--effector-size", type=int, nargs=2, metavar=("W", "D"), help="cells; default: as trained")
-    options.add_argument("--rotations", type=int, metavar="R", help="quarter turns to choose from; default: as trained")
-    options.add_argument(
-        "--trust",
-        action="append",
-        metavar="MODULE",
-        default=[],
-        help="a module of yours that the checkpoint's config may name",
-    )
-    options.add_argument("--threads", type=int, metavar="N", help="CPU threads; default: torch's")
-    options.add_argument("--device", default="cpu", help="cpu (the default) or cuda")
-    options.add_argument("--time", action="store_true", help="print the latency of each plan on standard error")
+    add = options.add_argument
+    add("checkpoint", help="a run folder, a checkpoint, or pretrained/<name>")
+    add("--bin", metavar="NPY", help="depth map [W_B, D_B]: height above the bin's floor")
+    add("--tote", metavar="NPY", help="depth map [W_T, D_T]: remaining height, from surface to rim")
+    add("--tote-height", type=float, metavar="H", help="height of the tote's rim; default: that of --tote-size")
+    add("--cell-size", type=float, metavar="M", help="side of a cell in metres, if the maps are in metres")
+    add(
+        "--tolerance", type=float, metavar="T", default=0.25,
+        help="greatest error of a measured height, in height units (default %(default)s)",
+    )  # fmt: skip
+    add("--candidates", metavar="K", default="all", help="number of most probable actions tried, or all (the default)")
+    add(
+        "--alternatives", type=int, metavar="N", default=10,
+        help="number of most probable choices reported (default %(default)s)",
+    )  # fmt: skip
+    add("--bin-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
+    add("--tote-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
+    add("--effector-size", type=int, nargs=2, metavar=("W", "D"), help="cells; default: as trained")
+    add("--rotations", type=int, metavar="R", help="quarter turns to choose from; default: as trained")
+    add(
+        "--trust", action="append", metavar="MODULE", default=[],
+        help="your own module whose classes the checkpoint's config may name; may be repeated",
+    )  # fmt: skip
+    add("--threads", type=int, metavar="N", help="CPU threads; default: torch's")
+    add("--device", default="cpu", help="cpu (the default) or cuda")
+    add("--time", action="store_true", help="print the latency of each plan on standard error")
     return options
 
 
 def run(args: argparse.Namespace) -> None:
-    """Load the planner, then plan once or for each line.
+    """Load the planner, then plan once, or once for each line of standard input.
 
     Raises:
         ValueError: for arguments, a checkpoint or maps that cannot be used.
@@ -80,21 +70,22 @@ def run(args: argparse.Namespace) -> None:
     import torch  # here, so that --help need not wait for it
 
     from pickplace.robot.planner import Planner
+    from pickplace.task.checks import whole_number
 
     if (args.bin is None) != (args.tote is None):
         missing = "--bin" if args.bin is None else "--tote"
         raise ValueError(f"{missing}: no file; expected both --bin and --tote, or neither to read JSON lines.")
     if args.threads is not None:
-        if args.threads < 1:
-            raise ValueError(f"--threads={args.threads}: expected a whole number >= 1.")
-        torch.set_num_threads(args.threads)
+        torch.set_num_threads(whole_number("--threads", args.threads, most=1024))
     sizes = {key: getattr(args, key) for key in ("bin_size", "tote_size", "effector_size", "rotations")}
     sizes = {key: value for key, value in sizes.items() if value is not None}
     candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates
     planner = Planner.load(args.checkpoint, candidates=candidates, device=args.device, trust=args.trust, **sizes)
     defaults = {key: getattr(args, key) for key in ("tote_height", "cell_size", "tolerance", "alternatives")}
     if args.bin is not None:
-        result = timed(planner, args.time, bin_depth=read_map(args.bin), tote_depth=read_map(args.tote), **defaults)
+        result = plan_as_dict(
+            planner, args.time, bin_depth=read_map(args.bin), tote_depth=read_map(args.tote), **defaults
+        )
         sys.stdout.write(json.dumps(result, indent=1) + "\n")
         return
     for line in sys.stdin.buffer:
@@ -103,50 +94,50 @@ def run(args: argparse.Namespace) -> None:
             sys.stdout.flush()
 
 
-def timed(planner: "Planner", tell: bool, **request) -> dict:
-    """A plan as plain values; its latency goes to standard error if asked for."""
+def plan_as_dict(planner: "Planner", print_latency: bool, **request) -> dict:
+    """Return a plan as plain values; its latency is printed on standard error if asked for."""
     start = time.perf_counter()
     plan = planner.plan(**request).as_dict()
-    if tell:
+    if print_latency:
         sys.stderr.write(f"planned in {(time.perf_counter() - start) * 1e3:.1f} ms\n")
         sys.stderr.flush()
     return plan
 
 
-def answer(planner: "Planner", line: bytes, defaults: dict, tell: bool = False) -> dict:
-    """The reply to one line: a plan, or ``{"error": ...}`` in one sentence; with the request's ``id`` if it has one."""
+def answer(planner: "Planner", line: bytes, defaults: dict, print_latency: bool = False) -> dict:
+    """Return the reply to one line: a plan, or ``{"error": ...}`` in one sentence; with the request's ``id``."""
     reply = {}
     try:
-        request = json.loads(line.decode(), parse_constant=refuse_constant, parse_float=finite)
+        request = json.loads(line.decode(), parse_constant=refuse_constant, parse_float=finite_float)
         if not isinstance(request, dict):
             raise ValueError(f"got {type(request).__name__}, expected an object with bin_depth and tote_depth.")
         if "id" in request:
             reply["id"] = request.pop("id")
-        if unknown := sorted(set(request) - set(REQUEST)):
-            raise ValueError(f"{unknown[0][:40]}: there is no such key; expected any of {', '.join(REQUEST)}.")
+        if unknown := sorted(set(request) - set(REQUEST_KEYS)):
+            raise ValueError(f"{unknown[0][:40]}: there is no such key; expected any of {', '.join(REQUEST_KEYS)}.")
         for key in ("bin_depth", "tote_depth"):
             if key not in request:
                 raise ValueError(f"{key}: missing; expected a depth map as a list of rows.")
-        return {**reply, **timed(planner, tell, **{**defaults, **request})}
+        return {**reply, **plan_as_dict(planner, print_latency, **{**defaults, **request})}
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         return {**reply, "error": f"the line is not JSON: {error}."}
     except ValueError as error:
         return {**reply, "error": " ".join(str(error).split())}
 
 
-def finite(text: str) -> float:
-    """JSON takes 1e999, which Python reads as infinity and would write as such."""
+def finite_float(text: str) -> float:
+    """Return a number of a JSON text; refuse 1e999, which Python reads as infinity and would write as such."""
     number = float(text)
     return number if abs(number) < float("inf") else refuse_constant(text)
 
 
 def refuse_constant(name: str):
-    """Python's parser takes NaN and Infinity, which JSON does not have."""
+    """Refuse NaN and Infinity, which Python's parser takes and JSON does not have."""
     raise ValueError(f"the line is not JSON: got {name[:20]}, expected a finite number.")
 
 
 def read_map(path: str) -> np.ndarray:
-    """A depth map from a ``.npy`` file; nothing in it is unpickled.
+    """Return a depth map from a ``.npy`` file; nothing in it is unpickled.
 
     Raises:
         ValueError: naming the file.

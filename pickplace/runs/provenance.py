@@ -1,4 +1,4 @@
-"""Where a result comes from: versions, commit, and the planner that a policy imitated."""
+"""Origin of a result: versions, commit, and the planner that a policy imitated."""
 
 import platform
 import subprocess

@@ -1,8 +1,9 @@
-"""What a training logs of a batch and of a validation, and its progress line."""
+"""Metrics of a batch and of a validation, and the progress line."""
 
 from tensordict import TensorDictBase
 
-from pickplace.evaluation.evaluate import Episodes, confidence95
+from pickplace.evaluation.play import Episodes
+from pickplace.evaluation.statistics import confidence95
 from pickplace.task.state import Failure
 from pickplace.training.curriculum import Curriculum
 

@@ -25,7 +25,7 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
     Args:
         run_dir: the run folder, with ``metrics.csv`` and ``learning_curve.png``.
         cfg: the composed config.
-        episodes: the last validation, an :class:`pickplace.evaluation.evaluate.Episodes` with recordings.
+        episodes: the last validation, an :class:`pickplace.evaluation.play.Episodes` with recordings.
         cell: the sizes.
         facts: versions and commit.
 

@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 
 class Expectation(NamedTuple):
-    """What a value of the config must be."""
+    """A condition on a value of the config, and its words."""
 
     holds: Callable[[Any], bool]
     words: str  # "... expected <words>."

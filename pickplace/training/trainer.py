@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
-from pickplace.evaluation.evaluate import Episodes, play
+from pickplace.evaluation.play import Episodes, play
 from pickplace.policies.base import Policy, as_collection_policy, as_critic
 from pickplace.runs import checkpoint
 from pickplace.runs.machine import use_machine

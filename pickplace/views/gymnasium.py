@@ -11,8 +11,8 @@ from tensordict import TensorDict
 
 from pickplace.envs.gymnasium import PickPlaceGymEnv
 from pickplace.task.state import Failure, bin_depth_from_item
-from pickplace.views.figures import draw_scene, item_colours
 from pickplace.views.recording import Recording, record_moves
+from pickplace.views.scene import draw_scene, item_colours
 
 
 class RenderedPickPlaceEnv(PickPlaceGymEnv):

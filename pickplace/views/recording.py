@@ -14,16 +14,19 @@ from pickplace.task.transition import apply
 
 FULL = "The tote is full."
 
+#: An item in the tote: ``(x, y, z, w, d, h)``, its minimum corner and its sides; in cells and height units.
+Box = tuple[int, int, int, int, int, int]
+
 
 @dataclass
 class Move:
     """One decision and its effect; in cells and height units."""
 
-    item: tuple[int, ...]  # x, y, w, d, h in the bin
+    item: tuple[int, int, int, int, int]  # x, y, w, d, h in the bin
     pick: tuple[int, int]  # min corner of the end effector in the bin
     place: tuple[int, int]  # min corner of the turned end effector in the tote
     rotation: int  # quarter turns, counter-clockwise seen from above
-    footprint: tuple[int, ...]  # x, y, w, d in the tote
+    footprint: tuple[int, int, int, int]  # x, y, w, d in the tote
     z: int  # height of the item's underside once it rests
     failure: Failure
     heat: np.ndarray | None = None  # uint8 [W_T, D_T]: the policy's preference for each place cell, 255 the highest
@@ -36,15 +39,19 @@ class Recording:
     episode: int  # its number in the stream
     tote_height: int
     moves: list[Move] = field(default_factory=list)
-    ending: Failure | None = None  # None while it goes on; NONE when a recorded stream is over
-    waiting: tuple[int, ...] | None = None  # the item that arrived last and fits nowhere, as `Move.item`
+    ending: Failure | None = None  # None while it goes on; Failure.NONE where the item stream ended
+    waiting: tuple[int, int, int, int, int] | None = None  # the item that arrived last and fits nowhere
     occupancy: float = 0.0
 
     @property
-    def boxes(self) -> list[tuple[int, ...]]:
-        """The items placed, ``(x, y, z, w, d, h)`` each, in order."""
-        good = [move for move in self.moves if not move.failure]
-        return [(*move.footprint[:2], move.z, *move.footprint[2:], move.item[4]) for move in good]
+    def boxes(self) -> list[Box]:
+        """The items placed, in order."""
+        boxes = []
+        for move in self.moves:
+            if not move.failure:
+                x, y, w, d = move.footprint
+                boxes.append((x, y, move.z, w, d, move.item[4]))
+        return boxes
 
     def describe_ending(self, num_places: int) -> str:
         """Return why the episode ended, in a sentence; empty while it goes on."""
@@ -56,11 +63,11 @@ class Recording:
 
 
 def record_moves(cell: CellSpec, planner, observation: TensorDictBase, state: State, action: Tensor) -> list[Move]:
-    """Return the moves that the given decisions make, one for each row.
+    """Return the moves that actions make, one for each row.
 
     Args:
         cell: the sizes.
-        planner: the planner that decided; if it has a ``heat_map`` it is asked for it.
+        planner: the planner that decided; its ``heat_map`` is recorded if it has one.
         observation: what the planner saw, ``[N]``.
         state: the states before the moves.
         action: int64 ``[N]``.

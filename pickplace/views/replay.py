@@ -13,8 +13,8 @@ import numpy as np
 
 from pickplace.task.cell import CellSpec
 from pickplace.task.state import Failure
-from pickplace.views.figures import draw_scene, item_colours
-from pickplace.views.recording import FULL, Recording
+from pickplace.views.recording import FULL, Box, Recording
+from pickplace.views.scene import draw_scene, item_colours
 
 ASSETS = Path(__file__).resolve().parent / "assets"
 
@@ -28,14 +28,14 @@ def page(recordings: list[Recording], cell: CellSpec, title: str) -> str:
         cell: the sizes.
         title: a short line, such as the planner's name and the stream.
     """
-    colours = item_colours([box for recording in recordings for box in recording.boxes + _others(recording)])
+    colours = item_colours([box for recording in recordings for box in recording.boxes + _items_not_placed(recording)])
+    kinds = {f"{w},{d},{_cells(h, cell)}": colour for (w, d, h), colour in colours.items()}
     data = {
         "title": title,
-        "bin": cell.bin_size,
-        "tote": cell.tote_size,
+        "bin": [*cell.bin_size[:2], _cells(cell.bin_size[2], cell)],
+        "tote": cell.tote_size[:2],
         "effector": cell.effector_size,
-        "height_unit": cell.height_unit,
-        "colours": {",".join(map(str, kind)): colour for kind, colour in colours.items()},
+        "colours": kinds,
         "episodes": [_episode(recording, cell) for recording in recordings],
     }
     packed = base64.b64encode(zlib.compress(json.dumps(data, separators=(",", ":")).encode(), 9)).decode()
@@ -46,14 +46,21 @@ def page(recordings: list[Recording], cell: CellSpec, title: str) -> str:
 
 @cache
 def _three() -> str:
+    """Return three.js, as it may stand inside of a script element."""
     return (ASSETS / "three.min.js").read_text(encoding="utf-8").replace("</script", "<\\/script")
 
 
-def _others(recording: Recording) -> list[tuple[int, ...]]:
-    """Return the items that are seen but not placed, as boxes."""
+def _cells(height: int, cell: CellSpec) -> int | float:
+    """Return a height in cells, without the tail of binary fractions."""
+    cells = round(height * cell.height_unit, 9)
+    return int(cells) if cells.is_integer() else cells
+
+
+def _items_not_placed(recording: Recording) -> list[Box]:
+    """Return the items that are seen but not placed, as boxes at the origin."""
     items = [move.item for move in recording.moves if move.failure]
     items += [recording.waiting] if recording.waiting else []
-    return [(0, 0, 0, *item[2:]) for item in items]
+    return [(0, 0, 0, w, d, h) for _, _, w, d, h in items]
 
 
 def _label(recording: Recording, ending: str) -> str:
@@ -64,31 +71,41 @@ def _label(recording: Recording, ending: str) -> str:
 
 
 def _episode(recording: Recording, cell: CellSpec) -> dict:
+    """Return an episode for the page; all lengths are in cells."""
     heat = [move.heat for move in recording.moves if move.heat is not None]
     ending = recording.describe_ending(cell.num_places)
+    # One flat list a move: 5 of the item, 2 pick, 2 place, rotation, 4 of the footprint, z, failure code.
+    moves = [
+        [*_item(move.item, cell), *move.pick, *move.place, move.rotation, *move.footprint, _cells(move.z, cell),
+         int(move.failure)]
+        for move in recording.moves
+    ]  # fmt: skip
     return {
         "episode": recording.episode,
-        "height": recording.tote_height,
+        "height": _cells(recording.tote_height, cell),
         "occupancy": recording.occupancy,
         "ending": ending,
-        "briefly": _label(recording, ending),
+        "label": _label(recording, ending),
         "failed": recording.ending not in (None, Failure.NONE, Failure.STUCK),
         "stuck": recording.ending == Failure.STUCK and ending != FULL,
-        "waiting": recording.waiting,
-        # One flat list a move: 5 of the item, 2 pick, 2 place, rotation, 4 of the footprint, z, failure code.
-        "moves": [
-            [*move.item, *move.pick, *move.place, move.rotation, *move.footprint, move.z, int(move.failure)]
-            for move in recording.moves
-        ],
+        "waiting": _item(recording.waiting, cell) if recording.waiting else None,
+        "moves": moves,
         "heat": base64.b64encode(np.stack(heat).tobytes()).decode() if heat else None,
     }
 
 
-# ---------------------------------------------------------------------- pictures for papers
+def _item(item: tuple[int, int, int, int, int], cell: CellSpec) -> list[int | float]:
+    """Return an item ``(x, y, w, d, h)`` with its height in cells."""
+    return [*item[:4], _cells(item[4], cell)]
+
+
+# ---------------------------------------------------------------------- pictures
 def picture(recording: Recording, cell: CellSpec, path: Path, moves: int | None = None) -> None:
     """Draw the tote after a number of moves, beside its height map, as PNG or SVG.
 
     Args:
+        recording, cell: the episode and the sizes.
+        path: the file to write.
         moves: how many moves have been made; None: all.
     """
     colours = item_colours(recording.boxes)
@@ -99,6 +116,8 @@ def animation(recording: Recording, cell: CellSpec, path: Path, seconds: float =
     """Write a GIF of the tote being packed.
 
     Args:
+        recording, cell: the episode and the sizes.
+        path: the file to write.
         seconds: how long it plays; the last picture stays for two more.
         frames: greatest number of pictures; a longer episode leaves moves out.
     """

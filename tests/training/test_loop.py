@@ -7,7 +7,7 @@ from torch import nn
 from torchrl.modules import ValueOperator
 
 from pickplace import PickPlaceEnv
-from pickplace.evaluation.evaluate import play
+from pickplace.evaluation.play import play
 from pickplace.planners.heuristics import JointDBL
 from pickplace.policies.base import as_collection_policy
 from pickplace.policies.fcn_grasp import fcn_grasp

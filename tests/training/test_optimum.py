@@ -7,7 +7,7 @@ from dynamic_programming import optimal_occupancy
 from hydra import compose, initialize_config_dir
 
 from pickplace import PickPlaceEnv
-from pickplace.evaluation.evaluate import play
+from pickplace.evaluation.play import play
 from pickplace.planners.heuristics import JointDBL, RandomFeasible
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.runs import checkpoint

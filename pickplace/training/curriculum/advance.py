@@ -12,7 +12,7 @@ TOLERANCE = 1e-6  # occupancies arrive as float32, in which 0.9 is slightly belo
 
 @dataclass
 class Tally:
-    """What an advance rule decides on: the level, and counts since it began.
+    """Input of an advance rule: the level, and counts since it began.
 
     Attributes:
         level: the tote height trained at now, in cells.

@@ -1,0 +1,169 @@
+"""Episodes played to their end by a planner, and the time of its decisions."""
+
+import time
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs.utils import step_mdp
+
+from pickplace.envs.torchrl import PickPlaceEnv
+from pickplace.planners.base import BatchPlanner
+from pickplace.task.feasibility import num_feasible, placing_maps
+from pickplace.task.state import Failure
+from pickplace.views.recording import Recording, record_moves
+
+#: ``make_env(first_episode, num_envs)`` makes the environment for a share of the episodes.
+MakeEnv = Callable[[int, int], PickPlaceEnv]
+
+#: The tensors of :class:`Episodes`.
+RESULTS = ("occupancy", "items_placed", "failure", "final_heights", "tote_height")
+
+
+@dataclass
+class Episodes:
+    """Results of a planner, one entry an episode."""
+
+    occupancy: Tensor  # float64 [E]
+    items_placed: Tensor  # int64 [E]
+    failure: Tensor  # int64 [E], a Failure; NONE where a recorded stream ended
+    final_heights: Tensor  # int32 [E, W_T, D_T]: the tote when the episode ended
+    tote_height: Tensor  # int64 [E]
+    feasible_share: float  # mean share of the N_a actions that were feasible, over all decisions
+    decisions: int  # over all episodes
+    seconds: float  # spent in the planner
+    recordings: list[Recording] = field(default_factory=list)  # of the episodes that were to be recorded
+
+
+class _Batch:
+    """Episodes played side by side, one in each slot of an environment; a slot's first episode counts.
+
+    Args:
+        env: the environment.
+        first: number of the first slot's episode.
+        record: numbers of the episodes to record.
+    """
+
+    def __init__(self, env: PickPlaceEnv, first: int, record: Collection[int]):
+        count, device = env.num_envs, env.device
+        self.env = env
+        self.running = torch.ones(count, dtype=torch.bool, device=device)
+        self.occupancy = torch.zeros(count, dtype=torch.float64, device=device)
+        self.items_placed = torch.zeros(count, dtype=torch.int64, device=device)
+        self.failure = torch.zeros(count, dtype=torch.int64, device=device)
+        self.observation = env.reset()
+        self.final_heights, self.tote_height = env.heights.clone(), env.tote_height.clone()
+        heights = enumerate(env.tote_height.tolist())
+        self.recordings = {slot: Recording(first + slot, high) for slot, high in heights if first + slot in record}
+
+    def feasible_shares(self) -> float:
+        """Return the share of the ``N_a`` actions that are feasible, summed over the running episodes."""
+        cell = self.env.cell
+        share = num_feasible(cell, placing_maps(cell, self.env.state)) / cell.num_actions
+        return float(share[self.running].sum())
+
+    def record(self, planner: BatchPlanner, action: Tensor) -> None:
+        """Add the moves that the actions are about to make to the recordings of running episodes."""
+        slots = [slot for slot in self.recordings if self.running[slot]]
+        if slots:
+            state = self.env.state.rows(slots)
+            moves = record_moves(self.env.cell, planner, self.observation[slots], state, action[slots])
+            for slot, move in zip(slots, moves, strict=True):
+                self.recordings[slot].moves.append(move)
+
+    def step(self, action: Tensor) -> None:
+        """Step the environment, and keep the results of the episodes that end.
+
+        A slot whose episode has ended plays on, uncounted, until all have ended.
+        """
+        after = self.env.step(self.observation.set("action", action))["next"]
+        done = after["done"][:, 0]
+        self._keep_results(self.running & done, after)
+        self.running = self.running & ~done
+        self.observation = step_mdp(self.observation)
+        if done.any() and self.running.any():
+            self.observation = self.env.reset(self.observation.set("_reset", after["done"]))
+
+    def _keep_results(self, ended: Tensor, after: TensorDictBase) -> None:
+        """Keep the results of the slots in ``ended``, bool ``[N]``, from the observation after their last step."""
+        env, occupancy = self.env, self.env.exact_occupancy
+        self.occupancy = torch.where(ended, occupancy, self.occupancy)
+        self.items_placed = torch.where(ended, env.steps, self.items_placed)
+        self.failure = torch.where(ended, after["failure"][:, 0], self.failure)
+        self.final_heights = torch.where(ended[:, None, None], env.heights, self.final_heights)
+        for slot, recording in self.recordings.items():
+            if ended[slot]:
+                recording.ending, recording.occupancy = Failure(int(self.failure[slot])), float(occupancy[slot])
+                if recording.ending == Failure.STUCK:
+                    recording.waiting = tuple(env.item[slot].tolist())
+
+
+@torch.no_grad()
+def play(
+    make_env: MakeEnv,
+    planner: BatchPlanner,
+    episodes: int,
+    batch_size: int,
+    record: Collection[int] = (),
+    until: float | None = None,
+) -> Episodes:
+    """Play episodes ``0 .. episodes - 1``, each in a slot of its own, to their ends, and count them all.
+
+    Collecting "the first n episodes to finish" would favour short ones, and short ones are the bad ones.
+
+    Args:
+        make_env: makes the environment, see :data:`MakeEnv`.
+        planner: decides, see :class:`~pickplace.planners.base.BatchPlanner`.
+        batch_size: episodes played side by side. It changes no result, except with a planner that draws random
+            numbers: it has one generator for all episodes of a batch.
+        record: numbers of the episodes to record move by move.
+        until: CPU time of this process (``time.process_time()``) after which no further batch begins; None: no limit.
+    """
+    feasible, decisions, seconds = 0.0, 0, 0.0
+    parts: list[dict[str, Tensor]] = []
+    recordings: list[Recording] = []
+    for first in range(0, episodes, batch_size):
+        if parts and until is not None and time.process_time() > until:
+            break
+        batch = _Batch(make_env(first, min(batch_size, episodes - first)), first, record)
+        while batch.running.any():
+            feasible += batch.feasible_shares()
+            decisions += int(batch.running.sum())
+            start = time.perf_counter()
+            action = planner.decide(batch.observation)
+            seconds += time.perf_counter() - start
+            batch.record(planner, action)
+            batch.step(action)
+        parts.append({name: getattr(batch, name) for name in RESULTS})
+        recordings += batch.recordings.values()
+    results = {name: torch.cat([part[name] for part in parts]).cpu() for name in RESULTS}
+    return Episodes(
+        **results, feasible_share=feasible / decisions, decisions=decisions, seconds=seconds, recordings=recordings
+    )
+
+
+@torch.no_grad()
+def decision_latency(make_env: MakeEnv, planner: BatchPlanner, decisions: int) -> dict[str, float] | None:
+    """Return the milliseconds of a decision for one tote: ``{"p50", "p95", "cpu_p50", "cpu_mean"}``; None for none.
+
+    The states are those of episodes. The last two figures are CPU time of all threads together, which depends little
+    on what else the machine does. A search may think long about few states, so that its mean is far above its median.
+    """
+    if decisions < 1:
+        return None
+    env = make_env(0, 1)
+    observation, times, cpu_times = env.reset(), [], []
+    planner.decide(observation)  # warm up
+    for _ in range(decisions):
+        start, cpu_start = time.perf_counter(), time.process_time()
+        action = planner.decide(observation)
+        if action.device.type == "cuda":  # where a call returns before its work is done
+            torch.cuda.synchronize(action.device)
+        times.append((time.perf_counter() - start) * 1e3)
+        cpu_times.append((time.process_time() - cpu_start) * 1e3)
+        _, observation = env.step_and_maybe_reset(observation.set("action", action))
+    wall, cpu = torch.tensor([times, cpu_times], dtype=torch.float64)
+    quantiles = {"p50": wall.quantile(0.5), "p95": wall.quantile(0.95), "cpu_p50": cpu.quantile(0.5)}
+    return {key: float(value) for key, value in {**quantiles, "cpu_mean": cpu.mean()}.items()}

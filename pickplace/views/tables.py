@@ -1,0 +1,42 @@
+"""Tables of results."""
+
+
+def evaluation_table(result: dict) -> str:
+    """Return the figures of an ``evaluation.json`` as a Markdown table."""
+    env, occupancy, latency = result["env"], result["occupancy"], result["latency_ms"]
+    low, high = occupancy["ci95"]
+    failures = ", ".join(f"{name} {count}" for name, count in result["failures"].items())
+    same = ", all of the same items" if result.get("same_items") else ""
+    rows = [
+        ("planner", result["planner"]),
+        ("tote, rotations", f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}"),
+        ("episodes", f"{result['episodes']} of the {result['stream']} stream, seed {result['seed']}{same}"),
+        ("occupancy", f"{occupancy['mean']:.4f} (95% interval {low:.4f} to {high:.4f}), least {occupancy['min']:.4f}"),
+        ("items placed", f"{result['items_placed']:.1f} an episode"),
+        ("episodes ended by", failures),
+        ("feasible actions", f"{result['feasible_action_share']:.2%} of all, mean over decisions"),
+    ]
+    if paired := result.get("paired_difference"):
+        low, high = paired["ci95"]
+        text = f"{paired['mean']:+.4f} (95% interval of the paired difference {low:+.4f} to {high:+.4f})"
+        rows.append((f"minus {paired['against']}", text))
+    if latency:
+        rows.append(("one decision", f"{latency['p50']:.1f} ms (median), {latency['p95']:.1f} ms (95th percentile)"))
+    if result.get("checkpoint"):
+        trained = result["trained"]
+        rows.append(("checkpoint", f"{result['checkpoint']} ({trained['frames']:,} frames, seed {trained['seed']})"))
+        if result.get("warm_start"):
+            rows.append(("warm start", f"imitated {result['warm_start']}"))
+    if "candidates" in result:
+        rows.append(("mask; candidates K", f"{_describe_masks(result)}; {result['candidates']}"))
+    width = max(len(name) for name, _ in rows)
+    values = max(len(value) for _, value in rows)
+    lines = [f"| {name:<{width}} | {value:<{values}} |" for name, value in rows]
+    return "\n".join([lines[0], f"|{'-' * (width + 2)}|{'-' * (values + 2)}|", *lines[1:]]) + "\n"
+
+
+def _describe_masks(result: dict) -> str:
+    """Return whether there was a mask in training, and in decisions."""
+    words = {True: "yes", False: "no", None: "unknown"}
+    training, decision = (result.get(key) for key in ("mask_in_training", "mask_at_decision"))
+    return f"in training {words.get(training, training)}, at decision {words.get(decision, decision)}"

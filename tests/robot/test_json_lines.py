@@ -1,0 +1,114 @@
+"""``pickplace-plan``: one plan from files, and a process that answers JSON lines."""
+
+import io
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from pickplace.robot import json_lines
+
+EMPTY = np.full((6, 6), 5)
+ITEM = np.zeros((5, 5), dtype=np.int64)
+ITEM[1:3, 2] = 1
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Run ``pickplace-plan`` in this process, in an empty folder; returns exit code, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments, lines=b""):
+        monkeypatch.setattr(sys, "argv", ["pickplace-plan", *map(str, arguments)])
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(lines)))
+        code = 0
+        try:
+            json_lines.main()
+        except SystemExit as exit:
+            code = exit.code or 0
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere"),
+        (
+            ["pretrained/none"],
+            "expected pretrained/fcn4d, pretrained/mixed, pretrained/r1, pretrained/r3, pretrained/r4",
+        ),
+        (["pretrained/r4", "--bin", "bin.npy"], "--tote: no file"),
+        (["pretrained/r4", "--bin", "bin.npy", "--tote", "missing.npy"], "missing.npy: cannot be read"),
+        (["pretrained/r4", "--bin", "bin.npy", "--tote", "pickle.npy"], "pickle.npy: cannot be read"),
+        (["pretrained/r4", "--bin", "bin.npy", "--tote", "bin.npy"], "tote_depth: got shape [5, 5]"),
+        (["pretrained/r4", "--candidates", "some"], "candidates='some'"),
+        (["pretrained/r4", "--threads", "0"], "--threads=0"),
+        (["pretrained/r4", "--rotations", "7"], "rotations=7"),
+        (["pretrained/r4", "--device", "tpu"], "tpu"),
+    ],
+)
+def test_command_refuses_in_one_sentence(command, tmp_path, arguments, message):
+    np.save(tmp_path / "bin.npy", ITEM)
+    np.save(tmp_path / "pickle.npy", np.array([{}]), allow_pickle=True)
+    code, out, err = command(*arguments)
+    assert code == 2 and out == ""
+    assert err.startswith("error: ") and err.count("\n") == 1 and message in err
+
+
+def test_command_answers_json_lines_and_survives_bad_ones(command):
+    good = {"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist(), "alternatives": 0}
+    lines = [
+        (b"not json", "not JSON"), (b"\xff\xfe", "utf-8"), (b"[" * 100_000, "recursion"), (b"[1, 2]", "got list"),
+    ]  # fmt: skip
+    requests = [
+        ({"id": "a", **good}, None), ({"id": 7, "tote_depth": good["tote_depth"]}, "bin_depth: missing"),
+        ({"id": 8, **good, "tote": 1}, "there is no such key"),
+        ({"id": 9, **good, "bin_depth": [[0.0] * 5] * 5}, "one item"),
+        ({**good, "tote_height": float("nan")}, "NaN"), ({"id": 11, **good, "tote_depth": [[0] * 6] * 6}, None),
+        ({"id": {"b": 1}, **good}, None),
+    ]  # fmt: skip
+    lines += [(json.dumps(request).encode(), error) for request, error in requests]
+    code, out, err = command("pretrained/r4", lines=b"\n\n".join(line for line, _ in lines))  # empty lines, too
+    replies = [json.loads(line) for line in out.splitlines()]
+    assert code == 0 and err == ""
+    for reply, (_, expected) in zip(replies, lines, strict=True):
+        assert ("error" in reply) == (expected is not None) and (expected or "") in reply.get("error", ""), reply
+    assert [reply.get("id") for reply in replies] == [None] * 4 + [request.get("id") for request, _ in requests]
+    first, *_, stuck, last = replies[4:]
+    assert stuck["status"] == "stuck" and sum(stuck["reasons"].values()) == 3600
+    assert {**first, "id": 0} == {**last, "id": 0} and first["status"] == "ok"
+
+
+def test_command_hands_every_option_on(command, tmp_path):
+    item = np.zeros((5, 4))
+    item[1:3, 2] = 1.1
+    np.save(tmp_path / "bin.npy", item * 0.05)
+    np.save(tmp_path / "tote.npy", np.full((7, 6), 0.2))
+    arguments = ["pretrained/r4", "--bin", "bin.npy", "--tote", "tote.npy", "--cell-size", 0.05, "--candidates", 10]
+    arguments += ["--bin-size", 5, 4, 1, "--tote-size", 7, 6, 9, "--effector-size", 2, 2, "--rotations", 1]
+    arguments += ["--tote-height", 0.2, "--alternatives", 1, "--threads", 1, "--time"]
+    code, out, err = command(*arguments)
+    assert code == 0 and err.startswith("planned in ") and err.endswith(" ms\n")
+    plan = json.loads(out)
+    assert plan["status"] == "ok" and plan["rotation_degrees"] == 0 and len(plan["alternatives"]) in (1, 2)
+    assert plan["occupancy_after"] == pytest.approx(2 / (7 * 6 * 4))
+    assert plan["pick"]["center"][:2] == pytest.approx([0.1, 0.125], abs=0.025)  # two cells of an effector cover both
+    assert "within 0.05" in command(*arguments, "--tolerance", 0.05)[2]
+
+
+def test_a_request_has_the_last_word(command):
+    """Over what the command line says for all."""
+    plain = {"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist()}
+    metric = {"bin_depth": (ITEM * 0.05).tolist(), "tote_depth": (EMPTY * 0.05).tolist(), "cell_size": 0.05}
+    low = {"bin_depth": ITEM.tolist(), "tote_depth": (EMPTY - 3).tolist(), "tote_height": 2, "alternatives": 2}
+    lines = "\n".join(json.dumps(request) for request in (plain, metric, low)).encode()
+    code, out, err = command("pretrained/r4", "--cell-size", 1, "--alternatives", 0, lines=lines)
+    replies = [json.loads(line) for line in out.splitlines()]
+    assert code == 0 and [reply.get("status") for reply in replies] == ["ok"] * 3, err
+    assert replies[1]["pick"]["center"] == pytest.approx([0.05 * length for length in replies[0]["pick"]["center"]])
+    assert replies[2]["occupancy_after"] == pytest.approx(2 / 72)
+    assert [bool(reply["alternatives"]) for reply in replies] == [False, False, True]

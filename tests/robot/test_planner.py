@@ -1,0 +1,251 @@
+"""The planner for a robot cell, against the oracle, plane geometry, and what a depth camera may deliver."""
+
+import json
+from collections import Counter
+from math import cos, radians, sin
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracle import Oracle, Rules
+from untrained import untrained_policy, write_checkpoint
+
+from pickplace import CellSpec, DepthMapError, Failure, Item, Planner, State
+from pickplace.planners.policy import PolicyPlanner
+from pickplace.policies.fcn4d import ActionPolicy
+from pickplace.task.observation import STANDARD_TERMS, observe
+
+EMPTY = np.full((6, 6), 5)
+ITEM = np.zeros((5, 5), dtype=np.int64)
+ITEM[1:3, 2] = 1
+
+
+@pytest.fixture(scope="module")
+def planner():
+    return Planner(CellSpec(), untrained_policy(CellSpec()))
+
+
+@st.composite
+def problems(draw):
+    """A cell of some sizes, an item in its bin ``(x, y, w, d, h)``, and heights in its tote."""
+    bin_w, bin_d, tote_w, tote_d = (draw(st.integers(least, most)) for least, most in ((2, 5), (2, 5), (3, 6), (3, 6)))
+    rim, effector = draw(st.integers(2, 5)), (draw(st.integers(1, 4)), draw(st.integers(1, 4)))
+    rule = draw(st.sampled_from(["contain", "overlap"]))
+    cell = CellSpec(
+        (bin_w, bin_d, draw(st.integers(1, 2))), (tote_w, tote_d, rim), effector, draw(st.integers(1, 4)), rule
+    )
+    w, d, h = (draw(st.integers(1, min(most, side))) for most, side in ((3, bin_w), (3, bin_d), (2, 2)))
+    item = draw(st.integers(0, bin_w - w)), draw(st.integers(0, bin_d - d)), w, d, h
+    levels = draw(st.lists(st.integers(0, rim), min_size=2, max_size=2))
+    return cell, item, np.random.default_rng(draw(st.integers(0, 1000))).choice(levels, size=(tote_w, tote_d))
+
+
+def outcomes(cell, item, heights):
+    """Return the oracle, and what it says of every action."""
+    rules = Rules(cell.bin_size, cell.tote_size, cell.effector_size, cell.rotations, cell.pick_rule)
+    oracle = Oracle(rules, cell.tote_size[2], item[2:], item[:2], heights.tolist())
+    return oracle, [oracle.try_action(action)[0] for action in range(cell.num_actions)]
+
+
+@settings(max_examples=40)
+@given(problems(), st.sampled_from(["all", 1, 7]), st.booleans(), st.integers(0, 5))
+def test_plans_agree_with_the_oracle_and_with_plane_geometry(problem, candidates, mask, seed):
+    cell, item, heights = problem
+    (x, y, w, d, h), rim = item, cell.tote_size[2]
+    bin_depth = np.zeros(cell.bin_size[:2])
+    bin_depth[x : x + w, y : y + d] = h
+    policy = untrained_policy(cell, mask, seed)
+    result = Planner(cell, policy, candidates).plan(bin_depth, rim - heights, alternatives=6)
+    oracle, codes = outcomes(cell, item, heights)
+    assert result.item == dict(zip("xywdh", item, strict=True))
+    assert result.occupancy_before == pytest.approx(heights.sum() / heights.size / rim)
+
+    # The same decision as the planner that evaluation uses.
+    state = State(torch.from_numpy(heights)[None].int(), torch.tensor([rim]), Item(*torch.tensor([item]).unbind(1)))
+    action = int(PolicyPlanner(cell, policy, candidates).decide(observe(STANDARD_TERMS, cell, state)))
+    feasible, ok = 0 in codes, codes[action] == 0
+    nothing = "stuck" if 0 in outcomes(cell, item, np.zeros_like(heights))[1] else "impossible"
+    assert result.status == ("ok" if ok else "rejected" if feasible else nothing)
+    assert result.action == (action if ok else None)
+    names = {failure: Failure(failure).name.lower() for failure in set(codes)}
+    assert result.reasons == (None if feasible else {names[code]: count for code, count in Counter(codes).items()})
+
+    # Alternatives: simulated as the oracle does, best first, the chosen one the first that would succeed.
+    for other in result.alternatives:
+        assert other.rejected == (names[codes[other.action]] if codes[other.action] else None)
+        assert (other.pick_cell, other.place_cell, other.rotation_degrees // 90) == oracle.rules.split(other.action)
+    shares = [other.probability for other in result.alternatives]
+    assert all(0 <= share <= 1 + 1e-5 for share in shares)
+    assert all(a >= b for a, b in zip(shares[:6], shares[1:6], strict=False))
+    chosen = [other for other in result.alternatives if other.chosen]
+    assert [other.action for other in chosen] == [action] * ok
+    if not ok:
+        assert result.pick is result.place is result.drop_height is result.rotation_degrees is None
+        assert result.occupancy_after == result.occupancy_before
+        return
+    good = [other.probability for other in result.alternatives if other.rejected is None]
+    assert chosen[0].probability == pytest.approx(good[0], rel=1e-5)
+
+    # Turning the item about the end effector's centre, as a robot would, leaves it where the oracle says.
+    after = np.array(oracle.try_action(action)[1])
+    changed = np.argwhere(after != heights)
+    angle = radians(result.rotation_degrees)
+    arm = np.array([x + w / 2, y + d / 2]) - np.array(result.pick.center[:2])
+    turned = np.array([[cos(angle), -sin(angle)], [sin(angle), cos(angle)]]) @ arm
+    assert np.allclose(np.array(result.place.center[:2]) + turned, (changed.min(0) + changed.max(0) + 1) / 2)
+    top = after[tuple(changed[0])]
+    assert result.pick.center[2] == h and result.place.center[2] == top and result.drop_height == top - h
+    assert result.occupancy_after == pytest.approx(result.occupancy_before + w * d * h / heights.size / rim)
+
+
+@pytest.mark.parametrize("height_unit", [1.0, 0.5])
+def test_every_length_is_in_metres(height_unit):
+    """Lengths along x and y are multiples of the cell's side, heights of the height unit."""
+    cell = CellSpec(height_unit=height_unit)
+    planner = Planner(cell, untrained_policy(cell))
+    low = EMPTY - 2  # something two units high lies everywhere
+    plain = planner.plan(ITEM, low)
+    noise = np.random.default_rng(0).uniform(-0.24, 0.24, (2, 6, 6))
+    unit = 0.05 * height_unit
+    metric = planner.plan(
+        (ITEM + noise[0, :5, :5]) * unit, torch.from_numpy((low + noise[1]) * unit), 5.02 * unit, cell_size=0.05
+    )
+    assert metric.action == plain.action and metric.status == "ok"
+    assert plain.drop_height == 2 and metric.drop_height == pytest.approx(2 * unit)
+    for pose, other in ((plain.pick, metric.pick), (plain.place, metric.place)):
+        assert other.cell == pose.cell
+        assert other.center == pytest.approx(np.multiply(pose.center, [0.05, 0.05, unit]))
+    assert json.loads(json.dumps(metric.as_dict()))["place"]["cell"] == list(metric.place.cell)
+    assert (metric.item["h"], metric.occupancy_before) == (1, pytest.approx(0.4))
+
+
+def test_only_rounding_goes_beyond_the_tolerance(planner):
+    high = np.where(ITEM, 3, 0)
+    exact = planner.plan(high, EMPTY, tolerance=0)
+    assert 0.15 / 0.05 != 3 and planner.plan(high * 0.05, EMPTY * 0.05, 5 * 0.05, 0.05, 0).action == exact.action
+    deep = (EMPTY * 0 + 117).astype(np.float32) * np.float32(0.05)
+    assert planner.plan(high * 0.05, deep, 200 * 0.05, 0.05, 0).status == "ok"
+    with pytest.raises(DepthMapError, match="within 0"):
+        planner.plan(high * 1.00001, EMPTY, tolerance=0)
+
+
+def test_stuck_in_this_tote_or_in_any(planner):
+    """A robot that is told to bring an empty tote must not be told so for ever."""
+    full = planner.plan(ITEM, np.zeros((6, 6)))
+    assert full.status == "stuck" and sum(full.reasons.values()) == planner.cell.num_actions
+    long = np.zeros((5, 5))
+    long[:4, 1] = 1  # an end effector of 3x3 does not cover it
+    assert planner.plan(long, EMPTY).status == planner.plan(long, np.zeros((6, 6))).status == "impossible"
+    assert planner.plan(ITEM * 6, EMPTY).status == "impossible"
+    assert planner.plan(ITEM * 6, EMPTY + 1, tote_height=6).status == "ok"
+
+
+def test_maps_of_other_kinds(planner):
+    plain = planner.plan(ITEM, EMPTY)
+    for make in (
+        lambda a: torch.tensor(a, dtype=torch.bfloat16),
+        lambda a: torch.tensor(a, dtype=torch.float32, requires_grad=True),
+        lambda a: np.ma.masked_array(a, mask=False),
+        lambda a: np.asfortranarray(a.astype(">u2")),
+    ):
+        assert planner.plan(make(ITEM), make(EMPTY)) == plain
+
+
+def test_four_dimensional_policy_plans_too():
+    cell = CellSpec(rotations=3)
+    result = Planner(cell, ActionPolicy(cell, filters=4).eval()).plan(ITEM, EMPTY, alternatives=3)
+    assert result.status == "ok" and result.rotation_degrees in (0, 90, 180)
+    assert len(result.alternatives) in (3, 4) and sum(other.chosen for other in result.alternatives) == 1
+
+
+def changed(array, cell, value, dtype=float):
+    array = array.astype(dtype)
+    array[cell] = value
+    return array
+
+
+TWO_ITEMS = changed(ITEM, (4, 4), 1)
+BAD = [
+    ({"bin_depth": ITEM[:4]}, "bin_depth: got shape [4, 5], expected [5, 5]"),
+    ({"bin_depth": []}, "bin_depth: got shape [0]"),
+    ({"bin_depth": [[1, 2], [3]]}, "bin_depth: expected an array of 5x5 numbers"),
+    ({"bin_depth": ITEM.astype(str)}, "bin_depth: got values of type"),
+    ({"bin_depth": ITEM.astype(bool)}, "bin_depth: got values of type bool"),
+    ({"bin_depth": np.zeros((5, 5))}, "bin_depth: got no cell above 0, expected one item"),
+    ({"bin_depth": TWO_ITEMS}, "bin_depth[1, 3]: got 0 cells, expected 1: one cuboid"),
+    ({"bin_depth": changed(ITEM, (2, 2), 2)}, "bin_depth[1, 2]: got 1 cells, expected 2: one cuboid"),
+    ({"bin_depth": changed(ITEM, (0, 0), np.nan)}, "bin_depth[0, 0]: got nan cells"),
+    ({"bin_depth": changed(ITEM, (4, 0), -1)}, "bin_depth[4, 0]: got -1 cells, expected 0 to"),
+    ({"bin_depth": changed(ITEM, (1, 2), 1.3)}, "bin_depth[1, 2]: got 1.3 cells, expected a whole number of cells"),
+    ({"bin_depth": np.ma.masked_equal(ITEM, 1)}, "bin_depth[1, 2]: got a masked value, expected a measured one."),
+    ({"tote_depth": EMPTY.T[:, :5]}, "tote_depth: got shape [6, 5], expected [6, 6]"),
+    ({"tote_depth": changed(EMPTY, (3, 1), 6)}, "tote_depth[3, 1]: got 6 cells, expected 0 to 5 cells"),
+    ({"tote_depth": EMPTY * 0.05 + 0.02, "bin_depth": ITEM * 0.05, "cell_size": 0.05},
+     "tote_depth[0, 0]: got 5.4 cells (0.27 m), expected a whole number of cells, within 0.25"),
+    ({"cell_size": "5cm"}, "cell_size='5cm': expected a length"),
+    ({"cell_size": b"1"}, "cell_size=b'1': expected a length"),
+    ({"cell_size": np.True_}, "cell_size=np.True_" if np.__version__ >= "2" else "cell_size=True"),
+    ({"cell_size": 1e-320}, "cell_size=1e-320: expected a length in metres, 1e-6 to 1e6"),
+    ({"tote_height": 0}, "tote_height=0: expected a whole number of cells, 1 to 1048575"),
+    ({"tote_height": 4.5}, "tote_height=4.5"),
+    ({"tote_height": 10**400}, "tote_height=1000"),
+    ({"tote_height": [5]}, "tote_height=[5]"),
+    ({"tolerance": 0.5}, "tolerance=0.5: expected a number of cells >= 0 and < 0.5"),
+    ({"alternatives": -1}, "alternatives=-1: expected a whole number >= 0"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("given", "message"), BAD)
+@pytest.mark.filterwarnings("error")
+def test_bad_maps_are_refused_in_one_sentence(planner, given, message):
+    with pytest.raises(DepthMapError) as caught:
+        planner.plan(**{"bin_depth": ITEM, "tote_depth": EMPTY, **given})
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("given", "message"), [
+    ({"tote_depth": EMPTY * 0.025 + 0.01}, "got 5.4 height units (0.135 m), expected a whole number of height units"),
+    ({"tote_depth": EMPTY * 0.05}, "got 10 height units (0.25 m), expected 0 to 5 height units"),
+    ({"tote_height": 0.13}, "expected a whole number of height units, 1 to 1048575, within 0.1, in metres"),
+])  # fmt: skip
+def test_errors_name_the_height_unit(given, message):
+    cell = CellSpec(height_unit=0.5)
+    good = {"bin_depth": ITEM * 0.025, "tote_depth": EMPTY * 0.025, "cell_size": 0.05, "tolerance": 0.1}
+    with pytest.raises(DepthMapError) as caught:
+        Planner(cell, untrained_policy(cell)).plan(**{**good, **given})
+    assert message in str(caught.value)
+
+
+def test_load():
+    shipped = Planner.load("pretrained/r4", tote_size=(8, 7, 9), candidates=10)
+    assert shipped.cell.tote_size == (8, 7, 9) and shipped.cell.bin_size == (5, 5, 1)
+    assert shipped.plan(ITEM, np.full((8, 7), 9)).status == "ok"
+    turned = Planner.load("pretrained/unmasked", effector_size=(2, 3), tote_size=(7, 8, 5))
+    assert turned.plan(ITEM, np.full((7, 8), 5)).status == "ok"  # without a mask, end effectors as long as its own
+
+
+@pytest.mark.parametrize(("path", "sizes", "message"), [
+    ("pretrained/r4", {"tote_sizes": 1}, "tote_sizes=1: expected one of bin_size"),
+    ("pretrained/r4", {"rotations": 5}, "rotations=5"),
+    ("pretrained/r4", {"effector_size": (0, 3)}, "effector_size"),
+    ("pretrained/r4", {"candidates": 0}, "candidates=0"),
+    ("pretrained/r9", {}, "pretrained/r9.*expected .*pretrained/r4"),
+    (None, {}, "path=None: expected a run folder"),
+    ("pretrained/unmasked", {"effector_size": (4, 4)},
+     r"env.effector_size=\[4, 4\]: the checkpoint was trained with \[3, 3\], and"),
+])  # fmt: skip
+def test_load_refuses(path, sizes, message):
+    with pytest.raises(ValueError, match=message):
+        Planner.load(path, **sizes)
+
+
+def test_load_of_a_policy_whose_grasps_depend_on_the_items(tmp_path):
+    """With ``pick_rule=overlap`` and no mask the number of grasp classes follows from the longest item in training."""
+    cell = CellSpec(tote_size=(5, 5, 2), pick_rule="overlap", longest_side=2)
+    overrides = ["env.pick_rule=overlap", "algo.mask_infeasible=false", "env.tote_size=[5,5,2]"]
+    loaded = Planner.load(write_checkpoint(tmp_path / "it", cell, *overrides))
+    assert loaded.plan(ITEM, np.full((5, 5), 2)).status == "ok"
+    with pytest.raises(DepthMapError, match="the item is 3 cells long, longer than .*; expected at most 2"):
+        loaded.plan(changed(ITEM, (3, 2), 1), np.full((5, 5), 2))

@@ -1,0 +1,76 @@
+"""Pictures of the Gymnasium environment."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from pickplace.views import gymnasium as module
+from pickplace.views.scene import draw_scene
+
+ITEMS = [(2, 2, 1), (1, 1, 1)]
+
+
+def make(**settings):
+    settings = {"tote_size": (4, 5, 2), "items": ITEMS, "render_mode": "rgb_array", **settings}
+    env = gymnasium.make("pickplace/PickPlace-v0", **settings)
+    return env, lambda info: env.step(int(np.flatnonzero(info["action_mask"])[0]))[-1]  # makes a feasible action
+
+
+@pytest.fixture
+def scenes(monkeypatch):
+    """The arguments and the figure of each scene that is drawn."""
+    drawn = []
+    monkeypatch.setattr(
+        module, "draw_scene", lambda *given: drawn.append((*given, draw_scene(*given))) or drawn[-1][-1]
+    )
+    return drawn
+
+
+def test_a_picture_shows_its_own_episode():
+    env, place = make()
+    _, info = env.reset(seed=0)
+    empty = env.render()
+    place(info)
+    after = env.render()
+    assert empty.dtype == np.uint8 and empty.shape == after.shape == (600, 1200, 3) and (empty != after).any()
+    env.reset(seed=0)
+    assert (env.render() == empty).all()
+    check_env(env.unwrapped)
+
+
+def test_an_item_keeps_its_colour_through_an_episode(scenes):
+    """Whatever is placed after it; and the last picture says how the episode ended."""
+    env, place = make()
+    _, info = env.reset(seed=0)
+    while info["action_mask"].any():
+        info = place(info)
+        env.render()
+    colours = [colours for _, _, colours, _ in scenes]
+    assert len(colours) > 2 and all(found == colours[0] for found in colours) and set(colours[0]) == {*ITEMS}
+    assert scenes[-1][-1].get_suptitle().endswith(("fits nowhere any more.", "The tote is full."))
+
+
+def test_the_bin_lies_as_the_height_map(scenes):
+    env, _ = make(bin_size=(3, 6, 1))
+    observation, _ = env.reset(seed=0)
+    env.render()
+    image = scenes[-1][-1].axes[-1].images[0]
+    assert np.array_equal(image.get_array(), observation["bin_depth"].T) and image.origin == "lower"
+
+
+def test_human_mode_without_a_display_warns(monkeypatch):
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    env, _ = make(render_mode="human")
+    with pytest.warns(UserWarning, match="there is no display"):
+        env.reset(seed=0)
+    env.close()
+
+
+def test_bad_use_is_refused():
+    with pytest.raises(ValueError, match="render_mode='ascii': expected"):
+        make(render_mode="ascii")
+    with pytest.raises(gymnasium.error.ResetNeeded, match="before reset"):
+        make()[0].unwrapped.render()
