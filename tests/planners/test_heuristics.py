@@ -100,7 +100,7 @@ def test_random_planners_are_uniform():
 
 @pytest.mark.parametrize("options", SETTINGS)
 def test_random_feasible_plays_feasible_actions_only(options):
-    for env, observation in random_states(**options):
+    for env, observation in random_states(steps=4, **options):
         action = RandomFeasible(env.cell, seed=7).decide(observation)
         assert observation["action_mask"].gather(1, action[:, None]).all()
         unmasked = observation.exclude("action_mask")  # as in an evaluation, where the planner makes its own mask
