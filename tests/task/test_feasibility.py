@@ -47,14 +47,17 @@ def test_masks_equal_the_step_and_the_oracle(problem):
         left = (turned * cell.tote_size[0] + x) * cell.tote_size[1] + y
         assert torch.equal(footprints[row][mask], left)
         assert torch.equal(reached[row].flatten().nonzero()[:, 0], left.unique())
-        # The other way round: every action that leaves a footprint, the lowest of them, and the tote after it.
-        for footprint in left.unique()[:4]:
-            one, leaving = maps.rows(torch.tensor([row])), mask.nonzero()[:, 0][left == footprint]
-            found = actions_reaching(cell, one, footprint[None])[0]
-            assert torch.equal(found[found >= 0].sort()[0], leaving)
-            assert first_action_reaching(cell, one, footprint[None]) == leaving[0]
-            after = put_down(cell, state.heights[[row]], one, footprint[None])
-            assert torch.equal(after, step.heights[leaving[:1]])
+        # The other way round: the actions that leave each footprint, the lowest of them, and the tote after it.
+        each = left.unique()
+        same = torch.full_like(each, row)
+        found = actions_reaching(cell, maps.rows(same), each)
+        index, reaching = (found >= 0).nonzero(as_tuple=True)[0], found[found >= 0]
+        assert torch.equal(reaching.sort()[0], mask.nonzero()[:, 0])
+        assert torch.equal(footprints[row][reaching], each[index])
+        first = first_action_reaching(cell, maps.rows(same), each)
+        assert torch.equal(first, torch.where(found >= 0, found, cell.num_actions).amin(1))
+        after = put_down(cell, state.heights[same], maps.rows(same), each)
+        assert torch.equal(after, step.heights[first])
 
 
 @settings(max_examples=40)
