@@ -1,15 +1,13 @@
 """A slow, plain-Python implementation of the task's rules, cell by cell, to compare the package with.
 
-It shares no code with the package and uses nothing but lists and integers. Sizes are in cells, grids are
-lists of columns (`grid[x][y]`), and a flat action is
-`(((x_bin * D_B + y_bin) * W_T + x_tote) * D_T + y_tote) * R + r`.
+It shares no code with the package and uses nothing but lists and integers. Grids are lists of columns (`grid[x][y]`),
+and a flat action is `(((x_bin * D_B + y_bin) * W_T + x_tote) * D_T + y_tote) * R + r`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import product
+from itertools import chain, product
 
 SUCCESS, PICK_MISS, BIN_COLLISION, TOTE_COLLISION, OVERFLOW, ITEM_COLLISION, UNSTABLE, STUCK, OUT_OF_REACH = range(9)
 
@@ -43,8 +41,7 @@ class Rules:
         rest, r = divmod(action, self.rotations)
         rest, y_tote = divmod(rest, self.tote_size[1])
         rest, x_tote = divmod(rest, self.tote_size[0])
-        x_bin, y_bin = divmod(rest, self.bin_size[1])
-        return (x_bin, y_bin), (x_tote, y_tote), r
+        return divmod(rest, self.bin_size[1]), (x_tote, y_tote), r
 
     def join(self, pick: Pair, place: Pair, r: int) -> int:
         """The flat action of a pick cell, a place cell and a rotation."""
@@ -55,15 +52,12 @@ class Rules:
 def rotate(r: int, effector: Pair, offset: Pair, size: Pair) -> tuple[Pair, Pair, Pair]:
     """The table of rotations: effector size, item offset inside it and item size after `r` quarter turns."""
     (effector_w, effector_d), (ox, oy), (w, d) = effector, offset, size
-    if r == 0:
-        return (effector_w, effector_d), (ox, oy), (w, d)
-    if r == 1:
-        return (effector_d, effector_w), (effector_d - oy - d, ox), (d, w)
-    if r == 2:
-        return (effector_w, effector_d), (effector_w - ox - w, effector_d - oy - d), (w, d)
-    if r == 3:
-        return (effector_d, effector_w), (oy, effector_w - ox - w), (d, w)
-    raise ValueError(f"r is {r}, expected 0 to 3")
+    return [
+        ((effector_w, effector_d), (ox, oy), (w, d)),
+        ((effector_d, effector_w), (effector_d - oy - d, ox), (d, w)),
+        ((effector_w, effector_d), (effector_w - ox - w, effector_d - oy - d), (w, d)),
+        ((effector_d, effector_w), (oy, effector_w - ox - w), (d, w)),
+    ][r]
 
 
 def corner_for(reference_at: Pair, size: Pair) -> Pair:
@@ -78,12 +72,6 @@ def cells(corner: Pair, size: Pair) -> list[Pair]:
 
 def inside(cell: Pair, grid: Grid) -> bool:
     return 0 <= cell[0] < len(grid) and 0 <= cell[1] < len(grid[0])
-
-
-def flat(size: Iterable[int], height: int = 0) -> Grid:
-    """A grid of the given width and depth, level at `height`."""
-    width, depth, *_ = size
-    return [[height] * depth for _ in range(width)]
 
 
 @dataclass
@@ -101,11 +89,12 @@ class Oracle:
     volume: int = 0
 
     def __post_init__(self):
-        self.heights = self.heights or flat(self.rules.tote_size)
+        wide, deep, _ = self.rules.tote_size
+        self.heights = self.heights or [[0] * deep for _ in range(wide)]
 
     def bin_depth(self) -> Grid:
         """Height above the bin's floor, `[W_B][D_B]`."""
-        grid = flat(self.rules.bin_size)
+        grid = [[0] * self.rules.bin_size[1] for _ in range(self.rules.bin_size[0])]
         for x, y in cells(self.position, self.item[:2]):
             grid[x][y] = self.item[2]
         return grid
@@ -171,17 +160,11 @@ class Oracle:
         """For each of the `N_a` flat actions, whether it would succeed."""
         return [self.try_action(action)[0] == SUCCESS for action in range(self.rules.num_actions)]
 
-    def has_feasible_action(self, try_first: Iterable[int] = ()) -> bool:
+    def has_feasible_action(self, try_first=()) -> bool:
         """Whether any action succeeds; `try_first` only saves time."""
-        return any(
-            self.try_action(action)[0] == SUCCESS
-            for actions in (try_first, range(self.rules.num_actions))
-            for action in actions
-        )
+        return any(self.try_action(action)[0] == SUCCESS for action in chain(try_first, range(self.rules.num_actions)))
 
-    def step(
-        self, action: int, next_item: Triple, next_position: Pair, try_first: Iterable[int] = ()
-    ) -> tuple[int, bool, int]:
+    def step(self, action: int, next_item: Triple, next_position: Pair, try_first=()) -> tuple[int, bool, int]:
         """Takes an action; returns reward, terminated and failure code.
 
         The next item arrives only after a success, and decides whether the episode is stuck.
@@ -196,20 +179,14 @@ class Oracle:
         return reward, stuck, STUCK if stuck else SUCCESS
 
 
-def can_always_start(rules: Rules, kinds: Iterable[Triple]) -> bool:
-    """Whether every kind has a feasible action on the empty tote from every bin position.
-
-    A bin position is one at which the item is wholly inside the bin; the heights tried are those an
-    episode may have, from the greatest item height to the tote's own.
-    """
-    kinds = list(kinds)
+def can_always_start(rules: Rules, kinds: list[Triple]) -> bool:
+    """Whether every kind has a feasible action on the empty tote, from every bin position and at every tote height."""
     (bin_w, bin_d, _), greatest = rules.bin_size, max(h for _, _, h in kinds)
-    tote_heights = range(greatest, rules.tote_size[2] + 1)
-    if not tote_heights or any(w > bin_w or d > bin_d for w, d, _ in kinds):
+    if greatest > rules.tote_size[2] or any(w > bin_w or d > bin_d for w, d, _ in kinds):
         return False
     return all(
         Oracle(rules, tote_height, kind, position).has_feasible_action()
-        for tote_height in tote_heights
+        for tote_height in range(greatest, rules.tote_size[2] + 1)
         for kind in kinds
         for position in product(range(bin_w - kind[0] + 1), range(bin_d - kind[1] + 1))
     )

@@ -8,11 +8,9 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from pickplace import PickPlaceEnv
+from pickplace import Failure, PickPlaceEnv
 from pickplace.task.items import Kinds, Recorded
 
 ID = "pickplace/PickPlace-v0"
@@ -40,18 +38,13 @@ def assert_equal(a, b, keys=None):
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"bin_size": (4, 6, 2), "effector_size": (2, 3), "rotations": 3}])
-def test_gymnasium_checker(kwargs):
+def test_checkers_of_other_projects(kwargs):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(make(**kwargs).unwrapped, skip_render_check=True)
-
-
-def test_stable_baselines_checker():
-    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs stable-baselines3")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs stable-baselines3")
         warnings.filterwarnings("ignore", ".*unconventional shape.*")  # depth maps are neither vectors nor RGB images
-        checker.check_env(make().unwrapped)
+        checker.check_env(make(**kwargs).unwrapped)
 
 
 def test_maskable_ppo_runs():
@@ -60,38 +53,27 @@ def test_maskable_ppo_runs():
     assert model.learn(64).num_timesteps == 64
 
 
-@settings(max_examples=8)
-@given(st.integers(0, 2**31), st.integers(1, 3), st.sampled_from([1, 2]))
-def test_single_against_the_batched_environment(seed, slots, height):
-    """Episode ``e`` of a seed is slot ``e`` of the environment underneath, in all that an agent gets."""
-    below = PickPlaceEnv(tote_size=(4, 5, 2), items=Kinds(SMALL["items"]), num_envs=slots, seed=seed)
-    states = below.reset(TensorDict({"tote_height": torch.full((slots, 1), height)}, [slots]))
-    env, generator, histories = make(), np.random.default_rng(seed), []
-    for slot in range(slots):
-        observation, info = env.reset(seed=seed if slot == 0 else None, options={"tote_height": height})
-        history = [(observation, info, None)]
-        for _ in range(4):
-            masks = env.get_wrapper_attr("action_masks")()
-            assert np.array_equal(masks, info["action_mask"])
-            action = feasible([masks], generator)[0]
-            observation, *rest, info = env.step(action)
-            history.append((observation, info, (action, *rest)))
-            if rest[1]:
+@pytest.mark.parametrize(("seed", "height"), [(0, 1), (3, 2), (2**31, 2)])
+def test_a_single_environment_against_the_batched_one(seed, height):
+    """It plays the episodes of a seed one after the other, and shows all that an agent gets."""
+    below = PickPlaceEnv(tote_size=(4, 5, 2), items=Kinds(SMALL["items"]), num_envs=1, seed=seed)
+    env, generator = make(), np.random.default_rng(seed)
+    for episode in range(3):
+        state = below.reset(TensorDict({"tote_height": torch.tensor([[height]])}, [1]))
+        observation, info = env.reset(seed=seed if episode == 0 else None, options={"tote_height": height})
+        ended = False
+        while True:
+            assert_equal(observation, {key: state[key][0].numpy() for key in below.terms})
+            assert np.array_equal(info["action_mask"], state["action_mask"][0].numpy())
+            assert np.array_equal(info["action_mask"], env.get_wrapper_attr("action_masks")())
+            assert info["occupancy"] == pytest.approx(float(state["occupancy"]))
+            assert info["failure"] == Failure(int(state["failure"])).name.lower()
+            if ended:
                 break
-        histories.append(history)
-    for step in range(5):
-        actions = torch.zeros(slots, dtype=torch.int64)
-        for slot, history in enumerate(histories):
-            if step < len(history):
-                observation, info, taken = history[step]
-                assert_equal(observation, {key: states[key][slot].numpy() for key in below.terms})
-                assert np.array_equal(info["action_mask"], states["action_mask"][slot].numpy())
-                assert info["occupancy"] == pytest.approx(float(states["occupancy"][slot]))
-                if taken:
-                    assert taken[1:] == (states["reward"][slot].item(), states["terminated"][slot].item(), False)
-            if step + 1 < len(history):
-                actions[slot] = int(history[step + 1][2][0])
-        states = below.step(TensorDict({"action": actions}, [slots]))["next"]
+            action = feasible([info["action_mask"]], generator)[0]
+            state = below.step(TensorDict({"action": torch.tensor([action])}, [1]))["next"]
+            observation, reward, ended, truncated, info = env.step(action)
+            assert (reward, ended, truncated) == (state["reward"].item(), state["terminated"].item(), False)
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
@@ -167,7 +149,7 @@ def test_a_recorded_stream_truncates(tmp_path):
     env = make(items=Recorded(tmp_path / "items.csv"))
     _, info = env.reset(seed=0)
     for expected in (False, True):
-        _, _, terminated, truncated, info = env.step(int(np.flatnonzero(info["action_mask"])[0]))
+        *_, terminated, truncated, info = env.step(int(np.flatnonzero(info["action_mask"])[0]))
         assert (terminated, truncated) == (False, expected)
 
 
@@ -186,10 +168,10 @@ def test_a_step_that_resets_hides_what_its_action_would_have_done(tmp_path):
 
 
 def test_async_vectorisation():
-    env = gymnasium.make_vec(ID, num_envs=2, vectorization_mode="async", **SMALL)
+    env = gymnasium.make_vec(ID, num_envs=1, vectorization_mode="async", **SMALL)
     _, info = env.reset(seed=1)
     observation, reward, *_ = env.step(feasible(info["action_mask"], np.random.default_rng(0)))
-    assert observation["bin_depth"].shape == (2, 5, 5) and (reward > 0).all()
+    assert observation["bin_depth"].shape == (1, 5, 5) and reward > 0
     env.close()
 
 

@@ -1,13 +1,11 @@
-"""The environment as TorchRL wants it, its episodes and their items, and properties that any packing must have."""
+"""The environment as TorchRL wants it: specs, resets, item streams, masks, and what it refuses."""
 
 import copy
 import re
 
 import pytest
 import torch
-from hypothesis import HealthCheck, assume, given, settings
-from hypothesis import strategies as st
-from oracle import OVERFLOW, STUCK, SUCCESS
+from oracle import OVERFLOW, STUCK
 from problems import late_state, random_limits
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs, step_mdp
@@ -29,33 +27,17 @@ def rows(chosen, **entries):
     return TensorDict({"_reset": torch.as_tensor(chosen)[:, None], **entries}, [len(chosen)])
 
 
-def first_feasible(td):
-    return td["action_mask"].int().argmax(-1)
-
-
-def ending(td, done):
-    """Return feasible actions, but for the rows to end: there the first infeasible one."""
-    return torch.where(done, (~td["action_mask"]).int().argmax(-1), first_feasible(td))
-
-
-def play(env, steps):
-    """Play the first feasible action on across episodes; return ``[(observation and next, ...)]``, one entry a step."""
-    td, history = env.reset(), []
-    for _ in range(steps):
-        td, following = env.step_and_maybe_reset(td.set("action", first_feasible(td)))
-        history.append(td.clone())
-        td = following
-    return history
+def actions(td, ending=False):
+    """Return the first feasible action of each row, but for the rows to end: there the first infeasible one."""
+    first, bad = td["action_mask"].int().argmax(-1), (~td["action_mask"]).int().argmax(-1)
+    return torch.where(torch.as_tensor(ending), bad, first)
 
 
 def same(left, right):
-    """Return whether two TensorDicts, or lists of them, hold the same keys and equal values."""
-    if isinstance(left, list):
-        return len(left) == len(right) and all(map(same, left, right))
+    """Return whether two TensorDicts hold the same keys and equal values."""
     return set(left.keys(True, True)) == set(right.keys(True, True)) and bool((left == right).all())
 
 
-# ---------------------------------------------------------------------- TorchRL
 @pytest.mark.parametrize(
     "kwargs",
     [
@@ -72,28 +54,14 @@ def test_specs_hold(kwargs):
 
 def test_shapes_and_dtypes():
     env = make_env([(1, 2, 1)], bin_size=(3, 4, 1), tote_size=(5, 6, 7), effector_size=(1, 2), rotations=2, num_envs=3)
-    assert env.batch_size == torch.Size([3])
-    td = env.rand_step(env.reset())
-    expected = {
-        "bin_depth": ((3, 3, 4), torch.float32),
-        "tote_depth": ((3, 5, 6), torch.float32),
-        "tote_height": ((3, 1), torch.int64),
-        "action_mask": ((3, 3 * 4 * 5 * 6 * 2), torch.bool),
-        "action": ((3,), torch.int64),
-        ("next", "reward"): ((3, 1), torch.float32),
-        **{("next", key): ((3, 1), torch.bool) for key in ("terminated", "truncated", "done")},
-        ("next", "failure"): ((3, 1), torch.int64),
-        ("next", "occupancy"): ((3, 1), torch.float32),
-    }
-    expected |= {("next", key): expected[key] for key in OBSERVATION}
-    assert {key: (tuple(td[key].shape), td[key].dtype) for key in expected} == expected
+    td, one = env.rand_step(env.reset()), (3, 1)
+    maps = {"bin_depth": (3, 3, 4), "tote_depth": (3, 5, 6), "tote_height": one, "action_mask": (3, 3 * 4 * 5 * 6 * 2)}
+    flags = {("next", key): one for key in ("terminated", "truncated", "done", "reward", "failure", "occupancy")}
+    expected = {"action": (3,), **maps, **{("next", key): shape for key, shape in maps.items()}, **flags}
+    assert {key: tuple(td[key].shape) for key in expected} == expected
+    types = [td["next"][key].dtype for key in ("tote_depth", "tote_height", "action_mask", "reward", "failure")]
+    assert types == [torch.float32, torch.int64, torch.bool, torch.float32, torch.int64]
     assert env.rollout(12, break_when_any_done=False).batch_size == torch.Size([3, 12])
-
-
-def test_reset_shows_an_empty_tote_and_one_item():
-    td = make_env(num_envs=64).reset()
-    assert (td["tote_height"] == 5).all() and (td["tote_depth"] == 5).all() and not td["done"].any()
-    assert set(td["bin_depth"].sum((1, 2)).tolist()) == {1.0, 2.0, 4.0}
 
 
 @pytest.mark.parametrize("chosen", [[True, False, True, False], [False, False, False, True], [False] * 4])
@@ -103,20 +71,18 @@ def test_partial_reset_touches_only_the_requested_rows(chosen, only_reset):
     (env, td), (other, other_td) = (late_state(4, num_envs=4, seed=0) for _ in range(2))
     before = td.select(*OBSERVATION).clone()
     reset = env.reset(rows(chosen) if only_reset else td.update(rows(chosen)))
-    assert (reset["tote_depth"][chosen] == 5).all()
-    assert reset["action_mask"][chosen].any(-1).all()
+    assert (reset["tote_depth"][chosen] == 5).all() and reset["action_mask"][chosen].any(-1).all()
     assert same(reset.select(*OBSERVATION)[~chosen], before[~chosen])
     # The running episodes go on as they do in the other environment, which was not reset.
-    action = torch.where(chosen, first_feasible(reset), first_feasible(before))
+    action = torch.where(chosen, actions(reset), actions(before))
     left, right = env.step(reset.set("action", action)), other.step(other_td.set("action", action))
-    assert same(left["next"][~chosen], right["next"][~chosen])
-    assert left["next", "reward"].gt(0).all()
+    assert same(left["next"][~chosen], right["next"][~chosen]) and left["next", "reward"].gt(0).all()
 
 
 def test_partial_reset_keeps_why_the_others_ended():
     env = make_env()
     td = env.reset()
-    after = env.step(td.set("action", ending(td, torch.ones(4, dtype=torch.bool))))["next"]
+    after = env.step(td.set("action", actions(td, ending=True)))["next"]
     assert after["terminated"].all() and same(after.select(*OBSERVATION), td.select(*OBSERVATION))
     chosen = torch.tensor([True, False, True, False])
     reset = env.reset(after.clone().update(rows(chosen)))
@@ -124,29 +90,19 @@ def test_partial_reset_keeps_why_the_others_ended():
         assert torch.equal(reset[key][~chosen], after[key][~chosen]) and not reset[key][chosen].any(), key
 
 
-def test_step_and_maybe_reset_renews_only_what_is_done():
-    env = make_env()
-    td, done = env.reset(), torch.tensor([False, True, False, True])
-    td, following = env.step_and_maybe_reset(td.set("action", ending(td, done)))
-    assert td["next", "done"].squeeze(-1).equal(done) and not td["next", "truncated"].any()
-    assert (following["tote_depth"][done] == 5).all() and not following["done"].any()
-    assert same(following.select(*OBSERVATION)[~done], td["next"].select(*OBSERVATION)[~done])
-    assert (following["tote_depth"][~done].amin((1, 2)) == 4).all()
-
-
 def test_tote_height_is_honoured_per_env_and_kept_by_running_episodes():
     env, heights = make_env(), torch.tensor([[1], [3], [5], [2]])
     td = env.reset(TensorDict({"tote_height": heights}, [4]))
     assert td["tote_height"].equal(heights) and (td["tote_depth"] == heights[..., None]).all()
-
     done = torch.tensor([True, False, False, True])
-    td = step_mdp(env.step(td.set("action", ending(td, done))))
+    td = step_mdp(env.step(td.set("action", actions(td, done))))
     assert td["tote_height"].equal(heights)
     td = env.reset(td.update(rows(done)).set("tote_height", torch.tensor([[4], [1], [1], [4]])))
     assert td["tote_height"].tolist() == [[4], [3], [5], [4]]
-    after = env.step(td.set("action", first_feasible(td)))["next"]
+    after = env.step(td.set("action", actions(td)))["next"]
     assert after["tote_height"].equal(td["tote_height"])
     assert after["occupancy"][done].equal(after["reward"][done] / (6 * 6 * 4))
+    assert (env.reset()["tote_height"] == 5).all()
 
 
 def test_nothing_that_was_handed_out_changes():
@@ -155,7 +111,7 @@ def test_nothing_that_was_handed_out_changes():
     td = env.reset()
     first, state, kept = td.clone(), copy.deepcopy(env.state_dict()), []
     for step in range(6):
-        td.set("action", ending(td, torch.tensor([False, step == 2, False, step == 4])))
+        td.set("action", actions(td, torch.tensor([False, step == 2, False, step == 4])))
         before = td.clone()
         after = env.step(td)
         assert same(td.exclude("next"), before) and after["next"] is not td
@@ -163,58 +119,27 @@ def test_nothing_that_was_handed_out_changes():
         td = step_mdp(after)
     env.load_state_dict(state)
     assert all(same(*pair) for pair in kept)
-    assert same(env._observation(), first.exclude("done", "terminated", "truncated"))
+    assert same(TensorDict(env._observation(), [4]), first.exclude("done", "terminated", "truncated"))
 
 
-# ---------------------------------------------------------------------- seeds and episodes
-def test_a_seed_is_a_stream_of_episodes():
-    histories = [play(make_env(seed=seed), 40) for seed in (3, 3, 4)]
-    assert same(histories[0], histories[1]) and not same(histories[0], histories[2])
-    used = make_env(seed=0)
-    play(used, 5)
-    used.set_seed(3)
-    assert same(play(used, 40), histories[0])
-
-
-@pytest.mark.parametrize("stream", ["train", "validation", "test"])
-def test_streams_differ_and_episodes_may_be_numbered(stream):
-    """Slot ``i`` plays episodes ``first + i``, ``first + i + stride``, ..."""
-    one, bins = make_env(num_envs=1, stream=stream), []
-    for _ in range(12):
-        bins.append(one.reset()["bin_depth"][0])
-    many = make_env(num_envs=3, stream=stream, first_episode=2, episode_stride=4)
-    for reset in range(2):
-        found = many.reset()["bin_depth"]
-        assert all(torch.equal(found[slot], bins[2 + slot + 4 * reset]) for slot in range(3))
-    other = make_env(num_envs=12, stream={"train": "test"}.get(stream, "train")).reset()["bin_depth"]
-    assert not torch.equal(other, torch.stack(bins))
-
-
-def episodes(num_envs, steps):
-    """Return, for each finished episode, its bin maps; the k-th of slot i among N has number ``k * N + i``."""
-    current, count, finished = [[] for _ in range(num_envs)], [0] * num_envs, {}
-    for td in play(make_env(num_envs=num_envs, tote_size=(4, 4, 2), seed=11), steps):
-        for i in range(num_envs):
-            current[i].append(td["bin_depth"][i].tolist())
-            if td["next", "done"][i]:
-                finished[count[i] * num_envs + i] = [*current[i], td["next", "bin_depth"][i].tolist()]
-                current[i], count[i] = [], count[i] + 1
-    return finished
-
-
-def test_an_episode_meets_the_same_items_whatever_the_number_of_envs():
-    few, many = episodes(2, 70), episodes(6, 25)
-    shared = few.keys() & many.keys()
-    assert len(shared) >= 8 and all(few[k] == many[k] for k in shared)
-    assert len({str(items) for items in many.values()}) == len(many)
-
-
-def test_kinds_and_positions_are_uniform():
-    bins = make_env(num_envs=8000).reset()["bin_depth"]
-    areas = bins.sum((1, 2))
-    shares = torch.stack([(areas == area).float().mean() for area in (1, 2, 4)])
-    assert torch.allclose(shares, torch.tensor([0.25, 0.5, 0.25]), atol=0.025)
-    assert torch.allclose(bins[areas == 1].mean(0), torch.full((5, 5), 1 / 25), atol=0.02)
+@pytest.mark.parametrize(
+    ("settings", "first", "stride"),
+    [({"stream": "train", "seed": 7}, 0, 4), ({"stream": "test", "first_episode": 5, "episode_stride": 9}, 5, 9)],
+)
+def test_an_item_depends_on_its_address_alone(settings, first, stride):
+    """Slot ``i`` plays episodes ``first + i``, ``first + i + stride``, ...; ``set_seed`` begins a stream again."""
+    env, address = make_env(tote_size=(4, 4, 2), **settings), settings["stream"]
+    for seed in (settings.get("seed", 0), 3):
+        env.set_seed(seed)
+        td, episode, step = env.reset(), first + torch.arange(4), torch.zeros(4, dtype=torch.int64)
+        for _ in range(20):
+            item = env.items.sample(address, torch.tensor(seed), episode, step, env.cell.bin_size)
+            assert torch.equal(env.item, torch.stack(item, 1))
+            td, following = env.step_and_maybe_reset(td.set("action", actions(td)))
+            done = td["next", "done"][:, 0]
+            episode, step = episode + stride * done, torch.where(done, 0, step + 1)
+            td = following
+        assert (episode >= first + stride).all()
 
 
 def test_a_reset_state_always_has_a_feasible_action():
@@ -226,7 +151,10 @@ def test_a_reset_state_always_has_a_feasible_action():
     assert make_env([(1, 1, 3)], tote_size=(2, 2, 3)).reset()["action_mask"].any(-1).all()
 
 
-# ---------------------------------------------------------------------- bad input
+NO_TOP = random_limits(CellSpec(), 0)
+NO_TOP.highest_top.fill_(0)
+
+
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
@@ -236,6 +164,7 @@ def test_a_reset_state_always_has_a_feasible_action():
         ({"kinds": [(4, 1, 1)]}, "item 4x1x1 does not fit effector_size: expected at most 3x3"),
         ({"kinds": [(1, 1, 6)]}, r"item 1x1x6 is higher than the tote: expected at most tote_size\[2\]=5"),
         ({"min_support": 1.0, "strict_support": True}, "item 1x1x1 .* has no feasible action"),
+        ({"limits": NO_TOP}, "item 1x1x1 .* has no feasible action"),
         # Deep bin walls: the effector cannot reach an item in the corner of a bin smaller than itself.
         ({"kinds": [(1, 1, 1)], "bin_size": (2, 2, 2)}, "1x1x1 at x=0, y=0 in the bin has no feasible action"),
         # A tote smaller than the effector: only an item level with its rim can be placed.
@@ -250,13 +179,6 @@ def test_a_reset_state_always_has_a_feasible_action():
 def test_an_impossible_configuration_is_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         make_env(**kwargs)
-
-
-def test_limits_that_leave_an_item_no_place_are_refused():
-    limits = random_limits(CellSpec(), 0)
-    limits.highest_top.fill_(0)
-    with pytest.raises(ValueError, match="has no feasible action on the empty tote"):
-        make_env(limits=limits)
 
 
 @pytest.mark.parametrize(
@@ -288,64 +210,19 @@ def test_reset_takes_no_seed():
         make_env().set_seed(1.5)
 
 
-# ---------------------------------------------------------------------- the rules
-def narrow_env(length, height):
-    """Return one bin that an item ``(2, 1, 1)`` fills, and a tote one cell deep: a place cell is a shift."""
-    sizes = {"bin_size": (2, 1, 1), "tote_size": (length, 1, height), "effector_size": (2, 1)}
-    return make_env([(2, 1, 1)], rotations=1, num_envs=1, **sizes)
-
-
-def test_a_full_tote_is_stuck_and_keeps_the_reward_of_the_last_step():
-    env = narrow_env(2, 1)
-    td = env.step(env.reset().set("action", torch.tensor([0])))["next"]
-    found = [td[key].item() for key in ("reward", "occupancy", "terminated", "done", "truncated", "failure")]
-    assert found == [2, 1, True, True, False, STUCK] and not td["action_mask"].any()
-
-
-def test_a_failure_leaves_tote_bin_and_mask_as_they_were():
-    env = narrow_env(4, 1)
-    first = step_mdp(env.step(env.reset().set("action", torch.tensor([0]))))
-    td = env.step(first.set("action", torch.tensor([0])))["next"]
-    assert [td[key].item() for key in ("failure", "reward", "terminated", "occupancy")] == [OVERFLOW, 0, True, 0.5]
-    assert same(td.select(*OBSERVATION), first.select(*OBSERVATION))
-
-
-SIDES = st.integers(1, 3)
-
-
-@settings(max_examples=20, suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow])
-@given(
-    kinds=st.lists(st.tuples(SIDES, SIDES, SIDES), min_size=1, max_size=4, unique=True),
-    walls=st.integers(1, 2),
-    tote_size=st.tuples(*[st.integers(3, 6)] * 3),
-    effector_size=st.tuples(SIDES, SIDES),
-    rotations=st.integers(1, 4),
-    pick_rule=st.sampled_from(["contain", "overlap"]),
-    min_support=st.sampled_from([0.0, 0.5, 1.0]),
-    seed=st.integers(0, 2**31 - 1),
-)
-def test_placing_only_raises_cells_up_to_the_rim_and_rewards_are_volumes(kinds, walls, **sizes):
-    try:
-        env = make_env(kinds, bin_size=(4, 5, walls), **sizes)
-    except ValueError:
-        assume(False)
-    torch.manual_seed(sizes["seed"])
-    before = env.reset()
-    rim, volume = before["tote_height"][..., None], torch.zeros(4, 1)
-    for _ in range(40):
-        item_volume = before["bin_depth"].sum((1, 2))[:, None]
-        action = torch.multinomial(before["action_mask"].float(), 1).squeeze(-1)
-        td = env.step(before.set("action", action))["next"]
-        assert ((td["tote_depth"] >= 0) & (td["tote_depth"] <= before["tote_depth"]) & (td["tote_depth"] <= rim)).all()
-        assert (before["tote_depth"] - td["tote_depth"]).sum((1, 2))[:, None].ge(item_volume).all()
-        assert td["reward"].equal(item_volume)
-        volume += td["reward"]
-        assert torch.allclose(td["occupancy"], volume / (env.cell.num_places * td["tote_height"]))
-        assert torch.isin(td["failure"], torch.tensor([SUCCESS, STUCK])).all()
-        assert (td["failure"] == STUCK).equal(td["done"])
-        if td["done"].any():
-            break
-        before = td
+@pytest.mark.parametrize(("length", "failure", "reward"), [(2, STUCK, 2), (4, OVERFLOW, 0)])
+def test_how_an_episode_ends(length, failure, reward):
+    """A full tote is stuck and keeps the reward of the last step; a failure leaves tote, bin and mask as they were."""
+    sizes = {"bin_size": (2, 1, 1), "tote_size": (length, 1, 1), "effector_size": (2, 1)}
+    env = make_env([(2, 1, 1)], rotations=1, num_envs=1, **sizes)
+    td, action = env.reset(), torch.tensor([0])
+    if failure == OVERFLOW:
+        td = step_mdp(env.step(td.set("action", action)))
+    after = env.step(td.set("action", action))["next"]
+    found = [after[key].item() for key in ("reward", "occupancy", "terminated", "done", "truncated", "failure")]
+    assert found == [reward, 2 / length, True, True, False, failure]
+    assert same(after.select(*OBSERVATION), td.select(*OBSERVATION)) == (failure == OVERFLOW)
+    assert after["action_mask"].any() == (failure == OVERFLOW)
 
 
 @pytest.mark.parametrize("kept", [0, 5000, 2**26])

@@ -85,23 +85,17 @@ def test_without_a_mask_it_tries_what_fails():
 def test_the_same_seed_is_the_same_search():
     env = make_env(3)
     observation = env.reset()
-    actions = [search_of(env, 50, seed=seed).decide(observation).tolist() for seed in (1, 1)]
-    assert actions[0] == actions[1]
+    assert torch.equal(*(search_of(env, 50, seed=1).decide(observation) for _ in range(2)))
 
 
-def test_a_recorded_stream_is_not_looked_up(tmp_path):
+def test_a_recorded_stream_is_not_looked_up_and_a_full_tote_has_nothing_to_search(tmp_path):
     (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
     env = make_env(items=Recorded(tmp_path / "items.csv"))
-    search = search_of(env, 20)
+    search, observation = search_of(env, 20), env.reset()
     assert isinstance(search.items, Kinds) and search.items.length is None
-    search.decide(env.reset())
-
-
-def test_a_full_tote_has_nothing_to_search():
-    env = make_env()
-    observation = env.reset()
-    observation["tote_depth"] = torch.zeros_like(observation["tote_depth"])
-    assert search_of(env, 20).decide(observation).item() in range(env.cell.num_actions)
+    for depth in (1.0, 0.0):
+        observation["tote_depth"] = torch.full_like(observation["tote_depth"], depth)
+        assert search.decide(observation).item() in range(env.cell.num_actions)
 
 
 @pytest.mark.parametrize(

@@ -72,12 +72,14 @@ def by_hand(network, item, tote_depth, parity, x, y):
     tote=st.tuples(st.integers(3, 7), st.integers(3, 6)),
     sizes=st.tuples(st.integers(1, 4), st.integers(1, 6), st.integers(1, 3), st.integers(1, 4)),
     headroom_bins=st.sampled_from([None, 1, 3, 12]),
+    deeper=st.sampled_from([0, 0, 100, 900_000]),
 )
-def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes, headroom_bins):
+def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes, headroom_bins, deeper):
     clip, levels, reach, items = sizes
     torch.manual_seed(seed)
     network = FootprintFcn(3, 8, field, 6, clip, levels, reach, items, headroom_bins=headroom_bins, **FLOAT)
     bins, totes = random_maps(seed, 2, (4, 6), tote)
+    totes += deeper  # depths are kept in 16 bits
     scores = network(bins, totes, 2)
     assert scores.shape == (2, 2, *tote, 3)
     item, found, expected = item_from_depth(bins), [], []
@@ -88,26 +90,6 @@ def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes,
             expected.append(by_hand(network, (w, d, h), totes[n], parity, x, y))
             found.append(scores[n, parity, x, y])
     torch.testing.assert_close(torch.stack(found), torch.stack(expected), rtol=1e-4, atol=1e-4)
-
-
-def test_turning_the_whole_problem_turns_the_scores():
-    """What is seen does not depend on which way the tote is laid: a transposed problem has transposed scores."""
-    network, (bins, totes) = FootprintFcn(2, 8, 5, **FLOAT), random_maps(0, 8, (5, 5), (6, 4))
-    item, scores = item_from_depth(bins), network(bins, totes, 2)
-    across = network(bins, totes.transpose(1, 2).contiguous(), 2)
-    for n in range(8):
-        w, d = int(item.w[n]), int(item.d[n])
-        ours, theirs = scores[n, 0, : 7 - w, : 5 - d], across[n, 1, : 5 - d, : 7 - w]
-        torch.testing.assert_close(ours, theirs.transpose(0, 1))
-
-
-@pytest.mark.parametrize(("deep", "deeper"), [(8, 2), (100, 900_000)])
-def test_only_differences_count_far_from_the_rim(deep, deeper):
-    """More cells below everything change nothing but the headroom, which is told apart up to a limit only."""
-    network = FootprintFcn(1, 8, 5, tote_clip=2, depth_range=4, **FLOAT)
-    bins, totes = random_maps(1, 8, (5, 5), (6, 6))
-    inside = (slice(None), slice(None), slice(0, 4), slice(0, 4))
-    torch.testing.assert_close(network(bins, totes + deep, 2)[inside], network(bins, totes + deep + deeper, 2)[inside])
 
 
 @pytest.mark.parametrize("rotations", [1, 2, 4])
@@ -205,13 +187,8 @@ def test_the_critic_adds_up_what_each_column_will_hold(seed, field, tote):
             share, more = critic.head(F.relu(critic.hidden(F.relu(out))))
             total += (share * room + more / 5).item()
         assert float(critic(bins, totes)[n]) == pytest.approx(total, rel=1e-4, abs=1e-4)
-
-
-def test_the_critic_takes_any_leading_dimensions():
-    (bins, totes), critic = random_maps(0, 6, (5, 5), (4, 3)), PooledCritic()
-    values = critic(bins, totes)
-    assert values.shape == (6, 1)
-    torch.testing.assert_close(critic(bins.view(2, 3, 5, 5), totes.view(2, 3, 4, 3)), values.view(2, 3, 1))
+    several = critic(bins.view(2, 1, 4, 6), totes.view(2, 1, *tote))  # any leading dimensions
+    torch.testing.assert_close(several, critic(bins, totes).view(2, 1, 1), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("make", [FootprintFcn, PooledCritic])

@@ -5,17 +5,8 @@ import torch
 from scipy.stats import chisquare
 
 from pickplace import PickPlaceEnv
-from pickplace.task.items import (
-    MAX_SEED,
-    PAPER_KINDS,
-    STREAMS,
-    Kinds,
-    Recorded,
-    Uniform,
-    check_seed,
-    hashed_uniform,
-    search_items,
-)
+from pickplace.task import items as module
+from pickplace.task.items import STREAMS, Kinds, Recorded, Uniform, hashed_uniform
 
 ZERO = torch.tensor(0)
 
@@ -35,7 +26,7 @@ def is_even(index, count, expected=None):
     return chisquare(torch.bincount(index, minlength=count), expected).pvalue > 1e-4
 
 
-def test_hashed_numbers_are_uniform():
+def test_hashed_numbers_are_uniform_and_unrelated():
     episodes = torch.arange(50_000)
     none = torch.zeros_like(episodes)
     by_episode = hashed_uniform("test", torch.tensor(2**63 - 1), episodes, none, 3)
@@ -44,35 +35,26 @@ def test_hashed_numbers_are_uniform():
         assert float(row.min()) >= 0 and float(row.max()) < 1
         assert is_even((row * 100).long(), 100)
         assert is_even((row[:-1] * 10).long() * 10 + (row[1:] * 10).long(), 100)  # pairs: one number tells no other
-
-
-def test_streams_seeds_episodes_and_numbers_are_unrelated():
     rows = [row for stream in STREAMS for row in numbers(stream, count=20_000)]
     rows += [*numbers(seed=1, count=20_000), *numbers(episode=1, count=20_000)]
     correlation = torch.corrcoef(torch.stack(rows))
     assert float((correlation - torch.eye(len(rows))).abs().max()) < 5 / 20_000**0.5
-
-
-def test_no_two_addresses_share_a_number():
-    """Families, seeds, episodes and steps: 10,000 addresses, 10,000 different numbers."""
+    # Families, seeds, episodes and steps: 10,000 addresses, 10,000 different numbers.
     seed, episode, step = (part.flatten() for part in torch.meshgrid(*[torch.arange(15)] * 3, indexing="ij"))
     rows = torch.cat([hashed_uniform(stream, seed, episode, step, 1)[0] for stream in STREAMS])
     assert len(rows.unique()) == len(rows) == 3 * 15**3
 
 
-def test_families_never_meet():
+@pytest.mark.parametrize("apart", [1, 2])
+def test_families_never_meet(apart):
     """Keys are equal where ``seed * factor + family`` is: their numbers show it, for seeds that are too far apart."""
-    factor = 0x2545F4914F6CDD1D
-    for apart in (1, 2):
-        seed = apart * pow(factor, -1, 2**64) % 2**64  # times the factor it makes up for the family's number
-        seed = min(seed, 2**64 - seed)
-        there, here = (
-            {stream: hashed_uniform(stream, at, ZERO, ZERO, 3).tolist() for stream in STREAMS}
-            for at in (torch.tensor(seed), ZERO)
-        )
-        pairs = zip(STREAMS[apart:], STREAMS, strict=False)
-        assert any(there[a] == here[b] or there[b] == here[a] for a, b in pairs)
-        assert seed >= MAX_SEED
+    seed = apart * pow(0x2545F4914F6CDD1D, -1, 2**64) % 2**64  # times the factor it is the difference of two families
+    seed = min(seed, 2**64 - seed)
+    there, here = (
+        [hashed_uniform(stream, at, ZERO, ZERO, 3).tolist() for stream in STREAMS] for at in (torch.tensor(seed), ZERO)
+    )
+    assert any(there[i + apart] == here[i] or there[i] == here[i + apart] for i in range(3 - apart))
+    assert seed >= module.MAX_SEED
 
 
 def test_an_item_is_a_hash_of_its_address():
@@ -84,16 +66,9 @@ def test_an_item_is_a_hash_of_its_address():
         "test": [[3, 2, 2, 2, 1], [4, 1, 1, 2, 1], [4, 2, 1, 1, 1]],
     }
     for stream in STREAMS:
-        item = Kinds(PAPER_KINDS).sample(stream, *address, (5, 5, 1))
-        assert torch.stack(item, 1).tolist() == expected[stream]
-
-
-def test_items_do_not_depend_on_the_batch():
-    kinds, steps = Kinds([(1, 1, 1), (2, 1, 3)]), torch.arange(40)
-    together = kinds.sample("test", torch.tensor(7), steps // 8, steps % 8, (5, 5, 1))
-    for i in range(40):
-        alone = kinds.sample("test", torch.tensor(7), steps[i : i + 1] // 8, steps[i : i + 1] % 8, (5, 5, 1))
-        assert [int(part) for part in alone] == [int(part[i]) for part in together]
+        for batch in (slice(0, 3), slice(1, 2)):
+            item = Kinds(module.PAPER_KINDS).sample(stream, *(part[batch] for part in address), (5, 5, 1))
+            assert torch.stack(item, 1).tolist() == expected[stream][batch]
 
 
 def test_positions_are_uniform_and_independent_of_the_kind():
@@ -144,7 +119,7 @@ def test_weights_and_ranges():
         (lambda: Recorded(5), "items.path='5': no such file"),
         (lambda: Recorded("missing.csv", loop="maybe"), "items.loop='maybe': expected true or false"),
         *(
-            (lambda seed=seed: check_seed(seed, "planner.seed"), "planner.seed=.*expected a whole number >= 0")
+            (lambda seed=seed: module.check_seed(seed, "planner.seed"), "planner.seed=.*expected a whole number >= 0")
             for seed in (-1, 2**62, 2**70, 1.5, "a", True)
         ),
     ],
@@ -166,29 +141,12 @@ def recorded(tmp_path):
     return make
 
 
-def test_a_recorded_stream_ends_the_episode(recorded):
-    env = PickPlaceEnv(items=recorded("\ufeffw,d,h,x,y\n1,2,1,3,0\n2,1,1,0,4\n\n"), num_envs=2)
-    observation = env.reset()
-    expected = torch.zeros(5, 5)
-    expected[3, 0:2] = 1
-    assert torch.equal(observation["bin_depth"], expected.expand(2, 5, 5))
-    for number in (1, 2):
-        after, observation = env.step_and_maybe_reset(
-            observation.set("action", observation["action_mask"].int().argmax(1))
-        )
-        after = after["next"]
-        assert after["truncated"].all() == (number == 2)
-        assert not after["terminated"].any() and not after["failure"].any()
-        assert (after["reward"] == 2).all()
-    assert not after["bin_depth"].any() and not after["action_mask"].any()
-    assert torch.equal(observation["bin_depth"], expected.expand(2, 5, 5))  # the next episode starts at row 1
-
-
-def test_a_recorded_stream_that_ends_while_others_play_on(recorded):
-    """A failed action restarts an episode, so slots are at different rows; each is truncated at its own end."""
-    env = PickPlaceEnv(items=recorded("w,d,h\n1,1,1\n1,1,1\n1,1,1\n"), num_envs=2)
-    observation = env.reset()
+def test_a_recorded_stream_ends_each_episode_at_its_own_time(recorded):
+    """A failed action restarts an episode at row 1, so slots are at different rows; each is truncated at its end."""
+    env = PickPlaceEnv(items=recorded("\ufeffw,d,h,x,y\n1,2,1,3,0\n2,1,1,0,4\n1,2,1,3,0\n\n"), num_envs=2)
+    observation, rows = env.reset(), [0, 0]
     for number in range(1, 6):
+        assert env.item.tolist() == [[[3, 0, 1, 2, 1], [0, 4, 2, 1, 1], [3, 0, 1, 2, 1]][row] for row in rows]
         action = observation["action_mask"].int().argmax(1)
         if number == 2:  # slot 1 fails
             action[1] = observation["action_mask"][1].int().argmin()
@@ -196,17 +154,18 @@ def test_a_recorded_stream_that_ends_while_others_play_on(recorded):
         truncated, terminated = [number == 3, number == 5], [False, number == 2]
         assert after["next", "truncated"][:, 0].tolist() == truncated
         assert after["next", "terminated"][:, 0].tolist() == terminated
-        assert after["next", "done"][:, 0].tolist() == [a or b for a, b in zip(truncated, terminated, strict=True)]
+        done = [a or b for a, b in zip(truncated, terminated, strict=True)]
+        assert after["next", "done"][:, 0].tolist() == done
+        assert not after["next", "bin_depth"][truncated].any() and not after["next", "action_mask"][truncated].any()
+        rows = [0 if ends else row + 1 for row, ends in zip(rows, done, strict=True)]
 
 
 def test_a_recorded_stream_may_loop_and_a_search_knows_its_sizes_only(recorded):
     items = recorded("w,d,h\n1,1,1\n2,1,1\n", loop=True)
     assert drawn(items, 6).w.tolist() == [1, 2, 1, 2, 1, 2] and items.length is None
-    imagined = search_items(recorded("w,d,h,x,y\n1,1,1,0,0\n2,1,1,0,0\n"))
+    imagined = module.search_items(recorded("w,d,h,x,y\n1,1,1,0,0\n2,1,1,0,0\n"))
     assert isinstance(imagined, Kinds) and imagined.length is None and imagined.sizes.tolist() == items.sizes.tolist()
-
-
-def test_recorded_positions_are_random_unless_given(recorded):
+    # Positions are random unless given.
     item = drawn(recorded("w,d,h\n2,1,1\n", loop=True), 20_000)
     assert is_even(item.x * 5 + item.y, 20)
     item = drawn(recorded("w,d,h,x,y\n2,1,1,3,4\n", loop=True), 20_000)
