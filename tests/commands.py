@@ -1,22 +1,24 @@
-"""Commands and configs for tests: composed configs, and trainings in processes of their own."""
+"""Commands and configs for tests: composed configs, trainings that are disturbed, and trainings in other processes."""
 
 import multiprocessing
 import os
 import sys
 import tempfile
-import time
+from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
 from pickplace.runs import checkpoint
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.loggers import read_csv
+from pickplace.training.trainer import Trainer
 
 ITERATION = 8 * 16  # frames: env.num_envs * algo.rollout_length of experiment=smoke
 
-#: A small training that draws in all its parts.
+#: A small training that draws in all its parts, and saves and validates at intervals that do not meet.
 SETTINGS = [
     "experiment=smoke",
     "env.tote_size=[5,5,3]",
@@ -25,11 +27,11 @@ SETTINGS = [
     "curriculum.advance.window=10",
     "warm_start=imitate",
     "planner@warm_start.teacher=random",  # a teacher that draws
-    f"warm_start.frames={6 * ITERATION}",
-    f"warm_start.critic_frames={3 * ITERATION}",
-    f"total_frames={24 * ITERATION}",
+    f"warm_start.frames={4 * ITERATION}",
+    f"warm_start.critic_frames={2 * ITERATION}",
+    f"total_frames={10 * ITERATION}",
     f"checkpoint_interval={3 * ITERATION}",
-    f"evaluation_interval={10 * ITERATION}",
+    f"evaluation_interval={4 * ITERATION}",
     "evaluation.episodes=4",
     "threads=1",
 ]
@@ -50,19 +52,28 @@ def options(group):
     return sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
 
 
+@contextmanager
+def after_batch(iteration, act):
+    """Call ``act(trainer)`` when a training in this process has finished that batch: trained, logged and saved."""
+    finish = Trainer.finish_batch
+
+    def finish_and_act(trainer, metrics, before):
+        finish(trainer, metrics, before)
+        if trainer.iteration == iteration:
+            act(trainer)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "finish_batch", finish_and_act)
+        yield
+
+
 class Training:
-    """``pickplace-train`` in a process of its own.
+    """``pickplace-train`` with these overrides in a process of its own."""
 
-    Args:
-        overrides: the command line.
-        own_group: whether it leads a process group.
-    """
-
-    def __init__(self, *overrides, own_group=False):
+    def __init__(self, *overrides):
         self.output = Path(tempfile.mkdtemp())
-        self.process = FORKSERVER.Process(target=_train, args=(overrides, self.output, own_group))
+        self.process = FORKSERVER.Process(target=_train, args=(overrides, self.output))
         self.process.start()
-        self.pid = self.process.pid
 
     def end(self):
         """Wait for the end; return exit code, standard output and standard error."""
@@ -80,42 +91,29 @@ class Training:
         self.process.kill()
         self.process.join()
 
-    def wait_for_rows(self, run_dir, count):
-        """Wait until ``metrics.csv`` has so many rows."""
-        path = Path(run_dir) / "metrics.csv"
-        for _ in range(120_000):
-            if path.is_file() and path.read_bytes().count(b"\n") > count:
-                return
-            assert self.process.is_alive(), self.end()
-            time.sleep(0.001)
-        raise AssertionError("no metrics appeared")
 
-
-def _train(overrides, output, own_group):
+def _train(overrides, output):
     for number, name in ((1, "stdout"), (2, "stderr")):
         os.dup2(os.open(output / name, os.O_WRONLY | os.O_CREAT), number)
     sys.stdout, sys.stderr = (os.fdopen(number, "w", buffering=1) for number in (1, 2))
     multiprocessing.set_start_method("spawn", force=True)  # as in a process that nobody forked
-    if own_group:
-        os.setpgrp()
     from pickplace.training import train
 
     sys.argv = ["pickplace-train", *overrides]
     train.main()
 
 
-def state_of(run_dir):
-    """Return what two equal runs have in common: tensors, counters, curriculum, metrics without times."""
-    state, facts = checkpoint.read(run_dir / "checkpoints" / "last")
-    rows = [{k: v for k, v in row.items() if not k.startswith("time/")} for row in read_csv(run_dir / "metrics.csv")]
-    return checkpoint.flatten(state), {k: facts[k] for k in ("frames", "iteration", "best", "curriculum")}, rows
-
-
 def assert_same(run_a, run_b):
-    """Compare two runs bit for bit."""
-    (tensors_a, rest_a), *others_a = state_of(run_a)
-    (tensors_b, rest_b), *others_b = state_of(run_b)
-    assert tensors_a.keys() == tensors_b.keys()
+    """Compare two runs bit for bit: tensors, counters, curriculum, metrics without times."""
+    (state_a, facts_a), (state_b, facts_b) = (checkpoint.read(run / "checkpoints" / "last") for run in (run_a, run_b))
+    (tensors_a, rest_a), (tensors_b, rest_b) = checkpoint.flatten(state_a), checkpoint.flatten(state_b)
+    assert tensors_a.keys() == tensors_b.keys() and rest_a == rest_b
     for key, value in tensors_a.items():
         assert torch.equal(value, tensors_b[key]), key
-    assert rest_a == rest_b and others_a == others_b
+    for key in ("frames", "iteration", "best", "curriculum"):
+        assert facts_a[key] == facts_b[key], key
+    rows_a, rows_b = (
+        [{key: value for key, value in row.items() if not key.startswith("time/")} for row in rows]
+        for rows in (read_csv(run / "metrics.csv") for run in (run_a, run_b))
+    )
+    assert rows_a == rows_b

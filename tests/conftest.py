@@ -1,19 +1,22 @@
 """Settings of all tests, and fixtures that several files use."""
 
 import logging
+import multiprocessing
 import sys
 
 import pytest
-from hydra import compose, initialize_config_dir
+from commands import composed
 from hypothesis import HealthCheck, settings
 
 from pickplace.evaluation import evaluate
-from pickplace.runs.hydra_app import conf_dir
 from pickplace.training import train
 
 # A busy machine is no fault of the code.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")
+
+# Workers of a collector are forked from a process that has imported torch, see commands.FORKSERVER.
+multiprocessing.set_start_method("forkserver", force=True)
 
 MAINS = {"train": train.main, "evaluate": evaluate.main}
 
@@ -43,9 +46,16 @@ def smoke():
     """Trains experiment=smoke in this process."""
 
     def run(run_dir, *overrides):
-        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            cfg = compose("train", ["experiment=smoke", "threads=1", *overrides])
         run_dir.mkdir(exist_ok=True)
-        return train.train(cfg, run_dir)
+        return train.train(composed("experiment=smoke", "threads=1", *overrides), run_dir)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def smoke_run(smoke, tmp_path_factory):
+    """A finished run with a whole checkpoint under each name; tests that change it copy it."""
+    run_dir = tmp_path_factory.mktemp("smoke") / "run"
+    smoke(run_dir, "evaluation_interval=512")
+    assert sorted(path.name for path in (run_dir / "checkpoints").iterdir()) == ["best", "last", "previous"]
+    return run_dir

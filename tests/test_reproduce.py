@@ -1,5 +1,7 @@
 """Test the comparison: definitions, tables and verdicts."""
 
+import re
+
 import cells
 import claims
 import figures
@@ -8,31 +10,26 @@ import results
 import table
 from hydra import compose, initialize_config_dir
 
-from pickplace.runs import hydra_app as config
+from pickplace.runs.hydra_app import conf_dir
 
 TRAININGS, EVALUATIONS = cells.read()
 
 
 def test_cells_compose():
-    chosen = {tuple(sorted(word.partition("=")[0] for word in cell.overrides)): cell for cell in EVALUATIONS.values()}
-    chosen |= {cell.name.partition("-")[0]: cell for cell in TRAININGS.values()}
-    with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
-        for cell in chosen.values():
-            if cell.command != "placement_only.py":
+    """The cells that hold all words that any cell holds, numbers aside."""
+    seen = set()
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        for cell in [*TRAININGS.values(), *EVALUATIONS.values()]:
+            words = {(cell.command, re.sub(r"=[\d_.,\[\]]+$", "", word)) for word in cell.overrides}
+            if cell.command != "placement_only.py" and not words <= seen:
                 stream = compose(cell.command.removeprefix("pickplace-"), list(cell.overrides)).evaluation.stream
                 assert stream == ("validation" if cell.command == "pickplace-train" else "test")
+                seen |= words
 
 
 def test_an_entry_stands_for_every_combination_of_its_axes():
-    entry = {
-        "name": "m-R{R}-s{seed}",
-        "training": "t-s{seed}",
-        "R": [1, 4],
-        "seed": [0],
-        "tote": ["6x6x5"],
-        "set": "a=1",
-    }
-    made = cells.expand(entry, "pickplace-evaluate")
+    entry = {"name": "m-R{R}-s{seed}", "training": "t-s{seed}", "R": [1, 4], "seed": [0], "tote": ["6x6x5"]}
+    made = cells.expand({**entry, "set": "a=1"}, "pickplace-evaluate")
     assert [cell.name for cell in made] == ["m-R1-s0", "m-R4-s0"] and made[1].training == "t-s0"
     assert made[1].overrides == ("env.rotations=4", "env.tote_size=[6,6,5]", "a=1")
     assert cells.expand({"name": "t-s{seed}", "seed": [3]}, "pickplace-train")[0].overrides == ("seed=3",)
@@ -48,18 +45,11 @@ def test_a_row_comes_back_from_its_table_as_it_was(tmp_path):
         "latency_ms": {"p50": 2.0, "cpu_mean": 1.5}, "commit": "1234567e123",
     }  # fmt: skip
     row = table.result_row("m-R4-s0", result, training_seed=1, checkpoint=None)
-    assert (
-        row["mean"] == 0.1 + 0.2 and row["low"] == 0.0 and row["decision_clock"] == "cpu_mean" and "settings" not in row
-    )
+    assert (row["mean"], row["low"], row["decision_clock"]) == (0.1 + 0.2, 0.0, "cpu_mean") and "settings" not in row
     table.update("results", [row, {"cell": "other", "method": "other"}], folder=tmp_path)
     assert table.read("results", tmp_path)["m-R4-s0"] == row
     table.update("results", [row | {"mean": 0.5}], drop=lambda found: found["cell"] == "other", folder=tmp_path)
     assert table.read("results", tmp_path) == {"m-R4-s0": row | {"mean": 0.5}}
-
-
-def made(mean, height=5):
-    """Return a row of results.csv, whose training reached a tote height."""
-    return {"mean": mean, "height_reached": height, "training_tote_height": 5}
 
 
 def test_differences_are_paired_and_cover_the_seeds():
@@ -75,20 +65,18 @@ def test_differences_are_paired_and_cover_the_seeds():
     assert claims.learning_difference("a", "b", points)["mean"] == pytest.approx(0.4)  # at 200 frames, which both have
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "episodes", "height", "word"),
-    [
-        (0.02, 0.04, 100, 5, "yes"),
-        (-0.01, 0.04, 100, 5, "undecided"),
-        (0.02, 0.04, 19, 5, "undecided"),
-        (-0.04, -0.02, 100, 4, "no"),
-        (-0.04, -0.02, 100, 3, "undecided"),  # it lost, but was not trained to the end
-        (0.02, 0.04, 100, 3, "yes"),  # it won although it was not
-    ],
-)
+@pytest.mark.parametrize(("low", "high", "episodes", "height", "word"), [
+    (0.02, 0.04, 100, 5, "yes"),
+    (-0.01, 0.04, 100, 5, "undecided"),
+    (0.02, 0.04, 19, 5, "undecided"),
+    (-0.04, -0.02, 100, 4, "no"),
+    (-0.04, -0.02, 100, 3, "undecided"),  # it lost, but was not trained to the end
+    (0.02, 0.04, 100, 3, "yes"),  # it won although it was not
+])  # fmt: skip
 def test_a_verdict_needs_a_clear_interval_episodes_and_a_finished_training(low, high, episodes, height, word):
     row = {"mean": (low + high) / 2, "low": low, "high": high, "episodes": episodes, "seeds_a": 1, "seeds_b": 0}
-    rows, found = {"a": made(0.5, height), "b": made(0.4)}, {("a", "b"): row}
+    ours = {"mean": 0.5, "height_reached": height, "training_tote_height": 5}
+    rows, found = {"a": ours, "b": {"mean": 0.4}}, {("a", "b"): row}
     assert claims.judge(claims.Comparison("a", ("b",)), rows, found).verdict == word
     below = claims.judge(claims.Comparison("a", ("b",), below=True), rows, found).verdict
     assert below == {"yes": "no", "no": "yes"}.get(word, word)
@@ -103,7 +91,7 @@ def test_a_gain_needs_both_intervals():
 
 
 def test_the_best_rival_counts_and_what_is_not_there_is_said():
-    rows = {"a": made(0.5), "b": made(0.4), "c": made(0.6), "tried": {"attempted": "no memory"}}
+    rows = {"a": {"mean": 0.5}, "b": {"mean": 0.4}, "c": {"mean": 0.6}, "tried": {"attempted": "no memory"}}
     both = claims.Comparison("a", ("b", "c"))
     assert claims.rival(both, rows) == "c" and claims.rival(claims.Comparison("a", ("b", "later")), rows) is None
     assert claims.judge(both, rows, {}).verdict == "missing"

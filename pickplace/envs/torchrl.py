@@ -1,7 +1,8 @@
 """The environment: one TorchRL ``EnvBase`` that simulates a batch of bins and totes as tensors."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.task.checks import whole_number
-from pickplace.task.feasibility import action_mask, footprint_mask, placing_maps
+from pickplace.task.feasibility import PlacingMaps, action_mask, footprint_mask, placing_maps
 from pickplace.task.items import PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.task.observation import Term, check_terms, observe
 from pickplace.task.state import Failure, Item, State
@@ -19,8 +20,18 @@ from pickplace.task.transition import apply
 
 CACHE_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes
 
-#: The masks that the environment can emit, bool ``[N, ...]`` each.
-MASKS = {"action": action_mask, "footprint": lambda cell, maps: footprint_mask(cell, maps).flatten(1)}
+
+class Mask(NamedTuple):
+    """A mask that the environment can emit, bool ``[N, size]``."""
+
+    size: Callable[[CellSpec], int]
+    make: Callable[[CellSpec, PlacingMaps], Tensor]
+
+
+MASKS = {
+    "action": Mask(lambda cell: cell.num_actions, action_mask),
+    "footprint": Mask(lambda cell: cell.num_footprints, lambda cell, maps: footprint_mask(cell, maps).flatten(1)),
+}
 
 
 class PickPlaceEnv(EnvBase):
@@ -132,9 +143,9 @@ class PickPlaceEnv(EnvBase):
             observation[key] = Bounded(low, high, (n, *shape), dtype=dtype, device=device)
         observation["occupancy"] = Bounded(0, 1, (n, 1), dtype=torch.float32, device=device)
         observation["failure"] = Categorical(len(Failure), (n, 1), dtype=torch.int64, device=device)
-        sizes = {"action": cell.num_actions, "footprint": cell.num_footprints}
         for name in self.masks:
-            observation[f"{name}_mask"] = Binary(sizes[name], (n, sizes[name]), device, torch.bool)
+            size = MASKS[name].size(cell)
+            observation[f"{name}_mask"] = Binary(size, (n, size), device, torch.bool)
         self.observation_spec = Composite(observation, shape=(n,), device=device)
         # Declared as state too, so that reset() is handed the height that a curriculum writes.
         height = observation["tote_height"].clone()
@@ -213,16 +224,16 @@ class PickPlaceEnv(EnvBase):
             bad = action[(action < 0) | (action >= self.cell.num_actions)][0].item()
             raise ValueError(f"action={bad}: expected between 0 and {self.cell.num_actions - 1} (N_a - 1).")
         step = apply(self.cell, self.state, action)
-        done = step.failure == 0
-        gained = torch.where(done, self.current_item.volume, 0)
+        placed = step.failure == 0
+        gained = torch.where(placed, self.current_item.volume, 0)
         self.heights.copy_(step.heights)
         self.volume.add_(gained)
-        self.steps.add_(done)
+        self.steps.add_(placed)
         arriving = torch.stack(self._arriving(), -1)
-        self.item.copy_(torch.where(done[:, None], arriving, self.item))
-        self._update_masks(done)
-        ended = done & (self.item[:, 4] == 0)  # a recorded stream has no further item
-        stuck = done & ~self.feasible & ~ended
+        self.item.copy_(torch.where(placed[:, None], arriving, self.item))
+        self._update_masks(placed)
+        ended = placed & self.current_item.is_empty  # a recorded stream has no further item
+        stuck = placed & ~self.feasible & ~ended
         failure = torch.where(stuck, int(Failure.STUCK), step.failure)
         result = {
             "reward": gained.float(),
@@ -253,7 +264,7 @@ class PickPlaceEnv(EnvBase):
     @property
     def exact_occupancy(self) -> Tensor:
         """The volume placed / the volume of the tote, float64 ``[N]``."""
-        return self.volume.double() / (self.tote_height * self.cell.num_places)
+        return self.volume.double() / self.cell.tote_volume(self.tote_height)
 
     def _arriving(self) -> Item:
         """The item at each slot's (episode, step)."""
@@ -279,7 +290,7 @@ class PickPlaceEnv(EnvBase):
     def _masks_of(self, heights: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
         """Return the masks that are emitted, or ``footprint``, bool ``[M, ...]``, of problems ``[M, ...]``."""
         maps = placing_maps(self.cell, State(heights, tote_height, Item(*item.unbind(-1))))
-        return {name: MASKS[name](self.cell, maps) for name in self.masks or ("footprint",)}
+        return {name: MASKS[name].make(self.cell, maps) for name in self.masks or ("footprint",)}
 
     def _masks_of_empty_totes(self, heights: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
         """Return the same as :meth:`_masks_of`; episodes begin in few ways, so what was computed is kept."""

@@ -6,12 +6,12 @@ from typing import Any, Protocol, runtime_checkable
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from pickplace.policies.base import Observation
 from pickplace.policies.restore import restore_critic, restore_policy
 from pickplace.runs.registry import find
 from pickplace.task.cell import CellSpec
 from pickplace.task.items import ItemDistribution
 from pickplace.task.observation import Term
+from pickplace.task.state import Observation
 
 
 @runtime_checkable

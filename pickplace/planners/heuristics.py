@@ -3,7 +3,6 @@
 import torch
 from torch import Tensor
 
-from pickplace.policies.base import Observation
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import number
 from pickplace.task.feasibility import (
@@ -15,7 +14,13 @@ from pickplace.task.feasibility import (
 )
 from pickplace.task.items import check_seed
 from pickplace.task.maps import FAR
-from pickplace.task.state import State
+from pickplace.task.state import Observation, State
+
+
+def dbl_order(cell: CellSpec, top: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Return a number that orders footprints by (top, y, x): deepest-bottom-left has the least one."""
+    tote_w, tote_d, _ = cell.tote_size
+    return (top * tote_d + y) * tote_w + x
 
 
 class UniformRandom:
@@ -87,9 +92,8 @@ class JointDBL:
         feasible = footprint_mask(cell, maps)  # [N, Q, W_T, D_T]
         x = torch.arange(tote_w, device=feasible.device)[:, None]
         y = torch.arange(tote_d, device=feasible.device)
-        # One number that orders (top, y, x); the parities that share the least one are tied.
-        order = (maps.top.long() * tote_d + y) * tote_w + x
-        order = torch.where(feasible, order, FAR**2).flatten(2)
+        # The parities that share the least order are tied.
+        order = torch.where(feasible, dbl_order(cell, maps.top.long(), x, y), FAR**2).flatten(2)
         best, corner = order.min(2)  # [N, Q]
         least = best.amin(1, keepdim=True)
         highest = cell.num_actions

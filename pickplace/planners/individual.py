@@ -3,13 +3,13 @@
 import torch
 from torch import Tensor
 
-from pickplace.policies.base import Observation
+from pickplace.planners.heuristics import dbl_order
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import one_of
 from pickplace.task.feasibility import PlacingMaps, action_footprints, action_mask, placing_maps
-from pickplace.task.grasps import heuristic_pick, select_pick, split_footprint
+from pickplace.task.grasps import heuristic_pick, join_pick, select_pick, split_footprint
 from pickplace.task.maps import FAR
-from pickplace.task.state import State
+from pickplace.task.state import Observation, State
 
 CANDIDATES = ("corners", "cells")
 
@@ -43,13 +43,12 @@ class IndividualHeuristic:
         if self.candidates == "corners":
             corners = corner_footprints(cell, state.heights, maps).flatten(1)
             allowed &= corners.gather(1, footprint.clamp(min=0))
-        tote_w, tote_d, _ = cell.tote_size
         top = maps.top.flatten(1).gather(1, footprint.clamp(min=0)).long()
         _, x, y = split_footprint(cell.tote_size, footprint)
-        order = (top * tote_d + y) * tote_w + x
+        order = dbl_order(cell, top, x, y)
         # Those that succeed, in order; then those that fail, in order; ties by the lowest flat index.
-        order = torch.where(allowed, order + FAR * ~(succeeds & allowed) * tote_w * tote_d, FAR**2)
-        return pick * footprint.shape[1] + order.argmin(1)
+        order = torch.where(allowed, order + FAR * ~(succeeds & allowed) * cell.num_places, FAR**2)
+        return join_pick(cell, pick, order.argmin(1))
 
 
 def corner_footprints(cell: CellSpec, heights: Tensor, maps: PlacingMaps) -> Tensor:

@@ -3,14 +3,14 @@
 import torch
 from torch import Tensor
 
-from pickplace.policies.base import MASKED, Observation
+from pickplace.policies.base import MASKED
 from pickplace.policies.fcn_grasp import FootprintPolicy
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import number, whole_number
 from pickplace.task.feasibility import PlacingMaps, first_action_reaching, footprint_mask, placing_maps
 from pickplace.task.items import ItemDistribution, check_seed, search_items
 from pickplace.task.observation import STANDARD_TERMS, observe
-from pickplace.task.state import State
+from pickplace.task.state import Observation, State
 from pickplace.task.transition import put_down
 
 
@@ -145,7 +145,7 @@ class Lookahead:
             horizon: items after which the critic judges the state; None: played out to the end.
         """
         cell, policy = self.cell, self.policy
-        keys = [*policy.in_keys, *getattr(self.critic, "in_keys", ("bin_depth", "tote_depth"))]
+        keys = [*policy.in_keys, *getattr(self.critic, "in_keys", ())]
         self._decisions += 1
         heights, tote_height, problem = (x.repeat_interleave(streams, 0) for x in (heights, tote_height, problem))
         stream = torch.arange(len(heights), device=heights.device) % streams

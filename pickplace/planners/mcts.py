@@ -6,13 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pickplace.policies.base import Observation
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import flag, number, whole_number
 from pickplace.task.feasibility import first_action_reaching, footprint_mask, placing_maps
 from pickplace.task.items import ItemDistribution, check_seed, search_items
 from pickplace.task.observation import STANDARD_TERMS
-from pickplace.task.state import Item, State
+from pickplace.task.state import Item, Observation, State
 from pickplace.task.transition import apply, put_down
 
 
@@ -169,7 +168,7 @@ class MCTS:
         for (problem, path, _), volume in zip(walks, returns.tolist(), strict=True):
             for edge in reversed(path):
                 volume += edge.volume
-                edge.total += volume / float(tote_height[problem] * self.cell.num_places)
+                edge.total += volume / float(self.cell.tote_volume(tote_height[problem]))
 
     def _carry_out(self, tried: list[tuple[int, _Edge]], tote_height: Tensor) -> None:
         """Simulate actions, and keep on their edges what they leave in the tote."""

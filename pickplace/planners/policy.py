@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pickplace.policies.base import Observation, Policy
+from pickplace.policies.base import Policy
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import is_whole
 from pickplace.task.feasibility import action_mask, placing_maps
-from pickplace.task.state import State
+from pickplace.task.state import Observation, State
 from pickplace.task.transition import apply
 
 

@@ -6,8 +6,6 @@ of the choice.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -27,14 +25,14 @@ from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import action_mask, placing_maps
 from pickplace.task.maps import FAR
 from pickplace.task.observation import STANDARD_TERMS
-from pickplace.task.state import State
+from pickplace.task.state import Observation, State
 
 #: The logit of what must not be chosen, far below what a network may score: its probability is exactly 0 in float32.
 #: The rest of float32's range is left for differences from the greatest logit.
 MASKED = -1e38
 
-#: An observation ``[N]``: a TensorDict, or a dict of its entries.
-Observation: TypeAlias = TensorDictBase | Mapping[str, Tensor]
+#: The entries of the observation that every network reads.
+DEPTH_KEYS = ("bin_depth", "tote_depth")
 
 
 class Policy(TensorDictModuleBase, ABC):
@@ -42,6 +40,7 @@ class Policy(TensorDictModuleBase, ABC):
 
     Args:
         cell: the sizes.
+        masks: see below; None: those of the class.
 
     Attributes:
         choice_key: name of the choice in the TensorDict.
@@ -59,10 +58,12 @@ class Policy(TensorDictModuleBase, ABC):
     needs_sizes = False
     network: torch.nn.Module
 
-    def __init__(self, cell: CellSpec):
+    def __init__(self, cell: CellSpec, masks: tuple[str, ...] | None = None):
         super().__init__()
         self.cell = cell
-        self.in_keys, self.out_keys = ["bin_depth", "tote_depth"], ["logits"]
+        if masks is not None:
+            self.masks = masks
+        self.in_keys, self.out_keys = [*DEPTH_KEYS, *(f"{mask}_mask" for mask in self.masks)], ["logits"]
 
     @abstractmethod
     def logits(self, observation: Observation) -> Tensor:
@@ -163,7 +164,7 @@ def pick_one(candidates: Tensor) -> Tensor:
 
 def as_critic(critic: torch.nn.Module) -> ValueOperator:
     """Return a value network as TorchRL wants it; it reads the entries of the observation in its ``in_keys``."""
-    return ValueOperator(critic, list(getattr(critic, "in_keys", ("bin_depth", "tote_depth"))))
+    return ValueOperator(critic, list(getattr(critic, "in_keys", DEPTH_KEYS)))
 
 
 def as_actor(policy: Policy) -> ProbabilisticTensorDictSequential:
@@ -184,7 +185,7 @@ def as_actor(policy: Policy) -> ProbabilisticTensorDictSequential:
 def as_collection_policy(policy: Policy) -> TensorDictSequential:
     """Return the policy as the collector runs it: choice, log-probability and flat action; logits are dropped."""
     choose = as_actor(policy)
-    if policy.choice_key == "action":
-        return TensorDictSequential(choose, selected_out_keys=["action", "log_prob"])
     act = TensorDictModule(policy.act, in_keys=[policy.choice_key, *policy.act_keys], out_keys=["action"])
-    return TensorDictSequential(choose, act, selected_out_keys=[policy.choice_key, "log_prob", "action"])
+    return TensorDictSequential(
+        choose, act, selected_out_keys=list(dict.fromkeys([policy.choice_key, "log_prob", "action"]))
+    )

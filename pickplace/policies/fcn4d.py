@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor, nn
 
-from pickplace.policies.base import MASKED, Observation, Policy
+from pickplace.policies.base import MASKED, Policy
 from pickplace.policies.networks.conv4d import Conv4dPolicy
 from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import action_mask, placing_maps
-from pickplace.task.state import State
+from pickplace.task.state import Observation, State
 
 
 class ActionPolicy(Policy):
@@ -23,11 +23,7 @@ class ActionPolicy(Policy):
     needs_sizes = True
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
-        super().__init__(cell)
-        self.mask_infeasible = mask_infeasible
-        if mask_infeasible:
-            self.masks = ("action",)
-            self.in_keys = [*self.in_keys, "action_mask"]
+        super().__init__(cell, masks=("action",) if mask_infeasible else ())
         self.network = Conv4dPolicy(4, **network)  # of which the first R count: the weights serve fewer rotations too
 
     def scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
@@ -43,7 +39,7 @@ class ActionPolicy(Policy):
         return torch.where(mask, logits.flatten(1), MASKED)
 
     def logits(self, observation: Observation) -> Tensor:
-        return self.scores(observation, observation["action_mask"] if self.mask_infeasible else None)
+        return self.scores(observation, observation["action_mask"] if self.masks else None)
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
         return choice

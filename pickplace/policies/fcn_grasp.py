@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from pickplace.policies.base import MASKED, Observation, Policy, pick_one
+from pickplace.policies.base import MASKED, Policy, pick_one
 from pickplace.policies.networks.footprint_fcn import FootprintFcn
 from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import (
@@ -14,8 +14,8 @@ from pickplace.task.feasibility import (
     footprint_mask,
     placing_maps,
 )
-from pickplace.task.grasps import class_index, footprint_index, is_outside, join_action, pick_classes
-from pickplace.task.state import State, item_from_depth
+from pickplace.task.grasps import class_index, footprint_index, is_outside, join_action, pick_classes, split_flat
+from pickplace.task.state import Observation, State, item_from_depth
 from pickplace.task.transition import apply
 
 
@@ -48,7 +48,6 @@ class FootprintPolicy(Policy):
 
     def __init__(self, cell: CellSpec, **network):
         super().__init__(cell)
-        self.in_keys = [*self.in_keys, "footprint_mask"]
         self.network = FootprintFcn(**network)
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
@@ -176,8 +175,8 @@ class GraspPolicy(Policy):
         return join_action(cell, pair // cell.rotations, place, pair % cell.rotations)
 
     def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
-        places, rotations = self.cell.num_places, self.cell.rotations
-        pick, place, rotation = action // (places * rotations), action // rotations % places, action % rotations
+        places = self.cell.num_places
+        pick, place, rotation = split_flat(self.cell, action)
         classes = pick_classes(self.cell, item_from_depth(observation["bin_depth"]))
         grasp = classes[torch.arange(len(action), device=action.device), pick, rotation]
         return torch.where(grasp < 0, self.classes * places, grasp * places + place)

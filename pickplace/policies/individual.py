@@ -5,13 +5,13 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from pickplace.policies.base import MASKED, Observation, Policy, pick_one
+from pickplace.policies.base import MASKED, Policy, pick_one
 from pickplace.policies.fcn4d import ActionPolicy
 from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy, count_ways
 from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import action_footprints, action_mask, placing_maps
-from pickplace.task.grasps import heuristic_pick, pick_classes, select_pick
-from pickplace.task.state import State, item_from_depth
+from pickplace.task.grasps import heuristic_pick, join_pick, pick_classes, select_pick
+from pickplace.task.state import Observation, State, item_from_depth
 
 EXCLUDES = "every pick but the heuristic one"
 
@@ -20,7 +20,7 @@ def spread_over_actions(cell: CellSpec, log_probs: Tensor, pick: Tensor) -> Tens
     """Return ``[N, W_T * D_T * R]`` with the pick cells ``[N]`` as ``[N, N_a]``, minus infinity for other picks."""
     number = torch.arange(log_probs.shape[1], device=pick.device)
     out = log_probs.new_full((len(log_probs), cell.num_actions), -torch.inf)
-    return out.scatter_(1, pick[:, None] * len(number) + number, log_probs)
+    return out.scatter_(1, join_pick(cell, pick[:, None], number), log_probs)
 
 
 class PlaceRotationPolicy(Policy):
@@ -42,13 +42,13 @@ class PlaceRotationPolicy(Policy):
     def logits(self, observation: Observation) -> Tensor:
         pick = self._pick(observation)
         logits = self.place_scores(observation, pick)
-        if "action_mask" not in self.in_keys:
+        if "action" not in self.masks:
             return logits
         allowed = select_pick(self.cell, observation["action_mask"], pick)
         return torch.where(allowed | ~allowed.any(1, keepdim=True), logits, MASKED)
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        return self._pick(observation) * self.cell.num_places * self.cell.rotations + choice
+        return join_pick(self.cell, self._pick(observation), choice)
 
     def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
         """Return place and rotation, whatever the pick."""
@@ -100,10 +100,6 @@ class IndividualFootprintPolicy(FootprintPolicy):
     excludes = EXCLUDES
     ranks_footprints = False
 
-    def __init__(self, cell: CellSpec, **network):
-        super().__init__(cell, **network)
-        self.in_keys = ["bin_depth", "tote_depth", "action_mask"]
-
     def _reached(self, observation: Observation, mask: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Return the heuristic pick, the footprints that it leaves, and those to choose among.
 
@@ -133,7 +129,7 @@ class IndividualFootprintPolicy(FootprintPolicy):
         pick, footprint, allowed = self._reached(observation, mask)
         number = torch.arange(footprint.shape[1], device=choice.device)
         place_rotation = pick_one(torch.where(allowed & (footprint == choice[:, None]), number, -1))
-        return pick * len(number) + place_rotation.clamp(min=0)
+        return join_pick(self.cell, pick, place_rotation.clamp(min=0))
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
         return self._action(choice, observation, self._feasible(observation))

@@ -8,10 +8,11 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from pickplace.policies.base import Observation, Policy, as_critic
+from pickplace.policies.base import Policy, as_critic
 from pickplace.runs import checkpoint
 from pickplace.runs.registry import build
 from pickplace.task.cell import CellSpec
+from pickplace.task.state import Observation
 
 SIZES = ("effector_size", "bin_size", "tote_size")
 
@@ -45,7 +46,7 @@ def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: di
         sizes = {key: size for key, size in sizes.items() if size != getattr(cell, key)}
         if not sizes:
             raise
-        restored(replace(cell, **sizes))  # if that fails too, the sizes are not the reason
+        restored(replace(cell, limits=None, **sizes))  # if that fails too, the sizes are not the reason
         ours = ", ".join(f"env.{key}={[*getattr(cell, key)]}" for key in sizes)
         theirs = ", ".join(f"{[*size]}" for size in sizes.values())
         raise checkpoint.CheckpointError(

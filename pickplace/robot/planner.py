@@ -30,7 +30,7 @@ from pickplace.task.feasibility import action_footprints, action_mask, footprint
 from pickplace.task.grasps import split_action
 from pickplace.task.maps import FAR
 from pickplace.task.observation import Term, check_terms, observe
-from pickplace.task.state import Failure, State, heights_from_depth, item_from_depth
+from pickplace.task.state import Failure, State
 from pickplace.task.transition import Step, apply
 
 
@@ -124,8 +124,6 @@ class Planner:
             raise ValueError(f"path={path!r}: expected a run folder, a checkpoint, or pretrained/<name>.")
         state, facts = checkpoint.read(checkpoint.locate(path))
         cfg = trusted_config(facts["config"], trust)
-        if unknown := sorted(set(sizes) - set(CELL_SETTINGS) - {"longest_side", "limits"}):
-            raise ValueError(f"{unknown[0]}={sizes[unknown[0]]!r}: expected one of {', '.join(CELL_SETTINGS)}.")
         env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
         cell = cell_from_settings({**{key: env[key] for key in CELL_SETTINGS if key in env}, **sizes})
         if cell.pick_rule == "overlap" and cell.longest_side is None:  # it determines the number of grasps
@@ -199,9 +197,8 @@ class Planner:
                 f"{cell.max_side}."
             )
         device = next(self._planner.policy.parameters()).device
-        rim = torch.tensor([height], device=device)
-        item = item_from_depth(bin_map.float()[None].to(device))
-        return State(heights_from_depth(tote_map[None].to(device), rim), rim, item)
+        measured = {"bin_depth": bin_map.float(), "tote_depth": tote_map, "tote_height": torch.tensor(height)}
+        return State.from_observation({key: value[None].to(device) for key, value in measured.items()})
 
     def _decide(self, observation, state: State) -> tuple[str, Tensor | None, Step | None]:
         """Return the status, and if an action was found that succeeds, the action and its effect."""

@@ -8,6 +8,7 @@ import signal
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -25,7 +26,7 @@ log = logging.getLogger(__name__)
 
 #: Counters in a checkpoint, with their values in a new run: frames and batches trained, best validation occupancy, and
 #: the latest validation.
-COUNTERS = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
+COUNTERS: dict[str, Any] = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
 
 #: Settings that may leave the run folder or the machine, and their values that do not. The user must repeat others on
 #: resume.

@@ -76,7 +76,8 @@ class CellSpec:
         strict_support: require more than ``min_support`` instead of at least.
         height_unit: length of a height unit, in sides of a cell. The rules only count units; what converts heights to
             lengths (the robot's planner, the replay page) multiplies by it.
-        longest_side: longest side of any item, where it is known; saves time only.
+        longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and under
+            ``overlap`` it also sets the number of offsets.
         limits: of the robot, see :class:`Limits`; None: there are none.
 
     Raises:
@@ -120,6 +121,10 @@ class CellSpec:
     def num_places(self) -> int:
         """The number of place cells, ``W_T * D_T``."""
         return self.tote_size[0] * self.tote_size[1]
+
+    def tote_volume(self, tote_height):
+        """Return the volume of a tote of some height, in cells times height units; an int or a tensor."""
+        return self.num_places * tote_height
 
     @property
     def num_actions(self) -> int:
@@ -188,5 +193,5 @@ def _sizes(name: str, value, count: int) -> tuple[int, ...]:
     except (TypeError, ValueError):
         sizes, exact = (), False
     if not exact or len(sizes) != count or min(sizes) < 1 or max(sizes) >= FAR:
-        raise ValueError(f"{name}={value!r}: expected {count} positive whole numbers of cells, below {FAR}.")
+        raise ValueError(f"{name}={value!r}: expected {count} positive whole numbers, below {FAR}.")
     return sizes

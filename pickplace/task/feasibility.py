@@ -25,6 +25,7 @@ from pickplace.task.grasps import (
     num_turns,
     pick_blocks,
     split_footprint,
+    turned_size,
 )
 from pickplace.task.maps import FAR, NEVER, surround, windows
 from pickplace.task.placing import clearance, is_within_reach, resting_top
@@ -185,16 +186,18 @@ def actions_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Te
     turned, x, y = split_footprint(cell.tote_size, footprint)
     place_x, place_y = (torch.stack([x, y], -1)[:, None, None] + refs - offset).unbind(-1)  # [N, P, R]
     in_tote = ~is_outside(place_x, 1, tote_w) & ~is_outside(place_y, 1, tote_d)
-    place = place_x.clamp(0, tote_w - 1) * tote_d + place_y.clamp(0, tote_d - 1)
-    clear = maps.clearance.flatten(1).gather(1, (parity * cell.num_places + place).flatten(1)).view_as(place)
+    place_x, place_y = place_x.clamp(0, tote_w - 1), place_y.clamp(0, tote_d - 1)
+    index = footprint_index(cell.tote_size, parity, place_x, place_y)
+    clear = maps.clearance.flatten(1).gather(1, index.flatten(1)).view_as(index)
     top = maps.top.flatten(1).gather(1, footprint[:, None])[..., None]
     same = (maps.item.w == maps.item.d)[:, None, None] | (parity == turned[:, None, None])
     good = in_tote & same & is_clear(top, clear) & lifted[..., None]
     if cell.limits is not None:
-        limits, number = cell.limits.on(device), rotation * cell.num_places + place
+        limits, number = cell.limits.on(device), footprint_index(cell.tote_size, rotation, place_x, place_y)
         good &= is_within_reach(limits.lowest_top.flatten()[number], limits.highest_top.flatten()[number], top)
     pick = torch.arange(cell.num_picks, device=device)[:, None]
-    return torch.where(good, join_action(cell, pick, place, rotation), -1).flatten(1)
+    action = join_action(cell, pick, place_x * tote_d + place_y, rotation)
+    return torch.where(good, action, -1).flatten(1)
 
 
 def first_action_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Tensor:
@@ -220,8 +223,8 @@ def action_footprints(cell: CellSpec, item: Item) -> Tensor:
     corner = (offset - refs)[:, :, None, None]  # [N, P, 1, 1, R, 2]
     x = corner[..., 0] + torch.arange(tote_w, device=device)[:, None, None]
     y = corner[..., 1] + torch.arange(tote_d, device=device)[:, None]
-    w = torch.where(turned == 1, item.d[:, None], item.w[:, None])[:, None, None, None]  # [N, 1, 1, 1, R]
-    d = torch.where(turned == 1, item.w[:, None], item.d[:, None])[:, None, None, None]
+    sizes = turned_size(item.rows((slice(None), None)), turned == 1)  # [N, R] each
+    w, d = (size[:, None, None, None] for size in sizes)
     inside = ~is_outside(x, w, tote_w) & ~is_outside(y, d, tote_d)
     parity = (turned * (item.w != item.d)[:, None])[:, None, None, None]
     footprint = footprint_index(cell.tote_size, parity, x, y)

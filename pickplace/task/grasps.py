@@ -45,7 +45,14 @@ def is_clear(face: Tensor, obstacle: Tensor | int, out: Tensor | None = None) ->
 
 
 def turn(near_x: Tensor, near_y: Tensor, back_x: Tensor, back_y: Tensor) -> tuple[tuple[Tensor, Tensor], ...]:
-    """Return the item's offset ``(x, y)`` under the end effector for each rotation ``0..3`` (table in the README).
+    """Return the item's offset ``(x, y)`` under the end effector for each rotation ``0..3``.
+
+    | rotation | x, y |
+    |---|---|
+    | 0 | ``near_x``, ``near_y`` |
+    | 90 degrees | ``back_y``, ``near_x`` |
+    | 180 degrees | ``back_x``, ``back_y`` |
+    | 270 degrees | ``near_y``, ``back_x`` |
 
     Args:
         near_x, near_y: the offset before turning.
@@ -91,14 +98,19 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor) -> Grasp:
     if cell.limits is not None:
         pick = (x.clamp(0, bin_w - 1) * bin_d + y.clamp(0, bin_d - 1)).expand_as(gripped)
         unreachable = ~cell.limits.on(pick.device).pick_ok[pick]
-    return Grasp(~(gripped & (item.w > 0)), collides, unreachable, near_x, near_y, back_x, back_y)
+    return Grasp(~(gripped & ~item.is_empty), collides, unreachable, near_x, near_y, back_x, back_y)
 
 
 # ---------------------------------------------------------------------- flat indices
+def split_flat(cell: CellSpec, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return pick cell, place cell (flat each) and rotation of a flat action."""
+    pick, rest = action // (cell.num_places * cell.rotations), action % (cell.num_places * cell.rotations)
+    return pick, rest // cell.rotations, rest % cell.rotations
+
+
 def split_action(cell: CellSpec, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return the flat action as ``(x_B, y_B, x_T, y_T, r)``, int64 of the action's shape each."""
-    pick, rest = action // (cell.num_places * cell.rotations), action % (cell.num_places * cell.rotations)
-    place, rotation = rest // cell.rotations, rest % cell.rotations
+    pick, place, rotation = split_flat(cell, action)
     bin_d, tote_d = cell.bin_size[1], cell.tote_size[1]
     return pick // bin_d, pick % bin_d, place // tote_d, place % tote_d, rotation
 
@@ -106,6 +118,11 @@ def split_action(cell: CellSpec, action: Tensor) -> tuple[Tensor, Tensor, Tensor
 def join_action(cell: CellSpec, pick: Tensor, place: Tensor, rotation: Tensor) -> Tensor:
     """Return the flat action of a pick cell, a place cell (flat each) and a rotation."""
     return (pick * cell.num_places + place) * cell.rotations + rotation
+
+
+def join_pick(cell: CellSpec, pick: Tensor, place_rotation: Tensor) -> Tensor:
+    """Return the flat action of a pick cell and the flat index of (place cell, rotation)."""
+    return pick * (cell.num_places * cell.rotations) + place_rotation
 
 
 def footprint_index(tote_size: Sequence[int], parity: Tensor | int, x: Tensor, y: Tensor) -> Tensor:

@@ -58,7 +58,7 @@ class ItemDistribution:
     """Base class of item distributions.
 
     Attributes:
-        sizes: int64 ``[K, 3]``, every size ``(w, d, h)`` that may arrive, in cells.
+        sizes: int64 ``[K, 3]``, every size ``(w, d, h)`` that may arrive, in cells and height units.
         length: number of items in an episode, or None if they never end.
         varies: whether episodes differ at all.
     """
@@ -93,7 +93,7 @@ class Kinds(ItemDistribution):
     """A list of kinds with weights.
 
     Args:
-        kinds: ``(w, d, h)`` triples, in cells.
+        kinds: ``(w, d, h)`` triples, in cells and height units.
         weights: a relative frequency for each kind; None means equally likely.
 
     Raises:
@@ -130,7 +130,7 @@ class Uniform(Kinds):
     """Cuboids whose sides and heights are drawn uniformly and independently from closed ranges.
 
     Args:
-        width, depth, height: ``(least, greatest)``, in cells.
+        width, depth, height: ``(least, greatest)``, in cells and height units.
     """
 
     def __init__(self, width=(1, 3), depth=(1, 3), height=(1, 3)):

@@ -98,6 +98,8 @@ RESERVED = (
     "advantage",
     "state_value",
     "value_target",
+    "taught",
+    "_reset",
 )
 
 

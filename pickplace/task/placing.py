@@ -59,7 +59,7 @@ def resting_top(cell: CellSpec, state: State) -> Tensor:
     w, d = w[:, None, None], d[:, None, None]  # [Q, 1, 1, N]
     z, level = rest(windows(padded, side).flatten(0, 1).unbind(0), is_under(w, d, side).unbind(0))
     top = z + item.h.to(z.dtype)
-    good = is_supported(cell, level, w * d) & ~overflows(top, state.tote_height) & (item.h > 0)
+    good = is_supported(cell, level, w * d) & ~overflows(top, state.tote_height) & ~item.is_empty
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2)
 
 

@@ -1,14 +1,17 @@
 """The state of a problem: the item in the bin, the heights in the tote, and why an episode ended."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from pickplace.task.maps import rectangle
+
+#: An observation ``[N]``: a TensorDict, or a dict of its entries.
+Observation: TypeAlias = TensorDictBase | Mapping[str, Tensor]
 
 
 class Failure(IntEnum):
@@ -65,6 +68,11 @@ class Item(NamedTuple):
         """The item's volume, in cells times height units, int64 ``[N]``."""
         return self.w * self.d * self.h
 
+    @property
+    def is_empty(self) -> Tensor:
+        """Whether the bin is empty, bool ``[N]``."""
+        return self.h <= 0
+
     def rows(self, index) -> "Item":
         """Return the items of some problems."""
         return Item(*(part[index] for part in self))
@@ -78,7 +86,7 @@ class State(NamedTuple):
     item: Item  # what lies in the bin
 
     @classmethod
-    def from_observation(cls, observation: TensorDictBase) -> "State":
+    def from_observation(cls, observation: Observation) -> "State":
         """Return the state that ``bin_depth``, ``tote_depth`` and ``tote_height`` of an observation ``[N]`` show."""
         tote_height = observation["tote_height"].reshape(-1)
         heights = heights_from_depth(observation["tote_depth"], tote_height)

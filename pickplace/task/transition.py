@@ -7,7 +7,16 @@ from torch import Tensor
 
 from pickplace.task.cell import CellSpec, reference_cell
 from pickplace.task.feasibility import PlacingMaps
-from pickplace.task.grasps import grasp, is_clear, is_outside, split_action, split_footprint, turn, turned_size
+from pickplace.task.grasps import (
+    footprint_index,
+    grasp,
+    is_clear,
+    is_outside,
+    split_action,
+    split_footprint,
+    turn,
+    turned_size,
+)
 from pickplace.task.maps import is_under, rectangle, squares
 from pickplace.task.placing import is_supported, is_within_reach, overflows, rest
 from pickplace.task.state import Failure, State
@@ -59,7 +68,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
         (Failure.PICK_MISS, picked.misses),
     ]
     if cell.limits is not None and picked.unreachable is not None:
-        limits, number = cell.limits.on(action.device), (rotation * tote_w + x_tote) * tote_d + y_tote
+        limits, number = cell.limits.on(action.device), footprint_index(cell.tote_size, rotation, x_tote, y_tote)
         lowest, highest_top = limits.lowest_top.flatten()[number], limits.highest_top.flatten()[number]
         checks.insert(0, (Failure.OUT_OF_REACH, picked.unreachable | ~is_within_reach(lowest, highest_top, top)))
     failure = torch.zeros_like(action)

@@ -69,9 +69,12 @@ class Trainer:
         self.resumed = resume is not None
         self.safe_folder: Path | None
         self.state, self.facts, self.safe_folder = resume or ({}, {}, None)
-        self.frames, self.iteration, self.best, self.latest = (
-            self.facts.get(key, default) for key, default in COUNTERS.items()
-        )
+        self.frames: int
+        self.iteration: int
+        self.best: float
+        self.latest: dict
+        for key, default in COUNTERS.items():
+            setattr(self, key, self.facts.get(key, default))
         self.episodes: Episodes | None = None
         # The order of these fixes the random draws of a seed.
         self._make_models()
@@ -184,6 +187,7 @@ class Trainer:
             push_level(self.collector, self.curriculum.level)
         # Last: everything above may have drawn.
         set_rng_state(checkpoint.matching_state(self.state, rng_state(self.device), "random generator"), self.device)
+        self.state = {}  # not needed any more
 
     def push_weights(self) -> None:
         """Send the newest weights to the collector's processes."""
@@ -251,9 +255,8 @@ class Trainer:
             "collector": self.collector.state_dict(),
             **rng_state(self.device),
         }
-        counters = (self.frames, self.iteration, self.best, self.latest)
         facts = {
-            **dict(zip(COUNTERS, counters, strict=True)),
+            **{key: getattr(self, key) for key in COUNTERS},
             "curriculum": self.curriculum.state_dict(),
             "config": self.saved_config,
             "versions": versions(),

@@ -1,6 +1,7 @@
 """Recorded episodes, move by move."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,8 +15,21 @@ from pickplace.task.transition import apply
 
 FULL = "The tote is full."
 
-#: An item in the tote: ``(x, y, z, w, d, h)``, its minimum corner and its sides; in cells and height units.
-Box = tuple[int, int, int, int, int, int]
+
+class Box(NamedTuple):
+    """An item in the tote: its minimum corner and its sides; in cells and height units."""
+
+    x: int
+    y: int
+    z: int
+    w: int
+    d: int
+    h: int
+
+    @property
+    def volume(self) -> int:
+        """The volume, in cells times height units."""
+        return self.w * self.d * self.h
 
 
 @dataclass
@@ -50,14 +64,14 @@ class Recording:
         for move in self.moves:
             if not move.failure:
                 x, y, w, d = move.footprint
-                boxes.append((x, y, move.z, w, d, move.item[4]))
+                boxes.append(Box(x, y, move.z, w, d, move.item[4]))
         return boxes
 
     def describe_ending(self, num_places: int) -> str:
         """Return why the episode ended, in a sentence; empty while it goes on."""
         if self.ending is None:
             return ""
-        volume = sum(w * d * h for *_, w, d, h in self.boxes)
+        volume = sum(box.volume for box in self.boxes)
         full = self.ending == Failure.STUCK and volume == num_places * self.tote_height
         return FULL if full else self.ending.sentence
 

@@ -60,7 +60,7 @@ def _items_not_placed(recording: Recording) -> list[Box]:
     """Return the items that are seen but not placed, as boxes at the origin."""
     items = [move.item for move in recording.moves if move.failure]
     items += [recording.waiting] if recording.waiting else []
-    return [(0, 0, 0, w, d, h) for _, _, w, d, h in items]
+    return [Box(0, 0, 0, w, d, h) for _, _, w, d, h in items]
 
 
 def _label(recording: Recording, ending: str) -> str:

@@ -32,7 +32,7 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
     if 0 < len(colours) <= 20:
         _draw_legend(figure, colours, cell)
     _draw_plan(plan, heights, recording.tote_height, cell)
-    share = 100 * sum(w * d * h for *_, w, d, h in boxes) / np.prod(size)
+    share = 100 * sum(box.volume for box in boxes) / np.prod(size)
     share = np.floor(10 * share + 1e-9) / 10  # never rounded up: 100% is full
     caption = f"{_sides(size, cell)} tote, {share:.1f}% full, {len(boxes)} items placed"
     if len(done) == len(recording.moves) and recording.ending is not None:

@@ -5,11 +5,14 @@ import json
 import numpy
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 from untrained import write_checkpoint
 
 from pickplace import CellSpec, PickPlaceEnv
+from pickplace.evaluation.evaluate import episode_settings, read_comparison
 from pickplace.evaluation.play import play
 from pickplace.planners.heuristics import JointDBL
+from pickplace.runs.hydra_app import conf_dir
 from pickplace.views.tables import evaluation_table
 
 SMALL = ["env.tote_size=[4,4,2]", "evaluation.latency_decisions=0", "evaluation.replay=0"]
@@ -18,13 +21,14 @@ JOINT = ["planner=joint_dbl", *SMALL]
 
 @pytest.fixture
 def evaluation(run, tmp_path):
-    """Evaluate in this process, in an empty folder; return exit code, standard error and ``evaluation.json``."""
+    """Evaluate in this process, in an empty folder; return ``evaluation.json``, with the printed table."""
 
-    def call(*arguments):
+    def call(*arguments, refused=None):
         folder = tmp_path / f"result{len(list(tmp_path.iterdir()))}"
-        code, _, err = run("evaluate", *arguments, f"hydra.run.dir={folder}")
+        code, out, err = run("evaluate", *arguments, f"hydra.run.dir={folder}")
+        assert (code == 2 and refused in err) if refused else code == 0, err
         path = folder / "evaluation.json"
-        return code, err, json.loads(path.read_text()) if path.is_file() else None
+        return {**json.loads(path.read_text()), "out": out, "path": path} if path.is_file() else None
 
     return call
 
@@ -33,8 +37,7 @@ def evaluation(run, tmp_path):
 def test_evaluation_json(evaluation, group, stream, seed):
     settings = [f"evaluation={group}", f"evaluation.seed={seed}", "evaluation.episodes=5"]
     settings += ["evaluation.latency_decisions=3", "env.tote_size=[4,5,2]"]
-    code, err, result = evaluation("planner=joint_dbl", *settings)
-    assert (code, err) == (0, "")
+    result = evaluation("planner=joint_dbl", *settings)
     assert (result["planner"], result["episodes"], result["seed"], result["stream"]) == ("joint_dbl", 5, seed, stream)
     assert result["env"]["tote_size"] == [4, 5, 2] and result["env"]["rotations"] == 4
     occupancy, latency = result["occupancy"], result["latency_ms"]
@@ -43,6 +46,8 @@ def test_evaluation_json(evaluation, group, stream, seed):
     assert occupancy["ci95"][0] <= occupancy["mean"] <= occupancy["ci95"][1]
     assert 0 < latency["p50"] <= latency["p95"] and 0 < latency["cpu_p50"] < 60_000 and 0 < latency["cpu_mean"] < 60_000
     assert set(result["versions"]) >= {"pickplace", "torch", "torchrl", "tensordict", "python"}
+    assert {path.name for path in result["path"].parent.iterdir()} >= {"tote.png", "evaluation.md"}
+    assert "occupancy" in result["out"]
 
     def make_env(first, count):
         settings = {"tote_size": (4, 5, 2), "stream": stream, "seed": seed, "masks": ()}
@@ -51,15 +56,11 @@ def test_evaluation_json(evaluation, group, stream, seed):
     assert play(make_env, JointDBL(make_env(0, 1).cell), 5, 5).occupancy.tolist() == occupancy["per_episode"]
 
 
-def test_candidates(evaluation, tmp_path):
+def test_evaluation_of_a_checkpoint(evaluation, tmp_path):
     folder = write_checkpoint(tmp_path / "it", CellSpec(rotations=2), "env.rotations=2")
     arguments = [f"checkpoint={folder}", *SMALL, "env.tote_size=[5,5,2]", "evaluation.episodes=8"]
-    results = {}
-    for candidates in ("1", "all"):
-        code, err, results[candidates] = evaluation(*arguments, f"planner.candidates={candidates}")
-        assert code == 0, err
-    one, best = results["1"], results["all"]
-    assert one["trained"]["frames"] == 256 and one["latency_ms"] is None
+    one, best = (evaluation(*arguments, f"planner.candidates={candidates}") for candidates in (1, "all"))
+    assert one["trained"]["frames"] == 256 and one["latency_ms"] is None and one["env"]["tote_size"] == [5, 5, 2]
     # With a mask in training it has never learnt to avoid what cannot be picked, and cannot choose it either.
     outside = "failed picks and footprints outside the tote"
     assert (one["candidates"], one["mask_in_training"], one["mask_at_decision"]) == (1, True, outside)
@@ -67,34 +68,63 @@ def test_candidates(evaluation, tmp_path):
     assert best["failures"] == {"stuck": 8}
     assert set(one["failures"]) != {"stuck"}  # not trained, without a mask: some actions fail
     assert one["occupancy"]["mean"] < best["occupancy"]["mean"]
+    half = [*arguments, "evaluation.episodes=1", "model.actor.compute_dtype=bfloat16"]
     search = ["planner=lookahead", "planner.samples=2", "planner.rounds=1", "planner.candidates=2"]
-    code, err, found = evaluation(*arguments, *search, "evaluation.episodes=1")
-    assert code == 0 and (found["candidates"], found["mask_at_decision"]) == ("all", True), err
-
-
-def test_recorded_items_are_compared_by_content_and_not_by_path(evaluation, tmp_path):
-    table, moved = tmp_path / "items.csv", tmp_path / "moved.csv"
-    arguments = [*JOINT, "items=recorded", "evaluation.episodes=1"]
-    table.write_text("w,d,h\n1,1,1\n2,1,1\n")
-    code, err, result = evaluation(*arguments, f"items.path={table}")
-    assert code == 0 and "same_items" not in result, err
-    other = next(tmp_path.glob("*/evaluation.json"))
-    arguments += [f"items.path={table.rename(moved)}", f"compare={other}"]
-    code, err, result = evaluation(*arguments)
-    assert code == 0 and result["paired_difference"]["mean"] == 0, err
-    moved.write_text("w,d,h\n1,1,1\n2,2,1\n")
-    code, err, _ = evaluation(*arguments)
-    assert code == 2 and "its items is" in err
+    found = evaluation(*half, *search)
+    assert (found["planner"], found["candidates"], found["mask_at_decision"]) == ("lookahead", "all", True)
+    assert {key: found["planner_settings"][key] for key in ("samples", "rounds")} == {"samples": 2, "rounds": 1}
+    found = evaluation(*half, "planner=mcts", "planner.simulations=8")
+    assert found["planner_settings"]["simulations"] == 8 and "mean_tree_depth" in found
 
 
 def test_items_of_a_checkpoint_and_other_ones(evaluation):
     """A key of the checkpoint's items is not one of the command's own items."""
     arguments = ["checkpoint=pretrained/mixed", *SMALL, "env.tote_size=[6,6,1]", "evaluation.episodes=2"]
-    code, err, result = evaluation(*arguments, "items.height=[1,1]")
-    assert code == 0, err
+    result = evaluation(*arguments, "items.height=[1,1]")
     assert (result["items"]["width"], result["items"]["height"]) == ([1, 3], [1, 1])
-    code, err, _ = evaluation(*arguments, "items=paper", "items.kinds=[[1,1,1]]")
-    assert code == 0, err
+    assert evaluation(*arguments, "items=kinds", "items.kinds=[[1,1,1]]")["items"]["kinds"] == [[1, 1, 1]]
+
+
+def test_paired_difference(evaluation):
+    settings = [*SMALL, "env.tote_size=[4,4,1]", "evaluation.episodes=20"]
+    a = evaluation("planner=random", *settings)
+    b = evaluation("planner=joint_dbl", *settings, f"compare={a['path']}")
+    paired = b["paired_difference"]
+    assert paired["against"] == "random" and "minus random" in b["out"]
+    assert paired["mean"] == pytest.approx(b["occupancy"]["mean"] - a["occupancy"]["mean"])
+    assert paired["ci95"][0] < paired["mean"] < paired["ci95"][1]
+
+
+@pytest.mark.parametrize("word", [
+    "env.rotations=2", "env.effector_size=[2,3]", "env.bin_size=[5,4,1]", "env.tote_size=[4,5,1]",
+    "env.pick_rule=overlap", "env.min_support=0.25", "env.strict_support=true",
+    "evaluation.seed=1", "evaluation.episodes=3", "evaluation.stream=validation", "items=mixed",
+])  # fmt: skip
+def test_only_the_same_episodes_are_compared(word, tmp_path):
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        ours, theirs = (episode_settings(compose("evaluate", words)) for words in ([], [word]))
+    path = tmp_path / "evaluation.json"
+    path.write_text(json.dumps({**ours, "occupancy": {"per_episode": [0.5]}}))
+    read_comparison(path, ours)
+    key = word.partition("=")[0]
+    with pytest.raises(
+        ValueError, match=key if key.startswith("env.") else f"its {key.removeprefix('evaluation.')} is"
+    ):
+        read_comparison(path, theirs)
+
+
+def test_recorded_items_are_compared_by_content_and_not_by_path(evaluation, tmp_path):
+    table, moved = tmp_path / "items.csv", tmp_path / "moved.csv"
+    arguments = [*JOINT, "items=recorded", "evaluation.episodes=2"]
+    table.write_text("w,d,h\n1,1,1\n2,1,1\n")
+    first = evaluation(*arguments, f"items.path={table}")
+    assert "same_items" not in first  # their places differ
+    arguments += [f"items.path={table.rename(moved)}"]
+    assert evaluation(*arguments, f"compare={first['path']}")["paired_difference"]["mean"] == 0
+    moved.write_text("w,d,h,x,y\n2,1,1,0,3\n2,1,1,0,3\n")
+    evaluation(*arguments, f"compare={first['path']}", refused="its items is")  # the command, too
+    result = evaluation(*arguments)
+    assert result["same_items"] and ", all of the same items" in evaluation_table(result)
 
 
 class Counting(JointDBL):
@@ -119,19 +149,8 @@ class Nameless(JointDBL):
 
 def test_own_planners_add_to_the_result(evaluation):
     arguments = [*JOINT, "evaluation.episodes=2", "trust=[test_evaluate]"]
-    code, err, result = evaluation(
-        *arguments, "planner._target_=test_evaluate.Counting", "+planner.weights=[1,{a:2.5}]"
-    )
-    assert code == 0, err
+    result = evaluation(*arguments, "planner._target_=test_evaluate.Counting", "+planner.weights=[1,{a:2.5}]")
     assert result["planner_settings"]["weights"] == [1, {"a": 2.5}]
     assert (result["heaviest"], result["seen"], result["share"], result["device"]) == (2.5, [3, 4], 0.5, "cpu")
-    code, err, result = evaluation(*arguments, "planner._target_=test_evaluate.Nameless")
-    assert code == 2 and "planner: Nameless has no name; expected" in err and result is None
-
-
-def test_recorded_items_with_places_are_the_same_in_every_episode(evaluation, tmp_path):
-    (tmp_path / "items.csv").write_text("w,d,h,x,y\n2,1,1,0,3\n2,1,1,0,3\n")
-    arguments = [*JOINT, "items=recorded", f"items.path={tmp_path / 'items.csv'}", "evaluation.episodes=3"]
-    code, err, result = evaluation(*arguments)
-    assert code == 0 and result["same_items"], err
-    assert ", all of the same items" in evaluation_table(result)
+    refused = "planner: Nameless has no name; expected"
+    assert evaluation(*arguments, "planner._target_=test_evaluate.Nameless", refused=refused) is None

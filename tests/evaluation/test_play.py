@@ -59,16 +59,6 @@ def test_no_batch_begins_after_the_time():
     assert len(play(make_env, JointDBL(CELL), 6, 2, until=0.0).occupancy) == 2  # the first batch is always played
 
 
-def test_streams_and_seeds_are_different_questions():
-    def occupancy(**settings):
-        return play(lambda *a: make_env(*a, **settings), JointDBL(CELL), 16, 16).occupancy
-
-    base = occupancy()
-    assert torch.equal(base, occupancy())
-    assert not torch.equal(base, occupancy(seed=2))
-    assert not torch.equal(base, occupancy(stream="validation"))
-
-
 def test_a_recorded_stream_that_ends_is_no_failure(tmp_path):
     path = tmp_path / "items.csv"
     path.write_text("w,d,h\n1,1,1\n2,1,1\n")

@@ -10,6 +10,7 @@ import random
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -31,10 +32,8 @@ def unfinished(run_dir: Path) -> set[tuple[str, int]]:
     """Return name and time of each checkpoint that is being written, or was when a process was killed."""
     found = set()
     for name in (".last.new", ".last.old"):
-        try:
+        with suppress(FileNotFoundError):
             found.add((name, (run_dir / "checkpoints" / name).stat().st_mtime_ns))
-        except FileNotFoundError:
-            continue
     return found
 
 
@@ -45,11 +44,7 @@ def start(run_dir: Path, settings: list[str]) -> Training:
 
 
 def kill_once(run_dir: Path, settings: list[str], draw: random.Random) -> str:
-    """Start or resume a training and kill it; return what it was doing.
-
-    Raises:
-        RuntimeError: if it ends by itself.
-    """
+    """Start or resume a training and kill it; return what it was doing."""
     aim = draw.choice((*MOMENTS, "saving"))
     leftover = unfinished(run_dir)  # by the process that was killed before
     wanted_rows = num_rows(run_dir) + draw.randint(1, 2)
@@ -71,9 +66,7 @@ def kill_once(run_dir: Path, settings: list[str], draw: random.Random) -> str:
             time.sleep(0.002)
     time.sleep(draw.uniform(0, 0.004 if aim == "saving" else 0.2))
     training.kill()
-    if is_saving():
-        return "saving"
-    return "starting" if aim == "starting" else "learning"
+    return "saving" if is_saving() else "starting" if aim == "starting" else "learning"
 
 
 def compare(folder: Path, kills: int, collector: str, seed: int) -> dict[str, int]:

@@ -42,14 +42,12 @@ DTYPES = (None, None, None, float, "f4", "f2", "i1", "u1", "u8", bool, complex, 
 def good_request(draw: random.Random, cell: CellSpec) -> dict:
     """Return a request as a camera would send it."""
     (bin_w, bin_d, _), (tote_w, tote_d, rim) = cell.bin_size, cell.tote_size
-    w, d, h = draw.randint(1, 3), draw.randint(1, 3), draw.randint(1, 3)
+    w, d, h = (draw.randint(1, 3) for _ in range(3))
     x, y = draw.randint(0, bin_w - w), draw.randint(0, bin_d - d)
     bin_depth = np.zeros((bin_w, bin_d), dtype=int)
     bin_depth[x : x + w, y : y + d] = h
-    return {
-        "bin_depth": bin_depth.tolist(),
-        "tote_depth": [[draw.randint(0, rim) for _ in range(tote_d)] for _ in range(tote_w)],
-    }
+    tote_depth = [[draw.randint(0, rim) for _ in range(tote_d)] for _ in range(tote_w)]
+    return {"bin_depth": bin_depth.tolist(), "tote_depth": tote_depth}
 
 
 def damage(draw: random.Random, request: dict) -> dict:
@@ -84,24 +82,15 @@ def line_of(draw: random.Random, request: dict) -> bytes:
         text = text[:index] + draw.choice(TEXTS) + text[index + 1 :]
     line = text.encode(draw.choice(("utf-8", "utf-8", "utf-8", "utf-16", "latin-1")))
     for _ in range(draw.choice((0, 0, 0, 1, 3))):
-        index, kind = draw.randrange(len(line) + 1), draw.random()
-        if kind < 0.3:
-            line = line[:index] + bytes([draw.randrange(256)]) + line[index + 1 :]
-        elif kind < 0.6:
-            line = line[:index] + line[index + draw.randint(1, 9) :]
-        elif kind < 0.8:
-            line = line[:index]
-        else:
-            line = line[:index] + line[max(0, index - 20) :]
+        index = draw.randrange(len(line) + 1)
+        other = bytes([draw.randrange(256)]) + line[index + 1 :]
+        shorter, repeated = line[index + draw.randint(1, 9) :], line[max(0, index - 20) :]
+        line = line[:index] + draw.choice((other, shorter, b"", repeated))
     return line
 
 
 def check_line(planner: Planner, line: bytes) -> str:
-    """Answer a line, check the answer and return its status.
-
-    Raises:
-        AssertionError: if the answer breaks a promise.
-    """
+    """Answer a line, check the answer and return its status."""
     reply = answer(planner, line, DEFAULTS)
     text = json.dumps(reply, allow_nan=False)
     assert "\n" not in text and json.loads(text).keys() == reply.keys()
@@ -163,11 +152,8 @@ def fuzz(minutes: float, seed: int) -> Counter:
     """Send requests to planners of several sizes for some minutes; return how often each status came back."""
     draw, end, counts = random.Random(seed), time.monotonic() + 60 * minutes, Counter()
     torch.manual_seed(seed)
-    cells = [
-        CellSpec(),
-        CellSpec((4, 6, 2), (5, 7, 6), (2, 3), 2),
-        CellSpec((3, 3, 1), (4, 4, 3), (1, 1), 1, "overlap"),
-    ]
+    others = ((4, 6, 2), (5, 7, 6), (2, 3), 2), ((3, 3, 1), (4, 4, 3), (1, 1), 1, "overlap")
+    cells = [CellSpec(), *(CellSpec(*sizes) for sizes in others)]
     policies = [FootprintPolicy(cell, filters=8, hidden=8).eval() for cell in cells]
     planners = [Planner(policy.cell, policy, candidates) for policy in policies for candidates in ("all", 5)]
     while time.monotonic() < end:
@@ -186,14 +172,10 @@ def fuzz(minutes: float, seed: int) -> Counter:
     return counts
 
 
-def main() -> None:
+if __name__ == "__main__":
+    torch.set_num_threads(1)
     given = sys.argv[1:]
     minutes, seed = given + ["60", "0"][len(given) :]
     counts = fuzz(float(minutes), int(seed))
     statuses = ", ".join(f"{count:,} {status}" for status, count in sorted(counts.items()))
     sys.stdout.write(f"{minutes} minutes, {counts.total():,} requests: {statuses}\n")
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    main()

@@ -13,12 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-ALLOWED_GROWTH = 0.05
-
-
-def console_command(name: str) -> str:
-    """Return the path of a command of this environment."""
-    return str(Path(sys.executable).with_name(name))
+ALLOWED_GROWTH, COMMANDS = 0.05, Path(sys.executable).parent
 
 
 def resident(pid: int) -> float:
@@ -28,11 +23,7 @@ def resident(pid: int) -> float:
 
 
 def summary(name: str, samples: list[float]) -> str:
-    """Return a line about samples of memory.
-
-    Raises:
-        RuntimeError: if it grew.
-    """
+    """Return a line about samples of memory; raise if it grew."""
     fifth = len(samples) // 5
     early, late = np.median(samples[fifth : 2 * fifth]), np.median(samples[-fifth:])
     line = f"{name}: {early:.0f} MiB when warm, {late:.0f} MiB at the end, {max(samples):.0f} MiB at most"
@@ -44,7 +35,7 @@ def summary(name: str, samples: list[float]) -> str:
 def watch_training(minutes: float, *overrides: str) -> str:
     """Train for some minutes, with many validations and checkpoints."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [console_command("pickplace-train"), "experiment=quick", "total_frames=1_000_000_000", "threads=1"]
+        command = [COMMANDS / "pickplace-train", "experiment=quick", "total_frames=1_000_000_000", "threads=1"]
         command += ["evaluation_interval=8192", "checkpoint_interval=4096", f"hydra.run.dir={folder}/run", *overrides]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
         samples, end = [], time.monotonic() + 60 * minutes
@@ -61,7 +52,7 @@ def watch_training(minutes: float, *overrides: str) -> str:
 def watch_planner(lines: int) -> str:
     """Send requests to the planner, a tenth of them cut off."""
     draw = np.random.default_rng(0)
-    command = [console_command("pickplace-plan"), "pretrained/r4", "--threads", "1"]
+    command = [COMMANDS / "pickplace-plan", "pretrained/r4", "--threads", "1"]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     samples = []
     for number in range(lines):
@@ -83,18 +74,8 @@ def watch_planner(lines: int) -> str:
     return summary(f"planner over {lines:,} lines", samples)
 
 
-PARTS = {
-    "planner": lambda: watch_planner(100_000),
-    "single": lambda: watch_training(30),
-    "multi_sync": lambda: watch_training(30, "collector=multi_sync"),
-}
-
-
-def main() -> None:
-    for part in sys.argv[1:] or PARTS:
-        sys.stdout.write(PARTS[part]() + "\n")
-        sys.stdout.flush()
-
-
 if __name__ == "__main__":
-    main()
+    for part in sys.argv[1:] or ("planner", "single", "multi_sync"):
+        line = watch_planner(100_000) if part == "planner" else watch_training(30, f"collector={part}")
+        sys.stdout.write(line + "\n")
+        sys.stdout.flush()

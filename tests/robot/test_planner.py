@@ -9,12 +9,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracle import Oracle, Rules
+from problems import oracle_of, problems, state_of
 from untrained import untrained_policy, write_checkpoint
 
-from pickplace import CellSpec, DepthMapError, Failure, Item, Planner, State
+from pickplace import CellSpec, DepthMapError, Failure, Planner
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.fcn4d import ActionPolicy
 from pickplace.task.observation import STANDARD_TERMS, observe
 
 EMPTY = np.full((6, 6), 5)
@@ -27,46 +26,26 @@ def planner():
     return Planner(CellSpec(), untrained_policy(CellSpec()))
 
 
-@st.composite
-def problems(draw):
-    """A cell of some sizes, an item in its bin ``(x, y, w, d, h)``, and heights in its tote."""
-    bin_w, bin_d, tote_w, tote_d = (draw(st.integers(least, most)) for least, most in ((2, 5), (2, 5), (3, 6), (3, 6)))
-    rim, effector = draw(st.integers(2, 5)), (draw(st.integers(1, 4)), draw(st.integers(1, 4)))
-    rule = draw(st.sampled_from(["contain", "overlap"]))
-    cell = CellSpec(
-        (bin_w, bin_d, draw(st.integers(1, 2))), (tote_w, tote_d, rim), effector, draw(st.integers(1, 4)), rule
-    )
-    w, d, h = (draw(st.integers(1, min(most, side))) for most, side in ((3, bin_w), (3, bin_d), (2, 2)))
-    item = draw(st.integers(0, bin_w - w)), draw(st.integers(0, bin_d - d)), w, d, h
-    levels = draw(st.lists(st.integers(0, rim), min_size=2, max_size=2))
-    return cell, item, np.random.default_rng(draw(st.integers(0, 1000))).choice(levels, size=(tote_w, tote_d))
-
-
-def outcomes(cell, item, heights):
-    """Return the oracle, and what it says of every action."""
-    rules = Rules(cell.bin_size, cell.tote_size, cell.effector_size, cell.rotations, cell.pick_rule)
-    oracle = Oracle(rules, cell.tote_size[2], item[2:], item[:2], heights.tolist())
-    return oracle, [oracle.try_action(action)[0] for action in range(cell.num_actions)]
-
-
 @settings(max_examples=40)
 @given(problems(), st.sampled_from(["all", 1, 7]), st.booleans(), st.integers(0, 5))
 def test_plans_agree_with_the_oracle_and_with_plane_geometry(problem, candidates, mask, seed):
-    cell, item, heights = problem
-    (x, y, w, d, h), rim = item, cell.tote_size[2]
+    cell, (case,) = problem
+    rim, heights, item = case
+    x, y, w, d, h = item
     bin_depth = np.zeros(cell.bin_size[:2])
     bin_depth[x : x + w, y : y + d] = h
     policy = untrained_policy(cell, mask, seed)
-    result = Planner(cell, policy, candidates).plan(bin_depth, rim - heights, alternatives=6)
-    oracle, codes = outcomes(cell, item, heights)
+    result = Planner(cell, policy, candidates).plan(bin_depth, rim - heights, rim, alternatives=6)
+    oracle, empty = oracle_of(cell, case), oracle_of(cell, case._replace(heights=np.zeros_like(heights)))
+    codes = [oracle.try_action(action)[0] for action in range(cell.num_actions)]
     assert result.item == dict(zip("xywdh", item, strict=True))
     assert result.occupancy_before == pytest.approx(heights.sum() / heights.size / rim)
 
     # The same decision as the planner that evaluation uses.
-    state = State(torch.from_numpy(heights)[None].int(), torch.tensor([rim]), Item(*torch.tensor([item]).unbind(1)))
-    action = int(PolicyPlanner(cell, policy, candidates).decide(observe(STANDARD_TERMS, cell, state)))
+    observation = observe(STANDARD_TERMS, cell, state_of(case))
+    action = int(PolicyPlanner(cell, policy, candidates).decide(observation))
     feasible, ok = 0 in codes, codes[action] == 0
-    nothing = "stuck" if 0 in outcomes(cell, item, np.zeros_like(heights))[1] else "impossible"
+    nothing = "stuck" if any(empty.try_action(action)[0] == 0 for action in range(cell.num_actions)) else "impossible"
     assert result.status == ("ok" if ok else "rejected" if feasible else nothing)
     assert result.action == (action if ok else None)
     names = {failure: Failure(failure).name.lower() for failure in set(codes)}
@@ -103,15 +82,12 @@ def test_plans_agree_with_the_oracle_and_with_plane_geometry(problem, candidates
 @pytest.mark.parametrize("height_unit", [1.0, 0.5])
 def test_every_length_is_in_metres(height_unit):
     """Lengths along x and y are multiples of the cell's side, heights of the height unit."""
-    cell = CellSpec(height_unit=height_unit)
+    cell, unit = CellSpec(height_unit=height_unit), 0.05 * height_unit
     planner = Planner(cell, untrained_policy(cell))
     low = EMPTY - 2  # something two units high lies everywhere
-    plain = planner.plan(ITEM, low)
     noise = np.random.default_rng(0).uniform(-0.24, 0.24, (2, 6, 6))
-    unit = 0.05 * height_unit
-    metric = planner.plan(
-        (ITEM + noise[0, :5, :5]) * unit, torch.from_numpy((low + noise[1]) * unit), 5.02 * unit, cell_size=0.05
-    )
+    maps = (ITEM + noise[0, :5, :5]) * unit, torch.from_numpy((low + noise[1]) * unit)
+    plain, metric = planner.plan(ITEM, low), planner.plan(*maps, 5.02 * unit, cell_size=0.05)
     assert metric.action == plain.action and metric.status == "ok"
     assert plain.drop_height == 2 and metric.drop_height == pytest.approx(2 * unit)
     for pose, other in ((plain.pick, metric.pick), (plain.place, metric.place)):
@@ -144,20 +120,14 @@ def test_stuck_in_this_tote_or_in_any(planner):
 
 def test_maps_of_other_kinds(planner):
     plain = planner.plan(ITEM, EMPTY)
-    for make in (
+    makes = (
         lambda a: torch.tensor(a, dtype=torch.bfloat16),
         lambda a: torch.tensor(a, dtype=torch.float32, requires_grad=True),
         lambda a: np.ma.masked_array(a, mask=False),
         lambda a: np.asfortranarray(a.astype(">u2")),
-    ):
+    )
+    for make in makes:
         assert planner.plan(make(ITEM), make(EMPTY)) == plain
-
-
-def test_four_dimensional_policy_plans_too():
-    cell = CellSpec(rotations=3)
-    result = Planner(cell, ActionPolicy(cell, filters=4).eval()).plan(ITEM, EMPTY, alternatives=3)
-    assert result.status == "ok" and result.rotation_degrees in (0, 90, 180)
-    assert len(result.alternatives) in (3, 4) and sum(other.chosen for other in result.alternatives) == 1
 
 
 def changed(array, cell, value, dtype=float):
@@ -169,9 +139,7 @@ def changed(array, cell, value, dtype=float):
 TWO_ITEMS = changed(ITEM, (4, 4), 1)
 BAD = [
     ({"bin_depth": ITEM[:4]}, "bin_depth: got shape [4, 5], expected [5, 5]"),
-    ({"bin_depth": []}, "bin_depth: got shape [0]"),
     ({"bin_depth": [[1, 2], [3]]}, "bin_depth: expected an array of 5x5 numbers"),
-    ({"bin_depth": ITEM.astype(str)}, "bin_depth: got values of type"),
     ({"bin_depth": ITEM.astype(bool)}, "bin_depth: got values of type bool"),
     ({"bin_depth": np.zeros((5, 5))}, "bin_depth: got no cell above 0, expected one item"),
     ({"bin_depth": TWO_ITEMS}, "bin_depth[1, 3]: got 0 cells, expected 1: one cuboid"),
@@ -185,40 +153,38 @@ BAD = [
     ({"tote_depth": EMPTY * 0.05 + 0.02, "bin_depth": ITEM * 0.05, "cell_size": 0.05},
      "tote_depth[0, 0]: got 5.4 cells (0.27 m), expected a whole number of cells, within 0.25"),
     ({"cell_size": "5cm"}, "cell_size='5cm': expected a length"),
-    ({"cell_size": b"1"}, "cell_size=b'1': expected a length"),
-    ({"cell_size": np.True_}, "cell_size=np.True_" if np.__version__ >= "2" else "cell_size=True"),
     ({"cell_size": 1e-320}, "cell_size=1e-320: expected a length in metres, 1e-6 to 1e6"),
     ({"tote_height": 0}, "tote_height=0: expected a whole number of cells, 1 to 1048575"),
-    ({"tote_height": 4.5}, "tote_height=4.5"),
     ({"tote_height": 10**400}, "tote_height=1000"),
-    ({"tote_height": [5]}, "tote_height=[5]"),
     ({"tolerance": 0.5}, "tolerance=0.5: expected a number of cells >= 0 and < 0.5"),
     ({"alternatives": -1}, "alternatives=-1: expected a whole number >= 0"),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("given", "message"), BAD)
-@pytest.mark.filterwarnings("error")
-def test_bad_maps_are_refused_in_one_sentence(planner, given, message):
-    with pytest.raises(DepthMapError) as caught:
-        planner.plan(**{"bin_depth": ITEM, "tote_depth": EMPTY, **given})
-    assert message in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(("given", "message"), [
+METRES = {"bin_depth": ITEM * 0.025, "tote_depth": EMPTY * 0.025, "cell_size": 0.05, "tolerance": 0.1}
+HALVES = [
     ({"tote_depth": EMPTY * 0.025 + 0.01}, "got 5.4 height units (0.135 m), expected a whole number of height units"),
     ({"tote_depth": EMPTY * 0.05}, "got 10 height units (0.25 m), expected 0 to 5 height units"),
     ({"tote_height": 0.13}, "expected a whole number of height units, 1 to 1048575, within 0.1, in metres"),
-])  # fmt: skip
-def test_errors_name_the_height_unit(given, message):
-    cell = CellSpec(height_unit=0.5)
-    good = {"bin_depth": ITEM * 0.025, "tote_depth": EMPTY * 0.025, "cell_size": 0.05, "tolerance": 0.1}
+]
+CASES = [(1.0, given, message) for given, message in BAD] + [
+    (0.5, METRES | given, message) for given, message in HALVES
+]
+
+
+@pytest.mark.parametrize(("unit", "given", "message"), CASES)
+@pytest.mark.filterwarnings("error")
+def test_bad_maps_are_refused_in_one_sentence(planner, unit, given, message):
+    cell = CellSpec(height_unit=unit)
+    chosen = planner if unit == 1 else Planner(cell, untrained_policy(cell))
     with pytest.raises(DepthMapError) as caught:
-        Planner(cell, untrained_policy(cell)).plan(**{**good, **given})
-    assert message in str(caught.value)
+        chosen.plan(**{"bin_depth": ITEM, "tote_depth": EMPTY, **given})
+    assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_load():
+    four = Planner.load("pretrained/fcn4d").plan(ITEM, EMPTY, alternatives=3)  # a policy of another kind
+    assert four.status == "ok" and sum(other.chosen for other in four.alternatives) == 1
     shipped = Planner.load("pretrained/r4", tote_size=(8, 7, 9), candidates=10)
     assert shipped.cell.tote_size == (8, 7, 9) and shipped.cell.bin_size == (5, 5, 1)
     assert shipped.plan(ITEM, np.full((8, 7), 9)).status == "ok"

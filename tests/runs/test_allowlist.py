@@ -13,13 +13,7 @@ from omegaconf import OmegaConf
 
 from pickplace import Planner
 from pickplace.runs import checkpoint
-from pickplace.runs.allowlist import (
-    REQUIRED_KEYS,
-    modules_to_trust,
-    own_modules,
-    refuse_foreign_targets,
-    trusted_config,
-)
+from pickplace.runs.allowlist import REQUIRED_KEYS, modules_to_trust, own_modules, trusted_config
 from pickplace.runs.folder import refuse_links
 from pickplace.runs.references import saved_form
 
@@ -42,59 +36,52 @@ def changed(**values):
 @pytest.fixture
 def mine(tmp_path, monkeypatch):
     """A module and a package of a user's, ``mine`` and ``mypkg``, which import things that must not be called."""
-    (tmp_path / "mine.py").write_text(
-        "import os\nfrom torch import load, nn\nfrom os import system\nclass Net(nn.Module): ...\ndef make(): ...\n"
-        "VALUE = 5\n"
-    )
-    package = tmp_path / "mypkg"
-    package.mkdir()
-    (package / "__init__.py").write_text("from mypkg.nets import Net\n")
-    (package / "nets.py").write_text("from torch import load\nclass Net: ...\n")
-    (package / "__main__.py").write_text("raise SystemExit('it was run')\n")
+    files = {
+        "mine.py": "import os\nfrom torch import load\nfrom os import system\nclass Net: ...\ndef make(): ...\nV = 5\n",
+        "mypkg/__init__.py": "from mypkg.nets import Net\n",
+        "mypkg/nets.py": "from torch import load\nclass Net: ...\n",
+        "mypkg/__main__.py": "raise SystemExit('it was run')\n",
+    }
+    (tmp_path / "mypkg").mkdir()
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
     monkeypatch.syspath_prepend(str(tmp_path))
     yield
     for name in ("mine", "mypkg", "mypkg.nets"):
         sys.modules.pop(name, None)
 
 
+FOREIGN = [
+    "os.system", "pickplace.runs.checkpoint.shutil.rmtree", "builtins.eval", "pickplace", None, 5, "", ["os.system"],
+    "pickplace.evaluation.export.export", "pickplace.task.items.Kinds", "joint_dbl", "items/kinds",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("place", ["env", "model.actor", "curriculum.advance", "collector"])
+@pytest.mark.parametrize("target", FOREIGN)
+def test_foreign_targets_are_refused(target, place):
+    with pytest.raises(ValueError, match=rf"{place}\._target_=.*: the checkpoint is refused; expected one of \w+"):
+        trusted_config(changed(**{f"{place}._target_".replace(".", "__"): target}))
+
+
 @pytest.mark.parametrize(
-    "target",
+    ("place", "node"),
     [
-        "os.system", "pickplace.runs.checkpoint.shutil.rmtree", "builtins.eval", "pickplace", None, 5,
-        "pickplace.evaluation.export.export", "pickplace.runs.checkpoint.write", "${planner._target_}", ["os.system"],
-        "", "pickplace.task.items.Kinds", "joint_dbl", "items/kinds",
+        ("model__actor__hidden", {"_target_": "kinds"}), ("model__actor__hidden", {"_target_": "items/kinds"}),
+        ("items__kinds", [[{"_target_": "kinds"}]]), ("_target_", "kinds"), ("model", [{"_target_": "fcn4d"}]),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("place", ["env", "model.actor", "curriculum.advance", "collector"])
-def test_foreign_targets_are_refused(target, place):
-    node = {"_target_": target}
-    for key in reversed(place.split(".")):
-        node = {key: node}
-    with pytest.raises(ValueError, match=rf"{place}\._target_=.*: the checkpoint is refused; expected one of \w+"):
-        refuse_foreign_targets(node)
-
-
-@pytest.mark.parametrize(
-    "node",
-    [
-        {"model": {"actor": {"hidden": {"_target_": "kinds"}}}},
-        {"items": {"kinds": [[{"_target_": "kinds"}]]}},
-        {"_target_": "kinds"},
-        {"model": [{"_target_": "fcn4d"}]},
-        {"model": {"actor": {"hidden": {"_target_": "items/kinds"}}}},
-    ],
-)
-def test_targets_in_other_places_are_refused(node):
+def test_targets_in_other_places_are_refused(place, node):
     with pytest.raises(ValueError, match="expected none in this place"):
-        refuse_foreign_targets(node)
+        trusted_config(changed(**{place: node}))
 
 
 def test_our_own_configs_are_accepted():
     groups = ("env", "items", "model", "curriculum", "curriculum/advance", "curriculum/sample", "collector", "logger")
-    for names in itertools.zip_longest(*map(options, (*groups, "warm_start"))):
-        choices = [f"{group}={name}" for group, name in zip((*groups, "warm_start"), names, strict=True) if name]
-        values = ["items.path=items.csv"] if "items=recorded" in choices else []
-        cfg = composed(*choices, *values)
+    groups += ("warm_start",)
+    for names in itertools.zip_longest(*map(options, groups)):
+        choices = [f"{group}={name}" for group, name in zip(groups, names, strict=True) if name]
+        cfg = composed(*choices, *(["items.path=items.csv"] if "items=recorded" in choices else []))
         assert trusted_config(saved_form(cfg)).env == cfg.env
 
 
@@ -105,14 +92,12 @@ HIDDEN = {
     "a resolver whose name is a reference": {"model__actor": "${${k}:${s}}", "k": "oc.create", "s": EVIL},
     "one in a value": {FILTERS: "${${k}:${s}}", "k": "oc.create", "s": EVIL},
     "one in text": {"items__path": "data/${oc.env:HOME}"},
-    "a reference in text": {"items__path": "data/${seed}"},
     "an escaped reference": {"items__path": "\\${seed}"},
     "a reference to what may be made elsewhere": {FILTERS: "${logger}"},
     "a reference to what may not be made": {FILTERS: "${evil}", "evil": {"_target_": "os.system"}},
     "a reference to a part": {FILTERS: "${algo}"},
     "a list of parts": {FILTERS: "${parts}", "parts": [[1], [2]]},
     "a reference as what is made": {"model__actor___target_": "${evil}", "evil": "os.system"},
-    "a reference to a reference": {FILTERS: "${a}", "a": "${seed}"},
     "a reference through a reference": {FILTERS: "${a.seed}", "a": "${env}"},
     "a long text": {FILTERS: "${text}", "text": "x" * 1001},
     "a long list": {FILTERS: "${many}", "many": list(range(101))},
@@ -124,21 +109,9 @@ HIDDEN = {
 
 @pytest.mark.parametrize("name", HIDDEN)
 def test_what_interpolations_hide_is_refused(name):
-    with pytest.raises(
-        ValueError, match="refused; expected (no interpolation but a reference to a number|one of fcn_grasp)"
-    ):
+    words = "refused; expected (no interpolation but a reference to a number|one of fcn_grasp)"
+    with pytest.raises(ValueError, match=words):
         trusted_config(changed(**HIDDEN[name]))
-
-
-def test_references_that_double_at_every_step_are_refused_at_once():
-    """OmegaConf would follow 2^35 of them."""
-    steps = {"p0": "${Z}", "q0": "${Y}", "Z": {}, "Y": {}}
-    for i in range(1, 36):
-        steps |= {f"p{i}": f"${{q{i - 1}.x{i - 1}}}", f"q{i}": f"${{p{i - 1}.x{i - 1}}}"}
-    for i in range(35):
-        steps["Z"][f"x{i}"], steps["Y"][f"x{i}"] = f"${{q{i}}}", f"${{p{i}}}"
-    with pytest.raises(ValueError, match="expected no interpolation"):
-        trusted_config(changed(**steps, a="${p35}"))
 
 
 def test_references_to_values_follow_what_they_lead_to():
@@ -172,10 +145,12 @@ def test_a_checkpoint_that_hides_a_pickle_runs_nothing(command, run, tmp_path):
 @pytest.mark.parametrize(
     ("target", "trust"),
     [
-        ("mine.Net", ["mine"]), ("mine.make", "mine"), ("mypkg.nets.Net", ["mine", "mypkg.nets"]),
+        ("mine.Net", ["mine"]),
+        ("mine.make", "mine"),
+        ("mypkg.nets.Net", ["mine", "mypkg.nets"]),
         ("mypkg.Net", ["mypkg"]),
     ],
-)  # fmt: skip
+)
 def test_what_a_trusted_module_defines_may_be_made_anywhere(target, trust, mine):
     trusted_config(changed(model__actor___target_=target, model__actor__part={"_target_": target}), trust)
 
@@ -183,7 +158,7 @@ def test_what_a_trusted_module_defines_may_be_made_anywhere(target, trust, mine)
 @pytest.mark.parametrize(
     "target",
     [
-        "mine.os.system", "mine.system", "mine.load", "mine.nn", "mine.VALUE", "mine", "mine.", "mine. Net",
+        "mine.os.system", "mine.system", "mine.load", "mine.V", "mine", "mine.", "mine. Net",
         "mine..Net", "mine.Missing", "mine.__setattr__", "mine.${evil}", "mines.Net", "mypkg.nets.Net",
         "mypkg.nets", "mypkg.__main__", "mypkg.nets.load", "os.system", "torch.load", "", None, 5, ["mine.Net"],
     ],
@@ -201,32 +176,22 @@ def test_parts_of_pickplace_within_what_is_trusted(mine):
             trusted_config(changed(items={"_target_": "mine.make", "base": {"_target_": target}}), ["mine"])
 
 
-def test_a_trusted_module_that_is_not_there(mine):
-    with pytest.raises(ValueError, match="trust=nowhere: it cannot be imported .*; expected it on PYTHONPATH"):
-        trusted_config(changed(model__actor___target_="nowhere.Net"), ["nowhere"])
-
-
 def test_the_refusal_says_what_to_type():
     with pytest.raises(ValueError, match=r"if mypkg\.nets is yours, say trust=mypkg\.nets \(--trust mypkg\.nets to"):
         trusted_config(changed(model__actor___target_="mypkg.nets.Net"))
+    with pytest.raises(ValueError, match="trust=nowhere: it cannot be imported .*; expected it on PYTHONPATH"):
+        trusted_config(changed(model__actor___target_="nowhere.Net"), ["nowhere"])
     for target in ("os.system", "sympy.sympify"):  # nobody should trust these
         with pytest.raises(ValueError, match=r"expected one of [^;]*\.$"):
             trusted_config(changed(model__actor___target_=target))
 
 
 @pytest.mark.parametrize(
-    "trust",
-    ["os", ["mine", "subprocess"], ["builtins"], "pickplace", "torch", "hydra.utils", 5, [3], "a b", [""], {"a": 1}],
+    "trust", ["os", ["mine", "subprocess"], ["builtins"], "pickplace", "torch", "hydra.utils", 5, [3], "a b", [""]]
 )
 def test_trust_in_what_is_nobodys_own_is_refused(trust):
     with pytest.raises(ValueError, match="trust=.*: expected names of modules of your own"):
         own_modules(trust)
-
-
-def test_names_of_modules():
-    assert own_modules(None) == own_modules([]) == ()
-    assert own_modules("mine") == ("mine",)
-    assert own_modules(OmegaConf.create(["mine", "my.nets"])) == ("mine", "my.nets")
 
 
 def test_what_is_saved(monkeypatch):
@@ -242,6 +207,8 @@ def test_what_is_saved(monkeypatch):
 
 
 def test_modules_to_trust():
+    assert own_modules(None) == own_modules([]) == ()
+    assert own_modules("mine") == ("mine",) and own_modules(OmegaConf.create(["mine", "a.b"])) == ("mine", "a.b")
     assert modules_to_trust(original()) == ()
     changes = {"model__actor___target_": "my.nets.Net", "items___target_": "mine.Items"}
     changes["algo__more"] = [{"_target_": "mine.Items"}, {"_target_": "torch.nn.ReLU"}, {"_target_": "items/kinds"}]
@@ -250,37 +217,22 @@ def test_modules_to_trust():
 
 @pytest.mark.parametrize(
     ("place", "value"),
-    [
-        ("env__bin_size", [10**6, 10**6, 1]), ("env__tote_size", [6, 6, 10**6]), ("env__effector_size", [1e9, 3]),
-        ("env__num_envs", 10**9), ("collector__workers", 4096),
-    ],
-)  # fmt: skip
+    [("env__tote_size", [6, 6, 10**6]), ("env__effector_size", [1e9, 3]), ("collector__workers", 4096)],
+)
 def test_numbers_that_would_take_all_memory_are_refused(place, value):
     with pytest.raises(ValueError, match=f"{place.replace('__', '.')}=.*: the checkpoint is refused; expected at most"):
         trusted_config(changed(**{place: value}))
 
 
-@pytest.mark.parametrize("seed", ["\x1b[31m", None, True, 1.5])
-def test_a_seed_is_a_whole_number(seed):
-    with pytest.raises(ValueError, match="seed"):
-        trusted_config(changed(seed=seed))
-
-
 @pytest.mark.parametrize("key", REQUIRED_KEYS)
 def test_a_config_that_no_training_wrote(key):
-    content = changed()
-    *parents, last = key.split(".")
-    node = content
-    for parent in parents:
-        node = node[parent]
-    del node[last]
-    with pytest.raises(ValueError, match=f"no {key}"):
-        trusted_config(content)
+    with pytest.raises(ValueError, match=f"no {key}|{key}=None"):
+        trusted_config(changed(**{key.replace(".", "__"): None}))
+    with pytest.raises(ValueError, match="seed='x': .* expected a whole number"):
+        trusted_config(changed(seed="x"))
 
 
-@pytest.mark.parametrize(
-    "name", ["train.log", ".metrics.csv.new", "report.html", "checkpoints/best", ".hydra/x", "pipe"]
-)
+@pytest.mark.parametrize("name", ["train.log", ".metrics.csv.new", "checkpoints/best", ".hydra/x", "pipe"])
 def test_a_run_folder_with_links_is_not_resumed(name, tmp_path):
     for folder in ("run/checkpoints", "run/.hydra"):
         (tmp_path / folder).mkdir(parents=True)

@@ -17,13 +17,9 @@ from pickplace.runs import checkpoint
 from pickplace.runs.checkpoint import CheckpointError
 
 leaves = st.one_of(
-    st.integers(-(2**40), 2**40),
-    st.floats(allow_nan=False),
-    st.booleans(),
-    st.none(),
-    st.lists(st.floats(-10, 10, width=32), max_size=4).map(lambda x: torch.tensor(x)),
-    st.integers(-9, 9).map(torch.tensor),
-)
+    st.integers(-(2**40), 2**40), st.floats(allow_nan=False), st.booleans(), st.none(),
+    st.lists(st.floats(-10, 10, width=32), max_size=4).map(torch.tensor), st.integers(-9, 9).map(torch.tensor),
+)  # fmt: skip
 keys = st.one_of(st.integers(0, 99), st.text("abc.xyz", min_size=1, max_size=5))
 trees = st.dictionaries(
     keys, st.recursive(leaves, lambda c: st.dictionaries(keys, c, min_size=1, max_size=3)), max_size=4
@@ -38,7 +34,7 @@ def same(a, b):
     return type(a) is type(b) and a == b
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(tree=trees)
 def test_round_trip(tree, tmp_path_factory):
     folder = tmp_path_factory.mktemp("round") / "last"
@@ -54,6 +50,13 @@ def write(folder, value=0.0, frames=1):
     return folder
 
 
+def write_tensors(folder, blob):
+    """Replace a checkpoint's tensors by anything, with the right checksum."""
+    facts = json.loads((folder / checkpoint.FACTS).read_text())
+    (folder / checkpoint.TENSORS).write_bytes(blob)
+    (folder / checkpoint.FACTS).write_text(json.dumps({**facts, "sha256": hashlib.sha256(blob).hexdigest()}))
+
+
 def test_a_kill_between_the_renames_loses_nothing(tmp_path):
     folder = write(tmp_path / "run" / "checkpoints" / "last")
     folder.rename(folder.with_name(".last.old"))  # killed right after this
@@ -61,22 +64,6 @@ def test_a_kill_between_the_renames_loses_nothing(tmp_path):
     write(folder, frames=2)
     assert checkpoint.read(checkpoint.locate(tmp_path / "run", prefer="last"))[1]["frames"] == 2
     assert [path.name for path in folder.parent.iterdir()] == ["last"]
-
-
-def test_a_full_disk_leaves_the_old_one(tmp_path, monkeypatch):
-    folder = write(tmp_path / "last")
-
-    def full(*_):
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(checkpoint.os, "fsync", full)
-    with pytest.raises(CheckpointError, match="cannot be written .No space left on device"):
-        write(folder, frames=2)
-    assert [path.name for path in tmp_path.iterdir()] == ["last"]
-    monkeypatch.undo()
-    assert checkpoint.read(folder)[1]["frames"] == 1
-    write(folder, frames=3)
-    assert [path.name for path in tmp_path.iterdir()] == ["last"]
 
 
 def test_locate_knows_runs_and_checkpoints(tmp_path):
@@ -125,11 +112,8 @@ def test_restore_names_what_does_not_fit():
     ):
         with pytest.raises(CheckpointError, match=words):
             checkpoint.restore(make, {**state, **bad}, "policy")
-
-
-def test_a_config_that_asks_for_more_memory_than_there_is_takes_none():
-    with pytest.raises(CheckpointError, match="weight is .* of shape .3, 2., expected .* of shape .10000000000, 2."):
-        checkpoint.restore(lambda: torch.nn.Linear(2, 10**10), torch.nn.Linear(2, 3).state_dict(), "policy")
+    with pytest.raises(CheckpointError, match="of shape .3, 2., expected .* of shape .10000000000, 2."):
+        checkpoint.restore(lambda: torch.nn.Linear(2, 10**10), state, "policy")  # takes no memory
 
 
 @pytest.mark.parametrize("name", [checkpoint.FACTS, checkpoint.TENSORS])
@@ -146,58 +130,35 @@ def test_links_are_refused_and_a_pipe_does_not_block(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    "tensor",
-    [
-        {"dtype": "F4", "shape": [2], "data_offsets": [0, 1]},
-        {"dtype": "F8_E8M0", "shape": [1], "data_offsets": [0, 1]},
-        {"dtype": "F32", "shape": [0, 2**63], "data_offsets": [0, 0]},
-        {"dtype": "F32", "shape": [2**62, 2**62], "data_offsets": [0, 8]},
-        {"dtype": "F32", "shape": [2], "data_offsets": [0, 2**40]},
-    ],
+    ("dtype", "shape", "size"),
+    [("F4", [2], 1), ("F8_E8M0", [1], 1), ("F32", [0, 2**63], 0), ("F32", [2**62, 2**62], 8), ("F32", [2], 2**40)],
 )
-def test_tensors_of_absurd_types_and_sizes(tmp_path, tensor):
+def test_tensors_of_absurd_types_and_sizes(tmp_path, dtype, shape, size):
     folder = write(tmp_path / "last")
-    header = json.dumps({"policy|x": tensor}).encode()
-    blob = struct.pack("<Q", len(header)) + header + bytes(tensor["data_offsets"][1] % 64)
-    facts = json.loads((folder / checkpoint.FACTS).read_text())
-    (folder / checkpoint.TENSORS).write_bytes(blob)
-    (folder / checkpoint.FACTS).write_text(json.dumps({**facts, "sha256": hashlib.sha256(blob).hexdigest()}))
+    header = json.dumps({"policy|x": {"dtype": dtype, "shape": shape, "data_offsets": [0, size]}}).encode()
+    write_tensors(folder, struct.pack("<Q", len(header)) + header + bytes(size % 64))
     with pytest.raises(CheckpointError, match="cannot be read") as caught:
         checkpoint.read(folder)
     assert "\n" not in str(caught.value)
 
 
-class Evil:
-    """Unpickling it makes a file."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), "w")
-
-
-@pytest.mark.parametrize("name", [checkpoint.TENSORS, checkpoint.FACTS, "state.pt", "checkpoint.pkl", ""])
+@pytest.mark.parametrize("name", [checkpoint.TENSORS, checkpoint.FACTS, "state.pt", ""])
 def test_a_pickle_is_never_run_whatever_its_name(tmp_path, name):
-    folder, made = tmp_path / "run" / "checkpoints" / "last", tmp_path / "made"
-    write(folder)
-    blob = pickle.dumps(Evil(made))
-    assert pickle.loads(blob) and made.unlink() is None  # it would
-    if name == checkpoint.TENSORS:  # with the right checksum
-        facts = json.loads((folder / checkpoint.FACTS).read_text())
-        facts["sha256"] = hashlib.sha256(blob).hexdigest()
-        (folder / checkpoint.FACTS).write_text(json.dumps(facts))
-    if name:
+    folder, made = write(tmp_path / "run" / "checkpoints" / "last"), tmp_path / "made"
+    blob = f"cos\nsystem\n(S'touch {made}'\ntR.".encode()
+    assert pickle.loads(blob) == 0 and made.unlink() is None  # it would
+    if name == checkpoint.TENSORS:
+        write_tensors(folder, blob)
+    elif name:
         (folder / name).write_bytes(blob)
     else:
         shutil.rmtree(folder)
         folder.write_bytes(blob)
-    if name in (checkpoint.TENSORS, checkpoint.FACTS, ""):
-        with pytest.raises(CheckpointError) as caught:
-            checkpoint.read(checkpoint.locate(folder))
-        assert "\n" not in str(caught.value)
-    else:
+    if name == "state.pt":
         checkpoint.read(checkpoint.locate(folder))
+    else:
+        with pytest.raises(CheckpointError):
+            checkpoint.read(checkpoint.locate(folder))
     assert not made.exists()
 
 
@@ -211,7 +172,7 @@ plain = st.recursive(
 )
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(
     st.dictionaries(st.sampled_from(["state", "config", "frames", "schema", "policy", "best"]), plain),
     st.dictionaries(paths, st.builds(torch.zeros, st.just(2)), max_size=4),
@@ -233,42 +194,22 @@ def test_whatever_a_checkpoint_holds_it_is_read_or_refused(tmp_path_factory, fac
         assert isinstance(state["policy"], dict) and isinstance(facts["config"], dict) and facts["frames"] >= 0
     except CheckpointError as error:
         assert "\n" not in str(error)
-    assert {path.name for path in folder.parent.parent.rglob("*")} == {
-        "checkpoints",
-        "last",
-        checkpoint.FACTS,
-        checkpoint.TENSORS,
-    }
+    assert {path.name for path in folder.parent.rglob("*")} == {"last", checkpoint.FACTS, checkpoint.TENSORS}
 
 
 @pytest.mark.parametrize(
-    ("damage", "words"),
+    ("change", "words"),
     [
-        ("truncate", "truncated or altered"), ("flip", "truncated or altered"), ("remove", "cannot be read"),
-        ("text", "cannot be read"), ("schema", "schema 99, expected 1"), ("state", "lacks its state"),
-        ("config", "lacks its state, config"), ("frames", "config or frames"), ("policy", "has no policy"),
-        *((text, "cannot be read") for text in ("[" * 200_000, '{"a":' * 200_000, "9" * 10_000, "\xff", "")),
+        ({"schema": 99}, "schema 99"), ({"state": None}, "lacks its state"), ({"sha256": "0"}, "or altered"),
+        ({"config": []}, "lacks its state, config"), ({"frames": None}, "config or frames"),
+        *((text, "cannot be read") for text in (b"[" * 200_000, b'{"a":' * 200_000, b"9" * 10_000, b"\xff", b"")),
     ],
     ids=lambda value: str(value)[:10],
 )  # fmt: skip
-def test_damaged_checkpoints_are_refused(tmp_path, damage, words):
-    folder = shutil.copytree(checkpoint.PRETRAINED / "r4", tmp_path / "copy")
-    tensors, facts = folder / checkpoint.TENSORS, folder / checkpoint.FACTS
-    blob, content = bytearray(tensors.read_bytes()), json.loads(facts.read_text())
-    if damage == "flip":
-        blob[len(blob) // 2] ^= 1
-    elif damage == "policy":
-        blob = save({"other": torch.zeros(1)})
-        content["sha256"] = hashlib.sha256(blob).hexdigest()
-    content |= {"schema": {"schema": 99}, "config": {"config": []}}.get(damage, {})
-    content.pop(damage if damage in ("state", "frames") else None, None)
-    text = json.dumps(content)
-    tensors.write_bytes(blob[:-10] if damage == "truncate" else blob)
-    if words == "cannot be read" and damage != "remove":
-        text = text[:-20] if damage == "text" else damage  # JSON without end, a number without end, not UTF-8
-    facts.write_bytes(text.encode("latin-1"))
-    if damage == "remove":
-        tensors.unlink()
+def test_damaged_facts_are_refused(tmp_path, change, words):
+    facts = write(tmp_path / "last") / checkpoint.FACTS
+    whole = json.loads(facts.read_text())
+    facts.write_bytes(change if isinstance(change, bytes) else json.dumps({**whole, **change}).encode())
     with pytest.raises(CheckpointError, match=words) as caught:
-        checkpoint.read(folder)
+        checkpoint.read(facts.parent)
     assert "\n" not in str(caught.value)

@@ -3,14 +3,12 @@
 import sys
 
 import pytest
-from commands import composed, options
 
 from pickplace.runs.loggers import CsvLogger, read_csv
-from pickplace.runs.registry import build
 from pickplace.training.train import resume_run
 
 
-@pytest.mark.parametrize("row", ["xyz,1", "1,xyz", ",2", "inf,1", "1,2,3"])
+@pytest.mark.parametrize("row", ["xyz,1", ",2", "inf,1", "1,2,3"])
 def test_metrics_that_are_no_numbers(tmp_path, row):
     (tmp_path / "metrics.csv").write_text(f"frames,a\n1,2\n{row}\n")
     with pytest.raises(ValueError, match="metrics.csv, line 3: expected a number"):
@@ -33,17 +31,6 @@ def test_metrics_survive_a_cut_line_and_a_resume(tmp_path):
     assert rows == [{"frames": 10, "a": 1.0}, {"frames": 20, "a": 2.0, "b": 5.0}, {"frames": 30, "a": 7.0}]
 
 
-@pytest.mark.parametrize("name", options("logger"))
-def test_every_logger(name, tmp_path):
-    if name not in ("csv", "none"):
-        pytest.importorskip(name)
-    logger = build("logger", composed(f"logger={name}").logger, folder=tmp_path, frames=0)
-    logger.log({"train/occupancy": 0.5}, 10)
-    logger.close()
-    kept = read_csv(tmp_path / "metrics.csv") if name != "none" else []
-    assert kept == [{"frames": 10, "train/occupancy": 0.5}][: name != "none"]
-
-
 @pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])
 def test_a_missing_extra_is_one_sentence(smoke, name, tmp_path, monkeypatch):
     for module in ("tensorboard", "wandb", "mlflow", "torch.utils.tensorboard"):
@@ -57,7 +44,7 @@ def test_a_missing_extra_is_one_sentence(smoke, name, tmp_path, monkeypatch):
 def test_a_logger_goes_on_after_a_resume_beside_metrics_csv(smoke, name, tmp_path):
     pytest.importorskip(name)
     run_dir = tmp_path / "run"
-    smoke(run_dir, f"logger={name}", "total_frames=256")
+    smoke(run_dir, f"logger={name}", "total_frames=256", "evaluation_interval=512")
     ids = [(run_dir / f"{name}_run_id").read_text()] if name != "tensorboard" else []
     resume_run([f"resume={run_dir}", "total_frames=512"])
     rows = read_csv(run_dir / "metrics.csv")

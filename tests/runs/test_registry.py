@@ -8,33 +8,37 @@ from commands import composed, options
 from omegaconf import OmegaConf
 
 from pickplace import PickPlaceEnv
-from pickplace.policies.networks.critics import Conv4dCritic, PooledCritic
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.registry import REGISTRY, accepted_arguments, build, find, names_at
 from pickplace.task.items import ItemDistribution
 from pickplace.training.curriculum import Curriculum
 
 
-@pytest.mark.parametrize("place", REGISTRY)
-def test_every_name_leads_to_a_class_or_function(place):
-    for name, path in REGISTRY[place].items():
-        found = find(place, name)
-        assert path.endswith(f".{found.__name__}") and found.__doc__
+def test_every_name_leads_to_a_class_or_function():
+    for place, names in REGISTRY.items():
+        for name, path in names.items():
+            found = find(place, name)
+            assert path.endswith(f".{found.__name__}") and found.__doc__, name
 
 
 def test_every_config_file_names_what_is_in_the_registry():
     used = set()
+
+    def visit(place, node, path):
+        if not isinstance(node, dict):
+            return
+        if target := node.get("_target_"):
+            names = names_at(place)
+            assert target in names, (path, place)
+            used.update((key, target) for key in REGISTRY if REGISTRY[key] is names)
+        for key, value in node.items():
+            visit(f"{place}.{key}".strip("."), value, path)
+
     for path in conf_dir().rglob("*.yaml"):
-        group = path.parent.relative_to(conf_dir()).as_posix().replace("/", ".").removeprefix("experiment")
         content = OmegaConf.to_container(OmegaConf.load(path))
-        for part, node in [("", content), *content.items()]:
-            target = node.get("_target_") if isinstance(node, dict) else None
-            if target:
-                place = ".".join(filter(None, (group, part)))
-                assert target in names_at(place), path
-                used.add((place, target))
-    unused = {(place, name) for place, names in REGISTRY.items() for name in names} - used
-    assert {place for place, _ in unused} <= {"warm_start.teacher"}  # which takes the files of planner
+        if path.name not in ("train.yaml", "evaluate.yaml"):  # these two configure Hydra itself, see below
+            visit(".".join(path.parent.relative_to(conf_dir()).parts).removeprefix("experiment"), content, path)
+    assert {(place, name) for place, names in REGISTRY.items() for name in names} == used
     text = "".join(path.read_text() for path in conf_dir().rglob("*.yaml"))
     assert len(re.findall("_target_: pickplace", text)) == 3  # Hydra's callbacks
 
@@ -77,10 +81,8 @@ open_settings.settings = ("a",)
 
 def test_a_class_of_the_user_s_and_the_parts_within_it():
     inner = {"_target_": "items/kinds", "kinds": [[1, 1, 1]]}
-    cfg = OmegaConf.create(
-        {"two": 2, "items": {"_target_": "test_registry.Wrapped", "base": inner, "factor": "${two}"}}
-    )
-    made = build("items", cfg["items"])
+    node = {"_target_": "test_registry.Wrapped", "base": inner, "factor": "${two}"}
+    made = build("items", OmegaConf.create({"two": 2, "items": node})["items"])
     assert isinstance(made, Wrapped) and isinstance(made.base, ItemDistribution) and made.factor == 2
     assert build("items", {"_target_": "test_registry.open_settings", "a": [{"b": 1}]}) == {"a": [{"b": 1}]}
 
@@ -93,58 +95,23 @@ def test_accepted_arguments():
     assert "rotations" in accepted_arguments(PickPlaceEnv)
 
 
-@pytest.mark.parametrize("name", options("env"))
-def test_every_env(name):
-    cfg = composed(f"env={name}")
-    env = build("env", cfg.env, items=build("items", cfg["items"]), num_envs=2)
-    assert isinstance(env, PickPlaceEnv)
-    assert env.reset()["action_mask"].any(1).all()
-
-
-@pytest.mark.parametrize("name", options("items"))
-def test_every_item_distribution(name, tmp_path):
+def test_every_env_and_item_distribution(tmp_path):
     (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
-    cfg = composed(f"items={name}", *([f"items.path={tmp_path}/items.csv"] if name == "recorded" else []))
-    assert isinstance(build("items", cfg["items"]), ItemDistribution)
+    for name in options("items"):
+        words = [f"items.path={tmp_path}/items.csv"] if name == "recorded" else []
+        assert isinstance(build("items", composed(f"items={name}", *words)["items"]), ItemDistribution)
+    for name in options("env"):
+        cfg = composed(f"env={name}")
+        env = build("env", cfg.env, items=build("items", cfg["items"]), num_envs=2)
+        assert isinstance(env, PickPlaceEnv) and env.reset()["action_mask"].any(1).all()
 
 
-@pytest.mark.parametrize("name", options("model"))
-def test_every_model(name):
-    cfg, cell = composed(f"model={name}"), PickPlaceEnv(num_envs=1).cell
-    for masked in (True, False):
-        policy = build("model.actor", cfg.model.actor, cell=cell, mask_infeasible=masked)
-        assert policy.mask_infeasible is masked
-    assert isinstance(build("model.critic", cfg.model.critic, cell=cell), Conv4dCritic | PooledCritic)
-
-
-@pytest.mark.parametrize("name", options("curriculum"))
-def test_every_curriculum_and_every_exchange_of_its_parts(name):
-    assert isinstance(build("curriculum", composed(f"curriculum={name}").curriculum), Curriculum)
-    for advance, sample in zip(
-        options("curriculum/advance"), itertools.cycle(options("curriculum/sample")), strict=False
-    ):
+def test_every_curriculum_and_every_exchange_of_its_parts():
+    """Every advance rule and every sampler, with some curriculum each."""
+    parts = [options("curriculum/advance"), options("curriculum/sample"), options("curriculum")]
+    longest = max(map(len, parts))
+    for advance, sample, name in itertools.islice(zip(*map(itertools.cycle, parts), strict=True), longest):
         cfg = composed(f"curriculum={name}", f"curriculum/advance={advance}", f"curriculum/sample={sample}")
         build("curriculum", cfg.curriculum).setup(1, 5, 10**9)
-
-
-@pytest.mark.parametrize("name", options("planner"))
-def test_every_planner(name):
-    env = PickPlaceEnv(num_envs=3, tote_size=(6, 6, 2))
-    quick = {"mcts": ["planner.simulations=20"], "lookahead": ["planner.samples=2", "planner.rounds=1"]}
-    cfg, kwargs = composed(f"planner={name}", *quick.get(name, []), name="evaluate"), {}
-    if name in ("mcts", "lookahead"):
-        kwargs["items"] = env.items
-    if name in ("policy", "lookahead"):
-        model = composed().model.actor
-        kwargs["policy"] = build("model.actor", model, cell=env.cell, mask_infeasible=True)
-    observation = env.reset()
-    action = build("planner", cfg.planner, cell=env.cell, **kwargs).decide(observation)
-    assert ((action >= 0) & (action < env.cell.num_actions)).all()
-    if name not in ("uniform", "individual_heuristic", "mcts"):
-        assert observation["action_mask"].gather(1, action[:, None]).all()
-
-
-@pytest.mark.parametrize("group", ["algo", "collector", "evaluation"])
-def test_every_other_group(group):
-    for name in options(group):
-        assert composed(f"{group}={name}")[group]
+    for name in options("curriculum"):
+        assert isinstance(build("curriculum", composed(f"curriculum={name}").curriculum), Curriculum)

@@ -5,8 +5,6 @@ import multiprocessing
 import os
 import queue
 import shutil
-import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -16,7 +14,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from commands import FORKSERVER, Training
+from commands import FORKSERVER, after_batch
 from torchrl._utils import _check_for_faulty_process
 from torchrl.collectors import RandomPolicy
 from torchrl.envs import TransformedEnv
@@ -26,28 +24,22 @@ from pickplace.evaluation.evaluate import main as evaluate_main
 from pickplace.runs import checkpoint
 from pickplace.runs.errors import WorkerDied
 from pickplace.runs.hydra_app import conf_dir
-from pickplace.training import collectors as collector
-from pickplace.training.collectors import ignore_signals, watched
+from pickplace.training import collectors
+from pickplace.training.collectors import ignore_signals, watch_workers
 from pickplace.training.train import main as train_main
 
 
-def test_a_dead_worker_ends_the_run_in_one_sentence(tmp_path):
+def test_a_dead_worker_ends_the_run_in_one_sentence(smoke, tmp_path):
     run_dir = tmp_path / "run"
-    endless = ["experiment=smoke", "total_frames=10_000_000", "threads=1"]
-    training = Training(*endless, "collector=multi_sync", f"hydra.run.dir={run_dir}")
+    words = rf"^collector worker 2 of 2 has died \(exit code -9\). .* is whole: .* resume={run_dir}/checkpoints/last$"
+    multiprocessing.set_start_method("spawn", force=True)  # this process hears of the death of its own children only
     try:
-        training.wait_for_rows(run_dir, 4)
-        workers = ["pgrep", "-f", "-P", str(training.pid), "spawn_main"]
-        children = subprocess.run(workers, capture_output=True, text=True)
-        os.kill(int(children.stdout.split()[-1]), signal.SIGKILL)
-        code, _, error = training.end()
+        with after_batch(3, lambda trainer: trainer.collector.procs[1].kill()), pytest.raises(WorkerDied, match=words):
+            smoke(run_dir, "collector=multi_sync", "total_frames=2048")
     finally:
-        training.kill()
-    assert code == 2
-    sentence = error.strip().splitlines()[-1]
-    assert sentence.startswith("error: collector worker 2 of 2 has died (exit code -9). What was saved before")
-    assert f" is whole: pickplace-train resume={run_dir}/checkpoints/" in sentence
-    assert checkpoint.read(run_dir / "checkpoints" / "last")
+        multiprocessing.set_start_method("forkserver", force=True)
+    assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 256
+    assert not multiprocessing.active_children()
 
 
 def slots(first: int, count: int) -> TransformedEnv:
@@ -59,26 +51,26 @@ def test_workers_that_cannot_begin_are_ended():
     before = set(multiprocessing.active_children())
     policy = RandomPolicy(PickPlaceEnv(num_envs=2).action_spec)
     with pytest.raises(ValueError, match="seed=-1"):
-        collector.multi_sync(slots, policy, num_envs=4, rollout_length=2, seed=-1)
+        collectors.multi_sync(slots, policy, num_envs=4, rollout_length=2, seed=-1)
     assert set(multiprocessing.active_children()) <= before
 
 
-@pytest.mark.parametrize("seed", [2**62 - 1, 20_000_000_000_000])
-def test_any_seed_is_one_for_the_workers(seed):
-    seeds = collector._seeds(seed, 3)
-    assert {item_seed for item_seed, _ in seeds} == {seed}
-    assert len({torch.Generator().manual_seed(own).initial_seed() for _, own in seeds}) == 3
+def test_any_seed_is_one_for_the_workers():
+    for seed in (2**62 - 1, 20_000_000_000_000):
+        seeds = collectors._seeds(seed, 3)
+        assert {item_seed for item_seed, _ in seeds} == {seed}
+        assert len({torch.Generator().manual_seed(own).initial_seed() for _, own in seeds}) == 3
 
 
 def test_a_worker_s_death_is_told_until_it_is_heard():
     """A logger or a finalizer swallows what is raised while it runs."""
-    worker = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600,))
+    worker = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
     worker.start()
-    with pytest.raises(WorkerDied, match="1 of 1 has died"), watched(SimpleNamespace(procs=[worker])):
+    with pytest.raises(WorkerDied, match="1 of 1 has died"), watch_workers(SimpleNamespace(procs=[worker])):
         worker.kill()
         with suppress(WorkerDied):
-            time.sleep(60)
-        time.sleep(60)
+            time.sleep(30)
+        time.sleep(30)
     time.sleep(0.6)  # and not once we have left
 
 
@@ -96,9 +88,9 @@ def test_a_worker_s_death_that_torchrl_sees_first_is_told(deaf):
     workers = [FORKSERVER.Process(target=work, args=(deaf, ready), daemon=True) for _ in range(2)]
     for worker in workers:
         worker.start()
-    for _ in workers:
-        assert ready.acquire(timeout=240)
-    with pytest.raises(WorkerDied, match=r"1 of 2 has died \(exit code -9\)"), watched(SimpleNamespace(procs=workers)):
+    assert all(ready.acquire(timeout=240) for _ in workers)
+    died = pytest.raises(WorkerDied, match=r"1 of 2 has died \(exit code -9\)")
+    with died, watch_workers(SimpleNamespace(procs=workers)):
         try:
             raise queue.Empty
         except queue.Empty:
@@ -117,60 +109,40 @@ def test_a_loss_that_is_not_finite_stops_the_run_with_a_summary(smoke, tmp_path)
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 
-def test_a_full_disk_ends_the_run_and_the_checkpoint_before_is_whole(smoke, tmp_path, monkeypatch):
-    run_dir, synced, fsync = tmp_path / "run", [], os.fsync
+@pytest.mark.parametrize(
+    ("owner", "function", "words"),
+    [
+        (checkpoint.os, "fsync", "cannot be written .*No space left"),
+        (csv.DictWriter, "writerow", "No space left on device: '{}/metrics.csv'. What was saved before is whole"),
+    ],
+)
+def test_a_full_disk_names_the_checkpoint_before_which_is_whole(smoke, tmp_path, monkeypatch, owner, function, words):
+    run_dir = tmp_path / "run"
 
-    def full(number):
-        synced.append(number)
-        if len(synced) > 4:  # the third save: best and last of the first 256 frames went well
-            raise OSError(28, "No space left on device")
-        fsync(number)
+    def full(*_):
+        raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(checkpoint.os, "fsync", full)
-    with pytest.raises(checkpoint.CheckpointError, match="cannot be written .*No space left.*resume=.*last$"):
+    filled = after_batch(3, lambda _: monkeypatch.setattr(owner, function, full))
+    with filled, pytest.raises(ValueError, match=rf"{words.format(run_dir)}.*: .*resume={run_dir}/checkpoints/last$"):
         smoke(run_dir, "total_frames=2048")
-    monkeypatch.undo()
     assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 256
     assert not [path for path in (run_dir / "checkpoints").iterdir() if path.name.startswith(".")]
 
 
-def test_a_full_disk_at_the_metrics_names_the_file_and_the_checkpoint(smoke, tmp_path, monkeypatch):
-    run_dir, write = tmp_path / "run", csv.DictWriter.writerow
-
-    def full(writer, row):
-        if isinstance(row["frames"], int) and row["frames"] > 300:
-            raise OSError(28, "No space left on device")
-        return write(writer, row)
-
-    monkeypatch.setattr(csv.DictWriter, "writerow", full)
-    words = rf"No space left on device: '{run_dir}/metrics.csv'. What was saved before is whole: .*resume={run_dir}/"
-    with pytest.raises(ValueError, match=words):
-        smoke(run_dir, "total_frames=2048")
-    assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 256
-
-
-@pytest.fixture(scope="module")
-def finished(smoke, tmp_path_factory):
-    run_dir = tmp_path_factory.mktemp("finished") / "run"
-    smoke(run_dir)
-    return run_dir
-
-
 @pytest.fixture
-def read_only(finished):
+def read_only(smoke_run):
     """A finished run in a folder where nothing can be written, not even by root."""
     with tempfile.TemporaryDirectory() as base:  # pytest's own folders are closed to other users
         run_dir = Path(base) / "run"
-        shutil.copytree(finished, run_dir)
+        shutil.copytree(smoke_run, run_dir)
         for path in (Path(base), run_dir, *run_dir.rglob("*")):
             path.chmod(0o555 if path.is_dir() else 0o444)
         user = os.geteuid()
         try:
             if user == 0:
                 os.seteuid(65534)
-                if not all(
-                    os.access(place, os.R_OK | os.X_OK, effective_ids=True) for place in (conf_dir(), sys.prefix)
-                ):
+                needed = (conf_dir(), sys.prefix)
+                if not all(os.access(place, os.R_OK | os.X_OK, effective_ids=True) for place in needed):
                     pytest.skip("another user cannot read the package, and root may write anywhere")
             yield run_dir
         finally:
@@ -197,7 +169,4 @@ def test_a_read_only_run_folder_is_named(read_only, monkeypatch, capsys, main, a
     expected = f"error: {read_only}/{name}: Permission denied; expected a place where you may read and write.\n"
     assert capsys.readouterr().err == expected
     assert before == {path: path.read_bytes() for path in read_only.rglob("*") if path.is_file()}
-
-
-def test_a_read_only_run_can_be_evaluated_from_elsewhere(read_only):
     Planner.load(read_only)

@@ -1,8 +1,10 @@
 """Training: advantages by hand, what each loss and step consists of, and the wiring of stream, slots and curriculum."""
 
+from copy import deepcopy
+
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from commands import composed
 from torch import nn
 from torchrl.modules import ValueOperator
 
@@ -13,7 +15,6 @@ from pickplace.policies.base import as_collection_policy
 from pickplace.policies.fcn_grasp import fcn_grasp
 from pickplace.policies.networks.critics import PooledCritic
 from pickplace.runs import checkpoint
-from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.loggers import read_csv
 from pickplace.runs.registry import build
 from pickplace.training import trainer
@@ -24,11 +25,6 @@ from pickplace.training.ppo import add_advantages, learning_rate, make_losses, u
 from pickplace.training.trainer import Trainer, training_env
 
 OBSERVED = ["bin_depth", "tote_depth"]  # by a critic
-
-
-def composed(*overrides):
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("train", list(overrides))
 
 
 class MeanDepthCritic(nn.Module):
@@ -52,7 +48,7 @@ def collected():
         return policy, env.rollout(6, as_collection_policy(policy), break_when_any_done=False)
 
 
-# ---------------------------------------------------------------- advantages, losses, steps
+# --- advantages, losses, steps
 
 
 def test_advantages_by_hand(collected):
@@ -105,16 +101,14 @@ def test_advantages_are_normalised_where_the_config_says_so(collected, algo, wan
 
 @pytest.mark.parametrize("limit", [1e-3, 1e9])
 @pytest.mark.parametrize("phase", Phase)
-def test_a_step_follows_what_its_phase_learns_from(phase, limit):
+def test_a_step_follows_what_its_phase_learns_from(phase, limit, collected):
     """The policy from reward or its teacher, the critic always; no further than the greatest norm of a gradient."""
-    env = PickPlaceEnv(num_envs=8, masks=("footprint",), tote_size=(4, 4, 1))
-    policy = fcn_grasp(env.cell, True, filters=8, hidden=8, head_std=1.0, compute_dtype="float32")
+    policy, data = deepcopy(collected[0]), collected[1].reshape(-1)
     critic = ValueOperator(PooledCritic(filters=8, hidden=8, compute_dtype="float32"), OBSERVED)
     settings = ["algo.entropy_coeff=0.3", "algo.epochs=1", "algo.minibatch_size=64"]
     cfg = composed(*settings, f"algo.max_grad_norm={limit}").algo
     advantage, loss = make_losses(cfg, policy, critic)
     with torch.no_grad():
-        data = env.rollout(6, as_collection_policy(policy), break_when_any_done=False).reshape(-1)
         advantage(data)
     data["taught"] = data["footprint"]
     losses = loss(data)
@@ -141,7 +135,7 @@ def test_the_learning_rate_falls_linearly_over_the_last_part():
     assert learning_rate(composed("algo.lr=0.2", "algo.lr_decay_start=null").algo, 1000, 1000) == 0.2
 
 
-# ---------------------------------------------------------------- the loop
+# --- the loop
 
 
 def test_intervals_fire_for_any_batch_size():
@@ -154,6 +148,7 @@ def test_a_run_counts_logs_scales_and_saves(smoke, tmp_path, monkeypatch):
     occupancies, rows = iter([0.5, 0.8, 0.6, 0.7, 0.1]), []
     interval = {"ci95_low": 0.0, "ci95_high": 1.0}
     monkeypatch.setattr(trainer, "validation_metrics", lambda _: {"occupancy": next(occupancies), **interval})
+    monkeypatch.setattr(Trainer, "write_report", lambda self: None)
     levels = ["curriculum=paper", "curriculum.advance.frames_per_level=256", "env.tote_size=[4,4,3]"]
     quick = ["algo.minibatch_size=128", "evaluation.episodes=1", "evaluation_interval=128"]
     for scale, frames, final in ((0.5, 512, 0.7), (5, 128, 0.1)):
@@ -180,13 +175,12 @@ def test_metrics_are_of_the_episodes_that_ended(collected):
 
 def test_the_slots_of_all_workers_share_the_episodes_of_a_stream():
     """Each episode is played once, by one of them."""
-    curriculum = Curriculum(NoAdvance(), Current())
+    curriculum, cfg, played = Curriculum(NoAdvance(), Current()), composed("env.tote_size=[4,4,2]"), []
     curriculum.setup(1, 2, 100)
-    cfg = composed("env.tote_size=[4,4,2]")
-    env_config, items = {k: v for k, v in cfg.env.items() if k != "num_envs"}, build("items", cfg["items"])
-    played = []
+    env_config = {key: value for key, value in cfg.env.items() if key != "num_envs"}
+    common = (env_config, build("items", cfg["items"]), "cpu", ("footprint",), 4, curriculum)
     for first in (0, 2):
-        env = training_env(env_config, items, "cpu", ("footprint",), 4, curriculum, first_episode=first, num_envs=2)
+        env = training_env(*common, first_episode=first, num_envs=2)
         env.set_seed(0)
         for _ in range(3):
             env.reset()
@@ -207,3 +201,20 @@ def test_validation_plays_its_own_stream_at_full_height(tmp_path):
     training.collector.shutdown()
     assert torch.equal(found.occupancy, play(make_env, training.planner, 6, 6).occupancy)
     assert (found.tote_height == 2).all()
+
+
+def test_a_learner_expects_nothing_after_the_end_of_a_recording(smoke, tmp_path, monkeypatch):
+    """Though it truncates: nothing more comes, and no critic learns the value of an empty bin."""
+    batches = []
+
+    def recording(*args):
+        advantage, loss = make_losses(*args)
+        return lambda batch: batches.append(advantage(batch).clone()), loss
+
+    monkeypatch.setattr(trainer, "make_losses", recording)
+    (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
+    quick = ["env.tote_size=[5,5,1]", "total_frames=128", "evaluation.episodes=1", "logger=none"]
+    smoke(tmp_path / "run", "items=recorded", f"items.path={tmp_path}/items.csv", *quick)
+    ended, target = (torch.cat([b[key].flatten() for b in batches]) for key in (("next", "truncated"), "value_target"))
+    assert ended.sum() > 20
+    torch.testing.assert_close(target[ended], torch.full_like(target[ended], 2 * 0.25))  # 2 cells, by reward_scale

@@ -1,5 +1,8 @@
 """Height samplers, and the transform that writes tote heights into resets, in one process and in several."""
 
+import multiprocessing
+
+import commands  # noqa: F401, its preloaded processes start fast
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,27 +12,15 @@ from torchrl.envs.utils import check_env_specs
 
 from pickplace import PickPlaceEnv
 from pickplace.training import collectors
-from pickplace.training.curriculum import (
-    Current,
-    Curriculum,
-    NoAdvance,
-    Recent,
-    ToteHeightCurriculum,
-    Uniform,
-    push_level,
-)
+from pickplace.training.curriculum import Current, Curriculum, NoAdvance, Recent, Uniform, push_level
+
+SAMPLERS = [  # shares of the heights 2 to 5, at level 5
+    (Current(), [0, 0, 0, 1]), (Uniform(), [1 / 4] * 4), (Recent(0.25), [1 / 12] * 3 + [3 / 4]),
+    (Recent(1.0), [1 / 3] * 3 + [0]), (Recent(0.0), [0, 0, 0, 1]),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("sampler", "shares"),  # of the heights 2 to 5, at level 5
-    [
-        (Current(), [0, 0, 0, 1]),
-        (Uniform(), [1 / 4] * 4),
-        (Recent(0.25), [1 / 12] * 3 + [3 / 4]),
-        (Recent(1.0), [1 / 3] * 3 + [0]),
-        (Recent(0.0), [0, 0, 0, 1]),
-    ],
-)
+@pytest.mark.parametrize(("sampler", "shares"), SAMPLERS)
 def test_samplers_draw_each_height_with_its_share(sampler, shares):
     torch.manual_seed(0)
     heights = sampler(5, 2, 12_000)
@@ -44,14 +35,6 @@ def make_env(level=3, sampler=None, num_envs=6, **settings):
     curriculum.setup(1, level, 1000)
     env = PickPlaceEnv(tote_size=(4, 4, 5), num_envs=num_envs, **settings)
     return TransformedEnv(env, Compose(curriculum.transform(), RewardSum(), StepCounter()))
-
-
-def first_feasible(td):
-    return td.set("action", td["action_mask"].int().argmax(-1))
-
-
-def first_infeasible(td):
-    return td.set("action", (~td["action_mask"]).int().argmax(-1))
 
 
 def heights(td):
@@ -77,8 +60,6 @@ def test_a_reset_gets_the_level_and_the_env_plays_at_it():
         assert heights(observation) == [4] * 6  # whatever lies in the TensorDict
     with pytest.raises(ValueError, match="level=0: .* >= 1"):
         env.transform[0].set_level(0)
-    without_compose = TransformedEnv(PickPlaceEnv(num_envs=2), ToteHeightCurriculum(2, Current(), 1))
-    assert heights(without_compose.reset()) == [2, 2]
     restored = make_env(level=2)
     restored.load_state_dict(env.state_dict())
     assert heights(restored.reset()) == [4] * 6
@@ -92,31 +73,33 @@ def test_a_partial_reset_leaves_running_episodes_their_height(hidden):
     mask = torch.tensor([1, 0, 0, 1, 0, 0]).bool()
     td = env.reset(td.set("_reset", mask[:, None]), select_reset_only=hidden)
     assert heights(td) == td["tote_depth"][:, 0, 0].tolist() == [5, 3, 3, 5, 3, 3]
-    assert heights(env.step(first_feasible(td))["next"]) == [5, 3, 3, 5, 3, 3]
     # The environment ignores rows that are not reset, so look at what the transform gives it.
     td = TensorDict(_reset=torch.tensor([[True], [False]]), tote_height=torch.tensor([[4], [4]]), batch_size=[2])
     assert heights(make_env(level=2).transform[0]._reset_env_preprocess(td)) == [2, 4]
 
 
-def test_automatic_resets_take_the_new_level_and_running_episodes_do_not():
-    env = make_env(level=3)
-    td = env.reset()
-    env.transform[0].set_level(4)
-    done = torch.tensor([0, 1, 0, 1, 0, 1]).bool()
-    action = torch.where(done, first_infeasible(td.clone())["action"], first_feasible(td.clone())["action"])
-    td, following = env.step_and_maybe_reset(td.set("action", action))
-    assert td["next", "done"].squeeze(-1).tolist() == done.tolist()
-    assert heights(td["next"]) == [3] * 6  # finished episodes report the height they were played at
-    assert heights(following) == [3, 4, 3, 4, 3, 4]
+@pytest.fixture
+def forkserver():
+    """Make TorchRL's workers children of the forkserver of ``commands``, which saves seconds."""
+    method = multiprocessing.get_start_method(allow_none=True)
+    multiprocessing.set_start_method("forkserver", force=True)
+    yield
+    multiprocessing.set_start_method(method, force=True)
+
+
+def slots(first, count):
+    return make_env(num_envs=count, first_episode=first)
+
+
+def fail(mask):
+    """Return infeasible actions: every episode lasts one step."""
+    return (~mask).int().argmax(-1)
 
 
 @pytest.mark.parametrize("kind", ["single", "multi_sync"])
-def test_push_level_reaches_every_process_which_has_its_own_slots(kind):
-    def make(first, count):
-        return make_env(num_envs=count, first_episode=first)
-
-    policy = TensorDictModule(lambda mask: (~mask).int().argmax(-1), ["action_mask"], ["action"])
-    collector = getattr(collectors, kind)(make, policy, num_envs=4, rollout_length=6, seed=0)
+def test_push_level_reaches_every_process_which_has_its_own_slots(kind, forkserver):
+    policy = TensorDictModule(fail, ["action_mask"], ["action"])
+    collector = getattr(collectors, kind)(slots, policy, num_envs=4, rollout_length=6, seed=0)
     try:
         if kind == "multi_sync":
             workers = [state for name, state in collector.state_dict().items() if name.startswith("worker")]
@@ -124,8 +107,9 @@ def test_push_level_reaches_every_process_which_has_its_own_slots(kind):
         batches = iter(collector)
         assert set(next(batches)["tote_height"].flatten().tolist()) == {3}
         push_level(collector, 5)
-        batch = next(batches)  # every episode lasts one step; those that had begun keep their height
-        assert batch["tote_height"][:, 0].flatten().tolist() == [3] * 4
+        batch = next(batches)
+        for part in (batch, batch["next"]):  # episodes that had begun keep their height, and report it when they end
+            assert part["tote_height"][:, 0].flatten().tolist() == [3] * 4
         assert set(batch["tote_height"][:, 1:].flatten().tolist()) == {5}
     finally:
         collector.shutdown()

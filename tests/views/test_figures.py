@@ -1,7 +1,4 @@
-"""Figures and tables: exact visibility, small and odd input, and no matplotlib before it is needed."""
-
-import subprocess
-import sys
+"""Figures and tables: exact visibility, small and odd input."""
 
 import numpy as np
 import pytest
@@ -14,7 +11,7 @@ from pickplace.views.scene import draw_scene, item_colours, visible_triangles
 from pickplace.views.tables import evaluation_table
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_visible_triangles_against_lines_of_sight(seed):
     size = (5, 4, 6)
     rng, boxes, taken = np.random.default_rng(seed), [], np.zeros(size, dtype=bool)
@@ -49,32 +46,23 @@ def recording_of(boxes, size, failure=Failure.STUCK):
     return Recording(0, size[2], moves, failure)
 
 
-@pytest.mark.parametrize(
-    ("boxes", "size", "failure"),
-    [
-        ([], (3, 5, 2), Failure.TOTE_COLLISION),
-        ([(3 * i, 3 * j, 3 * k, i + 1, j + 1, k + 1) for i in range(3) for j in range(3) for k in range(3)], (9, 9, 9),
-         Failure.NONE),  # 27 kinds
-        ([(x, y, z, 2, 2, 1) for z in range(10) for x in range(0, 30, 2) for y in range(0, 28, 2)], (30, 30, 10),
-         Failure.STUCK),
-    ],
-)  # fmt: skip
 @pytest.mark.filterwarnings("error")
-def test_picture(boxes, size, failure, tmp_path):
-    picture(recording_of(boxes, size, failure), CellSpec(tote_size=size), tmp_path / "tote.png")
-    assert (tmp_path / "tote.png").read_bytes().startswith(b"\x89PNG")
+def test_picture_of_a_large_tote_and_of_many_kinds(tmp_path):
+    small = [(3 * i, 3 * j, 3 * k, i + 1, j + 1, k + 1) for i in range(3) for j in range(3) for k in range(3)]
+    large = [(x, y, z, 2, 2, 1) for z in range(10) for x in range(0, 30, 2) for y in range(0, 28, 2)]
+    for boxes, size in ((small, (9, 9, 9)), (large, (30, 30, 10))):
+        picture(recording_of(boxes, size), CellSpec(tote_size=size), tmp_path / "tote.png")
+        assert (tmp_path / "tote.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize(
-    ("boxes", "failure", "ending"),
-    [
-        ([(0, 0, 0, 2, 1, 1)], Failure.STUCK, "50.0% full, 1 items placed. This item fits nowhere any more."),
-        ([(0, 0, 0, 2, 2, 1)], Failure.STUCK, "100.0% full, 1 items placed. The tote is full."),
-        ([(0, 0, 0, 2, 1, 1)], Failure.ITEM_COLLISION, "The gripper would hit an item in the tote."),
-        ([(0, 0, 0, 2, 1, 1)], Failure.NONE, "The item stream is over."),
-    ],
-)
-def test_caption(boxes, failure, ending):
+@pytest.mark.parametrize(("depth", "failure", "ending"), [
+    (1, Failure.STUCK, "50.0% full, 1 items placed. This item fits nowhere any more."),
+    (2, Failure.STUCK, "100.0% full, 1 items placed. The tote is full."),
+    (1, Failure.ITEM_COLLISION, "The gripper would hit an item in the tote."),
+    (1, Failure.NONE, "The item stream is over."),
+])  # fmt: skip
+def test_caption(depth, failure, ending):
+    boxes = [(0, 0, 0, 2, depth, 1)]
     cell, recording = CellSpec(tote_size=(2, 2, 1)), recording_of(boxes, (2, 2, 1), failure)
     caption = draw_scene(recording, cell, item_colours(boxes)).get_suptitle()
     assert caption.startswith("2x2x1 tote") and ending in caption
@@ -103,7 +91,7 @@ def test_the_height_map_lies_as_the_tote():
     assert (plan.get_xlabel(), plan.get_ylabel()) == ("x (cells)", "y (cells)")
 
 
-@pytest.mark.parametrize(("x", "y"), [(0, 0), (2, 0), (0, 3), (2, 3)])
+@pytest.mark.parametrize(("x", "y"), [(2, 0), (0, 3)])
 def test_the_picture_in_3d_shows_items_where_they_lie(x, y):
     """The middle of a cube is half a cell above that of the floor below it."""
     boxes, size = [(x, y, 0, 1, 1, 1)], (3, 4, 1)
@@ -120,61 +108,36 @@ CURVES = {
     "one row, nothing ended": "frames,time/fps\n128,900\n",
     "interval": "frames,eval/occupancy,eval/ci95_low,eval/ci95_high\n128,,,\n256,0.5,0.4,0.6\n384,1.0,1.0000001,1.0\n",
     "cut short": "frames,train/occupancy,curriculum/level\n128,0.4,2\n256,0.",
-    "long": "frames,train/occupancy,curriculum/level\n"
-    + "".join(f"{i},{i / 999},{1 + i // 300}\n" for i in range(999)),
 }
 
 
-@pytest.mark.parametrize("name", CURVES)
+@pytest.mark.parametrize("rows", CURVES.values(), ids=CURVES)
 @pytest.mark.filterwarnings("error")
-def test_learning_curve(name, tmp_path):
+def test_learning_curve(rows, tmp_path):
+    assert set(FAILURES) == {failure.name.lower() for failure in Failure}  # the colours of its areas
     metrics, path = tmp_path / "metrics.csv", tmp_path / "curve.png"
-    metrics.write_text(CURVES[name])
+    metrics.write_text(rows)
     learning_curve(metrics, path)
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
-def test_every_reason_has_a_colour():
-    """A reason without one would lack in the picture."""
-    assert set(FAILURES) == {failure.name.lower() for failure in Failure}
-
-
 RESULT = {
-    "planner": "joint_dbl", "env": {"tote_size": [6, 6, 5], "rotations": 4}, "stream": "test", "episodes": 4, "seed": 1,
+    "planner": "policy", "env": {"tote_size": [6, 6, 5], "rotations": 4}, "stream": "test", "episodes": 4, "seed": 1,
     "occupancy": {"mean": 0.97777, "ci95": [0.97, 0.985], "min": 0.9722}, "items_placed": 76.5,
     "failures": {"stuck": 3, "unstable": 1}, "feasible_action_share": 0.0925, "latency_ms": {"p50": 1.24, "p95": 1.44},
+    "checkpoint": "run/checkpoints/best", "trained": {"frames": 1_200_000, "seed": 3}, "warm_start": "joint_dbl",
+    "mask_in_training": True, "mask_at_decision": False, "candidates": 10,
 }  # fmt: skip
-POLICY = {
-    "checkpoint": "run/checkpoints/best", "trained": {"frames": 1_200_000, "seed": 3}, "warm_start": "JointDBL",
-    "mask_in_training": True, "mask_at_decision": False, "candidates": 10, "latency_ms": None,
-}  # fmt: skip
-
-
-def table(result):
-    """The rows of the Markdown table, as a dictionary."""
-    lines = evaluation_table(result).splitlines()
-    assert len({len(line) for line in lines}) == 1 and set(lines.pop(1)) == {"|", "-"}
-    return dict([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
 
 
 def test_evaluation_table():
-    rows = table(RESULT)
+    head, _, *lines = evaluation_table(RESULT).splitlines()
+    rows = dict([cell.strip() for cell in line.strip("|").split("|")] for line in [head, *lines])
     assert rows == {
-        "planner": "joint_dbl", "tote, rotations": "6x6x5, R=4", "episodes": "4 of the test stream, seed 1",
+        "planner": "policy", "tote, rotations": "6x6x5, R=4", "episodes": "4 of the test stream, seed 1",
         "occupancy": "0.9778 (95% interval 0.9700 to 0.9850), least 0.9722", "items placed": "76.5 an episode",
         "episodes ended by": "stuck 3, unstable 1", "feasible actions": "9.25% of all, mean over decisions",
-        "one decision": "1.2 ms (median), 1.4 ms (95th percentile)",
-    }  # fmt: skip
-    del rows["one decision"]
-    assert table(RESULT | POLICY) == rows | {
-        "mask; candidates K": "in training yes, at decision no; 10", "warm start": "imitated JointDBL",
+        "one decision": "1.2 ms (median), 1.4 ms (95th percentile)", "warm start": "imitated joint_dbl",
+        "mask; candidates K": "in training yes, at decision no; 10",
         "checkpoint": "run/checkpoints/best (1,200,000 frames, seed 3)",
     }  # fmt: skip
-    known_only_at_decision = {key: POLICY[key] for key in ("candidates", "mask_at_decision")}  # a planner of a user's
-    assert table(RESULT | known_only_at_decision)["mask; candidates K"] == "in training unknown, at decision no; 10"
-    assert "warm start" not in table(RESULT | POLICY | {"warm_start": None})
-
-
-def test_importing_the_package_does_not_import_matplotlib():
-    code = "import sys, pickplace.views.scene, pickplace.evaluation.evaluate; sys.exit('matplotlib' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pickplace.policies.networks.depth import clip_depth
+from pickplace.task.cell import reference_cell
 from pickplace.task.checks import number, odd_number, one_of, whole_number
 from pickplace.task.grasps import split_footprint
 from pickplace.task.state import item_from_depth
@@ -116,7 +117,7 @@ class FootprintFcn(nn.Module):
         parity, x, y = split_footprint((wide, long), footprint)
         turned = parity == 1
         # Patches begin some cells before their footprint along the item's own axes, to have it in their middle.
-        before_w, before_d = (side // 2 - (size - 1) // 2 for size in (item.w[row], item.d[row]))
+        before_w, before_d = (reference_cell(side) - reference_cell(size) for size in (item.w[row], item.d[row]))
         margin = side + max(bin_depth.shape[1:])
         stride = long + 2 * margin
         x = x + margin - torch.where(turned, before_d, before_w)
@@ -152,7 +153,7 @@ class FootprintFcn(nn.Module):
         tap = torch.arange(side, device=device)
         for longest in bin_size:
             size = torch.arange(longest + 1, device=device)[:, None]
-            begin = side // 2 - (size - 1) // 2
+            begin = reference_cell(side) - reference_cell(size)
             maps.append((tap >= begin) & (tap < begin + size))
         return (maps[0][:, None, :, None] & maps[1][None, :, None]).flatten(2)
 
