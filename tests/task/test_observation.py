@@ -3,7 +3,8 @@
 import gymnasium
 import pytest
 import torch
-from problems import late_state
+from hypothesis import given
+from problems import late_state, problems, state_of
 from torchrl.envs.utils import check_env_specs
 
 from pickplace import PickPlaceEnv, State
@@ -57,11 +58,13 @@ def test_a_term_of_ones_own_in_gymnasium():
     assert vector.observation_space.contains(observation) and observation["middle"].tolist() == [5, 5]
 
 
-@pytest.mark.parametrize("options", [{}, {"bin_size": (4, 3, 2), "tote_size": (4, 7, 3), "effector_size": (2, 3)}])
-def test_the_state_can_be_read_from_an_observation(options):
-    env, observation = late_state(**options)
-    for found, expected in zip(State.from_observation(observation), env.state, strict=True):
-        assert all(map(torch.equal, found, expected)) if isinstance(found, tuple) else torch.equal(found, expected)
+@given(problems(count=3))
+def test_the_state_can_be_read_from_an_observation(problem):
+    cell, cases = problem
+    state = state_of(*cases)
+    found = State.from_observation(observe(STANDARD_TERMS, cell, state))
+    for ours, expected in zip((*found[:2], *found.item), (*state[:2], *state.item), strict=True):
+        assert torch.equal(ours, expected)
 
 
 @pytest.mark.parametrize(
