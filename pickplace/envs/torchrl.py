@@ -223,9 +223,10 @@ class PickPlaceEnv(EnvBase):
         if bool(((action < 0) | (action >= self.cell.num_actions)).any()):
             bad = action[(action < 0) | (action >= self.cell.num_actions)][0].item()
             raise ValueError(f"action={bad}: expected between 0 and {self.cell.num_actions - 1} (N_a - 1).")
-        step = apply(self.cell, self.state, action)
+        state = self.state
+        step = apply(self.cell, state, action)
         placed = step.failure == 0
-        gained = torch.where(placed, self.current_item.volume, 0)
+        gained = torch.where(placed, state.item.volume, 0)
         self.heights.copy_(step.heights)
         self.volume.add_(gained)
         self.steps.add_(placed)

@@ -64,7 +64,7 @@ def turn(near_x: Tensor, near_y: Tensor, back_x: Tensor, back_y: Tensor) -> tupl
 class Grasp(NamedTuple):
     """The effect of a pick on the item; the fields have the common shape of the pick's coordinates and the item."""
 
-    misses: Tensor
+    grips: Tensor
     collides: Tensor
     unreachable: Tensor | None  # None: the robot has no limits
     near_x: Tensor
@@ -75,7 +75,7 @@ class Grasp(NamedTuple):
     @property
     def succeeds(self) -> Tensor:
         """Whether the pick lifts the item."""
-        good = ~self.misses & ~self.collides
+        good = self.grips & ~self.collides
         return good if self.unreachable is None else good & ~self.unreachable
 
 
@@ -98,7 +98,7 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor) -> Grasp:
     if cell.limits is not None:
         pick = (x.clamp(0, bin_w - 1) * bin_d + y.clamp(0, bin_d - 1)).expand_as(gripped)
         unreachable = ~cell.limits.on(pick.device).pick_ok[pick]
-    return Grasp(~(gripped & ~item.is_empty), collides, unreachable, near_x, near_y, back_x, back_y)
+    return Grasp(gripped & ~item.is_empty, collides, unreachable, near_x, near_y, back_x, back_y)
 
 
 # ---------------------------------------------------------------------- flat indices

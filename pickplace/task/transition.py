@@ -65,7 +65,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
         (Failure.OVERFLOW, overflows(top, tote_height)),
         (Failure.TOTE_COLLISION, item_leaves | (effector_leaves & ~is_clear(top, tote_height))),
         (Failure.BIN_COLLISION, picked.collides),
-        (Failure.PICK_MISS, picked.misses),
+        (Failure.PICK_MISS, ~picked.grips),
     ]
     if cell.limits is not None and picked.unreachable is not None:
         limits, number = cell.limits.on(action.device), footprint_index(cell.tote_size, rotation, x_tote, y_tote)
