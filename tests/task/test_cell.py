@@ -11,7 +11,7 @@ from pickplace.task.cell import CELL_SETTINGS, Limits, cell_from_settings, refer
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"bin_size": (-5, 5, 1)}, r"bin_size=\(-5, 5, 1\): expected 3 positive whole numbers of cells"),
+        ({"bin_size": (-5, 5, 1)}, r"bin_size=\(-5, 5, 1\): expected 3 positive whole numbers"),
         ({"tote_size": (6, 0, 5)}, r"tote_size=\(6, 0, 5\)"),
         ({"tote_size": (6, 6)}, r"tote_size=\(6, 6\): expected 3"),
         ({"tote_size": (6, 6, 2**20)}, "tote_size=.*below 1048576"),
