@@ -133,16 +133,19 @@ def test_support_is_compared_exactly_in_float64(width, length, shift):
         assert action_mask(cell, placing_maps(cell, state))[0, action].item() == (expected == SUCCESS)
 
 
-@pytest.mark.parametrize("wall", [1, 2])
-def test_the_heuristic_pick_has_the_item_in_the_effectors_corner_where_it_can(wall):
-    cell = CellSpec(bin_size=(5, 5, wall))
-    x, y = torch.arange(25) // 5, torch.arange(25) % 5
-    one = torch.ones(25, dtype=torch.int64)
-    # The reference cell is the middle of the 3x3 effector; it must be a cell of the bin, and under walls that are
-    # higher than the item the whole effector must stay inside.
-    most = 4 if wall == 1 else 3
-    expected = (x + 1).clamp(max=most) * 5 + (y + 1).clamp(max=most)
-    assert torch.equal(heuristic_pick(cell, Item(x, y, one, one, one)), expected)
+@settings(max_examples=50)
+@given(problems(limited=st.booleans(), count=3))
+def test_the_heuristic_pick_has_the_least_offset(problem):
+    """Least ``ox + oy``, then ``oy``, among the picks that succeed: the effector's corner where it can be."""
+    cell, cases = problem
+    item, (_, bin_d, _), (ee_w, ee_d) = state_of(*cases).item, cell.bin_size, cell.effector_size
+    picks, lifted = heuristic_pick(cell, item).tolist(), all_grasps(cell, item)[0]
+    for row, (x, y, *_) in enumerate(case.item for case in cases):
+        order = {}
+        for pick in lifted[row].nonzero()[:, 0].tolist():
+            ox, oy = x - pick // bin_d + (ee_w - 1) // 2, y - pick % bin_d + (ee_d - 1) // 2
+            order[pick] = (ox + oy, oy)
+        assert not order or picks[row] == min(order, key=order.get)
 
 
 def test_an_empty_bin_has_no_feasible_action():
