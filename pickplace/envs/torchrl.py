@@ -230,10 +230,10 @@ class PickPlaceEnv(EnvBase):
         self.heights.copy_(step.heights)
         self.volume.add_(gained)
         self.steps.add_(placed)
-        arriving = torch.stack(self._arriving(), -1)
-        self.item.copy_(torch.where(placed[:, None], arriving, self.item))
+        arriving = self._arriving()
+        self.item.copy_(torch.where(placed[:, None], torch.stack(arriving, -1), self.item))
         self._update_masks(placed)
-        ended = placed & self.current_item.is_empty  # a recorded stream has no further item
+        ended = placed & arriving.is_empty  # a recorded stream has no further item
         stuck = placed & ~self.feasible & ~ended
         failure = torch.where(stuck, int(Failure.STUCK), step.failure)
         result = {

@@ -43,12 +43,12 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
 
     # Picking and turning.
     picked = grasp(cell, item, x_bin, y_bin)
-    turned = turn(picked.near_x, picked.near_y, picked.back_x, picked.back_y)[: cell.rotations]
-    offset = torch.stack([torch.stack(pair) for pair in turned]).gather(0, rotation.expand(1, 2, -1))[0]  # [2, N]
+    turned = zip(*turn(picked.near_x, picked.near_y, picked.back_x, picked.back_y)[: cell.rotations], strict=True)
+    offset_x, offset_y = (torch.stack(offsets).gather(0, rotation[None])[0] for offsets in turned)
     w, d = turned_size(item, odd)
     wide, deep = torch.where(odd, ee_d, ee_w), torch.where(odd, ee_w, ee_d)  # the turned end effector
     left, front = x_tote - reference_cell(wide), y_tote - reference_cell(deep)  # its min corner in the tote
-    x, y = left + offset[0], front + offset[1]
+    x, y = left + offset_x, front + offset_y
 
     # Placing.
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
