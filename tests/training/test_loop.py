@@ -145,10 +145,11 @@ def test_intervals_fire_for_any_batch_size():
 
 def test_a_run_counts_logs_scales_and_saves(smoke, tmp_path, monkeypatch):
     """The curriculum counts the batch at hand, ``best`` is the best validation, only the learner's rewards scale."""
-    occupancies, rows = iter([0.5, 0.8, 0.6, 0.7, 0.1]), []
+    occupancies, rows, pushed = iter([0.5, 0.8, 0.6, 0.7, 0.1]), [], []
     interval = {"ci95_low": 0.0, "ci95_high": 1.0}
     monkeypatch.setattr(trainer, "validation_metrics", lambda _: {"occupancy": next(occupancies), **interval})
     monkeypatch.setattr(Trainer, "write_report", lambda self: None)
+    monkeypatch.setattr(Trainer, "push_weights", lambda self: pushed.append(self.frames))
     levels = ["curriculum=paper", "curriculum.advance.frames_per_level=256", "env.tote_size=[4,4,3]"]
     quick = ["algo.minibatch_size=128", "evaluation.episodes=1", "evaluation_interval=128"]
     for scale, frames, final in ((0.5, 512, 0.7), (5, 128, 0.1)):
@@ -157,6 +158,8 @@ def test_a_run_counts_logs_scales_and_saves(smoke, tmp_path, monkeypatch):
         rows.append(read_csv(tmp_path / str(scale) / "metrics.csv"))
     low, high = rows
     assert [(row["frames"], row["curriculum/level"]) for row in low] == [(128, 1), (256, 2), (384, 2), (512, 3)]
+    assert "curriculum/occupancy_at_2" in low[-1]  # the collector was told the level
+    assert pushed == [0, 128, 256, 384, 0]  # before each batch; a collector on one CPU shares the weights anyway
     best, last = (checkpoint.read(tmp_path / "0.5" / "checkpoints" / name)[1] for name in ("best", "last"))
     assert (best["frames"], best["best"], last["frames"], last["best"]) == (256, 0.8, 512, 0.8)
     assert low[0]["train/reward"] == high[0]["train/reward"] > 0
