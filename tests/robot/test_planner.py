@@ -167,9 +167,7 @@ HALVES = [
     ({"tote_depth": EMPTY * 0.05}, "got 10 height units (0.25 m), expected 0 to 5 height units"),
     ({"tote_height": 0.13}, "expected a whole number of height units, 1 to 1048575, within 0.1, in metres"),
 ]
-CASES = [(1.0, given, message) for given, message in BAD] + [
-    (0.5, METRES | given, message) for given, message in HALVES
-]
+CASES = [(1.0, *case) for case in BAD] + [(0.5, METRES | given, message) for given, message in HALVES]
 
 
 @pytest.mark.parametrize(("unit", "given", "message"), CASES)
