@@ -108,7 +108,7 @@ def results_by_hand(env, observation, row: int) -> dict[int, tuple[int, int, int
     for action in observation["action_mask"][row].nonzero()[:, 0].tolist():
         failure, after = plain.try_action(action)
         assert failure == SUCCESS
-        # What the item changed is its footprint, for it has a height and lands on top.
+        # The changed cells are the footprint: the item has a height and lands on top.
         grid = cells((0, 0), env.cell.tote_size[:2])
         changed = [(x, y) for x, y in grid if after[x][y] != plain.heights[x][y]]
         (x, y), (x1, y1) = min(changed), max(changed)

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from pickplace.evaluation.play import Episodes, MakeEnv, decision_latency, play
 from pickplace.evaluation.statistics import paired_difference, summarise
-from pickplace.planners.base import BatchPlanner, plain_settings, planner_parts
+from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import own_modules, trusted_config
 from pickplace.runs.hydra_app import apply_overrides, command
@@ -82,7 +82,8 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
         raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
     own_modules(cfg.trust)
     use_machine(cfg)
-    facts: dict[str, Any] = {"planner_settings": plain_settings(cfg.planner), "checkpoint": None}
+    settings = {key: value for key, value in resolved(cfg.planner).items() if key != "_target_"}
+    facts: dict[str, Any] = {"planner_settings": settings, "checkpoint": None}
     trained = None
     if cfg.checkpoint is not None:
         trained, facts_of_training = load_trained(cfg)
@@ -137,16 +138,16 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
 
 
 def evaluate(
-    cfg: DictConfig, make_env: MakeEnv, planner: BatchPlanner, facts: dict, record=(), until=None
+    cfg: DictConfig, make_env: MakeEnv, planner: BatchPlanner, facts: dict, record=()
 ) -> tuple[dict, Episodes]:
     """Evaluate a planner as the config group ``evaluation`` says; return the content of ``evaluation.json``, too.
 
     Args:
         cfg, make_env, planner, facts: as of :func:`prepare`.
-        record, until: as of :func:`~pickplace.evaluation.play.play`.
+        record: as of :func:`~pickplace.evaluation.play.play`.
     """
     ev = cfg.evaluation
-    result = play(make_env, planner, ev.episodes, ev.batch_size, record, until)
+    result = play(make_env, planner, ev.episodes, ev.batch_size, record)
     report = {
         "planner": planner.name,
         **facts,

@@ -107,7 +107,6 @@ def play(
     episodes: int,
     batch_size: int,
     record: Collection[int] = (),
-    until: float | None = None,
 ) -> Episodes:
     """Play episodes ``0 .. episodes - 1``, each in a slot of its own, to their ends, and count them all.
 
@@ -119,14 +118,11 @@ def play(
         batch_size: episodes played side by side. It changes no result, except with a planner that draws random
             numbers: it has one generator for all episodes of a batch.
         record: numbers of the episodes to record move by move.
-        until: CPU time of this process (``time.process_time()``) after which no further batch begins; None: no limit.
     """
     feasible, decisions, seconds = 0.0, 0, 0.0
     parts: list[dict[str, Tensor]] = []
     recordings: list[Recording] = []
     for first in range(0, episodes, batch_size):
-        if parts and until is not None and time.process_time() > until:
-            break
         batch = _Batch(make_env(first, min(batch_size, episodes - first)), first, record)
         while batch.running.any():
             feasible += batch.feasible_shares()

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import Tensor
 
 from pickplace.policies.restore import restore_critic, restore_policy
@@ -68,9 +68,3 @@ def planner_parts(
         if "critic" in needs:
             parts["critic"] = restore_critic(cfg, cell, state, env)
     return parts
-
-
-def plain_settings(node: DictConfig) -> dict[str, Any]:
-    """Return a planner's settings as plain values, without its name in the registry."""
-    settings = OmegaConf.to_container(node, resolve=True)
-    return {str(key): value for key, value in settings.items() if key != "_target_"}  # type: ignore[union-attr]

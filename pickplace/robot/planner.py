@@ -114,8 +114,8 @@ class Planner:
             device: where to compute, ``"cpu"`` or ``"cuda"``.
             trust: your own modules whose classes the checkpoint's config may name.
             **sizes: settings that differ from the training's, such as ``tote_size=(30, 30, 10)``; see
-                :class:`~pickplace.task.cell.CellSpec`. A policy serves any bin and tote; one that was trained with a
-                mask serves any end effector, too.
+                :class:`~pickplace.task.cell.CellSpec`. A fully convolutional policy serves any bin and tote, and any
+                end effector if it was trained with a mask.
 
         Raises:
             ValueError: for a checkpoint that cannot be used, or bad sizes.
@@ -166,7 +166,7 @@ class Planner:
         state = self._read_state(bin_depth, tote_depth, tote_height, lengths)
         observation = observe(self.terms, self.cell, state)
         status, action, step = self._decide(observation, state)
-        capacity = int(state.tote_height) * self.cell.num_places
+        capacity = self.cell.tote_volume(int(state.tote_height))
         before = int(state.heights.sum()) / capacity
         plan = Plan(
             status=status,

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.cell import CellSpec
+from pickplace.task.cell import CellSpec, Limits
 from pickplace.task.grasps import (
     all_grasps,
     available_offsets,
@@ -92,7 +92,7 @@ def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     for bit, turned in zip(flags, classes, strict=False):
         row = (turned + first * num_classes).t().reshape(-1)
         blocks[:-1].add_(by_class.index_select(0, row).to(packed), alpha=bit)
-    # Which block each pick cell has.
+    # The block of each pick cell.
     block = pick_blocks(cell, maps.item)
     usable = torch.cat([available.t(), available.new_zeros(batch, 1)], 1)
     block = torch.where(usable.gather(1, block), block + first[:, None] * count, batch * count)
@@ -120,7 +120,7 @@ def footprint_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
                 maps.top[:, parity].permute(1, 2, 0), _least_clearance(cell, maps, parity, grasped), out=reached[parity]
             )
         else:
-            reached[parity] = _reached_within_limits(cell, maps, parity, grasped)
+            reached[parity] = _reached_within_limits(cell, cell.limits.on(maps.top.device), maps, parity, grasped)
     if cell.parities == 2:
         square = maps.item.w == maps.item.d
         reached[0] |= square & reached[1]
@@ -150,10 +150,9 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Te
     return reduce(torch.minimum, usable)
 
 
-def _reached_within_limits(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Tensor) -> Tensor:
+def _reached_within_limits(cell: CellSpec, limits: Limits, maps: PlacingMaps, parity: int, grasped: Tensor) -> Tensor:
     """Return the footprints that some grasp of this parity reaches, bool ``[W_T, D_T, N]``, under the limits."""
     (tote_w, tote_d, _), count, margins = cell.tote_size, cell.num_offsets, _footprint_margins(cell, parity)
-    limits = cell.limits.on(maps.top.device)  # type: ignore[union-attr]
     top = maps.top[:, parity].permute(1, 2, 0)
     clear = surround(maps.clearance[:, parity].permute(1, 2, 0), margins, FAR)
     reached = torch.zeros_like(top, dtype=torch.bool)

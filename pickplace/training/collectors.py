@@ -49,7 +49,7 @@ class ResumableCollector(Collector):
         return OrderedDict(
             environment=dict(self.env.base_env.state_dict()),
             transforms=dict(self.env.transform.state_dict()),
-            # What the next step reads; not "collector", whose trajectory numbers come from a pool that workers share.
+            # The input of the next step; not "collector", whose trajectory numbers come from a pool that workers share.
             carried=self._carrier.select(*self.env.observation_spec.keys(), *self.env.done_keys).clone().to_dict(),
             counters={"frames": torch.tensor(self._frames), "iterations": torch.tensor(self._iter)},
             **rng_state(self.env.device),

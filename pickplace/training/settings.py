@@ -1,15 +1,13 @@
 """Checks of a training config before anything is built."""
 
-import logging
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.runs.allowlist import own_modules
+from pickplace.task.checks import is_number, is_whole
 from pickplace.task.items import check_seed
-
-log = logging.getLogger(__name__)
 
 
 class Expectation(NamedTuple):
@@ -19,18 +17,13 @@ class Expectation(NamedTuple):
     words: str  # "... expected <words>."
 
 
-def _is_number(value) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
 def _between(low: float, high: float | None = None) -> Expectation:
     words = f"a number >= {low}" + ("" if high is None else f" and <= {high}")
-    limit = float("inf") if high is None else high
-    return Expectation(lambda value: _is_number(value) and low <= value <= limit and value < float("inf"), words)
+    return Expectation(lambda value: is_number(value) and low <= value and (high is None or value <= high), words)
 
 
 COUNT = Expectation(
-    lambda value: isinstance(value, int) and not isinstance(value, bool) and 1 <= value < 2**63,
+    lambda value: is_whole(value) and 1 <= value < 2**63,
     "a whole number >= 1 and < 2**63",
 )
 NODE = Expectation(
@@ -56,7 +49,7 @@ EXPECTED = {
         lambda value: value == "validation", "validation, on which training selects its best policy"
     ),
     "algo.lr_decay_start": Expectation(
-        lambda value: value is None or (_is_number(value) and 0 <= value <= 1),
+        lambda value: value is None or (is_number(value) and 0 <= value <= 1),
         "a share of total_frames between 0 and 1, or null",
     ),
     **dict.fromkeys(("algo.gamma", "algo.lmbda", "algo.clip_epsilon"), _between(0, 1)),

@@ -55,10 +55,6 @@ def test_batch_size_does_not_change_the_episodes():
         assert result.feasible_share == pytest.approx(expected.feasible_share)
 
 
-def test_no_batch_begins_after_the_time():
-    assert len(play(make_env, JointDBL(CELL), 6, 2, until=0.0).occupancy) == 2  # the first batch is always played
-
-
 def test_a_recorded_stream_that_ends_is_no_failure(tmp_path):
     path = tmp_path / "items.csv"
     path.write_text("w,d,h\n1,1,1\n2,1,1\n")

@@ -1,4 +1,4 @@
-"""What holds of every policy: its choices, its distribution over flat actions, and how it plays."""
+"""Properties of every policy: its choices, its distribution over flat actions, its best action."""
 
 import pytest
 import torch

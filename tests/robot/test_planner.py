@@ -41,7 +41,7 @@ def test_plans_agree_with_the_oracle_and_with_plane_geometry(problem, candidates
     assert result.item == dict(zip("xywdh", item, strict=True))
     assert result.occupancy_before == pytest.approx(heights.sum() / heights.size / rim)
 
-    # The same decision as the planner that evaluation uses.
+    # The decision equals that of the planner in evaluation.
     observation = observe(STANDARD_TERMS, cell, state_of(case))
     action = int(PolicyPlanner(cell, policy, candidates).decide(observation))
     feasible, ok = 0 in codes, codes[action] == 0

@@ -1,4 +1,4 @@
-"""What a checkpoint's config may make: pickplace's own classes, each in its place, and what a user trusts."""
+"""Classes that a checkpoint's config may name: pickplace's own, each in its place, and those a user trusts."""
 
 import copy
 import functools
