@@ -31,8 +31,8 @@ def with_own_values(cfg: DictConfig) -> DictConfig:
 
     Hydra merges what a preset, or a config file of the user, wrote for the option that it expected, such as
     ``curriculum.advance.occupancy`` for ``threshold``, into the option that the command line chose instead. A part
-    whose ``_target_`` a choice on the command line changes gets the values of that option's own files, and the values on
-    the command line. So does a group of which the choice turns a part on or off (``warm_start.teacher``).
+    whose ``_target_`` a choice on the command line changes gets the values of that option's own files, and the values
+    on the command line. So does a group of which the choice turns a part on or off (``warm_start.teacher``).
     """
     given = OverridesParser.create().parse_overrides(list(HydraConfig.get().overrides.task))
     name = HydraConfig.get().job.config_name
@@ -49,8 +49,8 @@ def with_own_values(cfg: DictConfig) -> DictConfig:
         own = hydra.compose(None, [*search, f"+{str(choice.input_line).lstrip('+')}", *inner])
         before = hydra.compose(name, [*search, *others])
         inner_places = {_package(other) for other in choices if other.input_line in inner}
-        node, other = (OmegaConf.to_container(OmegaConf.select(c, place) or {}, resolve=False) for c in (own, before))
-        for leaf, content in _exchanged_leaves(place, node, other):
+        node, other = (OmegaConf.to_container(c, resolve=False) for c in (own, before))
+        for leaf, content in _exchanged_leaves(place, _at(node, place), _at(other, place)):
             if leaf not in inner_places:
                 cfg = cfg if replaced else cfg.copy()
                 OmegaConf.update(cfg, leaf, content, merge=False, force_add=True)
@@ -73,6 +73,13 @@ def _is_choice(override: Override) -> bool:
 def _package(choice: Override) -> str:
     """Return the place in the config of the group that an override chooses."""
     return choice.package or choice.key_or_group.replace("/", ".")
+
+
+def _at(config: Any, place: str) -> Any:
+    """Return the part of a config at a place, unresolved; None if there is none."""
+    for key in place.split("."):
+        config = config.get(key) if isinstance(config, dict) else None
+    return config
 
 
 def _exchanged_leaves(place: str, own: Any, before: Any) -> Iterator[tuple[str, dict]]:

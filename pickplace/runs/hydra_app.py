@@ -19,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from pickplace.runs.composition import composed_for_hint, conf_dir, options_of, with_own_values
 from pickplace.runs.errors import JobFailed, one_sentence, sentence, unknown_key
 from pickplace.runs.folder import FAILURE, OccupiedError, refuse_claimed, refuse_occupied, remove_empty_folders
+from pickplace.runs.registry import REGISTRY
 
 log = logging.getLogger(__name__)
 
@@ -172,6 +173,8 @@ def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> N
     """
     for key, node in cfg.items():
         name = path + str(key)
+        if f"{path}*" in REGISTRY:  # a dict of parts with names of the user's choice
+            continue
         if key not in known:
             raise ValueError(unknown_key(name, known, path))
         if OmegaConf.is_dict(node) and OmegaConf.is_dict(known[key]) and "_target_" not in node:

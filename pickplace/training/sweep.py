@@ -82,7 +82,8 @@ def read_run(folder: Path) -> SweepRun:
         run.status = "running"
     else:  # the checkpoint's config first: a resumed run may have a larger budget
         cfg = OmegaConf.create(facts["config"]) if facts else OmegaConf.load(folder / ".hydra" / "config.yaml")
-        run.status = "finished" if run.frames >= cfg.total_frames else "stopped"
+        is_complete = run.frames >= cfg.total_frames or facts.get("ended") is True
+        run.status = "finished" if is_complete else "stopped"
     return run
 
 
