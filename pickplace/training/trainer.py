@@ -269,7 +269,7 @@ class Trainer:
             self.save("best")
         if has_passed(before, frames, cfg.checkpoint_interval):
             self.save("last")
-        if has_passed(before, frames, cfg.progress_interval):
+        if has_passed(before, frames, cfg.progress_interval) and not self.ended:
             speed = (frames - self.start_frames) / (time.perf_counter() - self.start_time)
             log.info(progress_line(frames, cfg.total_frames, speed, self.curriculum, metrics))
 
