@@ -47,10 +47,12 @@ def with_own_values(cfg: DictConfig) -> DictConfig:
         others = [str(other.input_line) for other in choices if other.input_line not in inner]
         inner.remove(str(choice.input_line))
         own = hydra.compose(None, [*search, f"+{str(choice.input_line).lstrip('+')}", *inner])
-        before = hydra.compose(name, [*search, *others])
+        node = _at(OmegaConf.to_container(own, resolve=False), place)
+        if node == _at(OmegaConf.to_container(cfg, resolve=False), place):
+            continue
+        before = OmegaConf.to_container(hydra.compose(name, [*search, *others]), resolve=False)
         inner_places = {_package(other) for other in choices if other.input_line in inner}
-        node, other = (OmegaConf.to_container(c, resolve=False) for c in (own, before))
-        for leaf, content in _exchanged_leaves(place, _at(node, place), _at(other, place)):
+        for leaf, content in _exchanged_leaves(place, node, _at(before, place)):
             if leaf not in inner_places:
                 cfg = cfg if replaced else cfg.copy()
                 OmegaConf.update(cfg, leaf, content, merge=False, force_add=True)
@@ -160,17 +162,32 @@ def _search_path(words: list[str]) -> tuple[list[str], list[str]]:
     return [f"hydra.searchpath=[{quoted}]"] if paths else [], rest
 
 
-def folder_name(overrides: list[str]) -> str:
-    """Return the name of the folder of a sweep's run: its overrides, the seed last.
+def constant_keys(words: list[str]) -> list[str]:
+    """Return the keys that have the same value in all runs of a sweep's command line, but for the seed."""
+    given = OverridesParser.create().parse_overrides(words)
+    constant = [override.get_key_element().lstrip("+~") for override in given if not override.is_sweep_override()]
+    return [key for key in constant if key != "seed"]
 
-    Override values on a command line take ``+`` and ``-`` without quotes, but neither ``=`` nor ``,``. A name that
-    leaves out letters, or would be too long, ends in a hash of the overrides.
+
+def folder_name(overrides: list[str], constant: list[str]) -> str:
+    """Return the name of the folder of a sweep's run: the overrides in which the runs differ, the seed last.
+
+    The name needs no quotes in an override, which takes ``+`` and ``-``, but neither ``=`` nor ``,``. One that leaves
+    out letters, or would be too long, ends in a hash of the overrides.
+
+    Args:
+        overrides: of the run.
+        constant: keys that the sweep's runs have in common.
     """
-    words = sorted((word.lstrip("+") for word in overrides), key=lambda word: word.startswith("seed="))
-    pairs = [word.partition("=") for word in words]
-    plain = "+".join(f"{key.replace('/', '.')}{'-' if equals else ''}{value}" for key, equals, value in pairs)
-    name = re.sub(r"[^\w.+-]+", "-", plain, flags=re.ASCII).replace("..", ".").strip(".-")[:LONGEST_NAME]
-    return name if name == plain else f"{name}-{hashlib.sha256(plain.encode()).hexdigest()[:8]}"
+    pairs = [word.lstrip("+~").partition("=")[::2] for word in overrides]
+    pairs = [pair for pair in pairs if pair[0] not in constant] or pairs
+    pairs.sort(key=lambda pair: pair[0] == "seed")
+    plain = "+".join(f"{key.replace('/', '.')}-{value}" for key, value in pairs) or "run"
+    name = re.sub(r"[^\w.+-]+", "-", plain, flags=re.ASCII)
+    if name == plain and len(name) <= LONGEST_NAME:
+        return name
+    name = re.sub(r"[-.]*([-+.])[-.]*", r"\1", name)[:LONGEST_NAME]
+    return f"{name}-{hashlib.sha256(plain.encode()).hexdigest()[:8]}".lstrip("-.")
 
 
 OmegaConf.register_new_resolver("run_name", folder_name, replace=True)

@@ -13,10 +13,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.runs.composition import composed_for_hint, conf_dir, options_of, with_own_values
+from pickplace.runs.composition import composed_for_hint, conf_dir, constant_keys, options_of, with_own_values
 from pickplace.runs.errors import JobFailed, one_sentence, sentence, unknown_key
 from pickplace.runs.folder import FAILURE, OccupiedError, refuse_claimed, refuse_occupied, remove_empty_folders
 from pickplace.runs.registry import REGISTRY
@@ -157,10 +157,16 @@ class FreshFolder(Callback):
 
 
 class SweepCallback(Callback):
-    """Tells :func:`command` the folder of a sweep before its jobs are composed, which may fail."""
+    """Tells :func:`command` the folder of a sweep before its jobs are composed, which may fail, and names theirs."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
         HydraConfig.instance().set_config(config)
+        keys = ",".join(f"'{key}'" for key in constant_keys(list(config.hydra.overrides.task)))
+        naming = [f"hydra.job.config.override_dirname.exclude_keys=[{keys}]"]
+        if not config.hydra.sweeper._target_.endswith(".BasicSweeper"):  # it may draw the same values twice
+            naming.append("hydra.sweep.subdir=${hydra.job.num}")
+        with read_write(config.hydra):  # the jobs are composed with these; the user's own come later, and win
+            config.hydra.overrides.hydra = [*naming, *config.hydra.overrides.hydra]
 
 
 def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> None:

@@ -3,30 +3,28 @@
 import json
 import reprlib
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pickplace.evaluation.play import Episodes
 from pickplace.runs.errors import sentence
 from pickplace.runs.registry import build
 from pickplace.task.checks import number, whole_number
 
-if TYPE_CHECKING:
-    from pickplace.training.trainer import Trainer
-
 
 class Callback:
-    """Base class; a callback overrides what it needs. ``trainer.end(reason)`` ends the training after the batch.
+    """Base class; a callback overrides what it needs.
 
-    ``metrics`` are those of the batch, by name; entries that a callback adds or changes are logged.
+    ``trainer`` is the :class:`pickplace.training.trainer.Trainer`; ``trainer.end(reason)`` ends the training after the
+    batch. ``metrics`` are those of the batch, by name; entries that a callback adds or changes are logged.
     """
 
-    def on_batch(self, trainer: "Trainer", metrics: dict[str, float]) -> None:
+    def on_batch(self, trainer: Any, metrics: dict[str, float]) -> None:
         """Called when a batch is learnt, before a validation that may follow."""
 
-    def on_validation(self, trainer: "Trainer", episodes: Episodes, metrics: dict[str, float]) -> None:
+    def on_validation(self, trainer: Any, episodes: Episodes, metrics: dict[str, float]) -> None:
         """Called after a validation, whose means are in ``metrics["eval/..."]``, and before ``best`` is saved."""
 
-    def on_level_change(self, trainer: "Trainer", old: int, new: int) -> None:
+    def on_level_change(self, trainer: Any, old: int, new: int) -> None:
         """Called when the curriculum has moved from one tote height to another, in height units."""
 
     def state_dict(self) -> dict:
@@ -92,7 +90,7 @@ def make_callbacks(cfg, states) -> dict[str, Callback]:
     return callbacks
 
 
-def call(callbacks: dict[str, Callback], hook: str, trainer: "Trainer", *arguments: Any) -> None:
+def call(callbacks: dict[str, Callback], hook: str, trainer: Any, *arguments: Any) -> None:
     """Call a hook of each callback.
 
     Raises:

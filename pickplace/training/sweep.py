@@ -187,7 +187,7 @@ def ranked(settings: list[Setting]) -> list[Setting]:
 
 
 def summarize(folder: Path) -> list[Setting]:
-    """Write tables and figure of a sweep into its folder; return the settings in the order of the jobs.
+    """Write tables and figure of a sweep into its folder; return the settings in the order of their folders' names.
 
     Raises:
         FileNotFoundError: if it contains no run.
@@ -195,9 +195,7 @@ def summarize(folder: Path) -> list[Setting]:
     found = [path.parent.parent for path in Path(folder).glob("*/.hydra/overrides.yaml")]
     if not found:
         raise FileNotFoundError(f"{folder}: no run in it; expected the folder of a sweep.")
-    found.sort(
-        key=lambda path: [(not part.isdecimal(), part.zfill(9)) for part in re.split(r"(\d+)", path.name) if part]
-    )
+    found.sort(key=lambda path: [part.zfill(9) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)])
     runs = [read_run(path) for path in found]
     settings = settings_of(runs)
     keys = list(dict.fromkeys(key for run in runs for key in run.overrides))
