@@ -190,4 +190,12 @@ def folder_name(overrides: list[str], constant: list[str]) -> str:
     return f"{name}-{hashlib.sha256(plain.encode()).hexdigest()[:8]}".lstrip("-.")
 
 
-OmegaConf.register_new_resolver("run_name", folder_name, replace=True)
+def _run_name(_root_: DictConfig) -> str:
+    """Return the name of the folder of a sweep's run; its number where a sampler may draw the same values twice."""
+    cfg = _root_.hydra
+    if not cfg.sweeper._target_.endswith(".BasicSweeper"):
+        return str(cfg.job.num)
+    return folder_name(list(cfg.overrides.task), list(cfg.job.config.override_dirname.exclude_keys))
+
+
+OmegaConf.register_new_resolver("run_name", _run_name, replace=True)

@@ -162,11 +162,8 @@ class SweepCallback(Callback):
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
         HydraConfig.instance().set_config(config)
         keys = ",".join(f"'{key}'" for key in constant_keys(list(config.hydra.overrides.task)))
-        naming = [f"hydra.job.config.override_dirname.exclude_keys=[{keys}]"]
-        if not config.hydra.sweeper._target_.endswith(".BasicSweeper"):  # it may draw the same values twice
-            naming.append("hydra.sweep.subdir=${hydra.job.num}")
         with read_write(config.hydra):  # the jobs are composed with these; the user's own come later, and win
-            config.hydra.overrides.hydra = [*naming, *config.hydra.overrides.hydra]
+            config.hydra.overrides.hydra.insert(0, f"hydra.job.config.override_dirname.exclude_keys=[{keys}]")
 
 
 def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> None:
