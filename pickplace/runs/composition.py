@@ -12,7 +12,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
+from hydra.errors import ConfigCompositionException, HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
@@ -46,13 +46,15 @@ def with_own_values(cfg: DictConfig) -> DictConfig:
         inner = [str(other.input_line) for other in choices if f"{_package(other)}.".startswith(f"{place}.")]
         others = [str(other.input_line) for other in choices if other.input_line not in inner]
         inner.remove(str(choice.input_line))
-        own = hydra.compose(None, [*search, f"+{str(choice.input_line).lstrip('+')}", *inner])
-        node = _at(OmegaConf.to_container(own, resolve=False), place)
-        if node == _at(OmegaConf.to_container(cfg, resolve=False), place):
+        try:
+            own = _at(hydra.compose(None, [*search, f"+{str(choice.input_line).lstrip('+')}", *inner]), place)
+            if own == _at(cfg, place):
+                continue
+            before = _at(hydra.compose(name, [*search, *others]), place)
+        except ConfigCompositionException:  # an option that depends on those of other groups
             continue
-        before = OmegaConf.to_container(hydra.compose(name, [*search, *others]), resolve=False)
         inner_places = {_package(other) for other in choices if other.input_line in inner}
-        for leaf, content in _exchanged_leaves(place, node, _at(before, place)):
+        for leaf, content in _exchanged_leaves(place, own, before):
             if leaf not in inner_places:
                 cfg = cfg if replaced else cfg.copy()
                 OmegaConf.update(cfg, leaf, content, merge=False, force_add=True)
@@ -77,11 +79,12 @@ def _package(choice: Override) -> str:
     return choice.package or choice.key_or_group.replace("/", ".")
 
 
-def _at(config: Any, place: str) -> Any:
+def _at(cfg: DictConfig, place: str) -> Any:
     """Return the part of a config at a place, unresolved; None if there is none."""
+    part: Any = OmegaConf.to_container(cfg, resolve=False)
     for key in place.split("."):
-        config = config.get(key) if isinstance(config, dict) else None
-    return config
+        part = part.get(key) if isinstance(part, dict) else None
+    return part
 
 
 def _exchanged_leaves(place: str, own: Any, before: Any) -> Iterator[tuple[str, dict]]:
