@@ -1,8 +1,13 @@
 """Entry points of the commands; ``--help`` is answered without waiting for torch."""
 
+import os
 import sys
 
 from pickplace.runs.hydra_app import command
+
+# Threads that wait for others sleep. On a busy core, a thread that spins holds up the one that it waits for. OpenMP reads
+# this when torch is loaded.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 #: Flags that Hydra answers by itself.
 ANSWERED_BY_HYDRA = {"--help", "-h", "--hydra-help", "--version"}
