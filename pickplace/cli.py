@@ -5,8 +5,8 @@ import sys
 
 from pickplace.runs.hydra_app import command
 
-# Threads that wait for others sleep. On a busy core, a thread that spins holds up the one that it waits for. OpenMP reads
-# this when torch is loaded.
+# A thread that waits for others sleeps. If it spun, it would hold up those that share its core. OpenMP reads this when
+# torch is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 #: Flags that Hydra answers by itself.

@@ -54,9 +54,10 @@ VALUES = [
 #: Texts in place of a digit of a JSON line, which json.dumps would not write.
 TEXTS = ["NaN", "-Infinity", "1e999", "9" * 4299, "9" * 5000, "[" * 900, "[" * 200_000, "1.", "00", "{}"]
 WORDS = [
-    "", "=", "+", "~", "++", "env", "env.", ".", "model", "model=", "=1", "[", "{", "${", "'", '"', "\\", ",", "..", "*",
-    "seed", "null", "-m", "--cfg", "job", "--config-dir", "/nowhere", "hydra.run.dir", "resume", "checkpoint", "1e999",
-    "curriculum/advance", "plateau", "callbacks", "planner", "mcts", "compare", "\n", "é", "\x00", "\x1b", "x" * 50_000,
+    "", "=", "+", "~", "++", "env", "env.", ".", "model", "model=", "=1", "[", "{", "${", "'", '"', "\\", ",", "..",
+    "*", "seed", "null", "-m", "--cfg", "job", "--config-dir", "/nowhere", "hydra.run.dir", "resume", "checkpoint",
+    "1e999", "curriculum/advance", "plateau", "callbacks", "planner", "mcts", "compare", "\n", "é", "\x00", "\x1b",
+    "x" * 50_000,
 ]  # fmt: skip
 DTYPES = (None, None, None, float, "f4", "f2", "i1", "u1", "u8", bool, complex, object, "U3", "M8[s]")
 
