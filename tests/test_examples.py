@@ -1,5 +1,6 @@
 """The examples in docs/examples/ train, evaluate and plan."""
 
+import ast
 import importlib
 import json
 from pathlib import Path
@@ -151,3 +152,17 @@ def test_torchrl_ppo(monkeypatch):
     monkeypatch.syspath_prepend(str(EXAMPLES))
     before, after = importlib.import_module("torchrl_ppo").train(total_frames=10_240)
     assert 0.7 < before < before + 0.03 < after < 1
+
+
+def test_quickstart_notebook(tmp_path):
+    """It runs from top to bottom, and what is committed shows a curve and a replay too."""
+    nbclient, nbformat = importlib.import_module("nbclient"), importlib.import_module("nbformat")
+    path = EXAMPLES / "quickstart.ipynb"
+    committed, executed = (nbformat.read(path, as_version=4) for _ in range(2))
+    nbclient.NotebookClient(executed, timeout=300, kernel_name="python3").execute(cwd=tmp_path)
+    assert path.stat().st_size < 300_000
+    for notebook in (committed, executed):
+        shown = [output["data"] for cell in notebook.cells for output in cell.get("outputs", [])]
+        assert [kind for data in shown for kind in data if "image" in kind] == ["image/png", "image/gif"]
+        means = ast.literal_eval(shown[1]["text/plain"])
+        assert means["random"] < 0.5 < 0.9 < means["policy"] and float(shown[0]["text/plain"]) > 0.9

@@ -128,7 +128,7 @@ def test_phases_follow_each_other():
         (config(frames=-1), "warm_start.frames=-1: expected a whole number >= 0"),
         (config(critic_frames=1.5), "warm_start.critic_frames=1.5: expected a whole number >= 0"),
         (config(None), "warm_start.frames=100: there is no teacher; expected warm_start=imitate"),
-        (config("own_planner.Nothing"), "warm_start.teacher._target_=own_planner.Nothing: there is no such class or function"),
+        (config("own_planner.Nothing"), "warm_start.teacher._target_=own_planner.Nothing: there is no such"),
         (OmegaConf.create({**config(), "teacher": "mcts"}), "teacher='mcts': expected planner@warm_start.teacher=<"),
         (config("policy", candidates="all"), "warm_start.checkpoint=null: planner=policy needs a checkpoint"),
         (config("policy", checkpoint="nowhere", candidates="all"), "nowhere"),
