@@ -156,7 +156,9 @@ def test_torchrl_ppo(monkeypatch):
 
 def test_quickstart_notebook(tmp_path):
     """It runs from top to bottom, and what is committed shows a curve and a replay too."""
-    nbclient, nbformat = importlib.import_module("nbclient"), importlib.import_module("nbformat")
+    import nbclient
+    import nbformat
+
     path = EXAMPLES / "quickstart.ipynb"
     committed, executed = (nbformat.read(path, as_version=4) for _ in range(2))
     nbclient.NotebookClient(executed, timeout=300, kernel_name="python3").execute(cwd=tmp_path)

@@ -74,6 +74,9 @@ class TrainedPolicy(TensorDictModuleBase):
         policy: the distribution over choices, made for a cell.
         terms: of the observation, by key.
         config: of the training.
+
+    Attributes:
+        cell: the sizes that it decides for.
     """
 
     def __init__(self, policy: Policy, terms: Mapping[str, Term], config: DictConfig):
