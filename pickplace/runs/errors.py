@@ -3,7 +3,7 @@
 import errno
 import os
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
@@ -31,16 +31,34 @@ def one_sentence():
     """End the command with one sentence and exit code 2 on an error; ``HYDRA_FULL_ERROR=1`` shows the traceback."""
     try:
         yield
+        flush_output()
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # the reader of the output, such as head, has closed it
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except Exception as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
-        sys.stderr.write(f"error: {sentence(error)}\n")
+        with suppress(OSError):  # a terminal that was closed
+            sys.stderr.write(f"error: {sentence(error)}\n")
         sys.exit(2)
+    finally:
+        with suppress(OSError):
+            flush_output()
+
+
+def flush_output() -> None:
+    """Write what standard output still holds.
+
+    Raises:
+        OSError: if that fails. The output is dropped then: the interpreter would try again, and print a traceback.
+    """
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise OSError(error.errno, error.strerror, "standard output") from error
 
 
 def sentence(error: Exception) -> str:
@@ -60,6 +78,8 @@ def _sentence(error: Exception) -> str:
             return f"{error.missing_cfg_file}: there is no such config; expected one of {', '.join(error.options)}."
     if isinstance(error, OSError) and error.filename and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"{error.filename}: {error.strerror}; expected a place where you may read and write."
+    if isinstance(error, OSError) and error.filename and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"{error.filename}: {error.strerror}; expected free space. Nothing of it was written."
     if isinstance(error, EXPECTED):
         noise = ("full_key", "object_type", "See https", "To append", "Config search path", "provider=")
         lines = [line.strip() for line in str(error).splitlines()]

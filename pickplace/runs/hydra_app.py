@@ -142,7 +142,7 @@ class _Refusal(BaseException):
 
 
 class FreshFolder(Callback):
-    """Refuses the folder of another training, before Hydra overwrites its notes on that training."""
+    """Refuses the folder of another training or evaluation, before Hydra overwrites its notes on that one."""
 
     def on_run_start(self, config: DictConfig, **kwargs) -> None:
         before = HydraConfig.instance().cfg

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pickplace.runs.errors import missing_extra
+from pickplace.task.files import read_text, replaced_file
 
 if TYPE_CHECKING:
     from torchrl.record.loggers.common import Logger
@@ -35,12 +36,10 @@ class CsvLogger:
     def _rewrite(self, rows):
         """Write the file with these rows, and columns for all their metrics."""
         self._columns += [key for key in dict.fromkeys(key for row in rows for key in row) if key not in self._columns]
-        new = self.path.with_name(".metrics.csv.new")
-        with new.open("w", newline="") as file:
+        with replaced_file(self.path) as new, new.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
             writer.writerows(rows)
-        new.replace(self.path)
         self._file = self.path.open("a", newline="")
         self._writer = csv.DictWriter(self._file, self._columns)
 
@@ -223,8 +222,7 @@ def read_csv(path) -> list[dict[str, float]]:
     Raises:
         ValueError: naming file and line, for a cell that is no number.
     """
-    with Path(path).open(newline="") as file:
-        text = file.read()
+    text = read_text(path)
     lines = text[: text.rfind("\n") + 1].splitlines()  # a killed run may leave an incomplete last line
     rows = []
     for number, row in enumerate(csv.DictReader(lines), start=2):
