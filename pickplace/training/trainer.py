@@ -187,8 +187,9 @@ class Trainer:
             own = self.collector.state_dict()
             saved = checkpoint.matching_state(self.state.get("collector"), own, "collector")
             env = self.build_env(num_envs=1, masks=())
-            for part in [saved] if "environment" in saved else saved.values():  # one for each worker
-                check_saved_state(env, part["environment"], part["carried"])
+            for part in (saved, *saved.values()):  # of a collector of several workers each has a state
+                if isinstance(part, dict) and "environment" in part:
+                    check_saved_state(env, part["environment"], part["carried"])
             self.collector.load_state_dict(saved)
             push_level(self.collector, self.curriculum.level)
         # Last: everything above may have drawn.

@@ -101,7 +101,7 @@ def test_a_second_process_is_refused(run, undisturbed, tmp_path):
         run_dir.mkdir(exist_ok=True)
         with claim(run_dir):
             code, _, err = run("train", f"{command}={run_dir}")
-        taken = f"{run_dir}: another process is training there; expected another run folder, or to wait for it."
+        taken = f"{run_dir}: another process is working there; expected another run folder, or to wait for it."
         assert (code, err) == (2, f"error: {taken}\n")
 
 
