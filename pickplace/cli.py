@@ -4,71 +4,58 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable
+from functools import partial
+from importlib import import_module
 
-#: Flags that Hydra answers by itself.
-ANSWERED_BY_HYDRA = {"--help", "-h", "--hydra-help", "--version"}
+#: Flags that need no torch.
+HELP = {"--help", "-h", "--hydra-help", "--version"}
 
 
 def train() -> None:
     """Entry point of ``pickplace-train``, see :mod:`pickplace.training.train`."""
-
-    def load():
-        if ANSWERED_BY_HYDRA & set(sys.argv[1:]):
-            from pickplace.runs.hydra_app import command
-
-            return lambda: command("train", None)
-        from pickplace.training.train import main
-
-        return main
-
-    _run(load)
+    _run("pickplace.training.train", config_name="train")
 
 
 def evaluate() -> None:
     """Entry point of ``pickplace-evaluate``, see :mod:`pickplace.evaluation.evaluate`."""
-
-    def load():
-        if ANSWERED_BY_HYDRA & set(sys.argv[1:]):
-            from pickplace.runs.hydra_app import command
-
-            return lambda: command("evaluate", None)
-        from pickplace.evaluation.evaluate import main
-
-        return main
-
-    _run(load)
+    _run("pickplace.evaluation.evaluate", config_name="evaluate")
 
 
 def plan() -> None:
     """Entry point of ``pickplace-plan``, see :mod:`pickplace.robot.json_lines`."""
-
-    def load():
-        if not {"--help", "-h"} & set(sys.argv[1:]):
-            import pickplace.robot.planner  # noqa: F401  torch, before Ctrl-C is an error that its import could change
-        from pickplace.robot.json_lines import main
-
-        return main
-
-    _run(load)
+    _run("pickplace.robot.json_lines", "pickplace.robot.planner")
 
 
-def _run(load: Callable[[], Callable[[], None]]) -> None:
-    """Import a command and run it. While it is imported, and after it has ended, Ctrl-C ends the process quietly."""
+def _run(module: str, *needed: str, config_name: str | None = None) -> None:
+    """Import a command and run it. While it is imported, and after it has ended, Ctrl-C ends the process quietly.
+
+    Args:
+        module: the command's module, with a function ``main``.
+        needed: further modules to import, unless help is asked for.
+        config_name: of a Hydra application, which answers a call for help by itself.
+    """
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:  # closed: its number would go to the next file that is opened
             os.open(os.devnull, os.O_RDWR)
-    sys.stderr = sys.stderr or open(os.devnull, "w")
-    logging.raiseExceptions = False  # no tracebacks of a closed terminal or a full disk
-    handler = signal.signal(signal.SIGINT, _end) or signal.SIG_DFL
-    main = load()
-    signal.signal(signal.SIGINT, signal.SIG_IGN if handler == signal.SIG_IGN else signal.default_int_handler)
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115  open until the end
+    logging.raiseExceptions = False  # a closed terminal or a full disk is no reason for a traceback at each line
+    on_interrupt = signal.SIG_IGN if signal.getsignal(signal.SIGINT) == signal.SIG_IGN else _end
+    signal.signal(signal.SIGINT, on_interrupt)
+    help_only = bool(HELP & set(sys.argv[1:]))
+    if help_only and config_name:
+        main = partial(import_module("pickplace.runs.hydra_app").command, config_name, None)
+    else:
+        main = import_module(module).main
+        for name in () if help_only else needed:
+            import_module(name)
     try:
+        if on_interrupt == _end:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         main()
     except KeyboardInterrupt:
         sys.exit(130)
     finally:
-        signal.signal(signal.SIGINT, _end)
+        signal.signal(signal.SIGINT, on_interrupt)
 
 
 def _end(*_) -> None:

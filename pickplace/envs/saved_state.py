@@ -26,7 +26,7 @@ def check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: M
 
     def check(key: str, possible: Tensor, expected: str) -> None:
         if not possible.all():
-            raise CheckpointError(f"The checkpoint's environment is of no use: {key} is impossible; expected {expected}.")
+            raise CheckpointError(f"The checkpoint's environment is of no use: {key}: expected {expected}.")
 
     cell = env.cell
     heights, tote_height, volume, steps = (saved[key] for key in ("heights", "tote_height", "volume", "steps"))

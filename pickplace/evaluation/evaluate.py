@@ -15,6 +15,7 @@ from pickplace.evaluation.statistics import paired_difference, summarise
 from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import own_modules, trusted_config
+from pickplace.runs.errors import sentence
 from pickplace.runs.folder import EVALUATION, claim, refuse_occupied
 from pickplace.runs.hydra_app import apply_overrides, command
 from pickplace.runs.machine import use_machine
@@ -69,14 +70,17 @@ def _run(cfg: DictConfig, run_dir: Path) -> float:
     if replay:
         title = f"{cfg.checkpoint or planner.name}, {ev.stream} stream, seed {ev.seed}"
         texts["replay.html"] = page(episodes.recordings, cell, title)
-    for name, text in texts.items():
-        with replaced_file(run_dir / name) as new:
-            new.write_text(text, encoding="utf-8")
-    with replaced_file(run_dir / "tote.png") as new:
-        picture(episodes.recordings[0], cell, new)
-    if gif:
-        with replaced_file(run_dir / "replay.gif") as new:
-            animation(episodes.recordings[0], cell, new)
+    try:
+        for name, text in texts.items():
+            with replaced_file(run_dir / name) as new:
+                new.write_text(text, encoding="utf-8")
+        with replaced_file(run_dir / "tote.png") as new:
+            picture(episodes.recordings[0], cell, new)
+        if gif:
+            with replaced_file(run_dir / "replay.gif") as new:
+                animation(episodes.recordings[0], cell, new)
+    except OSError as error:
+        raise ValueError(f"{sentence(error)} The table above and the files that are there are whole.") from error
     log.info("run folder: %s", run_dir)
     return result["occupancy"]["mean"]
 

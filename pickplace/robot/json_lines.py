@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from pickplace.runs.errors import flush_output, one_sentence
+from pickplace.runs.errors import one_sentence, write_output
 from pickplace.task.files import read_file
 
 if TYPE_CHECKING:
@@ -98,12 +98,11 @@ def run(args: argparse.Namespace) -> None:
         except DepthMapError as error:
             file = args.tote if str(error).startswith("tote_depth") else args.bin
             raise DepthMapError(f"{file}: {error}") from error
-        sys.stdout.write(json.dumps(result, indent=1) + "\n")
+        write_output(json.dumps(result, indent=1) + "\n")
         return
     for line in lines_of(sys.stdin.buffer):
         if line.strip() or len(line) > MAX_LINE:
-            sys.stdout.write(json.dumps(answer(planner, line, defaults, args.time)) + "\n")
-            flush_output()
+            write_output(json.dumps(answer(planner, line, defaults, args.time)) + "\n")
 
 
 def lines_of(stream: BinaryIO) -> Iterator[bytes]:

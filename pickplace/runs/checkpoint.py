@@ -54,7 +54,9 @@ def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> No
     text = json.dumps({"schema": SCHEMA, "sha256": digest, **facts, "state": rest}, indent=1)
     contents = {TENSORS: blob, FACTS: text.encode()}
     if large := [name for name, content in contents.items() if len(content) > MAX_BYTES[name]]:
-        raise CheckpointError(f"{folder}: {large[0]} has more than {MAX_BYTES[large[0]]:,} bytes, and could not be read.")
+        raise CheckpointError(
+            f"{folder}: {large[0]} has more than {MAX_BYTES[large[0]]:,} bytes; nobody could read it."
+        )
     shutil.rmtree(new, ignore_errors=True)
     try:
         new.mkdir(parents=True)

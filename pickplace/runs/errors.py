@@ -31,7 +31,7 @@ def one_sentence():
     """End the command with one sentence and exit code 2 on an error; ``HYDRA_FULL_ERROR=1`` shows the traceback."""
     try:
         yield
-        flush_output()
+        write_output()
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # the reader of the output, such as head, has closed it
@@ -44,17 +44,18 @@ def one_sentence():
         sys.exit(2)
     finally:
         with suppress(OSError):
-            flush_output()
+            write_output()
 
 
-def flush_output() -> None:
-    """Write what standard output still holds.
+def write_output(text: str = "") -> None:
+    """Write to standard output, now.
 
     Raises:
         OSError: if that fails. The output is dropped then: the interpreter would try again, and print a traceback.
     """
     try:
         if sys.stdout is not None:
+            sys.stdout.write(text)
             sys.stdout.flush()
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -79,7 +80,7 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"{error.filename}: {error.strerror}; expected a place where you may read and write."
     if isinstance(error, OSError) and error.filename and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f"{error.filename}: {error.strerror}; expected free space. Nothing of it was written."
+        return f"{error.filename}: {error.strerror}; expected free space."
     if isinstance(error, EXPECTED):
         noise = ("full_key", "object_type", "See https", "To append", "Config search path", "provider=")
         lines = [line.strip() for line in str(error).splitlines()]

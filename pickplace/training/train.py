@@ -13,7 +13,7 @@ from pickplace.runs import checkpoint
 from pickplace.runs.errors import one_sentence
 from pickplace.runs.folder import FAILURE, claim, refuse_links
 from pickplace.runs.hydra_app import command
-from pickplace.runs.resume import interrupted_run, resumed_config
+from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config
 from pickplace.training.metrics import episode_metrics
 from pickplace.training.trainer import Trainer
 
@@ -79,7 +79,8 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             trainer.save("last")
 
     trainer.log_ending(stop.requested)
-    trainer.write_report()
+    with checkpoint_hint(lambda: trainer.safe_folder, trainer.resume_overrides):
+        trainer.write_report()
     log.info("run folder: %s", run_dir)
     if stop.requested and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise KeyboardInterrupt  # ends the whole sweep, not only this run

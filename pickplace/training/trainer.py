@@ -29,6 +29,7 @@ from pickplace.runs.resume import (
     load_optimizer,
     stale_best_frames,
 )
+from pickplace.task.files import replaced_file
 from pickplace.training.collectors import rng_state, set_rng_state, watch_workers
 from pickplace.training.curriculum import Curriculum, push_level
 from pickplace.training.imitation import Phase, WarmStart
@@ -294,7 +295,8 @@ class Trainer:
         run_dir = self.run_dir
         if not (run_dir / "metrics.csv").is_file():
             return
-        learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
+        with replaced_file(run_dir / "learning_curve.png") as new:
+            learning_curve(run_dir / "metrics.csv", new)
         up_to_date = self.episodes is None and (run_dir / REPORT).is_file()  # nothing was trained since
         if self.frames >= self.cfg.total_frames and not up_to_date:
             log.info("writing the report")
