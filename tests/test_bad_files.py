@@ -1,6 +1,7 @@
 """Files, folders and streams that are damaged, endless, taken or full: one sentence, and nothing is lost."""
 
 import csv
+import io
 import json
 import logging
 import os
@@ -35,7 +36,7 @@ FULL = OSError(28, "No space left on device")
 
 def make(kind: str, path: Path) -> Path:
     """Make something that is no file to read, and return its path."""
-    if kind in ("/proc/kmsg", "/dev/zero", "/proc/kcore"):
+    if kind.startswith("/"):
         return Path(kind)
     if kind == "pipe":
         os.mkfifo(path)
@@ -50,31 +51,23 @@ def make(kind: str, path: Path) -> Path:
 
 
 @pytest.mark.timeout(60)
-@pytest.mark.parametrize(
-    "kind", ["pipe", "folder", "link to a device", "large", "/dev/zero", "/proc/kmsg", "/proc/kcore"]
-)
+@pytest.mark.parametrize("kind", ["pipe", "folder", "link to a device", "large", "/dev/zero", "/proc/kmsg"])
 @pytest.mark.parametrize(
     "read",
-    [
-        Recorded,
-        json_lines.read_map,
-        lambda path: read_comparison(path, {}),
-        lambda path: checkpoint.read_facts(path.parent) or read_file(path, 0),
-    ],
-    ids=["items.path", "--bin", "compare", "read_file"],
+    [Recorded, json_lines.read_map, lambda path: read_comparison(path, {})],
+    ids=["items.path", "--bin", "compare"],
 )
 def test_only_regular_files_of_limited_size_are_read(tmp_path, read, kind):
-    path = make(kind, tmp_path / "state.json")
-    if kind == "/proc/kmsg":  # endless, of size 0
-        assert read_file(path) == b""
-    else:
-        with pytest.raises(ValueError, match=str(path)):
-            read(path)
+    path = make(kind, tmp_path / "file")
+    with pytest.raises(ValueError, match=str(path)):
+        read(path)
 
 
-BOMB = "a: &a [x, x]\n" + "".join(
-    f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
-)
+def test_an_endless_file_of_size_0_is_empty():
+    assert read_file("/proc/kmsg") == b""
+
+
+BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{f'*{a}, ' * 9}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
 NOTES = {
     "alias bomb": BOMB, "broken": "a: [", "deep": "[" * 100_000, "no date": "2001-13-45", "no time": "!!timestamp x",
     "numbers": "hydra: {runtime: {config_sources: [{path: 3, provider: command-line}]}, overrides: {hydra: [5]}}",
@@ -91,8 +84,8 @@ def test_a_note_of_hydra_is_never_resolved(tmp_path, note):
         (tmp_path / ".hydra" / f"{name}.yaml").write_text(NOTES[note])
     assert noted_overrides(tmp_path) == noted_config_folders(tmp_path) == []
     cfg = composed("experiment=smoke")
-    changed = changed_values(tmp_path, cfg)
-    assert not any(word.startswith("seed=") for word in changed) if note == "interpolation" else True
+    changed = {word.partition("=")[0] for word in changed_values(tmp_path, cfg)}
+    assert note != "interpolation" or "seed" not in changed
     OmegaConf.save(cfg, tmp_path / ".hydra" / "config.yaml")
     cfg.algo.epochs, cfg.model.critic.tote_clip = 3, 4  # the latter over a reference
     assert changed_values(tmp_path, cfg) == ["model.critic.tote_clip=4", "algo.epochs=3"]
@@ -119,8 +112,9 @@ def test_a_report_does_without_notes_that_cannot_be_read(smoke_run, tmp_path):
         ({"occupancy": {"per_episode": [0.5, True, 0.5]}}, "a list of 3 numbers"),
         ({"occupancy": {"per_episode": 0.5}}, "a list of 3 numbers"),
         ({"occupancy": None}, "expected an evaluation.json"),
-        ({"planner": "a\x1b[31m"}, "got 'a\\x1b[31m'"), ({"planner": "a" * 101}, "a name to print"), ({"planner": 3}, "got 3"),
-        ({"stream": "x" * 10**6}, "its stream is 'xxx"), ({"env": {}}, "env.bin_size=None"), ({"env": 3}, "evaluation.json"),
+        ({"planner": "a\x1b[31m"}, "a name to print, got 'a\\x1b[31m'"), ({"planner": "a" * 101}, "a name to print"),
+        ({"planner": 3}, "a name to print, got 3"), ({"stream": "x" * 10**6}, "its stream is 'xxx"),
+        ({"env": {}}, "env.bin_size=None"), ({"env": 3}, "expected an evaluation.json"),
     ],
 )  # fmt: skip
 def test_a_comparison_is_checked_before_playing(run, tmp_path, monkeypatch, change, words):
@@ -132,12 +126,7 @@ def test_a_comparison_is_checked_before_playing(run, tmp_path, monkeypatch, chan
     path.write_text(json.dumps({**content, **change}))
     monkeypatch.setattr(evaluate, "play", lambda *_: pytest.fail("it played"))
     code, _, err = run("evaluate", "planner=joint_dbl", TOTE, "evaluation.episodes=3", f"compare={path}")
-    assert (
-        code == 2
-        and len(err) < 1000
-        and words.encode("unicode_escape").decode() in err.replace("\\\\", "\\")
-        or words in err
-    )
+    assert code == 2 and words in err and len(err) < 1000
 
 
 def files(folder):
@@ -152,16 +141,11 @@ def test_an_evaluation_overwrites_no_other_run(run, smoke_run, tmp_path):
         "evaluation.latency_decisions=0",
         "evaluation.replay=0",
     ]
-    assert run("evaluate", *words, "hydra.run.dir=one")[0] == 0
-    trained = shutil.copytree(smoke_run, tmp_path / "trained")
-    for folder, command in ((tmp_path / "one", "evaluate"), (trained, "evaluate"), (tmp_path / "one", "train")):
+    evaluation, one, trained = ["evaluate", *words], tmp_path / "one", shutil.copytree(smoke_run, tmp_path / "trained")
+    assert run(*evaluation, f"hydra.run.dir={one}")[0] == 0
+    for folder, command in ((one, evaluation), (trained, evaluation), (one, ["train"])):
         before = files(folder)
-        code, _, err = run(
-            command,
-            *(words if command == "evaluate" else ()),
-            "seed=1" if command == "train" else TOTE,
-            f"hydra.run.dir={folder}",
-        )
+        code, _, err = run(*command, f"hydra.run.dir={folder}")
         assert code == 2 and err.startswith(f"error: {folder}: there is a") and err.count("\n") == 1
         assert files(folder) == before
     code, _, err = run("evaluate", "-m", *words, f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=one")
@@ -203,11 +187,11 @@ def full(*_, **__):
 @pytest.mark.parametrize(
     ("command", "owner", "function", "words"),
     [
-        ("evaluate", evaluate, "picture", "run/tote.png: No space left on device; expected free space. The table above"),
-        ("evaluate", "hydra.core.utils", "_save_config", "run: No space left on device; expected free space."),
-        ("train", "hydra.core.utils", "_save_config", "run: No space left on device; expected free space."),
-        ("train", csv.DictWriter, "writeheader", "run/metrics.csv: No space left on device; expected free space. Nothing"),
-        ("train", trainer, "learning_curve", "run/learning_curve.png: No space left on device; expected free space. What was saved"),
+        ("evaluate", evaluate, "picture", "run/tote.png: {} The table above and the files that are there are whole."),
+        ("evaluate", "hydra.core.utils", "_save_config", "run: {}"),
+        ("train", "hydra.core.utils", "_save_config", "run: {}"),
+        ("train", csv.DictWriter, "writeheader", "run/metrics.csv: {} Nothing had been saved before."),
+        ("train", trainer, "learning_curve", "run/learning_curve.png: {} What was saved before is whole: "),
     ],
 )  # fmt: skip
 def test_a_full_disk_is_named(run, tmp_path, monkeypatch, command, owner, function, words):
@@ -215,8 +199,9 @@ def test_a_full_disk_is_named(run, tmp_path, monkeypatch, command, owner, functi
     settings = ["planner=joint_dbl", TOTE, "evaluation.episodes=2", "evaluation.latency_decisions=0"]
     settings = settings if command == "evaluate" else ["experiment=smoke", "threads=1", "total_frames=128"]
     code, _, err = run(command, *settings, f"hydra.run.dir={tmp_path}/run")
-    assert code == 2 and err.splitlines()[-1].startswith(f"error: {tmp_path}/{words}"), err
-    assert (tmp_path / "run").exists() == (function != "_save_config")
+    reason = "No space left on device; expected free space."
+    assert code == 2 and err.splitlines()[-1].startswith(f"error: {tmp_path}/{words.format(reason)}"), err
+    assert (tmp_path / "run").exists() == (function in ("picture", "learning_curve"))
     assert not [path for path in tmp_path.rglob(".*") if ".new" in path.name]
 
 
@@ -226,7 +211,8 @@ def test_a_full_disk_is_named(run, tmp_path, monkeypatch, command, owner, functi
         ("heights", 0, -1, "heights: expected 0 to tote_height"), ("heights", 0, 9, "heights: expected"),
         ("tote_height", 0, 0, "tote_height: expected"), ("volume", 0, -1, "volume"), ("volume", 0, 10**9, "volume"),
         ("steps", 0, -1, "steps"), ("steps", 0, 10**9, "steps"), ("episode", 0, -1, "episode"),
-        ("item", (0, 0), 99, "item: expected"), ("item", (0, 4), -1, "item: expected"), ("item_seed", (), -1, "item_seed"),
+        ("item", (0, 0), 99, "item: expected"), ("item", (0, 4), -1, "item: expected"),
+        ("item_seed", (), -1, "item_seed: expected"),
     ],
 )  # fmt: skip
 def test_an_impossible_environment_is_not_resumed(smoke_run, tmp_path, part, index, value, words):
@@ -275,11 +261,11 @@ def plan(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("flag", [
-    "--tolerance=0.7", "--cell-size=-1", "--cell-size=nan", "--alternatives=-1", "--tote-height=1e9", "--tote-height=2.5",
-    "--candidates=0", "--rotations=5", "--threads=-1",
+    "--tolerance=0.7", "--cell-size=-1", "--cell-size=nan", "--alternatives=-1", "--tote-height=1e9",
+    "--tote-height=2.5", "--candidates=0", "--rotations=5", "--threads=-1",
 ])  # fmt: skip
 def test_impossible_flags_are_refused_before_the_first_line(plan, monkeypatch, flag):
-    monkeypatch.setattr(sys, "stdin", None if "stdin" in flag else open(os.devnull))
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO()))
     assert flag.partition("=")[0].lstrip("-").replace("-", "_") in plan(flag)
 
 
@@ -297,7 +283,8 @@ def test_maps_are_named_by_their_files(plan, tmp_path):
     )
     (tmp_path / "huge.npy").write_bytes(header)
     for bin_map, tote_map, named in (
-        (flat, large, flat), (good, flat, flat), (good, large, large), (nothing, good, good), (nothing, nothing, nothing),
+        (flat, large, flat), (good, flat, flat), (good, large, large), (nothing, good, good),
+        (nothing, nothing, nothing),
         (tmp_path / "zip.npy", good, tmp_path / "zip.npy"), (tmp_path / "huge.npy", good, tmp_path / "huge.npy"),
     ):  # fmt: skip
         assert plan("--bin", bin_map, "--tote", tote_map).startswith(f"error: {named}: ")
@@ -329,11 +316,11 @@ def test_a_closed_stream_ends_in_a_sentence(plan, monkeypatch, name):
 
 
 def test_a_full_output_ends_in_a_sentence(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "stdout", open("/dev/full", "w"))
-    with pytest.raises(SystemExit) as end, one_sentence():
-        sys.stdout.write("x")
+    with open("/dev/full", "w") as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        with pytest.raises(SystemExit) as end, one_sentence():
+            sys.stdout.write("x")
     assert end.value.code == 2 and "error: standard output: No space left" in capsys.readouterr().err
-    sys.stdout.close()
 
 
 @pytest.mark.parametrize("module", ["gymnasium", "hydra", "torch", "torchrl"])

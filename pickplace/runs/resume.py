@@ -228,16 +228,17 @@ class StopRequest:
 
 
 @contextmanager
-def checkpoint_hint(latest: Callable[[], Path | None], arguments: str = ""):
+def checkpoint_hint(latest: Callable[[], Path | None], arguments: str = "", errors: type[Exception] = Exception):
     """Add to an error that ends a training the command that resumes it.
 
     Args:
         latest: returns the folder of the latest whole checkpoint, or None.
         arguments: further words of that command, such as `` trust=[my_models]``.
+        errors: the type of errors to which it is added.
     """
     try:
         yield
-    except Exception as error:
+    except errors as error:
         hint = "Nothing had been saved before."
         if folder := latest():
             # With the same settings, the same batch would lead to the same numbers.

@@ -164,7 +164,7 @@ class Trainer:
             if self.resumed:
                 self._restore_state()
             settings = OmegaConf.to_container(cfg, resolve=True)
-            with checkpoint_hint(lambda: self.safe_folder, self.resume_overrides):
+            with checkpoint_hint(lambda: self.safe_folder, self.resume_overrides, OSError):
                 self.logger = build("logger", cfg.logger, folder=self.run_dir, frames=self.frames, settings=settings)
             stop, self.start_time, self.start_frames = StopRequest(), time.perf_counter(), self.frames
             is_last = self.safe_folder is None or "last" in self.safe_folder.name

@@ -160,7 +160,7 @@ def test_a_stale_best_is_replaced_if_the_config_has_changed(changed, smoke_run, 
     ("override", "message"),
     [
         ("env.rotations=1", "env.rotations=1: the run began with 4"), ("items.kinds=[[1,1,1]]", "items={"),
-        ("+env.observation.more._target_=tote_depth", "env.observation={"),
+        ("env.observation.tote_depth._target_=bin_depth", "env.observation={"),
         ("env.tote_size=[5,5,1]", "the run began with [4, 4, 1]"), ("env.num_envs=4", "the run began with 8"),
         ("algo.mask_infeasible=false", "the run began with True"), ("model.actor.filters=16", "does not fit"),
         ("curriculum=paper", "cannot be exchanged"), ("+algo.gama=0.9", "did you mean 'gamma'?"),
