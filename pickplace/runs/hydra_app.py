@@ -158,8 +158,9 @@ class FreshFolder(Callback):
         except OccupiedError as error:
             HydraConfig.instance().cfg = None  # nothing in that folder is ours
             raise _Refusal(str(error)) from None
-        with read_write(HydraConfig.get()):  # :func:`command` needs it if Hydra cannot write its notes
-            HydraConfig.get().runtime.output_dir = str(folder.absolute())
+        with read_write(config.hydra.runtime):  # :func:`command` needs it if Hydra cannot write its notes
+            config.hydra.runtime.output_dir = str(folder.absolute())
+        HydraConfig.instance().set_config(config)
 
 
 class SweepCallback(Callback):
