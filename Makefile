@@ -3,6 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 RUN ?= outputs/quick_$(shell date +%Y-%m-%d_%H-%M-%S)
+DEMO ?= outputs/demo_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
 PYTEST := $(BIN)/python -m pytest -q -n logical --maxprocesses 4 --dist worksteal
 
@@ -18,9 +19,10 @@ $(STAMP): pyproject.toml $(LOCK)
 	$(BIN)/pip install --quiet --disable-pip-version-check $(if $(LOCK),-c $(LOCK)) -e '.[dev]'
 	@touch $@
 
+demo: RUN_DIR := $(DEMO)
 demo: $(STAMP)  ## pack totes with shipped weights, and write a replay page
-	$(BIN)/pickplace-evaluate checkpoint=pretrained/r4 evaluation.episodes=20 hydra.run.dir=outputs/demo $(ARGS)
-	@echo "Open outputs/demo/replay.html in a browser."
+	$(BIN)/pickplace-evaluate checkpoint=pretrained/r4 evaluation.episodes=20 hydra.run.dir=$(RUN_DIR) $(ARGS)
+	@echo "Open $(RUN_DIR)/replay.html in a browser."
 
 train: RUN_DIR := $(RUN)
 train: $(STAMP)  ## train experiment=quick, and evaluate it (ARGS="key=value ..." adds overrides)

@@ -1,9 +1,16 @@
 """Reinforcement learning for packing with a suction robot: where to pick, where to place, and how to turn."""
 
+import os
+import signal
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-import gymnasium
+_is_command = os.path.basename(sys.argv[0]).startswith("pickplace-")
+if _is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, lambda *_: os._exit(130))  # no traceback of a Ctrl-C; cli.py goes on from here
+
+import gymnasium  # noqa: E402
 
 if TYPE_CHECKING:
     from pickplace.envs.torchrl import PickPlaceEnv

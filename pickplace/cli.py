@@ -1,40 +1,66 @@
 """Entry points of the commands; ``--help`` is answered without waiting for torch."""
 
+import logging
 import os
+import signal
 import sys
-
-from pickplace.runs.hydra_app import command
+from functools import partial
+from importlib import import_module
 
 # A thread that waits for others sleeps. If it spun, it would hold up those that share its core. OpenMP reads this when
 # torch is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-#: Flags that Hydra answers by itself.
-ANSWERED_BY_HYDRA = {"--help", "-h", "--hydra-help", "--version"}
+#: Flags that need no torch.
+HELP = {"--help", "-h", "--hydra-help", "--version"}
 
 
 def train() -> None:
     """Entry point of ``pickplace-train``, see :mod:`pickplace.training.train`."""
-    if ANSWERED_BY_HYDRA & set(sys.argv[1:]):
-        command("train", None)
-    else:
-        from pickplace.training.train import main
-
-        main()
+    _run("pickplace.training.train", config_name="train")
 
 
 def evaluate() -> None:
     """Entry point of ``pickplace-evaluate``, see :mod:`pickplace.evaluation.evaluate`."""
-    if ANSWERED_BY_HYDRA & set(sys.argv[1:]):
-        command("evaluate", None)
-    else:
-        from pickplace.evaluation.evaluate import main
-
-        main()
+    _run("pickplace.evaluation.evaluate", config_name="evaluate")
 
 
 def plan() -> None:
     """Entry point of ``pickplace-plan``, see :mod:`pickplace.robot.json_lines`."""
-    from pickplace.robot.json_lines import main
+    _run("pickplace.robot.json_lines", "pickplace.robot.planner")
 
-    main()
+
+def _run(module: str, *needed: str, config_name: str | None = None) -> None:
+    """Import a command and run it. While it is imported, and after it has ended, Ctrl-C ends the process quietly.
+
+    Args:
+        module: the command's module, with a function ``main``.
+        needed: further modules to import, unless help is asked for.
+        config_name: of a Hydra application, which answers a call for help by itself.
+    """
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed: its number would go to the next file that is opened
+            os.open(os.devnull, os.O_RDWR)
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115  open until the end
+    logging.raiseExceptions = False  # a closed terminal or a full disk is no reason for a traceback at each line
+    on_interrupt = signal.SIG_IGN if signal.getsignal(signal.SIGINT) == signal.SIG_IGN else _end
+    signal.signal(signal.SIGINT, on_interrupt)
+    help_only = bool(HELP & set(sys.argv[1:]))
+    if help_only and config_name:
+        main = partial(import_module("pickplace.runs.hydra_app").command, config_name, None)
+    else:
+        main = import_module(module).main
+        for name in () if help_only else needed:
+            import_module(name)
+    try:
+        if on_interrupt == _end:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        main()
+    except KeyboardInterrupt:
+        sys.exit(130)
+    finally:
+        signal.signal(signal.SIGINT, on_interrupt)
+
+
+def _end(*_) -> None:
+    os._exit(130)

@@ -3,10 +3,10 @@
 import hashlib
 import json
 import logging
+import reprlib
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
@@ -15,16 +15,21 @@ from pickplace.evaluation.statistics import paired_difference, summarise
 from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import own_modules, trusted_config
+from pickplace.runs.errors import sentence
+from pickplace.runs.folder import EVALUATION, claim, refuse_occupied
 from pickplace.runs.hydra_app import apply_overrides, command
 from pickplace.runs.machine import use_machine
 from pickplace.runs.provenance import commit, imitated_planner, versions
 from pickplace.runs.registry import build
 from pickplace.task.cell import CELL_SETTINGS
-from pickplace.task.checks import flag, one_of, whole_number
+from pickplace.task.checks import flag, is_number, one_of, whole_number
+from pickplace.task.files import read_file, replaced_file
 from pickplace.views.replay import animation, page, picture
 from pickplace.views.tables import evaluation_table
 
 log = logging.getLogger(__name__)
+
+MAX_EVALUATION = 2**26  # greatest size of an evaluation.json that is read, in bytes
 
 #: Config groups that an evaluation takes from the checkpoint.
 TRAINED = ("env", "items", "model", "algo")
@@ -41,8 +46,15 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
     Writes ``evaluation.json``, a table, a picture of a packed tote and a replay into ``run_dir``.
 
     Raises:
-        ValueError: for settings that make no sense, or a checkpoint that does not fit them.
+        ValueError: for settings that make no sense, a checkpoint that does not fit them, or a folder that holds a
+            training or another evaluation.
     """
+    with claim(run_dir):
+        refuse_occupied(run_dir)
+        return _run(cfg, run_dir)
+
+
+def _run(cfg: DictConfig, run_dir: Path) -> float:
     ev = cfg.evaluation
     replay = whole_number("evaluation.replay", ev.get("replay", 0), 0)  # evaluation=validation has neither
     gif = flag("evaluation.gif", ev.get("gif", False))
@@ -52,16 +64,23 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
     result, episodes = evaluate(cfg, make_env, planner, facts, record=range(max(replay, 1)))
     if other:
         result["paired_difference"] = paired_difference(result, other)
-    (run_dir / "evaluation.json").write_text(json.dumps(result, indent=1, default=to_json))
-    picture(episodes.recordings[0], cell, run_dir / "tote.png")
+    table = evaluation_table(result)
+    log.info("\n%s", table)  # before anything is written: the disk may be full
+    texts = {EVALUATION: json.dumps(result, indent=1, default=to_json), "evaluation.md": table}
     if replay:
         title = f"{cfg.checkpoint or planner.name}, {ev.stream} stream, seed {ev.seed}"
-        (run_dir / "replay.html").write_text(page(episodes.recordings, cell, title), encoding="utf-8")
-    if gif:
-        animation(episodes.recordings[0], cell, run_dir / "replay.gif")
-    table = evaluation_table(result)
-    (run_dir / "evaluation.md").write_text(table)
-    log.info("\n%s", table)
+        texts["replay.html"] = page(episodes.recordings, cell, title)
+    try:
+        for name, text in texts.items():
+            with replaced_file(run_dir / name) as new:
+                new.write_text(text, encoding="utf-8")
+        with replaced_file(run_dir / "tote.png") as new:
+            picture(episodes.recordings[0], cell, new)
+        if gif:
+            with replaced_file(run_dir / "replay.gif") as new:
+                animation(episodes.recordings[0], cell, new)
+    except OSError as error:
+        raise ValueError(f"{sentence(error)} The table above and the files that are there are whole.") from error
     log.info("run folder: %s", run_dir)
     return result["occupancy"]["mean"]
 
@@ -167,7 +186,7 @@ def episode_settings(cfg: DictConfig) -> dict:
     items = resolved(cfg["items"])
     path = items.get("path")
     if isinstance(path, str) and Path(path).is_file():  # of a recorded stream the content counts, not its place
-        items["sha256"] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        items["sha256"] = hashlib.sha256(read_file(path)).hexdigest()
     return {
         "env": resolved(cfg.env),
         "items": items,
@@ -187,22 +206,29 @@ def read_comparison(path: Path, expected: dict) -> dict:
     Raises:
         ValueError: for a file that cannot be read, or that is about other episodes.
     """
+    refused = f"compare={str(path)!r}: expected an evaluation.json"
     try:
-        other = json.loads(path.read_text())
-        torch.tensor(other["occupancy"]["per_episode"], dtype=torch.float64)
-        cell = dict(other["env"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"compare={str(path)!r}: expected an evaluation.json ({error}).") from error
+        other = json.loads(read_file(path, MAX_EVALUATION))
+        cell, values, name = dict(other["env"]), other["occupancy"]["per_episode"], other.get("planner")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{refused} ({error}).") from error
     for key in ("stream", "seed", "episodes", "items"):
         ours, theirs = expected[key], other.get(key)
         if key == "items" and isinstance(theirs, dict):  # a recorded stream: by content if both know it, else by path
             ignored = "path" if "sha256" in ours and "sha256" in theirs else "sha256"
             ours, theirs = ({k: v for k, v in items.items() if k != ignored} for items in (ours, theirs))
         if ours != theirs:
-            raise ValueError(f"compare={str(path)!r}: its {key} is {other.get(key)!r}, expected {expected[key]!r}.")
+            found = reprlib.repr(other.get(key))
+            raise ValueError(f"compare={str(path)!r}: its {key} is {found}, expected {reprlib.repr(expected[key])}.")
     for key in CELL_SETTINGS:
         if expected["env"][key] != cell.get(key):
-            raise ValueError(f"compare={str(path)!r}: env.{key}={cell.get(key)}, expected {expected['env'][key]}.")
+            found = reprlib.repr(cell.get(key))
+            raise ValueError(f"compare={str(path)!r}: env.{key}={found}, expected {expected['env'][key]}.")
+    count = expected["episodes"]
+    if not isinstance(values, list) or len(values) != count or not all(is_number(v) and 0 <= v <= 1 for v in values):
+        raise ValueError(f"{refused} whose occupancy.per_episode is a list of {count} numbers between 0 and 1.")
+    if not isinstance(name, str) or not name.isprintable() or len(name) > 100:
+        raise ValueError(f"{refused} whose planner is a name to print, got {reprlib.repr(name)}.")
     return other
 
 

@@ -16,6 +16,7 @@ from pickplace.runs.allowlist import trusted_config
 from pickplace.runs.errors import one_sentence
 from pickplace.runs.registry import build
 from pickplace.task.cell import CELL_SETTINGS, cell_from_settings
+from pickplace.task.files import read_text
 
 CARD = "card.json"
 
@@ -36,7 +37,7 @@ def export(source, folder: Path, evaluations: list[Path]) -> None:
     results = []
     for path in evaluations:
         try:
-            result = json.loads(Path(path).read_text())
+            result = json.loads(read_text(path))
             found = result["trained"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: expected an evaluation.json of a trained policy ({error}).") from error

@@ -1,17 +1,23 @@
 """The ``pickplace-plan`` command: one plan from two ``.npy`` files, or a process that answers JSON lines."""
 
 import argparse
+import io
 import json
 import sys
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from pickplace.runs.errors import one_sentence
+from pickplace.runs.errors import one_sentence, write_output
+from pickplace.task.files import read_file
 
 if TYPE_CHECKING:
     from pickplace.robot.planner import Planner
+
+MAX_LINE = 2**24  # greatest length of a request, in bytes
+MAX_MAP = 2**26  # greatest size of a .npy file, in bytes
 
 #: Keys of a request; ``id`` comes back as it is.
 REQUEST_KEYS = ("id", "bin_depth", "tote_depth", "tote_height", "cell_size", "tolerance", "alternatives")
@@ -67,28 +73,41 @@ def run(args: argparse.Namespace) -> None:
     Raises:
         ValueError: for arguments, a checkpoint or maps that cannot be used.
     """
-    from pickplace.robot.planner import Planner  # here, so that --help need not wait for torch
+    from pickplace.robot.planner import DepthMapError, Planner  # here, so that --help need not wait for torch
     from pickplace.runs.machine import use_threads
 
     if (args.bin is None) != (args.tote is None):
         missing = "--bin" if args.bin is None else "--tote"
         raise ValueError(f"{missing}: no file; expected both --bin and --tote, or neither to read JSON lines.")
+    if sys.stdout is None or (sys.stdin is None and args.bin is None):
+        raise ValueError("standard input or output is closed; expected requests and a place for the plans.")
     use_threads("--threads", args.threads)
     sizes = {key: getattr(args, key) for key in ("bin_size", "tote_size", "effector_size", "rotations")}
     sizes = {key: value for key, value in sizes.items() if value is not None}
     candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates
     planner = Planner.load(args.checkpoint, candidates=candidates, device=args.device, trust=args.trust, **sizes)
     defaults = {key: getattr(args, key) for key in ("tote_height", "cell_size", "tolerance", "alternatives")}
+    planner.check_settings(**defaults)  # now, not in the answer to each request
     if args.bin is not None:
-        result = plan_as_dict(
-            planner, args.time, bin_depth=read_map(args.bin), tote_depth=read_map(args.tote), **defaults
-        )
-        sys.stdout.write(json.dumps(result, indent=1) + "\n")
+        maps = {"bin_depth": read_map(args.bin), "tote_depth": read_map(args.tote)}
+        try:
+            result = plan_as_dict(planner, args.time, **maps, **defaults)
+        except DepthMapError as error:
+            file = args.tote if str(error).startswith("tote_depth") else args.bin
+            raise DepthMapError(f"{file}: {error}") from error
+        write_output(json.dumps(result, indent=1) + "\n")
         return
-    for line in sys.stdin.buffer:
-        if line.strip():
-            sys.stdout.write(json.dumps(answer(planner, line, defaults, args.time)) + "\n")
-            sys.stdout.flush()
+    for line in lines_of(sys.stdin.buffer):
+        if line.strip() or len(line) > MAX_LINE:
+            write_output(json.dumps(answer(planner, line, defaults, args.time)) + "\n")
+
+
+def lines_of(stream: BinaryIO) -> Iterator[bytes]:
+    """Yield the lines of a stream; of a line longer than :data:`MAX_LINE` only the first bytes, at once."""
+    while line := stream.readline(MAX_LINE + 1):
+        yield line
+        while len(line) > MAX_LINE and not line.endswith(b"\n"):
+            line = stream.readline(MAX_LINE + 1)
 
 
 def plan_as_dict(planner: "Planner", print_latency: bool, **request) -> dict:
@@ -105,6 +124,8 @@ def answer(planner: "Planner", line: bytes, defaults: dict, print_latency: bool 
     """Return the reply to one line: a plan, or ``{"error": ...}`` in one sentence; with the request's ``id``."""
     reply = {}
     try:
+        if len(line) > MAX_LINE:
+            raise ValueError(f"the line has more than {MAX_LINE:,} bytes; expected a shorter one.")
         request = json.loads(line.decode(), parse_constant=refuse_constant, parse_float=finite_float)
         if not isinstance(request, dict):
             raise ValueError(f"got {type(request).__name__}, expected an object with bin_depth and tote_depth.")
@@ -140,8 +161,8 @@ def read_map(path: str) -> np.ndarray:
         ValueError: naming the file.
     """
     try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        values = np.load(io.BytesIO(read_file(path, MAX_MAP)), allow_pickle=False)
+    except Exception as error:  # of any type: numpy evaluates the header
         raise ValueError(f"{path}: cannot be read as a .npy file ({error}).") from error
     if not isinstance(values, np.ndarray):
         raise ValueError(f"{path}: expected a .npy file with one array, got an archive.")

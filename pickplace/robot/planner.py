@@ -144,10 +144,8 @@ class Planner:
             DepthMapError: for a map of another shape or type, a value that is not finite, out of range or too far from
                 a whole number of height units, an empty bin, or anything but one cuboid in it; it names the cell.
         """
-        lengths = Lengths(self.cell, cell_size, tolerance)
-        if not is_whole(alternatives) or alternatives < 0:
-            raise DepthMapError(f"alternatives={reprlib.repr(alternatives)}: expected a whole number >= 0.")
-        state = self._read_state(bin_depth, tote_depth, tote_height, lengths)
+        lengths, height = self.check_settings(tote_height, cell_size, tolerance, alternatives)
+        state = self._read_state(bin_depth, tote_depth, height, lengths)
         observation = observe(self.terms, self.cell, state)
         status, action, step = self._decide(observation, state)
         capacity = self.cell.tote_volume(int(state.tote_height))
@@ -167,10 +165,20 @@ class Planner:
         )
         return plan if action is None or step is None else self._add_poses(plan, action, step, lengths)
 
-    def _read_state(self, bin_depth, tote_depth, tote_height, lengths: Lengths) -> State:
-        """Return the state that measured maps show; arguments and errors as of :meth:`plan`."""
+    def check_settings(self, tote_height, cell_size, tolerance, alternatives) -> tuple[Lengths, int]:
+        """Return the conversion of lengths and the tote's height in height units; arguments as of :meth:`plan`.
+
+        Raises:
+            DepthMapError: naming the argument that is out of range.
+        """
+        lengths = Lengths(self.cell, cell_size, tolerance)
+        if not is_whole(alternatives) or alternatives < 0:
+            raise DepthMapError(f"alternatives={reprlib.repr(alternatives)}: expected a whole number >= 0.")
+        return lengths, self.cell.tote_size[2] if tote_height is None else lengths.units_of_tote_height(tote_height)
+
+    def _read_state(self, bin_depth, tote_depth, height: int, lengths: Lengths) -> State:
+        """Return the state that measured maps show; ``height`` is the tote's, in height units."""
         cell = self.cell
-        height = cell.tote_size[2] if tote_height is None else lengths.units_of_tote_height(tote_height)
         bin_map = lengths.units_of_map("bin_depth", bin_depth, cell.bin_size[:2], FAR)
         tote_map = lengths.units_of_map("tote_depth", tote_depth, cell.tote_size[:2], height)
         check_one_cuboid(bin_map, lengths.unit_name)

@@ -9,7 +9,6 @@ import hashlib
 import json
 import os
 import shutil
-import stat
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,10 +19,13 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
+from pickplace.task.files import read_file
+
 SCHEMA = 1
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"  # weights that the package ships
 TENSORS, FACTS = "state.safetensors", "state.json"
 PREVIOUS = "previous"  # the checkpoint before checkpoints/last, beside it
+MAX_BYTES = {FACTS: 2**25, TENSORS: 2**32}  # greatest size of each file
 
 Module = TypeVar("Module", bound=torch.nn.Module)
 
@@ -50,10 +52,15 @@ def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> No
     blob = save(tensors)
     digest = hashlib.sha256(blob).hexdigest()
     text = json.dumps({"schema": SCHEMA, "sha256": digest, **facts, "state": rest}, indent=1)
+    contents = {TENSORS: blob, FACTS: text.encode()}
+    if large := [name for name, content in contents.items() if len(content) > MAX_BYTES[name]]:
+        raise CheckpointError(
+            f"{folder}: {large[0]} has more than {MAX_BYTES[large[0]]:,} bytes; nobody could read it."
+        )
     shutil.rmtree(new, ignore_errors=True)
     try:
         new.mkdir(parents=True)
-        for name, content in ((TENSORS, blob), (FACTS, text.encode())):
+        for name, content in contents.items():
             with open(new / name, "wb") as file:
                 file.write(content)
                 file.flush()
@@ -146,7 +153,7 @@ def locate(path, prefer: str = "best") -> Path:
 def read_facts(path, prefer: str = "best") -> dict:
     """Return the facts of the checkpoint that :func:`locate` finds, unchecked; empty if they cannot be read."""
     try:
-        facts = json.loads((locate(path, prefer) / FACTS).read_bytes())
+        facts = json.loads(read_file(locate(path, prefer) / FACTS, MAX_BYTES[FACTS]))
     except (CheckpointError, OSError, ValueError, RecursionError):
         return {}
     usable = isinstance(facts, dict) and isinstance(facts.get("frames"), int) and isinstance(facts.get("config"), dict)
@@ -220,15 +227,8 @@ def _read(folder: Path) -> tuple[dict, dict]:
 def _read_files(folder: Path) -> tuple[dict, bytes]:
     """Read the facts and the bytes of the tensors, and compare schema and checksum."""
     try:
-        for name in (FACTS, TENSORS):
-            if not stat.S_ISREG((folder / name).lstat().st_mode):  # reading a pipe would block
-                raise CheckpointError(
-                    f"{folder}: {name} is a link or no file; expected a file of the checkpoint itself."
-                )
-        facts = json.loads((folder / FACTS).read_bytes())
-        blob = (folder / TENSORS).read_bytes()
-    except CheckpointError:
-        raise
+        content, blob = (read_file(folder / name, MAX_BYTES[name], links=False) for name in (FACTS, TENSORS))
+        facts = json.loads(content)
     except (OSError, ValueError, RecursionError) as error:  # a RecursionError from deeply nested JSON
         raise CheckpointError(f"{folder}: the checkpoint cannot be read ({error}).") from error
     if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:

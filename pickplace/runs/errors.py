@@ -4,7 +4,7 @@ import errno
 import os
 import signal
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
@@ -35,16 +35,35 @@ def one_sentence():
     """
     try:
         yield
+        write_output()
     except KeyboardInterrupt as stop:  # its argument is the signal, of a training that saved before
         sys.exit(128 + (stop.args[0] if stop.args else signal.SIGINT))
     except BrokenPipeError:  # the reader of the output, such as head, has closed it
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except Exception as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
-        sys.stderr.write(f"error: {sentence(error)}\n")
+        with suppress(OSError):  # a terminal that was closed
+            sys.stderr.write(f"error: {sentence(error)}\n")
         sys.exit(2)
+    finally:
+        with suppress(OSError):
+            write_output()
+
+
+def write_output(text: str = "") -> None:
+    """Write to standard output, now.
+
+    Raises:
+        OSError: if that fails. The output is dropped then: the interpreter would try again, and print a traceback.
+    """
+    try:
+        if sys.stdout is not None:
+            sys.stdout.write(text)
+            sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise OSError(error.errno, error.strerror, "standard output") from error
 
 
 def sentence(error: Exception) -> str:
@@ -64,6 +83,8 @@ def _sentence(error: Exception) -> str:
             return f"{error.missing_cfg_file}: there is no such config; expected one of {', '.join(error.options)}."
     if isinstance(error, OSError) and error.filename and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"{error.filename}: {error.strerror}; expected a place where you may read and write."
+    if isinstance(error, OSError) and error.filename and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"{error.filename}: {error.strerror}; expected free space."
     if isinstance(error, EXPECTED):
         noise = ("full_key", "object_type", "See https", "To append", "Config search path", "provider=")
         lines = [line.strip() for line in str(error).splitlines()]

@@ -11,14 +11,18 @@ from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+
+from pickplace.runs.references import REFERENCE, children
+from pickplace.task.files import read_file
 
 LOCK = ".lock"  # held by the process that trains in the folder
 FAILURE = "failure.txt"  # the error of a failed run of a sweep
+EVALUATION = "evaluation.json"  # the result of an evaluation
+MAX_NOTE = 2**20  # greatest size of a note of Hydra's, in bytes
 
 
 class OccupiedError(ValueError):
-    """A run folder holds a training already, finished or running."""
+    """A run folder holds a training or an evaluation already, finished or running."""
 
 
 @contextmanager
@@ -33,7 +37,7 @@ def claim(run_dir: Path):
         lock.acquire(timeout=0)
     except Timeout:
         raise OccupiedError(
-            f"{run_dir}: another process is training there; expected another run folder, or to wait for it."
+            f"{run_dir}: another process is working there; expected another run folder, or to wait for it."
         ) from None
     try:
         yield
@@ -42,7 +46,7 @@ def claim(run_dir: Path):
 
 
 def refuse_claimed(run_dir: Path) -> None:
-    """Refuse a run folder in which another process trains.
+    """Refuse a run folder in which another process trains or evaluates.
 
     Raises:
         OccupiedError: naming the folder.
@@ -53,7 +57,7 @@ def refuse_claimed(run_dir: Path) -> None:
 
 
 def is_claimed(run_dir: Path) -> bool:
-    """Return whether another process trains in a run folder."""
+    """Return whether another process trains or evaluates in a run folder."""
     try:
         refuse_claimed(run_dir)
     except OccupiedError:
@@ -62,11 +66,15 @@ def is_claimed(run_dir: Path) -> bool:
 
 
 def refuse_occupied(run_dir: Path) -> None:
-    """Refuse a folder for a new run if it holds a checkpoint: the files of two runs would be mixed.
+    """Refuse a folder for a new run if it holds a checkpoint or an evaluation: the files of two runs would be mixed.
 
     Raises:
         OccupiedError: naming the folder.
     """
+    if (run_dir / EVALUATION).exists():
+        raise OccupiedError(
+            f"{run_dir}: there is an evaluation already; expected another folder, hydra.run.dir=<folder>."
+        )
     saved = run_dir / "checkpoints"
     if saved.is_dir() and any(not entry.name.endswith(".new") for entry in saved.iterdir()):
         raise occupied(run_dir)
@@ -81,12 +89,18 @@ def refuse_links(run_dir: Path) -> None:
     """Refuse to resume in a run folder, which may come from others, that redirects what is written elsewhere.
 
     Raises:
-        ValueError: for a link, a pipe or a device in it, naming it.
+        ValueError: for a link, a file with a second name (a hard link), a pipe or a device in it, naming it.
     """
     for folder in (run_dir, run_dir / "checkpoints", run_dir / ".hydra"):
         for entry in os.scandir(folder) if folder.is_dir() else ():
-            if entry.is_symlink() or not (entry.is_file() or entry.is_dir()):
+            is_file = entry.is_file(follow_symlinks=False)
+            if entry.is_symlink() or not (is_file or entry.is_dir()):
                 raise ValueError(f"{entry.path}: a link or no regular file; expected only files and folders in a run.")
+            if is_file and entry.stat(follow_symlinks=False).st_nlink > 1:
+                raise ValueError(
+                    f"{entry.path}: a hard link, a file with another name elsewhere; expected a run folder of its own, "
+                    "such as a copy (cp -r)."
+                )
 
 
 @contextmanager
@@ -119,40 +133,61 @@ def _remove_empty_folders(cfg) -> None:
 
 def noted_overrides(run_dir: Path) -> list[str]:
     """Return the overrides of the command that began a run; empty if Hydra noted none."""
-    words = _note(run_dir, "overrides.yaml")
-    return [word for word in words if isinstance(word, str)] if isinstance(words, list) else []
+    words = read_note(run_dir, "overrides.yaml")
+    return _texts(words)
 
 
 def noted_config_folders(run_dir: Path) -> list[str]:
     """Return the words of the command that began a run that name folders of config files."""
-    notes = _note(run_dir, "hydra.yaml")
+    notes = read_note(run_dir, "hydra.yaml")
     try:
         sources = notes["hydra"]["runtime"]["config_sources"]
-        folders = [source["path"] for source in sources if source["provider"] == "command-line"]
-        searchpath = [word for word in notes["hydra"]["overrides"]["hydra"] if "hydra.searchpath" in word]
+        folders = _texts([source["path"] for source in sources if source["provider"] == "command-line"])
+        searchpath = [word for word in _texts(notes["hydra"]["overrides"]["hydra"]) if "hydra.searchpath" in word]
     except (KeyError, TypeError):
         return []
     return [*(word for folder in folders for word in ("--config-dir", folder)), *searchpath]
 
 
+def _texts(values) -> list[str]:
+    """Return the texts of a list; none of anything else."""
+    return [value for value in values if isinstance(value, str)] if isinstance(values, list) else []
+
+
 def changed_values(run_dir: Path, cfg: DictConfig) -> list[str]:
-    """Return the values, as ``key=value``, in which a config differs from the one with which its run began."""
-    began = _note(run_dir, "config.yaml")
+    """Return the values, as ``key=value``, in which a config differs from the one with which its run began.
+
+    Nothing in the note is resolved. An interpolation that checkpoints do not keep, such as of a variable of the
+    environment, is taken as unchanged.
+    """
+    began = read_note(run_dir, "config.yaml")
     if not isinstance(began, dict):
         return []
 
     def leaves(node, path: str = "") -> dict:
         if not isinstance(node, dict):
             return {path.removeprefix("."): node}
-        return {key: value for name in node for key, value in leaves(node[name], f"{path}.{name}").items()}
+        return {key: value for name, child in children(node) for key, value in leaves(child, f"{path}.{name}").items()}
 
+    def is_unknown(value) -> bool:
+        return isinstance(value, str) and "${" in value and not REFERENCE.fullmatch(value)
+
+    before, now = leaves(began), leaves(OmegaConf.to_container(cfg, resolve=False))
+    return [f"{key}={now[key]}" for key in now if now[key] != before.get(key) and not is_unknown(before.get(key))]
+
+
+class _NoteLoader(yaml.SafeLoader):
+    """A loader without aliases, which Hydra does not write: a few of them unfold to more than any memory holds."""
+
+    def compose_node(self, parent, index):
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("an alias")
+        return super().compose_node(parent, index)
+
+
+def read_note(run_dir: Path, name: str):
+    """Return the content of a note of Hydra's, such as ``config.yaml``, unresolved; None if it cannot be read."""
     try:
-        before, now = (leaves(OmegaConf.to_container(OmegaConf.create(c), resolve=True)) for c in (began, cfg))
-    except OmegaConfBaseException:  # a reference that leads nowhere any more
-        return []
-    return [f"{key}={value}" for key, value in now.items() if value != before.get(key)]
-
-
-def _note(run_dir: Path, name: str):
-    path = Path(run_dir) / ".hydra" / name
-    return yaml.safe_load(path.read_text()) if path.is_file() else None
+        return yaml.load(read_file(Path(run_dir) / ".hydra" / name, MAX_NOTE), _NoteLoader)
+    except Exception:  # of any type: PyYAML's constructors do not check what they read
+        return None

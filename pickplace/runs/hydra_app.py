@@ -117,6 +117,11 @@ def _clearer_errors(config_name: str, overrides: list[str]):
         yield
     except _Refusal as error:
         raise ValueError(str(error)) from None
+    except OSError as error:
+        if error.filename or error.errno is None or not HydraConfig.initialized():
+            raise
+        folder = HydraConfig.get().runtime.output_dir  # Hydra's notes are there, which a full disk does not name
+        raise OSError(error.errno, error.strerror, folder) from error
     except ConfigCompositionException as error:
         if not (key := re.match("Could not override '(.*)'", str(error))):
             raise
@@ -140,20 +145,20 @@ class _Refusal(BaseException):
 
 
 class FreshFolder(Callback):
-    """Refuses the folder of another training, before Hydra overwrites its notes on that training."""
+    """Refuses the folder of another training or evaluation, before Hydra overwrites its notes on that one."""
 
     def on_run_start(self, config: DictConfig, **kwargs) -> None:
-        before = HydraConfig.instance().cfg
-        try:
-            HydraConfig.instance().set_config(config)  # for references such as ${hydra:job.name}
-            folder = Path(config.hydra.run.dir)
-        finally:
-            HydraConfig.instance().cfg = before
+        HydraConfig.instance().set_config(config)  # for references such as ${hydra:job.name}
+        folder = Path(config.hydra.run.dir)
         try:
             refuse_claimed(folder)
             refuse_occupied(folder)
         except OccupiedError as error:
+            HydraConfig.instance().cfg = None  # nothing in that folder is ours
             raise _Refusal(str(error)) from None
+        with read_write(config.hydra.runtime):  # :func:`command` needs it if Hydra cannot write its notes
+            config.hydra.runtime.output_dir = str(folder.absolute())
+        HydraConfig.instance().set_config(config)
 
 
 class SweepCallback(Callback):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from pickplace.runs.errors import missing_extra
+from pickplace.task.files import read_text, replaced_file
 
 if TYPE_CHECKING:
     from torchrl.record.loggers.common import Logger
@@ -39,12 +40,10 @@ class CsvLogger:
     def _rewrite(self, rows):
         """Write the file with these rows, and columns for all their metrics."""
         self._columns += [key for key in dict.fromkeys(key for row in rows for key in row) if key not in self._columns]
-        new = self.path.with_name(".metrics.csv.new")
-        with new.open("w", newline="") as file:
+        with replaced_file(self.path) as new, new.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
             writer.writerows(rows)
-        new.replace(self.path)
         self._file: IO[str] = self.path.open("a+", newline="")  # it can be read when its name is gone
         self._writer = csv.DictWriter(self._file, self._columns)
 
@@ -245,8 +244,7 @@ def read_csv(path) -> list[dict[str, float]]:
     Raises:
         ValueError: naming file and line, for a cell that is no number.
     """
-    with Path(path).open(newline="") as file:
-        return parse_csv(file.read(), path)
+    return parse_csv(read_text(path), path)
 
 
 def parse_csv(text: str, path) -> list[dict[str, float]]:

@@ -28,6 +28,9 @@ log = logging.getLogger(__name__)
 #: the latest validation.
 COUNTERS: dict[str, Any] = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
 
+#: Least and greatest value of each counter; other numbers need only be finite.
+RANGES = {"best": (-1, 1), "occupancy": (0, 1), "ci95_low": (0, 1), "ci95_high": (0, 1)}
+
 #: Settings that may leave the run folder or the machine, and their values that do not. The user must repeat others on
 #: resume.
 LOCAL_VALUES = {
@@ -38,8 +41,8 @@ LOCAL_VALUES = {
 
 #: Settings that a resumed run cannot change, since the state of its episodes depends on them.
 FIXED_KEYS = (
-    "seed", *(f"env.{key}" for key in CELL_SETTINGS), "env.num_envs", "items", "algo.mask_infeasible",
-    "collector.workers",
+    "seed", *(f"env.{key}" for key in CELL_SETTINGS), "env.num_envs", "env.observation", "items",
+    "algo.mask_infeasible", "collector.workers",
 )  # fmt: skip
 
 
@@ -104,8 +107,12 @@ def _check_counters(place: str, facts: dict) -> None:
         raise error("latest", facts["latest"], "a validation")
     for key, value in {"iteration": facts["iteration"], "best": facts["best"], **facts["latest"]}.items():
         kind = int if key == "iteration" else (int, float)
-        if isinstance(value, bool) or not isinstance(value, kind) or not -(2**63) < value < 2**63:
-            raise error(key, value, "a number")
+        least, most = (0, facts["frames"]) if key == "iteration" else RANGES.get(key, (1 - 2**63, 2**63 - 1))
+        if isinstance(value, bool) or not isinstance(value, kind) or not least <= value <= most:
+            raise error(key, value, f"a number from {least:,} to {most:,}")
+    frames = facts["curriculum"].get("frames") if isinstance(facts["curriculum"], dict) else None
+    if isinstance(frames, int) and frames > facts["frames"]:
+        raise error("curriculum|frames", frames, f"at most the {facts['frames']:,} frames")
 
 
 def _refuse_remote_values(saved: DictConfig, repeated: set[str]) -> None:
@@ -176,20 +183,43 @@ def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
         )
     own = {n: {"step": torch.tensor(0.0), "exp_avg": p, "exp_avg_sq": p} for n, p in parameters.items() if n in state}
     moments = checkpoint.matching_state(state, own, "optimizer")
+    for n, moment in moments.items():
+        for key in ("step", "exp_avg_sq"):
+            if (moment[key] < 0).any():
+                raise checkpoint.CheckpointError(f"The checkpoint's optimizer is of no use: {n}|{key} is negative.")
     optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
 
 
+#: Signals after which a training saves and ends: Ctrl-C, a scheduler's, and that of a closed terminal.
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
 class StopRequest:
-    """Ctrl-C or SIGTERM: the loop finishes its batch and saves. A second Ctrl-C ends the process at once."""
+    """A signal to stop: the loop finishes its batch and saves. Ctrl-C after it ends the process at once.
+
+    A closed terminal is ignored if it was before, as under ``nohup``.
+
+    Attributes:
+        signal: number of the first signal; None: there was none.
+    """
 
     def __init__(self):
-        self.requested = 0  # the signal
-        self._previous = {number: signal.signal(number, self._request) for number in (signal.SIGINT, signal.SIGTERM)}
+        self.signal: int | None = None
+        ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+        numbers = [number for number in STOP_SIGNALS if number != signal.SIGHUP or not ignored]
+        self._previous = {number: signal.signal(number, self._request) for number in numbers}
+
+    @property
+    def requested(self) -> bool:
+        """Whether a signal came."""
+        return self.signal is not None
 
     def _request(self, number, frame):
         if self.requested:
-            os._exit(130)
-        self.requested = number
+            if number == signal.SIGINT:
+                os._exit(130)
+            return  # a terminal sends several
+        self.signal = number
         log.info("stopping after this batch; press Ctrl-C again to stop at once")
 
     def restore(self) -> None:
@@ -199,16 +229,17 @@ class StopRequest:
 
 
 @contextmanager
-def checkpoint_hint(latest: Callable[[], Path | None], arguments: str = ""):
+def checkpoint_hint(latest: Callable[[], Path | None], arguments: str = "", errors: type[Exception] = Exception):
     """Add to an error that ends a training the command that resumes it.
 
     Args:
         latest: returns the folder of the latest whole checkpoint, or None.
         arguments: further words of that command, such as `` trust=[my_models]``.
+        errors: the type of errors to which it is added.
     """
     try:
         yield
-    except Exception as error:
+    except errors as error:
         hint = "Nothing had been saved before."
         if folder := latest():
             # With the same settings, the same batch would lead to the same numbers.

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from pickplace.task.checks import flag, is_whole
+from pickplace.task.files import read_text
 from pickplace.task.state import Item
 
 #: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
@@ -122,7 +123,7 @@ class Kinds(ItemDistribution):
         return torch.searchsorted(self._edges.to(uniform.device), uniform, right=True)
 
 
-#: Greatest length of a recorded file, in characters, and number of kinds: more would fill the memory.
+#: Greatest size of a recorded file, in bytes, and number of kinds: more would fill the memory.
 MAX_TEXT, MAX_KINDS = 100_000_000, 100_000
 
 
@@ -165,13 +166,9 @@ class Recorded(ItemDistribution):
         if not self.path.is_file():
             raise ValueError(f"items.path={str(path)!r}: no such file; expected a CSV with columns w,d,h (and x,y).")
         try:
-            with self.path.open(newline="", encoding="utf-8-sig") as file:
-                text = file.read(MAX_TEXT + 1)
-                if len(text) > MAX_TEXT:
-                    raise ValueError(f"items.path={str(path)!r}: longer than {MAX_TEXT:,} characters.")
-                reader = csv.reader(io.StringIO(text, newline=""))
-                table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
-        except (UnicodeDecodeError, csv.Error) as error:
+            reader = csv.reader(io.StringIO(read_text(path, MAX_TEXT, "utf-8-sig"), newline=""))
+            table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
+        except csv.Error as error:
             raise ValueError(f"{path}: {error}; expected a CSV in UTF-8.") from error
         header = table[0][1] if table else []
         if header not in (["w", "d", "h"], ["w", "d", "h", "x", "y"]):

@@ -15,6 +15,7 @@ from torchrl.collectors.distributed import RayCollector
 
 from pickplace.runs.checkpoint import CheckpointError
 from pickplace.runs.errors import WorkerDied, missing_extra
+from pickplace.runs.resume import STOP_SIGNALS
 
 
 class ResumableCollector(Collector):
@@ -130,12 +131,12 @@ def set_rng_state(state: dict, device: torch.device) -> None:
 
 
 def ignore_signals() -> None:
-    """Ignore Ctrl-C and SIGTERM in a worker process.
+    """Ignore Ctrl-C, SIGTERM and SIGHUP in a worker process.
 
     Terminals and schedulers send them to workers too; the main process finishes the batch, saves, and closes the
     workers.
     """
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 

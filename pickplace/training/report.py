@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from pickplace.runs.folder import changed_values, noted_config_folders, noted_overrides
 from pickplace.runs.loggers import read_csv
 from pickplace.task.cell import CellSpec
+from pickplace.task.files import replaced_file
 from pickplace.views.figures import failure_mix
 from pickplace.views.replay import ASSETS, page
 
@@ -64,13 +65,8 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
     html = (ASSETS / "report.html").read_text(encoding="utf-8")
     # In one pass, so that no content is taken for a placeholder.
     html = re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], html)
-    unfinished = run_dir / f".{REPORT}.new"
-    try:
-        unfinished.write_text(html, encoding="utf-8")
-        unfinished.replace(run_dir / REPORT)
-    except OSError as error:
-        unfinished.unlink(missing_ok=True)
-        raise OSError(error.errno, error.strerror, str(run_dir / REPORT)) from error
+    with replaced_file(run_dir / REPORT) as new:
+        new.write_text(html, encoding="utf-8")
 
 
 def _table(head: tuple, rows: list[tuple]) -> str:

@@ -15,13 +15,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf, read_write
+from omegaconf import DictConfig, read_write
 
 from pickplace.runs.checkpoint import read_facts
 from pickplace.runs.errors import one_sentence
-from pickplace.runs.folder import FAILURE, is_claimed, noted_overrides
+from pickplace.runs.folder import FAILURE, is_claimed, noted_overrides, read_note
 from pickplace.runs.hydra_app import SweepCallback
 from pickplace.runs.loggers import read_csv
+from pickplace.task.checks import is_whole
+from pickplace.task.files import read_text
 from pickplace.views.figures import figure_of
 
 log = logging.getLogger(__name__)
@@ -93,12 +95,13 @@ def read_run(folder: Path) -> SweepRun:
         if latest := facts.get("latest"):
             run.validations = [{"frames": run.frames, **{f"eval/{key}": value for key, value in latest.items()}}]
     if (folder / FAILURE).is_file():
-        run.status, run.error = "failed", (folder / FAILURE).read_text().strip()
+        run.status, run.error = "failed", read_text(folder / FAILURE).strip()
     elif is_claimed(folder):
         run.status = "running"
     else:  # the checkpoint's config first: a resumed run may have a larger budget
-        cfg = OmegaConf.create(facts["config"]) if facts else OmegaConf.load(folder / ".hydra" / "config.yaml")
-        is_complete = run.frames >= cfg.total_frames or facts.get("ended") is True
+        config = facts.get("config") or read_note(folder, "config.yaml")
+        budget = config.get("total_frames") if isinstance(config, dict) else None
+        is_complete = (is_whole(budget) and run.frames >= budget) or facts.get("ended") is True
         run.status = "finished" if is_complete else "stopped"
     return run
 

@@ -11,7 +11,7 @@ from pickplace.runs import checkpoint
 from pickplace.runs.errors import one_sentence
 from pickplace.runs.folder import FAILURE, claim, refuse_links
 from pickplace.runs.hydra_app import command
-from pickplace.runs.resume import interrupted_run, resumed_config
+from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config
 from pickplace.training.metrics import episode_metrics
 from pickplace.training.trainer import Trainer
 
@@ -80,11 +80,12 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         if trainer.last_saved != trainer.frames:  # after the loop, so that a stop request is never missed
             trainer.save("last")
 
-    trainer.log_ending(bool(stop.requested))
-    trainer.write_report()
+    trainer.log_ending(stop.requested)
+    with checkpoint_hint(lambda: trainer.safe_folder, trainer.resume_overrides):
+        trainer.write_report()
     log.info("run folder: %s", run_dir)
     if stop.requested:
-        raise KeyboardInterrupt(stop.requested)  # ends a whole sweep, not only this run
+        raise KeyboardInterrupt(stop.signal)  # ends a whole sweep, not only this run
     return float(trainer.latest.get("occupancy", float("nan")))
 
 

@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
+from pickplace.envs.saved_state import check_saved_state
 from pickplace.evaluation.play import Episodes, play
 from pickplace.policies.base import Policy, as_collection_policy, as_critic
 from pickplace.runs import checkpoint
@@ -29,6 +30,7 @@ from pickplace.runs.resume import (
     load_optimizer,
     stale_best_frames,
 )
+from pickplace.task.files import replaced_file
 from pickplace.training import callbacks
 from pickplace.training.collectors import rng_state, set_rng_state, watch_workers
 from pickplace.training.curriculum import Curriculum, push_level
@@ -183,7 +185,8 @@ class Trainer:
             if self.resumed:
                 self._restore_state()
             settings = OmegaConf.to_container(cfg, resolve=True)
-            self.logger = build("logger", cfg.logger, folder=self.run_dir, frames=self.frames, settings=settings)
+            with checkpoint_hint(lambda: self.safe_folder, self.resume_overrides, OSError):
+                self.logger = build("logger", cfg.logger, folder=self.run_dir, frames=self.frames, settings=settings)
             stop, self.start_time, self.start_frames = StopRequest(), time.perf_counter(), self.frames
             is_last = self.safe_folder is None or "last" in self.safe_folder.name
             self.last_saved = self.frames if is_last else None  # frames of checkpoints/last
@@ -207,7 +210,12 @@ class Trainer:
         load_optimizer(self.optimizer, self.state.get("optimizer", {}))
         with watch_workers(self.collector):
             own = self.collector.state_dict()
-            self.collector.load_state_dict(checkpoint.matching_state(self.state.get("collector"), own, "collector"))
+            saved = checkpoint.matching_state(self.state.get("collector"), own, "collector")
+            env = self.build_env(num_envs=1, masks=())
+            for part in (saved, *saved.values()):  # of a collector of several workers each has a state
+                if isinstance(part, dict) and "environment" in part:
+                    check_saved_state(env, part["environment"], part["carried"])
+            self.collector.load_state_dict(saved)
             push_level(self.collector, self.curriculum.level)
         # Last: everything above may have drawn.
         set_rng_state(checkpoint.matching_state(self.state, rng_state(self.device), "random generator"), self.device)
@@ -316,7 +324,8 @@ class Trainer:
         run_dir = self.run_dir
         if not (run_dir / "metrics.csv").is_file():
             return
-        learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
+        with replaced_file(run_dir / "learning_curve.png") as new:
+            learning_curve(run_dir / "metrics.csv", new)
         up_to_date = self.episodes is None and (run_dir / REPORT).is_file()  # nothing was trained since
         if self.is_complete and not up_to_date:
             log.info("writing the report")

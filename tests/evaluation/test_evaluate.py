@@ -104,7 +104,7 @@ def test_only_the_same_episodes_are_compared(word, tmp_path):
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         ours, theirs = (episode_settings(compose("evaluate", words)) for words in ([], [word]))
     path = tmp_path / "evaluation.json"
-    path.write_text(json.dumps({**ours, "occupancy": {"per_episode": [0.5]}}))
+    path.write_text(json.dumps({**ours, "planner": "a", "occupancy": {"per_episode": [0.5] * 100}}))
     read_comparison(path, ours)
     key = word.partition("=")[0].removeprefix("evaluation.")
     with pytest.raises(ValueError, match=key if "." in key else f"its {key} is"):

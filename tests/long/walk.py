@@ -25,7 +25,7 @@ SMALL = {
     "pickplace-train resume=": "",
     "pickplace-train": "total_frames=512 env.num_envs=8 evaluation.episodes=4 threads=1",
     "pickplace-evaluate": "evaluation.episodes=4 evaluation.latency_decisions=0 threads=1",
-    "make demo": 'ARGS="evaluation.episodes=2 threads=1"',
+    "make demo": 'DEMO=outputs/demo ARGS="evaluation.episodes=2 threads=1"',
     "make train": 'RUN=outputs/made ARGS="total_frames=2048 evaluation.episodes=4 threads=1"',
     "make test": 'ARGS="tests/task"',
 }

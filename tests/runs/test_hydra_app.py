@@ -171,10 +171,10 @@ def test_bad_files_are_named(run, tmp_path):
 
 
 def test_a_failure_leaves_earlier_results_in_the_folder(run, tmp_path):
-    (tmp_path / "evaluation.json").write_text("{}")
+    (tmp_path / "tote.png").write_text("earlier")
     code, _, err = run("evaluate", "planner=joint_dbl", "env.rotations=5", "hydra.run.dir=.")
     assert code == 2 and "rotations=5" in err
-    assert (tmp_path / "evaluation.json").read_text() == "{}"
+    assert (tmp_path / "tote.png").read_text() == "earlier"
 
 
 def test_full_error_shows_the_traceback(run, monkeypatch):

@@ -40,7 +40,7 @@ def test_every_config_file_names_what_is_in_the_registry():
             visit(".".join(path.parent.relative_to(conf_dir()).parts).removeprefix("experiment"), content, path)
     assert {(place, name) for place, names in REGISTRY.items() for name in names} == used
     text = "".join(path.read_text() for path in conf_dir().rglob("*.yaml"))
-    assert len(re.findall("_target_: pickplace", text)) == 3  # Hydra's callbacks
+    assert len(re.findall("_target_: pickplace", text)) == 4  # Hydra's callbacks
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def test_a_second_process_is_refused(run, undisturbed, tmp_path):
         run_dir.mkdir(exist_ok=True)
         with claim(run_dir):
             code, _, err = run("train", f"{command}={run_dir}")
-        taken = f"{run_dir}: another process is training there; expected another run folder, or to wait for it."
+        taken = f"{run_dir}: another process is working there; expected another run folder, or to wait for it."
         assert (code, err) == (2, f"error: {taken}\n")
 
 
@@ -171,6 +171,7 @@ def test_a_stale_best_is_replaced_if_the_config_has_changed(changed, smoke_run, 
     ("override", "message"),
     [
         ("env.rotations=1", "env.rotations=1: the run began with 4"), ("items.kinds=[[1,1,1]]", "items={"),
+        ("env.observation.tote_depth._target_=bin_depth", "env.observation={"),
         ("env.tote_size=[5,5,1]", "the run began with [4, 4, 1]"), ("env.num_envs=4", "the run began with 8"),
         ("algo.mask_infeasible=false", "the run began with True"), ("model.actor.filters=16", "does not fit"),
         ("curriculum=paper", "cannot be exchanged"), ("+algo.gama=0.9", "did you mean 'gamma'?"),
@@ -206,6 +207,12 @@ def test_a_damaged_checkpoint_is_refused_and_a_whole_one_is_named(smoke_run, tmp
     [
         *(("iteration", value, "iteration is") for value in (None, "x", [], 10**30, 2.5)),
         *(("best", value, "best is") for value in (None, {}, float("nan"))),
+        ("best", 1e18, "best is 1e+18; expected a number from -1 to 1"), ("iteration", -1, "iteration is -1"),
+        ("latest", {"occupancy": 7}, "occupancy is 7; expected a number from 0 to 1"),
+        ("curriculum|level", 10**6, "level of the checkpoint=1000000: expected a whole number"),
+        ("curriculum|frames", 10**6, "curriculum|frames is 1000000; expected at most the 512 frames"),
+        ("curriculum|episodes", 10**6, "episodes of the checkpoint=1000000: expected a whole number"),
+        ("curriculum|window", [float("nan")], "window of the checkpoint=nan: expected a number between 0 and 1"),
         ("latest", 3, "latest is 3; expected a validation that a training wrote"),
         ("latest", {"occupancy": [1]}, "occupancy is [1]; expected a number"),
         *(("curriculum", value, "curriculum is") for value in (None, "x", {}, 10**30)),

@@ -113,7 +113,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_with_a_summary(smoke, tmp_path)
     ("owner", "function", "words"),
     [
         (checkpoint.os, "fsync", "cannot be written .*No space left"),
-        (csv.DictWriter, "writerow", "No space left on device: '{}/metrics.csv'. What was saved before is whole"),
+        (csv.DictWriter, "writerow", "{}/metrics.csv: No space left on device; expected free space. What was saved"),
     ],
 )
 def test_a_full_disk_names_the_checkpoint_before_which_is_whole(smoke, tmp_path, monkeypatch, owner, function, words):

@@ -165,7 +165,8 @@ class Curriculum:
             )
         key = "curriculum {} of the checkpoint".format
         level = whole_number(key("level"), state["level"], self.start, self.end)
-        counts = {name: whole_number(key(name), state[name], 0) for name in ("frames", "level_start", "episodes")}
+        frames = whole_number(key("frames"), state["frames"], 0)
+        counts = {name: whole_number(key(name), state[name], 0, frames) for name in ("level_start", "episodes")}
         if not isinstance(state["window"], list):
             raise ValueError(
                 f"{key('window')}={reprlib.repr(state['window'])}: expected a list of numbers between 0 and 1."
@@ -174,5 +175,5 @@ class Curriculum:
         for name, value in rule.items():
             if not is_finite_number(value):
                 raise ValueError(f"{key(name)}={value!r}: expected a number.")
-        self.tally = Tally(level, window, **counts)
+        self.tally = Tally(level, window, frames, **counts)
         vars(self.advance).update(rule)

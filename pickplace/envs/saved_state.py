@@ -1,0 +1,48 @@
+"""Check of a saved environment before it is restored: a state that no episode leads to is refused."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from pickplace.envs.torchrl import PickPlaceEnv
+from pickplace.runs.checkpoint import CheckpointError
+from pickplace.task.items import MAX_SEED
+from pickplace.task.observation import observe
+from pickplace.task.state import Item, State
+
+
+def check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: Mapping[str, Tensor]) -> None:
+    """Refuse a saved environment whose values are out of range, or do not fit each other.
+
+    Args:
+        env: an environment of the same settings, with any number of problems.
+        saved: the ``state_dict()`` of the saved one.
+        carried: the observation that its next step starts from.
+
+    Raises:
+        CheckpointError: naming the first value that is impossible.
+    """
+
+    def check(key: str, possible: Tensor, expected: str) -> None:
+        if not possible.all():
+            raise CheckpointError(f"The checkpoint's environment is of no use: {key}: expected {expected}.")
+
+    cell = env.cell
+    heights, tote_height, volume, steps = (saved[key] for key in ("heights", "tote_height", "volume", "steps"))
+    episode, seed = saved["episode"], saved["item_seed"]
+    low, high = env.min_tote_height, cell.tote_size[2]
+    check("tote_height", (tote_height >= low) & (tote_height <= high), f"{low} to {high}")
+    check("heights", (heights >= 0) & (heights <= tote_height[:, None, None]), "0 to tote_height")
+    check("volume", (volume >= 0) & (volume <= heights.sum((1, 2))), "at most the volume below the surface")
+    check("steps", (steps >= 0) & (steps <= volume), "at most one for each unit of volume")
+    check("episode", episode >= 0, "at least 0")
+    check("item_seed", (seed >= 0) & (seed < MAX_SEED), "at least 0 and below 2**62")
+    item = env.items.sample(env.stream, seed.expand_as(episode), episode, steps, cell.bin_size)
+    check("item", saved["item"] == torch.stack(item, -1), "the item of this episode and step")
+    seen = observe(env.terms, cell, State(heights, tote_height, Item(*item)))
+    seen["occupancy"] = (volume / cell.tote_volume(tote_height))[:, None]
+    seen |= {key: torch.zeros(len(steps), 1) for key in ("failure", "done", "terminated", "truncated")}
+    for key, value in seen.items():
+        close = (carried[key].double() - value.double()).abs() < 1e-4  # another device rounds in another way
+        check(f"the carried {key}", close, "what the state shows")

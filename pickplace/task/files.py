@@ -1,0 +1,63 @@
+"""Files that a user or a stranger's run folder names: how they are read, and how they are replaced as a whole."""
+
+import stat
+from contextlib import contextmanager
+from pathlib import Path
+
+#: Greatest size of a file that is read, in bytes, unless a reader sets its own: more would fill the memory.
+MAX_BYTES = 2**30
+
+
+def read_file(path, most: int = MAX_BYTES, links: bool = True) -> bytes:
+    """Return the content of a regular file. Pipes and devices are not opened: reading them could block or never end.
+
+    The size is that at the beginning, which is 0 for the endless files of ``/proc``.
+
+    Args:
+        path: the file.
+        most: greatest size, in bytes.
+        links: follow a symbolic link instead of refusing it.
+
+    Raises:
+        ValueError: naming the file, if it is too large or not a regular one.
+        OSError: if there is none, or it cannot be read.
+    """
+    path = Path(path)
+    found = path.stat(follow_symlinks=links)
+    if not stat.S_ISREG(found.st_mode):
+        raise ValueError(f"{path}: a folder, link, pipe or device; expected a regular file.")
+    if found.st_size > most:
+        raise ValueError(f"{path}: {found.st_size:,} bytes; expected at most {most:,}.")
+    with path.open("rb") as file:
+        return file.read(found.st_size)
+
+
+def read_text(path, most: int = MAX_BYTES, encoding: str = "utf-8") -> str:
+    """Return the text of a regular file; arguments and errors as of :func:`read_file`."""
+    try:
+        return read_file(path, most).decode(encoding)
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: {error}; expected a text in UTF-8.") from error
+
+
+@contextmanager
+def replaced_file(path):
+    """Yield the path of a new file beside ``path``, which replaces it when the block ends.
+
+    If the block fails, the old file stays as it was and nothing of the new one is left. An old file that is a link is
+    replaced, and not written through.
+
+    Raises:
+        OSError: naming ``path``, if it cannot be written, for example because the disk is full.
+    """
+    path = Path(path)
+    new = path.with_name(f".{path.stem}.new{path.suffix}")
+    try:
+        try:
+            new.unlink(missing_ok=True)  # a link, perhaps
+            yield new
+            new.replace(path)
+        finally:
+            new.unlink(missing_ok=True)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error

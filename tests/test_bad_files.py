@@ -1,0 +1,372 @@
+"""Files, folders and streams that are damaged, endless, taken or full: one sentence, and nothing is lost."""
+
+import csv
+import io
+import json
+import logging
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from commands import after_batch, composed
+from omegaconf import OmegaConf
+
+import pickplace
+from pickplace.evaluation import evaluate
+from pickplace.evaluation.evaluate import episode_settings, read_comparison
+from pickplace.robot import json_lines
+from pickplace.runs import checkpoint
+from pickplace.runs.errors import one_sentence
+from pickplace.runs.folder import changed_values, noted_config_folders, noted_overrides, refuse_links
+from pickplace.runs.resume import StopRequest, load_optimizer
+from pickplace.task.files import read_file, replaced_file
+from pickplace.task.items import Recorded
+from pickplace.training import trainer
+from pickplace.training.train import resume_run
+
+TOTE = "env.tote_size=[4,4,2]"
+FULL = OSError(28, "No space left on device")
+
+
+def make(kind: str, path: Path) -> Path:
+    """Make something that is no file to read, and return its path."""
+    if kind.startswith("/"):
+        return Path(kind)
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "link to a device":
+        path.symlink_to("/dev/zero")
+    elif kind == "large":
+        with path.open("wb") as file:
+            file.truncate(2**40)
+    return path
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("kind", ["pipe", "folder", "link to a device", "large", "/dev/zero", "/proc/kmsg"])
+@pytest.mark.parametrize(
+    "read",
+    [Recorded, json_lines.read_map, lambda path: read_comparison(path, {})],
+    ids=["items.path", "--bin", "compare"],
+)
+def test_only_regular_files_of_limited_size_are_read(tmp_path, read, kind):
+    path = make(kind, tmp_path / "file")
+    with pytest.raises(ValueError, match=str(path)):
+        read(path)
+
+
+def test_an_endless_file_of_size_0_is_empty():
+    assert read_file("/proc/kmsg") == b""
+
+
+BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{f'*{a}, ' * 9}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
+NOTES = {
+    "alias bomb": BOMB, "broken": "a: [", "deep": "[" * 100_000, "no date": "2001-13-45", "no time": "!!timestamp x",
+    "numbers": "hydra: {runtime: {config_sources: [{path: 3, provider: command-line}]}, overrides: {hydra: [5]}}",
+    "class": "!!python/object/apply:os.getcwd []", "interpolation": "seed: ${oc.env:HOME}\nalgo: {lr: '${no.such}'}",
+    "list": "[[1], 2]", "large": "a: " + "x" * 2**21,
+}  # fmt: skip
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("note", NOTES)
+def test_a_note_of_hydra_is_never_resolved(tmp_path, note):
+    (tmp_path / ".hydra").mkdir()
+    for name in ("config", "overrides", "hydra"):
+        (tmp_path / ".hydra" / f"{name}.yaml").write_text(NOTES[note])
+    assert noted_overrides(tmp_path) == noted_config_folders(tmp_path) == []
+    cfg = composed("experiment=smoke")
+    changed = {word.partition("=")[0] for word in changed_values(tmp_path, cfg)}
+    assert note != "interpolation" or "seed" not in changed
+    OmegaConf.save(cfg, tmp_path / ".hydra" / "config.yaml")
+    cfg.algo.epochs, cfg.model.critic.tote_clip = 3, 4  # the latter over a reference
+    assert changed_values(tmp_path, cfg) == ["model.critic.tote_clip=4", "algo.epochs=3"]
+
+
+@pytest.mark.timeout(60)
+def test_a_report_does_without_notes_that_cannot_be_read(smoke_run, tmp_path):
+    run_dir = shutil.copytree(smoke_run, tmp_path / "run")
+    (run_dir / ".hydra").mkdir(exist_ok=True)
+    for name, note in (("config", "alias bomb"), ("overrides", "broken"), ("hydra", "numbers")):
+        (run_dir / ".hydra" / f"{name}.yaml").write_text(NOTES[note])
+    (run_dir / "report.html").unlink()
+    resume_run([f"resume={run_dir}"])
+    assert "pickplace-train" in (run_dir / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"occupancy": {"per_episode": [0.5]}}, "a list of 3 numbers"),
+        ({"occupancy": {"per_episode": [[0.5, 0.5, 0.5]]}}, "a list of 3 numbers"),
+        ({"occupancy": {"per_episode": [0.5, float("nan"), 0.5]}}, "a list of 3 numbers"),
+        ({"occupancy": {"per_episode": [0.5, 7, 0.5]}}, "a list of 3 numbers"),
+        ({"occupancy": {"per_episode": [0.5, True, 0.5]}}, "a list of 3 numbers"),
+        ({"occupancy": {"per_episode": 0.5}}, "a list of 3 numbers"),
+        ({"occupancy": None}, "expected an evaluation.json"),
+        ({"planner": "a\x1b[31m"}, "a name to print, got 'a\\x1b[31m'"), ({"planner": "a" * 101}, "a name to print"),
+        ({"planner": 3}, "a name to print, got 3"), ({"stream": "x" * 10**6}, "its stream is 'xxx"),
+        ({"env": {}}, "env.bin_size=None"), ({"env": 3}, "expected an evaluation.json"),
+    ],
+)  # fmt: skip
+def test_a_comparison_is_checked_before_playing(run, tmp_path, monkeypatch, change, words):
+    ours = episode_settings(composed("evaluation.episodes=3", "env.tote_size=[4,4,2]", name="evaluate"))
+    content = {**ours, "planner": "a", "occupancy": {"per_episode": [0.5] * 3}}
+    path = tmp_path / "evaluation.json"
+    path.write_text(json.dumps(content))
+    read_comparison(path, ours)
+    path.write_text(json.dumps({**content, **change}))
+    monkeypatch.setattr(evaluate, "play", lambda *_: pytest.fail("it played"))
+    code, _, err = run("evaluate", "planner=joint_dbl", TOTE, "evaluation.episodes=3", f"compare={path}")
+    assert code == 2 and words in err and len(err) < 1000
+
+
+def files(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_an_evaluation_overwrites_no_other_run(run, smoke_run, tmp_path):
+    words = [
+        "planner=joint_dbl",
+        TOTE,
+        "evaluation.episodes=2",
+        "evaluation.latency_decisions=0",
+        "evaluation.replay=0",
+    ]
+    evaluation, one, trained = ["evaluate", *words], tmp_path / "one", shutil.copytree(smoke_run, tmp_path / "trained")
+    assert run(*evaluation, f"hydra.run.dir={one}")[0] == 0
+    for folder, command in ((one, evaluation), (trained, evaluation), (one, ["train"])):
+        before = files(folder)
+        code, _, err = run(*command, f"hydra.run.dir={folder}")
+        assert code == 2 and err.startswith(f"error: {folder}: there is a") and err.count("\n") == 1
+        assert files(folder) == before
+    code, _, err = run("evaluate", "-m", *words, f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=one")
+    assert code == 2 and "there is an evaluation already" in err
+
+
+@pytest.mark.parametrize("name", ["train.log", "metrics.csv", ".lock", "checkpoints/note", ".hydra/config.yaml"])
+def test_a_hard_link_is_not_written_through(tmp_path, name):
+    run_dir, other = tmp_path / "run", tmp_path / "mine.txt"
+    (run_dir / name).parent.mkdir(parents=True)
+    other.write_text("mine")
+    refuse_links(run_dir)
+    os.link(other, run_dir / name)
+    with pytest.raises(ValueError, match=f"{run_dir / name}: a hard link"):
+        refuse_links(run_dir)
+
+
+def test_a_replaced_file_is_whole_or_as_it_was(tmp_path):
+    mine, path = tmp_path / "mine", tmp_path / "result.json"
+    mine.write_text("mine")
+    path.write_text("old")
+    os.link(mine, tmp_path / ".result.new.json")
+    with pytest.raises(OSError, match=f"No space left on device: '{path}'"), replaced_file(path) as new:
+        new.write_text("half")
+        raise FULL
+    assert path.read_text() == "old" and mine.read_text() == "mine"
+    path.unlink()
+    os.link(mine, path)
+    with replaced_file(path) as new:
+        new.write_text("new")
+    assert path.read_text() == "new" and mine.read_text() == "mine"
+    assert {entry.name for entry in tmp_path.iterdir()} == {"mine", "result.json"}
+
+
+def full(*_, **__):
+    raise FULL
+
+
+@pytest.mark.parametrize(
+    ("command", "owner", "function", "words"),
+    [
+        ("evaluate", evaluate, "picture", "run/tote.png: {} The table above and the files that are there are whole."),
+        ("evaluate", "hydra.core.utils", "_save_config", "run: {}"),
+        ("train", "hydra.core.utils", "_save_config", "run: {}"),
+        ("train", csv.DictWriter, "writeheader", "run/metrics.csv: {} Nothing had been saved before."),
+        ("train", trainer, "learning_curve", "run/learning_curve.png: {} What was saved before is whole: "),
+    ],
+)  # fmt: skip
+def test_a_full_disk_is_named(run, tmp_path, monkeypatch, command, owner, function, words):
+    monkeypatch.setattr(sys.modules[owner] if isinstance(owner, str) else owner, function, full)
+    settings = ["planner=joint_dbl", TOTE, "evaluation.episodes=2", "evaluation.latency_decisions=0"]
+    settings = settings if command == "evaluate" else ["experiment=smoke", "threads=1", "total_frames=128"]
+    code, _, err = run(command, *settings, f"hydra.run.dir={tmp_path}/run")
+    reason = "No space left on device; expected free space."
+    assert code == 2 and err.splitlines()[-1].startswith(f"error: {tmp_path}/{words.format(reason)}"), err
+    assert (tmp_path / "run").exists() == (function in ("picture", "learning_curve"))
+    assert not [path for path in tmp_path.rglob(".*") if ".new" in path.name]
+
+
+@pytest.mark.parametrize(
+    ("part", "index", "value", "words"),
+    [
+        ("heights", 0, -1, "heights: expected 0 to tote_height"), ("heights", 0, 9, "heights: expected"),
+        ("tote_height", 0, 0, "tote_height: expected"), ("volume", 0, -1, "volume"), ("volume", 0, 10**9, "volume"),
+        ("steps", 0, -1, "steps"), ("steps", 0, 10**9, "steps"), ("episode", 0, -1, "episode"),
+        ("item", (0, 0), 99, "item: expected"), ("item", (0, 4), -1, "item: expected"),
+        ("item_seed", (), -1, "item_seed: expected"),
+    ],
+)  # fmt: skip
+def test_an_impossible_environment_is_not_resumed(smoke_run, tmp_path, part, index, value, words):
+    run_dir = shutil.copytree(smoke_run, tmp_path / "run")
+    folder = run_dir / "checkpoints" / "last"
+    state, facts = checkpoint.read(folder)
+    state["collector"]["environment"][part][index] = value
+    del facts["schema"], facts["sha256"]
+    checkpoint.write(folder, state, facts)
+    with pytest.raises(ValueError, match=f"environment is of no use: {words}"):
+        resume_run([f"resume={run_dir}", "total_frames=1280"])
+
+
+def test_a_carried_observation_shows_the_state(smoke_run, tmp_path):
+    run_dir = shutil.copytree(smoke_run, tmp_path / "run")
+    folder = run_dir / "checkpoints" / "last"
+    state, facts = checkpoint.read(folder)
+    state["collector"]["carried"]["occupancy"][0] = 7.0
+    del facts["schema"], facts["sha256"]
+    checkpoint.write(folder, state, facts)
+    with pytest.raises(ValueError, match="the carried occupancy: expected what the state shows"):
+        resume_run([f"resume={run_dir}", "total_frames=1280"])
+
+
+@pytest.mark.parametrize(("key", "value"), [("step", -1.0), ("exp_avg_sq", -1e-3)])
+def test_negative_moments_are_refused(key, value):
+    weight = torch.nn.Parameter(torch.zeros(2))
+    moments = {"step": torch.tensor(3.0), "exp_avg": -torch.ones(2), "exp_avg_sq": torch.ones(2)}
+    load_optimizer(torch.optim.Adam([weight]), {0: moments})
+    with pytest.raises(checkpoint.CheckpointError, match=rf"optimizer is of no use: 0\|{key} is negative"):
+        load_optimizer(torch.optim.Adam([weight]), {0: {**moments, key: torch.full_like(moments[key], value)}})
+
+
+@pytest.fixture
+def plan(monkeypatch, capsys):
+    """Run ``pickplace-plan`` in this process."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["pickplace-plan", "pretrained/r4", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            json_lines.main()
+        assert end.value.code == 2
+        return capsys.readouterr().err
+
+    return call
+
+
+@pytest.mark.parametrize("flag", [
+    "--tolerance=0.7", "--cell-size=-1", "--cell-size=nan", "--alternatives=-1", "--tote-height=1e9",
+    "--tote-height=2.5", "--candidates=0", "--rotations=5", "--threads=-1",
+])  # fmt: skip
+def test_impossible_flags_are_refused_before_the_first_line(plan, monkeypatch, flag):
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO()))
+    assert flag.partition("=")[0].lstrip("-").replace("-", "_") in plan(flag)
+
+
+def test_maps_are_named_by_their_files(plan, tmp_path):
+    names = good, flat, large, nothing = [tmp_path / f"{name}.npy" for name in ("good", "flat", "large", "nothing")]
+    item = np.zeros((5, 5))
+    item[1, 1] = 1
+    for path, values in zip(names, (item, np.zeros(5), np.full((6, 6), 99), item * 0), strict=True):
+        np.save(path, values)
+    (tmp_path / "zip.npy").write_bytes(b"PK\x03\x04 no archive")
+    header = (
+        b"\x93NUMPY\x01\x00"
+        + (60).to_bytes(2, "little")
+        + b"{'descr': '<f8', 'fortran_order': False, 'shape': (10**12,)}"
+    )
+    (tmp_path / "huge.npy").write_bytes(header)
+    for bin_map, tote_map, named in (
+        (flat, large, flat), (good, flat, flat), (good, large, large), (nothing, good, good),
+        (nothing, nothing, nothing),
+        (tmp_path / "zip.npy", good, tmp_path / "zip.npy"), (tmp_path / "huge.npy", good, tmp_path / "huge.npy"),
+    ):  # fmt: skip
+        assert plan("--bin", bin_map, "--tote", tote_map).startswith(f"error: {named}: ")
+
+
+def test_an_endless_line_is_answered_and_skipped(monkeypatch):
+    monkeypatch.setattr(json_lines, "MAX_LINE", 8)
+
+    class Endless:
+        """A stream whose first line has 100 bytes; no more than a few may be asked for at a time."""
+
+        content = b"x" * 100 + b"\n{}\n" + b" " * 8 + b"\n" + b"y" * 9
+
+        def readline(self, limit):
+            assert 0 < limit <= 9
+            line, end, _ = self.content[:limit].partition(b"\n")
+            self.content = self.content[len(line + end) :]
+            return line + end
+
+    lines = list(json_lines.lines_of(Endless()))
+    assert lines == [b"x" * 9, b"{}\n", b" " * 8 + b"\n", b"y" * 9]
+    assert "more than 8 bytes" in json_lines.answer(None, lines[0], {})["error"]
+
+
+@pytest.mark.parametrize("name", ["stdin", "stdout"])
+def test_a_closed_stream_ends_in_a_sentence(plan, monkeypatch, name):
+    monkeypatch.setattr(sys, name, None)
+    assert plan().startswith("error: standard input or output is closed; expected")
+
+
+def test_a_full_output_ends_in_a_sentence(monkeypatch, capsys):
+    with open("/dev/full", "w") as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        with pytest.raises(SystemExit) as end, one_sentence():
+            sys.stdout.write("x")
+    assert end.value.code == 2 and "error: standard output: No space left" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("module", ["gymnasium", "hydra", "torch", "torchrl"])
+def test_ctrl_c_while_a_command_is_imported(tmp_path, module):
+    code = f"""
+import os, signal, sys
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupt())
+sys.argv = ["pickplace-evaluate", "planner=joint_dbl"]
+from pickplace.cli import evaluate
+evaluate()
+"""
+    environment = {**os.environ, "PYTHONPATH": str(Path(pickplace.__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_stop_request_knows_its_signal(number):
+    request = StopRequest()
+    try:
+        assert not request.requested and request.signal is None
+        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGHUP)  # a terminal sends several
+        assert request.requested and request.signal == number
+    finally:
+        request.restore()
+
+
+def test_nohup_keeps_working():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        request = StopRequest()
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert not request.requested
+        request.restore()
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_closed_terminal_saves(smoke, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    with after_batch(1, lambda _: os.kill(os.getpid(), signal.SIGHUP)):
+        smoke(tmp_path / "run", "total_frames=2048")
+    assert checkpoint.read(tmp_path / "run" / "checkpoints" / "last")[1]["frames"] == 128
