@@ -22,7 +22,6 @@ from pickplace.runs.errors import one_sentence
 from pickplace.runs.folder import FAILURE, is_claimed, noted_overrides, read_note
 from pickplace.runs.hydra_app import SweepCallback
 from pickplace.runs.loggers import read_csv
-from pickplace.task.checks import is_whole
 from pickplace.task.files import read_text
 from pickplace.views.figures import figure_of
 
@@ -101,7 +100,7 @@ def read_run(folder: Path) -> SweepRun:
     else:  # the checkpoint's config first: a resumed run may have a larger budget
         config = facts.get("config") or read_note(folder, "config.yaml")
         budget = config.get("total_frames") if isinstance(config, dict) else None
-        is_complete = (is_whole(budget) and run.frames >= budget) or facts.get("ended") is True
+        is_complete = (isinstance(budget, int) and run.frames >= budget) or facts.get("ended") is True
         run.status = "finished" if is_complete else "stopped"
     return run
 
