@@ -1,9 +1,10 @@
 """The environment: one TorchRL ``EnvBase`` that simulates a batch of bins and totes as tensors."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -11,14 +12,17 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
-from pickplace.task.checks import whole_number
+from pickplace.runs.machine import usable_device
+from pickplace.task.checks import check_bytes, one_of, shown, whole_number
 from pickplace.task.feasibility import PlacingMaps, action_mask, footprint_mask, placing_maps
-from pickplace.task.items import PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
+from pickplace.task.grasps import available_offsets
+from pickplace.task.items import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.task.observation import Term, check_terms, observe
 from pickplace.task.state import Failure, Item, State
 from pickplace.task.transition import apply
 
 CACHE_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes
+MAX_POSITIONS = 2_000_000  # of items in the bin, all kinds together, that are checked one by one
 
 
 class Mask(NamedTuple):
@@ -82,8 +86,8 @@ class PickPlaceEnv(EnvBase):
             for some position in the bin.
     """
 
-    #: Settings beside the named arguments, for configs.
-    settings = CELL_SETTINGS
+    #: Arguments that a config may give. The others decide which episodes are played, and where.
+    settings = (*CELL_SETTINGS, "num_envs", "observation")
 
     def __init__(
         self,
@@ -101,18 +105,21 @@ class PickPlaceEnv(EnvBase):
         cell = cell_from_settings(settings)
         whole_number("num_envs", num_envs)
         check_seed(seed)
-        if stream not in STREAMS:
-            raise ValueError(f"stream={stream!r}: expected one of {', '.join(STREAMS)}.")
-        if not set(masks) <= set(MASKS):
-            raise ValueError(f"masks={masks!r}: expected any of {', '.join(map(repr, MASKS))}.")
+        one_of("stream", stream, STREAMS)
+        if not isinstance(masks, (tuple, list)) or not all(isinstance(name, str) and name in MASKS for name in masks):
+            raise ValueError(f"masks={shown(masks)}: expected any of {', '.join(map(repr, MASKS))}.")
+        whole_number("first_episode", first_episode, 0, MAX_SEED)
+        if episode_stride is not None:
+            whole_number("episode_stride", episode_stride, 1, MAX_SEED)
         items = Kinds(PAPER_KINDS) if items is None else items
         if not isinstance(items, ItemDistribution):
-            raise ValueError(f"items={items!r}: expected an ItemDistribution, such as pickplace.task.items.Kinds.")
+            raise ValueError(f"items={shown(items)}: expected an ItemDistribution, such as pickplace.task.items.Kinds.")
         check_items(cell, items)
-        super().__init__(device=device, batch_size=[num_envs])
-        self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
-        self.items, self.stream, self.masks = items, stream, tuple(masks)
         self.terms = check_terms(observation)
+        self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
+        check_bytes(f"num_envs={num_envs}", num_envs * problem_bytes(self.cell, masks), device := usable_device(device))
+        super().__init__(device=device, batch_size=[num_envs])
+        self.items, self.stream, self.masks = items, stream, tuple(masks)
         self.min_tote_height = int(items.sizes[:, 2].max())
         self.first_episode, self.episode_stride = first_episode, episode_stride or num_envs
         self._make_specs()
@@ -328,6 +335,13 @@ def _any(mask: Tensor) -> Tensor:
     return mask.view(torch.uint8).amax(1) > 0
 
 
+def problem_bytes(cell: CellSpec, masks: Collection[str]) -> int:
+    """Return about how many bytes the masks of one problem, and what they are found with, take."""
+    offsets = cell.num_offsets**2
+    count = 64 * cell.num_footprints + 32 * cell.rotations * (offsets + cell.num_picks)
+    return count + ("action" in masks) * (4 * cell.num_actions + 8 * offsets * cell.num_places)
+
+
 def check_items(cell: CellSpec, items: ItemDistribution) -> None:
     """Refuse items that could make a fresh episode impossible.
 
@@ -351,7 +365,23 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
             if x + w > w_b or y + d > d_b:
                 raise ValueError(f"{items.label(kind)} at x={x}, y={y} leaves the bin: expected it inside {w_b}x{d_b}.")
             problems.setdefault((x, y, w, d, h), kind)
-    for chunk in torch.tensor([(*item, kind) for item, kind in problems.items()]).split(1024):
+        if len(problems) > MAX_POSITIONS:
+            raise ValueError(
+                f"bin_size={[*cell.bin_size]}: the kinds of items have more than {MAX_POSITIONS:,} positions in the bin; "
+                "expected a smaller bin, or fewer kinds."
+            )
+    cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
+    rows = torch.tensor([(*item, kind) for item, kind in problems.items()])
+    # Where the end effector can hold an item in the same ways, the same footprints are feasible.
+    distinct: dict[bytes, int] = {}
+    for numbers in torch.arange(len(rows)).split(max(1, 2**22 // (cell.rotations * cell.num_offsets**2))):
+        available, _ = available_offsets(cell, Item(*rows[numbers, :5].unbind(-1)))  # [K, M]
+        ways = np.packbits(available.numpy(), axis=0).T
+        keys = np.concatenate([rows[numbers, 2:5].contiguous().numpy().view(np.uint8), ways], 1)
+        _, first = np.unique(keys.view(f"V{keys.shape[1]}"), return_index=True)
+        for index in sorted(first.tolist()):
+            distinct.setdefault(keys[index].tobytes(), int(numbers[index]))
+    for chunk in rows[list(distinct.values())].split(max(1, min(1024, 2**24 // cell.num_footprints))):
         item = Item(*chunk[:, :5].unbind(-1))
         empty = torch.zeros(len(chunk), *cell.tote_size[:2], dtype=torch.int32)
         maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), item))

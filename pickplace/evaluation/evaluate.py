@@ -10,7 +10,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from pickplace.evaluation.play import Episodes, MakeEnv, decision_latency, play
+from pickplace.evaluation.play import Episodes, MakeEnv, check_episode_settings, decision_latency, play
 from pickplace.evaluation.statistics import paired_difference, summarise
 from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.runs import checkpoint
@@ -20,7 +20,7 @@ from pickplace.runs.machine import use_machine
 from pickplace.runs.provenance import commit, imitated_planner, versions
 from pickplace.runs.registry import build
 from pickplace.task.cell import CELL_SETTINGS
-from pickplace.task.checks import flag, one_of, whole_number
+from pickplace.task.checks import flag, whole_number
 from pickplace.views.replay import animation, page, picture
 from pickplace.views.tables import evaluation_table
 
@@ -44,7 +44,7 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
         ValueError: for settings that make no sense, or a checkpoint that does not fit them.
     """
     ev = cfg.evaluation
-    replay = whole_number("evaluation.replay", ev.get("replay", 0), 0)  # evaluation=validation has neither
+    replay = whole_number("evaluation.replay", ev.get("replay", 0), 0, 1_000)  # evaluation=validation has neither
     gif = flag("evaluation.gif", ev.get("gif", False))
     make_env, planner, facts = prepare(cfg)
     cell = make_env(0, 1).cell
@@ -75,9 +75,7 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
         ValueError: for settings that make no sense, or a checkpoint that does not fit them.
     """
     ev = cfg.evaluation
-    for key, least in {"episodes": 1, "batch_size": 1, "latency_decisions": 0}.items():
-        whole_number(f"evaluation.{key}", ev.get(key), least)
-    one_of("evaluation.stream", ev.stream, ("validation", "test"))
+    check_episode_settings(ev)
     if "model" in cfg and cfg.checkpoint is None:
         raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
     own_modules(cfg.trust)
@@ -96,7 +94,7 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
 
     def make_env(first, count):
         return build(
-            "env", cfg.env, items=items, device=cfg.device, num_envs=count, masks=(),
+            "env", {**resolved(cfg.env), "num_envs": count}, items=items, device=cfg.device, masks=(),
             stream=ev.stream, seed=ev.seed, first_episode=first,
         )  # fmt: skip
 

@@ -96,7 +96,8 @@ class WarmStart:
             iteration: the run's batch number; it seeds a teacher that draws, so that a resumed run is the same.
         """
         draws = {"seed": self.seed + iteration} if "seed" in self.teacher else {}
-        teacher = build("warm_start.teacher", self.teacher, **self._parts, **draws)
+        settings = cast(dict, OmegaConf.to_container(self.teacher, resolve=True))
+        teacher = build("warm_start.teacher", {**settings, **draws}, **self._parts)
         action = teacher.decide(data)
         state = State.from_observation(data)
         wanted = apply(self.cell, state, action)

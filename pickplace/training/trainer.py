@@ -7,13 +7,14 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
+from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.evaluation.play import Episodes, play
 from pickplace.policies.base import Policy, as_collection_policy, as_critic
 from pickplace.runs import checkpoint
@@ -85,7 +86,8 @@ class Trainer:
         """Make the items, the policy, the planner that validates it, the warm start and the critic."""
         cfg = self.cfg
         self.items = build("items", cfg["items"])
-        self.build_env = partial(build, "env", cfg.env, items=self.items, device=cfg.device)
+        self.env_config = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
+        self.build_env = partial(build_env, self.env_config, items=self.items, device=cfg.device)
         probe = self.build_env(num_envs=1, masks=())
         self.cell, self.terms, self.min_tote_height = probe.cell, probe.terms, probe.min_tote_height
         make_actor = partial(
@@ -130,9 +132,8 @@ class Trainer:
     def _make_learner(self) -> None:
         """Make TorchRL's parts: advantage, loss, optimizer and collector."""
         cfg, algo = self.cfg, self.algo
-        env_config = OmegaConf.to_container(cfg.env, resolve=True)
         make_env = partial(
-            training_env, env_config, self.items, cfg.device, self.policy.masks, cfg.env.num_envs, self.curriculum
+            training_env, self.env_config, self.items, cfg.device, self.policy.masks, cfg.env.num_envs, self.curriculum
         )
         self.acting = as_collection_policy(self.policy)
         self.advantage, self.loss = make_losses(algo, self.policy, self.critic)
@@ -297,16 +298,20 @@ class Trainer:
             write_report(run_dir, self.cfg, replayed, self.cell, versions() | {"commit": commit()})
 
 
+def build_env(env_config: dict, num_envs: int, **kwargs) -> PickPlaceEnv:
+    """Make the environment of the config group ``env`` with another number of slots."""
+    return build("env", {**env_config, "num_envs": num_envs}, **kwargs)
+
+
 def training_env(env_config, items, device, masks, total_envs, curriculum, first_episode, num_envs) -> TransformedEnv:
     """Make the environment of one collector process: slots ``first_episode ..`` of ``total_envs``, under the
     curriculum."""
-    env = build(
-        "env",
-        OmegaConf.create(env_config),
+    env = build_env(
+        env_config,
+        num_envs,
         items=items,
         device=device,
         masks=masks,
-        num_envs=num_envs,
         first_episode=first_episode,
         episode_stride=total_envs,
     )
