@@ -370,14 +370,19 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
                 f"bin_size={[*cell.bin_size]}: the kinds of items have more than {MAX_POSITIONS:,} positions in the bin; "
                 "expected a smaller bin, or fewer kinds."
             )
-    cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
+    description, cell = cell.describe(), replace(cell, longest_side=int(items.sizes[:, :2].max()))
     rows = torch.tensor([(*item, kind) for item, kind in problems.items()])
+    if cell.limits is None:
+        # The lower an item, the harder to clear the rim; and what is far from all walls of the tote is alike.
+        rows = rows[rows[:, 4].argsort(stable=True)]
+        enough = 2 * (max(cell.effector_size) + cell.max_side)
+        cell = replace(cell, tote_size=(*(min(side, enough) for side in cell.tote_size[:2]), height))
     # Where the end effector can hold an item in the same ways, the same footprints are feasible.
     distinct: dict[bytes, int] = {}
     for numbers in torch.arange(len(rows)).split(max(1, 2**22 // (cell.rotations * cell.num_offsets**2))):
         available, _ = available_offsets(cell, Item(*rows[numbers, :5].unbind(-1)))  # [K, M]
         ways = np.packbits(available.numpy(), axis=0).T
-        keys = np.concatenate([rows[numbers, 2:5].contiguous().numpy().view(np.uint8), ways], 1)
+        keys = np.concatenate([rows[numbers, 2 : 4 + (cell.limits is not None)].contiguous().numpy().view(np.uint8), ways], 1)
         _, first = np.unique(keys.view(f"V{keys.shape[1]}"), return_index=True)
         for index in sorted(first.tolist()):
             distinct.setdefault(keys[index].tobytes(), int(numbers[index]))
@@ -390,5 +395,5 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
             x, y, *_, kind = chunk[~feasible][0].tolist()
             raise ValueError(
                 f"{items.label(kind)} at x={x}, y={y} in the bin has no feasible action on the empty tote of height "
-                f"{height} ({cell.describe()}): expected every item to fit somewhere."
+                f"{height} ({description}): expected every item to fit somewhere."
             )
