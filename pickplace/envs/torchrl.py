@@ -1,28 +1,26 @@
 """The environment: one TorchRL ``EnvBase`` that simulates a batch of bins and totes as tensors."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
+from pickplace.envs.checks import check_items, problem_bytes
 from pickplace.runs.machine import usable_device
+from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.task.checks import check_bytes, one_of, shown, whole_number
 from pickplace.task.feasibility import PlacingMaps, action_mask, footprint_mask, placing_maps
-from pickplace.task.grasps import available_offsets
 from pickplace.task.items import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.task.observation import Term, check_terms, observe
 from pickplace.task.state import Failure, Item, State
 from pickplace.task.transition import apply
 
 CACHE_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes
-MAX_POSITIONS = 2_000_000  # of items in the bin, all kinds together, that are checked one by one
 
 
 class Mask(NamedTuple):
@@ -168,6 +166,11 @@ class PickPlaceEnv(EnvBase):
     def num_envs(self) -> int:
         """``N``, the number of problems that advance together."""
         return self.batch_size[0]
+
+    @property
+    def observation_bytes(self) -> int:
+        """Bytes of what the environment emits for one problem, masks included."""
+        return sum(spec.shape[1:].numel() * spec.dtype.itemsize for spec in self.observation_spec.values())
 
     # ------------------------------------------------------------------ EnvBase
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
@@ -333,67 +336,3 @@ class PickPlaceEnv(EnvBase):
 def _any(mask: Tensor) -> Tensor:
     """Return ``mask.any(1)`` of a bool ``[N, M]``; on a CPU the maximum of bytes is vectorised, and far faster."""
     return mask.view(torch.uint8).amax(1) > 0
-
-
-def problem_bytes(cell: CellSpec, masks: Collection[str]) -> int:
-    """Return about how many bytes the masks of one problem, and what they are found with, take."""
-    offsets = cell.num_offsets**2
-    count = 64 * cell.num_footprints + 32 * cell.rotations * (offsets + cell.num_picks)
-    return count + ("action" in masks) * (4 * cell.num_actions + 8 * offsets * cell.num_places)
-
-
-def check_items(cell: CellSpec, items: ItemDistribution) -> None:
-    """Refuse items that could make a fresh episode impossible.
-
-    Every kind needs a feasible action on the empty tote for every position in the bin. The full tote height decides:
-    a lower rim is only easier to clear, as long as it is not below the item's top.
-
-    Raises:
-        ValueError: naming the kind, the position and the tote height.
-    """
-    w_b, d_b, _ = cell.bin_size
-    height = cell.tote_size[2]
-    # (x, y, w, d, h) -> the first kind like it: the rows of a long recording repeat themselves
-    problems: dict[tuple[int, ...], int] = {}
-    for kind, (w, d, h) in enumerate(items.sizes.tolist()):
-        for (grid_w, grid_d), what in (((w_b, d_b), "bin_size"), (cell.effector_size, "effector_size")):
-            if (w > grid_w or d > grid_d) and (what == "bin_size" or cell.pick_rule == "contain"):
-                raise ValueError(f"{items.label(kind)} does not fit {what}: expected at most {grid_w}x{grid_d} cells.")
-        if h > height:
-            raise ValueError(f"{items.label(kind)} is higher than the tote: expected at most tote_size[2]={height}.")
-        for x, y in items.corners(kind, cell.bin_size):
-            if x + w > w_b or y + d > d_b:
-                raise ValueError(f"{items.label(kind)} at x={x}, y={y} leaves the bin: expected it inside {w_b}x{d_b}.")
-            problems.setdefault((x, y, w, d, h), kind)
-        if len(problems) > MAX_POSITIONS:
-            raise ValueError(
-                f"bin_size={[*cell.bin_size]}: the kinds of items have more than {MAX_POSITIONS:,} positions in the bin; "
-                "expected a smaller bin, or fewer kinds."
-            )
-    description, cell = cell.describe(), replace(cell, longest_side=int(items.sizes[:, :2].max()))
-    rows = torch.tensor([(*item, kind) for item, kind in problems.items()])
-    if cell.limits is None:
-        # The lower an item, the harder to clear the rim; and what is far from all walls of the tote is alike.
-        rows = rows[rows[:, 4].argsort(stable=True)]
-        enough = 2 * (max(cell.effector_size) + cell.max_side)
-        cell = replace(cell, tote_size=(*(min(side, enough) for side in cell.tote_size[:2]), height))
-    # Where the end effector can hold an item in the same ways, the same footprints are feasible.
-    distinct: dict[bytes, int] = {}
-    for numbers in torch.arange(len(rows)).split(max(1, 2**22 // (cell.rotations * cell.num_offsets**2))):
-        available, _ = available_offsets(cell, Item(*rows[numbers, :5].unbind(-1)))  # [K, M]
-        ways = np.packbits(available.numpy(), axis=0).T
-        keys = np.concatenate([rows[numbers, 2 : 4 + (cell.limits is not None)].contiguous().numpy().view(np.uint8), ways], 1)
-        _, first = np.unique(keys.view(f"V{keys.shape[1]}"), return_index=True)
-        for index in sorted(first.tolist()):
-            distinct.setdefault(keys[index].tobytes(), int(numbers[index]))
-    for chunk in rows[list(distinct.values())].split(max(1, min(1024, 2**24 // cell.num_footprints))):
-        item = Item(*chunk[:, :5].unbind(-1))
-        empty = torch.zeros(len(chunk), *cell.tote_size[:2], dtype=torch.int32)
-        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), item))
-        feasible = footprint_mask(cell, maps).flatten(1).any(1)
-        if not feasible.all():
-            x, y, *_, kind = chunk[~feasible][0].tolist()
-            raise ValueError(
-                f"{items.label(kind)} at x={x}, y={y} in the bin has no feasible action on the empty tote of height "
-                f"{height} ({description}): expected every item to fit somewhere."
-            )

@@ -10,7 +10,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from pickplace.evaluation.play import Episodes, MakeEnv, check_episode_settings, decision_latency, play
+from pickplace.evaluation.play import Episodes, MakeEnv, check_episode_settings, check_play, decision_latency, play
 from pickplace.evaluation.statistics import paired_difference, summarise
 from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.runs import checkpoint
@@ -99,6 +99,7 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
         )  # fmt: skip
 
     probe = make_env(0, 1)
+    check_play(ev, probe.cell, cfg.device)
     parts = planner_parts(cfg.planner, probe.cell, items, probe.terms, trained)
     planner = build("planner", cfg.planner, **parts)
     if not isinstance(planner, BatchPlanner) or not isinstance(planner.name, str):  # now, not after all episodes
@@ -130,7 +131,7 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
         "checkpoint": str(folder),
         "trained": {"frames": saved["frames"], "seed": merged.seed, "commit": saved["commit"]},
         "mask_in_training": merged.algo.mask_infeasible,
-        "warm_start": imitated_planner(resolved(trained)),
+        "warm_start": imitated_planner(saved["config"]),
     }
     return (cfg, state, resolved(trained.env)), facts
 

@@ -9,9 +9,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
+from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.planners.base import BatchPlanner
-from pickplace.task.checks import one_of, whole_number
+from pickplace.task.cell import CellSpec
+from pickplace.task.checks import check_bytes, one_of, whole_number
 from pickplace.task.feasibility import num_feasible, placing_maps
 from pickplace.task.items import check_seed
 from pickplace.task.state import Failure
@@ -115,6 +117,12 @@ def check_episode_settings(evaluation: Mapping) -> None:
         whole_number(f"evaluation.{key}", evaluation.get(key), least, MAX_EPISODES)
     one_of("evaluation.stream", evaluation.get("stream"), ("validation", "test"))
     check_seed(evaluation.get("seed"), "evaluation.seed")
+
+
+def check_play(evaluation: Mapping, cell: CellSpec, device) -> None:
+    """Refuse more episodes side by side than the memory holds, with a ``ValueError`` that names the key."""
+    together = min(evaluation["batch_size"], evaluation["episodes"])
+    check_bytes(f"evaluation.batch_size={together}", together * problem_bytes(cell, ()), device)
 
 
 @torch.no_grad()

@@ -51,7 +51,7 @@ def checkpoint_config(cfg: DictConfig) -> tuple[dict, str]:
     content = saved_form(cfg)
     own = modules_to_trust(OmegaConf.to_container(cfg, resolve=True))
     try:
-        trusted_config(content, own)
+        trusted_config(content, own, groups=None)
     except ValueError as error:
         log.warning("checkpoints of this run will not be loaded again: %s", error)
     values = {key: OmegaConf.select(cfg, key) for key in LOCAL_VALUES}
@@ -73,7 +73,7 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     _check_counters(place, facts)
     given = OverridesParser.create().parse_overrides(overrides)
     trust = own_modules(next((word.value() for word in reversed(given) if word.key_or_group == "trust"), None))
-    saved = trusted_config(facts["config"], trust)
+    saved = trusted_config(facts["config"], trust, groups=None)
     saved["trust"] = list(trust)  # only the user says what to trust, never the checkpoint
     _refuse_remote_values(saved, {word.key_or_group for word in given})
     cfg = apply_overrides(saved, [str(word.input_line) for word in given if word.key_or_group != "trust"])

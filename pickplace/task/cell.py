@@ -104,7 +104,9 @@ class CellSpec:
         object.__setattr__(self, "tote_size", _sizes("tote_size", self.tote_size, 3, MAX_SIDE))
         object.__setattr__(self, "effector_size", _sizes("effector_size", self.effector_size, 2, MAX_EFFECTOR))
         if not is_whole(self.rotations) or not 1 <= self.rotations <= 4:
-            raise ValueError(f"rotations={shown(self.rotations)}: expected 1, 2, 3 or 4 (quarter turns to choose from).")
+            raise ValueError(
+                f"rotations={shown(self.rotations)}: expected 1, 2, 3 or 4 (quarter turns to choose from)."
+            )
         one_of("pick_rule", self.pick_rule, PICK_RULES)
         number("min_support", self.min_support, 0, 1)
         flag("strict_support", self.strict_support)

@@ -3,14 +3,16 @@
 import sys
 from numbers import Integral, Real
 from reprlib import Repr
-
-import torch
+from typing import Any
 
 #: Greatest count that the program's tensors and files hold.
 MAX_COUNT = 2**63 - 1
 
 #: Bytes that one batch may take on a CPU; on a GPU, half of its memory.
 CPU_BYTES = 2**30
+
+#: Greatest width of a layer, and greatest number of inputs of a neuron.
+MAX_WIDTH, MAX_INPUTS = 1_024, 8_192
 
 _repr = Repr()
 _repr.maxstring = _repr.maxother = 80
@@ -27,7 +29,7 @@ def is_whole(value) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool)
 
 
-def is_number(value) -> bool:
+def is_number(value: Any) -> bool:
     """Return whether a value is a finite real number, and not a bool."""
     return isinstance(value, Real) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
@@ -62,11 +64,24 @@ def one_of(key: str, value, choices) -> str:
     return value
 
 
-def odd_number(key: str, value, least: int = 1, most: int = 999) -> int:
+def odd_number(key: str, value, least: int = 1, most: int = 99) -> int:
     """Return ``value`` if it is an odd whole number in ``[least, most]``."""
     if not is_whole(value) or not least <= value <= most or value % 2 == 0:
         raise ValueError(f"{key}={shown(value)}: expected an odd number >= {least} and <= {most}.")
     return int(value)
+
+
+def number_or_null(key: str, value, least: float, most: float) -> float | None:
+    """Return ``value`` if it is None or a finite number in ``[least, most]``."""
+    if value is not None and (not is_number(value) or not least <= value <= most):
+        raise ValueError(f"{key}={shown(value)}: expected a number between {least:g} and {most:g}, or null.")
+    return value
+
+
+def check_inputs(key: str, count: int) -> None:
+    """Refuse a layer with more inputs than :data:`MAX_INPUTS`."""
+    if count > MAX_INPUTS:
+        raise ValueError(f"{key}: a neuron would have {count:,} inputs; expected at most {MAX_INPUTS:,}.")
 
 
 def check_bytes(setting: str, needed: int, device="cpu") -> None:
@@ -77,6 +92,8 @@ def check_bytes(setting: str, needed: int, device="cpu") -> None:
         needed: bytes that they would take.
         device: where the tensors would be.
     """
+    import torch  # not before it is needed: errors are worded without it
+
     device = torch.device(device)
     most = torch.cuda.get_device_properties(device).total_memory // 2 if device.type == "cuda" else CPU_BYTES
     if needed > most:

@@ -24,7 +24,7 @@ MAX_SEED = 2**62  # beyond it, seeds of two families could meet
 PAPER_KINDS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1))
 
 
-def check_seed(seed: int, key: str = "seed") -> int:
+def check_seed(seed, key: str = "seed") -> int:
     """Return the seed, or raise a ``ValueError`` that names the ``key`` if it is none."""
     if not is_whole(seed) or not 0 <= seed < MAX_SEED:
         raise ValueError(f"{key}={shown(seed)}: expected a whole number >= 0 and < 2**62.")

@@ -14,9 +14,10 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
-from pickplace.envs.torchrl import PickPlaceEnv
-from pickplace.evaluation.play import Episodes, play
-from pickplace.policies.base import Policy, as_collection_policy, as_critic
+from pickplace.envs.checks import problem_bytes
+from pickplace.envs.torchrl import MASKS, PickPlaceEnv
+from pickplace.evaluation.play import Episodes, check_play, play
+from pickplace.policies.base import Policy, as_collection_policy, as_critic, refuse_large
 from pickplace.runs import checkpoint
 from pickplace.runs.machine import use_machine
 from pickplace.runs.provenance import commit, versions
@@ -29,6 +30,7 @@ from pickplace.runs.resume import (
     load_optimizer,
     stale_best_frames,
 )
+from pickplace.task.checks import check_bytes
 from pickplace.training.collectors import rng_state, set_rng_state, watch_workers
 from pickplace.training.curriculum import Curriculum, push_level
 from pickplace.training.imitation import Phase, WarmStart
@@ -100,9 +102,20 @@ class Trainer:
         self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, self.items, self.terms, cfg.seed, cfg.trust)
         make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
         self.critic = self._restored("critic", lambda: as_critic(make_critic()))
+        self._check_batch(probe)
+
+    def _check_batch(self, probe: PickPlaceEnv) -> None:
+        """Refuse a batch that would fill the memory; its frames hold two observations each, but masks once."""
+        slots, steps = self.cfg.env.num_envs, self.algo.rollout_length
+        masks = sum(MASKS[name].size(self.cell) for name in self.policy.masks)
+        setting = f"env.num_envs={slots}, algo.rollout_length={steps}"
+        check_bytes(setting, slots * steps * (2 * probe.observation_bytes + masks), self.device)
+        check_bytes(f"env.num_envs={slots}", slots * problem_bytes(self.cell, self.policy.masks), self.device)
+        check_play(self.cfg.evaluation, self.cell, self.device)
 
     def _restored(self, key: str, make) -> Any:
         """Make a module, with the checkpoint's weights if the run is resumed."""
+        refuse_large(make, f"model.{'actor' if key == 'policy' else key}")
         module = checkpoint.restore(make, self.state.get(key, {}), key) if self.resumed else make()
         return module.to(self.device)
 
