@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.task.checks import shown
+from pickplace.task.checks import shortened, shown
 
 #: A reference to another key of the same config, and nothing else.
 REFERENCE = re.compile(r"\$\{(\.*)([A-Za-z_]\w*(?:\.\w+)*)\}")
@@ -91,4 +91,4 @@ def children(node) -> Iterator[tuple]:
 
 def refusal(key: str, value, expected: str) -> ValueError:
     """Return the error for a value of a checkpoint's config."""
-    return ValueError(f"{shown(key)[1:-1]}={shown(value)}: the checkpoint is refused; expected {expected}.")
+    return ValueError(f"{shortened(key)}={shown(value)}: the checkpoint is refused; expected {expected}.")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.checks import flag, is_whole, number, one_of, shown, whole_number
+from pickplace.task.checks import flag, is_whole, number, one_of, shortened, shown, whole_number
 
 PICK_RULES = ("contain", "overlap")
 
@@ -203,7 +203,7 @@ def cell_from_settings(settings: dict) -> CellSpec:
     known = {item.name for item in fields(CellSpec)}
     if unknown := [name for name in settings if name not in known]:
         value = shown(settings[unknown[0]])
-        raise ValueError(f"{shown(unknown[0])[1:-1]}={value}: expected one of {', '.join(CELL_SETTINGS)}.")
+        raise ValueError(f"{shortened(unknown[0])}={value}: expected one of {', '.join(CELL_SETTINGS)}.")
     return CellSpec(**settings)
 
 

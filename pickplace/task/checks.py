@@ -24,6 +24,11 @@ def shown(value) -> str:
     return text if len(text) <= 120 else f"{text[:80]}...{text[-30:]}"
 
 
+def shortened(name) -> str:
+    """Return a name for a message, as :func:`shown` but without quotes."""
+    return shown(str(name))[1:-1]
+
+
 def is_whole(value) -> bool:
     """Return whether a value is an integer of Python's or numpy's, and not a bool."""
     return isinstance(value, Integral) and not isinstance(value, bool)
@@ -31,7 +36,7 @@ def is_whole(value) -> bool:
 
 def is_number(value: Any) -> bool:
     """Return whether a value is a finite real number, and not a bool."""
-    return isinstance(value, Real) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return isinstance(value, Real) and not isinstance(value, bool) and abs(value) <= sys.float_info.max  # type: ignore[operator]
 
 
 def whole_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:

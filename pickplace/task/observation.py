@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pickplace.task.cell import CellSpec
-from pickplace.task.checks import shown
+from pickplace.task.checks import shortened, shown
 from pickplace.task.state import State, bin_depth_from_item, depth_from_heights
 
 
@@ -115,7 +115,7 @@ def check_terms(terms: Mapping[str, Term] | None) -> dict[str, Term]:
     if not isinstance(terms, Mapping):
         raise ValueError(f"observation={shown(terms)}: expected terms by their keys.")
     for key, term in terms.items():
-        place = f"observation.{shown(str(key))[1:-1]}"
+        place = f"observation.{shortened(key)}"
         if not isinstance(term, Term):
             raise ValueError(f"{place}={shown(term)}: expected a Term, such as pickplace.task.observation.ToteDepth.")
         if not isinstance(key, str) or key in RESERVED or not key.isidentifier():

@@ -33,8 +33,8 @@ def make_losses(algo: DictConfig, policy: Policy, critic: ValueOperator) -> tupl
         loss = ClipPPOLoss(as_actor(policy), critic, **clip, **common)
     else:
         loss = A2CLoss(as_actor(policy), critic, **common)
-    loss.entropy_coeff.fill_(algo.entropy_coeff)
-    loss.critic_coeff.fill_(algo.critic_coeff)
+    loss.entropy_coeff.fill_(float(algo.entropy_coeff))
+    loss.critic_coeff.fill_(float(algo.critic_coeff))
     loss.set_keys(action=policy.choice_key, sample_log_prob="log_prob")
     # A2CLoss does not normalise advantages itself.
     average = algo.loss == "a2c" and algo.normalize_advantage

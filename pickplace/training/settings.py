@@ -20,6 +20,11 @@ def _group(key: str, value) -> None:
         raise ValueError(f"{key}={shown(value)}: expected settings by their names.")
 
 
+def _text(key: str, value) -> None:
+    if not isinstance(value, str):
+        raise ValueError(f"{key}={shown(value)}: expected a text.")
+
+
 def _or_null(check):
     return lambda key, value: None if value is None else check(key, value)
 
@@ -42,6 +47,8 @@ CHECKS = {
     **dict.fromkeys(("model", "algo", "evaluation", "warm_start"), _group),
     **dict.fromkeys(("model.actor", "model.critic"), _node),
     "warm_start.teacher": _or_null(_node),
+    "warm_start.checkpoint": _or_null(_text),
+    **dict.fromkeys(("warm_start.frames", "warm_start.critic_frames"), partial(whole_number, least=0)),
     **dict.fromkeys(("total_frames", "evaluation_interval", "checkpoint_interval", "progress_interval"), whole_number),
     **dict.fromkeys(("env.num_envs", "algo.rollout_length", "algo.minibatch_size"), whole_number),
     "algo.epochs": partial(whole_number, most=1_000),

@@ -7,6 +7,7 @@ from numbers import Integral, Real
 
 from torch import Tensor
 
+from pickplace.task.checks import shown
 from pickplace.training.curriculum.advance import Advance, Tally
 from pickplace.training.curriculum.checks import fraction, is_finite_number, whole_number
 from pickplace.training.curriculum.transform import ToteHeightCurriculum
@@ -24,9 +25,13 @@ class Curriculum:
 
     def __init__(self, advance: Advance, sample, start_height: int | None = None, end_height: int | None = None):
         if not isinstance(advance, Advance):
-            raise ValueError(f"curriculum.advance={advance!r}: expected a rule, such as curriculum/advance=threshold.")
+            raise ValueError(
+                f"curriculum.advance={shown(advance)}: expected a rule, such as curriculum/advance=threshold."
+            )
         if not callable(sample):
-            raise ValueError(f"curriculum.sample={sample!r}: expected a sampler, such as curriculum/sample=recent.")
+            raise ValueError(
+                f"curriculum.sample={shown(sample)}: expected a sampler, such as curriculum/sample=recent."
+            )
         self.advance, self.sample = advance, sample
         self.start_height, self.end_height = start_height, end_height
 
