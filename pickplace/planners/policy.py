@@ -13,8 +13,6 @@ from pickplace.task.feasibility import action_mask, placing_maps
 from pickplace.task.state import Observation, State
 from pickplace.task.transition import apply
 
-MAX_CANDIDATES = 10_000
-
 
 class PolicyPlanner:
     """Tries the policy's most probable actions in a forward simulation and plays the first that succeeds (Sec. III).
@@ -30,9 +28,8 @@ class PolicyPlanner:
     needs = ("policy",)
 
     def __init__(self, cell: CellSpec, policy: Policy, candidates: int | Literal["all"] = "all"):
-        if candidates != "all" and not (is_whole(candidates) and 1 <= candidates <= MAX_CANDIDATES):
-            expected = f"'all' or a whole number >= 1 and <= {MAX_CANDIDATES:,}"
-            raise ValueError(f"planner.candidates={shown(candidates)}: expected {expected}.")
+        if candidates != "all" and not (is_whole(candidates) and candidates >= 1):
+            raise ValueError(f"planner.candidates={shown(candidates)}: expected 'all' or a whole number >= 1.")
         self.cell, self.policy, self.candidates = cell, policy, candidates
 
     @torch.no_grad()

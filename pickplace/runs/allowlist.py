@@ -97,7 +97,7 @@ def own_modules(trust) -> tuple[str, ...]:
 
 
 def _may_be_own(module) -> bool:
-    is_name = isinstance(module, str) and all(part.isidentifier() for part in module.split("."))
+    is_name = isinstance(module, str) and len(module) <= 200 and all(part.isidentifier() for part in module.split("."))
     return is_name and module.partition(".")[0] not in RESERVED_MODULES
 
 

@@ -21,8 +21,8 @@ def _group(key: str, value) -> None:
 
 
 def _text(key: str, value) -> None:
-    if not isinstance(value, str):
-        raise ValueError(f"{key}={shown(value)}: expected a text.")
+    if not isinstance(value, str) or len(value) > 1_000:
+        raise ValueError(f"{key}={shown(value)}: expected a text of at most 1,000 characters.")
 
 
 def _or_null(check):

@@ -31,7 +31,7 @@ from pickplace.runs.resume import (
     stale_best_frames,
 )
 from pickplace.task.checks import check_bytes
-from pickplace.training.collectors import rng_state, set_rng_state, watch_workers
+from pickplace.training.collectors import refuse_other_workers, rng_state, set_rng_state, watch_workers
 from pickplace.training.curriculum import Curriculum, push_level
 from pickplace.training.imitation import Phase, WarmStart
 from pickplace.training.metrics import has_passed, progress_line, validation_metrics
@@ -151,6 +151,8 @@ class Trainer:
         self.acting = as_collection_policy(self.policy)
         self.advantage, self.loss = make_losses(algo, self.policy, self.critic)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=algo.lr, eps=1e-5)
+        if self.resumed:
+            refuse_other_workers(cfg.collector, self.state.get("collector"))
         self.collector = build(
             "collector",
             cfg.collector,
