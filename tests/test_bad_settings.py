@@ -17,6 +17,7 @@ from pickplace.runs import checkpoint, errors
 from pickplace.runs.allowlist import MAX_DEPTH, MAX_NODES, MAX_TEXT, trusted_config
 from pickplace.runs.references import saved_form
 from pickplace.runs.registry import build
+from pickplace.task import checks
 from pickplace.task.checks import shown
 from pickplace.task.items import Kinds, Uniform
 from pickplace.training.settings import check_settings
@@ -133,7 +134,9 @@ LARGE = [
         "bin_size=.* positions in the bin",
     ),
     ("items=mixed items.width=[1,100000] items.depth=[1,100000]", "items.width=.* kinds of items"),
-    ("env.num_envs=10000000", r"env.num_envs=10000000, algo.rollout_length=8: .* GB"),
+    ("env.num_envs=10000000", "env.num_envs=10000000: .*<= 32,768"),
+    ("env.num_envs=32768", "env.num_envs=32768, algo.rollout_length=8: .* GB"),
+    ("algo.minibatch_size=1000000 algo.rollout_length=64", "algo.minibatch_size=16384: .* GB"),
     ("algo.rollout_length=1000000", r"algo.rollout_length=1000000: .* GB; expected at most"),
     ("evaluation.batch_size=1000000 evaluation.episodes=1000000", "evaluation.batch_size=1000000: .* GB"),
     ("evaluation.episodes=10000000", "evaluation.episodes=10000000: .*<= 1,000,000"),
@@ -166,14 +169,18 @@ def test_many_kinds_are_refused():
         Kinds([[1, 1, 1]] * 300_000)
 
 
-def test_a_real_cell_and_a_large_batch_are_accepted(tmp_path):
+def test_a_real_cell_and_a_large_batch_are_accepted(tmp_path, monkeypatch):
     """A bin of 60x40 and a tote of 120x80 cells; and the paper's cell, as a GPU trains it."""
     sizes = {"bin_size": (60, 40, 20), "tote_size": (120, 80, 60), "effector_size": (12, 8)}
     assert CellSpec(**sizes).num_actions == 92_160_000
     env = PickPlaceEnv(items=Kinds([(4, 3, 2)]), num_envs=2, masks=("footprint",), **sizes)
     assert env.reset()["footprint_mask"].any(1).all()
-    probe = PickPlaceEnv(num_envs=1)
-    assert 4096 * 32 * (2 * probe.observation_bytes) < 2**30  # with action masks
+    large = composed("experiment=quick", "env.num_envs=4096", "algo.rollout_length=32", "threads=1")
+    monkeypatch.setattr(Trainer, "_make_learner", lambda trainer: None)
+    with pytest.raises(ValueError, match="GB; expected at most 0.8 GB"):
+        Trainer(large, tmp_path)
+    monkeypatch.setattr(checks, "CPU_BYTES", 40 * 2**30)  # half of a GPU's memory
+    Trainer(large, tmp_path)
 
 
 HANDED_OVER = [

@@ -9,7 +9,7 @@ from typing import Any
 MAX_COUNT = 2**63 - 1
 
 #: Bytes that one batch may take on a CPU; on a GPU, half of its memory.
-CPU_BYTES = 2**30
+CPU_BYTES = 3 * 2**28
 
 #: Greatest width of a layer, and greatest number of inputs of a neuron.
 MAX_WIDTH, MAX_INPUTS = 1_024, 8_192

@@ -105,11 +105,17 @@ class Trainer:
         self._check_batch(probe)
 
     def _check_batch(self, probe: PickPlaceEnv) -> None:
-        """Refuse a batch that would fill the memory; its frames hold two observations each, but masks once."""
+        """Refuse a batch that would fill the memory.
+
+        A frame holds two observations, masks once, and what the critic computes for it, measured with ``pooled``; in a
+        gradient step some 90 kB more, measured with ``fcn_grasp`` at the paper's cell.
+        """
         slots, steps = self.cfg.env.num_envs, self.algo.rollout_length
         masks = sum(MASKS[name].size(self.cell) for name in self.policy.masks)
-        setting = f"env.num_envs={slots}, algo.rollout_length={steps}"
-        check_bytes(setting, slots * steps * (2 * probe.observation_bytes + masks), self.device)
+        frame = 2 * probe.observation_bytes + masks + 200 * self.cell.num_places
+        check_bytes(f"env.num_envs={slots}, algo.rollout_length={steps}", slots * steps * frame, self.device)
+        part = min(self.algo.minibatch_size, slots * steps)
+        check_bytes(f"algo.minibatch_size={part}", part * 90_000, self.device)
         check_bytes(f"env.num_envs={slots}", slots * problem_bytes(self.cell, self.policy.masks), self.device)
         check_play(self.cfg.evaluation, self.cell, self.device)
 
