@@ -13,6 +13,7 @@ from pickplace import CellSpec, PickPlaceEnv, Planner
 from pickplace.evaluation.evaluate import prepare
 from pickplace.planners.mcts import MCTS
 from pickplace.policies.fcn_grasp import FootprintPolicy
+from pickplace.policies.networks import footprint_fcn
 from pickplace.runs import checkpoint, errors
 from pickplace.runs.allowlist import MAX_DEPTH, MAX_NODES, MAX_TEXT, trusted_config
 from pickplace.runs.references import saved_form
@@ -316,6 +317,16 @@ def test_a_search_that_would_fill_the_memory_is_refused():
     )  # fmt: skip
     with pytest.raises(ValueError, match="planner.samples=10000.* GB"):
         planner.decide(state)
+
+
+def test_scores_of_many_footprints_are_computed_in_parts(monkeypatch):
+    policy, state = FootprintPolicy(CellSpec(), filters=8, hidden=8, compute_dtype="float32"), PickPlaceEnv(num_envs=9)
+    seen = state.reset()
+    with torch.no_grad():
+        whole = policy.best_feasible(seen), policy.action_log_probs(seen)
+        monkeypatch.setattr(footprint_fcn, "CHUNK_BYTES", 4 * policy.network.patch.in_features * 7)
+        assert policy.best_feasible(seen).equal(whole[0])
+        torch.testing.assert_close(policy.action_log_probs(seen), whole[1])
 
 
 def test_values_and_sentences_are_short():

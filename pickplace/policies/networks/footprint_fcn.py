@@ -11,6 +11,7 @@ from pickplace.task.grasps import split_footprint
 from pickplace.task.state import item_from_depth
 
 DTYPES = ("auto", "float32", "bfloat16")
+CHUNK_BYTES = 2**29  # inputs of the first layer that are held at a time when gradients are off
 MAX_LEVELS = 255  # levels are uint8
 OUTSIDE = -1000  # the depth of a cell that is not in the tote
 FAR_DOWN = 10_000  # deeper than any tote
@@ -103,6 +104,10 @@ class FootprintFcn(nn.Module):
             row: int64 ``[M]``, which problem.
             footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
         """
+        at_once = CHUNK_BYTES // (4 * self.patch.in_features)
+        if len(row) > at_once and not torch.is_grad_enabled():  # of large totes: a part at a time, to save memory
+            parts = zip(row.split(at_once), footprint.split(at_once), strict=True)
+            return torch.cat([self.at(bin_depth, tote_depth, *part) for part in parts])
         dtype, count = matrix_dtype(self.compute_dtype, tote_depth.device.type), len(row)
         lower = dtype != torch.float32
         if lower:
