@@ -57,8 +57,8 @@ chaos: $(STAMP)  ## kill a training 100 times with each collector, and compare i
 	$(BIN)/python tests/long/chaos.py 100 single
 	$(BIN)/python tests/long/chaos.py 100 multi_sync
 
-fuzz: $(STAMP)  ## send damaged requests to the robot's planner (an hour)
-	$(BIN)/python tests/long/fuzz.py 60
+fuzz: $(STAMP)  ## give the commands 3,000 random bad inputs (an hour)
+	$(BIN)/python tests/long/fuzz.py 3000
 
 memory: export OMP_NUM_THREADS ?= 1
 memory: $(STAMP)  ## check that a planner and two trainings do not grow in memory (an hour and a half)

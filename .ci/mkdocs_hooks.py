@@ -1,4 +1,4 @@
-"""Hooks of mkdocs, so that the same files serve a code host and the site: top-level pages, and links out of docs/."""
+"""Hooks of mkdocs, so that the same files serve a code host and the site: top-level pages, links, docstrings."""
 
 import os
 import re
@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = {"README.md": "overview.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 STYLE = ".md-typeset td code {word-break: normal}\n"  # keep keys on one line
 REMOTE_ASSET = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
+API_NAME = re.compile(r"\[(\**`(\w+)`\**)\]\(\.\./(pickplace/[\w/]+)\.py\)")  # a name in a table of api.md
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
 
 
@@ -22,8 +23,20 @@ def on_files(files, config):
     return files
 
 
+def add_docstrings(markdown):
+    """Put the docstrings of the names in each table below it, and point the names at them."""
+    parts = re.split(r"(?=^## )", markdown, flags=re.MULTILINE)
+    for number, part in enumerate(parts):
+        paths = [f"{module.replace('/', '.')}.{name}" for _, name, module in API_NAME.findall(part)]
+        linked = API_NAME.sub(lambda name: f"[{name[1]}][{name[3].replace('/', '.')}.{name[2]}]", part)
+        parts[number] = linked + "".join(f"\n::: {path}\n" for path in paths) + "\n"
+    return "".join(parts)
+
+
 def on_page_markdown(markdown, page, config, files):
-    """Point links at pages of the site; links to other files become plain text."""
+    """Point links at pages of the site; links to other files become plain text. Add docstrings to api.md."""
+    if page.file.src_uri == "api.md":
+        markdown = add_docstrings(markdown)
     place = {name: source for source, name in PAGES.items()}.get(page.file.src_uri)
     folder = ROOT if place else ROOT / "docs" / Path(page.file.src_uri).parent
 

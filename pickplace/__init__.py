@@ -7,6 +7,7 @@ import gymnasium
 
 if TYPE_CHECKING:
     from pickplace.envs.torchrl import PickPlaceEnv
+    from pickplace.policies.restore import load_policy
     from pickplace.robot.planner import DepthMapError, Plan, Planner
     from pickplace.task.cell import CellSpec
     from pickplace.task.state import Failure, Item, State
@@ -15,6 +16,8 @@ gymnasium.register(
     "pickplace/PickPlace-v0",
     entry_point="pickplace.views.gymnasium:RenderedPickPlaceEnv",
     vector_entry_point="pickplace.envs.gymnasium:PickPlaceVectorEnv",
+    order_enforce=False,  # no wrappers, which hide action_masks(); the environment itself refuses a step before reset
+    disable_env_checker=True,
 )
 
 __version__ = "0.1.0"
@@ -29,8 +32,12 @@ _MODULES = {
     "Plan": "robot.planner",
     "Planner": "robot.planner",
     "State": "task.state",
+    "load_policy": "policies.restore",
 }
-__all__ = ["CellSpec", "DepthMapError", "Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "State", "__version__"]
+__all__ = [
+    "CellSpec", "DepthMapError", "Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "State", "__version__",
+    "load_policy",
+]  # fmt: skip
 
 
 def __getattr__(name: str):

@@ -1,8 +1,13 @@
 """Entry points of the commands; ``--help`` is answered without waiting for torch."""
 
+import os
 import sys
 
 from pickplace.runs.hydra_app import command
+
+# A thread that waits for others sleeps. If it spun, it would hold up those that share its core. OpenMP reads this when
+# torch is loaded.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 #: Flags that Hydra answers by itself.
 ANSWERED_BY_HYDRA = {"--help", "-h", "--hydra-help", "--version"}

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 
+import pickplace
 from pickplace import Planner
 from pickplace.robot import json_lines
 from pickplace.runs.hydra_app import conf_dir
@@ -101,6 +102,15 @@ def test_commands_compose_and_reach_their_last_height(page, monkeypatch):
             check_command(command, search, tuple(chosen), is_new)
 
 
+def test_the_page_of_the_python_interface_has_every_public_name():
+    rows = re.findall(r"\[(\**)`(\w+)`\**\]\(\.\./([\w/]+)\.py\)", (DOCS / "api.md").read_text())
+    for _, name, path in rows:
+        found = getattr(importlib.import_module(path.replace("/", ".")), name)
+        assert found.__module__ == path.replace("/", ".") and found.__doc__, name
+    public = {name for bold, name, _ in rows if bold}
+    assert public == set(pickplace.__all__) - {"__version__"} and len(rows) == len({name for _, name, _ in rows})
+
+
 def test_the_site_builds(tmp_path):
     """Strictly, where its tools are installed: a broken link fails, and so does anything fetched from elsewhere."""
     pytest.importorskip("mkdocs")
@@ -112,7 +122,7 @@ def test_the_site_builds(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     html = (tmp_path / "api.html").read_text()
-    assert "Observation space" in html and ":class:<code>" not in html
+    assert "Observation space" in html and ":class:<code>" not in html and "::: " not in html
     assert (tmp_path / "overview.html").is_file() and (tmp_path / "concepts.svg").is_file()
 
 

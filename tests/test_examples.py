@@ -1,5 +1,6 @@
 """The examples in docs/examples/ train, evaluate and plan."""
 
+import ast
 import importlib
 import json
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from pickplace import Planner
+from pickplace import PickPlaceEnv, Planner, load_policy
 from pickplace.robot import json_lines
 from pickplace.runs import checkpoint
 from pickplace.runs.hydra_app import conf_dir
@@ -44,6 +45,36 @@ def test_own_planner(example):
     ours = example("evaluate", "own_planner", "planner=soft_dbl", *EVALUATION)
     assert ours["planner"] == "soft_dbl" and set(ours["failures"]) == {"stuck"} and ours["occupancy"]["mean"] > 0.8
     assert ours["planner_settings"] == {"temperature": 0.05, "seed": 0}
+    again, other = (
+        example("evaluate", "own_planner", "planner=soft_dbl", f"planner.seed={seed}", *EVALUATION) for seed in (0, 1)
+    )
+    assert ours["occupancy"] == again["occupancy"] and ours["occupancy"] != other["occupancy"]
+
+
+def test_own_planner_draws_by_its_seed(monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES / "own_planner"))
+    env = PickPlaceEnv(num_envs=32)
+    make = importlib.import_module("own_planner").SoftDBL
+    first, same, other = (make(env.cell, temperature=1.0, seed=seed) for seed in (3, 3, 4))
+    for _ in range(3):
+        observation = env.reset()
+        action = first.decide(observation)
+        assert torch.equal(action, same.decide(observation)) and not torch.equal(action, other.decide(observation))
+
+
+def test_own_planner_teaches(example):
+    """A training that was resumed while it imitates draws what an undisturbed one draws."""
+    imitate = ["warm_start=imitate", "planner@warm_start.teacher=soft_dbl", "warm_start.teacher.temperature=1"]
+    imitate += ["warm_start.frames=128", "warm_start.critic_frames=64", "curriculum=none", "algo.lr_decay_start=null"]
+    whole = example("train", "own_planner", *imitate, *TRAINING, "total_frames=256")
+    folder = example("train", "own_planner", *imitate, *TRAINING)
+    resume = [f"resume={folder}", "total_frames=256"]
+    example("train", "own_planner", *resume, refused="if own_planner is yours, say trust=own_planner")
+    example("train", "own_planner", *resume, "trust=own_planner")
+    states = [checkpoint.read(checkpoint.locate(place, prefer="last"))[0]["policy"] for place in (whole, folder)]
+    assert all(torch.equal(value, states[1][key]) for key, value in states[0].items())
+    ours = example("evaluate", "own_planner", f"checkpoint={folder}", "trust=own_planner", *EVALUATION)
+    assert ours["warm_start"] == "own_planner.SoftDBL" and ours["planner"] == "policy"
 
 
 def test_own_model_is_trusted_by_name_and_each_time(example, capsys, tmp_path):
@@ -82,8 +113,11 @@ def test_own_observation(example):
         ours = example("evaluate", "own_observation", *given, *planner)
         assert list(ours["env"]["observation"]) == ["bin_depth", "tote_depth", "tote_height", "pit_depth"]
     assert ours["occupancy"]["mean"] > 0.2 and any("pits" in name for name in weights)
-    with pytest.raises(ValueError, match=r"own_observation\.P"):
-        Planner.load(folder)
+    for load in (Planner.load, load_policy):
+        with pytest.raises(ValueError, match=r"own_observation\.P"):
+            load(folder)
+    policy = load_policy(folder, trust=["own_observation"])
+    assert "pit_depth" in policy.in_keys and policy.make_env(num_envs=2).rollout(20, policy).shape[1] > 2
     assert Planner.load(folder, trust=["own_observation"]).plan(BIN, np.full((6, 6), 2)).status == "ok"
 
 
@@ -114,6 +148,23 @@ def test_own_curriculum(name, levels):
     assert seen == levels
 
 
-def test_torchrl_script(monkeypatch):
+def test_torchrl_ppo(monkeypatch):
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    assert 0.5 < importlib.import_module("torchrl_script").train(total_frames=2048) < 1
+    before, after = importlib.import_module("torchrl_ppo").train(total_frames=10_240)
+    assert 0.7 < before < before + 0.03 < after < 1
+
+
+def test_quickstart_notebook(tmp_path):
+    """It runs from top to bottom, and what is committed shows a curve and a replay too."""
+    import nbclient
+    import nbformat
+
+    path = EXAMPLES / "quickstart.ipynb"
+    committed, executed = (nbformat.read(path, as_version=4) for _ in range(2))
+    nbclient.NotebookClient(executed, timeout=300, kernel_name="python3").execute(cwd=tmp_path)
+    assert path.stat().st_size < 300_000
+    for notebook in (committed, executed):
+        shown = [output["data"] for cell in notebook.cells for output in cell.get("outputs", [])]
+        assert [kind for data in shown for kind in data if "image" in kind] == ["image/png", "image/gif"]
+        means = ast.literal_eval(shown[1]["text/plain"])
+        assert means["random"] < 0.5 < 0.9 < means["policy"] and float(shown[0]["text/plain"]) > 0.9

@@ -11,7 +11,7 @@ from torchrl.envs.utils import step_mdp
 
 from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import PickPlaceEnv
-from pickplace.planners.base import BatchPlanner
+from pickplace.planners.base import BatchPlanner, decide
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import check_bytes, one_of, whole_number
 from pickplace.task.feasibility import num_feasible, placing_maps
@@ -153,7 +153,7 @@ def play(
             feasible += batch.feasible_shares()
             decisions += int(batch.running.sum())
             start = time.perf_counter()
-            action = planner.decide(batch.observation)
+            action = decide(planner, batch.env.cell, batch.observation)
             seconds += time.perf_counter() - start
             batch.record(planner, action)
             batch.step(action)
@@ -176,10 +176,10 @@ def decision_latency(make_env: MakeEnv, planner: BatchPlanner, decisions: int) -
         return None
     env = make_env(0, 1)
     observation, times, cpu_times = env.reset(), [], []
-    planner.decide(observation)  # warm up
+    decide(planner, env.cell, observation)  # warm up
     for _ in range(decisions):
         start, cpu_start = time.perf_counter(), time.process_time()
-        action = planner.decide(observation)
+        action = decide(planner, env.cell, observation)
         if action.device.type == "cuda":  # where a call returns before its work is done
             torch.cuda.synchronize(action.device)
         times.append((time.perf_counter() - start) * 1e3)

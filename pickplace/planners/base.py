@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
+import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
@@ -35,6 +36,25 @@ class BatchPlanner(Protocol):
     def decide(self, observation: Observation) -> Tensor:
         """Return flat actions, int64 ``[N]``."""
         ...
+
+
+def decide(planner: BatchPlanner, cell: CellSpec, observation: Observation) -> Tensor:
+    """Return a planner's flat actions, int64 ``[N]``.
+
+    Raises:
+        ValueError: for anything else, naming the planner's class and what its ``decide`` returned.
+    """
+    action, count = planner.decide(observation), len(observation["bin_depth"])
+    if not isinstance(action, Tensor):
+        found = type(action).__name__ + (f" of {action.dtype}" if hasattr(action, "dtype") else "")
+    elif action.dtype != torch.int64 or action.shape != (count,):
+        found = f"{str(action.dtype).removeprefix('torch.')} of shape {list(action.shape)}"
+    elif outside := action[(action < 0) | (action >= cell.num_actions)].tolist():
+        found = f"action {outside[0]}"
+    else:
+        return action
+    wanted = f"a tensor of flat actions, int64 of shape [{count}], from 0 to {cell.num_actions - 1}"
+    raise ValueError(f"{type(planner).__name__}.decide returned {found}: expected {wanted}.")
 
 
 def planner_parts(

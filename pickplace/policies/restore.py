@@ -1,18 +1,28 @@
 """Policies and critics from checkpoints."""
 
-from dataclasses import dataclass, replace
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, exploration_type
 
-from pickplace.policies.base import Policy, as_critic
+from pickplace.envs.torchrl import MASKS, PickPlaceEnv
+from pickplace.policies.base import Policy, as_collection_policy, as_critic
 from pickplace.runs import checkpoint
+from pickplace.runs.allowlist import trusted_config
+from pickplace.runs.machine import usable_device
 from pickplace.runs.registry import build
-from pickplace.task.cell import CellSpec
-from pickplace.task.state import Observation
+from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
+from pickplace.task.feasibility import placing_maps
+from pickplace.task.observation import Term, check_terms
+from pickplace.task.state import Observation, State
 
 SIZES = ("effector_size", "bin_size", "tote_size")
 
@@ -52,6 +62,85 @@ def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: di
         raise checkpoint.CheckpointError(
             f"{ours}: the checkpoint was trained with {theirs}, and its policy does not serve every other size."
         ) from error
+
+
+class TrainedPolicy(TensorDictModuleBase):
+    """The policy of a checkpoint as a module: an observation of :class:`PickPlaceEnv` in, ``action`` int64 ``[N]`` out.
+
+    It plays the most probable feasible action. Under ``set_exploration_type(ExplorationType.RANDOM)``, which TorchRL's
+    collectors set, it draws as in training: among feasible actions if it was trained with a mask, else among all.
+
+    Args:
+        policy: the distribution over choices, made for a cell.
+        terms: of the observation, by key.
+        config: of the training.
+
+    Attributes:
+        cell: the sizes that it decides for.
+    """
+
+    def __init__(self, policy: Policy, terms: Mapping[str, Term], config: DictConfig):
+        super().__init__()
+        self.policy, self.cell, self.terms, self.config = policy, policy.cell, terms, config
+        masks = {f"{name}_mask" for name in policy.masks}
+        self.in_keys = [key for key in policy.act_keys if key not in masks]
+        self.out_keys = ["action"]
+        self._draw = as_collection_policy(policy)
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` into the observation."""
+        seen = tensordict.select(*self.in_keys).reshape(-1)
+        if exploration_type() == ExplorationType.RANDOM:
+            maps = placing_maps(self.cell, State.from_observation(seen))
+            for name in self.policy.masks:
+                seen[f"{name}_mask"] = MASKS[name].make(self.cell, maps)
+            action = self._draw(seen)["action"]
+        else:
+            action = self.policy.best_feasible(seen)
+        return tensordict.set("action", action.reshape(tensordict.batch_size))
+
+    def make_env(self, num_envs: int = 1, **options) -> PickPlaceEnv:
+        """Return an environment with the policy's cell, and with items and observation of its training.
+
+        Args:
+            num_envs: ``N``.
+            **options: further arguments of :class:`PickPlaceEnv`, such as ``items`` or ``stream="test"``.
+        """
+        if options.get("items") is None:
+            options["items"] = build("items", self.config["items"])
+        cell = {item.name: getattr(self.cell, item.name) for item in fields(CellSpec)}
+        device = next(self.parameters()).device
+        return PickPlaceEnv(num_envs=num_envs, observation=self.terms, device=device, **cell, **options)
+
+
+def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -> TrainedPolicy:
+    """Return the policy of a checkpoint as a module; its ``make_env()`` makes an environment for it.
+
+    Args:
+        path: a run folder, a checkpoint, or ``pretrained/<name>``.
+        device: where to compute, ``"cpu"`` or ``"cuda"``.
+        trust: your own modules whose classes the checkpoint's config may name.
+        **sizes: settings that differ from the training's, such as ``tote_size=(30, 30, 10)``; see
+            :class:`~pickplace.task.cell.CellSpec`. A fully convolutional policy serves any bin and tote, and any
+            end effector if it was trained with a mask.
+
+    Raises:
+        ValueError: for a checkpoint that cannot be used, or bad sizes.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise ValueError(f"path={path!r}: expected a run folder, a checkpoint, or pretrained/<name>.")
+    state, facts = checkpoint.read(checkpoint.locate(path))
+    cfg = trusted_config(facts["config"], trust)
+    env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
+    cell = cell_from_settings({**{key: env[key] for key in CELL_SETTINGS if key in env}, **sizes})
+    if cell.pick_rule == "overlap" and cell.longest_side is None:  # it determines the number of grasps
+        longest = int(build("items", cfg["items"]).sizes[:, :2].max())
+        cell = replace(cell, longest_side=longest)
+    policy = restore_policy(cfg, cell, state["policy"], env)
+    nodes = cfg.env.get("observation") or {}
+    terms = {str(key): build(f"env.observation.{key}", node) for key, node in nodes.items()}
+    return TrainedPolicy(policy.to(usable_device(device)), check_terms(terms or None), cfg)
 
 
 @dataclass(frozen=True)

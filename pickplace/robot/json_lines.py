@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
         "--trust", action="append", metavar="MODULE", default=[],
         help="your own module whose classes the checkpoint's config may name; may be repeated",
     )  # fmt: skip
-    add("--threads", type=int, metavar="N", help="CPU threads; default: torch's")
+    add("--threads", type=int, metavar="N", help="CPU threads; default: as many as it may use")
     add("--device", default="cpu", help="cpu (the default) or cuda")
     add("--time", action="store_true", help="print the latency of each plan on standard error")
     return options
@@ -67,16 +67,13 @@ def run(args: argparse.Namespace) -> None:
     Raises:
         ValueError: for arguments, a checkpoint or maps that cannot be used.
     """
-    import torch  # here, so that --help need not wait for it
-
-    from pickplace.robot.planner import Planner
-    from pickplace.task.checks import whole_number
+    from pickplace.robot.planner import Planner  # here, so that --help need not wait for torch
+    from pickplace.runs.machine import use_threads
 
     if (args.bin is None) != (args.tote is None):
         missing = "--bin" if args.bin is None else "--tote"
         raise ValueError(f"{missing}: no file; expected both --bin and --tote, or neither to read JSON lines.")
-    if args.threads is not None:
-        torch.set_num_threads(whole_number("--threads", args.threads, most=1024))
+    use_threads("--threads", args.threads)
     sizes = {key: getattr(args, key) for key in ("bin_size", "tote_size", "effector_size", "rotations")}
     sizes = {key: value for key, value in sizes.items() if value is not None}
     candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates

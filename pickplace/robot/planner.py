@@ -6,25 +6,20 @@ cell ``(0, 0)`` on the inner floor; x runs along the first axis of the depth map
 seen from above.
 """
 
-import os
 import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Literal, cast
+from typing import Literal
 
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
+from pickplace.planners.base import decide
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy
-from pickplace.policies.restore import restore_policy
+from pickplace.policies.restore import load_policy
 from pickplace.robot.depth_maps import DepthMapError, Lengths, check_one_cuboid
-from pickplace.runs import checkpoint
-from pickplace.runs.allowlist import trusted_config
-from pickplace.runs.machine import usable_device
-from pickplace.runs.registry import build
-from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings, reference_cell
+from pickplace.task.cell import CellSpec, reference_cell
 from pickplace.task.checks import is_whole
 from pickplace.task.feasibility import action_footprints, action_mask, footprint_mask, placing_maps
 from pickplace.task.grasps import split_action
@@ -120,19 +115,8 @@ class Planner:
         Raises:
             ValueError: for a checkpoint that cannot be used, or bad sizes.
         """
-        if not isinstance(path, (str, os.PathLike)):
-            raise ValueError(f"path={path!r}: expected a run folder, a checkpoint, or pretrained/<name>.")
-        state, facts = checkpoint.read(checkpoint.locate(path))
-        cfg = trusted_config(facts["config"], trust)
-        env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
-        cell = cell_from_settings({**{key: env[key] for key in CELL_SETTINGS if key in env}, **sizes})
-        if cell.pick_rule == "overlap" and cell.longest_side is None:  # it determines the number of grasps
-            longest = int(build("items", cfg["items"]).sizes[:, :2].max())
-            cell = replace(cell, longest_side=longest)
-        policy = restore_policy(cfg, cell, state["policy"], env)
-        nodes = cfg.env.get("observation") or {}
-        terms = {str(key): build(f"env.observation.{key}", node) for key, node in nodes.items()}
-        return cls(cell, policy.to(usable_device(device)), candidates, terms or None)
+        trained = load_policy(path, device, trust, **sizes)
+        return cls(trained.cell, trained.policy, candidates, trained.terms)
 
     @torch.inference_mode()
     def plan(
@@ -203,7 +187,7 @@ class Planner:
     def _decide(self, observation, state: State) -> tuple[str, Tensor | None, Step | None]:
         """Return the status, and if an action was found that succeeds, the action and its effect."""
         if _any_feasible(self.cell, state):
-            action = self._planner.decide(observation)
+            action = decide(self._planner, self.cell, observation)
             step = apply(self.cell, state, action)
             return ("ok", action, step) if int(step.failure[0]) == 0 else ("rejected", None, None)
         empty = state._replace(heights=torch.zeros_like(state.heights))

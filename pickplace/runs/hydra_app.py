@@ -10,23 +10,18 @@ from pathlib import Path
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import ConfigCompositionException, HydraException
+from hydra.errors import ConfigCompositionException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
+from pickplace.runs.composition import composed_for_hint, conf_dir, constant_keys, options_of, with_own_values
 from pickplace.runs.errors import JobFailed, one_sentence, sentence, unknown_key
 from pickplace.runs.folder import FAILURE, OccupiedError, refuse_claimed, refuse_occupied, remove_empty_folders
+from pickplace.runs.registry import REGISTRY
 
 log = logging.getLogger(__name__)
-
-
-def conf_dir() -> Path:
-    """Return the folder of the config files: inside the package in a wheel, beside it in a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    inside = package / "conf"
-    return inside if inside.is_dir() else package.parent / "conf"
 
 
 def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> None:
@@ -48,11 +43,12 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
         hydra_cfg = HydraConfig.get()
         os.environ["HYDRA_FULL_ERROR"] = full_error
         with _job_of_sweep() if hydra_cfg.mode == RunMode.MULTIRUN else _single_run():
+            cfg = _with_own_values(cfg)
             if missing := OmegaConf.missing_keys(cfg):
                 raise ValueError(f"{min(missing)}: no value; expected {min(missing)}=<value>.")
             known = hydra.compose(hydra_cfg.job.config_name)
-            own = [str(key) for key in cfg if key not in from_checkpoint]
-            refuse_unknown_keys(OmegaConf.masked_copy(cfg, own), known)
+            checked = [str(key) for key in cfg if key not in from_checkpoint]
+            refuse_unknown_keys(OmegaConf.masked_copy(cfg, checked), known)
             return task(cfg, Path(hydra_cfg.runtime.output_dir))
 
     app.__module__, app.__qualname__ = "__main__", "app"
@@ -64,6 +60,15 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
                 hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(app)()
         finally:
             os.environ["HYDRA_FULL_ERROR"] = full_error
+
+
+def _with_own_values(cfg: DictConfig) -> DictConfig:
+    """Return the config without values of options that the command line replaced, and correct Hydra's note on it."""
+    own = with_own_values(cfg)
+    runtime, subdir = HydraConfig.get().runtime, HydraConfig.get().output_subdir
+    if own is not cfg and subdir is not None:
+        OmegaConf.save(own, Path(runtime.output_dir) / subdir / "config.yaml")
+    return own
 
 
 @contextmanager
@@ -115,26 +120,19 @@ def _clearer_errors(config_name: str, overrides: list[str]):
     except ConfigCompositionException as error:
         if not (key := re.match("Could not override '(.*)'", str(error))):
             raise
-        raise ValueError(unknown_key(key[1], _composed_without(key[1], config_name, overrides))) from error
+        raise ValueError(unknown_key(key[1], composed_for_hint(config_name, overrides, key[1]))) from error
     except ValueError as error:  # Hydra's own, which names no key
         if isinstance(error.__cause__, OSError):  # such as a log file that cannot be opened
             raise error.__cause__ from None
         for word in overrides:  # a group without an option, allowed for experiment only
             group, _, option = word.lstrip("+").partition("=")
-            if option in ("null", "") and group != "experiment" and (conf_dir() / group).is_dir():
-                names = sorted(file.stem for file in (conf_dir() / group).glob("*.yaml"))
+            if (
+                option in ("null", "")
+                and group != "experiment"
+                and (names := options_of(group, config_name, overrides))
+            ):
                 raise ValueError(f"{word}: expected {group}=<one of {', '.join(names)}>.") from error
         raise ValueError(f"{' '.join(overrides)}: {error}.") from error
-
-
-def _composed_without(key: str, config_name: str, overrides: list[str]) -> DictConfig:
-    """Return the config without the overrides of a key, or without any if others are wrong too."""
-    rest = [word for word in overrides if not word.startswith("-") and word.partition("=")[0] != key]
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        try:
-            return hydra.compose(config_name, rest)
-        except (HydraException, OmegaConfBaseException, ValueError):
-            return hydra.compose(config_name)
 
 
 class _Refusal(BaseException):
@@ -159,10 +157,13 @@ class FreshFolder(Callback):
 
 
 class SweepCallback(Callback):
-    """Tells :func:`command` the folder of a sweep before its jobs are composed, which may fail."""
+    """Tells :func:`command` the folder of a sweep before its jobs are composed, which may fail, and names theirs."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
         HydraConfig.instance().set_config(config)
+        keys = ",".join(f"'{key}'" for key in constant_keys(list(config.hydra.overrides.task)))
+        with read_write(config.hydra):  # the jobs are composed with these; the user's own come later, and win
+            config.hydra.overrides.hydra.insert(0, f"hydra.job.config.override_dirname.exclude_keys=[{keys}]")
 
 
 def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> None:
@@ -175,6 +176,8 @@ def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> N
     """
     for key, node in cfg.items():
         name = path + str(key)
+        if f"{path}*" in REGISTRY:  # a dict of parts with names of the user's choice
+            continue
         if key not in known:
             raise ValueError(unknown_key(name, known, path))
         if OmegaConf.is_dict(node) and OmegaConf.is_dict(known[key]) and "_target_" not in node:

@@ -4,21 +4,25 @@ All but ``logger=none`` write ``metrics.csv``, which reports, figures and sweeps
 """
 
 import csv
+import logging
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 from pickplace.runs.errors import missing_extra
 
 if TYPE_CHECKING:
     from torchrl.record.loggers.common import Logger
 
+log = logging.getLogger(__name__)
+
 
 class CsvLogger:
     """A table, ``metrics.csv``: a row for each batch, a column ``frames``, and a column for each metric.
 
     A new metric adds a column. On resume, rows after the checkpoint, which a killed run may have left, are dropped.
+    A table that is deleted or replaced meanwhile is written again, with all rows.
 
     Args:
         folder: the run folder.
@@ -41,7 +45,7 @@ class CsvLogger:
             writer.writeheader()
             writer.writerows(rows)
         new.replace(self.path)
-        self._file = self.path.open("a", newline="")
+        self._file: IO[str] = self.path.open("a+", newline="")  # it can be read when its name is gone
         self._writer = csv.DictWriter(self._file, self._columns)
 
     def log(self, metrics: dict[str, float], frames: int) -> None:
@@ -52,17 +56,35 @@ class CsvLogger:
         """
         row = {"frames": frames, **metrics}
         try:
+            self._restore()
             if set(row) <= set(self._columns):
                 self._writer.writerow(row)
                 self._file.flush()
             else:
-                self._file.close()
-                self._rewrite([*read_csv(self.path), row])
+                self._rewrite([*self._rows(), row])
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(self.path)) from error
 
+    def _rows(self) -> list[dict[str, float]]:
+        """Return the rows of the open file, and close it."""
+        with self._file as file:
+            file.seek(0)
+            return parse_csv(file.read(), self.path)
+
+    def _restore(self) -> None:
+        """Write the table again, with a warning, if its path no longer leads to the open file, or if that was cut."""
+        ours = os.fstat(self._file.fileno())
+        with suppress(FileNotFoundError):
+            if os.path.samestat(ours, self.path.stat()) and ours.st_size >= self._file.tell():
+                return
+        log.warning("%s was deleted, replaced or cut while the training writes it; it is written again", self.path)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._rewrite(self._rows())
+
     def close(self) -> None:
         """Close the file; rows that a full disk did not take are lost."""
+        with suppress(OSError):
+            self._restore()
         with suppress(OSError):
             self._file.close()
 
@@ -224,7 +246,11 @@ def read_csv(path) -> list[dict[str, float]]:
         ValueError: naming file and line, for a cell that is no number.
     """
     with Path(path).open(newline="") as file:
-        text = file.read()
+        return parse_csv(file.read(), path)
+
+
+def parse_csv(text: str, path) -> list[dict[str, float]]:
+    """As :func:`read_csv`, of the file's text."""
     lines = text[: text.rfind("\n") + 1].splitlines()  # a killed run may leave an incomplete last line
     rows = []
     for number, row in enumerate(csv.DictReader(lines), start=2):

@@ -1,9 +1,10 @@
 """The machine that a command runs on: threads and device."""
 
 import torch
+from loky import cpu_count
 from omegaconf import DictConfig
 
-from pickplace.task.checks import shortened
+from pickplace.task.checks import shortened, whole_number
 
 
 def use_machine(cfg: DictConfig) -> torch.device:
@@ -12,11 +13,18 @@ def use_machine(cfg: DictConfig) -> torch.device:
     Raises:
         ValueError: for a device that this machine lacks, or a bad number of threads.
     """
-    if cfg.threads is not None:
-        if not isinstance(cfg.threads, int) or isinstance(cfg.threads, bool) or not 1 <= cfg.threads <= 1024:
-            raise ValueError(f"threads={shortened(cfg.threads)}: expected a whole number >= 1 and <= 1024, or null.")
-        torch.set_num_threads(cfg.threads)
+    use_threads("threads", cfg.threads)
     return usable_device(cfg.device)
+
+
+def use_threads(key: str, threads: int | None) -> None:
+    """Set the number of threads of this process; None: as many as it may use, by its affinity and its cgroup's quota.
+
+    Raises:
+        ValueError: naming the ``key``, for a bad number.
+    """
+    default = min(torch.get_num_threads(), cpu_count())
+    torch.set_num_threads(default if threads is None else whole_number(key, threads, most=1024))
 
 
 def usable_device(name: str) -> torch.device:

@@ -71,6 +71,7 @@ REGISTRY: dict[str, dict[str, str]] = {
         "multi_sync": "pickplace.training.collectors.multi_sync",
         "ray": "pickplace.training.collectors.ray",
     },
+    "callbacks.*": {"early_stopping": "pickplace.training.callbacks.EarlyStopping"},
     "logger": {
         "csv": "pickplace.runs.loggers.CsvLogger",
         "tensorboard": "pickplace.runs.loggers.TensorboardLogger",

@@ -135,7 +135,7 @@ def interrupted_run(cfg: DictConfig, run_dir: Path) -> tuple[dict, dict, Path] |
     except checkpoint.CheckpointError:
         refuse_occupied(run_dir)
         return None
-    if facts["config"] != _as_json(saved_form(cfg)) or "curriculum" not in facts:
+    if not has_config(facts, saved_form(cfg)) or "curriculum" not in facts:
         raise occupied(run_dir)
     log.info("going on with %s at %s frames", run_dir, f"{facts['frames']:,}")
     return state, facts, folder
@@ -152,12 +152,13 @@ def stale_best_frames(run_dir: Path, frames: int, config: dict) -> int | None:
         config: the settings from now on, in the form that checkpoints hold.
     """
     facts = checkpoint.read_facts(run_dir)
-    is_stale = facts and facts["frames"] > frames and facts["config"] != _as_json(config)
+    is_stale = facts and facts["frames"] > frames and not has_config(facts, config)
     return facts["frames"] if is_stale else None
 
 
-def _as_json(config: dict) -> dict:
-    return json.loads(json.dumps(config))
+def has_config(facts: dict, config: dict) -> bool:
+    """Return whether a checkpoint is of this config, given in the form that checkpoints hold."""
+    return facts["config"] == json.loads(json.dumps(config))
 
 
 def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
@@ -182,13 +183,13 @@ class StopRequest:
     """Ctrl-C or SIGTERM: the loop finishes its batch and saves. A second Ctrl-C ends the process at once."""
 
     def __init__(self):
-        self.requested = False
+        self.requested = 0  # the signal
         self._previous = {number: signal.signal(number, self._request) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def _request(self, number, frame):
         if self.requested:
             os._exit(130)
-        self.requested = True
+        self.requested = number
         log.info("stopping after this batch; press Ctrl-C again to stop at once")
 
     def restore(self) -> None:

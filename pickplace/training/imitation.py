@@ -1,5 +1,6 @@
 """Warm start: a policy imitates a planner before it learns from reward."""
 
+import reprlib
 from collections.abc import Mapping
 from enum import Enum
 from typing import cast
@@ -10,11 +11,11 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pickplace.planners.base import planner_parts
+from pickplace.planners.base import decide, planner_parts
 from pickplace.policies.base import Policy
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import trusted_config
-from pickplace.runs.registry import build
+from pickplace.runs.registry import accepted_arguments, build, find
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import whole_number
 from pickplace.task.items import ItemDistribution
@@ -65,8 +66,13 @@ class WarmStart:
             whole_number(f"warm_start.{key}", cfg[key], 0)
         if cfg.frames and cfg.teacher is None:
             raise ValueError(f"warm_start.frames={cfg.frames}: there is no teacher; expected warm_start=imitate.")
+        if cfg.teacher is not None and not OmegaConf.is_dict(cfg.teacher):
+            given = reprlib.repr(cfg.teacher)
+            raise ValueError(f"warm_start.teacher={given}: expected planner@warm_start.teacher=<planner>.")
         self.policy, self.cell, self.seed = policy, cell, seed
         self.teacher, self.frames, self.critic_frames = cfg.teacher, cfg.frames, cfg.critic_frames
+        known = accepted_arguments(find("warm_start.teacher", cfg.teacher._target_)) if self.frames else ()
+        self._draws = "seed" in (cfg.teacher if known is None else known)
         self._parts = self._teacher_parts(cfg, items, terms, trust) if self.frames else {}
 
     def _teacher_parts(self, cfg: DictConfig, items: ItemDistribution, terms: Mapping[str, Term], trust) -> dict:
@@ -95,10 +101,10 @@ class WarmStart:
             data: observations ``[B]``.
             iteration: the run's batch number; it seeds a teacher that draws, so that a resumed run is the same.
         """
-        draws = {"seed": self.seed + iteration} if "seed" in self.teacher else {}
+        draws = {"seed": self.seed + iteration} if self._draws else {}
         settings = cast(dict, OmegaConf.to_container(self.teacher, resolve=True))
         teacher = build("warm_start.teacher", {**settings, **draws}, **self._parts)
-        action = teacher.decide(data)
+        action = decide(teacher, self.cell, data)
         state = State.from_observation(data)
         wanted = apply(self.cell, state, action)
         choice = self.policy.to_choice(action, data)

@@ -1,14 +1,20 @@
-"""The table ``sweep.csv`` and the figure ``sweep.png`` of all runs of a sweep, for any sweeper and launcher.
+"""The tables and the figure of a sweep, for any sweeper and launcher.
+
+``sweep.csv`` has a row for each run, ``sweep_settings.csv`` a row for each setting, over its seeds, and ``sweep.png``
+the mean validation curve of each setting.
 
 ``python -m pickplace.training.sweep outputs/sweep/...`` writes them again, for example after a run was resumed.
 """
 
 import csv
 import logging
+import re
 import sys
+import textwrap
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from pickplace.runs.checkpoint import read_facts
@@ -20,8 +26,18 @@ from pickplace.views.figures import figure_of
 
 log = logging.getLogger(__name__)
 
-TABLE, FIGURE = "sweep.csv", "sweep.png"
-LARGEST_LEGEND = 40  # runs that the figure names; of more, the best
+TABLE, SETTINGS_TABLE, FIGURE = "sweep.csv", "sweep_settings.csv", "sweep.png"
+LARGEST_LEGEND = 40  # settings that the figure and the console name; of more, the best
+RESAMPLES = 9999  # of the bootstrap
+COLOURS = [
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#e69f00",
+    "#56b4e9",
+    "#8c8c8c",
+]  # without Okabe and Ito's yellow
 
 
 class SweepSummary(SweepCallback):
@@ -82,12 +98,96 @@ def read_run(folder: Path) -> SweepRun:
         run.status = "running"
     else:  # the checkpoint's config first: a resumed run may have a larger budget
         cfg = OmegaConf.create(facts["config"]) if facts else OmegaConf.load(folder / ".hydra" / "config.yaml")
-        run.status = "finished" if run.frames >= cfg.total_frames else "stopped"
+        is_complete = run.frames >= cfg.total_frames or facts.get("ended") is True
+        run.status = "finished" if is_complete else "stopped"
     return run
 
 
-def summarize(folder: Path) -> list[SweepRun]:
-    """Write table and figure of a sweep into its folder; return the runs in the order of the jobs.
+@dataclass
+class Setting:
+    """The runs of a sweep that differ in their seed only, and statistics over those that finished."""
+
+    overrides: dict[str, str]  # without the seed
+    runs: list[SweepRun]
+
+    @property
+    def finished(self) -> list[SweepRun]:
+        """The runs that finished with a validation."""
+        return [run for run in self.runs if run.status == "finished" and run.final is not None]
+
+    @property
+    def finals(self) -> np.ndarray:
+        """Their final validation occupancies, float ``[S]``."""
+        return np.array([run.final for run in self.finished], dtype=float)
+
+    @property
+    def mean(self) -> float | None:
+        """Their mean."""
+        return float(self.finals.mean()) if len(self.finals) else None
+
+    @property
+    def interquartile_mean(self) -> float | None:
+        """The mean of their middle half."""
+        from scipy.stats import trim_mean
+
+        return float(trim_mean(self.finals, 0.25)) if len(self.finals) else None
+
+    @property
+    def interval(self) -> tuple[float, float] | tuple[None, None]:
+        """The 95% interval of their mean, see :func:`bootstrap95`; None with fewer than two."""
+        if len(self.finals) < 2:
+            return None, None
+        low, high = bootstrap95(self.finals)
+        return float(low), float(high)
+
+    @property
+    def curves(self) -> tuple[np.ndarray, np.ndarray]:
+        """Frames ``[V]`` and validation occupancies ``[V, S]`` of the finished runs; one that ended earlier keeps its
+        last."""
+        frames = sorted({int(row["frames"]) for run in self.finished for row in run.validations})
+        values = np.full((len(frames), len(self.finished)), np.nan)
+        for column, run in enumerate(self.finished):
+            for row in run.validations:
+                values[frames.index(int(row["frames"])) :, column] = row["eval/occupancy"]
+        complete = ~np.isnan(values).any(1)
+        return np.array(frames)[complete], values[complete]
+
+
+def bootstrap95(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the 95% percentile bootstrap interval of the mean over the last axis.
+
+    Two or three values give their range, which is too narrow for 95%.
+
+    Args:
+        values: ``[..., S]`` with ``S >= 2``.
+
+    Returns:
+        Low and high ends, each ``[...]``; the same for the same values.
+    """
+    from scipy.stats import bootstrap
+
+    found = bootstrap(
+        (values,), np.mean, axis=-1, n_resamples=RESAMPLES, batch=1000, method="percentile", random_state=0
+    ).confidence_interval
+    return found.low, found.high
+
+
+def settings_of(runs: list[SweepRun]) -> list[Setting]:
+    """Return the settings of a sweep: its runs, grouped by their overrides without the seed."""
+    settings: dict[tuple, Setting] = {}
+    for run in runs:
+        overrides = {key: value for key, value in run.overrides.items() if key != "seed"}
+        settings.setdefault(tuple(sorted(overrides.items())), Setting(overrides, [])).runs.append(run)
+    return list(settings.values())
+
+
+def ranked(settings: list[Setting]) -> list[Setting]:
+    """Return settings with the best mean first; those without a finished run are last."""
+    return sorted(settings, key=lambda setting: -1.0 if setting.mean is None else setting.mean, reverse=True)
+
+
+def summarize(folder: Path) -> list[Setting]:
+    """Write tables and figure of a sweep into its folder; return the settings in the order of their folders' names.
 
     Raises:
         FileNotFoundError: if it contains no run.
@@ -95,45 +195,92 @@ def summarize(folder: Path) -> list[SweepRun]:
     found = [path.parent.parent for path in Path(folder).glob("*/.hydra/overrides.yaml")]
     if not found:
         raise FileNotFoundError(f"{folder}: no run in it; expected the folder of a sweep.")
-    found.sort(key=lambda path: (not path.name.isdecimal(), path.name.zfill(9)))
+    found.sort(key=lambda path: [part.zfill(9) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)])
     runs = [read_run(path) for path in found]
+    settings = settings_of(runs)
     keys = list(dict.fromkeys(key for run in runs for key in run.overrides))
-    with (folder / TABLE).open("w", newline="") as file:
-        columns = ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "error"]
+    columns = ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "error"]
+    rows = []
+    for run in runs:
+        last = run.validations[-1] if run.validations else {}
+        results = run.frames, run.best, run.final, last.get("eval/ci95_low"), last.get("eval/ci95_high"), run.error
+        rows.append([run.name, run.status, *(run.overrides.get(key) for key in keys), *results])
+    _write_table(folder / TABLE, ["run", "status", *keys, *columns], rows)
+    keys = [key for key in keys if key != "seed"]
+    columns = ["runs", "finished", "mean_occupancy", "interquartile_mean", "mean_ci95_low", "mean_ci95_high"]
+    rows = [
+        [*(each.overrides.get(key) for key in keys), len(each.runs), len(each.finished), each.mean]
+        + [each.interquartile_mean, *each.interval]
+        for each in settings
+    ]
+    _write_table(folder / SETTINGS_TABLE, [*keys, *columns], rows)
+    draw(settings, folder / FIGURE)
+    for setting in ranked(settings)[:LARGEST_LEGEND]:
+        log.info("%s  %s", result(setting), label(setting, settings))
+    log.info("tables and figure of the sweep: %s, %s, %s", folder / SETTINGS_TABLE, folder / TABLE, folder / FIGURE)
+    return settings
+
+
+def _write_table(path: Path, columns: list[str], rows: list[list]) -> None:
+    with path.open("w", newline="") as file:
         table = csv.writer(file)
-        table.writerow(["run", "status", *keys, *columns])
-        for run in runs:
-            last = run.validations[-1] if run.validations else {}
-            results = run.frames, run.best, run.final, last.get("eval/ci95_low"), last.get("eval/ci95_high"), run.error
-            table.writerow([run.name, run.status, *(run.overrides.get(key) for key in keys), *results])
-    draw(runs, folder / FIGURE)
-    log.info("table and figure of the sweep: %s, %s", folder / TABLE, folder / FIGURE)
-    return runs
+        table.writerow(columns)
+        table.writerows(rows)
 
 
-def label(run: SweepRun, runs: list[SweepRun]) -> str:
-    """Label of a run in the figure: the overrides in which the runs differ, and its status unless it finished."""
-    differing = [key for key in run.overrides if len({other.overrides.get(key) for other in runs}) > 1]
-    words = [f"{key}={run.overrides[key]}" for key in differing] or [f"run {run.name}"]
-    return ", ".join(words) + ("" if run.status == "finished" else f" ({run.status})")
+def label(setting: Setting, settings: list[Setting]) -> str:
+    """Label of a setting: the overrides in which the settings differ, and its runs that did not finish."""
+    differing = [key for key in setting.overrides if len({other.overrides.get(key) for other in settings}) > 1]
+    words = [f"{key}={setting.overrides[key]}" for key in differing] or ["all runs"]
+    open_ends = [run.status for run in setting.runs if run.status != "finished"]
+    counts = [f"{open_ends.count(status)} {status}" for status in dict.fromkeys(open_ends)]
+    return ", ".join(words) + (f" ({', '.join(counts)})" if counts else "")
 
 
-def draw(runs: list[SweepRun], path: Path) -> None:
-    """Draw the validation curves of all runs; the legend names them with their final occupancy, best first."""
+def result(setting: Setting) -> str:
+    """Mean final occupancy of a setting, its interval and number of seeds, as text of equal width."""
+    if setting.mean is None:
+        return f"{'none finished':<34}"
+    low, high = setting.interval
+    interval = "" if low is None else f"({low:.4f} to {high:.4f})"
+    count = len(setting.finals)
+    return f"{setting.mean:.4f} {interval:<18} {f'{count} seed' + 's' * (count > 1):>8}"
+
+
+def draw(settings: list[Setting], path: Path) -> None:
+    """Draw the mean validation curve of each setting over its finished runs, with its 95% interval, best first.
+
+    Runs that did not finish are single dashed lines.
+    """
     from matplotlib import colormaps
+    from matplotlib.ticker import EngFormatter
 
-    ranked = sorted(runs, key=lambda run: -1.0 if run.final is None else run.final, reverse=True)
-    figure = figure_of(11, max(3.6, 1.4 + 0.24 * min(len(runs), LARGEST_LEGEND)))
+    order = ranked(settings)
+    figure = figure_of(8, max(4.5, 0.6 + 0.18 * min(len(order), LARGEST_LEGEND)))
     axes = figure.subplots()
-    for rank, run in enumerate(ranked):
-        frames, means = ([row[key] for row in run.validations] for key in ("frames", "eval/occupancy"))
-        text = f"{'no validation' if run.final is None else f'{run.final:.4f}'}  {label(run, runs)}"
-        named = text if rank < LARGEST_LEGEND else None
-        axes.plot(frames, means, ".-", color=colormaps["viridis"](0.9 * rank / len(ranked)), label=named)
-    axes.set(title="Validation at full height", xlabel="frames (environment steps)", ylabel="occupancy (0 to 1)")
-    axes.legend(title="final occupancy", loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, fontsize=8)
+    for rank, setting in enumerate(order):
+        few = len(order) <= len(COLOURS)
+        colour = COLOURS[rank] if few else colormaps["viridis"](0.95 * rank / len(order))
+        for run in setting.runs:
+            if run.status != "finished":
+                points = [(row["frames"], row["eval/occupancy"]) for row in run.validations]
+                axes.plot(*np.array(points).reshape(-1, 2).T, ".--", color=colour, lw=0.8)
+        frames, values = setting.curves
+        text = f"{result(setting)}  {textwrap.shorten(label(setting, settings), 90, placeholder=' ...')}"
+        means = values.mean(1) if len(frames) else frames
+        axes.plot(frames, means, "o-", color=colour, ms=3.5, label=text if rank < LARGEST_LEGEND else None)
+        if len(frames) and values.shape[1] > 1:
+            axes.fill_between(frames, *bootstrap95(values), color=colour, alpha=0.2, lw=0)
+    axes.set(title="Validation at full height: mean over seeds and its 95% interval; dashed: not finished")
+    axes.set(xlabel="frames (environment steps)", ylabel="occupancy (0 to 1)")
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
+    legend = axes.legend(
+        title="final occupancy, mean over seeds (95% interval)", loc="upper left", bbox_to_anchor=(1.02, 1),
+        frameon=False, alignment="left", borderaxespad=0, prop={"family": "monospace", "size": 8},
+    )  # fmt: skip
+    legend.set_in_layout(False)  # the picture grows by it; the axes keep their size
+    figure.savefig(path, dpi=120, bbox_inches="tight", bbox_extra_artists=[legend])
 
 
 if __name__ == "__main__":

@@ -5,8 +5,6 @@ import sys
 import time
 from pathlib import Path
 
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from pickplace.runs import checkpoint
@@ -32,6 +30,7 @@ def train(cfg: DictConfig, run_dir: Path) -> float:
 
     Raises:
         ValueError: for settings that make no sense, or a run folder that holds another training.
+        KeyboardInterrupt: as :func:`run`.
     """
     if cfg.resume is not None:
         raise ValueError(f"resume={cfg.resume}: expected as resume=<run folder> on the command line, without a +.")
@@ -48,11 +47,14 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
 
     Returns:
         As :func:`train`.
+
+    Raises:
+        KeyboardInterrupt: with the signal, after Ctrl-C or SIGTERM; the checkpoint ``last`` is saved.
     """
     trainer = Trainer(cfg, run_dir, resume)
     with trainer.running() as stop:
         batches = iter(trainer.collector)
-        while trainer.frames < cfg.total_frames and not stop.requested:
+        while not (trainer.is_complete or stop.requested):
             # Collect a batch, [num_envs, rollout_length], with the newest weights.
             trainer.push_weights()
             started = time.perf_counter()
@@ -78,11 +80,11 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         if trainer.last_saved != trainer.frames:  # after the loop, so that a stop request is never missed
             trainer.save("last")
 
-    trainer.log_ending(stop.requested)
+    trainer.log_ending(bool(stop.requested))
     trainer.write_report()
     log.info("run folder: %s", run_dir)
-    if stop.requested and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise KeyboardInterrupt  # ends the whole sweep, not only this run
+    if stop.requested:
+        raise KeyboardInterrupt(stop.requested)  # ends a whole sweep, not only this run
     return float(trainer.latest.get("occupancy", float("nan")))
 
 

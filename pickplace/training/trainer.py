@@ -27,10 +27,12 @@ from pickplace.runs.resume import (
     StopRequest,
     checkpoint_config,
     checkpoint_hint,
+    has_config,
     load_optimizer,
     stale_best_frames,
 )
 from pickplace.task.checks import check_bytes
+from pickplace.training import callbacks
 from pickplace.training.collectors import refuse_other_workers, rng_state, set_rng_state, watch_workers
 from pickplace.training.curriculum import Curriculum, push_level
 from pickplace.training.imitation import Phase, WarmStart
@@ -57,6 +59,7 @@ class Trainer:
         best: best validation occupancy so far; -1 before the first validation.
         latest: metrics of the latest validation.
         episodes: episodes of the latest validation of this process, or None.
+        ended: whether a callback has ended the training.
         safe_folder: the checkpoint that was read or written last, or None.
 
     Raises:
@@ -79,6 +82,9 @@ class Trainer:
         for key, default in COUNTERS.items():
             setattr(self, key, self.facts.get(key, default))
         self.episodes: Episodes | None = None
+        # With other settings, a training that a callback had ended goes on.
+        self.ended = self.facts.get("ended") is True and has_config(self.facts, self.saved_config)
+        self.callbacks = callbacks.make_callbacks(cfg.get("callbacks") or {}, self.facts.get("callbacks") or {})
         # The order of these fixes the random draws of a seed.
         self._make_models()
         self._make_curriculum()
@@ -169,6 +175,21 @@ class Trainer:
             seed=cfg.seed,
         )
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether nothing is left to train."""
+        return self.ended or self.frames >= self.cfg.total_frames
+
+    def end(self, reason: str) -> None:
+        """End the training after this batch, for a callback; it is validated, saved and reported as a complete one.
+
+        Args:
+            reason: a sentence for the log.
+        """
+        if not self.ended:
+            log.info("%s frames: %s", f"{self.frames:,}", reason)
+        self.ended = True
+
     @contextmanager
     def running(self) -> Iterator[StopRequest]:
         """Prepare everything for the loop, and close it afterwards, however the loop ends.
@@ -190,12 +211,15 @@ class Trainer:
             self.last_saved = self.frames if is_last else None  # frames of checkpoints/last
             cleanup.callback(stop.restore)
             cleanup.callback(self.logger.close)
-            log.info(
-                "%s frames to train, at tote height %d of %d",
-                f"{max(cfg.total_frames - self.frames, 0):,}",
-                self.curriculum.level,
-                self.curriculum.end,
-            )
+            if self.ended:
+                log.info("a callback ended this training at %s frames; other settings continue it", f"{self.frames:,}")
+            else:
+                log.info(
+                    "%s frames to train, at tote height %d of %d",
+                    f"{max(cfg.total_frames - self.frames, 0):,}",
+                    self.curriculum.level,
+                    self.curriculum.end,
+                )
             cleanup.enter_context(checkpoint_hint(lambda: self.safe_folder, self.resume_overrides))
             cleanup.enter_context(watch_workers(self.collector))
             yield stop
@@ -224,6 +248,7 @@ class Trainer:
         if self.curriculum.level != level:
             push_level(self.collector, self.curriculum.level)
             log.info("%s frames: tote height %d -> %d", f"{self.frames:,}", level, self.curriculum.level)
+            callbacks.call(self.callbacks, "on_level_change", self, level, self.curriculum.level)
         return metrics
 
     def learn(self, batch: TensorDictBase, phase: Phase) -> dict:
@@ -252,11 +277,13 @@ class Trainer:
     def finish_batch(self, metrics: dict, before: int) -> None:
         """Validate, log, save and print progress where their intervals ended between ``before`` and now."""
         cfg, frames = self.cfg, self.frames
-        if frames >= cfg.total_frames or has_passed(before, frames, cfg.evaluation_interval):
+        callbacks.call(self.callbacks, "on_batch", self, metrics)
+        if self.is_complete or has_passed(before, frames, cfg.evaluation_interval):
             self.episodes = self.validate()
             self.latest = validation_metrics(self.episodes)
             metrics |= {f"eval/{key}": value for key, value in self.latest.items()}
             log.info("%s frames: validation occupancy %.4f", f"{frames:,}", self.latest["occupancy"])
+            callbacks.call(self.callbacks, "on_validation", self, self.episodes, metrics)
         self.logger.log(metrics, frames)
         # After the row was logged, which a run resumed from this checkpoint needs.
         if "eval/occupancy" in metrics and self.latest["occupancy"] > self.best:
@@ -264,7 +291,7 @@ class Trainer:
             self.save("best")
         if has_passed(before, frames, cfg.checkpoint_interval):
             self.save("last")
-        if has_passed(before, frames, cfg.progress_interval):
+        if has_passed(before, frames, cfg.progress_interval) and not self.ended:
             speed = (frames - self.start_frames) / (time.perf_counter() - self.start_time)
             log.info(progress_line(frames, cfg.total_frames, speed, self.curriculum, metrics))
 
@@ -280,6 +307,8 @@ class Trainer:
         facts = {
             **{key: getattr(self, key) for key in COUNTERS},
             "curriculum": self.curriculum.state_dict(),
+            "callbacks": {name: callback.state_dict() for name, callback in self.callbacks.items()},
+            "ended": self.ended,
             "config": self.saved_config,
             "versions": versions(),
             "commit": commit(),
@@ -311,7 +340,7 @@ class Trainer:
             return
         learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png")
         up_to_date = self.episodes is None and (run_dir / REPORT).is_file()  # nothing was trained since
-        if self.frames >= self.cfg.total_frames and not up_to_date:
+        if self.is_complete and not up_to_date:
             log.info("writing the report")
             episodes = self.episodes or self.validate()
             extremes = {int(episodes.occupancy.argmin()), int(episodes.occupancy.argmax())}

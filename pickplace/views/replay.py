@@ -112,7 +112,9 @@ def picture(recording: Recording, cell: CellSpec, path: Path, moves: int | None 
     draw_scene(recording, cell, colours, moves).savefig(path, dpi=120)
 
 
-def animation(recording: Recording, cell: CellSpec, path: Path, seconds: float = 12.0, frames: int = 120) -> None:
+def animation(
+    recording: Recording, cell: CellSpec, path: Path, seconds: float = 12.0, frames: int = 120, dpi: int = 60
+) -> None:
     """Write a GIF of the tote being packed.
 
     Args:
@@ -120,6 +122,7 @@ def animation(recording: Recording, cell: CellSpec, path: Path, seconds: float =
         path: the file to write.
         seconds: how long it plays; the last picture stays for two more.
         frames: greatest number of pictures; a longer episode leaves moves out.
+        dpi: pixels an inch; a picture is 12 inches wide.
     """
     from PIL import Image  # comes with matplotlib
 
@@ -129,7 +132,7 @@ def animation(recording: Recording, cell: CellSpec, path: Path, seconds: float =
     images = []
     for moves in shown:
         buffer = io.BytesIO()
-        draw_scene(recording, cell, colours, moves).savefig(buffer, format="png", dpi=60)
+        draw_scene(recording, cell, colours, moves).savefig(buffer, format="png", dpi=dpi)
         images.append(Image.open(buffer).convert("RGB").quantize(128, dither=Image.Dither.NONE))
     each = max(20, round(1000 * seconds / len(images)))
     durations = [each] * (len(images) - 1) + [each + 2000]

@@ -65,7 +65,7 @@ def test_a_single_environment_against_the_batched_one(seed, height):
         while True:
             assert_equal(observation, {key: state[key][0].numpy() for key in below.terms})
             assert np.array_equal(info["action_mask"], state["action_mask"][0].numpy())
-            assert np.array_equal(info["action_mask"], env.get_wrapper_attr("action_masks")())
+            assert np.array_equal(info["action_mask"], env.action_masks())
             assert info["occupancy"] == pytest.approx(float(state["occupancy"]))
             assert info["failure"] == Failure(int(state["failure"])).name.lower()
             if ended:

@@ -7,11 +7,23 @@ from pathlib import Path
 
 import pytest
 from commands import composed
+from omegaconf import OmegaConf
 
 import pickplace
 from pickplace.runs.errors import sentence
 from pickplace.runs.folder import noted_overrides
 from pickplace.runs.hydra_app import apply_overrides
+from pickplace.training import train
+
+CURRICULA = Path(__file__).parents[2] / "docs/examples/own_curriculum"
+PLATEAU = {"_target_": "plateau", "window": 400, "patience": 3, "min_improvement": 0.01}
+MINE = """\
+# @package _global_
+defaults: [{override /curriculum: adaptive}, _self_]
+curriculum: {advance: {window: 7, occupancy: 0.5}}
+items: {kinds: [[1, 1, 1]]}
+algo: {lr: 0.5}
+"""
 
 #: Command, its words, and parts of the sentence: a sample of each kind; tests of the parts hold the others.
 BAD = [
@@ -66,6 +78,74 @@ BAD = [
     ("train", "algo.mask_infeasible=maybe", ["algo.mask_infeasible='maybe'", "true or false"]),
     ("train", "evaluation.stream=test", ["evaluation.stream='test'", "validation"]),
 ]
+
+
+#: Words of the command line, and of the resulting config: a part, and what it is.
+OWN_VALUES = [
+    # a config file of the user's, written for threshold
+    ("curriculum=careful curriculum/advance=plateau", "curriculum.advance", PLATEAU),
+    ("curriculum=careful curriculum/advance=plateau curriculum.advance.window=9", "curriculum.advance.window", 9),
+    ("curriculum=careful curriculum/advance=plateau", "curriculum.sample.share", 0.33),
+    ("curriculum=careful curriculum/advance=threshold", "curriculum.advance.window", 200),
+    ("curriculum=careful", "curriculum.advance.window", 200),
+    # presets
+    ("experiment=smoke model=fcn4d", "model.actor.filters", 64),
+    ("experiment=smoke model=fcn4d model.actor={filters:4}", "model.actor.filters", 4),
+    ("experiment=smoke model=fcn4d", "model.critic.hidden", 256),
+    ("experiment=smoke model=fcn_grasp", "model.actor.filters", 8),
+    ("experiment=smoke env=deep_bin", "env.tote_size", [4, 4, 1]),
+    ("experiment=mixed warm_start=none", "warm_start.frames", 0),
+    ("experiment=mixed planner@warm_start.teacher=mcts", "warm_start.frames", 100_000),
+    ("experiment=mine", "curriculum.advance.window", 7),
+    ("experiment=mine curriculum=mixture", "curriculum.advance.window", 7),
+    ("experiment=mine curriculum/advance=plateau", "curriculum.advance", PLATEAU),
+    ("experiment=mine curriculum=paper", "curriculum.advance", {"_target_": "frames", "frames_per_level": 5_000_000}),
+    ("experiment=mine curriculum=careful curriculum/advance=plateau", "curriculum.advance", PLATEAU),
+    ("experiment=mine items=tall", "items.kinds", None),
+    ("experiment=mine algo=a2c", "algo.lr", 0.5),
+    ("experiment=mine ~curriculum.advance.window curriculum/advance=plateau", "curriculum.advance.window", None),
+]
+
+
+@pytest.mark.parametrize(("words", "key", "expected"), OWN_VALUES)
+def test_an_option_chosen_on_the_command_line_has_its_own_values(run, tmp_path, monkeypatch, words, key, expected):
+    """In the config that the training gets and in Hydra's note on it."""
+    (tmp_path / "conf" / "experiment").mkdir(parents=True)
+    (tmp_path / "conf" / "experiment" / "mine.yaml").write_text(MINE)
+    search = f"hydra.searchpath=[file://{tmp_path}/conf,file://{CURRICULA}]"
+    given = []
+    monkeypatch.setattr(train, "train", lambda cfg, run_dir: given.append(cfg))
+    code, _, err = run("train", search, *words.split(), "hydra.run.dir=run")
+    assert code == 0, err
+    for cfg in (given[0], OmegaConf.load("run/.hydra/config.yaml")):
+        assert OmegaConf.select(cfg, key) == expected
+
+
+def test_own_values_in_a_sweep(run, monkeypatch):
+    given = []
+    monkeypatch.setattr(train, "train", lambda cfg, run_dir: given.append(cfg.curriculum.advance))
+    words = ["-m", "--config-dir", str(CURRICULA), "curriculum=careful", "curriculum/advance=plateau,threshold"]
+    run("train", *words, "hydra.sweep.dir=sweep")
+    assert given[0] == PLATEAU and (given[1].window, given[1].occupancy) == (200, 0.85)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("model=mlp model.actor.hiden=1", "model.actor; did you mean 'hidden'?"),
+        ("model=mlp model.actor.hiden=1 seed=0,1", "model.actor; did you mean 'hidden'?"),
+        ("model=null", "expected model=<one of fcn4d, fcn4d_noclip, fcn_grasp, individual_grasp, individual_rl, mlp, "),
+        ("model=mpl", "individual_rl, mlp, typical."),
+        ("curriculum=careful curriculum/advance=plateau curriculum.advance.occupancy=1", "expected one of window, "),
+    ],
+)
+@pytest.mark.parametrize("given", ["--config-dir {0}/own_model", "hydra.searchpath=[file://{0}/own_model]"])
+def test_hints_know_the_user_s_folders(run, monkeypatch, words, expected, given):
+    monkeypatch.syspath_prepend(str(CURRICULA.parent / "own_model"))
+    given = given.replace("own_model", "own_curriculum") if "careful" in words else given
+    flags = ["-m"] if "seed=0,1" in words else []
+    code, _, err = run("train", *flags, *given.format(CURRICULA.parent).split(), *words.split())
+    assert code == 2 and expected in err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(("command", "words", "expected"), BAD)

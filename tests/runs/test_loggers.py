@@ -31,6 +31,33 @@ def test_metrics_survive_a_cut_line_and_a_resume(tmp_path):
     assert rows == [{"frames": 10, "a": 1.0}, {"frames": 20, "a": 2.0, "b": 5.0}, {"frames": 30, "a": 7.0}]
 
 
+@pytest.mark.parametrize("damage", ["delete", "replace", "cut", "folder"])
+@pytest.mark.parametrize("when", ["row", "column", "close"])
+def test_a_table_that_is_taken_away_is_written_again(tmp_path, caplog, damage, when):
+    path = tmp_path / "run" / "metrics.csv"
+    path.parent.mkdir()
+    logger = CsvLogger(path.parent)
+    logger.log({"a": 1.0}, 10)
+    logger.log({"a": 2.0}, 20)
+    if damage == "cut":
+        path.write_text("")
+    elif damage == "folder":
+        path.parent.rename(tmp_path / "moved")
+    else:
+        path.unlink()
+        if damage == "replace":
+            path.write_text("frames,a\n7,7\n")
+    rows = [] if damage == "cut" else [{"frames": 10, "a": 1.0}, {"frames": 20, "a": 2.0}]
+    if when != "close":
+        more = {"a": 3.0} if when == "row" else {"a": 3.0, "b": 4.0}
+        for frames in (30, 40):
+            logger.log(more, frames)
+        rows += [{"frames": frames, **more} for frames in (30, 40)]
+    logger.close()
+    assert read_csv(path) == rows
+    assert len(caplog.messages) == 1 and str(path) in caplog.text
+
+
 @pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])
 def test_a_missing_extra_is_one_sentence(smoke, name, tmp_path, monkeypatch):
     for module in ("tensorboard", "wandb", "mlflow", "torch.utils.tensorboard"):

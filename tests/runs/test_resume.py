@@ -60,7 +60,7 @@ def test_a_run_that_is_killed_and_stopped_equals_an_undisturbed_one(collector, u
         for pid in (*(worker.pid for worker in multiprocessing.active_children()), os.getpid()):
             os.kill(pid, signal.SIGTERM)
 
-    with after_batch(7, stop):
+    with after_batch(7, stop), pytest.raises(KeyboardInterrupt, match="15"):
         resume_run([f"resume={run_dir}"])
     assert f"continue with: pickplace-train resume={run_dir}" in caplog.text
     assert read_csv(run_dir / "metrics.csv")[-1]["frames"] == saved_frames(run_dir) == 7 * ITERATION
@@ -108,10 +108,10 @@ def test_a_second_process_is_refused(run, undisturbed, tmp_path):
 def test_a_job_of_a_sweep_that_is_started_again_goes_on(run, undisturbed, tmp_path):
     """As after a preemption. With another config it is refused, which is no failure of the run that is there."""
     whole, killed = undisturbed("single")
-    job = shutil.copytree(killed, tmp_path / "sweep" / "0")
+    job = shutil.copytree(killed, tmp_path / "sweep" / "seed-0")
     sweep = ["-m", *SETTINGS, "hydra.sweep.dir=sweep", "seed=0"]
     code, out, err = run("train", *sweep)
-    assert code == 0 and "sweep/0 at 384 frames" in out, out + err
+    assert code == 0 and "sweep/seed-0 at 384 frames" in out, out + err
     assert_same(whole, job)
     code, _, err = run("train", *sweep, "algo.lr=1e-4")
     assert code == 2 and "there is a training already" in err
@@ -119,11 +119,22 @@ def test_a_job_of_a_sweep_that_is_started_again_goes_on(run, undisturbed, tmp_pa
     assert_same(whole, job)
 
 
+@pytest.mark.parametrize(("number", "expected"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_training_has_the_exit_code_of_its_signal(run, tmp_path, number, expected):
+    with after_batch(1, lambda _: os.kill(os.getpid(), number)):
+        code, out, _ = run("train", "experiment=smoke", "threads=1", "hydra.run.dir=run")
+    assert code == expected and "continue with: pickplace-train resume=" in out
+    with after_batch(2, lambda _: os.kill(os.getpid(), number)):
+        assert run("train", "resume=run")[0] == expected
+    assert saved_frames(tmp_path / "run") == 2 * ITERATION and (tmp_path / "run" / "learning_curve.png").is_file()
+    assert run("train", "resume=run")[0] == 0
+
+
 def test_a_stop_request_ends_a_sweep(run, tmp_path):
     with after_batch(1, lambda _: os.kill(os.getpid(), signal.SIGINT)):
         code, _, err = run("train", "-m", "seed=0,1", "experiment=smoke", "threads=1", "hydra.sweep.dir=sweep")
     assert code == 130, err
-    assert saved_frames(tmp_path / "sweep" / "0") == ITERATION and not (tmp_path / "sweep" / "1").exists()
+    assert saved_frames(tmp_path / "sweep" / "seed-0") == ITERATION and not (tmp_path / "sweep" / "seed-1").exists()
 
 
 def test_a_missing_report_is_written_on_resume(smoke_run, tmp_path):

@@ -1,7 +1,10 @@
 """Warm start: what the teacher is asked, what is learnt from it, and when."""
 
+from pathlib import Path
+
 import pytest
 import torch
+from commands import composed
 from omegaconf import OmegaConf
 from problems import late_state
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -12,6 +15,7 @@ from pickplace.policies.fcn4d import ActionPolicy
 from pickplace.policies.fcn_grasp import fcn_grasp
 from pickplace.policies.individual import IndividualRlPolicy, individual_grasp
 from pickplace.runs.provenance import imitated_planner
+from pickplace.runs.registry import PLANNERS
 from pickplace.task.transition import apply
 from pickplace.training.imitation import Phase, WarmStart, imitation_loss
 
@@ -71,6 +75,26 @@ def test_teachers_that_fail_draw_or_are_trained(states):
     assert (trained.ask(td, 0) >= 0).all()
 
 
+@pytest.mark.parametrize("name", PLANNERS)
+def test_every_planner_teaches_by_its_name(name, states):
+    fast = {"mcts": ["simulations=8"], "lookahead": ["samples=2", "candidates=2", "rounds=1"]}.get(name, [])
+    words = [f"warm_start.teacher.{word}" for word in fast]
+    words += ["warm_start.checkpoint=pretrained/r4"] if name in ("policy", "lookahead") else []
+    cfg = composed("warm_start=imitate", f"planner@warm_start.teacher={name}", *words).warm_start
+    taught = warm_start(cfg, env=states[0])[0].ask(states[1], 0)
+    assert imitated_planner({"warm_start": dict(cfg)}) == name and (taught >= 0).any()
+
+
+@pytest.mark.parametrize("settings", [{}, {"seed": 0}])
+def test_an_own_teacher_that_draws_gets_a_seed_of_each_batch(settings, states, monkeypatch):
+    """Whether or not its config names a seed; so a resumed training draws the same, and no two batches do."""
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "docs/examples/own_planner"))
+    ask = warm_start(config("own_planner.SoftDBL", temperature=1.0, **settings), env=states[0], seed=7)[0].ask
+    own = warm_start(config("own_planner.SoftDBL", temperature=1.0, **settings), env=states[0], seed=6)[0].ask
+    assert torch.equal(ask(states[1], 3), ask(states[1], 3)) and torch.equal(ask(states[1], 3), own(states[1], 4))
+    assert not torch.equal(ask(states[1], 3), ask(states[1], 4))
+
+
 def test_imitation_learns_the_teachers_choices(states):
     env, td = states[0], states[1].clone()
     start, policy = warm_start(config(), env=env)
@@ -104,6 +128,8 @@ def test_phases_follow_each_other():
         (config(frames=-1), "warm_start.frames=-1: expected a whole number >= 0"),
         (config(critic_frames=1.5), "warm_start.critic_frames=1.5: expected a whole number >= 0"),
         (config(None), "warm_start.frames=100: there is no teacher; expected warm_start=imitate"),
+        (config("own_planner.Nothing"), "warm_start.teacher._target_=own_planner.Nothing: there is no such"),
+        (OmegaConf.create({**config(), "teacher": "mcts"}), "teacher='mcts': expected planner@warm_start.teacher=<"),
         (config("policy", candidates="all"), "warm_start.checkpoint=null: planner=policy needs a checkpoint"),
         (config("policy", checkpoint="nowhere", candidates="all"), "nowhere"),
     ],

@@ -1,22 +1,28 @@
 """The table and the figure of a sweep, and sweeps by plugins; those that are not installed are skipped."""
 
 import csv
+import logging
+import re
 import shutil
 import sys
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from pickplace.runs import checkpoint
 from pickplace.runs import hydra_app as config
-from pickplace.training.sweep import label, read_run, summarize
+from pickplace.runs.composition import constant_keys, folder_name
+from pickplace.training.sweep import label, read_run, settings_of, summarize
 
 SMOKE = ["experiment=smoke", "threads=1"]
 
 
-def table(folder):
-    with (folder / "sweep.csv").open(newline="") as file:
+def table(folder, name="sweep.csv"):
+    with (folder / name).open(newline="") as file:
         return list(csv.DictReader(file))
 
 
@@ -40,21 +46,114 @@ def test_the_table_shows_how_every_run_ended(tmp_path):
     make_run(tmp_path, "0", ["algo.lr=0.001", "seed=1"], [0.2, 0.9, 0.8], total=300)
     make_run(tmp_path, "2", ["algo.lr=0.01", "seed=1"], [0.5])
     make_run(tmp_path, "10", ["algo.lr=1", "seed=1"], [], failure="the loss is not finite.\n")
-    runs = summarize(tmp_path)
+    settings = summarize(tmp_path)
+    runs = [each for setting in settings for each in setting.runs]
     found = [(each.name, each.status, each.frames) for each in runs]
     assert found == [("0", "finished", 300), ("2", "stopped", 100), ("10", "failed", 0)]
     assert (runs[0].best, runs[0].final, runs[2].best) == (0.9, 0.8, None)
-    labels = [label(each, runs) for each in runs]
-    assert labels == ["algo.lr=0.001", "algo.lr=0.01 (stopped)", "algo.lr=1 (failed)"]
+    labels = [label(each, settings) for each in settings]
+    assert labels == ["algo.lr=0.001", "algo.lr=0.01 (1 stopped)", "algo.lr=1 (1 failed)"]
     first, _, last = table(tmp_path)
     assert (first["algo.lr"], first["best_occupancy"], first["final_ci95_low"]) == ("0.001", "0.9", "0.79")
     assert (last["status"], last["best_occupancy"], last["error"]) == ("failed", "", "the loss is not finite.")
     assert is_png(tmp_path / "sweep.png")
 
 
+def test_settings_are_compared_over_their_seeds(tmp_path, caplog):
+    """The best run belongs to the worse setting."""
+    caplog.set_level(logging.INFO)
+    finals = {"adaptive": [0.1, 0.9, 0.5, 0.6, 0.4], "none": [0.5, 0.7, 0.6], "mixture": [0.3]}
+    for name, occupancies in finals.items():
+        for seed, final in enumerate(occupancies):
+            make_run(tmp_path, f"{name}{seed}", [f"curriculum={name}", f"seed={seed}"], [0.0, final], total=200)
+    make_run(tmp_path, "none9", ["seed=9", "curriculum=none"], [0.95], total=200)  # stopped: not counted
+    summarize(tmp_path)
+    rows = table(tmp_path, "sweep_settings.csv")
+    assert [(row["curriculum"], row["runs"], row["finished"]) for row in rows] == [
+        ("adaptive", "5", "5"), ("mixture", "1", "1"), ("none", "4", "3"),
+    ]  # fmt: skip
+    means, middles = ([float(row[key]) for row in rows] for key in ("mean_occupancy", "interquartile_mean"))
+    assert means == pytest.approx([0.5, 0.3, 0.6])
+    assert middles == pytest.approx([0.5, 0.3, 0.6])  # of 5 without the lowest and the highest one
+    low, high = (float(rows[0][f"mean_ci95_{end}"]) for end in ("low", "high"))
+    assert 0.22 < low < 0.32 and 0.68 < high < 0.78  # 0.5 +- 1.96 * 0.261 / sqrt(5), roughly
+    assert (rows[1]["mean_ci95_low"], rows[1]["mean_ci95_high"]) == ("", "")  # one seed
+    assert [float(rows[2][f"mean_ci95_{end}"]) for end in ("low", "high")] == pytest.approx([0.5, 0.7])  # the range
+    assert "curriculum=none" in caplog.messages[0] and caplog.messages[0].startswith("0.6000 (0.5000 to 0.7000)")
+    assert "seed" not in rows[0] and len(table(tmp_path)) == 10
+
+
+def test_a_curve_is_the_mean_of_runs_that_end_at_different_frames(tmp_path):
+    make_run(tmp_path, "0", ["seed=0"], [0.2, 0.4, 0.8], total=300)
+    make_run(tmp_path, "1", ["seed=1"], [0.4, 0.6], total=200)  # as after early stopping
+    frames, values = settings_of([read_run(tmp_path / "0"), read_run(tmp_path / "1")])[0].curves
+    assert frames.tolist() == [100, 200, 300] and values.mean(1) == pytest.approx([0.3, 0.5, 0.7])
+
+
+def test_a_sweep_over_seeds_ends_in_a_row_for_each_setting(run, tmp_path):
+    """And its folders are named by overrides, seed last; started again, it has nothing to do."""
+    quick = ["total_frames=128", "evaluation.episodes=4", "logger=none", "env.tote_size=[5,5,1]"]
+    command = [
+        "train",
+        "-m",
+        *SMOKE,
+        *quick,
+        "seed=0,1,2",
+        "curriculum=adaptive",
+        "curriculum/sample=current,recent",
+        "hydra.sweep.dir=sweep",
+    ]
+    code, _, err = run(*command)
+    assert code == 0, err
+    runs, settings = table(tmp_path / "sweep"), table(tmp_path / "sweep", "sweep_settings.csv")
+    assert [row["curriculum/sample"] for row in settings] == ["current", "recent"]
+    for setting in settings:
+        finals = [
+            float(row["final_occupancy"]) for row in runs if row["curriculum/sample"] == setting["curriculum/sample"]
+        ]
+        assert len(finals) == 3 and float(setting["mean_occupancy"]) == pytest.approx(sum(finals) / 3)
+        assert min(finals) <= float(setting["mean_ci95_low"]) <= float(setting["mean_ci95_high"]) <= max(finals)
+    names = [row["run"] for row in runs]
+    assert names == [
+        f"curriculum.sample-{sample}+seed-{seed}" for sample in ("current", "recent") for seed in (0, 1, 2)
+    ]
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "sweep").glob("*/checkpoints/last/*")}
+    assert run(*command)[0] == 0 and len(before) == 12
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "sweep").glob("*/checkpoints/last/*")} == before
+
+
+def test_names_of_folders():
+    words = ["seed=3", "+curriculum/advance=plateau", "algo.lr=1e-3", "planner@warm_start.teacher=mcts"]
+    command = [*words[:2], "algo.lr=1e-3,1e-2", words[3]]
+    assert constant_keys(command) == ["curriculum/advance", "planner@warm_start.teacher"]
+    assert folder_name(words, constant_keys(command)) == "algo.lr-1e-3+seed-3"
+    assert folder_name(words[:2], []) == "curriculum.advance-plateau+seed-3"
+    assert folder_name(["experiment=quick"], ["experiment"]) == "experiment-quick"
+    odd = ["items.path=/data/my items.csv", "items.kinds=[[1,1,1],[2,1,1]]", "a=../..", f"x={'y' * 300}", "é='='"]
+    odd += ["a=[1,[2]]", "a=[[1],2]", "env.tote_size=[6,6,5]"]
+    names = [folder_name(words, []) for words in ([], odd, *([word] for word in odd))]
+    assert len(set(names)) == len(names)
+    for name in names:
+        assert re.fullmatch(r"\w[\w.+-]+", name, re.ASCII) and len(name) < 200 and ".." not in name
+        path = f"outputs/sweep/{name}"
+        assert OverridesParser.create().parse_override(f"checkpoint={path}").value() == path
+
+
+@pytest.mark.parametrize(("sweeper", "numbered"), [("hydra._internal.BasicSweeper", False), ("optuna.Sweeper", True)])
+def test_a_sweeper_that_draws_values_numbers_its_runs(sweeper, numbered, monkeypatch):
+    """It may draw the same values twice."""
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
+    with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
+        cfg = compose("train", [f"hydra.sweeper._target_={sweeper}", "seed=1"], return_hydra_config=True)
+        config.SweepCallback().on_multirun_start(cfg)
+        job = compose("train", [*cfg.hydra.overrides.hydra, "seed=1", "hydra.job.num=3"], return_hydra_config=True)
+    HydraConfig.instance().set_config(job)
+    assert job.hydra.sweep.subdir == ("3" if numbered else "seed-1")
+
+
 def test_a_sweep_of_many_runs_and_one_of_none(tmp_path):
     for number in range(42):  # the figure names 40
-        make_run(tmp_path, str(number), [f"seed={number}"], [number / 50])
+        make_run(tmp_path, str(number), [f"algo.lr={number}"], [number / 50], total=100 + 100 * (number % 2))
     assert len(summarize(tmp_path)) == 42 and is_png(tmp_path / "sweep.png")
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match="empty: no run in it"):
@@ -77,8 +176,8 @@ def test_a_run_without_metrics_is_known_by_its_checkpoint(smoke_run, tmp_path):
 def test_a_run_that_fails_leaves_the_others_alone(run, tmp_path):
     quick = ["total_frames=128", "evaluation.episodes=2"]
     code, _, err = run("train", "-m", *SMOKE, *quick, "algo.reward_scale=1e38,1", "hydra.sweep.dir=sweep")
-    assert code == 2 and "error: run 0: the loss or its gradient is not finite" in err
-    failed, finished = table(tmp_path / "sweep")
+    assert code == 2 and "error: run algo.reward_scale-1e+38: the loss or its gradient is not finite" in err
+    finished, failed = table(tmp_path / "sweep")
     assert failed["status"] == "failed" and failed["error"].startswith("the loss or its gradient is not finite")
     assert (finished["status"], finished["frames"]) == ("finished", "128")
     assert 0 <= float(finished["final_occupancy"]) <= float(finished["best_occupancy"]) <= 1

@@ -1,0 +1,103 @@
+"""Callbacks (config group ``callbacks``): a user's code at each batch, validation and change of level of a training."""
+
+import json
+import reprlib
+from numbers import Real
+from typing import Any
+
+from pickplace.evaluation.play import Episodes
+from pickplace.runs.errors import sentence
+from pickplace.runs.registry import build
+from pickplace.task.checks import number, whole_number
+
+
+class Callback:
+    """Base class; a callback overrides what it needs.
+
+    ``trainer`` is the :class:`pickplace.training.trainer.Trainer`; ``trainer.end(reason)`` ends the training after the
+    batch. ``metrics`` are those of the batch, by name; entries that a callback adds or changes are logged.
+    """
+
+    def on_batch(self, trainer: Any, metrics: dict[str, float]) -> None:
+        """Called when a batch is learnt, before a validation that may follow."""
+
+    def on_validation(self, trainer: Any, episodes: Episodes, metrics: dict[str, float]) -> None:
+        """Called after a validation, whose means are in ``metrics["eval/..."]``, and before ``best`` is saved."""
+
+    def on_level_change(self, trainer: Any, old: int, new: int) -> None:
+        """Called when the curriculum has moved from one tote height to another, in height units."""
+
+    def state_dict(self) -> dict:
+        """Return what a checkpoint stores for a resume, as JSON: numbers, texts, lists and dicts."""
+        return {}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Continue from a :meth:`state_dict`, which may come from a stranger's checkpoint."""
+
+
+class EarlyStopping(Callback):
+    """End the training at a validation occupancy, or when validations no longer improve.
+
+    Args:
+        occupancy: mean validation occupancy, 0 to 1, that ends it; None: any.
+        patience: validations in a row without a new best that end it; None: any number.
+    """
+
+    def __init__(self, occupancy: float | None = None, patience: int | None = None):
+        key = "callbacks.early_stopping."
+        if occupancy is None and patience is None:
+            raise ValueError(f"{key}occupancy=None: expected a number, here or in {key}patience.")
+        self.occupancy = None if occupancy is None else number(f"{key}occupancy", occupancy, 0, 1)
+        self.patience = None if patience is None else whole_number(f"{key}patience", patience)
+        self.best, self.stale = -1.0, 0
+
+    def on_validation(self, trainer, episodes, metrics):
+        occupancy = metrics["eval/occupancy"]
+        self.stale = 0 if occupancy > self.best else self.stale + 1
+        self.best = max(self.best, occupancy)
+        if self.occupancy is not None and occupancy >= self.occupancy:
+            trainer.end(f"early stopping: the validation occupancy has reached {self.occupancy}")
+        elif self.patience is not None and self.stale >= self.patience:
+            trainer.end(f"early stopping: {self.stale} validations without one above {self.best:.4f}")
+
+    def state_dict(self):
+        return {"best": self.best, "stale": self.stale}
+
+    def load_state_dict(self, state):
+        self.best, self.stale = number("best", state["best"], -1, 1), whole_number("stale", state["stale"], 0)
+
+
+def make_callbacks(cfg, states) -> dict[str, Callback]:
+    """Return the callbacks of a run by name, in the order of their config.
+
+    Args:
+        cfg: the config group ``callbacks``.
+        states: the state of each by name, from a checkpoint; one that has none begins anew.
+
+    Raises:
+        ValueError: naming the callback, for bad settings, a state that does not fit or one that cannot be saved.
+    """
+    callbacks = {name: build(f"callbacks.{name}", node) for name, node in cfg.items()}
+    for name, callback in callbacks.items():
+        if not isinstance(callback, Callback):
+            raise ValueError(f"callbacks.{name}: expected the settings of a callback, with its _target_.")
+        try:
+            if name in states:
+                callback.load_state_dict(states[name])
+            json.dumps(callback.state_dict(), allow_nan=False)
+        except Exception as error:
+            raise ValueError(f"callbacks.{name}: its state cannot be loaded or saved ({sentence(error)}).") from error
+    return callbacks
+
+
+def call(callbacks: dict[str, Callback], hook: str, trainer: Any, *arguments: Any) -> None:
+    """Call a hook of each callback.
+
+    Raises:
+        ValueError: for a metric that is no number.
+    """
+    for name, callback in callbacks.items():
+        getattr(callback, hook)(trainer, *arguments)
+        for key, value in arguments[-1].items() if isinstance(arguments[-1], dict) else ():
+            if not isinstance(value, Real):
+                raise ValueError(f"callbacks.{name}: it logs {key}={reprlib.repr(value)}; expected a number.")

@@ -1,0 +1,45 @@
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from pickplace.runs.machine import use_threads
+
+THREADS = """
+import os
+import pickplace.cli, torch
+from pickplace.runs.machine import use_threads
+os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+use_threads("threads", None)
+print(torch.get_num_threads(), os.environ["OMP_WAIT_POLICY"])
+"""
+
+
+@pytest.fixture
+def threads():
+    """Restores the number of threads of this process."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs an affinity")
+@pytest.mark.parametrize("policy", ["PASSIVE", "ACTIVE"])
+def test_command_uses_its_processors_only_and_waits_as_the_user_says(policy):
+    given = {} if policy == "PASSIVE" else {"OMP_WAIT_POLICY": policy}
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("OMP")} | given
+    out = subprocess.run([sys.executable, "-c", THREADS], env=environment, capture_output=True, text=True, check=True)
+    assert out.stdout.split() == ["1", policy]
+
+
+def test_quota_limits_the_default_only(threads, monkeypatch):
+    torch.set_num_threads(4)
+    monkeypatch.setattr("pickplace.runs.machine.cpu_count", lambda: 2)
+    use_threads("threads", None)
+    assert torch.get_num_threads() == 2
+    use_threads("threads", 3)
+    assert torch.get_num_threads() == 3
+    with pytest.raises(ValueError, match="--threads=0: expected a whole number >= 1"):
+        use_threads("--threads", 0)

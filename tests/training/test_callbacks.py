@@ -1,0 +1,185 @@
+"""Callbacks: when they are called, how they end a training, and that a resume goes on with their state."""
+
+import json
+import logging
+import shutil
+from pathlib import Path
+
+import pytest
+from commands import ITERATION, SETTINGS, after_batch, assert_same, composed
+
+from pickplace.runs import checkpoint
+from pickplace.runs.loggers import read_csv
+from pickplace.training.callbacks import Callback, EarlyStopping, make_callbacks
+from pickplace.training.sweep import read_run
+from pickplace.training.train import resume_run, train
+
+EXAMPLE = Path(__file__).parents[2] / "docs/examples/own_callback"
+CALLED: list[tuple] = []
+
+
+class Recorder(Callback):
+    """Notes its calls, counts batches, and ends the training after so many."""
+
+    def __init__(self, last: int = 10**6):
+        self.last, self.batches = last, 0
+
+    def on_batch(self, trainer, metrics):
+        self.batches += 1
+        metrics["train/recorded"] = self.batches
+        CALLED.append(("batch", trainer.frames, "train/grad_norm" in metrics))
+        if self.batches == self.last:
+            trainer.end("enough")
+
+    def on_validation(self, trainer, episodes, metrics):
+        CALLED.append(("validation", trainer.frames, metrics["eval/occupancy"] == float(episodes.occupancy.mean())))
+
+    def on_level_change(self, trainer, old, new):
+        CALLED.append(("level", trainer.frames, (old, new)))
+
+    def state_dict(self):
+        return {"batches": self.batches}
+
+    def load_state_dict(self, state):
+        self.batches = state["batches"]
+
+
+class Broken(Callback):
+    def __init__(self, state=None, metric=None):
+        self.state, self.metric = state, metric
+
+    def on_batch(self, trainer, metrics):
+        metrics["train/broken"] = self.metric
+
+    def state_dict(self):
+        return {"state": {1, 2}} if self.state else {}
+
+
+@pytest.fixture(autouse=True)
+def forget():
+    CALLED.clear()
+
+
+def words(**settings):
+    return (
+        "+callbacks.mine={_target_: test_callbacks.Recorder" + "".join(f", {k}: {v}" for k, v in settings.items()) + "}"
+    )
+
+
+def test_callbacks_are_called_at_batches_validations_and_levels(smoke, tmp_path):
+    levels = ["curriculum=paper", "curriculum.advance.frames_per_level=256", "env.tote_size=[4,4,3]"]
+    smoke(tmp_path / "run", words(), *levels, "total_frames=512", "evaluation_interval=384")
+    assert CALLED == [
+        ("batch", 128, True),
+        ("level", 256, (1, 2)), ("batch", 256, True),
+        ("batch", 384, True), ("validation", 384, True),
+        ("level", 512, (2, 3)), ("batch", 512, True), ("validation", 512, True),
+    ]  # fmt: skip
+    assert [row["train/recorded"] for row in read_csv(tmp_path / "run/metrics.csv")] == [1, 2, 3, 4]
+
+
+def test_a_training_that_a_callback_ends_is_a_complete_one(smoke, tmp_path, caplog):
+    """It is validated, saved and reported, and only other settings continue it."""
+    caplog.set_level(logging.INFO)
+    run_dir = tmp_path / "run"
+    smoke(run_dir, words(last=2), "total_frames=1024", "evaluation_interval=1024")
+    rows = read_csv(run_dir / "metrics.csv")
+    assert [row["frames"] for row in rows] == [128, 256] and "eval/occupancy" in rows[-1]
+    assert (run_dir / "report.html").is_file() and "256 frames: enough" in caplog.text
+    (run_dir / ".hydra").mkdir()
+    (run_dir / ".hydra" / "config.yaml").write_text("total_frames: 1024\n")
+    assert read_run(run_dir).status == "finished"
+    assert resume_run([f"resume={run_dir}", "trust=test_callbacks"]) == rows[-1]["eval/occupancy"]
+    assert read_csv(run_dir / "metrics.csv") == rows
+    assert "a callback ended this training at 256 frames" in caplog.text
+    resume_run([f"resume={run_dir}", "trust=test_callbacks", "total_frames=512"])
+    rows = read_csv(run_dir / "metrics.csv")
+    assert [(row["frames"], row["train/recorded"]) for row in rows[2:]] == [(384, 3), (512, 4)]
+
+
+def test_a_resume_goes_on_with_the_state_of_the_callbacks(tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    whole.mkdir()
+    with after_batch(5, lambda _: shutil.copytree(whole, killed)):
+        train(composed(*SETTINGS, words(last=8)), whole)
+    resume_run([f"resume={killed}", "trust=test_callbacks"])
+    assert_same(whole, killed)
+    facts = checkpoint.read(killed / "checkpoints" / "last")[1]
+    assert (facts["frames"], facts["callbacks"]) == (8 * ITERATION, {"mine": {"batches": 8}})
+
+
+class Trainer:
+    ended = False
+
+    def end(self, reason):
+        self.ended = True
+
+
+@pytest.mark.parametrize(
+    ("settings", "occupancies", "ends"),
+    [
+        ({"occupancy": 0.5}, [0.1, 0.49, 0.5], 2),
+        ({"occupancy": 0.9, "patience": 2}, [0.3, 0.2, 0.4, 0.4, 0.1], 4),
+        ({"patience": 1}, [0.0, 0.1, 0.1], 2),
+        ({"patience": 3}, [0.3, 0.2, 0.1], None),
+    ],
+)
+def test_early_stopping(settings, occupancies, ends):
+    trainer, callback = Trainer(), EarlyStopping(**settings)
+    found = None
+    for number, occupancy in enumerate(occupancies):
+        callback.on_validation(trainer, None, {"eval/occupancy": occupancy})
+        found = number if trainer.ended and found is None else found
+        state = json.loads(json.dumps(callback.state_dict()))
+        callback = EarlyStopping(**settings)
+        callback.load_state_dict(state)
+    assert found == ends
+
+
+def test_early_stopping_by_the_command(run, tmp_path):
+    stop = ["callbacks=early_stopping", "callbacks.early_stopping.occupancy=0.1", "total_frames=4096"]
+    code, out, err = run("train", "experiment=smoke", "threads=1", *stop, "hydra.run.dir=run")
+    assert code == 0 and "256 frames: early stopping: the validation occupancy has reached 0.1" in out, err
+
+
+@pytest.mark.parametrize(
+    ("node", "states", "expected"),
+    [
+        ({"_target_": "early_stoping"}, {}, "callbacks.mine._target_=early_stoping: .* did you mean 'early_stopping'"),
+        ({"_target_": "early_stopping", "ocupancy": 1}, {}, "callbacks.mine.ocupancy: there is no key 'ocupancy'"),
+        ({"_target_": "early_stopping"}, {}, "occupancy=None: expected a number"),
+        ({"_target_": "early_stopping", "occupancy": 2}, {}, "occupancy=2: expected a number between 0 and 1"),
+        ({"_target_": "early_stopping", "patience": 0}, {}, "patience=0: expected a whole number >= 1"),
+        ({"occupancy": 0.9}, {}, "callbacks.mine: expected the settings of a callback, with its _target_"),
+        ({"_target_": "items/kinds", "kinds": [[1, 1, 1]]}, {}, "callbacks.mine: expected the settings of a callback"),
+        ({"_target_": "early_stopping", "patience": 1}, {"mine": {"best": 5}}, "callbacks.mine: its state cannot be"),
+        ({"_target_": "early_stopping", "patience": 1}, {"mine": [1]}, "callbacks.mine: its state cannot be"),
+        ({"_target_": "test_callbacks.Broken", "state": True}, {}, "callbacks.mine: its state .* set is not JSON"),
+    ],
+)
+def test_bad_callbacks_are_one_sentence(node, states, expected):
+    with pytest.raises(ValueError, match=expected) as caught:
+        make_callbacks({"mine": node}, states)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_metric_that_is_no_number_is_named(smoke, tmp_path):
+    words = "+callbacks.mine={_target_: test_callbacks.Broken, metric: many}"
+    with pytest.raises(ValueError, match="callbacks.mine: it logs train/broken='many'; expected a number"):
+        smoke(tmp_path / "run", words)
+
+
+def test_own_callback(run, monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(EXAMPLE))
+    mine = [
+        "--config-dir",
+        str(EXAMPLE),
+        "callbacks=[worst_episode,early_stopping]",
+        "callbacks.worst_episode.occupancy=0",
+    ]
+    code, out, err = run("train", *mine, "experiment=smoke", "threads=1", "total_frames=4096", "hydra.run.dir=run")
+    assert code == 0 and "the worst episode has reached 0 2 times in a row" in out, err
+    rows = read_csv(tmp_path / "run" / "metrics.csv")
+    assert rows[-1]["frames"] == 512 and 0 < rows[-1]["eval/worst"] <= rows[-1]["eval/occupancy"]
+    code, out, _ = run("train", "resume=run", "callbacks.worst_episode.times=4", "trust=own_callback")
+    assert code == 0 and "1,024 frames: the worst episode has reached 0 4 times in a row" in out
