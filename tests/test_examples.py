@@ -73,7 +73,7 @@ def test_own_planner_teaches(example):
     example("train", "own_planner", *resume, "trust=own_planner")
     states = [checkpoint.read(checkpoint.locate(place, prefer="last"))[0]["policy"] for place in (whole, folder)]
     assert all(torch.equal(value, states[1][key]) for key, value in states[0].items())
-    ours = example("evaluate", "own_planner", f"checkpoint={folder}", "trust=own_planner", *EVALUATION)
+    ours = example("evaluate", "own_planner", f"checkpoint={folder}", *EVALUATION)
     assert ours["warm_start"] == "own_planner.SoftDBL" and ours["planner"] == "policy"
 
 

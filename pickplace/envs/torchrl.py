@@ -10,10 +10,12 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from pickplace.envs.checks import check_items, problem_bytes
+from pickplace.runs.machine import usable_device
 from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
-from pickplace.task.checks import whole_number
+from pickplace.task.checks import check_bytes, one_of, shown, whole_number
 from pickplace.task.feasibility import PlacingMaps, action_mask, footprint_mask, placing_maps
-from pickplace.task.items import PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
+from pickplace.task.items import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.task.observation import Term, check_terms, observe
 from pickplace.task.state import Failure, Item, State
 from pickplace.task.transition import apply
@@ -82,8 +84,8 @@ class PickPlaceEnv(EnvBase):
             for some position in the bin.
     """
 
-    #: Settings beside the named arguments, for configs.
-    settings = CELL_SETTINGS
+    #: Arguments that a config may give. The others decide which episodes are played, and where.
+    settings = (*CELL_SETTINGS, "num_envs", "observation")
 
     def __init__(
         self,
@@ -101,18 +103,21 @@ class PickPlaceEnv(EnvBase):
         cell = cell_from_settings(settings)
         whole_number("num_envs", num_envs)
         check_seed(seed)
-        if stream not in STREAMS:
-            raise ValueError(f"stream={stream!r}: expected one of {', '.join(STREAMS)}.")
-        if not set(masks) <= set(MASKS):
-            raise ValueError(f"masks={masks!r}: expected any of {', '.join(map(repr, MASKS))}.")
+        one_of("stream", stream, STREAMS)
+        if not isinstance(masks, (tuple, list)) or not all(isinstance(name, str) and name in MASKS for name in masks):
+            raise ValueError(f"masks={shown(masks)}: expected any of {', '.join(map(repr, MASKS))}.")
+        whole_number("first_episode", first_episode, 0, MAX_SEED)
+        if episode_stride is not None:
+            whole_number("episode_stride", episode_stride, 1, MAX_SEED)
         items = Kinds(PAPER_KINDS) if items is None else items
         if not isinstance(items, ItemDistribution):
-            raise ValueError(f"items={items!r}: expected an ItemDistribution, such as pickplace.task.items.Kinds.")
+            raise ValueError(f"items={shown(items)}: expected an ItemDistribution, such as pickplace.task.items.Kinds.")
         check_items(cell, items)
-        super().__init__(device=device, batch_size=[num_envs])
-        self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
-        self.items, self.stream, self.masks = items, stream, tuple(masks)
         self.terms = check_terms(observation)
+        self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
+        check_bytes(f"num_envs={num_envs}", num_envs * problem_bytes(self.cell, masks), device := usable_device(device))
+        super().__init__(device=device, batch_size=[num_envs])
+        self.items, self.stream, self.masks = items, stream, tuple(masks)
         self.min_tote_height = int(items.sizes[:, 2].max())
         self.first_episode, self.episode_stride = first_episode, episode_stride or num_envs
         self._make_specs()
@@ -161,6 +166,11 @@ class PickPlaceEnv(EnvBase):
     def num_envs(self) -> int:
         """``N``, the number of problems that advance together."""
         return self.batch_size[0]
+
+    @property
+    def observation_bytes(self) -> int:
+        """Bytes of what the environment emits for one problem, masks included."""
+        return sum(spec.shape[1:].numel() * spec.dtype.itemsize for spec in self.observation_spec.values())
 
     # ------------------------------------------------------------------ EnvBase
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
@@ -326,39 +336,3 @@ class PickPlaceEnv(EnvBase):
 def _any(mask: Tensor) -> Tensor:
     """Return ``mask.any(1)`` of a bool ``[N, M]``; on a CPU the maximum of bytes is vectorised, and far faster."""
     return mask.view(torch.uint8).amax(1) > 0
-
-
-def check_items(cell: CellSpec, items: ItemDistribution) -> None:
-    """Refuse items that could make a fresh episode impossible.
-
-    Every kind needs a feasible action on the empty tote for every position in the bin. The full tote height decides:
-    a lower rim is only easier to clear, as long as it is not below the item's top.
-
-    Raises:
-        ValueError: naming the kind, the position and the tote height.
-    """
-    w_b, d_b, _ = cell.bin_size
-    height = cell.tote_size[2]
-    # (x, y, w, d, h) -> the first kind like it: the rows of a long recording repeat themselves
-    problems: dict[tuple[int, ...], int] = {}
-    for kind, (w, d, h) in enumerate(items.sizes.tolist()):
-        for (grid_w, grid_d), what in (((w_b, d_b), "bin_size"), (cell.effector_size, "effector_size")):
-            if (w > grid_w or d > grid_d) and (what == "bin_size" or cell.pick_rule == "contain"):
-                raise ValueError(f"{items.label(kind)} does not fit {what}: expected at most {grid_w}x{grid_d} cells.")
-        if h > height:
-            raise ValueError(f"{items.label(kind)} is higher than the tote: expected at most tote_size[2]={height}.")
-        for x, y in items.corners(kind, cell.bin_size):
-            if x + w > w_b or y + d > d_b:
-                raise ValueError(f"{items.label(kind)} at x={x}, y={y} leaves the bin: expected it inside {w_b}x{d_b}.")
-            problems.setdefault((x, y, w, d, h), kind)
-    for chunk in torch.tensor([(*item, kind) for item, kind in problems.items()]).split(1024):
-        item = Item(*chunk[:, :5].unbind(-1))
-        empty = torch.zeros(len(chunk), *cell.tote_size[:2], dtype=torch.int32)
-        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), item))
-        feasible = footprint_mask(cell, maps).flatten(1).any(1)
-        if not feasible.all():
-            x, y, *_, kind = chunk[~feasible][0].tolist()
-            raise ValueError(
-                f"{items.label(kind)} at x={x}, y={y} in the bin has no feasible action on the empty tote of height "
-                f"{height} ({cell.describe()}): expected every item to fit somewhere."
-            )

@@ -3,14 +3,13 @@
 import hashlib
 import json
 import logging
-import reprlib
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from pickplace.evaluation.play import Episodes, MakeEnv, decision_latency, play
+from pickplace.evaluation.play import Episodes, MakeEnv, check_episode_settings, check_play, decision_latency, play
 from pickplace.evaluation.statistics import paired_difference, summarise
 from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.runs import checkpoint
@@ -22,7 +21,7 @@ from pickplace.runs.machine import use_machine
 from pickplace.runs.provenance import commit, imitated_planner, versions
 from pickplace.runs.registry import build
 from pickplace.task.cell import CELL_SETTINGS
-from pickplace.task.checks import flag, is_number, one_of, whole_number
+from pickplace.task.checks import flag, is_number, shown, whole_number
 from pickplace.task.files import read_file, replaced_file
 from pickplace.views.replay import animation, page, picture
 from pickplace.views.tables import evaluation_table
@@ -56,7 +55,7 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
 
 def _run(cfg: DictConfig, run_dir: Path) -> float:
     ev = cfg.evaluation
-    replay = whole_number("evaluation.replay", ev.get("replay", 0), 0)  # evaluation=validation has neither
+    replay = whole_number("evaluation.replay", ev.get("replay", 0), 0, 1_000)  # evaluation=validation has neither
     gif = flag("evaluation.gif", ev.get("gif", False))
     make_env, planner, facts = prepare(cfg)
     cell = make_env(0, 1).cell
@@ -94,9 +93,7 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
         ValueError: for settings that make no sense, or a checkpoint that does not fit them.
     """
     ev = cfg.evaluation
-    for key, least in {"episodes": 1, "batch_size": 1, "latency_decisions": 0}.items():
-        whole_number(f"evaluation.{key}", ev.get(key), least)
-    one_of("evaluation.stream", ev.stream, ("validation", "test"))
+    check_episode_settings(ev)
     if "model" in cfg and cfg.checkpoint is None:
         raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
     own_modules(cfg.trust)
@@ -115,11 +112,12 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
 
     def make_env(first, count):
         return build(
-            "env", cfg.env, items=items, device=cfg.device, num_envs=count, masks=(),
+            "env", {**resolved(cfg.env), "num_envs": count}, items=items, device=cfg.device, masks=(),
             stream=ev.stream, seed=ev.seed, first_episode=first,
         )  # fmt: skip
 
     probe = make_env(0, 1)
+    check_play(ev, probe.cell, cfg.device)
     parts = planner_parts(cfg.planner, probe.cell, items, probe.terms, trained)
     planner = build("planner", cfg.planner, **parts)
     if not isinstance(planner, BatchPlanner) or not isinstance(planner.name, str):  # now, not after all episodes
@@ -151,7 +149,7 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
         "checkpoint": str(folder),
         "trained": {"frames": saved["frames"], "seed": merged.seed, "commit": saved["commit"]},
         "mask_in_training": merged.algo.mask_infeasible,
-        "warm_start": imitated_planner(resolved(trained)),
+        "warm_start": imitated_planner(saved["config"]),
     }
     return (cfg, state, resolved(trained.env)), facts
 
@@ -218,17 +216,17 @@ def read_comparison(path: Path, expected: dict) -> dict:
             ignored = "path" if "sha256" in ours and "sha256" in theirs else "sha256"
             ours, theirs = ({k: v for k, v in items.items() if k != ignored} for items in (ours, theirs))
         if ours != theirs:
-            found = reprlib.repr(other.get(key))
-            raise ValueError(f"compare={str(path)!r}: its {key} is {found}, expected {reprlib.repr(expected[key])}.")
+            found = shown(other.get(key))
+            raise ValueError(f"compare={str(path)!r}: its {key} is {found}, expected {shown(expected[key])}.")
     for key in CELL_SETTINGS:
         if expected["env"][key] != cell.get(key):
-            found = reprlib.repr(cell.get(key))
+            found = shown(cell.get(key))
             raise ValueError(f"compare={str(path)!r}: env.{key}={found}, expected {expected['env'][key]}.")
     count = expected["episodes"]
     if not isinstance(values, list) or len(values) != count or not all(is_number(v) and 0 <= v <= 1 for v in values):
         raise ValueError(f"{refused} whose occupancy.per_episode is a list of {count} numbers between 0 and 1.")
     if not isinstance(name, str) or not name.isprintable() or len(name) > 100:
-        raise ValueError(f"{refused} whose planner is a name to print, got {reprlib.repr(name)}.")
+        raise ValueError(f"{refused} whose planner is a name to print, got {shown(name)}.")
     return other
 
 

@@ -1,7 +1,7 @@
 """Episodes played to their end by a planner, and the time of its decisions."""
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -9,14 +9,21 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
+from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.planners.base import BatchPlanner, decide
+from pickplace.task.cell import CellSpec
+from pickplace.task.checks import check_bytes, one_of, whole_number
 from pickplace.task.feasibility import num_feasible, placing_maps
+from pickplace.task.items import check_seed
 from pickplace.task.state import Failure
 from pickplace.views.recording import Recording, record_moves
 
 #: ``make_env(first_episode, num_envs)`` makes the environment for a share of the episodes.
 MakeEnv = Callable[[int, int], PickPlaceEnv]
+
+#: Greatest number of episodes, or of decisions that are timed.
+MAX_EPISODES = 1_000_000
 
 #: The tensors of :class:`Episodes`.
 RESULTS = ("occupancy", "items_placed", "failure", "final_heights", "tote_height")
@@ -98,6 +105,24 @@ class _Batch:
                 recording.ending, recording.occupancy = Failure(int(self.failure[slot])), float(occupancy[slot])
                 if recording.ending == Failure.STUCK:
                     recording.waiting = tuple(env.item[slot].tolist())
+
+
+def check_episode_settings(evaluation: Mapping) -> None:
+    """Check the values of the config group ``evaluation`` that determine what is played.
+
+    Raises:
+        ValueError: naming the key, its value, and what was expected.
+    """
+    for key, least in {"episodes": 1, "batch_size": 1, "latency_decisions": 0}.items():
+        whole_number(f"evaluation.{key}", evaluation.get(key), least, MAX_EPISODES)
+    one_of("evaluation.stream", evaluation.get("stream"), ("validation", "test"))
+    check_seed(evaluation.get("seed"), "evaluation.seed")
+
+
+def check_play(evaluation: Mapping, cell: CellSpec, device) -> None:
+    """Refuse more episodes side by side than the memory holds, with a ``ValueError`` that names the key."""
+    together = min(evaluation["batch_size"], evaluation["episodes"])
+    check_bytes(f"evaluation.batch_size={together}", together * problem_bytes(cell, ()), device)
 
 
 @torch.no_grad()

@@ -6,7 +6,7 @@ from torch import Tensor
 from pickplace.policies.base import MASKED
 from pickplace.policies.fcn_grasp import FootprintPolicy
 from pickplace.task.cell import CellSpec
-from pickplace.task.checks import number, whole_number
+from pickplace.task.checks import check_bytes, number, whole_number
 from pickplace.task.feasibility import PlacingMaps, first_action_reaching, footprint_mask, placing_maps
 from pickplace.task.items import ItemDistribution, check_seed, search_items
 from pickplace.task.observation import STANDARD_TERMS, observe
@@ -56,8 +56,12 @@ class Lookahead:
         confidence: float = 2.0,
         seed: int = 0,
     ):
-        for key, value, least in (("candidates", candidates, 1), ("samples", samples, 2), ("rounds", rounds, 1)):
-            whole_number(f"planner.{key}", value, least)
+        for key, value, least, most in (
+            ("candidates", candidates, 1, 1_000),
+            ("samples", samples, 2, 10_000),
+            ("rounds", rounds, 1, 10),
+        ):
+            whole_number(f"planner.{key}", value, least, most)
         if horizon is not None:
             whole_number("planner.horizon", horizon)
         number("planner.confidence", confidence)
@@ -73,6 +77,12 @@ class Lookahead:
     def decide(self, observation: Observation) -> Tensor:
         """Return flat actions, int64 ``[N]``."""
         state = State.from_observation(observation)
+        streams = self.candidates * self.samples * 2 ** (self.rounds - 1)
+        check_bytes(
+            f"planner.candidates={self.candidates}, planner.samples={self.samples}, planner.rounds={self.rounds}",
+            len(state.heights) * streams * 16 * self.cell.num_footprints,
+            state.heights.device,
+        )
         maps = placing_maps(self.cell, state)
         logits = self.policy.footprint_logits(observation, footprint_mask(self.cell, maps).flatten(1))
         # Of equals the first, as the policy itself plays.

@@ -14,6 +14,8 @@ from pickplace.task.observation import STANDARD_TERMS
 from pickplace.task.state import Item, Observation, State
 from pickplace.task.transition import apply, put_down
 
+MAX_NODES = 1_000_000  # of all trees of a decision
+
 
 @dataclass(eq=False)
 class _Node:
@@ -74,9 +76,9 @@ class MCTS:
         wave: int = 256,
         seed: int = 0,
     ):
-        whole_number("planner.simulations", simulations)
-        whole_number("planner.wave", wave)
-        number("planner.exploration", exploration)
+        whole_number("planner.simulations", simulations, most=MAX_NODES)
+        whole_number("planner.wave", wave, most=4_096)
+        number("planner.exploration", exploration, most=1e6)
         number("planner.widening", widening, most=1)
         flag("planner.mask", mask)
         self.cell, self.items, self.simulations, self.mask = cell, search_items(items), simulations, mask
@@ -90,6 +92,11 @@ class MCTS:
         cell, device = self.cell, observation["tote_depth"].device
         state = State.from_observation({key: observation[key].cpu() for key in STANDARD_TERMS})
         roots, tote_height = self._nodes(state), state.tote_height
+        if self.simulations * len(roots) > MAX_NODES:
+            raise ValueError(
+                f"planner.simulations={self.simulations}: for {len(roots)} problems at once the trees would have more "
+                f"than {MAX_NODES:,} nodes; expected fewer, or a smaller evaluation.batch_size."
+            )
         each = max(1, self.wave // len(roots))
         for done in range(0, self.simulations, each):
             walks = [

@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace.policies.base import Policy
 from pickplace.task.cell import CellSpec
-from pickplace.task.checks import is_whole
+from pickplace.task.checks import check_bytes, is_whole, shown
 from pickplace.task.feasibility import action_mask, placing_maps
 from pickplace.task.state import Observation, State
 from pickplace.task.transition import apply
@@ -29,7 +29,7 @@ class PolicyPlanner:
 
     def __init__(self, cell: CellSpec, policy: Policy, candidates: int | Literal["all"] = "all"):
         if candidates != "all" and not (is_whole(candidates) and candidates >= 1):
-            raise ValueError(f"planner.candidates={candidates!r}: expected 'all' or a whole number >= 1.")
+            raise ValueError(f"planner.candidates={shown(candidates)}: expected 'all' or a whole number >= 1.")
         self.cell, self.policy, self.candidates = cell, policy, candidates
 
     @torch.no_grad()
@@ -40,6 +40,7 @@ class PolicyPlanner:
                 return self.policy.best_feasible(observation)
         count = min(self.candidates, self.cell.num_actions)
         score, tried = self.policy.action_log_probs(observation).topk(count, dim=1)  # [N, K]
+        check_bytes(f"planner.candidates={count}", 32 * tried.numel() * self.cell.num_places, tried.device)
         step = apply(self.cell, State.from_observation(observation).repeat(count), tried.flatten())
         succeeds = (step.failure.view_as(tried) == 0) & (score > -torch.inf)
         first = succeeds.int().argmax(1, keepdim=True)  # 0, the most probable, if none

@@ -6,6 +6,7 @@ of the choice.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import torch
 from tensordict import TensorDictBase
@@ -30,6 +31,9 @@ from pickplace.task.state import Observation, State
 #: The logit of what must not be chosen, far below what a network may score: its probability is exactly 0 in float32.
 #: The rest of float32's range is left for differences from the greatest logit.
 MASKED = -1e38
+
+#: Greatest number of parameters of a network; with gradients and Adam's moments each takes 16 bytes.
+MAX_PARAMETERS = 110_000_000
 
 #: The entries of the observation that every network reads.
 DEPTH_KEYS = ("bin_depth", "tote_depth")
@@ -160,6 +164,23 @@ def pick_one(candidates: Tensor) -> Tensor:
         highest = torch.iinfo(candidates.dtype).max
         index = torch.where(candidates >= 0, candidates, highest).argmin(1, keepdim=True)
     return candidates.gather(1, index)[:, 0]
+
+
+def refuse_large(make: Callable[[], torch.nn.Module], key: str) -> None:
+    """Refuse a network with more parameters than :data:`MAX_PARAMETERS`, before memory is allocated.
+
+    Args:
+        make: makes the network.
+        key: its place in the config.
+
+    Raises:
+        ValueError: naming the key and the number; and what ``make`` raises.
+    """
+    with torch.device("meta"):
+        network = make()
+    count = sum(parameter.numel() for parameter in network.parameters())
+    if count > MAX_PARAMETERS:
+        raise ValueError(f"{key}: the network has {count:,} parameters; expected at most {MAX_PARAMETERS:,}.")
 
 
 def as_critic(critic: torch.nn.Module) -> ValueOperator:

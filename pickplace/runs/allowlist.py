@@ -3,7 +3,6 @@
 import importlib
 import inspect
 import re
-import reprlib
 import sys
 from collections.abc import Collection
 from importlib.metadata import packages_distributions
@@ -11,8 +10,9 @@ from importlib.metadata import packages_distributions
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.runs.references import children, refusal, refuse_interpolations
+from pickplace.runs.references import children, only_groups, refusal, refuse_interpolations
 from pickplace.runs.registry import names_at, qualified_names
+from pickplace.task.checks import shown
 
 #: Modules that are never a user's own: with their functions a config could do anything.
 RESERVED_MODULES = {"pickplace", "hydra", "numpy", "omegaconf", "tensordict", "torch", "torchrl"}
@@ -22,22 +22,30 @@ RESERVED_MODULES |= sys.stdlib_module_names
 REQUIRED_KEYS = ["env._target_", "env.rotations", "env.tote_size", "items._target_", "model.actor._target_"]
 REQUIRED_KEYS += ["algo.mask_infeasible", "seed"]
 
-#: Greatest accepted values of numbers that alone could take all memory, or start any number of processes.
-GREATEST = {f"env.{key}": 2_000 for key in ("bin_size", "tote_size", "effector_size")}
-GREATEST |= {"env.num_envs": 65_536, "collector.workers": 1_024}
+#: The groups and keys that a policy is restored from. The others are of use to the training alone.
+POLICY_GROUPS = ("env", "items", "model", "algo", "seed", "device")
+
+#: Greatest depth and number of nodes of a config, and length of a text in it: more would fill the memory.
+MAX_DEPTH, MAX_NODES, MAX_TEXT = 32, 50_000, 10_000
 
 
-def trusted_config(content: dict, trust=()) -> DictConfig:
+def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POLICY_GROUPS) -> DictConfig:
     """Return a checkpoint's config, after checking that it is one of a training and makes nothing unexpected.
 
     Args:
         content: the config.
         trust: modules whose classes it may make beside pickplace's own, see :func:`own_modules`.
+        groups: the groups and keys that are used, and returned; None: all. Nothing in the others is looked at, but
+            for values that these refer to.
 
     Raises:
         ValueError: naming the key that is missing, or refused.
     """
     own = own_modules(trust)
+    if groups is None:
+        groups = tuple(content)
+    refuse_large({key: content[key] for key in groups if key in content})
+    content = only_groups(content, groups)
     try:
         refuse_interpolations(content)
         refuse_foreign_targets(content, own)
@@ -49,14 +57,30 @@ def trusted_config(content: dict, trust=()) -> DictConfig:
         raise ValueError(f"The checkpoint's config cannot be read ({reason}).") from error
     if missing:
         raise ValueError(f"The checkpoint's config has no {missing[0]}; expected the config of a training.")
-    for key, greatest in GREATEST.items():
-        value = OmegaConf.select(cfg, key)
-        for number in value if isinstance(value, ListConfig) else [value]:
-            if isinstance(number, (int, float)) and number > greatest:
-                raise refusal(key, number, f"at most {greatest:,}")
     if type(cfg.seed) is not int:
         raise refusal("seed", cfg.seed, "a whole number")
     return cfg
+
+
+def refuse_large(content) -> None:
+    """Refuse a config that would fill the memory, before OmegaConf makes an object of each of its nodes.
+
+    Raises:
+        ValueError: naming the limit.
+    """
+    level, count, depth = [content], 1, 0
+    while level:
+        pairs = [pair for node in level for pair in children(node)]
+        count, depth = count + len(pairs), depth + 1
+        longest = max((len(part) for pair in pairs for part in pair if isinstance(part, str)), default=0)
+        for found, most, what in (
+            (count, MAX_NODES, "entries"),
+            (depth, MAX_DEPTH, "levels"),
+            (longest, MAX_TEXT, "characters in a text"),
+        ):
+            if found > most:
+                raise ValueError(f"The checkpoint's config has {found:,} {what} or more; expected at most {most:,}.")
+        level = [value for _, value in pairs]
 
 
 def own_modules(trust) -> tuple[str, ...]:
@@ -68,13 +92,12 @@ def own_modules(trust) -> tuple[str, ...]:
     names = list(trust) if isinstance(trust, (list, tuple, ListConfig)) else [] if trust is None else [trust]
     for name in names:
         if not _may_be_own(name):
-            value = reprlib.repr(name)
-            raise ValueError(f"trust={value}: expected names of modules of your own, such as trust=my_models.")
+            raise ValueError(f"trust={shown(name)}: expected names of modules of your own, such as trust=my_models.")
     return tuple(names)
 
 
 def _may_be_own(module) -> bool:
-    is_name = isinstance(module, str) and all(part.isidentifier() for part in module.split("."))
+    is_name = isinstance(module, str) and len(module) <= 200 and all(part.isidentifier() for part in module.split("."))
     return is_name and module.partition(".")[0] not in RESERVED_MODULES
 
 

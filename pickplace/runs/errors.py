@@ -11,6 +11,8 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from pickplace.task.checks import shortened
+
 
 class JobFailed(Exception):
     """A run of a sweep failed; the message is one sentence. It crosses processes, which the error itself may not."""
@@ -22,6 +24,9 @@ class WorkerDied(Exception):
 
 #: Errors caused by the user or the machine. Any other may be a fault of the program, and its type is printed too.
 EXPECTED = (ValueError, OSError, FloatingPointError, JobFailed, WorkerDied, HydraException, OmegaConfBaseException)
+
+#: Greatest length of an error that is shown; the middle of a longer one is left out.
+MAX_LENGTH = 1_000
 
 #: Config files of Hydra plugins, and the optional extras that bring them.
 EXTRAS = {"hydra/sweeper/optuna": "optuna", "hydra/launcher/joblib": "joblib", "hydra/launcher/submitit": "submitit"}
@@ -67,8 +72,10 @@ def write_output(text: str = "") -> None:
 
 
 def sentence(error: Exception) -> str:
-    """Return an error as one line, without characters that control a terminal."""
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in _sentence(error))
+    """Return an error as one line of at most :data:`MAX_LENGTH` letters, without those that control a terminal."""
+    text = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in _sentence(error))
+    half = MAX_LENGTH // 2
+    return text if len(text) <= MAX_LENGTH else f"{text[: half - 3]} ... {text[2 - half :]}"
 
 
 def _sentence(error: Exception) -> str:
@@ -115,4 +122,5 @@ def unknown_key(key: str, node: DictConfig | dict, prefix: str = "") -> str:
     known = [str(name) for name in node if name not in ("_target_", "hydra")]
     close = get_close_matches(leaf, known, 1)
     hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known) or 'none'}."
+    key, leaf = map(shortened, (key, leaf))
     return f"{key}: there is no key {leaf!r} in {prefix[:-1] or 'the config'}; {hint}"

@@ -4,7 +4,7 @@ import torch
 from loky import cpu_count
 from omegaconf import DictConfig
 
-from pickplace.task.checks import whole_number
+from pickplace.task.checks import shortened, whole_number
 
 
 def use_machine(cfg: DictConfig) -> torch.device:
@@ -37,8 +37,8 @@ def usable_device(name: str) -> torch.device:
         device = torch.device(name)
         torch.empty(0, device=device)
         usable = device.type in ("cpu", "cuda")
-    except (RuntimeError, TypeError, AssertionError):
+    except (RuntimeError, TypeError, AssertionError, ValueError, OverflowError):
         usable = False
     if not usable:
-        raise ValueError(f"device={name}: expected cpu, or cuda on a machine that has it.")
+        raise ValueError(f"device={shortened(name)}: expected cpu, or cuda on a machine that has it.")
     return device

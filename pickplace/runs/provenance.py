@@ -2,6 +2,7 @@
 
 import platform
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 
 import tensordict
@@ -43,6 +44,10 @@ def commit() -> str | None:
 
 
 def imitated_planner(cfg: dict) -> str | None:
-    """Return the name of the planner that a run with this saved config imitated first, or None."""
-    warm_start = cfg.get("warm_start") or {}
-    return warm_start["teacher"]["_target_"] if warm_start.get("frames") else None
+    """Return the name of the planner that a run with this saved config, unchecked, imitated first, or None."""
+    warm_start = cfg.get("warm_start")
+    if not isinstance(warm_start, Mapping) or not warm_start.get("frames"):
+        return None
+    teacher = warm_start.get("teacher")
+    name = teacher.get("_target_") if isinstance(teacher, Mapping) else None
+    return name if isinstance(name, str) and name.isprintable() and len(name) <= 100 else None

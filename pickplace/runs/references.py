@@ -1,13 +1,14 @@
 """References between keys of a config, ``${..actor.filters}``: which ones a checkpoint keeps, and may hold."""
 
 import re
-import reprlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import reduce
 from operator import getitem
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+
+from pickplace.task.checks import shortened, shown
 
 #: A reference to another key of the same config, and nothing else.
 REFERENCE = re.compile(r"\$\{(\.*)([A-Za-z_]\w*(?:\.\w+)*)\}")
@@ -48,13 +49,34 @@ def refuse_interpolations(node, path: tuple = (), root=None) -> None:
         refuse_interpolations(value, (*path, key), root)
 
 
+def only_groups(content: dict, groups: Collection[str]) -> dict:
+    """Return some groups of a config, in which references to values in other groups are replaced by the values."""
+
+    def replaced(node, path: tuple):
+        if isinstance(node, dict):
+            return {key: replaced(value, (*path, key)) for key, value in node.items()}
+        if isinstance(node, list):
+            return [replaced(value, (*path, index)) for index, value in enumerate(node)]
+        if path[-1] != "_target_" and _is_reference_to_value(node, path, content):
+            target = _target_path(node, path)
+            return node if target[0] in groups else reduce(getitem, target, content)
+        return node
+
+    return {key: replaced(content[key], (key,)) for key in groups if key in content}
+
+
+def _target_path(text: str, path: tuple) -> tuple:
+    """Return the path of the value to which a reference at a path leads."""
+    dots, keys = REFERENCE.fullmatch(text).groups()  # type: ignore[union-attr]
+    return (*(path[: -len(dots)] if dots else ()), *keys.split("."))
+
+
 def _is_reference_to_value(text, path: tuple, root) -> bool:
     """Return whether a text is a reference to a number, a short text, or a short list of such."""
-    if not isinstance(text, str) or not (reference := REFERENCE.fullmatch(text)):
+    if not isinstance(text, str) or not REFERENCE.fullmatch(text):
         return False
-    dots, keys = reference.groups()
     try:
-        found = reduce(getitem, (*(path[: -len(dots)] if dots else ()), *keys.split(".")), root)
+        found = reduce(getitem, _target_path(text, path), root)
     except (KeyError, TypeError):  # a TypeError from a key of a list or of a value
         return False
     values = found if isinstance(found, list) else [found]
@@ -69,4 +91,4 @@ def children(node) -> Iterator[tuple]:
 
 def refusal(key: str, value, expected: str) -> ValueError:
     """Return the error for a value of a checkpoint's config."""
-    return ValueError(f"{key}={reprlib.repr(value)}: the checkpoint is refused; expected {expected}.")
+    return ValueError(f"{shortened(key)}={shown(value)}: the checkpoint is refused; expected {expected}.")

@@ -16,6 +16,7 @@ from importlib import import_module
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.runs.errors import unknown_key
+from pickplace.task.checks import shortened
 
 PLANNERS = {
     "policy": "pickplace.planners.policy.PolicyPlanner",
@@ -89,7 +90,7 @@ def build(place: str, node: DictConfig | dict, **kwargs):
     Args:
         place: the node's place in the config, such as ``"planner"`` or ``"model.actor"``.
         node: the settings, with a ``_target_``.
-        **kwargs: arguments handed over as they are.
+        **kwargs: arguments handed over as they are; the node may not set them.
 
     Raises:
         ValueError: for an unknown ``_target_`` or setting, or an argument that is missing; and what the constructor
@@ -108,13 +109,13 @@ def _make(place: str, node, given: dict):
         return settings
     function = find(place, node["_target_"])
     known = accepted_arguments(function)
-    if known is not None and (unknown := [key for key in settings if key not in known]):
-        free = dict.fromkeys(key for key in known if key not in given)
-        raise ValueError(unknown_key(f"{place}.{unknown[0]}", free, f"{place}."))
+    free = dict.fromkeys(key for key in known or () if key not in given)
+    if refused := [key for key in settings if key in given or (known is not None and key not in free)]:
+        raise ValueError(unknown_key(f"{place}.{refused[0]}", free, f"{place}."))
     try:
-        return function(**{**settings, **given})
+        return function(**settings, **given)
     except TypeError as error:
-        raise ValueError(f"{place}._target_={node['_target_']}: {error}.") from error
+        raise ValueError(f"{place}._target_={shortened(node['_target_'])}: {error}.") from error
 
 
 def names_at(place: str) -> dict[str, str]:
@@ -145,18 +146,20 @@ def find(place: str, target) -> Callable:
         if callable(found := getattr(import_module(module), name) if module else None):
             return found
     except (ImportError, AttributeError, TypeError, ValueError) as error:  # the last two from ".a.b" and "..a"
-        reason = f" ({error})"
+        reason = f" ({shortened(error)})"
     close = get_close_matches(path, names, 1)
     known = f"one of {', '.join(names)}, or " if names else ""
     hint = f"did you mean {close[0]!r}?" if close else f"expected {known}the dotted path of a class of your own."
-    raise ValueError(f"{place}._target_={target}: there is no such class or function{reason}; {hint}")
+    raise ValueError(f"{place}._target_={shortened(target)}: there is no such class or function{reason}; {hint}")
 
 
 def accepted_arguments(function: Callable) -> list[str] | None:
-    """Return the keywords that a class or function takes, or None if it takes any.
+    """Return the keywords that a config may give to a class or function, or None if any.
 
-    One with ``**keywords`` takes any, unless its attribute ``settings``, a tuple of names, says which ones they are.
+    One with ``**keywords`` takes any. An attribute ``settings``, a tuple of names, states them instead.
     """
+    if hasattr(function, "settings"):
+        return list(function.settings)
     has_init = inspect.isclass(function) and function.__init__ is not object.__init__
     try:  # of __init__ itself, since a metaclass may hide its arguments
         parameters = inspect.signature(function.__init__ if has_init else function).parameters.values()
@@ -164,6 +167,4 @@ def accepted_arguments(function: Callable) -> list[str] | None:
         return None
     named = [each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)]
     names = [name for name in named if name != "self"]
-    if all(each.kind != each.VAR_KEYWORD for each in parameters):
-        return names
-    return [*names, *function.settings] if hasattr(function, "settings") else None
+    return names if all(each.kind != each.VAR_KEYWORD for each in parameters) else None

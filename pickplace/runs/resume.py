@@ -3,7 +3,6 @@
 import json
 import logging
 import os
-import reprlib
 import signal
 from collections.abc import Callable
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from pickplace.runs.folder import occupied, refuse_occupied
 from pickplace.runs.hydra_app import apply_overrides
 from pickplace.runs.references import saved_form
 from pickplace.task.cell import CELL_SETTINGS
+from pickplace.task.checks import shown
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ def checkpoint_config(cfg: DictConfig) -> tuple[dict, str]:
     content = saved_form(cfg)
     own = modules_to_trust(OmegaConf.to_container(cfg, resolve=True))
     try:
-        trusted_config(content, own)
+        trusted_config(content, own, groups=None)
     except ValueError as error:
         log.warning("checkpoints of this run will not be loaded again: %s", error)
     values = {key: OmegaConf.select(cfg, key) for key in LOCAL_VALUES}
@@ -76,7 +76,7 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     _check_counters(place, facts)
     given = OverridesParser.create().parse_overrides(overrides)
     trust = own_modules(next((word.value() for word in reversed(given) if word.key_or_group == "trust"), None))
-    saved = trusted_config(facts["config"], trust)
+    saved = trusted_config(facts["config"], trust, groups=None)
     saved["trust"] = list(trust)  # only the user says what to trust, never the checkpoint
     _refuse_remote_values(saved, {word.key_or_group for word in given})
     cfg = apply_overrides(saved, [str(word.input_line) for word in given if word.key_or_group != "trust"])
@@ -100,7 +100,7 @@ def _check_counters(place: str, facts: dict) -> None:
         raise ValueError(f"resume={place}: the checkpoint has no {missing[0]!r}; expected one that a training wrote.")
 
     def error(key: str, value, expected: str) -> ValueError:
-        words = f"the checkpoint's {reprlib.repr(key)[1:-1]} is {reprlib.repr(value)}"
+        words = f"the checkpoint's {shown(key)[1:-1]} is {shown(value)}"
         return ValueError(f"resume={place}: {words}; expected {expected} that a training wrote.")
 
     if not isinstance(facts["latest"], dict):
@@ -179,7 +179,7 @@ def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
     parameters = dict(enumerate(optimizer.param_groups[0]["params"]))
     if unknown := [key for key in state if key not in parameters]:
         raise checkpoint.CheckpointError(
-            f"The checkpoint's optimizer has {reprlib.repr(unknown[0])}; expected numbers below {len(parameters)}."
+            f"The checkpoint's optimizer has {shown(unknown[0])}; expected numbers below {len(parameters)}."
         )
     own = {n: {"step": torch.tensor(0.0), "exp_avg": p, "exp_avg_sq": p} for n, p in parameters.items() if n in state}
     moments = checkpoint.matching_state(state, own, "optimizer")

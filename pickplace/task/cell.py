@@ -7,10 +7,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.checks import flag, is_number, is_whole, one_of, whole_number
-from pickplace.task.maps import FAR
+from pickplace.task.checks import flag, is_whole, number, one_of, shortened, shown, whole_number
 
 PICK_RULES = ("contain", "overlap")
+
+#: Greatest side of a grid or height, in cells or height units, and greatest side of an end effector.
+MAX_SIDE, MAX_EFFECTOR = 2_000, 64
+#: Greatest number of cells of a grid, of flat actions, and of entries in a table over offsets and place cells.
+MAX_CELLS, MAX_ACTIONS, MAX_TABLE = 2**16, 2**27, 2**25
 
 
 def reference_cell(side):
@@ -96,21 +100,38 @@ class CellSpec:
     limits: Limits | None = field(default=None, compare=False, metadata={"derived": True})
 
     def __post_init__(self):
-        object.__setattr__(self, "bin_size", _sizes("bin_size", self.bin_size, 3))
-        object.__setattr__(self, "tote_size", _sizes("tote_size", self.tote_size, 3))
-        object.__setattr__(self, "effector_size", _sizes("effector_size", self.effector_size, 2))
+        object.__setattr__(self, "bin_size", _sizes("bin_size", self.bin_size, 3, MAX_SIDE))
+        object.__setattr__(self, "tote_size", _sizes("tote_size", self.tote_size, 3, MAX_SIDE))
+        object.__setattr__(self, "effector_size", _sizes("effector_size", self.effector_size, 2, MAX_EFFECTOR))
         if not is_whole(self.rotations) or not 1 <= self.rotations <= 4:
-            raise ValueError(f"rotations={self.rotations!r}: expected 1, 2, 3 or 4 (quarter turns to choose from).")
+            raise ValueError(
+                f"rotations={shown(self.rotations)}: expected 1, 2, 3 or 4 (quarter turns to choose from)."
+            )
         one_of("pick_rule", self.pick_rule, PICK_RULES)
-        if not is_number(self.min_support) or not 0 <= self.min_support <= 1:
-            raise ValueError(f"min_support={self.min_support!r}: expected a share between 0 and 1.")
+        number("min_support", self.min_support, 0, 1)
         flag("strict_support", self.strict_support)
-        if not is_number(self.height_unit) or not 1e-3 <= self.height_unit <= 1e3:
-            raise ValueError(f"height_unit={self.height_unit!r}: expected sides of a cell, 0.001 to 1000.")
+        number("height_unit", self.height_unit, 1e-3, 1e3)
         if self.longest_side is not None:
             whole_number("longest_side", self.longest_side)
+        self._check_products()
         if self.limits is not None:
             self.limits.check(self)
+
+    def _check_products(self) -> None:
+        """Refuse sizes each of which is possible, but whose products would fill the memory."""
+        bin_size, tote_size = f"bin_size={[*self.bin_size]}", f"tote_size={[*self.tote_size]}"
+        products = [
+            (f"{bin_size}: the bin has", self.num_picks, "cells", MAX_CELLS),
+            (f"{tote_size}: the tote has", self.num_places, "cells", MAX_CELLS),
+            (f"{bin_size}, {tote_size}: the cell has", self.num_actions, "actions", MAX_ACTIONS),
+        ]
+        if self.pick_rule == "contain" or self.longest_side is not None:  # else the items will say how many
+            table = self.rotations * self.num_offsets**2 * self.num_places
+            key = f"effector_size={[*self.effector_size]}, {tote_size}: the table of offsets has"
+            products.append((key, table, "entries", MAX_TABLE))
+        for words, count, what, most in products:
+            if count > most:
+                raise ValueError(f"{words} {count:,} {what}; expected at most {most:,}.")
 
     @property
     def num_picks(self) -> int:
@@ -181,17 +202,18 @@ def cell_from_settings(settings: dict) -> CellSpec:
     """Return the cell of settings by name, such as a config's; raises ``ValueError`` for a name that there is not."""
     known = {item.name for item in fields(CellSpec)}
     if unknown := [name for name in settings if name not in known]:
-        raise ValueError(f"{unknown[0]}={settings[unknown[0]]!r}: expected one of {', '.join(CELL_SETTINGS)}.")
+        value = shown(settings[unknown[0]])
+        raise ValueError(f"{shortened(unknown[0])}={value}: expected one of {', '.join(CELL_SETTINGS)}.")
     return CellSpec(**settings)
 
 
-def _sizes(name: str, value, count: int) -> tuple[int, ...]:
-    """Return ``value`` as a tuple of ``count`` positive ints."""
+def _sizes(name: str, value, count: int, most: int) -> tuple[int, ...]:
+    """Return ``value`` as a tuple of ``count`` positive ints, at most ``most``."""
     try:
         sizes = tuple(int(v) for v in value)
         exact = all(int(v) == v and not isinstance(v, bool) for v in value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         sizes, exact = (), False
-    if not exact or len(sizes) != count or min(sizes) < 1 or max(sizes) >= FAR:
-        raise ValueError(f"{name}={value!r}: expected {count} positive whole numbers, below {FAR}.")
+    if not exact or len(sizes) != count or min(sizes) < 1 or max(sizes) > most:
+        raise ValueError(f"{name}={shown(value)}: expected {count} whole numbers >= 1 and <= {most:,}.")
     return sizes

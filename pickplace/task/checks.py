@@ -1,8 +1,33 @@
 """Checks of settings: each returns the value, or raises a ``ValueError`` that names the key and what was expected."""
 
-import math
-import reprlib
+import os
+import sys
 from numbers import Integral, Real
+from reprlib import Repr
+from typing import Any
+
+#: Greatest count that the program's tensors and files hold.
+MAX_COUNT = 2**63 - 1
+
+#: Gigabytes that one batch may take on a CPU, unless the environment variable of that name says otherwise.
+MEMORY_VARIABLE, CPU_GIGABYTES = "PICKPLACE_MEMORY_GB", 0.8
+
+#: Greatest width of a layer, and greatest number of inputs of a neuron.
+MAX_WIDTH, MAX_INPUTS = 1_024, 8_192
+
+_repr = Repr()
+_repr.maxstring = _repr.maxother = 80
+
+
+def shown(value) -> str:
+    """Return a value for a message, cut to some 100 characters."""
+    text = _repr.repr(value)
+    return text if len(text) <= 120 else f"{text[:80]}...{text[-30:]}"
+
+
+def shortened(name) -> str:
+    """Return a name for a message, as :func:`shown` but without quotes."""
+    return shown(str(name))[1:-1]
 
 
 def is_whole(value) -> bool:
@@ -10,43 +35,81 @@ def is_whole(value) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool)
 
 
-def is_number(value) -> bool:
+def is_number(value: Any) -> bool:
     """Return whether a value is a finite real number, and not a bool."""
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, Real) and not isinstance(value, bool) and abs(value) <= sys.float_info.max  # type: ignore[operator]
 
 
-def whole_number(key: str, value, least: int = 1, most: int | None = None) -> int:
-    """Return ``value`` if it is a whole number in ``[least, most]``; ``most=None`` means no upper limit."""
-    if not is_whole(value) or value < least or (most is not None and value > most):
-        limit = "" if most is None else f" and <= {most:,}"
-        raise ValueError(f"{key}={reprlib.repr(value)}: expected a whole number >= {least}{limit}.")
+def whole_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:
+    """Return ``value`` if it is a whole number in ``[least, most]``."""
+    if not is_whole(value) or not least <= value <= most:
+        limit = "< 2**63" if most == MAX_COUNT else f"<= {most:,}"
+        raise ValueError(f"{key}={shown(value)}: expected a whole number >= {least} and {limit}.")
     return int(value)
 
 
 def number(key: str, value, least: float = 0.0, most: float | None = None) -> float:
     """Return ``value`` if it is a finite number in ``[least, most]``; ``most=None`` means no upper limit."""
     if not is_number(value) or value < least or (most is not None and value > most):
-        limit = "" if most is None else f" and <= {most:g}"
-        raise ValueError(f"{key}={reprlib.repr(value)}: expected a number >= {least:g}{limit}.")
+        limits = f">= {least:g}" if most is None else f"between {least:g} and {most:g}"
+        raise ValueError(f"{key}={shown(value)}: expected a number {limits}.")
     return value
 
 
 def flag(key: str, value) -> bool:
     """Return ``value`` if it is true or false."""
     if not isinstance(value, bool):
-        raise ValueError(f"{key}={reprlib.repr(value)}: expected true or false.")
+        raise ValueError(f"{key}={shown(value)}: expected true or false.")
     return value
 
 
 def one_of(key: str, value, choices) -> str:
-    """Return ``value`` if it is among the choices."""
-    if value not in choices:
-        raise ValueError(f"{key}={reprlib.repr(value)}: expected {' or '.join(map(repr, choices))}.")
+    """Return ``value`` if it is a text among the choices."""
+    if not isinstance(value, str) or value not in choices:
+        raise ValueError(f"{key}={shown(value)}: expected {' or '.join(map(repr, choices))}.")
     return value
 
 
-def odd_number(key: str, value, least: int = 1) -> int:
-    """Return ``value`` if it is an odd whole number of at least ``least``."""
-    if not is_whole(value) or value < least or value % 2 == 0:
-        raise ValueError(f"{key}={reprlib.repr(value)}: expected an odd number >= {least}.")
+def odd_number(key: str, value, least: int = 1, most: int = 99) -> int:
+    """Return ``value`` if it is an odd whole number in ``[least, most]``."""
+    if not is_whole(value) or not least <= value <= most or value % 2 == 0:
+        raise ValueError(f"{key}={shown(value)}: expected an odd number >= {least} and <= {most}.")
     return int(value)
+
+
+def number_or_null(key: str, value, least: float, most: float) -> float | None:
+    """Return ``value`` if it is None or a finite number in ``[least, most]``."""
+    if value is not None and (not is_number(value) or not least <= value <= most):
+        raise ValueError(f"{key}={shown(value)}: expected a number between {least:g} and {most:g}, or null.")
+    return value
+
+
+def check_inputs(key: str, count: int) -> None:
+    """Refuse a layer with more inputs than :data:`MAX_INPUTS`."""
+    if count > MAX_INPUTS:
+        raise ValueError(f"{key}: a neuron would have {count:,} inputs; expected at most {MAX_INPUTS:,}.")
+
+
+def check_bytes(setting: str, needed: int, device="cpu") -> None:
+    """Refuse settings whose tensors would fill the memory: :data:`CPU_GIGABYTES`, or half of a GPU's.
+
+    The environment variable ``PICKPLACE_MEMORY_GB`` sets another limit. A checkpoint cannot.
+
+    Args:
+        setting: the keys and their values, for the message.
+        needed: bytes that they would take.
+        device: where the tensors would be.
+    """
+    import torch  # not before it is needed: errors are worded without it
+
+    device, given = torch.device(device), os.environ.get(MEMORY_VARIABLE)
+    most = torch.cuda.get_device_properties(device).total_memory / 2e9 if device.type == "cuda" else CPU_GIGABYTES
+    try:
+        most = most if given is None else number(MEMORY_VARIABLE, float(given))
+    except ValueError as error:
+        raise ValueError(f"{MEMORY_VARIABLE}={shown(given)}: expected a number of gigabytes.") from error
+    if needed > most * 1e9:
+        raise ValueError(
+            f"{setting}: it would take {needed / 1e9:,.1f} GB; expected at most {most:.1f} GB, or a greater limit in "
+            f"the environment variable {MEMORY_VARIABLE}."
+        )

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from pickplace.task.cell import CellSpec, Limits
+from pickplace.task.checks import check_bytes
 from pickplace.task.grasps import (
     all_grasps,
     available_offsets,
@@ -30,6 +31,8 @@ from pickplace.task.grasps import (
 from pickplace.task.maps import FAR, NEVER, surround, windows
 from pickplace.task.placing import clearance, is_within_reach, resting_top
 from pickplace.task.state import Item, State
+
+CLASS_BYTES = 2**28  # of the masks of grasp classes that are held at a time
 
 
 class PlacingMaps(NamedTuple):
@@ -68,8 +71,21 @@ def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     return mask.flatten(3, 4).flatten(0, 2)
 
 
+def check_actions(cell: CellSpec, batch: int, device) -> None:
+    """Refuse to list all flat actions of more problems than the memory holds, with a ``ValueError``."""
+    check_bytes(
+        f"{cell.describe()}: {cell.num_actions:,} actions for {batch} problems at once",
+        5 * batch * cell.num_actions,
+        device,
+    )
+
+
 def num_feasible(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     """Return how many flat actions succeed, int64 ``[N]``, without listing them."""
+    at_once = max(1, CLASS_BYTES // (num_turns(cell) * cell.num_offsets**2 * cell.num_places))
+    if at_once < len(maps.top):
+        parts = torch.arange(len(maps.top), device=maps.top.device).split(at_once)
+        return torch.cat([num_feasible(cell, maps.rows(part)) for part in parts])
     available, classes = available_offsets(cell, maps.item)
     places = class_mask(cell, maps).sum(1)  # [T * K, N]
     return reduce(torch.add, [(places.gather(0, turned) * available).sum(0) for turned in classes])
@@ -77,6 +93,7 @@ def num_feasible(cell: CellSpec, maps: PlacingMaps) -> Tensor:
 
 def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     """Return exactly the flat actions that succeed, bool ``[N, N_a]``."""
+    check_actions(cell, len(maps.top), maps.top.device)
     places, batch, rotations = cell.num_places, len(maps.top), cell.rotations
     available, classes = available_offsets(cell, maps.item)
     by_class = class_mask(cell, maps)
@@ -217,6 +234,7 @@ def action_footprints(cell: CellSpec, item: Item) -> Tensor:
     tote_w, tote_d, _ = cell.tote_size
     lifted, offset = all_grasps(cell, item)
     device = offset.device
+    check_actions(cell, len(lifted), device)
     turned = torch.arange(cell.rotations, device=device) % 2  # [R]
     refs = torch.tensor([shape[2:] for shape in cell.effectors], device=device)[turned]  # [R, 2]
     corner = (offset - refs)[:, :, None, None]  # [N, P, 1, 1, R, 2]

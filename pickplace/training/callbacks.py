@@ -1,14 +1,13 @@
 """Callbacks (config group ``callbacks``): a user's code at each batch, validation and change of level of a training."""
 
 import json
-import reprlib
 from numbers import Real
 from typing import Any
 
 from pickplace.evaluation.play import Episodes
 from pickplace.runs.errors import sentence
 from pickplace.runs.registry import build
-from pickplace.task.checks import number, whole_number
+from pickplace.task.checks import number, shown, whole_number
 
 
 class Callback:
@@ -100,4 +99,4 @@ def call(callbacks: dict[str, Callback], hook: str, trainer: Any, *arguments: An
         getattr(callback, hook)(trainer, *arguments)
         for key, value in arguments[-1].items() if isinstance(arguments[-1], dict) else ():
             if not isinstance(value, Real):
-                raise ValueError(f"callbacks.{name}: it logs {key}={reprlib.repr(value)}; expected a number.")
+                raise ValueError(f"callbacks.{name}: it logs {key}={shown(value)}; expected a number.")

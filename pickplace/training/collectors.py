@@ -4,7 +4,7 @@ import signal
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 
@@ -15,7 +15,9 @@ from torchrl.collectors.distributed import RayCollector
 
 from pickplace.runs.checkpoint import CheckpointError
 from pickplace.runs.errors import WorkerDied, missing_extra
+from pickplace.runs.registry import names_at
 from pickplace.runs.resume import STOP_SIGNALS
+from pickplace.task.checks import shown, whole_number
 
 
 class ResumableCollector(Collector):
@@ -215,7 +217,7 @@ def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, 
 
     Args: as :func:`single`, and ``workers``, the number of processes; it must divide ``num_envs``.
     """
-    share = _share(num_envs, workers)
+    share = _share(num_envs, workers, 64)
     collector = MultiSyncCollector(
         [partial(make_env, worker * share, share) for worker in range(workers)],
         policy,
@@ -248,7 +250,7 @@ def ray(
         raise missing_extra("collector", "ray") from error
     if any(parameter.is_cuda for parameter in policy.parameters()):
         raise ValueError("collector=ray: its workers have no GPU; expected device=cpu, or collector=single.")
-    share = _share(num_envs, workers)
+    share = _share(num_envs, workers, 1_024)
     # A new Ray gets a core per worker, however few this machine has; a cluster states its own number.
     resources = {"num_cpus": workers} if address == "local" else {}
     collector = ResumableRayCollector(
@@ -283,11 +285,28 @@ def _started(collector, seeds: Sequence[tuple[int, ...]]):
     return collector
 
 
-def _share(num_envs: int, workers: int) -> int:
-    """Number of slots of each worker."""
-    if not isinstance(workers, int) or workers < 1 or num_envs % workers:
+def _share(num_envs: int, workers: int, most: int) -> int:
+    """Number of slots of each worker, of which there may be ``most``."""
+    whole_number("collector.workers", workers, most=most)
+    if num_envs % workers:
         raise ValueError(f"collector.workers={workers}: expected a divisor of env.num_envs={num_envs}.")
     return num_envs // workers
+
+
+def refuse_other_workers(settings: Mapping, state: object) -> None:
+    """Refuse to resume with more or fewer workers than a checkpoint has states of, before any of them starts.
+
+    Args:
+        settings: the config of one of pickplace's collectors; one of the user's own is not judged.
+        state: the checkpoint's state of the collector.
+
+    Raises:
+        CheckpointError: naming both numbers.
+    """
+    saved = sum(str(key).startswith("worker") for key in state) if isinstance(state, dict) else 0
+    if settings["_target_"] in names_at("collector") and settings.get("workers", 0) != saved:
+        workers = shown(settings.get("workers", 0))
+        raise CheckpointError(f"collector.workers={workers}: the checkpoint has {saved} workers; expected as many.")
 
 
 def _seeds(seed: int, workers: int) -> list[tuple[int, int]]:

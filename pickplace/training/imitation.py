@@ -1,6 +1,5 @@
 """Warm start: a policy imitates a planner before it learns from reward."""
 
-import reprlib
 from collections.abc import Mapping
 from enum import Enum
 from typing import cast
@@ -17,7 +16,7 @@ from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import trusted_config
 from pickplace.runs.registry import accepted_arguments, build, find
 from pickplace.task.cell import CellSpec
-from pickplace.task.checks import whole_number
+from pickplace.task.checks import shown, whole_number
 from pickplace.task.items import ItemDistribution
 from pickplace.task.observation import Term
 from pickplace.task.state import State
@@ -67,7 +66,7 @@ class WarmStart:
         if cfg.frames and cfg.teacher is None:
             raise ValueError(f"warm_start.frames={cfg.frames}: there is no teacher; expected warm_start=imitate.")
         if cfg.teacher is not None and not OmegaConf.is_dict(cfg.teacher):
-            given = reprlib.repr(cfg.teacher)
+            given = shown(cfg.teacher)
             raise ValueError(f"warm_start.teacher={given}: expected planner@warm_start.teacher=<planner>.")
         self.policy, self.cell, self.seed = policy, cell, seed
         self.teacher, self.frames, self.critic_frames = cfg.teacher, cfg.frames, cfg.critic_frames
@@ -102,7 +101,8 @@ class WarmStart:
             iteration: the run's batch number; it seeds a teacher that draws, so that a resumed run is the same.
         """
         draws = {"seed": self.seed + iteration} if self._draws else {}
-        teacher = build("warm_start.teacher", self.teacher, **self._parts, **draws)
+        settings = cast(dict, OmegaConf.to_container(self.teacher, resolve=True))
+        teacher = build("warm_start.teacher", {**settings, **draws}, **self._parts)
         action = decide(teacher, self.cell, data)
         state = State.from_observation(data)
         wanted = apply(self.cell, state, action)

@@ -26,12 +26,15 @@ DIAGNOSTICS = {
 
 def make_losses(algo: DictConfig, policy: Policy, critic: ValueOperator) -> tuple[GAE, A2CLoss | ClipPPOLoss]:
     """Make the advantage estimator and the loss that ``algo.loss`` names."""
-    common = {"entropy_coeff": algo.entropy_coeff, "critic_coeff": algo.critic_coeff, "loss_critic_type": "l2"}
+    # TorchRL leaves out a part whose coefficient is 0 at first; with 1 it is computed, so that it can be logged.
+    common = {"entropy_coeff": 1.0, "critic_coeff": 1.0, "loss_critic_type": "l2"}
     if algo.loss == "ppo":
         clip = {"clip_epsilon": algo.clip_epsilon, "normalize_advantage": algo.normalize_advantage}
         loss = ClipPPOLoss(as_actor(policy), critic, **clip, **common)
     else:
         loss = A2CLoss(as_actor(policy), critic, **common)
+    loss.entropy_coeff.fill_(float(algo.entropy_coeff))
+    loss.critic_coeff.fill_(float(algo.critic_coeff))
     loss.set_keys(action=policy.choice_key, sample_log_prob="log_prob")
     # A2CLoss does not normalise advantages itself.
     average = algo.loss == "a2c" and algo.normalize_advantage

@@ -1,60 +1,67 @@
 """Checks of a training config before anything is built."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
 
 from omegaconf import DictConfig, OmegaConf
 
+from pickplace.evaluation.play import check_episode_settings
 from pickplace.runs.allowlist import own_modules
-from pickplace.task.checks import is_number, is_whole
+from pickplace.task.checks import flag, number, one_of, shown, whole_number
 from pickplace.task.items import check_seed
 
 
-class Expectation(NamedTuple):
-    """A condition on a value of the config, and its words."""
-
-    holds: Callable[[Any], bool]
-    words: str  # "... expected <words>."
+def _node(key: str, value) -> None:
+    if not OmegaConf.is_dict(value) or "_target_" not in value:
+        raise ValueError(f"{key}={shown(value)}: expected the settings of an object, with its _target_.")
 
 
-def _between(low: float, high: float | None = None) -> Expectation:
-    words = f"a number >= {low}" + ("" if high is None else f" and <= {high}")
-    return Expectation(lambda value: is_number(value) and low <= value and (high is None or value <= high), words)
+def _group(key: str, value) -> None:
+    if not OmegaConf.is_dict(value):
+        raise ValueError(f"{key}={shown(value)}: expected settings by their names.")
 
 
-COUNT = Expectation(
-    lambda value: is_whole(value) and 1 <= value < 2**63,
-    "a whole number >= 1 and < 2**63",
-)
-NODE = Expectation(
-    lambda value: OmegaConf.is_dict(value) and "_target_" in value,
-    "the settings of an object, with its _target_",
-)
-SWITCH = Expectation(lambda value: isinstance(value, bool), "true or false")
+def _text(key: str, value) -> None:
+    if not isinstance(value, str) or len(value) > 1_000:
+        raise ValueError(f"{key}={shown(value)}: expected a text of at most 1,000 characters.")
 
-#: What each key must be, checked in this order.
-EXPECTED = {
-    **dict.fromkeys(("total_frames", "evaluation_interval", "checkpoint_interval", "progress_interval"), COUNT),
-    **dict.fromkeys(("env.num_envs", "algo.rollout_length", "algo.epochs", "algo.minibatch_size"), COUNT),
-    **dict.fromkeys(("evaluation.episodes", "evaluation.batch_size"), COUNT),
-    **dict.fromkeys(("items", "env", "model.actor", "model.critic", "curriculum", "collector"), NODE),
-    **dict.fromkeys(("planner", "logger"), NODE),
-    "algo.loss": Expectation(lambda value: value in ("a2c", "ppo"), "ppo or a2c"),
-    **dict.fromkeys(("algo.mask_infeasible", "algo.normalize_advantage"), SWITCH),
-    "planner._target_": Expectation(
-        lambda value: value == "policy",
-        "planner=policy, since training validates its own policy",
-    ),
-    "evaluation.stream": Expectation(
-        lambda value: value == "validation", "validation, on which training selects its best policy"
-    ),
-    "algo.lr_decay_start": Expectation(
-        lambda value: value is None or (is_number(value) and 0 <= value <= 1),
-        "a share of total_frames between 0 and 1, or null",
-    ),
-    **dict.fromkeys(("algo.gamma", "algo.lmbda", "algo.clip_epsilon"), _between(0, 1)),
-    **dict.fromkeys(("algo.lr", "algo.entropy_coeff", "algo.critic_coeff"), _between(0)),
-    **dict.fromkeys(("algo.max_grad_norm", "algo.reward_scale"), _between(0)),
+
+def _or_null(check):
+    return lambda key, value: None if value is None else check(key, value)
+
+
+def _only(expected: str, reason: str):
+    def check(key: str, value) -> None:
+        if value != expected:
+            raise ValueError(f"{key}={shown(value)}: expected {expected}, {reason}.")
+
+    return check
+
+
+_share = partial(number, most=1)
+_weight = partial(number, most=1e38)  # float32 ends there
+_positive = partial(number, least=1e-9, most=1e38)
+
+#: The check of each key, in this order.
+CHECKS = {
+    **dict.fromkeys(("env", "items", "curriculum", "collector", "planner", "logger"), _node),
+    **dict.fromkeys(("model", "algo", "evaluation", "warm_start"), _group),
+    **dict.fromkeys(("model.actor", "model.critic"), _node),
+    "warm_start.teacher": _or_null(_node),
+    "warm_start.checkpoint": _or_null(_text),
+    **dict.fromkeys(("warm_start.frames", "warm_start.critic_frames"), partial(whole_number, least=0)),
+    **dict.fromkeys(("total_frames", "evaluation_interval", "checkpoint_interval", "progress_interval"), whole_number),
+    "env.num_envs": partial(whole_number, most=32_768),
+    **dict.fromkeys(("algo.rollout_length", "algo.minibatch_size"), whole_number),
+    "algo.epochs": partial(whole_number, most=1_000),
+    "algo.loss": partial(one_of, choices=("ppo", "a2c")),
+    **dict.fromkeys(("algo.mask_infeasible", "algo.normalize_advantage"), flag),
+    "planner._target_": _only("policy", "since training validates its own policy"),
+    "evaluation.stream": _only("validation", "on which training selects its best policy"),
+    "algo.lr_decay_start": _or_null(_share),
+    **dict.fromkeys(("algo.gamma", "algo.lmbda", "algo.clip_epsilon"), _share),
+    **dict.fromkeys(("algo.lr", "algo.entropy_coeff", "algo.critic_coeff"), _weight),
+    **dict.fromkeys(("algo.max_grad_norm", "algo.reward_scale"), _positive),
+    "seed": lambda key, value: check_seed(value, key),
 }
 
 
@@ -64,12 +71,9 @@ def check_settings(cfg: DictConfig) -> None:
     Raises:
         ValueError: naming the key, its value, and what was expected.
     """
-    for key, expected in EXPECTED.items():
-        value = OmegaConf.select(cfg, key)
-        if not expected.holds(value):
-            raise ValueError(f"{key}={value}: expected {expected.words}.")
-    check_seed(cfg.seed)
-    check_seed(cfg.evaluation.seed, "evaluation.seed")
+    for key, check in CHECKS.items():
+        check(key, OmegaConf.select(cfg, key))
+    check_episode_settings(cfg.evaluation)
     own_modules(cfg.trust)
     if cfg.algo.loss == "a2c" and cfg.algo.normalize_advantage and cfg.env.num_envs * cfg.algo.rollout_length == 1:
         raise ValueError(

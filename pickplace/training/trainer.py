@@ -7,16 +7,18 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
+from pickplace.envs.checks import problem_bytes
 from pickplace.envs.saved_state import check_saved_state
-from pickplace.evaluation.play import Episodes, play
-from pickplace.policies.base import Policy, as_collection_policy, as_critic
+from pickplace.envs.torchrl import MASKS, PickPlaceEnv
+from pickplace.evaluation.play import Episodes, check_play, play
+from pickplace.policies.base import Policy, as_collection_policy, as_critic, refuse_large
 from pickplace.runs import checkpoint
 from pickplace.runs.machine import use_machine
 from pickplace.runs.provenance import commit, versions
@@ -30,9 +32,10 @@ from pickplace.runs.resume import (
     load_optimizer,
     stale_best_frames,
 )
+from pickplace.task.checks import check_bytes
 from pickplace.task.files import replaced_file
 from pickplace.training import callbacks
-from pickplace.training.collectors import rng_state, set_rng_state, watch_workers
+from pickplace.training.collectors import refuse_other_workers, rng_state, set_rng_state, watch_workers
 from pickplace.training.curriculum import Curriculum, push_level
 from pickplace.training.imitation import Phase, WarmStart
 from pickplace.training.metrics import has_passed, progress_line, validation_metrics
@@ -93,7 +96,8 @@ class Trainer:
         """Make the items, the policy, the planner that validates it, the warm start and the critic."""
         cfg = self.cfg
         self.items = build("items", cfg["items"])
-        self.build_env = partial(build, "env", cfg.env, items=self.items, device=cfg.device)
+        self.env_config = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
+        self.build_env = partial(build_env, self.env_config, items=self.items, device=cfg.device)
         probe = self.build_env(num_envs=1, masks=())
         self.cell, self.terms, self.min_tote_height = probe.cell, probe.terms, probe.min_tote_height
         make_actor = partial(
@@ -106,9 +110,26 @@ class Trainer:
         self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, self.items, self.terms, cfg.seed, cfg.trust)
         make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
         self.critic = self._restored("critic", lambda: as_critic(make_critic()))
+        self._check_batch(probe)
+
+    def _check_batch(self, probe: PickPlaceEnv) -> None:
+        """Refuse a batch that would fill the memory.
+
+        A frame holds two observations, masks once, and what the critic computes for it, measured with ``pooled``; in a
+        gradient step some 90 kB more, measured with ``fcn_grasp`` at the paper's cell.
+        """
+        slots, steps = self.cfg.env.num_envs, self.algo.rollout_length
+        masks = sum(MASKS[name].size(self.cell) for name in self.policy.masks)
+        frame = 2 * probe.observation_bytes + masks + 200 * self.cell.num_places
+        check_bytes(f"env.num_envs={slots}, algo.rollout_length={steps}", slots * steps * frame, self.device)
+        part = min(self.algo.minibatch_size, slots * steps)
+        check_bytes(f"algo.minibatch_size={part}", part * 90_000, self.device)
+        check_bytes(f"env.num_envs={slots}", slots * problem_bytes(self.cell, self.policy.masks), self.device)
+        check_play(self.cfg.evaluation, self.cell, self.device)
 
     def _restored(self, key: str, make) -> Any:
         """Make a module, with the checkpoint's weights if the run is resumed."""
+        refuse_large(make, f"model.{'actor' if key == 'policy' else key}")
         module = checkpoint.restore(make, self.state.get(key, {}), key) if self.resumed else make()
         return module.to(self.device)
 
@@ -138,13 +159,14 @@ class Trainer:
     def _make_learner(self) -> None:
         """Make TorchRL's parts: advantage, loss, optimizer and collector."""
         cfg, algo = self.cfg, self.algo
-        env_config = OmegaConf.to_container(cfg.env, resolve=True)
         make_env = partial(
-            training_env, env_config, self.items, cfg.device, self.policy.masks, cfg.env.num_envs, self.curriculum
+            training_env, self.env_config, self.items, cfg.device, self.policy.masks, cfg.env.num_envs, self.curriculum
         )
         self.acting = as_collection_policy(self.policy)
         self.advantage, self.loss = make_losses(algo, self.policy, self.critic)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=algo.lr, eps=1e-5)
+        if self.resumed:
+            refuse_other_workers(cfg.collector, self.state.get("collector"))
         self.collector = build(
             "collector",
             cfg.collector,
@@ -335,16 +357,20 @@ class Trainer:
             write_report(run_dir, self.cfg, replayed, self.cell, versions() | {"commit": commit()})
 
 
+def build_env(env_config: dict, num_envs: int, **kwargs) -> PickPlaceEnv:
+    """Make the environment of the config group ``env`` with another number of slots."""
+    return build("env", {**env_config, "num_envs": num_envs}, **kwargs)
+
+
 def training_env(env_config, items, device, masks, total_envs, curriculum, first_episode, num_envs) -> TransformedEnv:
     """Make the environment of one collector process: slots ``first_episode ..`` of ``total_envs``, under the
     curriculum."""
-    env = build(
-        "env",
-        OmegaConf.create(env_config),
+    env = build_env(
+        env_config,
+        num_envs,
         items=items,
         device=device,
         masks=masks,
-        num_envs=num_envs,
         first_episode=first_episode,
         episode_stride=total_envs,
     )

@@ -172,7 +172,7 @@ NO_TOP.highest_top.fill_(0)
         ({"items": [(1, 1, 1)]}, "items=.*expected an ItemDistribution"),
         *(({"num_envs": value}, f"num_envs={value}: expected a whole number >= 1") for value in (0, 1.5, True)),
         ({"seed": -1}, "seed=-1: expected a whole number >= 0"),
-        ({"stream": "dev"}, "stream='dev': expected one of train, validation, test"),
+        ({"stream": "dev"}, "stream='dev': expected 'train' or 'validation' or 'test'"),
         ({"masks": ("all",)}, "masks=.'all',.: expected any of 'action', 'footprint'"),
     ],
 )

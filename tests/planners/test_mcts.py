@@ -104,8 +104,8 @@ def test_a_recorded_stream_is_not_looked_up_and_a_full_tote_has_nothing_to_searc
         ({"simulations": 0}, "planner.simulations=0: expected a whole number >= 1"),
         ({"wave": 1.5}, "planner.wave=1.5"),
         ({"seed": -1}, "planner.seed=-1"),
-        ({"exploration": -1}, "planner.exploration=-1: expected a number >= 0"),
-        ({"widening": 2}, "planner.widening=2: expected a number >= 0 and <= 1"),
+        ({"exploration": -1}, "planner.exploration=-1: expected a number between 0"),
+        ({"widening": 2}, "planner.widening=2: expected a number between 0 and 1"),
         ({"mask": 1}, "planner.mask=1: expected true or false"),
     ],
 )

@@ -61,7 +61,7 @@ FOREIGN = [
 @pytest.mark.parametrize("target", FOREIGN)
 def test_foreign_targets_are_refused(target, place):
     with pytest.raises(ValueError, match=rf"{place}\._target_=.*: the checkpoint is refused; expected one of \w+"):
-        trusted_config(changed(**{f"{place}._target_".replace(".", "__"): target}))
+        trusted_config(changed(**{f"{place}._target_".replace(".", "__"): target}), groups=None)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_foreign_targets_are_refused(target, place):
 )  # fmt: skip
 def test_targets_in_other_places_are_refused(place, node):
     with pytest.raises(ValueError, match="expected none in this place"):
-        trusted_config(changed(**{place: node}))
+        trusted_config(changed(**{place: node}), groups=None)
 
 
 def test_our_own_configs_are_accepted():
@@ -111,7 +111,7 @@ HIDDEN = {
 def test_what_interpolations_hide_is_refused(name):
     words = "refused; expected (no interpolation but a reference to a number|one of fcn_grasp)"
     with pytest.raises(ValueError, match=words):
-        trusted_config(changed(**HIDDEN[name]))
+        trusted_config(changed(**HIDDEN[name]), groups=None)
 
 
 def test_references_to_values_follow_what_they_lead_to():
@@ -203,7 +203,7 @@ def test_what_is_saved(monkeypatch):
     assert saved["items"]["path"] == "/data/items.csv" and saved["total_frames"] == "${seed}" and saved["trust"] == []
     assert saved["algo"]["part"]["stream"] == "validation"
     assert saved["model"]["critic"]["tote_clip"] == "${..actor.tote_clip}"
-    assert trusted_config(saved).total_frames == 7
+    assert trusted_config(saved, groups=None).total_frames == 7
 
 
 def test_modules_to_trust():
@@ -213,15 +213,6 @@ def test_modules_to_trust():
     changes = {"model__actor___target_": "my.nets.Net", "items___target_": "mine.Items"}
     changes["algo__more"] = [{"_target_": "mine.Items"}, {"_target_": "torch.nn.ReLU"}, {"_target_": "items/kinds"}]
     assert modules_to_trust(changed(**changes)) == ("mine", "my.nets")
-
-
-@pytest.mark.parametrize(
-    ("place", "value"),
-    [("env__tote_size", [6, 6, 10**6]), ("env__effector_size", [1e9, 3]), ("collector__workers", 4096)],
-)
-def test_numbers_that_would_take_all_memory_are_refused(place, value):
-    with pytest.raises(ValueError, match=f"{place.replace('__', '.')}=.*: the checkpoint is refused; expected at most"):
-        trusted_config(changed(**{place: value}))
 
 
 @pytest.mark.parametrize("key", REQUIRED_KEYS)

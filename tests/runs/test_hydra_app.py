@@ -39,13 +39,13 @@ BAD = [
     ("train", "model.actor._target_=fcn", ["model.actor._target_=fcn", "'fcn4d'"]),
     ("train", "model.actor._target_=os.system", ["model.actor", "command"]),
     ("train", "trust=[os]", ["trust='os'", "modules of your own"]),
-    ("train", "planner=random", ["planner._target_=random", "planner=policy"]),
+    ("train", "planner=random", ["planner._target_='random'", "expected policy"]),
     # sweeps, before their first run
     ("train", "-m algo.gama=0.9,1", ["algo.gama", "'gamma'"]),
     ("train", "-m curriculum=none,mien", ["curriculum/mien", "adaptive"]),
     # cells, items, models and curricula
-    ("train", "env.tote_size=[6,6,-5]", ["tote_size=[6, 6, -5]", "positive whole numbers"]),
-    ("train", "env.tote_size=[5,5,3000000000]", ["3000000000", "below 1048576"]),
+    ("train", "env.tote_size=[6,6,-5]", ["tote_size=[6, 6, -5]", "3 whole numbers >= 1"]),
+    ("train", "env.tote_size=[5,5,3000000000]", ["3000000000", "<= 2,000"]),
     ("train", "items.kinds=[[1,1,9]]", ["item 1x1x9", "tote_size[2]=5"]),
     ("train", "items=recorded items.path=nowhere.csv", ["items.path='nowhere.csv'", "no such file"]),
     ("train", "items=recorded", ["items.path", "no value"]),
@@ -68,14 +68,15 @@ BAD = [
     ("evaluate", "planner=joint_dbl evaluation.latency_decisions=x", ["latency_decisions='x'", ">= 0"]),
     # ranges, and overrides that the sentence repeats
     *(("train", word, [word, ">= 1"]) for word in ("env.num_envs=0", "threads=0", "model.critic.hidden=-1")),
-    *(("train", word, [word, ">= 0"]) for word in ("algo.lr=fast", "algo.lr=-1", "algo.lr=inf")),
-    *(("train", word, [word, "<= 1"]) for word in ("algo.gamma=1.5", "threads=10000000000")),
+    *(("train", word, [word, "between 0 and 1"]) for word in ("algo.lr=-1", "algo.lr=inf", "algo.gamma=1.5")),
+    ("train", "threads=10000000000", ["threads=10000000000", "<= 1"]),
+    ("train", "algo.lr=fast", ["algo.lr='fast'", "between 0 and 1"]),
     *(("train", word, [word, "cpu"]) for word in ("device=tpu", "device=meta")),
     ("train", "algo.lr_decay_start=true", ["algo.lr_decay_start=True", "between 0 and 1"]),
-    ("train", "total_frames=many", ["total_frames=many", "whole number"]),
-    ("train", "algo.loss=dqn", ["algo.loss=dqn", "ppo or a2c"]),
-    ("train", "algo.mask_infeasible=maybe", ["algo.mask_infeasible=maybe", "true or false"]),
-    ("train", "evaluation.stream=test", ["evaluation.stream=test", "validation"]),
+    ("train", "total_frames=many", ["total_frames='many'", "whole number"]),
+    ("train", "algo.loss=dqn", ["algo.loss='dqn'", "'ppo' or 'a2c'"]),
+    ("train", "algo.mask_infeasible=maybe", ["algo.mask_infeasible='maybe'", "true or false"]),
+    ("train", "evaluation.stream=test", ["evaluation.stream='test'", "validation"]),
 ]
 
 

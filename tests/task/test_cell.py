@@ -11,10 +11,10 @@ from pickplace.task.cell import CELL_SETTINGS, Limits, cell_from_settings, refer
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"bin_size": (-5, 5, 1)}, r"bin_size=\(-5, 5, 1\): expected 3 positive whole numbers"),
+        ({"bin_size": (-5, 5, 1)}, r"bin_size=\(-5, 5, 1\): expected 3 whole numbers >= 1"),
         ({"tote_size": (6, 0, 5)}, r"tote_size=\(6, 0, 5\)"),
         ({"tote_size": (6, 6)}, r"tote_size=\(6, 6\): expected 3"),
-        ({"tote_size": (6, 6, 2**20)}, "tote_size=.*below 1048576"),
+        ({"tote_size": (6, 6, 2**20)}, "tote_size=.*and <= 2,000"),
         ({"tote_size": 6}, "tote_size=6"),
         ({"tote_size": (6, 6.5, 5)}, "tote_size="),
         ({"tote_size": (6, True, 5)}, "tote_size="),
@@ -22,10 +22,16 @@ from pickplace.task.cell import CELL_SETTINGS, Limits, cell_from_settings, refer
         ({"effector_size": (3, 3, 1)}, r"effector_size=\(3, 3, 1\)"),
         *(({"rotations": value}, f"rotations={value}: expected 1, 2, 3 or 4") for value in (0, 5, 4.0, True)),
         ({"pick_rule": "grab"}, "pick_rule='grab': expected 'contain' or 'overlap'"),
-        *(({"min_support": value}, f"min_support={value!r}: expected a share") for value in (1.5, -0.1, "half", True)),
+        *(
+            ({"min_support": value}, f"min_support={value!r}: .* between 0 and 1")
+            for value in (1.5, -0.1, "half", True)
+        ),
         ({"min_support": float("nan")}, "min_support=nan"),
         ({"strict_support": 1}, "strict_support=1: expected true or false"),
-        *(({"height_unit": value}, f"height_unit={value!r}: expected sides") for value in (0, -1, 1e-4, 2000, "1")),
+        *(
+            ({"height_unit": value}, f"height_unit={value!r}: .* between 0.001 and 1000")
+            for value in (0, -1, 1e-4, 2000, "1")
+        ),
         ({"height_unit": float("inf")}, "height_unit=inf"),
         ({"height_unit": True}, "height_unit=True"),
         ({"longest_side": 0}, "longest_side=0: expected a whole number >= 1"),

@@ -114,7 +114,7 @@ def test_weights_and_ranges():
             (lambda limits=limits: Uniform(depth=limits), "items.depth")
             for limits in ((1, "2"), (1.0, 2.5), (1, 2, 3), (2, 1), (0, 1))
         ),
-        (lambda: Uniform((1, 100), (1, 100), (1, 100)), "items: the ranges have 1,000,000 kinds"),
+        (lambda: Uniform((1, 100), (1, 100), (1, 100)), "items.width=.* the ranges have 1,000,000 kinds"),
         (lambda: Recorded("missing.csv"), "items.path='missing.csv': no such file"),
         (lambda: Recorded(5), "items.path='5': no such file"),
         (lambda: Recorded("missing.csv", loop="maybe"), "items.loop='maybe': expected true or false"),

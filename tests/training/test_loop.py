@@ -5,6 +5,7 @@ from copy import deepcopy
 import pytest
 import torch
 from commands import composed
+from omegaconf import OmegaConf
 from torch import nn
 from torchrl.modules import ValueOperator
 
@@ -180,7 +181,7 @@ def test_the_slots_of_all_workers_share_the_episodes_of_a_stream():
     """Each episode is played once, by one of them."""
     curriculum, cfg, played = Curriculum(NoAdvance(), Current()), composed("env.tote_size=[4,4,2]"), []
     curriculum.setup(1, 2, 100)
-    env_config = {key: value for key, value in cfg.env.items() if key != "num_envs"}
+    env_config = OmegaConf.to_container(cfg.env)
     common = (env_config, build("items", cfg["items"]), "cpu", ("footprint",), 4, curriculum)
     for first in (0, 2):
         env = training_env(*common, first_episode=first, num_envs=2)

@@ -24,10 +24,18 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pickplace.policies.networks.depth import clip_depth, pad_depth
-from pickplace.task.checks import one_of, whole_number
+from pickplace.task.checks import MAX_WIDTH, number, number_or_null, one_of, whole_number
 
 BIN_PADDING, TOTE_PADDING = -1.0, 0.0
 DTYPES = ("float32", "bfloat16")
+MAX_DEPTH = 10_000  # height units; deeper than any tote
+
+
+def check_clips(place: str, bin_clip: float | None, tote_clip: float | None, floor: float | None) -> None:
+    """Refuse limits of depth clipping that are no depths; ``place`` is where the config has them."""
+    number_or_null(f"{place}.bin_clip", bin_clip, 0, MAX_DEPTH)
+    number_or_null(f"{place}.tote_clip", tote_clip, 0, MAX_DEPTH)
+    number_or_null(f"{place}.floor", floor, -MAX_DEPTH, MAX_DEPTH)
 
 
 class Conv4dParameters(nn.Module):
@@ -73,6 +81,7 @@ class Conv4dPolicy(nn.Module):
     def __init__(
         self,
         rotations: int,
+        /,
         filters: int = 64,
         bin_clip: float | None = 1.0,
         tote_clip: float | None = 5.0,
@@ -82,8 +91,11 @@ class Conv4dPolicy(nn.Module):
         chunk_bytes: int = 64 * 2**20,
     ):
         super().__init__()
-        whole_number("model.actor.filters", filters)
+        whole_number("model.actor.filters", filters, most=MAX_WIDTH)
         one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
+        check_clips("model.actor", bin_clip, tote_clip, floor)
+        number_or_null("model.actor.head_std", head_std, 0, 1e3)
+        whole_number("model.actor.chunk_bytes", chunk_bytes, most=2**30)
         self.rotations = rotations
         self.filters = filters
         self.bin_clip = bin_clip
@@ -230,6 +242,7 @@ class Conv4dCritic(nn.Module):
         self,
         bin_size: Sequence[int],
         tote_size: Sequence[int],
+        /,
         filters: int = 64,
         hidden: int = 256,
         bin_clip: float | None = 1.0,
@@ -238,8 +251,10 @@ class Conv4dCritic(nn.Module):
         depth_scale: float = 5.0,
     ):
         super().__init__()
-        whole_number("model.critic.filters", filters)
-        whole_number("model.critic.hidden", hidden)
+        whole_number("model.critic.filters", filters, most=MAX_WIDTH)
+        whole_number("model.critic.hidden", hidden, most=MAX_WIDTH)
+        check_clips("model.critic", bin_clip, tote_clip, floor)
+        number("model.critic.depth_scale", depth_scale, 1e-3, 1e6)
         self.bin_size = tuple(bin_size)[:2]
         self.tote_size = tuple(tote_size)[:2]
         self.bin_clip = bin_clip

@@ -6,9 +6,9 @@ from torch import Tensor, nn
 
 from pickplace.policies.networks.conv4d import Conv4dCritic
 from pickplace.policies.networks.depth import depth_levels, item_code, one_hot
-from pickplace.policies.networks.footprint_fcn import DTYPES, matrix_dtype
+from pickplace.policies.networks.footprint_fcn import DTYPES, MAX_LEVELS, matrix_dtype
 from pickplace.task.cell import CellSpec
-from pickplace.task.checks import odd_number, one_of, whole_number
+from pickplace.task.checks import MAX_WIDTH, check_inputs, odd_number, one_of, whole_number
 
 
 class PooledCritic(nn.Module):
@@ -42,9 +42,11 @@ class PooledCritic(nn.Module):
     ):
         super().__init__()
         odd_number("model.critic.receptive_field", receptive_field)
-        widths = {"filters": filters, "hidden": hidden, "tote_clip": tote_clip}
-        for key, value in {**widths, "depth_range": depth_range, "item_range": item_range}.items():
-            whole_number(f"model.critic.{key}", value)
+        for key, value in {"filters": filters, "hidden": hidden}.items():
+            whole_number(f"model.critic.{key}", value, most=MAX_WIDTH)
+        for key, value in {"tote_clip": tote_clip, "depth_range": depth_range, "item_range": item_range}.items():
+            whole_number(f"model.critic.{key}", value, most=MAX_LEVELS)
+        check_inputs(f"model.critic.receptive_field={receptive_field}", depth_range * receptive_field**2)
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
         self.compute_dtype = one_of("model.critic.compute_dtype", compute_dtype, DTYPES)
         self.around = nn.Conv2d(depth_range, filters, receptive_field, padding=receptive_field // 2)

@@ -6,11 +6,13 @@ from torch import Tensor, nn
 
 from pickplace.policies.networks.depth import clip_depth
 from pickplace.task.cell import reference_cell
-from pickplace.task.checks import number, odd_number, one_of, whole_number
+from pickplace.task.checks import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_number
 from pickplace.task.grasps import split_footprint
 from pickplace.task.state import item_from_depth
 
 DTYPES = ("auto", "float32", "bfloat16")
+CHUNK_BYTES = 2**29  # inputs of the first layer that are held at a time when gradients are off
+MAX_LEVELS = 255  # levels are uint8
 OUTSIDE = -1000  # the depth of a cell that is not in the tote
 FAR_DOWN = 10_000  # deeper than any tote
 
@@ -49,6 +51,7 @@ class FootprintFcn(nn.Module):
     def __init__(
         self,
         out_channels: int = 1,
+        /,
         filters: int = 96,
         receptive_field: int = 5,
         hidden: int = 64,
@@ -64,9 +67,9 @@ class FootprintFcn(nn.Module):
         odd_number("model.actor.receptive_field", receptive_field, least=3)
         sizes = {"filters": filters, "hidden": hidden, "depth_range": depth_range, "item_range": item_range}
         sizes["headroom_bins"] = headroom_bins = depth_range if headroom_bins is None else headroom_bins
-        for key, value in {**sizes, "tote_clip": tote_clip, "reach": reach, "out_channels": out_channels}.items():
-            whole_number(f"model.actor.{key}", value)
-        number("model.actor.head_std", head_std)
+        for key, value in {**sizes, "tote_clip": tote_clip, "reach": reach}.items():
+            whole_number(f"model.actor.{key}", value, most=MAX_WIDTH if key in ("filters", "hidden") else MAX_LEVELS)
+        number("model.actor.head_std", head_std, most=1e3)
         self.receptive_field, self.reach = receptive_field, reach
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
         self.headroom_bins = headroom_bins
@@ -74,7 +77,9 @@ class FootprintFcn(nn.Module):
         self.planes = max(
             3 * reach + 2, depth_range, item_range, headroom_bins
         )  # around: -reach .. reach; under: holes 0 .. reach
-        self.patch = nn.Linear(self.planes * (receptive_field**2 + 5), filters)
+        inputs = self.planes * (receptive_field**2 + 5)
+        check_inputs(f"model.actor.receptive_field={receptive_field}, {self.planes} planes", inputs)
+        self.patch = nn.Linear(inputs, filters)
         self.hidden = nn.Linear(filters, hidden)
         self.head = nn.Linear(hidden, out_channels)
         nn.init.normal_(self.head.weight, std=head_std)
@@ -99,6 +104,10 @@ class FootprintFcn(nn.Module):
             row: int64 ``[M]``, which problem.
             footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
         """
+        at_once = CHUNK_BYTES // (4 * self.patch.in_features)
+        if len(row) > at_once and not torch.is_grad_enabled():  # of large totes: a part at a time, to save memory
+            parts = zip(row.split(at_once), footprint.split(at_once), strict=True)
+            return torch.cat([self.at(bin_depth, tote_depth, *part) for part in parts])
         dtype, count = matrix_dtype(self.compute_dtype, tote_depth.device.type), len(row)
         lower = dtype != torch.float32
         if lower:

@@ -1,12 +1,11 @@
 """The TorchRL transform that writes tote heights into resets, and the way the level reaches it."""
 
-import reprlib
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
+from pickplace.task.checks import shown
 from pickplace.training.curriculum.checks import whole_number
 
 
@@ -39,7 +38,7 @@ class ToteHeightCurriculum(Transform):
         height = self.sampler(int(self.level), self.min_height, count)
         if not isinstance(height, Tensor) or height.numel() != count or height.is_floating_point():
             raise ValueError(
-                f"curriculum.sample: {type(self.sampler).__name__} returned {reprlib.repr(height)}; "
+                f"curriculum.sample: {type(self.sampler).__name__} returned {shown(height)}; "
                 f"expected heights, whole numbers in a tensor [{count}]."
             )
         height = height.to(self.level.device).reshape(*tensordict.batch_size, 1)

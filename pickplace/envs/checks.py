@@ -1,0 +1,80 @@
+"""Checks before an environment is made: its memory, and whether every item fits the empty tote."""
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from pickplace.task.cell import CellSpec
+from pickplace.task.feasibility import footprint_mask, placing_maps
+from pickplace.task.grasps import available_offsets
+from pickplace.task.items import ItemDistribution
+from pickplace.task.state import Item, State
+
+MAX_POSITIONS = 2_000_000  # of items in the bin, all kinds together, that are checked one by one
+
+
+def problem_bytes(cell: CellSpec, masks: Collection[str]) -> int:
+    """Return about how many bytes the masks of one problem, and what they are found with, take."""
+    offsets = cell.num_offsets**2
+    count = 64 * cell.num_footprints + 32 * cell.rotations * (offsets + cell.num_picks)
+    return count + ("action" in masks) * (4 * cell.num_actions + 8 * offsets * cell.num_places)
+
+
+def check_items(cell: CellSpec, items: ItemDistribution) -> None:
+    """Refuse items that could make a fresh episode impossible.
+
+    Every kind needs a feasible action on the empty tote for every position in the bin. The full tote height decides:
+    a lower rim is only easier to clear, as long as it is not below the item's top.
+
+    Raises:
+        ValueError: naming the kind, the position and the tote height.
+    """
+    w_b, d_b, _ = cell.bin_size
+    height = cell.tote_size[2]
+    # (x, y, w, d, h) -> the first kind like it: the rows of a long recording repeat themselves
+    problems: dict[tuple[int, ...], int] = {}
+    for kind, (w, d, h) in enumerate(items.sizes.tolist()):
+        for (grid_w, grid_d), what in (((w_b, d_b), "bin_size"), (cell.effector_size, "effector_size")):
+            if (w > grid_w or d > grid_d) and (what == "bin_size" or cell.pick_rule == "contain"):
+                raise ValueError(f"{items.label(kind)} does not fit {what}: expected at most {grid_w}x{grid_d} cells.")
+        if h > height:
+            raise ValueError(f"{items.label(kind)} is higher than the tote: expected at most tote_size[2]={height}.")
+        for x, y in items.corners(kind, cell.bin_size):
+            if x + w > w_b or y + d > d_b:
+                raise ValueError(f"{items.label(kind)} at x={x}, y={y} leaves the bin: expected it inside {w_b}x{d_b}.")
+            problems.setdefault((x, y, w, d, h), kind)
+        if len(problems) > MAX_POSITIONS:
+            raise ValueError(
+                f"bin_size={[*cell.bin_size]}: the kinds of items have more than {MAX_POSITIONS:,} positions in the "
+                "bin; expected a smaller bin, or fewer kinds."
+            )
+    description, cell = cell.describe(), replace(cell, longest_side=int(items.sizes[:, :2].max()))
+    rows = torch.tensor([(*item, kind) for item, kind in problems.items()])
+    if cell.limits is None:
+        # The lower an item, the harder to clear the rim; and what is far from all walls of the tote is alike.
+        rows = rows[rows[:, 4].argsort(stable=True)]
+        enough = 2 * (max(cell.effector_size) + cell.max_side)
+        cell = replace(cell, tote_size=(min(cell.tote_size[0], enough), min(cell.tote_size[1], enough), height))
+    # Where the end effector can hold an item in the same ways, the same footprints are feasible.
+    distinct: dict[bytes, int] = {}
+    for numbers in torch.arange(len(rows)).split(max(1, 2**22 // (cell.rotations * cell.num_offsets**2))):
+        available, _ = available_offsets(cell, Item(*rows[numbers, :5].unbind(-1)))  # [K, M]
+        ways = np.packbits(available.numpy(), axis=0).T
+        sizes = rows[numbers, 2 : 4 if cell.limits is None else 5].contiguous()
+        keys = np.concatenate([sizes.numpy().view(np.uint8), ways], 1)
+        _, first = np.unique(keys.view(f"V{keys.shape[1]}"), return_index=True)
+        for index in sorted(first.tolist()):
+            distinct.setdefault(keys[index].tobytes(), int(numbers[index]))
+    for chunk in rows[list(distinct.values())].split(max(1, min(1024, 2**24 // cell.num_footprints))):
+        item = Item(*chunk[:, :5].unbind(-1))
+        empty = torch.zeros(len(chunk), *cell.tote_size[:2], dtype=torch.int32)
+        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), item))
+        feasible = footprint_mask(cell, maps).flatten(1).any(1)
+        if not feasible.all():
+            x, y, *_, kind = chunk[~feasible][0].tolist()
+            raise ValueError(
+                f"{items.label(kind)} at x={x}, y={y} in the bin has no feasible action on the empty tote of height "
+                f"{height} ({description}): expected every item to fit somewhere."
+            )
