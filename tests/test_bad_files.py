@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import logging
 import os
 import shutil
 import signal
@@ -365,8 +364,9 @@ def test_nohup_keeps_working():
         signal.signal(signal.SIGHUP, before)
 
 
-def test_a_closed_terminal_saves(smoke, tmp_path, caplog):
-    caplog.set_level(logging.INFO)
+def test_a_closed_terminal_saves(run, tmp_path):
     with after_batch(1, lambda _: os.kill(os.getpid(), signal.SIGHUP)):
-        smoke(tmp_path / "run", "total_frames=2048")
+        words = ["experiment=smoke", "threads=1", "total_frames=2048", f"hydra.run.dir={tmp_path}/run"]
+        code, _, _ = run("train", *words)
+    assert code == 128 + signal.SIGHUP
     assert checkpoint.read(tmp_path / "run" / "checkpoints" / "last")[1]["frames"] == 128
