@@ -75,6 +75,21 @@ def workers(result: dict) -> str:
     )
 
 
+def neighbours(result: dict) -> str:
+    speeds = result["frames per second"]
+    rows = [
+        (case, *(f"{row[when]:,.0f}" for when in ("idle", "busy")), f"{row['busy'] / row['idle']:.0%}")
+        for case, row in speeds.items()
+    ]
+    return section(
+        "Busy neighbours",
+        "Frames/s of a training with `experiment=quick`, alone and beside two processes that keep 2 cores busy; the "
+        f"median batch of {result['repeats']} trainings. The commands let waiting threads sleep "
+        "(`OMP_WAIT_POLICY=PASSIVE`). With `ACTIVE` they spin: faster on an idle machine, slower on a busy one.",
+        table("training | alone | beside two | share", rows),
+    )
+
+
 def environment(result: dict) -> str:
     rows = []
     for batch, row in result["batches"].items():
@@ -143,7 +158,7 @@ def startup(result: dict) -> str:
 def main() -> None:
     sections: list[str] = []
     machines: dict[str, list[str]] = {}
-    for write in (learning, training, workers, environment, collector, conv4d, decision, startup):
+    for write in (learning, training, neighbours, workers, environment, collector, conv4d, decision, startup):
         path = RESULTS / f"{write.__name__}.json"
         if path.is_file():
             result = json.loads(path.read_text())

@@ -14,9 +14,9 @@ from pickplace.runs.loggers import read_csv
 FRAMES, REPEATS = 65_536, 3
 NO_EVALUATION = ["evaluation_interval=1_000_000_000", "evaluation.episodes=1", "evaluation.batch_size=1"]
 CASES = {
-    "`quick`, all cores": ["experiment=quick"],
-    "`quick`, one thread a process": ["experiment=quick", "threads=1"],
-    "`quick`, one thread a process, one pass over a batch": ["experiment=quick", "threads=1", "algo.epochs=1"],
+    "`quick`, all cores": ["experiment=quick", "threads=null"],
+    "`quick`, one thread a process": ["experiment=quick"],
+    "`quick`, one thread a process, one pass over a batch": ["experiment=quick", "algo.epochs=1"],
 }
 COLLECTORS = {"single": ["collector=single"], "multi_sync, 2 workers": ["collector=multi_sync", "collector.workers=2"]}
 
@@ -24,8 +24,8 @@ COLLECTORS = {"single": ["collector=single"], "multi_sync, 2 workers": ["collect
 def batches(overrides: list[str]) -> list[float]:
     """Return the milliseconds of each batch of a training, without the first four, which warm up."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [console_command("pickplace-train"), *overrides, *NO_EVALUATION]
-        command += [f"total_frames={FRAMES}", f"hydra.run.dir={folder}/run"]
+        command = [console_command("pickplace-train"), f"total_frames={FRAMES}", *overrides, *NO_EVALUATION]
+        command += [f"hydra.run.dir={folder}/run"]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         rows = read_csv(Path(folder) / "run" / "metrics.csv")
     return [row["time/collect_ms"] + row["time/update_ms"] for row in rows[4:]]

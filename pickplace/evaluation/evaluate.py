@@ -164,6 +164,7 @@ def evaluate(
         record: as of :func:`~pickplace.evaluation.play.play`.
     """
     ev = cfg.evaluation
+    log.info("%s episodes to play with %s", f"{ev.episodes:,}", planner.name)
     result = play(make_env, planner, ev.episodes, ev.batch_size, record)
     report = {
         "planner": planner.name,

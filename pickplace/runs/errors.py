@@ -1,11 +1,13 @@
 """Errors in one sentence, for a person in front of a terminal."""
 
+import argparse
 import errno
 import os
 import signal
 import sys
 from contextlib import contextmanager, suppress
 from difflib import get_close_matches
+from typing import NoReturn
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig
@@ -20,6 +22,10 @@ class JobFailed(Exception):
 
 class WorkerDied(Exception):
     """A collector worker process has died. Not an OSError: signal handling code elsewhere catches those."""
+
+
+class UsageError(ValueError):
+    """The command line has arguments that the command does not take."""
 
 
 #: Errors caused by the user or the machine. Any other may be a fault of the program, and its type is printed too.
@@ -38,6 +44,7 @@ def one_sentence():
 
     A command that a signal ended has the exit code 128 + its number: 130 after Ctrl-C, 143 after SIGTERM.
     """
+    usage_error, argparse.ArgumentParser.error = argparse.ArgumentParser.error, _refuse_arguments  # type: ignore
     try:
         yield
         write_output()
@@ -52,8 +59,15 @@ def one_sentence():
             sys.stderr.write(f"error: {sentence(error)}\n")
         sys.exit(2)
     finally:
+        argparse.ArgumentParser.error = usage_error  # type: ignore[method-assign]
         with suppress(OSError):
             write_output()
+
+
+def _refuse_arguments(parser: argparse.ArgumentParser, message: str) -> NoReturn:
+    """Raise an error of the command line, which argparse would print below the usage."""
+    between = ", and overrides on one side of the flags" if "unrecognized" in message else ""
+    raise UsageError(f"{message}; expected the arguments that --help shows{between}.")
 
 
 def write_output(text: str = "") -> None:

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from pickplace.runs.composition import composed_for_hint, conf_dir, constant_keys, options_of, with_own_values
-from pickplace.runs.errors import JobFailed, one_sentence, sentence, unknown_key
+from pickplace.runs.errors import JobFailed, UsageError, one_sentence, sentence, unknown_key
 from pickplace.runs.folder import FAILURE, OccupiedError, refuse_claimed, refuse_occupied, remove_empty_folders
 from pickplace.runs.registry import REGISTRY
 
@@ -126,6 +126,8 @@ def _clearer_errors(config_name: str, overrides: list[str]):
         if not (key := re.match("Could not override '(.*)'", str(error))):
             raise
         raise ValueError(unknown_key(key[1], composed_for_hint(config_name, overrides, key[1]))) from error
+    except UsageError:
+        raise
     except ValueError as error:  # Hydra's own, which names no key
         if isinstance(error.__cause__, OSError):  # such as a log file that cannot be opened
             raise error.__cause__ from None

@@ -40,7 +40,7 @@ from pickplace.training import train  # noqa: E402
 
 SECONDS, BYTES = 20, 1.5e9
 #: Printed by a training and by an evaluation when they have begun.
-BEGUN = ("frames to train", "decisions")
+BEGUN = ("frames to train", "episodes to play")
 SMOKE = ["experiment=smoke", "threads=1", "total_frames=256", "evaluation.episodes=2"]
 DEFAULTS = {"tote_height": None, "cell_size": None, "tolerance": 0.25, "alternatives": 3}
 REQUEST_KEYS = ("id", "bin_depth", "tote_depth", "tote_height", "cell_size", "tolerance", "alternatives", "more")
@@ -361,8 +361,7 @@ def run_case(kind: str, seed: str) -> tuple[str, str]:
             for file in ("stdout", "stderr", "case.txt")
         )
         long_run = late and any(words in out for words in BEGUN)
-        errors = [line for line in err.splitlines() if line.startswith(("error:", "usage:", "pickplace-plan: error:"))]
-        said = code == 2 and len(errors) >= 1 and len(err) < 3_000
+        said = code == 2 and err.rpartition("\n")[0].rpartition("\n")[2].startswith("error: ") and len(err) < 3_000
         wrong = ""
         if "Traceback" in err or "HYDRA_FULL_ERROR" in err:
             wrong = "a traceback"

@@ -45,6 +45,8 @@ def command(monkeypatch, capsys, tmp_path):
         (["pretrained/r4", "--threads", "0"], "--threads=0"),
         (["pretrained/r4", "--rotations", "7"], "rotations=7"),
         (["pretrained/r4", "--device", "tpu"], "tpu"),
+        ([], "checkpoint; expected the arguments that --help shows"),
+        (["pretrained/r4", "more"], "unrecognized arguments: more"),
     ],
 )
 def test_command_refuses_in_one_sentence(command, tmp_path, arguments, message):

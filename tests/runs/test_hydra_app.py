@@ -32,6 +32,8 @@ BAD = [
     ("train", "+env.foo=1", ["env.foo", "no key 'foo'"]),
     ("train", "algo.gama=0.9 --help", ["algo.gama", "'gamma'"]),
     ("train", "--config-dir nowhere", ["nowhere"]),
+    ("train", "seed=1 --config-dir . seed=2", ["unrecognized arguments: seed=2", "on one side of the flags"]),
+    ("evaluate", "--cfg foo", ["--cfg", "'foo'", "job"]),
     ("train", "env.tote_size=[6,6", ["'env.tote_size=[6,6'", "<key>=<value>"]),
     ("train", "seed=1,2", ["seed=1,2", "--multirun"]),
     ("train", "curriculum=null", ["curriculum=null", "adaptive", "paper"]),
