@@ -64,8 +64,8 @@ DTYPES = (None, None, None, float, "f4", "f2", "i1", "u1", "u8", bool, complex, 
 
 def bad_value(draw: random.Random, good=None):
     """Return a value in place of a good one; of a number often a multiple, which may only be too large."""
-    if isinstance(good, (int, float)) and draw.random() < 0.4:
-        return good * draw.choice((-1, 0, 3, 100, 10_000, 10**6, 10**9))
+    if isinstance(good, (int, float)) and not isinstance(good, bool) and draw.random() < 0.7:
+        return good * draw.choice((-1, 0, 2, 3, 3, 10, 10, 30, 100, 1_000, 10_000, 10**6, 10**9))
     return copy.deepcopy(draw.choice(VALUES))  # it may be damaged further
 
 
