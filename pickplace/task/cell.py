@@ -110,7 +110,7 @@ class CellSpec:
         one_of("pick_rule", self.pick_rule, PICK_RULES)
         number("min_support", self.min_support, 0, 1)
         flag("strict_support", self.strict_support)
-        number("height_unit", self.height_unit, 1e-3, 1e3)
+        object.__setattr__(self, "height_unit", float(number("height_unit", self.height_unit, 1e-3, 1e3)))
         if self.longest_side is not None:
             whole_number("longest_side", self.longest_side)
         self._check_products()

@@ -101,7 +101,7 @@ def test_heights_on_the_page_are_in_cells():
     assert (data["bin"], episode["height"], episode["waiting"]) == ([5, 5, 0.3], 0.6, [1, 1, 1, 1, 0.7])
     assert [(move[4], move[14]) for move in episode["moves"]] == [(0.3, 0), (0.2, 0.3)]
     assert set(data["colours"]) == {"1,2,0.3", "1,2,0.2", "1,1,0.7"}
-    double = unpack(replay.page([recording], CellSpec(height_unit=2.0), ""))
+    double = unpack(replay.page([recording], CellSpec(height_unit=2), ""))
     assert set(double["colours"]) == {"1,2,6", "1,2,4", "1,1,14"}  # written as a browser writes whole numbers
 
 
