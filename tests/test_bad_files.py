@@ -26,6 +26,7 @@ from pickplace.runs.folder import changed_values, noted_config_folders, noted_ov
 from pickplace.runs.resume import StopRequest, load_optimizer
 from pickplace.task.files import read_file, replaced_file
 from pickplace.task.items import Recorded
+from pickplace.task.observation import ToteDepth
 from pickplace.training import trainer
 from pickplace.training.train import resume_run
 
@@ -234,6 +235,19 @@ def test_a_carried_observation_shows_the_state(smoke_run, tmp_path):
     checkpoint.write(folder, state, facts)
     with pytest.raises(ValueError, match="the carried occupancy: expected what the state shows"):
         resume_run([f"resume={run_dir}", "total_frames=1280"])
+
+
+class Noise(ToteDepth):
+    """A term that draws."""
+
+    def value(self, cell, state):
+        return torch.rand_like(super().value(cell, state))
+
+
+def test_a_term_that_draws_can_be_resumed(smoke, tmp_path):
+    run_dir = tmp_path / "run"
+    smoke(run_dir, "+env.observation.noise={_target_: test_bad_files.Noise}", "total_frames=128")
+    resume_run([f"resume={run_dir}", "total_frames=256", "trust=test_bad_files"])
 
 
 @pytest.mark.parametrize(("key", "value"), [("step", -1.0), ("exp_avg_sq", -1e-3)])

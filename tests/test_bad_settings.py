@@ -21,6 +21,7 @@ from pickplace.runs.registry import build
 from pickplace.task import checks
 from pickplace.task.checks import shown
 from pickplace.task.items import Kinds, Uniform
+from pickplace.training.collectors import refuse_other_workers
 from pickplace.training.settings import check_settings
 from pickplace.training.trainer import Trainer
 
@@ -41,6 +42,7 @@ TRAININGS = {
     "curriculum plateau": ["curriculum=mixture", "curriculum/advance=plateau"],
     "curriculum staged": ["curriculum/advance=staged", "env.tote_size=[4,4,3]"],
     "curriculum frames": ["curriculum/advance=frames"],
+    "callbacks": ["callbacks=early_stopping"],
     "collector": [],
     "logger": [],
     "seed total_frames device threads evaluation_interval checkpoint_interval progress_interval": [],
@@ -299,6 +301,7 @@ def test_another_number_of_workers_starts_none(smoke_run, tmp_path):
     cfg = OmegaConf.create(facts["config"] | {"collector": {"_target_": "multi_sync", "workers": 8}})
     with pytest.raises(ValueError, match="collector.workers=8: the checkpoint has 0 workers; expected as many"):
         Trainer(cfg, tmp_path, (state, facts, folder))
+    refuse_other_workers({"_target_": "multi_sync"}, {"worker0": {}, "worker1": {}})  # the default number
     cfg.collector = {"_target_": "single", "workers": 0}
     with pytest.raises(ValueError, match="collector.workers: there is no key 'workers'"):
         Trainer(cfg, tmp_path, (state, facts, folder))

@@ -93,12 +93,11 @@ def _exchanged_leaves(place: str, own: Any, before: Any) -> Iterator[tuple[str, 
         return
     before = before if isinstance(before, dict) else {}
 
-    def is_switched(key) -> bool:
-        """Return whether a part is turned on or off."""
-        pair = own[key], before.get(key, "")
-        return None in pair and any(isinstance(node, dict) and "_target_" in node for node in pair)
+    def parts(cfg: dict) -> set:
+        """Return the keys of the parts in a group."""
+        return {key for key, node in cfg.items() if isinstance(node, dict) and "_target_" in node}
 
-    if own.get("_target_") != before.get("_target_") or any(map(is_switched, own)):
+    if own.get("_target_") != before.get("_target_") or parts(own) != parts(before):
         yield place, own
     else:
         for key, node in own.items():

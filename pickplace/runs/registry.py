@@ -158,8 +158,8 @@ def accepted_arguments(function: Callable) -> list[str] | None:
 
     One with ``**keywords`` takes any. An attribute ``settings``, a tuple of names, states them instead.
     """
-    if hasattr(function, "settings"):
-        return list(function.settings)
+    if isinstance(settings := getattr(function, "settings", None), tuple):
+        return list(settings)
     has_init = inspect.isclass(function) and function.__init__ is not object.__init__
     try:  # of __init__ itself, since a metaclass may hide its arguments
         parameters = inspect.signature(function.__init__ if has_init else function).parameters.values()

@@ -46,6 +46,7 @@ CHECKS = {
     **dict.fromkeys(("env", "items", "curriculum", "collector", "planner", "logger"), _node),
     **dict.fromkeys(("model", "algo", "evaluation", "warm_start"), _group),
     **dict.fromkeys(("model.actor", "model.critic"), _node),
+    "callbacks": _or_null(_group),
     "warm_start.teacher": _or_null(_node),
     "warm_start.checkpoint": _or_null(_text),
     **dict.fromkeys(("warm_start.frames", "warm_start.critic_frames"), partial(whole_number, least=0)),

@@ -19,7 +19,8 @@ CURRICULA = Path(__file__).parents[2] / "docs/examples/own_curriculum"
 PLATEAU = {"_target_": "plateau", "window": 400, "patience": 3, "min_improvement": 0.01}
 MINE = """\
 # @package _global_
-defaults: [{override /curriculum: adaptive}, _self_]
+defaults: [{override /curriculum: adaptive}, {override /callbacks: early_stopping}, _self_]
+callbacks: {early_stopping: {patience: 3}}
 curriculum: {advance: {window: 7, occupancy: 0.5}}
 items: {kinds: [[1, 1, 1]]}
 algo: {lr: 0.5}
@@ -105,6 +106,8 @@ OWN_VALUES = [
     ("experiment=mine curriculum=careful curriculum/advance=plateau", "curriculum.advance", PLATEAU),
     ("experiment=mine items=tall", "items.kinds", None),
     ("experiment=mine algo=a2c", "algo.lr", 0.5),
+    ("experiment=mine callbacks=early_stopping", "callbacks.early_stopping.patience", 3),
+    ("experiment=mine callbacks=none", "callbacks", {}),
     ("experiment=mine ~curriculum.advance.window curriculum/advance=plateau", "curriculum.advance.window", None),
 ]
 

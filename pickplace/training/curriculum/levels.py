@@ -174,6 +174,6 @@ class Curriculum:
         window = deque((fraction(key("window"), value) for value in state["window"]), self.advance.window)
         for name, value in rule.items():
             if not is_finite_number(value):
-                raise ValueError(f"{key(name)}={value!r}: expected a number.")
+                raise ValueError(f"{key(name)}={shown(value)}: expected a number.")
         self.tally = Tally(level, window, frames, **counts)
         vars(self.advance).update(rule)
