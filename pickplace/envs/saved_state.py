@@ -12,17 +12,28 @@ from pickplace.task.observation import STANDARD_TERMS, observe
 from pickplace.task.state import Item, State
 
 
-def check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: Mapping[str, Tensor]) -> None:
-    """Refuse a saved environment whose values are out of range, or do not fit each other.
+def check_saved_states(env: PickPlaceEnv, collector: Mapping) -> None:
+    """Refuse a collector's state with an environment whose values are out of range, or do not fit each other.
 
     Args:
         env: an environment of the same settings, with any number of problems.
-        saved: the ``state_dict()`` of the saved one.
-        carried: the observation that its next step starts from. A term of the user's own may draw, so that only
-            pickplace's are compared.
+        collector: the saved ``state_dict()``, or that of each worker by its name.
 
     Raises:
         CheckpointError: naming the first value that is impossible.
+    """
+    for part in (collector, *collector.values()):
+        if isinstance(part, Mapping) and "environment" in part:
+            _check_saved_state(env, part["environment"], part["carried"])
+
+
+def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: Mapping[str, Tensor]) -> None:
+    """Check one environment.
+
+    Args:
+        env, saved: as of :func:`check_saved_states`; the ``state_dict()`` of the saved one.
+        carried: the observation that its next step starts from. A term of the user's own may draw, so that only
+            pickplace's are compared.
     """
 
     def check(key: str, possible: Tensor, expected: str) -> None:

@@ -44,7 +44,7 @@ def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POL
     own = own_modules(trust)
     if groups is None:
         groups = tuple(content)
-    refuse_large({key: content[key] for key in groups if key in content})
+    refuse_large_config({key: content[key] for key in groups if key in content})
     content = only_groups(content, groups)
     try:
         refuse_interpolations(content)
@@ -62,7 +62,7 @@ def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POL
     return cfg
 
 
-def refuse_large(content) -> None:
+def refuse_large_config(content) -> None:
     """Refuse a config that would fill the memory, before OmegaConf makes an object of each of its nodes.
 
     Raises:

@@ -32,7 +32,8 @@ def with_own_values(cfg: DictConfig) -> DictConfig:
     Hydra merges what a preset, or a config file of the user, wrote for the option that it expected, such as
     ``curriculum.advance.occupancy`` for ``threshold``, into the option that the command line chose instead. A part
     whose ``_target_`` a choice on the command line changes gets the values of that option's own files, and the values
-    on the command line. So does a group of which the choice turns a part on or off (``warm_start.teacher``).
+    on the command line. So does a group of which the choice turns a part on or off (``warm_start.teacher``). Hydra's
+    note on the config is corrected.
     """
     given = OverridesParser.create().parse_overrides(list(HydraConfig.get().overrides.task))
     name = HydraConfig.get().job.config_name
@@ -59,12 +60,12 @@ def with_own_values(cfg: DictConfig) -> DictConfig:
                 cfg = cfg if replaced else cfg.copy()
                 OmegaConf.update(cfg, leaf, content, merge=False, force_add=True)
                 replaced.append(leaf)
-    for value in given:
-        path = f"{value.key_or_group}."
-        if value not in choices and any(
-            f"{leaf}.".startswith(path) or path.startswith(f"{leaf}.") for leaf in replaced
-        ):
-            _apply(value, cfg)
+    if replaced:
+        for value in given:
+            if value not in choices:
+                _apply(value, cfg)
+        if (notes := HydraConfig.get().output_subdir) is not None:
+            OmegaConf.save(cfg, Path(HydraConfig.get().runtime.output_dir) / notes / "config.yaml")
     return cfg
 
 

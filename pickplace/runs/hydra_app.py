@@ -43,7 +43,7 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
         hydra_cfg = HydraConfig.get()
         os.environ["HYDRA_FULL_ERROR"] = full_error
         with _job_of_sweep() if hydra_cfg.mode == RunMode.MULTIRUN else _single_run():
-            cfg = _with_own_values(cfg)
+            cfg = with_own_values(cfg)
             if missing := OmegaConf.missing_keys(cfg):
                 raise ValueError(f"{min(missing)}: no value; expected {min(missing)}=<value>.")
             known = hydra.compose(hydra_cfg.job.config_name)
@@ -60,15 +60,6 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
                 hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(app)()
         finally:
             os.environ["HYDRA_FULL_ERROR"] = full_error
-
-
-def _with_own_values(cfg: DictConfig) -> DictConfig:
-    """Return the config without values of options that the command line replaced, and correct Hydra's note on it."""
-    own = with_own_values(cfg)
-    runtime, subdir = HydraConfig.get().runtime, HydraConfig.get().output_subdir
-    if own is not cfg and subdir is not None:
-        OmegaConf.save(own, Path(runtime.output_dir) / subdir / "config.yaml")
-    return own
 
 
 @contextmanager
@@ -133,11 +124,8 @@ def _clearer_errors(config_name: str, overrides: list[str]):
             raise error.__cause__ from None
         for word in overrides:  # a group without an option, allowed for experiment only
             group, _, option = word.lstrip("+").partition("=")
-            if (
-                option in ("null", "")
-                and group != "experiment"
-                and (names := options_of(group, config_name, overrides))
-            ):
+            is_empty = option in ("null", "") and group != "experiment"
+            if is_empty and (names := options_of(group, config_name, overrides)):
                 raise ValueError(f"{word}: expected {group}=<one of {', '.join(names)}>.") from error
         raise ValueError(f"{' '.join(overrides)}: {error}.") from error
 

@@ -20,7 +20,7 @@ from pickplace.runs.folder import occupied, refuse_occupied
 from pickplace.runs.hydra_app import apply_overrides
 from pickplace.runs.references import saved_form
 from pickplace.task.cell import CELL_SETTINGS
-from pickplace.task.checks import shown
+from pickplace.task.checks import shortened, shown
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +100,7 @@ def _check_counters(place: str, facts: dict) -> None:
         raise ValueError(f"resume={place}: the checkpoint has no {missing[0]!r}; expected one that a training wrote.")
 
     def error(key: str, value, expected: str) -> ValueError:
-        words = f"the checkpoint's {shown(key)[1:-1]} is {shown(value)}"
+        words = f"the checkpoint's {shortened(key)} is {shown(value)}"
         return ValueError(f"resume={place}: {words}; expected {expected} that a training wrote.")
 
     if not isinstance(facts["latest"], dict):

@@ -48,12 +48,23 @@ def whole_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:
     return int(value)
 
 
+def integral_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:
+    """Return ``value`` as an int, as :func:`whole_number`; a float such as 5e6 is accepted."""
+    is_integral = isinstance(value, float) and value.is_integer()
+    return whole_number(key, int(value) if is_integral else value, least, most)
+
+
 def number(key: str, value, least: float = 0.0, most: float | None = None) -> float:
     """Return ``value`` if it is a finite number in ``[least, most]``; ``most=None`` means no upper limit."""
     if not is_number(value) or value < least or (most is not None and value > most):
         limits = f">= {least:g}" if most is None else f"between {least:g} and {most:g}"
         raise ValueError(f"{key}={shown(value)}: expected a number {limits}.")
     return value
+
+
+def is_name(value: Any) -> bool:
+    """Return whether a value is a short text that a terminal can show."""
+    return isinstance(value, str) and value.isprintable() and len(value) <= 100
 
 
 def flag(key: str, value) -> bool:

@@ -30,15 +30,7 @@ log = logging.getLogger(__name__)
 TABLE, SETTINGS_TABLE, FIGURE = "sweep.csv", "sweep_settings.csv", "sweep.png"
 LARGEST_LEGEND = 40  # settings that the figure and the console name; of more, the best
 RESAMPLES = 9999  # of the bootstrap
-COLOURS = [
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-    "#8c8c8c",
-]  # without Okabe and Ito's yellow
+COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c"]  # Okabe and Ito's, no yellow
 
 
 class SweepSummary(SweepCallback):

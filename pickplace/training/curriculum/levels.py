@@ -6,9 +6,8 @@ from numbers import Integral, Real
 
 from torch import Tensor
 
-from pickplace.task.checks import shown
+from pickplace.task.checks import integral_number, is_number, number, shown
 from pickplace.training.curriculum.advance import Advance, Tally
-from pickplace.training.curriculum.checks import fraction, is_finite_number, whole_number
 from pickplace.training.curriculum.transform import ToteHeightCurriculum
 
 
@@ -46,11 +45,11 @@ class Curriculum:
             ValueError: naming the setting that does not fit these numbers.
         """
         end = max_height if self.end_height is None else self.end_height
-        self.end = whole_number("curriculum.end_height", end, min_height, max_height)
+        self.end = integral_number("curriculum.end_height", end, min_height, max_height)
         self.full_height = max_height
         start = min_height if self.start_height is None else self.start_height
-        self.start = whole_number("curriculum.start_height", start, min_height, self.end)
-        first = self.advance.setup(self.start, self.end, whole_number("total_frames", total_frames))
+        self.start = integral_number("curriculum.start_height", start, min_height, self.end)
+        first = self.advance.setup(self.start, self.end, integral_number("total_frames", total_frames))
         self.tally = Tally(self._clamped(first), deque(maxlen=self.advance.window))
         self._rule_state()  # raises here, not at the first checkpoint
 
@@ -139,7 +138,7 @@ class Curriculum:
         """Return the rule's own state; raise if a checkpoint could not store it."""
         state = {key: getattr(self.advance, key, None) for key in self.advance.state_keys}
         for name, value in state.items():
-            if not is_finite_number(value):
+            if not isinstance(value, (int, float)) or not is_number(value):  # JSON stores these exactly
                 raise ValueError(
                     f"{self._rule_name}: its state has {name}={shown(value)}; expected a finite Python number."
                 )
@@ -166,14 +165,14 @@ class Curriculum:
                 f"{sorted(rule)}, expected {sorted(self.advance.state_keys)}; resume with the run's own rule."
             )
         key = "curriculum {} of the checkpoint".format
-        level = whole_number(key("level"), state["level"], self.start, self.end)
-        frames = whole_number(key("frames"), state["frames"], 0)
-        counts = {name: whole_number(key(name), state[name], 0, frames) for name in ("level_start", "episodes")}
+        level = integral_number(key("level"), state["level"], self.start, self.end)
+        frames = integral_number(key("frames"), state["frames"], 0)
+        counts = {name: integral_number(key(name), state[name], 0, frames) for name in ("level_start", "episodes")}
         if not isinstance(state["window"], list):
             raise ValueError(f"{key('window')}={shown(state['window'])}: expected a list of numbers between 0 and 1.")
-        window = deque((fraction(key("window"), value) for value in state["window"]), self.advance.window)
+        window = deque((number(key("window"), value, most=1) for value in state["window"]), self.advance.window)
         for name, value in rule.items():
-            if not is_finite_number(value):
+            if not is_number(value):
                 raise ValueError(f"{key(name)}={shown(value)}: expected a number.")
         self.tally = Tally(level, window, frames, **counts)
         vars(self.advance).update(rule)
