@@ -19,7 +19,7 @@ from pickplace.runs.allowlist import MAX_DEPTH, MAX_NODES, MAX_TEXT, trusted_con
 from pickplace.runs.references import saved_form
 from pickplace.runs.registry import build
 from pickplace.task import checks
-from pickplace.task.checks import shown
+from pickplace.task.checks import excerpt
 from pickplace.task.items import Kinds, Uniform
 from pickplace.training.collectors import refuse_other_workers
 from pickplace.training.settings import check_settings
@@ -92,7 +92,7 @@ def test_every_leaf_of_a_training(name, tmp_path, monkeypatch):
             except ValueError as error:
                 check_sentence(error, str(path[-1]))
             except Exception as error:
-                raise AssertionError(f"{'.'.join(path)}={shown(value)}: {error!r}") from error
+                raise AssertionError(f"{'.'.join(path)}={excerpt(value)}: {error!r}") from error
             assert time.perf_counter() - started < 20
 
 
@@ -214,7 +214,7 @@ def test_what_pickplace_hands_over_cannot_be_set(place, key, value, tmp_path):
 
 
 @pytest.mark.parametrize("place", ["env", "items"])
-def test_nor_in_an_evaluation(place):
+def test_unknown_settings_of_an_evaluation_are_refused(place):
     cfg = composed("planner=joint_dbl", f"+{place}.stream=train", name="evaluate")
     with pytest.raises(ValueError, match=rf"{place}.stream: there is no key 'stream'"):
         prepare(cfg)
@@ -334,7 +334,7 @@ def test_scores_of_many_footprints_are_computed_in_parts(monkeypatch):
 
 def test_values_and_sentences_are_short():
     for value in ("x" * 100_000, list(range(10**5)), {"a" * 10**5: "b" * 10**5}, 10**3000, object()):
-        assert len(shown(value)) < 200
+        assert len(excerpt(value)) < 200
     for error in (ValueError("x" * 100_000), RuntimeError("y" * 100_000), OSError(13, "z" * 10**5, "f" * 10**5)):
         assert len(errors.sentence(error)) <= errors.MAX_LENGTH
     with pytest.raises(ValueError) as caught:

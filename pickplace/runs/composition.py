@@ -26,7 +26,7 @@ def conf_dir() -> Path:
     return inside if inside.is_dir() else package.parent / "conf"
 
 
-def with_own_values(cfg: DictConfig) -> DictConfig:
+def drop_replaced_values(cfg: DictConfig) -> DictConfig:
     """Return the config of this run, in which an option chosen on the command line has no values of another one.
 
     Hydra merges what a preset, or a config file of the user, wrote for the option that it expected, such as
@@ -48,10 +48,10 @@ def with_own_values(cfg: DictConfig) -> DictConfig:
         others = [str(other.input_line) for other in choices if other.input_line not in inner]
         inner.remove(str(choice.input_line))
         try:
-            own = _at(hydra.compose(None, [*search, f"+{str(choice.input_line).lstrip('+')}", *inner]), place)
-            if own == _at(cfg, place):
+            own = _part_at(hydra.compose(None, [*search, f"+{str(choice.input_line).lstrip('+')}", *inner]), place)
+            if own == _part_at(cfg, place):
                 continue
-            before = _at(hydra.compose(name, [*search, *others]), place)
+            before = _part_at(hydra.compose(name, [*search, *others]), place)
         except ConfigCompositionException:  # an option that depends on those of other groups
             continue
         inner_places = {_package(other) for other in choices if other.input_line in inner}
@@ -80,7 +80,7 @@ def _package(choice: Override) -> str:
     return choice.package or choice.key_or_group.replace("/", ".")
 
 
-def _at(cfg: DictConfig, place: str) -> Any:
+def _part_at(cfg: DictConfig, place: str) -> Any:
     """Return the part of a config at a place, unresolved; None if there is none."""
     part: Any = OmegaConf.to_container(cfg, resolve=False)
     for key in place.split("."):
@@ -115,7 +115,7 @@ def _apply(value: Override, cfg: DictConfig) -> None:
             node.pop(key, None)
 
 
-def composed_for_hint(config_name: str, words: list[str], without: str) -> DictConfig:
+def compose_for_hint(config_name: str, words: list[str], without: str) -> DictConfig:
     """Return the config of a command line without the overrides of a key, or without any if others are wrong too.
 
     Args:
@@ -140,7 +140,7 @@ def _first_of_sweep(word: str) -> str:
     return f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}"
 
 
-def options_of(group: str, config_name: str, words: list[str]) -> list[str]:
+def list_options(group: str, config_name: str, words: list[str]) -> list[str]:
     """Return the options of a config group, those in the user's folders too; none if there is no such group."""
     search, _ = _search_path(words)
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):

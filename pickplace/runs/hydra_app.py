@@ -16,7 +16,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.runs.composition import composed_for_hint, conf_dir, constant_keys, options_of, with_own_values
+from pickplace.runs.composition import compose_for_hint, conf_dir, constant_keys, drop_replaced_values, list_options
 from pickplace.runs.errors import JobFailed, UsageError, one_sentence, sentence, unknown_key
 from pickplace.runs.folder import FAILURE, OccupiedError, refuse_claimed, refuse_occupied, remove_empty_folders
 from pickplace.runs.registry import REGISTRY
@@ -43,7 +43,7 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
         hydra_cfg = HydraConfig.get()
         os.environ["HYDRA_FULL_ERROR"] = full_error
         with _job_of_sweep() if hydra_cfg.mode == RunMode.MULTIRUN else _single_run():
-            cfg = with_own_values(cfg)
+            cfg = drop_replaced_values(cfg)
             if missing := OmegaConf.missing_keys(cfg):
                 raise ValueError(f"{min(missing)}: no value; expected {min(missing)}=<value>.")
             known = hydra.compose(hydra_cfg.job.config_name)
@@ -116,7 +116,7 @@ def _clearer_errors(config_name: str, overrides: list[str]):
     except ConfigCompositionException as error:
         if not (key := re.match("Could not override '(.*)'", str(error))):
             raise
-        raise ValueError(unknown_key(key[1], composed_for_hint(config_name, overrides, key[1]))) from error
+        raise ValueError(unknown_key(key[1], compose_for_hint(config_name, overrides, key[1]))) from error
     except UsageError:
         raise
     except ValueError as error:  # Hydra's own, which names no key
@@ -125,7 +125,7 @@ def _clearer_errors(config_name: str, overrides: list[str]):
         for word in overrides:  # a group without an option, allowed for experiment only
             group, _, option = word.lstrip("+").partition("=")
             is_empty = option in ("null", "") and group != "experiment"
-            if is_empty and (names := options_of(group, config_name, overrides)):
+            if is_empty and (names := list_options(group, config_name, overrides)):
                 raise ValueError(f"{word}: expected {group}=<one of {', '.join(names)}>.") from error
         raise ValueError(f"{' '.join(overrides)}: {error}.") from error
 

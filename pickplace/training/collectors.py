@@ -17,7 +17,7 @@ from pickplace.runs.checkpoint import CheckpointError
 from pickplace.runs.errors import WorkerDied, missing_extra
 from pickplace.runs.registry import names_at
 from pickplace.runs.resume import STOP_SIGNALS
-from pickplace.task.checks import shown, whole_number
+from pickplace.task.checks import excerpt, whole_number
 
 
 class ResumableCollector(Collector):
@@ -307,7 +307,7 @@ def refuse_other_workers(settings: Mapping, state: object) -> None:
     workers = settings.get("workers", saved)
     if settings["_target_"] in names_at("collector") and workers != saved:
         raise CheckpointError(
-            f"collector.workers={shown(workers)}: the checkpoint has {saved} workers; expected as many."
+            f"collector.workers={excerpt(workers)}: the checkpoint has {saved} workers; expected as many."
         )
 
 

@@ -9,23 +9,23 @@ from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
 from pickplace.evaluation.play import check_episode_settings, check_play
 from pickplace.runs.allowlist import own_modules
-from pickplace.task.checks import check_bytes, flag, number, one_of, shown, whole_number
+from pickplace.task.checks import check_bytes, excerpt, flag, number, one_of, whole_number
 from pickplace.task.items import check_seed
 
 
 def _node(key: str, value) -> None:
     if not OmegaConf.is_dict(value) or "_target_" not in value:
-        raise ValueError(f"{key}={shown(value)}: expected the settings of an object, with its _target_.")
+        raise ValueError(f"{key}={excerpt(value)}: expected the settings of an object, with its _target_.")
 
 
 def _group(key: str, value) -> None:
     if not OmegaConf.is_dict(value):
-        raise ValueError(f"{key}={shown(value)}: expected settings by their names.")
+        raise ValueError(f"{key}={excerpt(value)}: expected settings by their names.")
 
 
 def _text(key: str, value) -> None:
     if not isinstance(value, str) or len(value) > 1_000:
-        raise ValueError(f"{key}={shown(value)}: expected a text of at most 1,000 characters.")
+        raise ValueError(f"{key}={excerpt(value)}: expected a text of at most 1,000 characters.")
 
 
 def _or_null(check):
@@ -35,7 +35,7 @@ def _or_null(check):
 def _only(expected: str, reason: str):
     def check(key: str, value) -> None:
         if value != expected:
-            raise ValueError(f"{key}={shown(value)}: expected {expected}, {reason}.")
+            raise ValueError(f"{key}={excerpt(value)}: expected {expected}, {reason}.")
 
     return check
 

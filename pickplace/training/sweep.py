@@ -166,7 +166,7 @@ def bootstrap95(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return found.low, found.high
 
 
-def settings_of(runs: list[SweepRun]) -> list[Setting]:
+def group_by_setting(runs: list[SweepRun]) -> list[Setting]:
     """Return the settings of a sweep: its runs, grouped by their overrides without the seed."""
     settings: dict[tuple, Setting] = {}
     for run in runs:
@@ -175,7 +175,7 @@ def settings_of(runs: list[SweepRun]) -> list[Setting]:
     return list(settings.values())
 
 
-def ranked(settings: list[Setting]) -> list[Setting]:
+def rank_settings(settings: list[Setting]) -> list[Setting]:
     """Return settings with the best mean first; those without a finished run are last."""
     return sorted(settings, key=lambda setting: -1.0 if setting.mean is None else setting.mean, reverse=True)
 
@@ -191,7 +191,7 @@ def summarize(folder: Path) -> list[Setting]:
         raise FileNotFoundError(f"{folder}: no run in it; expected the folder of a sweep.")
     found.sort(key=lambda path: [part.zfill(9) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)])
     runs = [read_run(path) for path in found]
-    settings = settings_of(runs)
+    settings = group_by_setting(runs)
     keys = list(dict.fromkeys(key for run in runs for key in run.overrides))
     columns = ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "error"]
     rows = []
@@ -209,7 +209,7 @@ def summarize(folder: Path) -> list[Setting]:
     ]
     _write_table(folder / SETTINGS_TABLE, [*keys, *columns], rows)
     draw(settings, folder / FIGURE)
-    for setting in ranked(settings)[:LARGEST_LEGEND]:
+    for setting in rank_settings(settings)[:LARGEST_LEGEND]:
         log.info("%s  %s", result(setting), label(setting, settings))
     log.info("tables and figure of the sweep: %s, %s, %s", folder / SETTINGS_TABLE, folder / TABLE, folder / FIGURE)
     return settings
@@ -249,7 +249,7 @@ def draw(settings: list[Setting], path: Path) -> None:
     from matplotlib import colormaps
     from matplotlib.ticker import EngFormatter
 
-    order = ranked(settings)
+    order = rank_settings(settings)
     figure = figure_of(8, max(4.5, 0.6 + 0.18 * min(len(order), LARGEST_LEGEND)))
     axes = figure.subplots()
     for rank, setting in enumerate(order):

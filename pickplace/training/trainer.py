@@ -179,7 +179,7 @@ class Trainer:
     def running(self) -> Iterator[StopRequest]:
         """Prepare everything for the loop, and close it afterwards, however the loop ends.
 
-        Restores the checkpoint, opens the logger, takes over Ctrl-C and SIGTERM, and watches the workers.
+        Restores the checkpoint, opens the logger, takes over the signals to stop, and watches the workers.
 
         Returns:
             The request to stop, as the value of the ``with`` statement.

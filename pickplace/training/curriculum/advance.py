@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pickplace.task.checks import integral_number, number, shown
+from pickplace.task.checks import excerpt, integral_number, number
 
 TOLERANCE = 1e-6  # occupancies arrive as float32, in which 0.9 is slightly below 0.9
 
@@ -202,10 +202,12 @@ class Staged(Advance):
     def __init__(self, stages):
         self.stages, least = [], 0
         if not isinstance(stages, Sequence) or isinstance(stages, str):
-            raise ValueError(f"curriculum.advance.stages={shown(stages)}: expected a list of {{frames: F, height: H}}.")
+            raise ValueError(
+                f"curriculum.advance.stages={excerpt(stages)}: expected a list of {{frames: F, height: H}}."
+            )
         for stage in stages:
             if not isinstance(stage, Mapping) or set(stage) != {"frames", "height"}:
-                raise ValueError(f"curriculum.advance.stages: got {shown(stage)}, expected {{frames: F, height: H}}.")
+                raise ValueError(f"curriculum.advance.stages: got {excerpt(stage)}, expected {{frames: F, height: H}}.")
             frames = integral_number("curriculum.advance.stages: frames", stage["frames"], least)
             self.stages.append((frames, stage["height"]))
             least = frames + 1

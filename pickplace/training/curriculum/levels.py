@@ -6,7 +6,7 @@ from numbers import Integral, Real
 
 from torch import Tensor
 
-from pickplace.task.checks import integral_number, is_number, number, shown
+from pickplace.task.checks import excerpt, integral_number, is_number, number
 from pickplace.training.curriculum.advance import Advance, Tally
 from pickplace.training.curriculum.transform import ToteHeightCurriculum
 
@@ -24,11 +24,11 @@ class Curriculum:
     def __init__(self, advance: Advance, sample, start_height: int | None = None, end_height: int | None = None):
         if not isinstance(advance, Advance):
             raise ValueError(
-                f"curriculum.advance={shown(advance)}: expected a rule, such as curriculum/advance=threshold."
+                f"curriculum.advance={excerpt(advance)}: expected a rule, such as curriculum/advance=threshold."
             )
         if not callable(sample):
             raise ValueError(
-                f"curriculum.sample={shown(sample)}: expected a sampler, such as curriculum/sample=recent."
+                f"curriculum.sample={excerpt(sample)}: expected a sampler, such as curriculum/sample=recent."
             )
         self.advance, self.sample = advance, sample
         self.start_height, self.end_height = start_height, end_height
@@ -116,12 +116,14 @@ class Curriculum:
         """Return the rule's next level and logs, checked: the rule may be a user's own."""
         answer = self.advance.update(self.tally)
         if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], dict):
-            raise ValueError(f"{self._rule_name}: update returned {shown(answer)}; expected (level, {{name: number}}).")
+            raise ValueError(
+                f"{self._rule_name}: update returned {excerpt(answer)}; expected (level, {{name: number}})."
+            )
         level, logs = self._clamped(answer[0]), {**answer[1]}
         self._rule_state()
         for name, value in logs.items():
             if not isinstance(value, Real):
-                raise ValueError(f"{self._rule_name}: it logs {name}={shown(value)}; expected a number.")
+                raise ValueError(f"{self._rule_name}: it logs {name}={excerpt(value)}; expected a number.")
         return level, logs
 
     @property
@@ -131,7 +133,7 @@ class Curriculum:
     def _clamped(self, level) -> int:
         """Return a rule's level, limited to the first and the last height."""
         if isinstance(level, bool) or not isinstance(level, Integral):
-            raise ValueError(f"{self._rule_name}: its level is {shown(level)}; expected a whole number.")
+            raise ValueError(f"{self._rule_name}: its level is {excerpt(level)}; expected a whole number.")
         return min(max(int(level), self.start), self.end)
 
     def _rule_state(self) -> dict:
@@ -140,7 +142,7 @@ class Curriculum:
         for name, value in state.items():
             if not isinstance(value, (int, float)) or not is_number(value):  # JSON stores these exactly
                 raise ValueError(
-                    f"{self._rule_name}: its state has {name}={shown(value)}; expected a finite Python number."
+                    f"{self._rule_name}: its state has {name}={excerpt(value)}; expected a finite Python number."
                 )
         return state
 
@@ -157,7 +159,7 @@ class Curriculum:
         rule = state.get("advance") if isinstance(state, dict) else None
         if not isinstance(rule, dict) or set(state) != {*vars(self.tally), "advance"}:
             raise ValueError(
-                f"The checkpoint's curriculum is {shown(state)}; expected the state that a training saved."
+                f"The checkpoint's curriculum is {excerpt(state)}; expected the state that a training saved."
             )
         if set(rule) != set(self.advance.state_keys):
             raise ValueError(
@@ -169,10 +171,10 @@ class Curriculum:
         frames = integral_number(key("frames"), state["frames"], 0)
         counts = {name: integral_number(key(name), state[name], 0, frames) for name in ("level_start", "episodes")}
         if not isinstance(state["window"], list):
-            raise ValueError(f"{key('window')}={shown(state['window'])}: expected a list of numbers between 0 and 1.")
+            raise ValueError(f"{key('window')}={excerpt(state['window'])}: expected a list of numbers between 0 and 1.")
         window = deque((number(key("window"), value, most=1) for value in state["window"]), self.advance.window)
         for name, value in rule.items():
             if not is_number(value):
-                raise ValueError(f"{key(name)}={shown(value)}: expected a number.")
+                raise ValueError(f"{key(name)}={excerpt(value)}: expected a number.")
         self.tally = Tally(level, window, frames, **counts)
         vars(self.advance).update(rule)

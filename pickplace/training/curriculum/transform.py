@@ -5,7 +5,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-from pickplace.task.checks import integral_number, shown
+from pickplace.task.checks import excerpt, integral_number
 
 
 class ToteHeightCurriculum(Transform):
@@ -37,7 +37,7 @@ class ToteHeightCurriculum(Transform):
         height = self.sampler(int(self.level), self.min_height, count)
         if not isinstance(height, Tensor) or height.numel() != count or height.is_floating_point():
             raise ValueError(
-                f"curriculum.sample: {type(self.sampler).__name__} returned {shown(height)}; "
+                f"curriculum.sample: {type(self.sampler).__name__} returned {excerpt(height)}; "
                 f"expected heights, whole numbers in a tensor [{count}]."
             )
         height = height.to(self.level.device).reshape(*tensordict.batch_size, 1)
