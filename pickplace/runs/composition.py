@@ -1,4 +1,4 @@
-"""The config that a command line makes, beyond Hydra's merge: leaves keep to their own values; names of run folders."""
+"""The config that a command line makes, beyond Hydra's merge: values of replaced options, hints, names of folders."""
 
 import argparse
 import hashlib
@@ -106,7 +106,7 @@ def _exchanged_leaves(place: str, own: Any, before: Any) -> Iterator[tuple[str, 
 
 
 def _apply(value: Override, cfg: DictConfig) -> None:
-    """Apply the override of a value, also of a key that is not there: whoever reads the config refuses it."""
+    """Apply the override of a value; a key that is not there is added, and refused later by its reader."""
     parent, _, key = value.key_or_group.rpartition(".")
     if not value.is_delete():
         OmegaConf.update(cfg, value.key_or_group, value.value(), merge=True, force_add=True)

@@ -136,8 +136,7 @@ class Setting:
 
     @property
     def curves(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frames ``[V]`` and validation occupancies ``[V, S]`` of the finished runs; one that ended earlier keeps its
-        last."""
+        """Frames ``[V]`` and validation occupancies ``[V, S]`` of the finished runs; an early end keeps the last value."""
         frames = sorted({int(row["frames"]) for run in self.finished for row in run.validations})
         values = np.full((len(frames), len(self.finished)), np.nan)
         for column, run in enumerate(self.finished):
