@@ -344,6 +344,11 @@ evaluate()
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
+def test_pickplace_is_imported_in_an_interpreter_without_arguments():
+    code = f"import sys; sys.argv.clear(); sys.path.insert(0, {str(Path(pickplace.__file__).parents[1])!r}); "
+    subprocess.run([sys.executable, "-c", code + "import pickplace"], check=True)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_stop_request_knows_its_signal(number):
     request = StopRequest()

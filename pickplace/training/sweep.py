@@ -106,7 +106,7 @@ class Setting:
 
     @property
     def finished(self) -> list[SweepRun]:
-        """The runs that finished with a validation."""
+        """The runs that finished, with a validation."""
         return [run for run in self.runs if run.status == "finished" and run.final is not None]
 
     @property
@@ -136,7 +136,7 @@ class Setting:
 
     @property
     def curves(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frames ``[V]`` and validation occupancies ``[V, S]`` of the finished runs; an early end keeps the last value."""
+        """Frames ``[V]`` and validation occupancies ``[V, S]`` of the finished runs; after an end, the last."""
         frames = sorted({int(row["frames"]) for run in self.finished for row in run.validations})
         values = np.full((len(frames), len(self.finished)), np.nan)
         for column, run in enumerate(self.finished):
