@@ -6,7 +6,7 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-_is_command = os.path.basename(sys.argv[0]).startswith("pickplace-")
+_is_command = os.path.basename(next(iter(sys.argv), "")).startswith("pickplace-")
 if _is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))  # no traceback of a Ctrl-C; cli.py goes on from here
 

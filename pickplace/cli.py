@@ -42,7 +42,7 @@ def _run(module: str, *needed: str, config_name: str | None = None) -> None:
         if getattr(sys, name) is None:  # closed: its number would go to the next file that is opened
             os.open(os.devnull, os.O_RDWR)
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115  open until the end
-    logging.raiseExceptions = False  # a closed terminal or a full disk is no reason for a traceback at each line
+    logging.raiseExceptions = False  # else each line prints a traceback on a closed terminal or a full disk
     on_interrupt = signal.SIG_IGN if signal.getsignal(signal.SIGINT) == signal.SIG_IGN else _end
     signal.signal(signal.SIGINT, on_interrupt)
     help_only = bool(HELP & set(sys.argv[1:]))

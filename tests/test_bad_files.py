@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from commands import after_batch, composed
+from commands import composed
 from omegaconf import OmegaConf
 
 import pickplace
@@ -26,10 +26,12 @@ from pickplace.runs.folder import changed_values, noted_config_folders, noted_ov
 from pickplace.runs.resume import StopRequest, load_optimizer
 from pickplace.task.files import read_file, replaced_file
 from pickplace.task.items import Recorded
+from pickplace.task.observation import ToteDepth
 from pickplace.training import trainer
 from pickplace.training.train import resume_run
 
 TOTE = "env.tote_size=[4,4,2]"
+SHORT = ["planner=joint_dbl", TOTE, "evaluation.episodes=2", "evaluation.latency_decisions=0"]
 FULL = OSError(28, "No space left on device")
 
 
@@ -133,13 +135,7 @@ def files(folder):
 
 
 def test_an_evaluation_overwrites_no_other_run(run, smoke_run, tmp_path):
-    words = [
-        "planner=joint_dbl",
-        TOTE,
-        "evaluation.episodes=2",
-        "evaluation.latency_decisions=0",
-        "evaluation.replay=0",
-    ]
+    words = [*SHORT, "evaluation.replay=0"]
     evaluation, one, trained = ["evaluate", *words], tmp_path / "one", shutil.copytree(smoke_run, tmp_path / "trained")
     assert run(*evaluation, f"hydra.run.dir={one}")[0] == 0
     for folder, command in ((one, evaluation), (trained, evaluation), (one, ["train"])):
@@ -152,13 +148,22 @@ def test_an_evaluation_overwrites_no_other_run(run, smoke_run, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["train.log", "metrics.csv", ".lock", "checkpoints/note", ".hydra/config.yaml"])
-def test_a_hard_link_is_not_written_through(tmp_path, name):
+@pytest.mark.parametrize(
+    ("make_link", "words"),
+    [
+        (lambda path, other: os.link(other, path), "a hard link"),
+        (lambda path, other: path.symlink_to(other), "a link or no regular file"),
+        (lambda path, other: path.symlink_to("nowhere"), "a link or no regular file"),
+        (lambda path, other: os.mkfifo(path), "a link or no regular file"),
+    ],
+)
+def test_a_run_folder_with_links_is_not_resumed(tmp_path, name, make_link, words):
     run_dir, other = tmp_path / "run", tmp_path / "mine.txt"
     (run_dir / name).parent.mkdir(parents=True)
     other.write_text("mine")
     refuse_links(run_dir)
-    os.link(other, run_dir / name)
-    with pytest.raises(ValueError, match=f"{run_dir / name}: a hard link"):
+    make_link(run_dir / name, other)
+    with pytest.raises(ValueError, match=f"{run_dir / name}: {words}"):
         refuse_links(run_dir)
 
 
@@ -195,8 +200,7 @@ def full(*_, **__):
 )  # fmt: skip
 def test_a_full_disk_is_named(run, tmp_path, monkeypatch, command, owner, function, words):
     monkeypatch.setattr(sys.modules[owner] if isinstance(owner, str) else owner, function, full)
-    settings = ["planner=joint_dbl", TOTE, "evaluation.episodes=2", "evaluation.latency_decisions=0"]
-    settings = settings if command == "evaluate" else ["experiment=smoke", "threads=1", "total_frames=128"]
+    settings = SHORT if command == "evaluate" else ["experiment=smoke", "threads=1", "total_frames=128"]
     code, _, err = run(command, *settings, f"hydra.run.dir={tmp_path}/run")
     reason = "No space left on device; expected free space."
     assert code == 2 and err.splitlines()[-1].startswith(f"error: {tmp_path}/{words.format(reason)}"), err
@@ -212,28 +216,32 @@ def test_a_full_disk_is_named(run, tmp_path, monkeypatch, command, owner, functi
         ("steps", 0, -1, "steps"), ("steps", 0, 10**9, "steps"), ("episode", 0, -1, "episode"),
         ("item", (0, 0), 99, "item: expected"), ("item", (0, 4), -1, "item: expected"),
         ("item_seed", (), -1, "item_seed: expected"),
+        ("occupancy", 0, 7.0, "the carried occupancy: expected what the state shows"),
     ],
 )  # fmt: skip
 def test_an_impossible_environment_is_not_resumed(smoke_run, tmp_path, part, index, value, words):
     run_dir = shutil.copytree(smoke_run, tmp_path / "run")
     folder = run_dir / "checkpoints" / "last"
     state, facts = checkpoint.read(folder)
-    state["collector"]["environment"][part][index] = value
+    environment = state["collector"]["environment"]
+    (environment if part in environment else state["collector"]["carried"])[part][index] = value
     del facts["schema"], facts["sha256"]
     checkpoint.write(folder, state, facts)
     with pytest.raises(ValueError, match=f"environment is of no use: {words}"):
         resume_run([f"resume={run_dir}", "total_frames=1280"])
 
 
-def test_a_carried_observation_shows_the_state(smoke_run, tmp_path):
-    run_dir = shutil.copytree(smoke_run, tmp_path / "run")
-    folder = run_dir / "checkpoints" / "last"
-    state, facts = checkpoint.read(folder)
-    state["collector"]["carried"]["occupancy"][0] = 7.0
-    del facts["schema"], facts["sha256"]
-    checkpoint.write(folder, state, facts)
-    with pytest.raises(ValueError, match="the carried occupancy: expected what the state shows"):
-        resume_run([f"resume={run_dir}", "total_frames=1280"])
+class Noise(ToteDepth):
+    """A term that draws."""
+
+    def value(self, cell, state):
+        return torch.rand_like(super().value(cell, state))
+
+
+def test_a_term_that_draws_can_be_resumed(smoke, tmp_path):
+    run_dir = tmp_path / "run"
+    smoke(run_dir, "+env.observation.noise={_target_: test_bad_files.Noise}", "total_frames=128")
+    resume_run([f"resume={run_dir}", "total_frames=256", "trust=test_bad_files"])
 
 
 @pytest.mark.parametrize(("key", "value"), [("step", -1.0), ("exp_avg_sq", -1e-3)])
@@ -275,12 +283,8 @@ def test_maps_are_named_by_their_files(plan, tmp_path):
     for path, values in zip(names, (item, np.zeros(5), np.full((6, 6), 99), item * 0), strict=True):
         np.save(path, values)
     (tmp_path / "zip.npy").write_bytes(b"PK\x03\x04 no archive")
-    header = (
-        b"\x93NUMPY\x01\x00"
-        + (60).to_bytes(2, "little")
-        + b"{'descr': '<f8', 'fortran_order': False, 'shape': (10**12,)}"
-    )
-    (tmp_path / "huge.npy").write_bytes(header)
+    shape = b"{'descr': '<f8', 'fortran_order': False, 'shape': (10**12,)}"
+    (tmp_path / "huge.npy").write_bytes(b"\x93NUMPY\x01\x00" + (60).to_bytes(2, "little") + shape)
     for bin_map, tote_map, named in (
         (flat, large, flat), (good, flat, flat), (good, large, large), (nothing, good, good),
         (nothing, nothing, nothing),
@@ -303,7 +307,7 @@ def test_an_endless_line_is_answered_and_skipped(monkeypatch):
             self.content = self.content[len(line + end) :]
             return line + end
 
-    lines = list(json_lines.lines_of(Endless()))
+    lines = list(json_lines.read_lines(Endless()))
     assert lines == [b"x" * 9, b"{}\n", b" " * 8 + b"\n", b"y" * 9]
     assert "more than 8 bytes" in json_lines.answer(None, lines[0], {})["error"]
 
@@ -340,6 +344,11 @@ evaluate()
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
+def test_pickplace_is_imported_in_an_interpreter_without_arguments():
+    code = f"import sys; sys.argv.clear(); sys.path.insert(0, {str(Path(pickplace.__file__).parents[1])!r}); "
+    subprocess.run([sys.executable, "-c", code + "import pickplace"], check=True)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_stop_request_knows_its_signal(number):
     request = StopRequest()
@@ -362,11 +371,3 @@ def test_nohup_keeps_working():
         assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-def test_a_closed_terminal_saves(run, tmp_path):
-    with after_batch(1, lambda _: os.kill(os.getpid(), signal.SIGHUP)):
-        words = ["experiment=smoke", "threads=1", "total_frames=2048", f"hydra.run.dir={tmp_path}/run"]
-        code, _, _ = run("train", *words)
-    assert code == 128 + signal.SIGHUP
-    assert checkpoint.read(tmp_path / "run" / "checkpoints" / "last")[1]["frames"] == 128

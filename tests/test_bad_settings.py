@@ -19,8 +19,9 @@ from pickplace.runs.allowlist import MAX_DEPTH, MAX_NODES, MAX_TEXT, trusted_con
 from pickplace.runs.references import saved_form
 from pickplace.runs.registry import build
 from pickplace.task import checks
-from pickplace.task.checks import shown
+from pickplace.task.checks import excerpt
 from pickplace.task.items import Kinds, Uniform
+from pickplace.training.collectors import refuse_other_workers
 from pickplace.training.settings import check_settings
 from pickplace.training.trainer import Trainer
 
@@ -41,6 +42,7 @@ TRAININGS = {
     "curriculum plateau": ["curriculum=mixture", "curriculum/advance=plateau"],
     "curriculum staged": ["curriculum/advance=staged", "env.tote_size=[4,4,3]"],
     "curriculum frames": ["curriculum/advance=frames"],
+    "callbacks": ["callbacks=early_stopping"],
     "collector": [],
     "logger": [],
     "seed total_frames device threads evaluation_interval checkpoint_interval progress_interval": [],
@@ -90,7 +92,7 @@ def test_every_leaf_of_a_training(name, tmp_path, monkeypatch):
             except ValueError as error:
                 check_sentence(error, str(path[-1]))
             except Exception as error:
-                raise AssertionError(f"{'.'.join(path)}={shown(value)}: {error!r}") from error
+                raise AssertionError(f"{'.'.join(path)}={excerpt(value)}: {error!r}") from error
             assert time.perf_counter() - started < 20
 
 
@@ -212,7 +214,7 @@ def test_what_pickplace_hands_over_cannot_be_set(place, key, value, tmp_path):
 
 
 @pytest.mark.parametrize("place", ["env", "items"])
-def test_nor_in_an_evaluation(place):
+def test_unknown_settings_of_an_evaluation_are_refused(place):
     cfg = composed("planner=joint_dbl", f"+{place}.stream=train", name="evaluate")
     with pytest.raises(ValueError, match=rf"{place}.stream: there is no key 'stream'"):
         prepare(cfg)
@@ -299,6 +301,7 @@ def test_another_number_of_workers_starts_none(smoke_run, tmp_path):
     cfg = OmegaConf.create(facts["config"] | {"collector": {"_target_": "multi_sync", "workers": 8}})
     with pytest.raises(ValueError, match="collector.workers=8: the checkpoint has 0 workers; expected as many"):
         Trainer(cfg, tmp_path, (state, facts, folder))
+    refuse_other_workers({"_target_": "multi_sync"}, {"worker0": {}, "worker1": {}})  # the default number
     cfg.collector = {"_target_": "single", "workers": 0}
     with pytest.raises(ValueError, match="collector.workers: there is no key 'workers'"):
         Trainer(cfg, tmp_path, (state, facts, folder))
@@ -331,7 +334,7 @@ def test_scores_of_many_footprints_are_computed_in_parts(monkeypatch):
 
 def test_values_and_sentences_are_short():
     for value in ("x" * 100_000, list(range(10**5)), {"a" * 10**5: "b" * 10**5}, 10**3000, object()):
-        assert len(shown(value)) < 200
+        assert len(excerpt(value)) < 200
     for error in (ValueError("x" * 100_000), RuntimeError("y" * 100_000), OSError(13, "z" * 10**5, "f" * 10**5)):
         assert len(errors.sentence(error)) <= errors.MAX_LENGTH
     with pytest.raises(ValueError) as caught:

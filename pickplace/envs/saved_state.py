@@ -8,20 +8,32 @@ from torch import Tensor
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.runs.checkpoint import CheckpointError
 from pickplace.task.items import MAX_SEED
-from pickplace.task.observation import observe
+from pickplace.task.observation import STANDARD_TERMS, observe
 from pickplace.task.state import Item, State
 
 
-def check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: Mapping[str, Tensor]) -> None:
-    """Refuse a saved environment whose values are out of range, or do not fit each other.
+def check_saved_states(env: PickPlaceEnv, collector: Mapping) -> None:
+    """Refuse a collector's state with an environment whose values are out of range, or do not fit each other.
 
     Args:
         env: an environment of the same settings, with any number of problems.
-        saved: the ``state_dict()`` of the saved one.
-        carried: the observation that its next step starts from.
+        collector: the saved ``state_dict()``, or that of each worker by its name.
 
     Raises:
         CheckpointError: naming the first value that is impossible.
+    """
+    for part in (collector, *collector.values()):
+        if isinstance(part, Mapping) and "environment" in part:
+            _check_saved_state(env, part["environment"], part["carried"])
+
+
+def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: Mapping[str, Tensor]) -> None:
+    """Check one environment.
+
+    Args:
+        env, saved: as of :func:`check_saved_states`; the ``state_dict()`` of the saved one.
+        carried: the observation that its next step starts from. A term of the user's own may draw, so that only
+            pickplace's are compared.
     """
 
     def check(key: str, possible: Tensor, expected: str) -> None:
@@ -40,7 +52,7 @@ def check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: M
     check("item_seed", (seed >= 0) & (seed < MAX_SEED), "at least 0 and below 2**62")
     item = env.items.sample(env.stream, seed.expand_as(episode), episode, steps, cell.bin_size)
     check("item", saved["item"] == torch.stack(item, -1), "the item of this episode and step")
-    seen = observe(env.terms, cell, State(heights, tote_height, Item(*item)))
+    seen = observe(STANDARD_TERMS, cell, State(heights, tote_height, Item(*item)))
     seen["occupancy"] = (volume / cell.tote_volume(tote_height))[:, None]
     seen |= {key: torch.zeros(len(steps), 1) for key in ("failure", "done", "terminated", "truncated")}
     for key, value in seen.items():

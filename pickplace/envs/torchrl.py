@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from pickplace.envs.checks import check_items, problem_bytes
 from pickplace.runs.machine import usable_device
 from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
-from pickplace.task.checks import check_bytes, one_of, shown, whole_number
+from pickplace.task.checks import check_bytes, excerpt, one_of, whole_number
 from pickplace.task.feasibility import PlacingMaps, action_mask, footprint_mask, placing_maps
 from pickplace.task.items import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.task.observation import Term, check_terms, observe
@@ -105,17 +105,20 @@ class PickPlaceEnv(EnvBase):
         check_seed(seed)
         one_of("stream", stream, STREAMS)
         if not isinstance(masks, (tuple, list)) or not all(isinstance(name, str) and name in MASKS for name in masks):
-            raise ValueError(f"masks={shown(masks)}: expected any of {', '.join(map(repr, MASKS))}.")
+            raise ValueError(f"masks={excerpt(masks)}: expected any of {', '.join(map(repr, MASKS))}.")
         whole_number("first_episode", first_episode, 0, MAX_SEED)
         if episode_stride is not None:
             whole_number("episode_stride", episode_stride, 1, MAX_SEED)
         items = Kinds(PAPER_KINDS) if items is None else items
         if not isinstance(items, ItemDistribution):
-            raise ValueError(f"items={shown(items)}: expected an ItemDistribution, such as pickplace.task.items.Kinds.")
+            raise ValueError(
+                f"items={excerpt(items)}: expected an ItemDistribution, such as pickplace.task.items.Kinds."
+            )
         check_items(cell, items)
         self.terms = check_terms(observation)
         self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
-        check_bytes(f"num_envs={num_envs}", num_envs * problem_bytes(self.cell, masks), device := usable_device(device))
+        device = usable_device(device)
+        check_bytes(f"num_envs={num_envs}", num_envs * problem_bytes(self.cell, masks), device)
         super().__init__(device=device, batch_size=[num_envs])
         self.items, self.stream, self.masks = items, stream, tuple(masks)
         self.min_tote_height = int(items.sizes[:, 2].max())

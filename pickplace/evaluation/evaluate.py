@@ -21,7 +21,7 @@ from pickplace.runs.machine import use_machine
 from pickplace.runs.provenance import commit, imitated_planner, versions
 from pickplace.runs.registry import build
 from pickplace.task.cell import CELL_SETTINGS
-from pickplace.task.checks import flag, is_number, shown, whole_number
+from pickplace.task.checks import excerpt, flag, is_name, is_number, whole_number
 from pickplace.task.files import read_file, replaced_file
 from pickplace.views.replay import animation, page, picture
 from pickplace.views.tables import evaluation_table
@@ -217,17 +217,17 @@ def read_comparison(path: Path, expected: dict) -> dict:
             ignored = "path" if "sha256" in ours and "sha256" in theirs else "sha256"
             ours, theirs = ({k: v for k, v in items.items() if k != ignored} for items in (ours, theirs))
         if ours != theirs:
-            found = shown(other.get(key))
-            raise ValueError(f"compare={str(path)!r}: its {key} is {found}, expected {shown(expected[key])}.")
+            found = excerpt(other.get(key))
+            raise ValueError(f"compare={str(path)!r}: its {key} is {found}, expected {excerpt(expected[key])}.")
     for key in CELL_SETTINGS:
         if expected["env"][key] != cell.get(key):
-            found = shown(cell.get(key))
+            found = excerpt(cell.get(key))
             raise ValueError(f"compare={str(path)!r}: env.{key}={found}, expected {expected['env'][key]}.")
     count = expected["episodes"]
     if not isinstance(values, list) or len(values) != count or not all(is_number(v) and 0 <= v <= 1 for v in values):
         raise ValueError(f"{refused} whose occupancy.per_episode is a list of {count} numbers between 0 and 1.")
-    if not isinstance(name, str) or not name.isprintable() or len(name) > 100:
-        raise ValueError(f"{refused} whose planner is a name to print, got {shown(name)}.")
+    if not is_name(name):
+        raise ValueError(f"{refused} whose planner is a name to print, got {excerpt(name)}.")
     return other
 
 

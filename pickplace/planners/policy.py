@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace.policies.base import Policy
 from pickplace.task.cell import CellSpec
-from pickplace.task.checks import check_bytes, is_whole, shown
+from pickplace.task.checks import check_bytes, excerpt, is_whole
 from pickplace.task.feasibility import action_mask, placing_maps
 from pickplace.task.state import Observation, State
 from pickplace.task.transition import apply
@@ -29,7 +29,7 @@ class PolicyPlanner:
 
     def __init__(self, cell: CellSpec, policy: Policy, candidates: int | Literal["all"] = "all"):
         if candidates != "all" and not (is_whole(candidates) and candidates >= 1):
-            raise ValueError(f"planner.candidates={shown(candidates)}: expected 'all' or a whole number >= 1.")
+            raise ValueError(f"planner.candidates={excerpt(candidates)}: expected 'all' or a whole number >= 1.")
         self.cell, self.policy, self.candidates = cell, policy, candidates
 
     @torch.no_grad()

@@ -166,7 +166,7 @@ def pick_one(candidates: Tensor) -> Tensor:
     return candidates.gather(1, index)[:, 0]
 
 
-def refuse_large(make: Callable[[], torch.nn.Module], key: str) -> None:
+def refuse_large_network(make: Callable[[], torch.nn.Module], key: str) -> None:
     """Refuse a network with more parameters than :data:`MAX_PARAMETERS`, before memory is allocated.
 
     Args:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from pickplace.task.cell import CellSpec
-from pickplace.task.checks import shown
+from pickplace.task.checks import excerpt
 from pickplace.task.maps import FAR
 from pickplace.task.state import item_from_depth
 
@@ -99,7 +99,7 @@ def checked_number(name: str, value, wanted: str, accepts: Callable[[float], boo
     except (TypeError, ValueError, OverflowError):
         number = float("nan")
     if isinstance(value, (bool, np.bool_, str, bytes)) or not np.isfinite(number) or not accepts(number):
-        raise DepthMapError(f"{name}={shown(value)}: expected {wanted}.")
+        raise DepthMapError(f"{name}={excerpt(value)}: expected {wanted}.")
     return number
 
 

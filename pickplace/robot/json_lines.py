@@ -97,12 +97,12 @@ def run(args: argparse.Namespace) -> None:
             raise DepthMapError(f"{file}: {error}") from error
         write_output(json.dumps(result, indent=1) + "\n")
         return
-    for line in lines_of(sys.stdin.buffer):
+    for line in read_lines(sys.stdin.buffer):
         if line.strip() or len(line) > MAX_LINE:
             write_output(json.dumps(answer(planner, line, defaults, args.time)) + "\n")
 
 
-def lines_of(stream: BinaryIO) -> Iterator[bytes]:
+def read_lines(stream: BinaryIO) -> Iterator[bytes]:
     """Yield the lines of a stream; of a line longer than :data:`MAX_LINE` only the first bytes, at once."""
     while line := stream.readline(MAX_LINE + 1):
         yield line

@@ -19,7 +19,7 @@ from pickplace.policies.base import Policy
 from pickplace.policies.restore import load_policy
 from pickplace.robot.depth_maps import DepthMapError, Lengths, check_one_cuboid
 from pickplace.task.cell import CellSpec, reference_cell
-from pickplace.task.checks import is_whole, shown
+from pickplace.task.checks import excerpt, is_whole
 from pickplace.task.feasibility import action_footprints, action_mask, footprint_mask, placing_maps
 from pickplace.task.grasps import split_action
 from pickplace.task.maps import FAR
@@ -172,7 +172,7 @@ class Planner:
         """
         lengths = Lengths(self.cell, cell_size, tolerance)
         if not is_whole(alternatives) or alternatives < 0:
-            raise DepthMapError(f"alternatives={shown(alternatives)}: expected a whole number >= 0.")
+            raise DepthMapError(f"alternatives={excerpt(alternatives)}: expected a whole number >= 0.")
         return lengths, self.cell.tote_size[2] if tote_height is None else lengths.units_of_tote_height(tote_height)
 
     def _read_state(self, bin_depth, tote_depth, height: int, lengths: Lengths) -> State:

@@ -10,9 +10,9 @@ from importlib.metadata import packages_distributions
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.runs.references import children, only_groups, refusal, refuse_interpolations
+from pickplace.runs.references import children, refusal, refuse_interpolations, select_groups
 from pickplace.runs.registry import names_at, qualified_names
-from pickplace.task.checks import shown
+from pickplace.task.checks import excerpt
 
 #: Modules that are never a user's own: with their functions a config could do anything.
 RESERVED_MODULES = {"pickplace", "hydra", "numpy", "omegaconf", "tensordict", "torch", "torchrl"}
@@ -44,8 +44,8 @@ def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POL
     own = own_modules(trust)
     if groups is None:
         groups = tuple(content)
-    refuse_large({key: content[key] for key in groups if key in content})
-    content = only_groups(content, groups)
+    refuse_large_config({key: content[key] for key in groups if key in content})
+    content = select_groups(content, groups)
     try:
         refuse_interpolations(content)
         refuse_foreign_targets(content, own)
@@ -62,7 +62,7 @@ def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POL
     return cfg
 
 
-def refuse_large(content) -> None:
+def refuse_large_config(content) -> None:
     """Refuse a config that would fill the memory, before OmegaConf makes an object of each of its nodes.
 
     Raises:
@@ -92,7 +92,7 @@ def own_modules(trust) -> tuple[str, ...]:
     names = list(trust) if isinstance(trust, (list, tuple, ListConfig)) else [] if trust is None else [trust]
     for name in names:
         if not _may_be_own(name):
-            raise ValueError(f"trust={shown(name)}: expected names of modules of your own, such as trust=my_models.")
+            raise ValueError(f"trust={excerpt(name)}: expected names of modules of your own, such as trust=my_models.")
     return tuple(names)
 
 

@@ -1,4 +1,4 @@
-"""The config that a command line makes, beyond Hydra's merge: leaves keep to their own values; names of run folders."""
+"""The config that a command line makes, beyond Hydra's merge: values of replaced options, hints, names of folders."""
 
 import argparse
 import hashlib
@@ -26,13 +26,14 @@ def conf_dir() -> Path:
     return inside if inside.is_dir() else package.parent / "conf"
 
 
-def with_own_values(cfg: DictConfig) -> DictConfig:
+def drop_replaced_values(cfg: DictConfig) -> DictConfig:
     """Return the config of this run, in which an option chosen on the command line has no values of another one.
 
     Hydra merges what a preset, or a config file of the user, wrote for the option that it expected, such as
     ``curriculum.advance.occupancy`` for ``threshold``, into the option that the command line chose instead. A part
     whose ``_target_`` a choice on the command line changes gets the values of that option's own files, and the values
-    on the command line. So does a group of which the choice turns a part on or off (``warm_start.teacher``).
+    on the command line. So does a group of which the choice turns a part on or off (``warm_start.teacher``). Hydra's
+    note on the config is corrected.
     """
     given = OverridesParser.create().parse_overrides(list(HydraConfig.get().overrides.task))
     name = HydraConfig.get().job.config_name
@@ -47,10 +48,10 @@ def with_own_values(cfg: DictConfig) -> DictConfig:
         others = [str(other.input_line) for other in choices if other.input_line not in inner]
         inner.remove(str(choice.input_line))
         try:
-            own = _at(hydra.compose(None, [*search, f"+{str(choice.input_line).lstrip('+')}", *inner]), place)
-            if own == _at(cfg, place):
+            own = _part_at(hydra.compose(None, [*search, f"+{str(choice.input_line).lstrip('+')}", *inner]), place)
+            if own == _part_at(cfg, place):
                 continue
-            before = _at(hydra.compose(name, [*search, *others]), place)
+            before = _part_at(hydra.compose(name, [*search, *others]), place)
         except ConfigCompositionException:  # an option that depends on those of other groups
             continue
         inner_places = {_package(other) for other in choices if other.input_line in inner}
@@ -59,12 +60,12 @@ def with_own_values(cfg: DictConfig) -> DictConfig:
                 cfg = cfg if replaced else cfg.copy()
                 OmegaConf.update(cfg, leaf, content, merge=False, force_add=True)
                 replaced.append(leaf)
-    for value in given:
-        path = f"{value.key_or_group}."
-        if value not in choices and any(
-            f"{leaf}.".startswith(path) or path.startswith(f"{leaf}.") for leaf in replaced
-        ):
-            _apply(value, cfg)
+    if replaced:
+        for value in given:
+            if value not in choices:
+                _apply(value, cfg)
+        if (notes := HydraConfig.get().output_subdir) is not None:
+            OmegaConf.save(cfg, Path(HydraConfig.get().runtime.output_dir) / notes / "config.yaml")
     return cfg
 
 
@@ -79,7 +80,7 @@ def _package(choice: Override) -> str:
     return choice.package or choice.key_or_group.replace("/", ".")
 
 
-def _at(cfg: DictConfig, place: str) -> Any:
+def _part_at(cfg: DictConfig, place: str) -> Any:
     """Return the part of a config at a place, unresolved; None if there is none."""
     part: Any = OmegaConf.to_container(cfg, resolve=False)
     for key in place.split("."):
@@ -93,12 +94,11 @@ def _exchanged_leaves(place: str, own: Any, before: Any) -> Iterator[tuple[str, 
         return
     before = before if isinstance(before, dict) else {}
 
-    def is_switched(key) -> bool:
-        """Return whether a part is turned on or off."""
-        pair = own[key], before.get(key, "")
-        return None in pair and any(isinstance(node, dict) and "_target_" in node for node in pair)
+    def parts(cfg: dict) -> set:
+        """Return the keys of the parts in a group."""
+        return {key for key, node in cfg.items() if isinstance(node, dict) and "_target_" in node}
 
-    if own.get("_target_") != before.get("_target_") or any(map(is_switched, own)):
+    if own.get("_target_") != before.get("_target_") or parts(own) != parts(before):
         yield place, own
     else:
         for key, node in own.items():
@@ -106,7 +106,7 @@ def _exchanged_leaves(place: str, own: Any, before: Any) -> Iterator[tuple[str, 
 
 
 def _apply(value: Override, cfg: DictConfig) -> None:
-    """Apply the override of a value, also of a key that is not there: whoever reads the config refuses it."""
+    """Apply the override of a value; a key that is not there is added, and refused later by its reader."""
     parent, _, key = value.key_or_group.rpartition(".")
     if not value.is_delete():
         OmegaConf.update(cfg, value.key_or_group, value.value(), merge=True, force_add=True)
@@ -115,7 +115,7 @@ def _apply(value: Override, cfg: DictConfig) -> None:
             node.pop(key, None)
 
 
-def composed_for_hint(config_name: str, words: list[str], without: str) -> DictConfig:
+def compose_for_hint(config_name: str, words: list[str], without: str) -> DictConfig:
     """Return the config of a command line without the overrides of a key, or without any if others are wrong too.
 
     Args:
@@ -140,7 +140,7 @@ def _first_of_sweep(word: str) -> str:
     return f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}"
 
 
-def options_of(group: str, config_name: str, words: list[str]) -> list[str]:
+def list_options(group: str, config_name: str, words: list[str]) -> list[str]:
     """Return the options of a config group, those in the user's folders too; none if there is no such group."""
     search, _ = _search_path(words)
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):

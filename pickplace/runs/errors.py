@@ -13,7 +13,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.task.checks import shortened
+from pickplace.task.checks import short_text
 
 
 class JobFailed(Exception):
@@ -136,5 +136,5 @@ def unknown_key(key: str, node: DictConfig | dict, prefix: str = "") -> str:
     known = [str(name) for name in node if name not in ("_target_", "hydra")]
     close = get_close_matches(leaf, known, 1)
     hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known) or 'none'}."
-    key, leaf = map(shortened, (key, leaf))
+    key, leaf = map(short_text, (key, leaf))
     return f"{key}: there is no key {leaf!r} in {prefix[:-1] or 'the config'}; {hint}"

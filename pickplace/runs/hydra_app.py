@@ -16,7 +16,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.runs.composition import composed_for_hint, conf_dir, constant_keys, options_of, with_own_values
+from pickplace.runs.composition import compose_for_hint, conf_dir, constant_keys, drop_replaced_values, list_options
 from pickplace.runs.errors import JobFailed, UsageError, one_sentence, sentence, unknown_key
 from pickplace.runs.folder import FAILURE, OccupiedError, refuse_claimed, refuse_occupied, remove_empty_folders
 from pickplace.runs.registry import REGISTRY
@@ -43,7 +43,7 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
         hydra_cfg = HydraConfig.get()
         os.environ["HYDRA_FULL_ERROR"] = full_error
         with _job_of_sweep() if hydra_cfg.mode == RunMode.MULTIRUN else _single_run():
-            cfg = _with_own_values(cfg)
+            cfg = drop_replaced_values(cfg)
             if missing := OmegaConf.missing_keys(cfg):
                 raise ValueError(f"{min(missing)}: no value; expected {min(missing)}=<value>.")
             known = hydra.compose(hydra_cfg.job.config_name)
@@ -60,15 +60,6 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
                 hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(app)()
         finally:
             os.environ["HYDRA_FULL_ERROR"] = full_error
-
-
-def _with_own_values(cfg: DictConfig) -> DictConfig:
-    """Return the config without values of options that the command line replaced, and correct Hydra's note on it."""
-    own = with_own_values(cfg)
-    runtime, subdir = HydraConfig.get().runtime, HydraConfig.get().output_subdir
-    if own is not cfg and subdir is not None:
-        OmegaConf.save(own, Path(runtime.output_dir) / subdir / "config.yaml")
-    return own
 
 
 @contextmanager
@@ -125,7 +116,7 @@ def _clearer_errors(config_name: str, overrides: list[str]):
     except ConfigCompositionException as error:
         if not (key := re.match("Could not override '(.*)'", str(error))):
             raise
-        raise ValueError(unknown_key(key[1], composed_for_hint(config_name, overrides, key[1]))) from error
+        raise ValueError(unknown_key(key[1], compose_for_hint(config_name, overrides, key[1]))) from error
     except UsageError:
         raise
     except ValueError as error:  # Hydra's own, which names no key
@@ -133,11 +124,8 @@ def _clearer_errors(config_name: str, overrides: list[str]):
             raise error.__cause__ from None
         for word in overrides:  # a group without an option, allowed for experiment only
             group, _, option = word.lstrip("+").partition("=")
-            if (
-                option in ("null", "")
-                and group != "experiment"
-                and (names := options_of(group, config_name, overrides))
-            ):
+            is_empty = option in ("null", "") and group != "experiment"
+            if is_empty and (names := list_options(group, config_name, overrides)):
                 raise ValueError(f"{word}: expected {group}=<one of {', '.join(names)}>.") from error
         raise ValueError(f"{' '.join(overrides)}: {error}.") from error
 

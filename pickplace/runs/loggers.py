@@ -82,7 +82,7 @@ class CsvLogger:
 
     def close(self) -> None:
         """Close the file; rows that a full disk did not take are lost."""
-        with suppress(OSError):
+        with suppress(OSError, ValueError):  # a ValueError if a full disk has closed it
             self._restore()
         with suppress(OSError):
             self._file.close()

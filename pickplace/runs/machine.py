@@ -4,7 +4,7 @@ import torch
 from loky import cpu_count
 from omegaconf import DictConfig
 
-from pickplace.task.checks import shortened, whole_number
+from pickplace.task.checks import short_text, whole_number
 
 
 def use_machine(cfg: DictConfig) -> torch.device:
@@ -40,5 +40,5 @@ def usable_device(name: str) -> torch.device:
     except (RuntimeError, TypeError, AssertionError, ValueError, OverflowError):
         usable = False
     if not usable:
-        raise ValueError(f"device={shortened(name)}: expected cpu, or cuda on a machine that has it.")
+        raise ValueError(f"device={short_text(name)}: expected cpu, or cuda on a machine that has it.")
     return device

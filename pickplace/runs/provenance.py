@@ -10,6 +10,7 @@ import torch
 import torchrl
 
 import pickplace
+from pickplace.task.checks import is_name
 
 
 def versions() -> dict[str, str]:
@@ -50,4 +51,4 @@ def imitated_planner(cfg: dict) -> str | None:
         return None
     teacher = warm_start.get("teacher")
     name = teacher.get("_target_") if isinstance(teacher, Mapping) else None
-    return name if isinstance(name, str) and name.isprintable() and len(name) <= 100 else None
+    return name if is_name(name) else None

@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.task.checks import shortened, shown
+from pickplace.task.checks import excerpt, short_text
 
 #: A reference to another key of the same config, and nothing else.
 REFERENCE = re.compile(r"\$\{(\.*)([A-Za-z_]\w*(?:\.\w+)*)\}")
@@ -49,7 +49,7 @@ def refuse_interpolations(node, path: tuple = (), root=None) -> None:
         refuse_interpolations(value, (*path, key), root)
 
 
-def only_groups(content: dict, groups: Collection[str]) -> dict:
+def select_groups(content: dict, groups: Collection[str]) -> dict:
     """Return some groups of a config, in which references to values in other groups are replaced by the values."""
 
     def replaced(node, path: tuple):
@@ -91,4 +91,4 @@ def children(node) -> Iterator[tuple]:
 
 def refusal(key: str, value, expected: str) -> ValueError:
     """Return the error for a value of a checkpoint's config."""
-    return ValueError(f"{shortened(key)}={shown(value)}: the checkpoint is refused; expected {expected}.")
+    return ValueError(f"{short_text(key)}={excerpt(value)}: the checkpoint is refused; expected {expected}.")

@@ -16,7 +16,7 @@ from importlib import import_module
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.runs.errors import unknown_key
-from pickplace.task.checks import shortened
+from pickplace.task.checks import short_text
 
 PLANNERS = {
     "policy": "pickplace.planners.policy.PolicyPlanner",
@@ -115,7 +115,7 @@ def _make(place: str, node, given: dict):
     try:
         return function(**settings, **given)
     except TypeError as error:
-        raise ValueError(f"{place}._target_={shortened(node['_target_'])}: {error}.") from error
+        raise ValueError(f"{place}._target_={short_text(node['_target_'])}: {error}.") from error
 
 
 def names_at(place: str) -> dict[str, str]:
@@ -146,11 +146,11 @@ def find(place: str, target) -> Callable:
         if callable(found := getattr(import_module(module), name) if module else None):
             return found
     except (ImportError, AttributeError, TypeError, ValueError) as error:  # the last two from ".a.b" and "..a"
-        reason = f" ({shortened(error)})"
+        reason = f" ({short_text(error)})"
     close = get_close_matches(path, names, 1)
     known = f"one of {', '.join(names)}, or " if names else ""
     hint = f"did you mean {close[0]!r}?" if close else f"expected {known}the dotted path of a class of your own."
-    raise ValueError(f"{place}._target_={shortened(target)}: there is no such class or function{reason}; {hint}")
+    raise ValueError(f"{place}._target_={short_text(target)}: there is no such class or function{reason}; {hint}")
 
 
 def accepted_arguments(function: Callable) -> list[str] | None:
@@ -158,8 +158,8 @@ def accepted_arguments(function: Callable) -> list[str] | None:
 
     One with ``**keywords`` takes any. An attribute ``settings``, a tuple of names, states them instead.
     """
-    if hasattr(function, "settings"):
-        return list(function.settings)
+    if isinstance(settings := getattr(function, "settings", None), tuple):
+        return list(settings)
     has_init = inspect.isclass(function) and function.__init__ is not object.__init__
     try:  # of __init__ itself, since a metaclass may hide its arguments
         parameters = inspect.signature(function.__init__ if has_init else function).parameters.values()

@@ -20,7 +20,7 @@ from pickplace.runs.folder import occupied, refuse_occupied
 from pickplace.runs.hydra_app import apply_overrides
 from pickplace.runs.references import saved_form
 from pickplace.task.cell import CELL_SETTINGS
-from pickplace.task.checks import shown
+from pickplace.task.checks import excerpt, short_text
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +100,7 @@ def _check_counters(place: str, facts: dict) -> None:
         raise ValueError(f"resume={place}: the checkpoint has no {missing[0]!r}; expected one that a training wrote.")
 
     def error(key: str, value, expected: str) -> ValueError:
-        words = f"the checkpoint's {shown(key)[1:-1]} is {shown(value)}"
+        words = f"the checkpoint's {short_text(key)} is {excerpt(value)}"
         return ValueError(f"resume={place}: {words}; expected {expected} that a training wrote.")
 
     if not isinstance(facts["latest"], dict):
@@ -179,7 +179,7 @@ def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
     parameters = dict(enumerate(optimizer.param_groups[0]["params"]))
     if unknown := [key for key in state if key not in parameters]:
         raise checkpoint.CheckpointError(
-            f"The checkpoint's optimizer has {shown(unknown[0])}; expected numbers below {len(parameters)}."
+            f"The checkpoint's optimizer has {excerpt(unknown[0])}; expected numbers below {len(parameters)}."
         )
     own = {n: {"step": torch.tensor(0.0), "exp_avg": p, "exp_avg_sq": p} for n, p in parameters.items() if n in state}
     moments = checkpoint.matching_state(state, own, "optimizer")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.checks import flag, is_whole, number, one_of, shortened, shown, whole_number
+from pickplace.task.checks import excerpt, flag, is_whole, number, one_of, short_text, whole_number
 
 PICK_RULES = ("contain", "overlap")
 
@@ -105,7 +105,7 @@ class CellSpec:
         object.__setattr__(self, "effector_size", _sizes("effector_size", self.effector_size, 2, MAX_EFFECTOR))
         if not is_whole(self.rotations) or not 1 <= self.rotations <= 4:
             raise ValueError(
-                f"rotations={shown(self.rotations)}: expected 1, 2, 3 or 4 (quarter turns to choose from)."
+                f"rotations={excerpt(self.rotations)}: expected 1, 2, 3 or 4 (quarter turns to choose from)."
             )
         one_of("pick_rule", self.pick_rule, PICK_RULES)
         number("min_support", self.min_support, 0, 1)
@@ -202,8 +202,8 @@ def cell_from_settings(settings: dict) -> CellSpec:
     """Return the cell of settings by name, such as a config's; raises ``ValueError`` for a name that there is not."""
     known = {item.name for item in fields(CellSpec)}
     if unknown := [name for name in settings if name not in known]:
-        value = shown(settings[unknown[0]])
-        raise ValueError(f"{shortened(unknown[0])}={value}: expected one of {', '.join(CELL_SETTINGS)}.")
+        value = excerpt(settings[unknown[0]])
+        raise ValueError(f"{short_text(unknown[0])}={value}: expected one of {', '.join(CELL_SETTINGS)}.")
     return CellSpec(**settings)
 
 
@@ -215,5 +215,5 @@ def _sizes(name: str, value, count: int, most: int) -> tuple[int, ...]:
     except (TypeError, ValueError, OverflowError):
         sizes, exact = (), False
     if not exact or len(sizes) != count or min(sizes) < 1 or max(sizes) > most:
-        raise ValueError(f"{name}={shown(value)}: expected {count} whole numbers >= 1 and <= {most:,}.")
+        raise ValueError(f"{name}={excerpt(value)}: expected {count} whole numbers >= 1 and <= {most:,}.")
     return sizes

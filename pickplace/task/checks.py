@@ -19,15 +19,15 @@ _repr = Repr()
 _repr.maxstring = _repr.maxother = 80
 
 
-def shown(value) -> str:
-    """Return a value for a message, cut to some 100 characters."""
+def excerpt(value) -> str:
+    """Return the representation of a value for a message, cut to some 100 characters."""
     text = _repr.repr(value)
     return text if len(text) <= 120 else f"{text[:80]}...{text[-30:]}"
 
 
-def shortened(name) -> str:
-    """Return a name for a message, as :func:`shown` but without quotes."""
-    return shown(str(name))[1:-1]
+def short_text(name) -> str:
+    """Return a name for a message, as :func:`excerpt` but without quotes."""
+    return excerpt(str(name))[1:-1]
 
 
 def is_whole(value) -> bool:
@@ -44,43 +44,54 @@ def whole_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:
     """Return ``value`` if it is a whole number in ``[least, most]``."""
     if not is_whole(value) or not least <= value <= most:
         limit = "< 2**63" if most == MAX_COUNT else f"<= {most:,}"
-        raise ValueError(f"{key}={shown(value)}: expected a whole number >= {least} and {limit}.")
+        raise ValueError(f"{key}={excerpt(value)}: expected a whole number >= {least} and {limit}.")
     return int(value)
+
+
+def integral_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:
+    """Return ``value`` as an int, as :func:`whole_number`; a float such as 5e6 is accepted."""
+    is_integral = isinstance(value, float) and value.is_integer()
+    return whole_number(key, int(value) if is_integral else value, least, most)
 
 
 def number(key: str, value, least: float = 0.0, most: float | None = None) -> float:
     """Return ``value`` if it is a finite number in ``[least, most]``; ``most=None`` means no upper limit."""
     if not is_number(value) or value < least or (most is not None and value > most):
         limits = f">= {least:g}" if most is None else f"between {least:g} and {most:g}"
-        raise ValueError(f"{key}={shown(value)}: expected a number {limits}.")
+        raise ValueError(f"{key}={excerpt(value)}: expected a number {limits}.")
     return value
+
+
+def is_name(value: Any) -> bool:
+    """Return whether a value is a short text that a terminal can show."""
+    return isinstance(value, str) and value.isprintable() and len(value) <= 100
 
 
 def flag(key: str, value) -> bool:
     """Return ``value`` if it is true or false."""
     if not isinstance(value, bool):
-        raise ValueError(f"{key}={shown(value)}: expected true or false.")
+        raise ValueError(f"{key}={excerpt(value)}: expected true or false.")
     return value
 
 
 def one_of(key: str, value, choices) -> str:
     """Return ``value`` if it is a text among the choices."""
     if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{key}={shown(value)}: expected {' or '.join(map(repr, choices))}.")
+        raise ValueError(f"{key}={excerpt(value)}: expected {' or '.join(map(repr, choices))}.")
     return value
 
 
 def odd_number(key: str, value, least: int = 1, most: int = 99) -> int:
     """Return ``value`` if it is an odd whole number in ``[least, most]``."""
     if not is_whole(value) or not least <= value <= most or value % 2 == 0:
-        raise ValueError(f"{key}={shown(value)}: expected an odd number >= {least} and <= {most}.")
+        raise ValueError(f"{key}={excerpt(value)}: expected an odd number >= {least} and <= {most}.")
     return int(value)
 
 
 def number_or_null(key: str, value, least: float, most: float) -> float | None:
     """Return ``value`` if it is None or a finite number in ``[least, most]``."""
     if value is not None and (not is_number(value) or not least <= value <= most):
-        raise ValueError(f"{key}={shown(value)}: expected a number between {least:g} and {most:g}, or null.")
+        raise ValueError(f"{key}={excerpt(value)}: expected a number between {least:g} and {most:g}, or null.")
     return value
 
 
@@ -107,7 +118,7 @@ def check_bytes(setting: str, needed: int, device="cpu") -> None:
     try:
         most = most if given is None else number(MEMORY_VARIABLE, float(given))
     except ValueError as error:
-        raise ValueError(f"{MEMORY_VARIABLE}={shown(given)}: expected a number of gigabytes.") from error
+        raise ValueError(f"{MEMORY_VARIABLE}={excerpt(given)}: expected a number of gigabytes.") from error
     if needed > most * 1e9:
         raise ValueError(
             f"{setting}: it would take {needed / 1e9:,.1f} GB; expected at most {most:.1f} GB, or a greater limit in "

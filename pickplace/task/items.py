@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pickplace.task.checks import flag, is_number, is_whole, shown
+from pickplace.task.checks import excerpt, flag, is_number, is_whole
 from pickplace.task.files import read_text
 from pickplace.task.state import Item
 
@@ -28,7 +28,7 @@ PAPER_KINDS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1))
 def check_seed(seed, key: str = "seed") -> int:
     """Return the seed, or raise a ``ValueError`` that names the ``key`` if it is none."""
     if not is_whole(seed) or not 0 <= seed < MAX_SEED:
-        raise ValueError(f"{key}={shown(seed)}: expected a whole number >= 0 and < 2**62.")
+        raise ValueError(f"{key}={excerpt(seed)}: expected a whole number >= 0 and < 2**62.")
     return int(seed)
 
 
@@ -108,17 +108,17 @@ class Kinds(ItemDistribution):
 
     def __init__(self, kinds, weights=None):
         if not isinstance(kinds, (list, tuple)) or not kinds:
-            raise ValueError(f"items.kinds={shown(kinds)}: expected a list of at least one (w, d, h).")
+            raise ValueError(f"items.kinds={excerpt(kinds)}: expected a list of at least one (w, d, h).")
         _check_count("items.kinds: the list has", len(kinds))
         for kind in kinds:
             if not isinstance(kind, (list, tuple)) or len(kind) != 3 or not all(map(_is_length, kind)):
-                raise ValueError(f"items.kinds: got {shown(kind)}, expected (w, d, h) in positive whole cells.")
+                raise ValueError(f"items.kinds: got {excerpt(kind)}, expected (w, d, h) in positive whole cells.")
         if weights is None:
             weights = [1.0] * len(kinds)
         if not isinstance(weights, (list, tuple)) or len(weights) != len(kinds):
-            raise ValueError(f"items.weights={shown(weights)}: expected {len(kinds)} numbers, one for each kind.")
+            raise ValueError(f"items.weights={excerpt(weights)}: expected {len(kinds)} numbers, one for each kind.")
         if not all(is_number(v) and v >= 0 for v in weights) or not is_number(total := sum(weights)) or total <= 0:
-            raise ValueError(f"items.weights={shown(weights)}: expected finite numbers >= 0 that are not all 0.")
+            raise ValueError(f"items.weights={excerpt(weights)}: expected finite numbers >= 0 that are not all 0.")
         used = [i for i, v in enumerate(weights) if v > 0]
         self.sizes = torch.tensor([list(kinds[i]) for i in used], dtype=torch.int64)
         share = torch.tensor([weights[i] for i in used], dtype=torch.float64)
@@ -145,7 +145,7 @@ class Uniform(Kinds):
             pair = isinstance(limits, (list, tuple)) and len(limits) == 2 and all(map(_is_length, limits))
             if not pair or limits[0] > limits[1]:
                 expected = "[least, greatest], whole cells with 1 <= least <= greatest"
-                raise ValueError(f"items.{name}={shown(limits)}: expected {expected}.")
+                raise ValueError(f"items.{name}={excerpt(limits)}: expected {expected}.")
         words = ", ".join(f"items.{name}={[*limits]}" for name, limits in ranges.items())
         _check_count(f"{words}: the ranges have", math.prod(high - low + 1 for low, high in ranges.values()))
         super().__init__(list(product(*(range(low, high + 1) for low, high in ranges.values()))))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pickplace.task.cell import CellSpec
-from pickplace.task.checks import shortened, shown
+from pickplace.task.checks import excerpt, short_text
 from pickplace.task.state import State, bin_depth_from_item, depth_from_heights
 
 
@@ -113,17 +113,17 @@ def check_terms(terms: Mapping[str, Term] | None) -> dict[str, Term]:
     if terms is None:
         return dict(STANDARD_TERMS)
     if not isinstance(terms, Mapping):
-        raise ValueError(f"observation={shown(terms)}: expected terms by their keys.")
+        raise ValueError(f"observation={excerpt(terms)}: expected terms by their keys.")
     for key, term in terms.items():
-        place = f"observation.{shortened(key)}"
+        place = f"observation.{short_text(key)}"
         if not isinstance(term, Term):
-            raise ValueError(f"{place}={shown(term)}: expected a Term, such as pickplace.task.observation.ToteDepth.")
+            raise ValueError(f"{place}={excerpt(term)}: expected a Term, such as pickplace.task.observation.ToteDepth.")
         if not isinstance(key, str) or key in RESERVED or not key.isidentifier():
             raise ValueError(f"{place}: expected another name; taken are {', '.join(RESERVED)}.")
     for key, term in STANDARD_TERMS.items():
         if type(found := terms.get(key)) is not type(term):
             expected = f"{type(term).__name__}, which is always there"
-            raise ValueError(f"observation.{key}={shown(found)}: expected {expected}.")
+            raise ValueError(f"observation.{key}={excerpt(found)}: expected {expected}.")
     return {key: terms[key] for key in (*STANDARD_TERMS, *(key for key in terms if key not in STANDARD_TERMS))}
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from pickplace.evaluation.play import Episodes
 from pickplace.runs.errors import sentence
 from pickplace.runs.registry import build
-from pickplace.task.checks import number, shown, whole_number
+from pickplace.task.checks import excerpt, number, whole_number
 
 
 class Callback:
@@ -99,4 +99,4 @@ def call(callbacks: dict[str, Callback], hook: str, trainer: Any, *arguments: An
         getattr(callback, hook)(trainer, *arguments)
         for key, value in arguments[-1].items() if isinstance(arguments[-1], dict) else ():
             if not isinstance(value, Real):
-                raise ValueError(f"callbacks.{name}: it logs {key}={shown(value)}; expected a number.")
+                raise ValueError(f"callbacks.{name}: it logs {key}={excerpt(value)}; expected a number.")

@@ -17,7 +17,7 @@ from pickplace.runs.checkpoint import CheckpointError
 from pickplace.runs.errors import WorkerDied, missing_extra
 from pickplace.runs.registry import names_at
 from pickplace.runs.resume import STOP_SIGNALS
-from pickplace.task.checks import shown, whole_number
+from pickplace.task.checks import excerpt, whole_number
 
 
 class ResumableCollector(Collector):
@@ -304,9 +304,11 @@ def refuse_other_workers(settings: Mapping, state: object) -> None:
         CheckpointError: naming both numbers.
     """
     saved = sum(str(key).startswith("worker") for key in state) if isinstance(state, dict) else 0
-    if settings["_target_"] in names_at("collector") and settings.get("workers", 0) != saved:
-        workers = shown(settings.get("workers", 0))
-        raise CheckpointError(f"collector.workers={workers}: the checkpoint has {saved} workers; expected as many.")
+    workers = settings.get("workers", saved)
+    if settings["_target_"] in names_at("collector") and workers != saved:
+        raise CheckpointError(
+            f"collector.workers={excerpt(workers)}: the checkpoint has {saved} workers; expected as many."
+        )
 
 
 def _seeds(seed: int, workers: int) -> list[tuple[int, int]]:

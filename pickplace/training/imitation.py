@@ -16,7 +16,7 @@ from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import trusted_config
 from pickplace.runs.registry import accepted_arguments, build, find
 from pickplace.task.cell import CellSpec
-from pickplace.task.checks import shown, whole_number
+from pickplace.task.checks import excerpt, whole_number
 from pickplace.task.items import ItemDistribution
 from pickplace.task.observation import Term
 from pickplace.task.state import State
@@ -66,7 +66,7 @@ class WarmStart:
         if cfg.frames and cfg.teacher is None:
             raise ValueError(f"warm_start.frames={cfg.frames}: there is no teacher; expected warm_start=imitate.")
         if cfg.teacher is not None and not OmegaConf.is_dict(cfg.teacher):
-            given = shown(cfg.teacher)
+            given = excerpt(cfg.teacher)
             raise ValueError(f"warm_start.teacher={given}: expected planner@warm_start.teacher=<planner>.")
         self.policy, self.cell, self.seed = policy, cell, seed
         self.teacher, self.frames, self.critic_frames = cfg.teacher, cfg.frames, cfg.critic_frames

@@ -1,28 +1,31 @@
 """Checks of a training config before anything is built."""
 
+from collections.abc import Collection
 from functools import partial
 
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.evaluation.play import check_episode_settings
+from pickplace.envs.checks import problem_bytes
+from pickplace.envs.torchrl import MASKS, PickPlaceEnv
+from pickplace.evaluation.play import check_episode_settings, check_play
 from pickplace.runs.allowlist import own_modules
-from pickplace.task.checks import flag, number, one_of, shown, whole_number
+from pickplace.task.checks import check_bytes, excerpt, flag, number, one_of, whole_number
 from pickplace.task.items import check_seed
 
 
 def _node(key: str, value) -> None:
     if not OmegaConf.is_dict(value) or "_target_" not in value:
-        raise ValueError(f"{key}={shown(value)}: expected the settings of an object, with its _target_.")
+        raise ValueError(f"{key}={excerpt(value)}: expected the settings of an object, with its _target_.")
 
 
 def _group(key: str, value) -> None:
     if not OmegaConf.is_dict(value):
-        raise ValueError(f"{key}={shown(value)}: expected settings by their names.")
+        raise ValueError(f"{key}={excerpt(value)}: expected settings by their names.")
 
 
 def _text(key: str, value) -> None:
     if not isinstance(value, str) or len(value) > 1_000:
-        raise ValueError(f"{key}={shown(value)}: expected a text of at most 1,000 characters.")
+        raise ValueError(f"{key}={excerpt(value)}: expected a text of at most 1,000 characters.")
 
 
 def _or_null(check):
@@ -32,7 +35,7 @@ def _or_null(check):
 def _only(expected: str, reason: str):
     def check(key: str, value) -> None:
         if value != expected:
-            raise ValueError(f"{key}={shown(value)}: expected {expected}, {reason}.")
+            raise ValueError(f"{key}={excerpt(value)}: expected {expected}, {reason}.")
 
     return check
 
@@ -46,6 +49,7 @@ CHECKS = {
     **dict.fromkeys(("env", "items", "curriculum", "collector", "planner", "logger"), _node),
     **dict.fromkeys(("model", "algo", "evaluation", "warm_start"), _group),
     **dict.fromkeys(("model.actor", "model.critic"), _node),
+    "callbacks": _or_null(_group),
     "warm_start.teacher": _or_null(_node),
     "warm_start.checkpoint": _or_null(_text),
     **dict.fromkeys(("warm_start.frames", "warm_start.critic_frames"), partial(whole_number, least=0)),
@@ -80,3 +84,26 @@ def check_settings(cfg: DictConfig) -> None:
             "algo.normalize_advantage=True: a batch of one frame (env.num_envs x algo.rollout_length) has no variance; "
             "expected more frames, or false."
         )
+
+
+def check_memory(cfg: DictConfig, env: PickPlaceEnv, masks: Collection[str]) -> None:
+    """Refuse batches that would fill the memory.
+
+    A frame holds two observations, masks once, and what the critic computes for it, measured with ``pooled``; in a
+    gradient step some 90 kB more, measured with ``fcn_grasp`` at the paper's cell.
+
+    Args:
+        cfg: the config.
+        env: its environment, with any number of problems and without masks.
+        masks: the policy's.
+
+    Raises:
+        ValueError: naming the keys, their values, and the memory.
+    """
+    cell, slots, steps = env.cell, cfg.env.num_envs, cfg.algo.rollout_length
+    frame = 2 * env.observation_bytes + sum(MASKS[name].size(cell) for name in masks) + 200 * cell.num_places
+    check_bytes(f"env.num_envs={slots}, algo.rollout_length={steps}", slots * steps * frame, env.device)
+    part = min(cfg.algo.minibatch_size, slots * steps)
+    check_bytes(f"algo.minibatch_size={part}", part * 90_000, env.device)
+    check_bytes(f"env.num_envs={slots}", slots * problem_bytes(cell, masks), env.device)
+    check_play(cfg.evaluation, cell, env.device)

@@ -30,15 +30,7 @@ log = logging.getLogger(__name__)
 TABLE, SETTINGS_TABLE, FIGURE = "sweep.csv", "sweep_settings.csv", "sweep.png"
 LARGEST_LEGEND = 40  # settings that the figure and the console name; of more, the best
 RESAMPLES = 9999  # of the bootstrap
-COLOURS = [
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-    "#8c8c8c",
-]  # without Okabe and Ito's yellow
+COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c"]  # Okabe and Ito's, no yellow
 
 
 class SweepSummary(SweepCallback):
@@ -114,7 +106,7 @@ class Setting:
 
     @property
     def finished(self) -> list[SweepRun]:
-        """The runs that finished with a validation."""
+        """The runs that finished, with a validation."""
         return [run for run in self.runs if run.status == "finished" and run.final is not None]
 
     @property
@@ -144,8 +136,7 @@ class Setting:
 
     @property
     def curves(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frames ``[V]`` and validation occupancies ``[V, S]`` of the finished runs; one that ended earlier keeps its
-        last."""
+        """Frames ``[V]`` and validation occupancies ``[V, S]`` of the finished runs; after an end, the last."""
         frames = sorted({int(row["frames"]) for run in self.finished for row in run.validations})
         values = np.full((len(frames), len(self.finished)), np.nan)
         for column, run in enumerate(self.finished):
@@ -174,7 +165,7 @@ def bootstrap95(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return found.low, found.high
 
 
-def settings_of(runs: list[SweepRun]) -> list[Setting]:
+def group_by_setting(runs: list[SweepRun]) -> list[Setting]:
     """Return the settings of a sweep: its runs, grouped by their overrides without the seed."""
     settings: dict[tuple, Setting] = {}
     for run in runs:
@@ -183,7 +174,7 @@ def settings_of(runs: list[SweepRun]) -> list[Setting]:
     return list(settings.values())
 
 
-def ranked(settings: list[Setting]) -> list[Setting]:
+def rank_settings(settings: list[Setting]) -> list[Setting]:
     """Return settings with the best mean first; those without a finished run are last."""
     return sorted(settings, key=lambda setting: -1.0 if setting.mean is None else setting.mean, reverse=True)
 
@@ -199,7 +190,7 @@ def summarize(folder: Path) -> list[Setting]:
         raise FileNotFoundError(f"{folder}: no run in it; expected the folder of a sweep.")
     found.sort(key=lambda path: [part.zfill(9) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)])
     runs = [read_run(path) for path in found]
-    settings = settings_of(runs)
+    settings = group_by_setting(runs)
     keys = list(dict.fromkeys(key for run in runs for key in run.overrides))
     columns = ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "error"]
     rows = []
@@ -217,7 +208,7 @@ def summarize(folder: Path) -> list[Setting]:
     ]
     _write_table(folder / SETTINGS_TABLE, [*keys, *columns], rows)
     draw(settings, folder / FIGURE)
-    for setting in ranked(settings)[:LARGEST_LEGEND]:
+    for setting in rank_settings(settings)[:LARGEST_LEGEND]:
         log.info("%s  %s", result(setting), label(setting, settings))
     log.info("tables and figure of the sweep: %s, %s, %s", folder / SETTINGS_TABLE, folder / TABLE, folder / FIGURE)
     return settings
@@ -257,7 +248,7 @@ def draw(settings: list[Setting], path: Path) -> None:
     from matplotlib import colormaps
     from matplotlib.ticker import EngFormatter
 
-    order = ranked(settings)
+    order = rank_settings(settings)
     figure = figure_of(8, max(4.5, 0.6 + 0.18 * min(len(order), LARGEST_LEGEND)))
     axes = figure.subplots()
     for rank, setting in enumerate(order):

@@ -49,7 +49,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         As :func:`train`.
 
     Raises:
-        KeyboardInterrupt: with the signal, after Ctrl-C or SIGTERM; the checkpoint ``last`` is saved.
+        KeyboardInterrupt: with the number of the signal that asked to stop; the checkpoint ``last`` is saved.
     """
     trainer = Trainer(cfg, run_dir, resume)
     with trainer.running() as stop:

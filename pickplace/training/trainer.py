@@ -14,11 +14,10 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
-from pickplace.envs.checks import problem_bytes
-from pickplace.envs.saved_state import check_saved_state
-from pickplace.envs.torchrl import MASKS, PickPlaceEnv
-from pickplace.evaluation.play import Episodes, check_play, play
-from pickplace.policies.base import Policy, as_collection_policy, as_critic, refuse_large
+from pickplace.envs.saved_state import check_saved_states
+from pickplace.envs.torchrl import PickPlaceEnv
+from pickplace.evaluation.play import Episodes, play
+from pickplace.policies.base import Policy, as_collection_policy, as_critic, refuse_large_network
 from pickplace.runs import checkpoint
 from pickplace.runs.machine import use_machine
 from pickplace.runs.provenance import commit, versions
@@ -32,7 +31,6 @@ from pickplace.runs.resume import (
     load_optimizer,
     stale_best_frames,
 )
-from pickplace.task.checks import check_bytes
 from pickplace.task.files import replaced_file
 from pickplace.training import callbacks
 from pickplace.training.collectors import refuse_other_workers, rng_state, set_rng_state, watch_workers
@@ -41,7 +39,7 @@ from pickplace.training.imitation import Phase, WarmStart
 from pickplace.training.metrics import has_passed, progress_line, validation_metrics
 from pickplace.training.ppo import add_advantages, learning_rate, make_losses, update
 from pickplace.training.report import REPORT, write_report
-from pickplace.training.settings import check_settings
+from pickplace.training.settings import check_memory, check_settings
 from pickplace.views.figures import learning_curve
 
 log = logging.getLogger(__name__)
@@ -110,26 +108,11 @@ class Trainer:
         self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, self.items, self.terms, cfg.seed, cfg.trust)
         make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
         self.critic = self._restored("critic", lambda: as_critic(make_critic()))
-        self._check_batch(probe)
-
-    def _check_batch(self, probe: PickPlaceEnv) -> None:
-        """Refuse a batch that would fill the memory.
-
-        A frame holds two observations, masks once, and what the critic computes for it, measured with ``pooled``; in a
-        gradient step some 90 kB more, measured with ``fcn_grasp`` at the paper's cell.
-        """
-        slots, steps = self.cfg.env.num_envs, self.algo.rollout_length
-        masks = sum(MASKS[name].size(self.cell) for name in self.policy.masks)
-        frame = 2 * probe.observation_bytes + masks + 200 * self.cell.num_places
-        check_bytes(f"env.num_envs={slots}, algo.rollout_length={steps}", slots * steps * frame, self.device)
-        part = min(self.algo.minibatch_size, slots * steps)
-        check_bytes(f"algo.minibatch_size={part}", part * 90_000, self.device)
-        check_bytes(f"env.num_envs={slots}", slots * problem_bytes(self.cell, self.policy.masks), self.device)
-        check_play(self.cfg.evaluation, self.cell, self.device)
+        check_memory(cfg, probe, self.policy.masks)
 
     def _restored(self, key: str, make) -> Any:
         """Make a module, with the checkpoint's weights if the run is resumed."""
-        refuse_large(make, f"model.{'actor' if key == 'policy' else key}")
+        refuse_large_network(make, f"model.{'actor' if key == 'policy' else key}")
         module = checkpoint.restore(make, self.state.get(key, {}), key) if self.resumed else make()
         return module.to(self.device)
 
@@ -196,7 +179,7 @@ class Trainer:
     def running(self) -> Iterator[StopRequest]:
         """Prepare everything for the loop, and close it afterwards, however the loop ends.
 
-        Restores the checkpoint, opens the logger, takes over Ctrl-C and SIGTERM, and watches the workers.
+        Restores the checkpoint, opens the logger, takes over the signals to stop, and watches the workers.
 
         Returns:
             The request to stop, as the value of the ``with`` statement.
@@ -233,10 +216,7 @@ class Trainer:
         with watch_workers(self.collector):
             own = self.collector.state_dict()
             saved = checkpoint.matching_state(self.state.get("collector"), own, "collector")
-            env = self.build_env(num_envs=1, masks=())
-            for part in (saved, *saved.values()):  # of a collector of several workers each has a state
-                if isinstance(part, dict) and "environment" in part:
-                    check_saved_state(env, part["environment"], part["carried"])
+            check_saved_states(self.build_env(num_envs=1, masks=()), saved)
             self.collector.load_state_dict(saved)
             push_level(self.collector, self.curriculum.level)
         # Last: everything above may have drawn.

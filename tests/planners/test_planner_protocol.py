@@ -1,4 +1,4 @@
-"""The planners' protocol: what ``decide`` may return, whoever asks."""
+"""The planners' protocol: what ``decide`` may return is checked in training, evaluation and on the robot."""
 
 import pytest
 import torch

@@ -1,5 +1,6 @@
 """Loggers: metrics survive a killed run, and every backend goes on after a resume."""
 
+import csv
 import sys
 
 import pytest
@@ -56,6 +57,17 @@ def test_a_table_that_is_taken_away_is_written_again(tmp_path, caplog, damage, w
     logger.close()
     assert read_csv(path) == rows
     assert len(caplog.messages) == 1 and str(path) in caplog.text
+
+
+def test_a_disk_that_is_full_for_a_new_column(tmp_path, monkeypatch):
+    logger = CsvLogger(tmp_path)
+    logger.log({"a": 1.0}, 10)
+    with monkeypatch.context() as full:
+        full.setattr(csv.DictWriter, "writeheader", lambda _: (_ for _ in ()).throw(OSError(28, "No space left")))
+        with pytest.raises(OSError, match="No space left.*metrics.csv"):
+            logger.log({"b": 1.0}, 20)
+    logger.close()
+    assert read_csv(tmp_path / "metrics.csv") == [{"frames": 10, "a": 1.0}]
 
 
 @pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])

@@ -71,6 +71,10 @@ class Wrapped:
     def __init__(self, base, factor=1):
         self.base, self.factor = base, factor
 
+    @property
+    def settings(self):
+        return self.factor
+
 
 def open_settings(first=None, **settings):
     return settings

@@ -119,7 +119,7 @@ def test_a_job_of_a_sweep_that_is_started_again_goes_on(run, undisturbed, tmp_pa
     assert_same(whole, job)
 
 
-@pytest.mark.parametrize(("number", "expected"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "expected"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_stopped_training_has_the_exit_code_of_its_signal(run, tmp_path, number, expected):
     with after_batch(1, lambda _: os.kill(os.getpid(), number)):
         code, out, _ = run("train", "experiment=smoke", "threads=1", "hydra.run.dir=run")

@@ -171,12 +171,8 @@ def test_a_metric_that_is_no_number_is_named(smoke, tmp_path):
 
 def test_own_callback(run, monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(str(EXAMPLE))
-    mine = [
-        "--config-dir",
-        str(EXAMPLE),
-        "callbacks=[worst_episode,early_stopping]",
-        "callbacks.worst_episode.occupancy=0",
-    ]
+    mine = ["--config-dir", str(EXAMPLE), "callbacks=[worst_episode,early_stopping]"]
+    mine.append("callbacks.worst_episode.occupancy=0")
     code, out, err = run("train", *mine, "experiment=smoke", "threads=1", "total_frames=4096", "hydra.run.dir=run")
     assert code == 0 and "the worst episode has reached 0 2 times in a row" in out, err
     rows = read_csv(tmp_path / "run" / "metrics.csv")

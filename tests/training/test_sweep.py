@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from pickplace.runs import checkpoint
 from pickplace.runs import hydra_app as config
 from pickplace.runs.composition import constant_keys, folder_name
-from pickplace.training.sweep import label, read_run, settings_of, summarize
+from pickplace.training.sweep import group_by_setting, label, read_run, summarize
 
 SMOKE = ["experiment=smoke", "threads=1"]
 
@@ -86,23 +86,15 @@ def test_settings_are_compared_over_their_seeds(tmp_path, caplog):
 def test_a_curve_is_the_mean_of_runs_that_end_at_different_frames(tmp_path):
     make_run(tmp_path, "0", ["seed=0"], [0.2, 0.4, 0.8], total=300)
     make_run(tmp_path, "1", ["seed=1"], [0.4, 0.6], total=200)  # as after early stopping
-    frames, values = settings_of([read_run(tmp_path / "0"), read_run(tmp_path / "1")])[0].curves
+    frames, values = group_by_setting([read_run(tmp_path / "0"), read_run(tmp_path / "1")])[0].curves
     assert frames.tolist() == [100, 200, 300] and values.mean(1) == pytest.approx([0.3, 0.5, 0.7])
 
 
 def test_a_sweep_over_seeds_ends_in_a_row_for_each_setting(run, tmp_path):
     """And its folders are named by overrides, seed last; started again, it has nothing to do."""
     quick = ["total_frames=128", "evaluation.episodes=4", "logger=none", "env.tote_size=[5,5,1]"]
-    command = [
-        "train",
-        "-m",
-        *SMOKE,
-        *quick,
-        "seed=0,1,2",
-        "curriculum=adaptive",
-        "curriculum/sample=current,recent",
-        "hydra.sweep.dir=sweep",
-    ]
+    sampled = ["curriculum=adaptive", "curriculum/sample=current,recent"]
+    command = ["train", "-m", *SMOKE, *quick, "seed=0,1,2", *sampled, "hydra.sweep.dir=sweep"]
     code, _, err = run(*command)
     assert code == 0, err
     runs, settings = table(tmp_path / "sweep"), table(tmp_path / "sweep", "sweep_settings.csv")

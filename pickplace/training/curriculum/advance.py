@@ -5,8 +5,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pickplace.task.checks import shown
-from pickplace.training.curriculum.checks import fraction, whole_number
+from pickplace.task.checks import excerpt, integral_number, number
 
 TOLERANCE = 1e-6  # occupancies arrive as float32, in which 0.9 is slightly below 0.9
 
@@ -94,7 +93,7 @@ class Frames(Advance):
 
     def __init__(self, frames_per_level: int | None = None):
         if frames_per_level is not None:
-            frames_per_level = whole_number("curriculum.advance.frames_per_level", frames_per_level)
+            frames_per_level = integral_number("curriculum.advance.frames_per_level", frames_per_level)
         self.frames_per_level = frames_per_level
 
     def setup(self, start, end, total_frames):
@@ -127,14 +126,14 @@ class Threshold(Advance):
         max_frames_per_level: int | None = None,
         demote_below: float | None = None,
     ):
-        self.occupancy = fraction("curriculum.advance.occupancy", occupancy)
-        self.window = whole_number("curriculum.advance.window", window)
+        self.occupancy = number("curriculum.advance.occupancy", occupancy, most=1)
+        self.window = integral_number("curriculum.advance.window", window)
         self.max_frames = math.inf
         if max_frames_per_level is not None:
-            self.max_frames = whole_number("curriculum.advance.max_frames_per_level", max_frames_per_level)
+            self.max_frames = integral_number("curriculum.advance.max_frames_per_level", max_frames_per_level)
         self.demote_below = 0.0
         if demote_below is not None:
-            self.demote_below = fraction("curriculum.advance.demote_below", demote_below)
+            self.demote_below = number("curriculum.advance.demote_below", demote_below, most=1)
             if self.demote_below >= self.occupancy:
                 raise ValueError(f"curriculum.advance.demote_below={demote_below}: expected < {occupancy=}.")
 
@@ -163,9 +162,9 @@ class Plateau(Advance):
     state_keys = ("best", "stale", "compared")
 
     def __init__(self, window: int, patience: int, min_improvement: float = 0.01):
-        self.window = whole_number("curriculum.advance.window", window)
-        self.patience = whole_number("curriculum.advance.patience", patience)
-        self.min_improvement = fraction("curriculum.advance.min_improvement", min_improvement)
+        self.window = integral_number("curriculum.advance.window", window)
+        self.patience = integral_number("curriculum.advance.patience", patience)
+        self.min_improvement = number("curriculum.advance.min_improvement", min_improvement, most=1)
 
     def setup(self, start, end, total_frames):
         self._clear()
@@ -203,11 +202,13 @@ class Staged(Advance):
     def __init__(self, stages):
         self.stages, least = [], 0
         if not isinstance(stages, Sequence) or isinstance(stages, str):
-            raise ValueError(f"curriculum.advance.stages={shown(stages)}: expected a list of {{frames: F, height: H}}.")
+            raise ValueError(
+                f"curriculum.advance.stages={excerpt(stages)}: expected a list of {{frames: F, height: H}}."
+            )
         for stage in stages:
             if not isinstance(stage, Mapping) or set(stage) != {"frames", "height"}:
-                raise ValueError(f"curriculum.advance.stages: got {shown(stage)}, expected {{frames: F, height: H}}.")
-            frames = whole_number("curriculum.advance.stages: frames", stage["frames"], least)
+                raise ValueError(f"curriculum.advance.stages: got {excerpt(stage)}, expected {{frames: F, height: H}}.")
+            frames = integral_number("curriculum.advance.stages: frames", stage["frames"], least)
             self.stages.append((frames, stage["height"]))
             least = frames + 1
         if not self.stages:
@@ -216,7 +217,7 @@ class Staged(Advance):
     def setup(self, start, end, total_frames):
         super().setup(start, end, total_frames)
         key = "curriculum.advance.stages: height"
-        self.plan = [(f, end if h is None else whole_number(key, h, start, end)) for f, h in self.stages]
+        self.plan = [(f, end if h is None else integral_number(key, h, start, end)) for f, h in self.stages]
         return self._height_at(0)
 
     def _height_at(self, frames: int) -> int:

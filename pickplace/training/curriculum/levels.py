@@ -6,9 +6,8 @@ from numbers import Integral, Real
 
 from torch import Tensor
 
-from pickplace.task.checks import shown
+from pickplace.task.checks import excerpt, integral_number, is_number, number
 from pickplace.training.curriculum.advance import Advance, Tally
-from pickplace.training.curriculum.checks import fraction, is_finite_number, whole_number
 from pickplace.training.curriculum.transform import ToteHeightCurriculum
 
 
@@ -25,11 +24,11 @@ class Curriculum:
     def __init__(self, advance: Advance, sample, start_height: int | None = None, end_height: int | None = None):
         if not isinstance(advance, Advance):
             raise ValueError(
-                f"curriculum.advance={shown(advance)}: expected a rule, such as curriculum/advance=threshold."
+                f"curriculum.advance={excerpt(advance)}: expected a rule, such as curriculum/advance=threshold."
             )
         if not callable(sample):
             raise ValueError(
-                f"curriculum.sample={shown(sample)}: expected a sampler, such as curriculum/sample=recent."
+                f"curriculum.sample={excerpt(sample)}: expected a sampler, such as curriculum/sample=recent."
             )
         self.advance, self.sample = advance, sample
         self.start_height, self.end_height = start_height, end_height
@@ -46,11 +45,11 @@ class Curriculum:
             ValueError: naming the setting that does not fit these numbers.
         """
         end = max_height if self.end_height is None else self.end_height
-        self.end = whole_number("curriculum.end_height", end, min_height, max_height)
+        self.end = integral_number("curriculum.end_height", end, min_height, max_height)
         self.full_height = max_height
         start = min_height if self.start_height is None else self.start_height
-        self.start = whole_number("curriculum.start_height", start, min_height, self.end)
-        first = self.advance.setup(self.start, self.end, whole_number("total_frames", total_frames))
+        self.start = integral_number("curriculum.start_height", start, min_height, self.end)
+        first = self.advance.setup(self.start, self.end, integral_number("total_frames", total_frames))
         self.tally = Tally(self._clamped(first), deque(maxlen=self.advance.window))
         self._rule_state()  # raises here, not at the first checkpoint
 
@@ -117,12 +116,14 @@ class Curriculum:
         """Return the rule's next level and logs, checked: the rule may be a user's own."""
         answer = self.advance.update(self.tally)
         if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], dict):
-            raise ValueError(f"{self._rule_name}: update returned {shown(answer)}; expected (level, {{name: number}}).")
+            raise ValueError(
+                f"{self._rule_name}: update returned {excerpt(answer)}; expected (level, {{name: number}})."
+            )
         level, logs = self._clamped(answer[0]), {**answer[1]}
         self._rule_state()
         for name, value in logs.items():
             if not isinstance(value, Real):
-                raise ValueError(f"{self._rule_name}: it logs {name}={shown(value)}; expected a number.")
+                raise ValueError(f"{self._rule_name}: it logs {name}={excerpt(value)}; expected a number.")
         return level, logs
 
     @property
@@ -132,16 +133,16 @@ class Curriculum:
     def _clamped(self, level) -> int:
         """Return a rule's level, limited to the first and the last height."""
         if isinstance(level, bool) or not isinstance(level, Integral):
-            raise ValueError(f"{self._rule_name}: its level is {shown(level)}; expected a whole number.")
+            raise ValueError(f"{self._rule_name}: its level is {excerpt(level)}; expected a whole number.")
         return min(max(int(level), self.start), self.end)
 
     def _rule_state(self) -> dict:
         """Return the rule's own state; raise if a checkpoint could not store it."""
         state = {key: getattr(self.advance, key, None) for key in self.advance.state_keys}
         for name, value in state.items():
-            if not is_finite_number(value):
+            if not isinstance(value, (int, float)) or not is_number(value):  # JSON stores these exactly
                 raise ValueError(
-                    f"{self._rule_name}: its state has {name}={shown(value)}; expected a finite Python number."
+                    f"{self._rule_name}: its state has {name}={excerpt(value)}; expected a finite Python number."
                 )
         return state
 
@@ -158,7 +159,7 @@ class Curriculum:
         rule = state.get("advance") if isinstance(state, dict) else None
         if not isinstance(rule, dict) or set(state) != {*vars(self.tally), "advance"}:
             raise ValueError(
-                f"The checkpoint's curriculum is {shown(state)}; expected the state that a training saved."
+                f"The checkpoint's curriculum is {excerpt(state)}; expected the state that a training saved."
             )
         if set(rule) != set(self.advance.state_keys):
             raise ValueError(
@@ -166,14 +167,14 @@ class Curriculum:
                 f"{sorted(rule)}, expected {sorted(self.advance.state_keys)}; resume with the run's own rule."
             )
         key = "curriculum {} of the checkpoint".format
-        level = whole_number(key("level"), state["level"], self.start, self.end)
-        frames = whole_number(key("frames"), state["frames"], 0)
-        counts = {name: whole_number(key(name), state[name], 0, frames) for name in ("level_start", "episodes")}
+        level = integral_number(key("level"), state["level"], self.start, self.end)
+        frames = integral_number(key("frames"), state["frames"], 0)
+        counts = {name: integral_number(key(name), state[name], 0, frames) for name in ("level_start", "episodes")}
         if not isinstance(state["window"], list):
-            raise ValueError(f"{key('window')}={shown(state['window'])}: expected a list of numbers between 0 and 1.")
-        window = deque((fraction(key("window"), value) for value in state["window"]), self.advance.window)
+            raise ValueError(f"{key('window')}={excerpt(state['window'])}: expected a list of numbers between 0 and 1.")
+        window = deque((number(key("window"), value, most=1) for value in state["window"]), self.advance.window)
         for name, value in rule.items():
-            if not is_finite_number(value):
-                raise ValueError(f"{key(name)}={value!r}: expected a number.")
+            if not is_number(value):
+                raise ValueError(f"{key(name)}={excerpt(value)}: expected a number.")
         self.tally = Tally(level, window, frames, **counts)
         vars(self.advance).update(rule)

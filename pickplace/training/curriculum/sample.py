@@ -6,7 +6,7 @@ A sampler is called as ``sampler(level, min_height, count)`` and returns heights
 import torch
 from torch import Tensor
 
-from pickplace.training.curriculum.checks import fraction
+from pickplace.task.checks import number
 
 
 class Current:
@@ -33,7 +33,7 @@ class Recent:
     """
 
     def __init__(self, share: float = 0.25):
-        self.share = fraction("curriculum.sample.share", share)
+        self.share = number("curriculum.sample.share", share, most=1)
 
     def __call__(self, level: int, min_height: int, count: int) -> Tensor:
         """Return heights for ``count`` episodes, int64 ``[count]``."""

@@ -5,8 +5,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-from pickplace.task.checks import shown
-from pickplace.training.curriculum.checks import whole_number
+from pickplace.task.checks import excerpt, integral_number
 
 
 class ToteHeightCurriculum(Transform):
@@ -22,14 +21,14 @@ class ToteHeightCurriculum(Transform):
 
     def __init__(self, level: int, sampler, min_height: int):
         super().__init__()
-        self.sampler, self.min_height = sampler, whole_number("min_height", min_height)
+        self.sampler, self.min_height = sampler, integral_number("min_height", min_height)
         # A buffer, so that it is in state_dict() and follows the environment to its device.
         self.register_buffer("level", torch.tensor(0, dtype=torch.int64))
         self.set_level(level)
 
     def set_level(self, level: int) -> None:
         """Draw the heights of later episodes at this level."""
-        self.level.fill_(whole_number("level", level, self.min_height))
+        self.level.fill_(integral_number("level", level, self.min_height))
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         if tensordict is None:  # a plain env.reset()
@@ -38,7 +37,7 @@ class ToteHeightCurriculum(Transform):
         height = self.sampler(int(self.level), self.min_height, count)
         if not isinstance(height, Tensor) or height.numel() != count or height.is_floating_point():
             raise ValueError(
-                f"curriculum.sample: {type(self.sampler).__name__} returned {shown(height)}; "
+                f"curriculum.sample: {type(self.sampler).__name__} returned {excerpt(height)}; "
                 f"expected heights, whole numbers in a tensor [{count}]."
             )
         height = height.to(self.level.device).reshape(*tensordict.batch_size, 1)
