@@ -169,6 +169,8 @@ def pick_one(candidates: Tensor) -> Tensor:
 def refuse_large_network(make: Callable[[], torch.nn.Module], key: str) -> None:
     """Refuse a network with more parameters than :data:`MAX_PARAMETERS`, before memory is allocated.
 
+    A network whose constructor needs the values of tensors is not counted.
+
     Args:
         make: makes the network.
         key: its place in the config.
@@ -176,8 +178,11 @@ def refuse_large_network(make: Callable[[], torch.nn.Module], key: str) -> None:
     Raises:
         ValueError: naming the key and the number; and what ``make`` raises.
     """
-    with torch.device("meta"):
-        network = make()
+    try:
+        with torch.device("meta"):
+            network = make()
+    except (NotImplementedError, RuntimeError):
+        return
     count = sum(parameter.numel() for parameter in network.parameters())
     if count > MAX_PARAMETERS:
         raise ValueError(f"{key}: the network has {count:,} parameters; expected at most {MAX_PARAMETERS:,}.")

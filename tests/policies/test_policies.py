@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.base import as_actor, as_collection_policy
+from pickplace.policies.base import as_actor, as_collection_policy, refuse_large_network
 from pickplace.policies.fcn4d import ActionPolicy, TypicalPolicy
 from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy
 from pickplace.policies.individual import IndividualFootprintPolicy, IndividualGraspPolicy, IndividualRlPolicy
@@ -168,3 +168,16 @@ def test_the_papers_conditions_on_sizes():
     assert len(small(GraspPolicy, low).check_sizes()) == 1
     with pytest.raises(ValueError, match=sentence):  # fcn4d cannot learn then
         small(ActionPolicy, low).check_sizes()
+
+
+class NeedsValues(torch.nn.Linear):
+    """A layer whose constructor reads the value of a tensor."""
+
+    def __init__(self):
+        super().__init__(2, 1 + int(torch.ones(1).item()))
+
+
+def test_only_networks_that_can_be_made_without_values_are_counted():
+    refuse_large_network(NeedsValues, "model.actor")
+    with pytest.raises(ValueError, match=r"model.actor: the network has 200,010,000 parameters; expected at most"):
+        refuse_large_network(lambda: torch.nn.Linear(20_000, 10_000), "model.actor")
