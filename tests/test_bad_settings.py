@@ -152,6 +152,14 @@ LARGE = [
     ("model=fcn4d model.actor.filters=100000", "model.actor.filters=100000"),
     ("model=fcn4d env.tote_size=[64,64,5] model.critic.hidden=1024", "model.critic: the network has .* parameters"),
     ("model=typical env.tote_size=[30,30,5]", "model.actor: the network has .* parameters"),
+    (
+        "model=fcn4d env.bin_size=[30,30,1] env.tote_size=[30,30,2] algo.minibatch_size=64",
+        "algo.minibatch_size=64: .* GB",
+    ),
+    (
+        "model=fcn4d env.bin_size=[30,30,1] env.tote_size=[30,30,2] algo.minibatch_size=1 algo.mask_infeasible=false",
+        "env.num_envs=256: .* GB",
+    ),
     ("collector=multi_sync collector.workers=128", "collector.workers=128: .*<= 64"),
     ("algo.max_grad_norm=0", "algo.max_grad_norm=0"),
     ("algo.reward_scale=0", "algo.reward_scale=0"),

@@ -1,5 +1,7 @@
 """The paper's policy over all flat actions, and the "typical" network that it is compared with."""
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -21,6 +23,7 @@ class ActionPolicy(Policy):
 
     choice_key = "action"
     needs_sizes = True
+    network: Conv4dPolicy
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
         super().__init__(cell, masks=("action",) if mask_infeasible else ())
@@ -37,6 +40,16 @@ class ActionPolicy(Policy):
         needed = self.network(bin_depth[row], tote_depth[row], pick).unflatten(1, (-1, 4))[..., :rotations].flatten(1)
         logits = needed.new_full(by_pick.shape, MASKED).index_put((row, pick), needed)
         return torch.where(mask, logits.flatten(1), MASKED)
+
+    @property
+    def learning_bytes(self) -> int:
+        """About how many bytes a frame takes in a gradient step, measured at bins and totes of 5x5 to 12x12."""
+        sides = (*self.cell.bin_size[:2], *self.cell.tote_size[:2])
+        return 8 * self.network.filters * math.prod(side + 2 for side in sides) + self.acting_bytes
+
+    @property
+    def acting_bytes(self) -> int:
+        return 40 * self.cell.num_actions
 
     def logits(self, observation: Observation) -> Tensor:
         return self.scores(observation, observation["action_mask"] if self.masks else None)

@@ -1,6 +1,5 @@
 """Checks of a training config before anything is built."""
 
-from collections.abc import Collection
 from functools import partial
 
 from omegaconf import DictConfig, OmegaConf
@@ -8,6 +7,7 @@ from omegaconf import DictConfig, OmegaConf
 from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
 from pickplace.evaluation.play import check_episode_settings, check_play
+from pickplace.policies.base import Policy
 from pickplace.runs.allowlist import own_modules
 from pickplace.task.checks import check_bytes, excerpt, flag, number, one_of, whole_number
 from pickplace.task.items import check_seed
@@ -86,24 +86,24 @@ def check_settings(cfg: DictConfig) -> None:
         )
 
 
-def check_memory(cfg: DictConfig, env: PickPlaceEnv, masks: Collection[str]) -> None:
+def check_memory(cfg: DictConfig, env: PickPlaceEnv, policy: Policy) -> None:
     """Refuse batches that would fill the memory.
 
-    A frame holds two observations, masks once, and what the critic computes for it, measured with ``pooled``; in a
-    gradient step some 90 kB more, measured with ``fcn_grasp`` at the paper's cell.
+    A frame holds two observations, masks once, and what the critic computes for it, measured with ``pooled``.
 
     Args:
         cfg: the config.
         env: its environment, with any number of problems and without masks.
-        masks: the policy's.
+        policy: the policy that is trained.
 
     Raises:
         ValueError: naming the keys, their values, and the memory.
     """
-    cell, slots, steps = env.cell, cfg.env.num_envs, cfg.algo.rollout_length
+    cell, masks, slots, steps = env.cell, policy.masks, cfg.env.num_envs, cfg.algo.rollout_length
     frame = 2 * env.observation_bytes + sum(MASKS[name].size(cell) for name in masks) + 200 * cell.num_places
     check_bytes(f"env.num_envs={slots}, algo.rollout_length={steps}", slots * steps * frame, env.device)
     part = min(cfg.algo.minibatch_size, slots * steps)
-    check_bytes(f"algo.minibatch_size={part}", part * 90_000, env.device)
-    check_bytes(f"env.num_envs={slots}", slots * problem_bytes(cell, masks), env.device)
+    check_bytes(f"algo.minibatch_size={part}", part * policy.learning_bytes, env.device)
+    problem = max(problem_bytes(cell, masks), policy.acting_bytes)
+    check_bytes(f"env.num_envs={slots}", slots * problem, env.device)
     check_play(cfg.evaluation, cell, env.device)

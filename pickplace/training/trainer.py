@@ -108,7 +108,7 @@ class Trainer:
         self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, self.items, self.terms, cfg.seed, cfg.trust)
         make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
         self.critic = self._restored("critic", lambda: as_critic(make_critic()))
-        check_memory(cfg, probe, self.policy.masks)
+        check_memory(cfg, probe, self.policy)
 
     def _restored(self, key: str, make) -> Any:
         """Make a module, with the checkpoint's weights if the run is resumed."""
