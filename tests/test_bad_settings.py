@@ -124,6 +124,8 @@ def test_every_argument_of_the_environment(key, value):
     check_sentence(caught.value, key)
 
 
+LARGE_FCN4D = "model=fcn4d algo.mask_infeasible=false env.bin_size=[30,30,1] env.tote_size=[30,30,2]"
+
 #: Settings each of which is possible, but not together, or that would fill the memory; and words of the refusal.
 LARGE = [
     ("env.bin_size=[3000,3000,1]", "bin_size=.*<= 2,000"),
@@ -152,14 +154,8 @@ LARGE = [
     ("model=fcn4d model.actor.filters=100000", "model.actor.filters=100000"),
     ("model=fcn4d env.tote_size=[64,64,5] model.critic.hidden=1024", "model.critic: the network has .* parameters"),
     ("model=typical env.tote_size=[30,30,5]", "model.actor: the network has .* parameters"),
-    (
-        "model=fcn4d env.bin_size=[30,30,1] env.tote_size=[30,30,2] algo.minibatch_size=64",
-        "algo.minibatch_size=64: .* GB",
-    ),
-    (
-        "model=fcn4d env.bin_size=[30,30,1] env.tote_size=[30,30,2] algo.minibatch_size=1 algo.mask_infeasible=false",
-        "env.num_envs=256: .* GB",
-    ),
+    (f"{LARGE_FCN4D} env.num_envs=4 algo.minibatch_size=16", "algo.minibatch_size=16: .* GB"),
+    (f"{LARGE_FCN4D} algo.minibatch_size=1", "env.num_envs=256: .* GB"),
     ("collector=multi_sync collector.workers=128", "collector.workers=128: .*<= 64"),
     ("algo.max_grad_norm=0", "algo.max_grad_norm=0"),
     ("algo.reward_scale=0", "algo.reward_scale=0"),
