@@ -147,8 +147,9 @@ def test_a_long_path_is_shortened(run, key, value):
         ("compare=/proc/kmsg", "/proc/kmsg: 0 bytes"),
         ("compare=digits.json", "expected an evaluation.json (Exceeds the limit (4300 digits) for integer string "
          "conversion: value has 10000 digits)."),
-        ("hydra.run.dir=/proc/x", "/proc/x: No such file or directory; expected a path that exists or can be made."),
-        ("hydra.run.dir=digits.json/x", "digits.json/x: Not a directory; expected a path"),
+        ("hydra.run.dir=/proc/x", "/proc/x: No such file or directory; expected another path."),
+        ("hydra.run.dir=digits.json", "digits.json: File exists; expected another path"),
+        ("hydra.run.dir=digits.json/x", "digits.json/x: Not a directory; expected another path"),
     ],
 )  # fmt: skip
 def test_a_path_that_cannot_be_used_is_named_with_the_reason(run, tmp_path, words, expected):

@@ -110,7 +110,7 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"{error.filename}: {error.strerror}; expected free space."
     if isinstance(error, OSError) and error.filename and error.strerror:
-        return f"{error.filename}: {error.strerror}; expected a path that exists or can be made."
+        return f"{error.filename}: {error.strerror}; expected another path."
     if isinstance(error, EXPECTED):
         noise = ("full_key", "object_type", "See https", "To append", "Config search path", "provider=")
         lines = [line.strip() for line in str(error).splitlines()]

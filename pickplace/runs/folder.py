@@ -36,10 +36,8 @@ def claim(run_dir: Path):
         OccupiedError: if another process holds it.
         ValueError: if its lock is a link.
     """
-    path = Path(run_dir) / LOCK
-    if os.path.lexists(path):
-        _refuse_link(path)
-    lock = FileLock(path)
+    _refuse_link(Path(run_dir) / LOCK)
+    lock = FileLock(Path(run_dir) / LOCK)
     try:
         lock.acquire(timeout=0)
     except Timeout:
@@ -119,7 +117,10 @@ def refuse_links(run_dir: Path) -> None:
 
 
 def _refuse_link(path: Path) -> None:
-    found = path.lstat()
+    try:
+        found = path.lstat()
+    except FileNotFoundError:  # or removed, by the process that works there
+        return
     if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
         raise ValueError(f"{path}: a link or no regular file; expected only files and folders in a run.")
     if stat.S_ISREG(found.st_mode) and found.st_nlink > 1:

@@ -150,9 +150,9 @@ def _refusal():
     """Turn an error about a folder into a refusal of the run, or sweep, that would begin there."""
     try:
         yield
-    except ValueError as error:
+    except (OSError, ValueError) as error:
         HydraConfig.instance().cfg = None  # nothing in that folder is ours
-        raise _Refusal(str(error)) from None
+        raise _Refusal(sentence(error)) from None
 
 
 class FreshFolder(Callback):

@@ -241,9 +241,8 @@ def _write_table(path: Path, columns: list[str], rows: list[list]) -> None:
 def label(setting: Setting, settings: list[Setting]) -> str:
     """Label of a setting: the overrides in which the settings differ, and its runs that did not finish."""
     differing = [key for key in setting.overrides if len({other.overrides.get(key) for other in settings}) > 1]
-    words = [f"{key}={setting.overrides[key]}" for key in differing] or [
-        "all runs" if len(settings) == 1 else "defaults"
-    ]
+    words = [f"{key}={setting.overrides[key]}" for key in differing]
+    words = words or ["all runs" if len(settings) == 1 else "defaults"]
     open_ends = [run.status for run in setting.runs if run.status != "finished"]
     counts = [f"{open_ends.count(status)} {status}" for status in dict.fromkeys(open_ends)]
     return ", ".join(words) + (f" ({', '.join(counts)})" if counts else "")
