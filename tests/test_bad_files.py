@@ -22,7 +22,7 @@ from pickplace.evaluation.evaluate import episode_settings, read_comparison
 from pickplace.robot import json_lines
 from pickplace.runs import checkpoint
 from pickplace.runs.errors import one_sentence
-from pickplace.runs.folder import changed_values, noted_config_folders, noted_overrides, refuse_links
+from pickplace.runs.folder import changed_values, is_claimed, noted_config_folders, noted_overrides, refuse_links
 from pickplace.runs.resume import StopRequest, load_optimizer
 from pickplace.task.files import read_file, replaced_file
 from pickplace.task.items import Recorded
@@ -130,6 +130,42 @@ def test_a_comparison_is_checked_before_playing(run, tmp_path, monkeypatch, chan
     assert code == 2 and words in err and len(err) < 1000
 
 
+@pytest.mark.parametrize("key", ["compare", "checkpoint", "items.path"])
+@pytest.mark.parametrize("value", ["x" * 5000, "x/" * 2500], ids=["name", "path"])
+def test_a_long_path_is_shortened(run, key, value):
+    items = ["items=recorded"] if key == "items.path" else []
+    code, _, err = run("evaluate", "planner=joint_dbl", *items, f"{key}={value}")
+    assert code == 2 and err.startswith("error: ") and len(err) < 500
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("items=recorded items.path=/dev/zero", "/dev/zero: a folder, link, pipe or device; expected a regular file"),
+        ("items=recorded items.path=.", ".: a folder, link, pipe or device"),
+        ("items=recorded items.path=/proc/kmsg", "/proc/kmsg: 0 bytes; expected a file with content"),
+        ("compare=/proc/kmsg", "/proc/kmsg: 0 bytes"),
+        ("compare=digits.json", "expected an evaluation.json (Exceeds the limit (4300 digits) for integer string "
+         "conversion: value has 10000 digits)."),
+        ("hydra.run.dir=/proc/x", "/proc/x: No such file or directory; expected another path."),
+        ("hydra.run.dir=digits.json", "digits.json: File exists; expected another path"),
+        ("hydra.run.dir=digits.json/x", "digits.json/x: Not a directory; expected another path"),
+    ],
+)  # fmt: skip
+def test_a_path_that_cannot_be_used_is_named_with_the_reason(run, tmp_path, words, expected):
+    (tmp_path / "digits.json").write_text("9" * 10_000)
+    code, _, err = run("evaluate", "planner=joint_dbl", *words.split())
+    assert code == 2 and expected in err and err.count("\n") == 1
+
+
+def test_an_echoed_value_of_a_checkpoint_is_shortened(tmp_path):
+    (tmp_path / "state.json").write_text(json.dumps({"schema": [1] * 10**5}))
+    (tmp_path / "state.safetensors").touch()
+    with pytest.raises(checkpoint.CheckpointError, match="schema .1, 1") as error:
+        checkpoint.read(tmp_path)
+    assert len(str(error.value)) < 300
+
+
 def files(folder):
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
@@ -145,6 +181,26 @@ def test_an_evaluation_overwrites_no_other_run(run, smoke_run, tmp_path):
         assert files(folder) == before
     code, _, err = run("evaluate", "-m", *words, f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=one")
     assert code == 2 and "there is an evaluation already" in err
+    (trained / "evaluation").mkdir()
+    assert run(*evaluation, f"hydra.run.dir={trained}/evaluation")[0] == 0
+
+
+@pytest.mark.parametrize("part", ["checkpoints", "checkpoints/best", "checkpoints/new", ".hydra", ".hydra/new", "."])
+def test_a_part_of_a_run_is_no_run_folder(run, smoke_run, tmp_path, part):
+    run_dir = shutil.copytree(smoke_run, tmp_path / "run")
+    (run_dir / ".hydra").mkdir(exist_ok=True)
+    (run_dir / ".hydra" / "hydra.yaml").touch()
+    words = "a part of another run"
+    if part == ".":  # the checkpoints were deleted to save space
+        shutil.rmtree(run_dir / "checkpoints")
+        words = "there is a report of a training already"
+    before = files(run_dir)
+    for command in (["evaluate", *SHORT], ["train", "experiment=smoke"]):
+        code, _, err = run(*command, f"hydra.run.dir={run_dir / part}")
+        assert code == 2 and f"{run_dir / part}: {words}" in err
+    code, _, err = run("train", "-m", "experiment=smoke", f"hydra.sweep.dir={run_dir}", f"hydra.sweep.subdir={part}")
+    assert code == 2 and words in err and before.keys() <= files(run_dir).keys()
+    assert not (run_dir / part / "metrics.csv").exists() or part == "."
 
 
 @pytest.mark.parametrize("name", ["train.log", "metrics.csv", ".lock", "checkpoints/note", ".hydra/config.yaml"])
@@ -165,6 +221,56 @@ def test_a_run_folder_with_links_is_not_resumed(tmp_path, name, make_link, words
     make_link(run_dir / name, other)
     with pytest.raises(ValueError, match=f"{run_dir / name}: {words}"):
         refuse_links(run_dir)
+
+
+@pytest.mark.parametrize(
+    ("make_link", "words"),
+    [
+        (lambda path, other: os.link(other, path), "a hard link"),
+        (lambda path, other: path.symlink_to(other), "a link or no regular file"),
+        (lambda path, other: path.symlink_to(path), "a link or no regular file"),
+    ],
+    ids=["hard", "symbolic", "to itself"],
+)
+@pytest.mark.parametrize(
+    "flags", [["hydra.run.dir=runs/one"], ["-m", "hydra.sweep.dir=runs", "hydra.sweep.subdir=one"]]
+)
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+def test_a_new_run_writes_through_no_link(run, tmp_path, command, flags, make_link, words):
+    """In a folder prepared by others, which may be reached by a link of the user's."""
+    (tmp_path / "disk" / "one" / ".hydra").mkdir(parents=True)
+    (tmp_path / "runs").symlink_to("disk")
+    other = tmp_path / "mine.txt"
+    other.write_text("mine")
+    settings = ["experiment=smoke"] if command == "train" else SHORT
+    for name in (f"{command}.log", ".hydra/config.yaml", ".lock"):
+        path = tmp_path / "disk" / "one" / name
+        make_link(path, other)
+        before = sorted(tmp_path.rglob("*"))
+        code, _, err = run(command, *flags, *settings)
+        assert code == 2 and err.startswith(f"error: runs/one/{name}: {words}") and err.count("\n") == 1
+        assert other.read_text() == "mine" and sorted(tmp_path.rglob("*")) == before
+        path.unlink()
+    assert command == "train" or run(command, *flags, *settings)[0] == 0
+
+
+def test_a_job_writes_through_no_link(run, tmp_path):
+    """Also below a folder of the sweep, where it is seen when the job begins."""
+    other, folder = tmp_path / "mine.txt", tmp_path / "runs" / "a" / "b"
+    other.write_text("mine")
+    folder.mkdir(parents=True)
+    for name in ("metrics.csv", "failure.txt"):
+        (folder / name).symlink_to(other)
+    code, _, err = run("train", "-m", "experiment=smoke", "hydra.sweep.dir=runs", "hydra.sweep.subdir=a/b")
+    assert code == 2 and "a link or no regular file" in err and other.read_text() == "mine"
+
+
+def test_a_lock_that_is_a_link_is_not_opened(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    os.link(tmp_path / "mine.txt", tmp_path / ".lock")
+    with pytest.raises(ValueError, match=".lock: a hard link"):
+        is_claimed(tmp_path)
+    assert (tmp_path / "mine.txt").read_text() == "mine"
 
 
 def test_a_replaced_file_is_whole_or_as_it_was(tmp_path):
@@ -269,6 +375,7 @@ def plan(monkeypatch, capsys):
 
 @pytest.mark.parametrize("flag", [
     "--tolerance=0.7", "--cell-size=-1", "--cell-size=nan", "--alternatives=-1", "--tote-height=1e9",
+    f"--alternatives={10**20}",
     "--tote-height=2.5", "--candidates=0", "--rotations=5", "--threads=-1",
 ])  # fmt: skip
 def test_impossible_flags_are_refused_before_the_first_line(plan, monkeypatch, flag):

@@ -205,9 +205,9 @@ def read_comparison(path: Path, expected: dict) -> dict:
     Raises:
         ValueError: for a file that cannot be read, or that is about other episodes.
     """
-    refused = f"compare={str(path)!r}: expected an evaluation.json"
+    refused = f"compare={excerpt(str(path))}: expected an evaluation.json"
     try:
-        other = json.loads(read_file(path, MAX_EVALUATION))
+        other = json.loads(read_file(path, MAX_EVALUATION, empty=False))
         cell, values, name = dict(other["env"]), other["occupancy"]["per_episode"], other.get("planner")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{refused} ({error}).") from error
@@ -218,11 +218,11 @@ def read_comparison(path: Path, expected: dict) -> dict:
             ours, theirs = ({k: v for k, v in items.items() if k != ignored} for items in (ours, theirs))
         if ours != theirs:
             found = excerpt(other.get(key))
-            raise ValueError(f"compare={str(path)!r}: its {key} is {found}, expected {excerpt(expected[key])}.")
+            raise ValueError(f"compare={excerpt(str(path))}: its {key} is {found}, expected {excerpt(expected[key])}.")
     for key in CELL_SETTINGS:
         if expected["env"][key] != cell.get(key):
             found = excerpt(cell.get(key))
-            raise ValueError(f"compare={str(path)!r}: env.{key}={found}, expected {expected['env'][key]}.")
+            raise ValueError(f"compare={excerpt(str(path))}: env.{key}={found}, expected {expected['env'][key]}.")
     count = expected["episodes"]
     if not isinstance(values, list) or len(values) != count or not all(is_number(v) and 0 <= v <= 1 for v in values):
         raise ValueError(f"{refused} whose occupancy.per_episode is a list of {count} numbers between 0 and 1.")

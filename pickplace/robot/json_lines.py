@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from pickplace.runs.errors import one_sentence, write_output
+from pickplace.runs.errors import one_sentence, sentence, write_output
 from pickplace.task.files import read_file
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ def answer(planner: "Planner", line: bytes, defaults: dict, print_latency: bool 
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         return {**reply, "error": f"the line is not JSON: {error}."}
     except ValueError as error:
-        return {**reply, "error": " ".join(str(error).split())}
+        return {**reply, "error": sentence(error)}
 
 
 def finite_float(text: str) -> float:
@@ -161,9 +161,13 @@ def read_map(path: str) -> np.ndarray:
         ValueError: naming the file.
     """
     try:
-        values = np.load(io.BytesIO(read_file(path, MAX_MAP)), allow_pickle=False)
+        content = read_file(path, MAX_MAP, empty=False)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: cannot be read ({error}).") from error
+    try:
+        values = np.load(io.BytesIO(content), allow_pickle=False)
     except Exception as error:  # of any type: numpy evaluates the header
-        raise ValueError(f"{path}: cannot be read as a .npy file ({error}).") from error
+        raise ValueError(f"{path}: cannot be read; expected a .npy file with one array of numbers.") from error
     if not isinstance(values, np.ndarray):
         raise ValueError(f"{path}: expected a .npy file with one array, got an archive.")
     return values

@@ -27,6 +27,8 @@ from pickplace.task.observation import Term, check_terms, observe
 from pickplace.task.state import Failure, State
 from pickplace.task.transition import Step, apply
 
+MAX_ALTERNATIVES = 100_000  # greatest number of choices that a plan may report
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -171,8 +173,9 @@ class Planner:
             DepthMapError: naming the argument that is out of range.
         """
         lengths = Lengths(self.cell, cell_size, tolerance)
-        if not is_whole(alternatives) or alternatives < 0:
-            raise DepthMapError(f"alternatives={excerpt(alternatives)}: expected a whole number >= 0.")
+        if not is_whole(alternatives) or not 0 <= alternatives <= MAX_ALTERNATIVES:
+            expected = f"expected a whole number >= 0 and <= {MAX_ALTERNATIVES:,}."
+            raise DepthMapError(f"alternatives={excerpt(alternatives)}: {expected}")
         return lengths, self.cell.tote_size[2] if tote_height is None else lengths.units_of_tote_height(tote_height)
 
     def _read_state(self, bin_depth, tote_depth, height: int, lengths: Lengths) -> State:

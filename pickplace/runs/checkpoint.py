@@ -19,6 +19,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
+from pickplace.task.checks import excerpt
 from pickplace.task.files import read_file
 
 SCHEMA = 1
@@ -233,7 +234,7 @@ def _read_files(folder: Path) -> tuple[dict, bytes]:
         raise CheckpointError(f"{folder}: the checkpoint cannot be read ({error}).") from error
     if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
         found = facts.get("schema") if isinstance(facts, dict) else None
-        raise CheckpointError(f"{folder}: schema {found!r}, expected {SCHEMA}; another version wrote it.")
+        raise CheckpointError(f"{folder}: schema {excerpt(found)}, expected {SCHEMA}; another version wrote it.")
     if hashlib.sha256(blob).hexdigest() != facts.get("sha256"):
         raise CheckpointError(f"{folder}: {TENSORS} is truncated or altered, its checksum does not match {FACTS}.")
     return facts, blob

@@ -3,6 +3,7 @@
 import argparse
 import errno
 import os
+import re
 import signal
 import sys
 from contextlib import contextmanager, suppress
@@ -31,8 +32,8 @@ class UsageError(ValueError):
 #: Errors caused by the user or the machine. Any other may be a fault of the program, and its type is printed too.
 EXPECTED = (ValueError, OSError, FloatingPointError, JobFailed, WorkerDied, HydraException, OmegaConfBaseException)
 
-#: Greatest length of an error that is shown; the middle of a longer one is left out.
-MAX_LENGTH = 1_000
+#: Greatest length of an error that is shown, and of a word in it; the middle of a longer one is left out.
+MAX_LENGTH, MAX_WORD = 1_000, 300
 
 #: Config files of Hydra plugins, and the optional extras that bring them.
 EXTRAS = {"hydra/sweeper/optuna": "optuna", "hydra/launcher/joblib": "joblib", "hydra/launcher/submitit": "submitit"}
@@ -88,6 +89,8 @@ def write_output(text: str = "") -> None:
 def sentence(error: Exception) -> str:
     """Return an error as one line of at most :data:`MAX_LENGTH` letters, without those that control a terminal."""
     text = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in _sentence(error))
+    text = re.sub(r"; use sys\.set_int_max_str_digits\(\) to increase the limit", "", text)
+    text = re.sub(rf"\S{{{MAX_WORD},}}", lambda word: f"{word[0][:80]}...{word[0][-30:]}", text)
     half = MAX_LENGTH // 2
     return text if len(text) <= MAX_LENGTH else f"{text[: half - 3]} ... {text[2 - half :]}"
 
@@ -106,6 +109,8 @@ def _sentence(error: Exception) -> str:
         return f"{error.filename}: {error.strerror}; expected a place where you may read and write."
     if isinstance(error, OSError) and error.filename and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"{error.filename}: {error.strerror}; expected free space."
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}; expected another path."
     if isinstance(error, EXPECTED):
         noise = ("full_key", "object_type", "See https", "To append", "Config search path", "provider=")
         lines = [line.strip() for line in str(error).splitlines()]

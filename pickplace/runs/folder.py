@@ -3,6 +3,7 @@
 import logging
 import os
 import shutil
+import stat
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from pickplace.task.files import read_file
 LOCK = ".lock"  # held by the process that trains in the folder
 FAILURE = "failure.txt"  # the error of a failed run of a sweep
 EVALUATION = "evaluation.json"  # the result of an evaluation
+REPORT = "report.html"  # the report of a finished training
+CHECKPOINTS = ("best", "last", "previous")  # names of the folders in checkpoints/
 MAX_NOTE = 2**20  # greatest size of a note of Hydra's, in bytes
 
 
@@ -31,7 +34,9 @@ def claim(run_dir: Path):
 
     Raises:
         OccupiedError: if another process holds it.
+        ValueError: if its lock is a link.
     """
+    _refuse_link(Path(run_dir) / LOCK)
     lock = FileLock(Path(run_dir) / LOCK)
     try:
         lock.acquire(timeout=0)
@@ -51,7 +56,7 @@ def refuse_claimed(run_dir: Path) -> None:
     Raises:
         OccupiedError: naming the folder.
     """
-    if (Path(run_dir) / LOCK).exists():
+    if os.path.lexists(Path(run_dir) / LOCK):
         with claim(run_dir):
             pass
 
@@ -66,18 +71,18 @@ def is_claimed(run_dir: Path) -> bool:
 
 
 def refuse_occupied(run_dir: Path) -> None:
-    """Refuse a folder for a new run if it holds a checkpoint or an evaluation: the files of two runs would be mixed.
+    """Refuse a folder for a new run if it holds the results of another: the files of two runs would be mixed.
 
     Raises:
         OccupiedError: naming the folder.
     """
-    if (run_dir / EVALUATION).exists():
-        raise OccupiedError(
-            f"{run_dir}: there is an evaluation already; expected another folder, hydra.run.dir=<folder>."
-        )
     saved = run_dir / "checkpoints"
     if saved.is_dir() and any(not entry.name.endswith(".new") for entry in saved.iterdir()):
         raise occupied(run_dir)
+    for name, content in ((EVALUATION, "an evaluation"), (REPORT, "a report of a training")):
+        if (run_dir / name).exists():
+            words = f"there is {content} already; expected another folder, hydra.run.dir=<folder>."
+            raise OccupiedError(f"{run_dir}: {words}")
 
 
 def occupied(run_dir: Path) -> OccupiedError:
@@ -85,22 +90,44 @@ def occupied(run_dir: Path) -> OccupiedError:
     return OccupiedError(f"{run_dir}: there is a training already; expected another run folder, or resume={run_dir}.")
 
 
+def refuse_parts(run_dir: Path) -> None:
+    """Refuse the folder of another run's notes or checkpoints, and a folder in it, for a new run.
+
+    Raises:
+        OccupiedError: naming the folder.
+    """
+    folder = run_dir.resolve()
+    for part in (folder, *folder.parents[:2]):
+        names = {"checkpoints": CHECKPOINTS, ".hydra": ("hydra.yaml",)}.get(part.name, ())
+        is_checkpoint = part == folder and (part / "state.json").exists()
+        if is_checkpoint or any((part / name).exists() for name in names):
+            words = "a part of another run; expected another folder, hydra.run.dir=<folder>."
+            raise OccupiedError(f"{run_dir}: {words}")
+
+
 def refuse_links(run_dir: Path) -> None:
-    """Refuse to resume in a run folder, which may come from others, that redirects what is written elsewhere.
+    """Refuse a run folder, which may come from others, that redirects what is written elsewhere.
 
     Raises:
         ValueError: for a link, a file with a second name (a hard link), a pipe or a device in it, naming it.
     """
     for folder in (run_dir, run_dir / "checkpoints", run_dir / ".hydra"):
         for entry in os.scandir(folder) if folder.is_dir() else ():
-            is_file = entry.is_file(follow_symlinks=False)
-            if entry.is_symlink() or not (is_file or entry.is_dir()):
-                raise ValueError(f"{entry.path}: a link or no regular file; expected only files and folders in a run.")
-            if is_file and entry.stat(follow_symlinks=False).st_nlink > 1:
-                raise ValueError(
-                    f"{entry.path}: a hard link, a file with another name elsewhere; expected a run folder of its own, "
-                    "such as a copy (cp -r)."
-                )
+            _refuse_link(Path(entry.path))
+
+
+def _refuse_link(path: Path) -> None:
+    try:
+        found = path.lstat()
+    except FileNotFoundError:  # or removed, by the process that works there
+        return
+    if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+        raise ValueError(f"{path}: a link or no regular file; expected only files and folders in a run.")
+    if stat.S_ISREG(found.st_mode) and found.st_nlink > 1:
+        raise ValueError(
+            f"{path}: a hard link, a file with another name elsewhere; expected a run folder of its own, such as a "
+            "copy (cp -r)."
+        )
 
 
 @contextmanager

@@ -18,8 +18,17 @@ from omegaconf.errors import OmegaConfBaseException
 
 from pickplace.runs.composition import compose_for_hint, conf_dir, constant_keys, drop_replaced_values, list_options
 from pickplace.runs.errors import JobFailed, UsageError, one_sentence, sentence, unknown_key
-from pickplace.runs.folder import FAILURE, OccupiedError, refuse_claimed, refuse_occupied, remove_empty_folders
+from pickplace.runs.folder import (
+    FAILURE,
+    OccupiedError,
+    refuse_claimed,
+    refuse_links,
+    refuse_occupied,
+    refuse_parts,
+    remove_empty_folders,
+)
 from pickplace.runs.registry import REGISTRY
+from pickplace.task.files import replaced_file
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +52,8 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
         hydra_cfg = HydraConfig.get()
         os.environ["HYDRA_FULL_ERROR"] = full_error
         with _job_of_sweep() if hydra_cfg.mode == RunMode.MULTIRUN else _single_run():
+            refuse_parts(Path(hydra_cfg.runtime.output_dir))
+            refuse_links(Path(hydra_cfg.runtime.output_dir))
             cfg = drop_replaced_values(cfg)
             if missing := OmegaConf.missing_keys(cfg):
                 raise ValueError(f"{min(missing)}: no value; expected {min(missing)}=<value>.")
@@ -70,8 +81,8 @@ def _job_of_sweep():
     except Exception as error:
         folder = Path(HydraConfig.get().runtime.output_dir)
         if not isinstance(error, OccupiedError):  # the training in that folder has not failed
-            with suppress(OSError):  # the disk may be full
-                (folder / FAILURE).write_text(f"{sentence(error)}\n")
+            with suppress(OSError), replaced_file(folder / FAILURE) as new:  # the disk may be full
+                new.write_text(f"{sentence(error)}\n")
         log.error("run %s failed: %s", folder.name, sentence(error))
         raise JobFailed(f"run {folder.name}: {sentence(error)}") from error
     finally:
@@ -134,28 +145,46 @@ class _Refusal(BaseException):
     """A run is refused before it begins. A BaseException, since Hydra only warns of an Exception in a callback."""
 
 
+@contextmanager
+def _refusal():
+    """Turn an error about a folder into a refusal of the run, or sweep, that would begin there."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        HydraConfig.instance().cfg = None  # nothing in that folder is ours
+        raise _Refusal(sentence(error)) from None
+
+
 class FreshFolder(Callback):
-    """Refuses the folder of another training or evaluation, before Hydra overwrites its notes on that one."""
+    """Refuses a folder of another run or with links, before Hydra writes its notes there."""
 
     def on_run_start(self, config: DictConfig, **kwargs) -> None:
         HydraConfig.instance().set_config(config)  # for references such as ${hydra:job.name}
         folder = Path(config.hydra.run.dir)
-        try:
+        with _refusal():
+            refuse_parts(folder)
+            refuse_links(folder)
             refuse_claimed(folder)
             refuse_occupied(folder)
-        except OccupiedError as error:
-            HydraConfig.instance().cfg = None  # nothing in that folder is ours
-            raise _Refusal(str(error)) from None
         with read_write(config.hydra.runtime):  # :func:`command` needs it if Hydra cannot write its notes
             config.hydra.runtime.output_dir = str(folder.absolute())
         HydraConfig.instance().set_config(config)
 
 
 class SweepCallback(Callback):
-    """Tells :func:`command` the folder of a sweep before its jobs are composed, which may fail, and names theirs."""
+    """Tells :func:`command` the folder of a sweep before its jobs are composed, which may fail, and names theirs.
+
+    A folder with links is refused, before Hydra writes its notes there.
+    """
 
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
         HydraConfig.instance().set_config(config)
+        sweep, notes = Path(config.hydra.sweep.dir), (".hydra", f"{config.hydra.job.name}.log")
+        with _refusal():
+            refuse_links(sweep)
+            for folder in sweep.iterdir() if sweep.is_dir() else ():
+                if any(os.path.lexists(folder / name) for name in notes):
+                    refuse_links(folder)
         keys = ",".join(f"'{key}'" for key in constant_keys(list(config.hydra.overrides.task)))
         with read_write(config.hydra):  # the jobs are composed with these; the user's own come later, and win
             config.hydra.overrides.hydra.insert(0, f"hydra.job.config.override_dirname.exclude_keys=[{keys}]")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from pickplace.runs.errors import missing_extra
+from pickplace.task.checks import excerpt
 from pickplace.task.files import read_text, replaced_file
 
 if TYPE_CHECKING:
@@ -251,7 +252,10 @@ def parse_csv(text: str, path) -> list[dict[str, float]]:
     """As :func:`read_csv`, of the file's text."""
     lines = text[: text.rfind("\n") + 1].splitlines()  # a killed run may leave an incomplete last line
     rows = []
-    for number, row in enumerate(csv.DictReader(lines), start=2):
+    table = csv.DictReader(lines or [text])
+    if table.fieldnames and "frames" not in table.fieldnames:
+        raise ValueError(f"{path}, line 1: expected a column frames, got {excerpt(','.join(table.fieldnames))}.")
+    for number, row in enumerate(table, start=2):
         try:
             rows.append({key: float(value) for key, value in row.items() if value})
             rows[-1]["frames"] = int(rows[-1]["frames"])

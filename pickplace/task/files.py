@@ -8,7 +8,7 @@ from pathlib import Path
 MAX_BYTES = 2**30
 
 
-def read_file(path, most: int = MAX_BYTES, links: bool = True) -> bytes:
+def read_file(path, most: int = MAX_BYTES, links: bool = True, empty: bool = True) -> bytes:
     """Return the content of a regular file. Pipes and devices are not opened: reading them could block or never end.
 
     The size is that at the beginning, which is 0 for the endless files of ``/proc``.
@@ -17,6 +17,7 @@ def read_file(path, most: int = MAX_BYTES, links: bool = True) -> bytes:
         path: the file.
         most: greatest size, in bytes.
         links: follow a symbolic link instead of refusing it.
+        empty: accept a file of 0 bytes instead of refusing it.
 
     Raises:
         ValueError: naming the file, if it is too large or not a regular one.
@@ -28,14 +29,16 @@ def read_file(path, most: int = MAX_BYTES, links: bool = True) -> bytes:
         raise ValueError(f"{path}: a folder, link, pipe or device; expected a regular file.")
     if found.st_size > most:
         raise ValueError(f"{path}: {found.st_size:,} bytes; expected at most {most:,}.")
+    if not (found.st_size or empty):
+        raise ValueError(f"{path}: 0 bytes; expected a file with content.")
     with path.open("rb") as file:
         return file.read(found.st_size)
 
 
-def read_text(path, most: int = MAX_BYTES, encoding: str = "utf-8") -> str:
+def read_text(path, most: int = MAX_BYTES, encoding: str = "utf-8", empty: bool = True) -> str:
     """Return the text of a regular file; arguments and errors as of :func:`read_file`."""
     try:
-        return read_file(path, most).decode(encoding)
+        return read_file(path, most, empty=empty).decode(encoding)
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: {error}; expected a text in UTF-8.") from error
 

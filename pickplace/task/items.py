@@ -166,16 +166,16 @@ class Recorded(ItemDistribution):
     def __init__(self, path, loop=False):
         flag("items.loop", loop)
         self.path = Path(str(path))
-        if not self.path.is_file():
+        if not self.path.exists():
             raise ValueError(f"items.path={str(path)!r}: no such file; expected a CSV with columns w,d,h (and x,y).")
         try:
-            reader = csv.reader(io.StringIO(read_text(path, MAX_TEXT, "utf-8-sig"), newline=""))
+            reader = csv.reader(io.StringIO(read_text(path, MAX_TEXT, "utf-8-sig", empty=False), newline=""))
             table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
         except csv.Error as error:
             raise ValueError(f"{path}: {error}; expected a CSV in UTF-8.") from error
         header = table[0][1] if table else []
         if header not in (["w", "d", "h"], ["w", "d", "h", "x", "y"]):
-            raise ValueError(f"{path}: the header is {','.join(header)!r}, expected 'w,d,h' or 'w,d,h,x,y'.")
+            raise ValueError(f"{path}: the header is {excerpt(','.join(header))}, expected 'w,d,h' or 'w,d,h,x,y'.")
         rows = [self._row(line, row, header) for line, row in table[1:] if any(row)]
         if not rows:
             raise ValueError(f"{path}: no items, expected at least one row below the header.")
@@ -192,7 +192,7 @@ class Recorded(ItemDistribution):
         values = [int(field) for field in row] if whole else []
         if len(values) != len(header) or min(values[:3]) < 1:
             raise ValueError(
-                f"{self.path}, line {line}: got {','.join(row)!r}, expected {','.join(header)} as whole numbers "
+                f"{self.path}, line {line}: got {excerpt(','.join(row))}, expected {','.join(header)} as whole numbers "
                 "with w, d, h >= 1 and x, y >= 0."
             )
         return values

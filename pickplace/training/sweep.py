@@ -18,11 +18,11 @@ import numpy as np
 from omegaconf import DictConfig, read_write
 
 from pickplace.runs.checkpoint import read_facts
-from pickplace.runs.errors import one_sentence
-from pickplace.runs.folder import FAILURE, is_claimed, noted_overrides, read_note
+from pickplace.runs.errors import one_sentence, sentence
+from pickplace.runs.folder import FAILURE, is_claimed, read_note
 from pickplace.runs.hydra_app import SweepCallback
 from pickplace.runs.loggers import read_csv
-from pickplace.task.files import read_text
+from pickplace.task.files import read_text, replaced_file
 from pickplace.views.figures import figure_of
 
 log = logging.getLogger(__name__)
@@ -57,10 +57,10 @@ class SweepRun:
 
     name: str  # of its folder
     overrides: dict[str, str]  # of the command line, by key
-    status: str = "stopped"  # or finished, running, failed
+    status: str = "stopped"  # or finished, running, failed, unreadable
     frames: int = 0  # environment steps trained
     validations: list[dict[str, float]] = field(default_factory=list)  # rows of metrics.csv with a validation
-    error: str = ""  # of a failed run, in one sentence
+    error: str = ""  # of a failed or unreadable run, in one sentence
 
     @property
     def best(self) -> float | None:
@@ -75,7 +75,20 @@ class SweepRun:
 
 def read_run(folder: Path) -> SweepRun:
     """Read a run folder, in whatever state the run left it."""
-    run = SweepRun(folder.name, dict(word.lstrip("+").partition("=")[::2] for word in noted_overrides(folder)))
+    run = SweepRun(folder.name, {})
+    try:
+        _read_results(run, folder)
+    except Exception as error:  # of any type: the checkpoint's facts are unchecked
+        run.status, run.error = "unreadable", sentence(error)
+    return run
+
+
+def _read_results(run: SweepRun, folder: Path) -> None:
+    """Fill in what a run folder holds."""
+    words = read_note(folder, "overrides.yaml")
+    if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+        raise ValueError(f"{folder / '.hydra' / 'overrides.yaml'}: expected the overrides of the run, as Hydra notes.")
+    run.overrides = dict(word.lstrip("+").partition("=")[::2] for word in words)
     facts = read_facts(folder, "last")
     if (folder / "metrics.csv").is_file():
         rows = read_csv(folder / "metrics.csv")
@@ -84,7 +97,7 @@ def read_run(folder: Path) -> SweepRun:
     elif facts:  # logger=none
         run.frames = facts["frames"]
         if latest := facts.get("latest"):
-            run.validations = [{"frames": run.frames, **{f"eval/{key}": value for key, value in latest.items()}}]
+            run.validations = [{"frames": run.frames, **{f"eval/{key}": float(value) for key, value in latest.items()}}]
     if (folder / FAILURE).is_file():
         run.status, run.error = "failed", read_text(folder / FAILURE).strip()
     elif is_claimed(folder):
@@ -94,7 +107,6 @@ def read_run(folder: Path) -> SweepRun:
         budget = config.get("total_frames") if isinstance(config, dict) else None
         is_complete = (isinstance(budget, int) and run.frames >= budget) or facts.get("ended") is True
         run.status = "finished" if is_complete else "stopped"
-    return run
 
 
 @dataclass
@@ -121,10 +133,10 @@ class Setting:
 
     @property
     def interquartile_mean(self) -> float | None:
-        """The mean of their middle half."""
+        """The mean of their middle half; None with fewer than four, of which it would be the plain mean."""
         from scipy.stats import trim_mean
 
-        return float(trim_mean(self.finals, 0.25)) if len(self.finals) else None
+        return float(trim_mean(self.finals, 0.25)) if len(self.finals) >= 4 else None
 
     @property
     def interval(self) -> tuple[float, float] | tuple[None, None]:
@@ -166,9 +178,14 @@ def bootstrap95(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def group_by_setting(runs: list[SweepRun]) -> list[Setting]:
-    """Return the settings of a sweep: its runs, grouped by their overrides without the seed."""
+    """Return the settings of a sweep: its runs, grouped by their overrides without the seed.
+
+    A run whose overrides cannot be read belongs to none.
+    """
     settings: dict[tuple, Setting] = {}
     for run in runs:
+        if run.status == "unreadable" and not run.overrides:
+            continue
         overrides = {key: value for key, value in run.overrides.items() if key != "seed"}
         settings.setdefault(tuple(sorted(overrides.items())), Setting(overrides, [])).runs.append(run)
     return list(settings.values())
@@ -215,7 +232,7 @@ def summarize(folder: Path) -> list[Setting]:
 
 
 def _write_table(path: Path, columns: list[str], rows: list[list]) -> None:
-    with path.open("w", newline="") as file:
+    with replaced_file(path) as new, new.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(columns)
         table.writerows(rows)
@@ -224,7 +241,8 @@ def _write_table(path: Path, columns: list[str], rows: list[list]) -> None:
 def label(setting: Setting, settings: list[Setting]) -> str:
     """Label of a setting: the overrides in which the settings differ, and its runs that did not finish."""
     differing = [key for key in setting.overrides if len({other.overrides.get(key) for other in settings}) > 1]
-    words = [f"{key}={setting.overrides[key]}" for key in differing] or ["all runs"]
+    words = [f"{key}={setting.overrides[key]}" for key in differing]
+    words = words or ["all runs" if len(settings) == 1 else "defaults"]
     open_ends = [run.status for run in setting.runs if run.status != "finished"]
     counts = [f"{open_ends.count(status)} {status}" for status in dict.fromkeys(open_ends)]
     return ", ".join(words) + (f" ({', '.join(counts)})" if counts else "")
@@ -273,7 +291,8 @@ def draw(settings: list[Setting], path: Path) -> None:
         frameon=False, alignment="left", borderaxespad=0, prop={"family": "monospace", "size": 8},
     )  # fmt: skip
     legend.set_in_layout(False)  # the picture grows by it; the axes keep their size
-    figure.savefig(path, dpi=120, bbox_inches="tight", bbox_extra_artists=[legend])
+    with replaced_file(path) as new:
+        figure.savefig(new, dpi=120, bbox_inches="tight", bbox_extra_artists=[legend])
 
 
 if __name__ == "__main__":

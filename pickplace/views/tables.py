@@ -1,5 +1,7 @@
 """Tables of results."""
 
+import re
+
 
 def evaluation_table(result: dict) -> str:
     """Return the figures of an ``evaluation.json`` as a Markdown table."""
@@ -29,10 +31,16 @@ def evaluation_table(result: dict) -> str:
             rows.append(("warm start", f"imitated {result['warm_start']}"))
     if "candidates" in result:
         rows.append(("mask; candidates K", f"{_describe_masks(result)}; {result['candidates']}"))
+    rows = [(_escape(name), _escape(value)) for name, value in rows]
     width = max(len(name) for name, _ in rows)
     values = max(len(value) for _, value in rows)
     lines = [f"| {name:<{width}} | {value:<{values}} |" for name, value in rows]
     return "\n".join([lines[0], f"|{'-' * (width + 2)}|{'-' * (values + 2)}|", *lines[1:]]) + "\n"
+
+
+def _escape(text: str) -> str:
+    """Return the text of a cell in Markdown: names may have letters that end the cell or begin a tag."""
+    return re.sub(r"([|<])", r"\\\1", text)
 
 
 def _describe_masks(result: dict) -> str:

@@ -188,7 +188,7 @@ def test_ways_to_write_the_same_file(recorded, text):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "the header is ''"),
+        ("", "0 bytes; expected a file with content"),
         ("w,h,d\n1,1,1\n", "the header is 'w,h,d'"),
         ("W;D;H\n1;1;1\n", "the header is 'W;D;H', expected 'w,d,h' or 'w,d,h,x,y'"),
         ("w,d,h,x\n1,1,1,1\n", "the header is 'w,d,h,x'"),

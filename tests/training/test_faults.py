@@ -155,9 +155,9 @@ def read_only(smoke_run):
     ("main", "arguments", "name"),
     [
         (train_main, ["resume={}", "total_frames=1280"], ".lock"),
-        (train_main, ["experiment=smoke", "hydra.run.dir={}"], "train.log"),
+        (train_main, ["experiment=smoke", "hydra.run.dir={}"], ".lock"),
         (train_main, ["experiment=smoke", "hydra.run.dir={}/below"], "below"),
-        (evaluate_main, ["planner=random", "hydra.run.dir={}"], "evaluate.log"),
+        (evaluate_main, ["planner=random", "hydra.run.dir={}"], ".lock"),
     ],
 )
 def test_a_read_only_run_folder_is_named(read_only, monkeypatch, capsys, main, arguments, name):

@@ -72,15 +72,52 @@ def test_settings_are_compared_over_their_seeds(tmp_path, caplog):
     assert [(row["curriculum"], row["runs"], row["finished"]) for row in rows] == [
         ("adaptive", "5", "5"), ("mixture", "1", "1"), ("none", "4", "3"),
     ]  # fmt: skip
-    means, middles = ([float(row[key]) for row in rows] for key in ("mean_occupancy", "interquartile_mean"))
-    assert means == pytest.approx([0.5, 0.3, 0.6])
-    assert middles == pytest.approx([0.5, 0.3, 0.6])  # of 5 without the lowest and the highest one
+    assert [float(row["mean_occupancy"]) for row in rows] == pytest.approx([0.5, 0.3, 0.6])
+    middle, *others = [row["interquartile_mean"] for row in rows]
+    assert float(middle) == pytest.approx(0.5)  # of 5 without the lowest and the highest one
+    assert others == ["", ""]  # fewer than 4
     low, high = (float(rows[0][f"mean_ci95_{end}"]) for end in ("low", "high"))
     assert 0.22 < low < 0.32 and 0.68 < high < 0.78  # 0.5 +- 1.96 * 0.261 / sqrt(5), roughly
     assert (rows[1]["mean_ci95_low"], rows[1]["mean_ci95_high"]) == ("", "")  # one seed
     assert [float(rows[2][f"mean_ci95_{end}"]) for end in ("low", "high")] == pytest.approx([0.5, 0.7])  # the range
     assert "curriculum=none" in caplog.messages[0] and caplog.messages[0].startswith("0.6000 (0.5000 to 0.7000)")
     assert "seed" not in rows[0] and len(table(tmp_path)) == 10
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("metrics.csv", b"frames,eval/occupancy\n\xff,1\n", "metrics.csv: 'utf-8' codec"),
+        ("metrics.csv", b"\0\0", "metrics.csv, line 1: expected a column frames"),
+        ("metrics.csv", b"a,b\n", "metrics.csv, line 1: expected a column frames, got 'a,b'"),
+        (".hydra/overrides.yaml", b"\xff", "overrides.yaml: expected the overrides"),
+        (".hydra/overrides.yaml", b"algo.lr=1", "overrides.yaml: expected the overrides"),
+        (".hydra/overrides.yaml", b"- [3]", "overrides.yaml: expected the overrides"),
+        ("failure.txt", b"\xff", "failure.txt: 'utf-8' codec"),
+    ],
+)
+def test_a_run_that_cannot_be_read_leaves_the_others_alone(tmp_path, name, content, words):
+    for number in range(3):
+        make_run(tmp_path, str(number), [f"algo.lr={number}", "seed=1"], [0.2, 0.4], total=200)
+    (tmp_path / "1" / name).write_bytes(content)
+    settings = summarize(tmp_path)
+    rows = table(tmp_path)
+    assert [row["status"] for row in rows] == ["finished", "unreadable", "finished"] and words in rows[1]["error"]
+    labels = ["algo.lr=0", "algo.lr=1 (1 unreadable)", "algo.lr=2"]
+    if "overrides" in name:  # of no known setting
+        del labels[1]
+    assert [label(each, settings) for each in settings] == labels and is_png(tmp_path / "sweep.png")
+
+
+def test_a_sweep_writes_through_no_link(tmp_path):
+    make_run(tmp_path / "sweep", "0", [], [0.2], total=100)
+    make_run(tmp_path / "sweep", "1", ["algo.lr=1"], [0.2], total=100)
+    (tmp_path / "mine").write_text("mine")
+    for name in ("sweep.csv", "sweep_settings.csv", "sweep.png"):
+        (tmp_path / "sweep" / name).symlink_to(tmp_path / "mine")
+    settings = summarize(tmp_path / "sweep")
+    assert (tmp_path / "mine").read_text() == "mine" and is_png(tmp_path / "sweep" / "sweep.png")
+    assert [label(each, settings) for each in settings] == ["defaults", "algo.lr=1"]
 
 
 def test_a_curve_is_the_mean_of_runs_that_end_at_different_frames(tmp_path):

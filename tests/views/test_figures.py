@@ -130,6 +130,11 @@ RESULT = {
 }  # fmt: skip
 
 
+def test_a_name_ends_no_cell_of_a_table():
+    result = {**RESULT, "paired_difference": {"against": "a|b<script>", "mean": 0.1, "ci95": [0, 0.2]}}
+    assert r"| minus a\|b\<script> | " in evaluation_table(result)
+
+
 def test_evaluation_table():
     head, _, *lines = evaluation_table(RESULT).splitlines()
     rows = dict([cell.strip() for cell in line.strip("|").split("|")] for line in [head, *lines])
