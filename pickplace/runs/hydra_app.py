@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import hydra
+from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException
@@ -35,7 +36,7 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
         from_checkpoint: groups whose keys a checkpoint brings; overrides of them reach ``task`` unchecked.
     """
     full_error = os.environ.get("HYDRA_FULL_ERROR", "")
-    overrides = sys.argv[1:]
+    overrides = overrides_first(sys.argv[1:])
     unchecked = tuple(f"{group}." for group in from_checkpoint)
     sys.argv[1:] = [f"++{word}" if word.startswith(unchecked) else word for word in overrides]
 
@@ -56,10 +57,42 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
     with one_sentence(), _clearer_errors(config_name, overrides):
         os.environ["HYDRA_FULL_ERROR"] = "1"  # makes Hydra raise errors instead of printing them over many lines
         try:
-            with _callbacks_at_end_of_sweep(), remove_empty_folders():
+            with _callbacks_at_end_of_sweep(), remove_empty_folders(), _final_config_shown():
                 hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(app)()
         finally:
             os.environ["HYDRA_FULL_ERROR"] = full_error
+
+
+def overrides_first(words: list[str]) -> list[str]:
+    """Return a command line with its overrides before its flags: argparse takes overrides on one side of them only."""
+    takes_value = [
+        "--config-dir",
+        "-cd",
+        "--config-path",
+        "-cp",
+        "--config-name",
+        "-cn",
+        "--cfg",
+        "-c",
+        "--package",
+        "-p",
+        "--info",
+        "-i",
+    ]
+    pairs = zip(["", *words], words, strict=False)
+    is_flag = [word.startswith("-") or before in takes_value for before, word in pairs]
+    return [word for _, word in sorted(zip(is_flag, words, strict=True), key=lambda pair: pair[0])]
+
+
+@contextmanager
+def _final_config_shown():
+    """Let ``--cfg`` and ``--help`` print the config that is run, not the one that Hydra merged."""
+    select = Hydra.get_sanitized_cfg
+    Hydra.get_sanitized_cfg = lambda self, cfg, kind: select(self, drop_replaced_values(cfg), kind)  # type: ignore
+    try:
+        yield
+    finally:
+        Hydra.get_sanitized_cfg = select  # type: ignore[method-assign]
 
 
 @contextmanager
