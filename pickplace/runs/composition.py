@@ -35,7 +35,7 @@ def drop_replaced_values(cfg: DictConfig) -> DictConfig:
     without that choice it had another option. ``env`` is exempt: its options differ in sizes only, and a preset's sizes
     belong to the experiment. Hydra's note on the config is corrected.
     """
-    given = OverridesParser.create().parse_overrides(list(HydraConfig.get().overrides.task))
+    given = OverridesParser.create().parse_overrides(task_overrides(HydraConfig.get()))
     name = HydraConfig.get().job.config_name
     search = [word for word in HydraConfig.get().overrides.hydra if word.startswith("hydra.searchpath")]
     choices = [override for override in given if _is_choice(override)]
@@ -68,6 +68,12 @@ def drop_replaced_values(cfg: DictConfig) -> DictConfig:
         if notes is not None and not OmegaConf.is_missing(runtime, "output_dir"):  # which --cfg has none of
             OmegaConf.save(cfg, Path(runtime.output_dir) / notes / "config.yaml")
     return cfg
+
+
+def task_overrides(hydra_cfg: Any) -> list[str]:
+    """Return the words of the command line; references in them stay, which lead elsewhere from there."""
+    words: Any = OmegaConf.to_container(hydra_cfg.overrides.task, resolve=False)
+    return list(words)
 
 
 def _is_choice(override: Override) -> bool:
@@ -193,7 +199,7 @@ def _run_name(_root_: DictConfig) -> str:
     cfg = _root_.hydra
     if not cfg.sweeper._target_.endswith(".BasicSweeper"):
         return str(cfg.job.num)
-    return folder_name(list(cfg.overrides.task), list(cfg.job.config.override_dirname.exclude_keys))
+    return folder_name(task_overrides(cfg), list(cfg.job.config.override_dirname.exclude_keys))
 
 
 OmegaConf.register_new_resolver("run_name", _run_name, replace=True)

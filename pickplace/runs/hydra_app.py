@@ -17,12 +17,23 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.runs.composition import compose_for_hint, conf_dir, constant_keys, drop_replaced_values, list_options
+from pickplace.runs.composition import (
+    compose_for_hint,
+    conf_dir,
+    constant_keys,
+    drop_replaced_values,
+    list_options,
+    task_overrides,
+)
 from pickplace.runs.errors import JobFailed, UsageError, one_sentence, sentence, unknown_key
 from pickplace.runs.folder import FAILURE, OccupiedError, refuse_claimed, refuse_occupied, remove_empty_folders
 from pickplace.runs.registry import REGISTRY
 
 log = logging.getLogger(__name__)
+
+#: Hydra's flags that take a value.
+VALUE_FLAGS = {"--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "--cfg", "-c", "--package", "-p"}
+VALUE_FLAGS |= {"--info", "-i"}
 
 
 def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> None:
@@ -65,22 +76,8 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
 
 def overrides_first(words: list[str]) -> list[str]:
     """Return a command line with its overrides before its flags: argparse takes overrides on one side of them only."""
-    takes_value = [
-        "--config-dir",
-        "-cd",
-        "--config-path",
-        "-cp",
-        "--config-name",
-        "-cn",
-        "--cfg",
-        "-c",
-        "--package",
-        "-p",
-        "--info",
-        "-i",
-    ]
     pairs = zip(["", *words], words, strict=False)
-    is_flag = [word.startswith("-") or before in takes_value for before, word in pairs]
+    is_flag = [word.startswith("-") or before in VALUE_FLAGS for before, word in pairs]
     return [word for _, word in sorted(zip(is_flag, words, strict=True), key=lambda pair: pair[0])]
 
 
@@ -189,7 +186,7 @@ class SweepCallback(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
         HydraConfig.instance().set_config(config)
-        keys = ",".join(f"'{key}'" for key in constant_keys(list(config.hydra.overrides.task)))
+        keys = ",".join(f"'{key}'" for key in constant_keys(task_overrides(config.hydra)))
         with read_write(config.hydra):  # the jobs are composed with these; the user's own come later, and win
             config.hydra.overrides.hydra.insert(0, f"hydra.job.config.override_dirname.exclude_keys=[{keys}]")
 

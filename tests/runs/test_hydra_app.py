@@ -32,7 +32,6 @@ defaults: [{override /model: fcn4d}, {override /items: mixed}, {override /callba
 model: {actor: {filters: 7}}
 items: {width: [1, 1]}
 callbacks: {early_stopping: {patience: 5}}
-evaluation: {episodes: 5}
 """
 SLOW = """\
 defaults: [{advance: frames}, {sample: current}, _self_]
@@ -76,6 +75,11 @@ BAD = [
     ("train", "items=recorded", ["items.path", "no value"]),
     ("train", "model=fcn4d env.tote_size=[4,4,1]", ["tote_size=[4, 4, 1]", "eq. 3"]),
     ("train", "curriculum.start_height=9", ["start_height=9"]),
+    (
+        "train",
+        "experiment=smoke warm_start=imitate planner@warm_start.teacher=mcts warm_start.teacher.simulations=100000000",
+        ["warm_start.teacher.simulations=100000000", "<= "],
+    ),
     ("train", "collector=multi_sync collector.workers=3", ["collector.workers=3", "divisor"]),
     ("train", "algo=a2c env.num_envs=1 algo.rollout_length=1", ["algo.normalize_advantage=True", "one frame"]),
     # resume
@@ -128,7 +132,7 @@ OWN_VALUES = [
     ("experiment=wide items=tall", "items.width", [1, 2]),
     ("experiment=wide items=mixed", "items.width", [1, 1]),
     ("experiment=wide callbacks=[early_stopping]", "callbacks.early_stopping.patience", 5),
-    ("experiment=wide evaluation=default", "evaluation.episodes", 5),
+    ("curriculum=careful curriculum.sample.share='${..advance.occupancy}'", "curriculum.sample.share", 0.85),
     ("experiment=mine curriculum/advance=plateau", "curriculum.advance", PLATEAU),
     ("experiment=mine curriculum=paper", "curriculum.advance", {"_target_": "frames", "frames_per_level": 5_000_000}),
     ("experiment=mine curriculum=careful curriculum/advance=plateau", "curriculum.advance", PLATEAU),
