@@ -14,6 +14,7 @@ from pickplace.evaluation.statistics import paired_difference, summarise
 from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import own_modules, trusted_config
+from pickplace.runs.composition import task_overrides
 from pickplace.runs.errors import sentence
 from pickplace.runs.folder import EVALUATION, claim, refuse_occupied
 from pickplace.runs.hydra_app import apply_overrides, command
@@ -139,7 +140,7 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
     state, saved = checkpoint.read(folder)
     trained = trusted_config(saved["config"], cfg.trust)
     groups = {key: OmegaConf.create(resolved(cfg[key])) for key in ("env", "items")}
-    words = HydraConfig.get().overrides.task
+    words = task_overrides(HydraConfig.get())
     ours = [word for word in words if word.lstrip("+~").split("=")[0].split(".")[0] in TRAINED]
     merged = apply_overrides(trained, ours, groups)
     with open_dict(cfg):

@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from pickplace.policies.restore import restore_critic, restore_policy
+from pickplace.runs.errors import sentence
 from pickplace.runs.registry import find
 from pickplace.task.cell import CellSpec
 from pickplace.task.items import ItemDistribution
@@ -42,9 +43,14 @@ def decide(planner: BatchPlanner, cell: CellSpec, observation: Observation) -> T
     """Return a planner's flat actions, int64 ``[N]``.
 
     Raises:
-        ValueError: for anything else, naming the planner's class and what its ``decide`` returned.
+        ValueError: for anything else, naming the planner's class and what its ``decide`` returned or raised.
     """
-    action, count = planner.decide(observation), len(observation["bin_depth"])
+    try:
+        action, count = planner.decide(observation), len(observation["bin_depth"])
+    except ValueError:
+        raise
+    except Exception as error:
+        raise ValueError(f"{type(planner).__name__}.decide failed: {sentence(error)}") from error
     if not isinstance(action, Tensor):
         found = type(action).__name__ + (f" of {action.dtype}" if hasattr(action, "dtype") else "")
     elif action.dtype != torch.int64 or action.shape != (count,):

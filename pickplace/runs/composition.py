@@ -3,7 +3,7 @@
 import argparse
 import hashlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -30,19 +30,19 @@ def drop_replaced_values(cfg: DictConfig) -> DictConfig:
     """Return the config of this run, in which an option chosen on the command line has no values of another one.
 
     Hydra merges what a preset, or a config file of the user, wrote for the option that it expected, such as
-    ``curriculum.advance.occupancy`` for ``threshold``, into the option that the command line chose instead. A part
-    whose ``_target_`` a choice on the command line changes gets the values of that option's own files, and the values
-    on the command line. So does a group of which the choice turns a part on or off (``warm_start.teacher``). Hydra's
-    note on the config is corrected.
+    ``curriculum.advance.occupancy`` for ``threshold``, into the option that the command line chose instead. A group of
+    parts with a ``_target_`` gets the values of the chosen option's own files, and the values on the command line, if
+    without that choice it had another option. ``env`` is exempt: its options differ in sizes only, and a preset's sizes
+    belong to the experiment. Hydra's note on the config is corrected.
     """
-    given = OverridesParser.create().parse_overrides(list(HydraConfig.get().overrides.task))
+    given = OverridesParser.create().parse_overrides(task_overrides(HydraConfig.get()))
     name = HydraConfig.get().job.config_name
     search = [word for word in HydraConfig.get().overrides.hydra if word.startswith("hydra.searchpath")]
     choices = [override for override in given if _is_choice(override)]
-    replaced: list[str] = []
+    replaced = False
     for choice in sorted(choices, key=lambda choice: _package(choice).count(".")):  # an outer part before its own parts
         place = _package(choice)
-        if choice.is_delete() or not OmegaConf.is_dict(OmegaConf.select(cfg, place)):  # such as experiment=
+        if choice.is_delete() or place == "env" or not OmegaConf.is_dict(OmegaConf.select(cfg, place)):
             continue
         inner = [str(other.input_line) for other in choices if f"{_package(other)}.".startswith(f"{place}.")]
         others = [str(other.input_line) for other in choices if other.input_line not in inner]
@@ -51,22 +51,29 @@ def drop_replaced_values(cfg: DictConfig) -> DictConfig:
             own = _part_at(hydra.compose(None, [*search, f"+{str(choice.input_line).lstrip('+')}", *inner]), place)
             if own == _part_at(cfg, place):
                 continue
-            before = _part_at(hydra.compose(name, [*search, *others]), place)
+            before = hydra.compose(name, [*search, *others], return_hydra_config=True)
         except ConfigCompositionException:  # an option that depends on those of other groups
             continue
-        inner_places = {_package(other) for other in choices if other.input_line in inner}
-        for leaf, content in _exchanged_leaves(place, own, before):
-            if leaf not in inner_places:
-                cfg = cfg if replaced else cfg.copy()
-                OmegaConf.update(cfg, leaf, content, merge=False, force_add=True)
-                replaced.append(leaf)
+        options = {_package(key): option for key, option in before.hydra.runtime.choices.items()}
+        has_parts = _has_parts(own) or _has_parts(_part_at(before, place))
+        if has_parts and str(options.get(place)) != str(choice.value()):
+            cfg = cfg if replaced else cfg.copy()
+            OmegaConf.update(cfg, place, own, merge=False, force_add=True)
+            replaced = True
     if replaced:
         for value in given:
             if value not in choices:
                 _apply(value, cfg)
-        if (notes := HydraConfig.get().output_subdir) is not None:
-            OmegaConf.save(cfg, Path(HydraConfig.get().runtime.output_dir) / notes / "config.yaml")
+        runtime, notes = HydraConfig.get().runtime, HydraConfig.get().output_subdir
+        if notes is not None and not OmegaConf.is_missing(runtime, "output_dir"):  # which --cfg has none of
+            OmegaConf.save(cfg, Path(runtime.output_dir) / notes / "config.yaml")
     return cfg
+
+
+def task_overrides(hydra_cfg: Any) -> list[str]:
+    """Return the words of the command line; references in them stay, which lead elsewhere from there."""
+    words: Any = OmegaConf.to_container(hydra_cfg.overrides.task, resolve=False)
+    return list(words)
 
 
 def _is_choice(override: Override) -> bool:
@@ -75,9 +82,10 @@ def _is_choice(override: Override) -> bool:
     return bool(is_group or "/" in override.key_or_group) and not isinstance(override.value(), dict)
 
 
-def _package(choice: Override) -> str:
-    """Return the place in the config of the group that an override chooses."""
-    return choice.package or choice.key_or_group.replace("/", ".")
+def _package(choice: Override | str) -> str:
+    """Return the place in the config of the group that an override chooses, or of a ``group`` or ``group@package``."""
+    group, _, package = choice.partition("@") if isinstance(choice, str) else (choice.key_or_group, "", choice.package)
+    return package or group.replace("/", ".")
 
 
 def _part_at(cfg: DictConfig, place: str) -> Any:
@@ -88,21 +96,9 @@ def _part_at(cfg: DictConfig, place: str) -> Any:
     return part
 
 
-def _exchanged_leaves(place: str, own: Any, before: Any) -> Iterator[tuple[str, dict]]:
-    """Yield place and content of each part that is another one than before."""
-    if not isinstance(own, dict):
-        return
-    before = before if isinstance(before, dict) else {}
-
-    def parts(cfg: dict) -> set:
-        """Return the keys of the parts in a group."""
-        return {key for key, node in cfg.items() if isinstance(node, dict) and "_target_" in node}
-
-    if own.get("_target_") != before.get("_target_") or parts(own) != parts(before):
-        yield place, own
-    else:
-        for key, node in own.items():
-            yield from _exchanged_leaves(f"{place}.{key}", node, before.get(key))
+def _has_parts(node: Any) -> bool:
+    """Return whether a part of a config has a ``_target_``, itself or in its own parts."""
+    return isinstance(node, dict) and ("_target_" in node or any(map(_has_parts, node.values())))
 
 
 def _apply(value: Override, cfg: DictConfig) -> None:
@@ -115,6 +111,12 @@ def _apply(value: Override, cfg: DictConfig) -> None:
             node.pop(key, None)
 
 
+def compose_plain(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
+    """Return the config of a file in ``conf/`` as Hydra merges it, outside a Hydra application too."""
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return hydra.compose(config_name, list(overrides))
+
+
 def compose_for_hint(config_name: str, words: list[str], without: str) -> DictConfig:
     """Return the config of a command line without the overrides of a key, or without any if others are wrong too.
 
@@ -125,11 +127,10 @@ def compose_for_hint(config_name: str, words: list[str], without: str) -> DictCo
     """
     search, rest = _search_path(words)
     rest = [word for word in rest if word.lstrip("+~").partition("=")[0] != without]
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        try:
-            return hydra.compose(config_name, [*search, *map(_first_of_sweep, rest)])
-        except (HydraException, OmegaConfBaseException, ValueError):
-            return hydra.compose(config_name, search)
+    try:
+        return compose_plain(config_name, [*search, *map(_first_of_sweep, rest)])
+    except (HydraException, OmegaConfBaseException, ValueError):
+        return compose_plain(config_name, search)
 
 
 def _first_of_sweep(word: str) -> str:
@@ -198,7 +199,7 @@ def _run_name(_root_: DictConfig) -> str:
     cfg = _root_.hydra
     if not cfg.sweeper._target_.endswith(".BasicSweeper"):
         return str(cfg.job.num)
-    return folder_name(list(cfg.overrides.task), list(cfg.job.config.override_dirname.exclude_keys))
+    return folder_name(task_overrides(cfg), list(cfg.job.config.override_dirname.exclude_keys))
 
 
 OmegaConf.register_new_resolver("run_name", _run_name, replace=True)

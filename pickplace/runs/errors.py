@@ -67,8 +67,7 @@ def one_sentence():
 
 def _refuse_arguments(parser: argparse.ArgumentParser, message: str) -> NoReturn:
     """Raise an error of the command line, which argparse would print below the usage."""
-    between = ", and overrides on one side of the flags" if "unrecognized" in message else ""
-    raise UsageError(f"{message}; expected the arguments that --help shows{between}.")
+    raise UsageError(f"{message}; expected the arguments that --help shows.")
 
 
 def write_output(text: str = "") -> None:
@@ -114,7 +113,9 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, EXPECTED):
         noise = ("full_key", "object_type", "See https", "To append", "Config search path", "provider=")
         lines = [line.strip() for line in str(error).splitlines()]
-        return " ".join(line for line in lines if line and not line.startswith(noise)) or type(error).__name__
+        text = " ".join(line for line in lines if line and not line.startswith(noise)) or type(error).__name__
+        key = getattr(error, "full_key", None)  # OmegaConf's
+        return f"{key}: {text}" if key and key not in text else text
     return f"{type(error).__name__}: {' '.join(str(error).split())} (HYDRA_FULL_ERROR=1 shows where)"
 
 
@@ -140,6 +141,7 @@ def unknown_key(key: str, node: DictConfig | dict, prefix: str = "") -> str:
         prefix, node = f"{prefix}{parent}.", child
     known = [str(name) for name in node if name not in ("_target_", "hydra")]
     close = get_close_matches(leaf, known, 1)
-    hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known) or 'none'}."
+    expected = f"one of {', '.join(known)}" if known else "no key"
+    hint = f"did you mean {close[0]!r}?" if close else f"expected {expected}."
     key, leaf = map(short_text, (key, leaf))
     return f"{key}: there is no key {leaf!r} in {prefix[:-1] or 'the config'}; {hint}"

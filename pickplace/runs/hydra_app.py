@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import hydra
+from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException
@@ -16,7 +17,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.runs.composition import compose_for_hint, conf_dir, constant_keys, drop_replaced_values, list_options
+from pickplace.runs.composition import (
+    compose_for_hint,
+    conf_dir,
+    constant_keys,
+    drop_replaced_values,
+    list_options,
+    task_overrides,
+)
 from pickplace.runs.errors import JobFailed, UsageError, one_sentence, sentence, unknown_key
 from pickplace.runs.folder import (
     FAILURE,
@@ -32,6 +40,10 @@ from pickplace.task.files import replaced_file
 
 log = logging.getLogger(__name__)
 
+#: Hydra's flags that take a value.
+VALUE_FLAGS = {"--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "--cfg", "-c", "--package", "-p"}
+VALUE_FLAGS |= {"--info", "-i"}
+
 
 def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> None:
     """Run ``task(cfg, run_dir)`` as a Hydra application; a user's mistake ends in one sentence and exit code 2.
@@ -44,7 +56,7 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
         from_checkpoint: groups whose keys a checkpoint brings; overrides of them reach ``task`` unchecked.
     """
     full_error = os.environ.get("HYDRA_FULL_ERROR", "")
-    overrides = sys.argv[1:]
+    overrides = overrides_first(sys.argv[1:])
     unchecked = tuple(f"{group}." for group in from_checkpoint)
     sys.argv[1:] = [f"++{word}" if word.startswith(unchecked) else word for word in overrides]
 
@@ -67,10 +79,28 @@ def command(config_name: str, task, from_checkpoint: tuple[str, ...] = ()) -> No
     with one_sentence(), _clearer_errors(config_name, overrides):
         os.environ["HYDRA_FULL_ERROR"] = "1"  # makes Hydra raise errors instead of printing them over many lines
         try:
-            with _callbacks_at_end_of_sweep(), remove_empty_folders():
+            with _callbacks_at_end_of_sweep(), remove_empty_folders(), _final_config_shown():
                 hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(app)()
         finally:
             os.environ["HYDRA_FULL_ERROR"] = full_error
+
+
+def overrides_first(words: list[str]) -> list[str]:
+    """Return a command line with its overrides before its flags: argparse takes overrides on one side of them only."""
+    pairs = zip(["", *words], words, strict=False)
+    is_flag = [word.startswith("-") or before in VALUE_FLAGS for before, word in pairs]
+    return [word for _, word in sorted(zip(is_flag, words, strict=True), key=lambda pair: pair[0])]
+
+
+@contextmanager
+def _final_config_shown():
+    """Let ``--cfg`` and ``--help`` print the config that is run, not the one that Hydra merged."""
+    select = Hydra.get_sanitized_cfg
+    Hydra.get_sanitized_cfg = lambda self, cfg, kind: select(self, drop_replaced_values(cfg), kind)  # type: ignore
+    try:
+        yield
+    finally:
+        Hydra.get_sanitized_cfg = select  # type: ignore[method-assign]
 
 
 @contextmanager
@@ -130,7 +160,7 @@ def _clearer_errors(config_name: str, overrides: list[str]):
         raise ValueError(unknown_key(key[1], compose_for_hint(config_name, overrides, key[1]))) from error
     except UsageError:
         raise
-    except ValueError as error:  # Hydra's own, which names no key
+    except (ValueError, TypeError) as error:  # Hydra's own, which names no key
         if isinstance(error.__cause__, OSError):  # such as a log file that cannot be opened
             raise error.__cause__ from None
         for word in overrides:  # a group without an option, allowed for experiment only
@@ -185,7 +215,7 @@ class SweepCallback(Callback):
             for folder in sweep.iterdir() if sweep.is_dir() else ():
                 if any(os.path.lexists(folder / name) for name in notes):
                     refuse_links(folder)
-        keys = ",".join(f"'{key}'" for key in constant_keys(list(config.hydra.overrides.task)))
+        keys = ",".join(f"'{key}'" for key in constant_keys(task_overrides(config.hydra)))
         with read_write(config.hydra):  # the jobs are composed with these; the user's own come later, and win
             config.hydra.overrides.hydra.insert(0, f"hydra.job.config.override_dirname.exclude_keys=[{keys}]")
 

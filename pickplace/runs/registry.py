@@ -9,6 +9,7 @@ To add an option, write one line into :data:`REGISTRY` and one file into ``conf/
 """
 
 import inspect
+import re
 from collections.abc import Callable
 from difflib import get_close_matches
 from importlib import import_module
@@ -115,6 +116,10 @@ def _make(place: str, node, given: dict):
     try:
         return function(**settings, **given)
     except TypeError as error:
+        unknown = re.search("unexpected keyword argument '(.*)'", str(error))  # of what it hands its **keywords to
+        if unknown and unknown[1] in settings:
+            others = {key: value for key, value in settings.items() if key != unknown[1]}
+            raise ValueError(unknown_key(f"{place}.{unknown[1]}", others, f"{place}.")) from error
         raise ValueError(f"{place}._target_={short_text(node['_target_'])}: {error}.") from error
 
 

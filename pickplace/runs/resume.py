@@ -11,16 +11,18 @@ from typing import Any
 
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from loky import cpu_count
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import modules_to_trust, own_modules, trusted_config
+from pickplace.runs.composition import compose_plain
 from pickplace.runs.errors import WorkerDied, sentence
 from pickplace.runs.folder import occupied, refuse_occupied
-from pickplace.runs.hydra_app import apply_overrides
+from pickplace.runs.hydra_app import apply_overrides, refuse_unknown_keys
 from pickplace.runs.references import saved_form
 from pickplace.task.cell import CELL_SETTINGS
-from pickplace.task.checks import excerpt, short_text
+from pickplace.task.checks import excerpt, is_name, is_whole, short_text
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +32,14 @@ COUNTERS: dict[str, Any] = {"frames": 0, "iteration": 0, "best": -1.0, "latest":
 
 #: Least and greatest value of each counter; other numbers need only be finite.
 RANGES = {"best": (-1, 1), "occupancy": (0, 1), "ci95_low": (0, 1), "ci95_high": (0, 1)}
+
+#: Types of further facts in a checkpoint, and their names.
+FACT_TYPES: dict[str, tuple] = {
+    "callbacks": (dict, "a dict"),
+    "ended": (bool, "true or false"),
+    "commit": (str | None, "a text or null"),
+    "versions": (dict, "a dict"),
+}
 
 #: Settings that may leave the run folder or the machine, and their values that do not. The user must repeat others on
 #: resume.
@@ -78,7 +88,15 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     trust = own_modules(next((word.value() for word in reversed(given) if word.key_or_group == "trust"), None))
     saved = trusted_config(facts["config"], trust, groups=None)
     saved["trust"] = list(trust)  # only the user says what to trust, never the checkpoint
-    _refuse_remote_values(saved, {word.key_or_group for word in given})
+    try:
+        refuse_unknown_keys(saved, compose_plain("train"))
+    except ValueError as error:
+        raise ValueError(f"resume={place}: in the checkpoint's config, {error}") from error
+    repeated = {word.key_or_group for word in given}
+    _refuse_remote_values(saved, repeated)
+    if "threads" not in repeated and is_whole(saved.get("threads")) and saved.threads > cpu_count():
+        log.warning("threads=%s of the checkpoint: going on with %d, all of this machine", saved.threads, cpu_count())
+        saved["threads"] = cpu_count()
     cfg = apply_overrides(saved, [str(word.input_line) for word in given if word.key_or_group != "trust"])
     for key in FIXED_KEYS:
         before, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
@@ -103,7 +121,10 @@ def _check_counters(place: str, facts: dict) -> None:
         words = f"the checkpoint's {short_text(key)} is {excerpt(value)}"
         return ValueError(f"resume={place}: {words}; expected {expected} that a training wrote.")
 
-    if not isinstance(facts["latest"], dict):
+    for key, (kind, name) in FACT_TYPES.items():
+        if key in facts and not isinstance(facts[key], kind):
+            raise error(key, facts[key], name)
+    if not isinstance(facts["latest"], dict) or len(facts["latest"]) > 100 or not all(map(is_name, facts["latest"])):
         raise error("latest", facts["latest"], "a validation")
     for key, value in {"iteration": facts["iteration"], "best": facts["best"], **facts["latest"]}.items():
         kind = int if key == "iteration" else (int, float)

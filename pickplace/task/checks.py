@@ -15,7 +15,16 @@ MEMORY_VARIABLE, CPU_GIGABYTES = "PICKPLACE_MEMORY_GB", 0.8
 #: Greatest width of a layer, and greatest number of inputs of a neuron.
 MAX_WIDTH, MAX_INPUTS = 1_024, 8_192
 
-_repr = Repr()
+
+class _Repr(Repr):
+    """Without addresses of objects."""
+
+    def repr_instance(self, x, level):
+        has_address = type(x).__repr__ is object.__repr__  # type: ignore[comparison-overlap]
+        return type(x).__name__ if has_address else super().repr_instance(x, level)
+
+
+_repr = _Repr()
 _repr.maxstring = _repr.maxother = 80
 
 

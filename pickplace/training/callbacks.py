@@ -83,20 +83,39 @@ def make_callbacks(cfg, states) -> dict[str, Callback]:
         try:
             if name in states:
                 callback.load_state_dict(states[name])
-            json.dumps(callback.state_dict(), allow_nan=False)
         except Exception as error:
-            raise ValueError(f"callbacks.{name}: its state cannot be loaded or saved ({sentence(error)}).") from error
+            raise ValueError(f"callbacks.{name}: its state cannot be loaded ({sentence(error)}).") from error
+    saved_states(callbacks)  # now, not after hours
     return callbacks
+
+
+def saved_states(callbacks: dict[str, Callback]) -> dict[str, Any]:
+    """Return the states of callbacks, as a checkpoint stores them.
+
+    Raises:
+        ValueError: naming the callback whose state is no JSON.
+    """
+    states = {}
+    for name, callback in callbacks.items():
+        try:
+            states[name] = json.loads(json.dumps(callback.state_dict(), allow_nan=False))
+        except Exception as error:
+            raise ValueError(f"callbacks.{name}: its state cannot be saved ({sentence(error)}).") from error
+    return states
 
 
 def call(callbacks: dict[str, Callback], hook: str, trainer: Any, *arguments: Any) -> None:
     """Call a hook of each callback.
 
     Raises:
-        ValueError: for a metric that is no number.
+        ValueError: naming the callback, for a metric that it removes or that is no number.
     """
+    metrics = arguments[-1] if isinstance(arguments[-1], dict) else {}
     for name, callback in callbacks.items():
+        before = list(metrics)
         getattr(callback, hook)(trainer, *arguments)
-        for key, value in arguments[-1].items() if isinstance(arguments[-1], dict) else ():
+        if removed := [key for key in before if key not in metrics]:
+            raise ValueError(f"callbacks.{name}: it removes {removed[0]} from the metrics; expected changed values.")
+        for key, value in metrics.items():
             if not isinstance(value, Real):
                 raise ValueError(f"callbacks.{name}: it logs {key}={excerpt(value)}; expected a number.")

@@ -1,6 +1,8 @@
 """Warm start: a policy imitates a planner before it learns from reward."""
 
+import re
 from collections.abc import Mapping
+from contextlib import contextmanager
 from enum import Enum
 from typing import cast
 
@@ -10,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pickplace.planners.base import decide, planner_parts
+from pickplace.planners.base import BatchPlanner, decide, planner_parts
 from pickplace.policies.base import Policy
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import trusted_config
@@ -73,6 +75,8 @@ class WarmStart:
         known = accepted_arguments(find("warm_start.teacher", cfg.teacher._target_)) if self.frames else ()
         self._draws = "seed" in (cfg.teacher if known is None else known)
         self._parts = self._teacher_parts(cfg, items, terms, trust) if self.frames else {}
+        if self.frames:
+            self._make_teacher(seed)  # refuses bad settings before the first batch
 
     def _teacher_parts(self, cfg: DictConfig, items: ItemDistribution, terms: Mapping[str, Term], trust) -> dict:
         """Return the teacher's arguments beside its settings, such as the policy of its checkpoint."""
@@ -85,6 +89,12 @@ class WarmStart:
             return planner_parts(cfg.teacher, self.cell, items, terms, trained)
         except ValueError as error:
             raise ValueError(f"warm_start.{error}") from error
+
+    def _make_teacher(self, seed: int) -> BatchPlanner:
+        """Make the teacher anew; one that draws gets the seed."""
+        settings = cast(dict, OmegaConf.to_container(self.teacher, resolve=True))
+        with _named_teacher():
+            return build("warm_start.teacher", {**settings, **({"seed": seed} if self._draws else {})}, **self._parts)
 
     def phase(self, frames: int) -> Phase:
         """Return the phase of the batch that begins after ``frames`` frames of the run."""
@@ -100,10 +110,9 @@ class WarmStart:
             data: observations ``[B]``.
             iteration: the run's batch number; it seeds a teacher that draws, so that a resumed run is the same.
         """
-        draws = {"seed": self.seed + iteration} if self._draws else {}
-        settings = cast(dict, OmegaConf.to_container(self.teacher, resolve=True))
-        teacher = build("warm_start.teacher", {**settings, **draws}, **self._parts)
-        action = decide(teacher, self.cell, data)
+        teacher = self._make_teacher(self.seed + iteration)
+        with _named_teacher():
+            action = decide(teacher, self.cell, data)
         state = State.from_observation(data)
         wanted = apply(self.cell, state, action)
         choice = self.policy.to_choice(action, data)
@@ -113,6 +122,15 @@ class WarmStart:
         reached = apply(self.cell, state, action)
         same = (reached.footprint == wanted.footprint).all(1) & (reached.failure == 0) & (wanted.failure == 0)
         return torch.where(same, choice, -1)
+
+
+@contextmanager
+def _named_teacher():
+    """Name a teacher's settings in the errors of planners, which call them ``planner``."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(re.sub(r"^planner\b", "warm_start.teacher", str(error))) from error
 
 
 def imitation_loss(policy: Policy, data: TensorDictBase) -> tuple[Tensor, Tensor]:

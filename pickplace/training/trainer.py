@@ -295,7 +295,7 @@ class Trainer:
         facts = {
             **{key: getattr(self, key) for key in COUNTERS},
             "curriculum": self.curriculum.state_dict(),
-            "callbacks": {name: callback.state_dict() for name, callback in self.callbacks.items()},
+            "callbacks": callbacks.saved_states(self.callbacks),
             "ended": self.ended,
             "config": self.saved_config,
             "versions": versions(),

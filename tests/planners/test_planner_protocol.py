@@ -49,6 +49,16 @@ def test_a_wrong_return_of_decide_is_named(found):
     assert str(error.value) == f"Wrong.decide returned {found}: {wanted}."
 
 
+def test_a_planner_that_fails_is_named():
+    """But its own sentence stays, and the cause."""
+    env = PickPlaceEnv(num_envs=4)
+    with pytest.raises(ValueError, match=r"^Wrong.decide failed: ZeroDivisionError: .* by zero") as caught:
+        decide(Wrong(env.cell, lambda action: 1 // 0), env.cell, env.reset())
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+    with pytest.raises(ValueError, match="^invalid literal"):
+        decide(Wrong(env.cell, lambda action: int("x")), env.cell, env.reset())
+
+
 def ask_robot(planner):
     robot, item = Planner(CellSpec(), untrained_policy(CellSpec())), torch.zeros(5, 5)
     item[0, 0] = 1

@@ -26,6 +26,21 @@ items: {kinds: [[1, 1, 1]]}
 algo: {lr: 0.5}
 """
 
+WIDE = """\
+# @package _global_
+defaults: [{override /model: fcn4d}, {override /items: mixed}, {override /callbacks: [early_stopping]}, _self_]
+model: {actor: {filters: 7}}
+items: {width: [1, 1]}
+callbacks: {early_stopping: {patience: 5}}
+"""
+SLOW = """\
+defaults: [{advance: frames}, {sample: current}, _self_]
+_target_: curriculum
+start_height: null
+end_height: null
+advance: {frames_per_level: 50_000}
+"""
+
 #: Command, its words, and parts of the sentence: a sample of each kind; tests of the parts hold the others.
 BAD = [
     # keys and values that Hydra or the config does not know
@@ -33,7 +48,14 @@ BAD = [
     ("train", "+env.foo=1", ["env.foo", "no key 'foo'"]),
     ("train", "algo.gama=0.9 --help", ["algo.gama", "'gamma'"]),
     ("train", "--config-dir nowhere", ["nowhere"]),
-    ("train", "seed=1 --config-dir . seed=2", ["unrecognized arguments: seed=2", "on one side of the flags"]),
+    ("train", "algo.gamma=1.5 --config-dir . seed=2", ["algo.gamma=1.5"]),  # flags between overrides
+    ("train", "seed=1 -m algo.gamma=1.5,2", ["algo.gamma=1.5"]),
+    ("train", "--seed 1", ["unrecognized arguments: --seed", "--help"]),
+    ("train", "+model.actor.foo=1", ["model.actor.foo", "expected one of filters, receptive_field, "]),
+    ("train", "+collector.foo=1", ["collector.foo", "in collector; expected no key."]),
+    ("train", "algo.lr=${algo.lr}", ["algo.lr: ", "interpolation"]),
+    ("train", "env.observation.bin_depth={_target_:tote_depth}", ["bin_depth=ToteDepth: expected BinDepth"]),
+    ("evaluate", "planner=[[1,2],[3]]", ["planner=[[1,2],[3]]"]),
     ("evaluate", "--cfg foo", ["--cfg", "'foo'", "job"]),
     ("train", "env.tote_size=[6,6", ["'env.tote_size=[6,6'", "<key>=<value>"]),
     ("train", "seed=1,2", ["seed=1,2", "--multirun"]),
@@ -54,6 +76,11 @@ BAD = [
     ("train", "items=recorded", ["items.path", "no value"]),
     ("train", "model=fcn4d env.tote_size=[4,4,1]", ["tote_size=[4, 4, 1]", "eq. 3"]),
     ("train", "curriculum.start_height=9", ["start_height=9"]),
+    (
+        "train",
+        "experiment=smoke warm_start=imitate planner@warm_start.teacher=mcts warm_start.teacher.simulations=100000000",
+        ["warm_start.teacher.simulations=100000000", "<= "],
+    ),
     ("train", "collector=multi_sync collector.workers=3", ["collector.workers=3", "divisor"]),
     ("train", "algo=a2c env.num_envs=1 algo.rollout_length=1", ["algo.normalize_advantage=True", "one frame"]),
     # resume
@@ -95,7 +122,18 @@ OWN_VALUES = [
     ("experiment=mixed warm_start=none", "warm_start.frames", 0),
     ("experiment=mixed planner@warm_start.teacher=mcts", "warm_start.frames", 100_000),
     ("experiment=mine", "curriculum.advance.window", 7),
-    ("experiment=mine curriculum=mixture", "curriculum.advance.window", 7),
+    # other options with the same _target_
+    ("experiment=mine curriculum=mixture", "curriculum.advance.window", 400),
+    ("experiment=mine curriculum=mixture curriculum.advance.window=9", "curriculum.advance.window", 9),
+    ("curriculum=slow curriculum/advance=paper", "curriculum.advance.frames_per_level", 5_000_000),
+    ("curriculum=slow curriculum/advance=frames", "curriculum.advance.frames_per_level", 50_000),
+    ("experiment=smoke model=individual_grasp", "model.critic.filters", 32),
+    ("experiment=wide model=fcn4d_noclip", "model.actor.filters", 64),
+    ("experiment=wide model=fcn4d", "model.actor.filters", 7),
+    ("experiment=wide items=tall", "items.width", [1, 2]),
+    ("experiment=wide items=mixed", "items.width", [1, 1]),
+    ("experiment=wide callbacks=[early_stopping]", "callbacks.early_stopping.patience", 5),
+    ("curriculum=careful curriculum.sample.share='${..advance.occupancy}'", "curriculum.sample.share", 0.85),
     ("experiment=mine curriculum/advance=plateau", "curriculum.advance", PLATEAU),
     ("experiment=mine curriculum=paper", "curriculum.advance", {"_target_": "frames", "frames_per_level": 5_000_000}),
     ("experiment=mine curriculum=careful curriculum/advance=plateau", "curriculum.advance", PLATEAU),
@@ -109,15 +147,17 @@ OWN_VALUES = [
 
 @pytest.mark.parametrize(("words", "key", "expected"), OWN_VALUES)
 def test_an_option_chosen_on_the_command_line_has_its_own_values(run, tmp_path, monkeypatch, words, key, expected):
-    """In the config that the training gets and in Hydra's note on it."""
-    (tmp_path / "conf" / "experiment").mkdir(parents=True)
-    (tmp_path / "conf" / "experiment" / "mine.yaml").write_text(MINE)
+    """In the config that the training gets, in Hydra's note on it, and in what ``--cfg job`` prints."""
+    for name, text in {"experiment/mine": MINE, "experiment/wide": WIDE, "curriculum/slow": SLOW}.items():
+        (tmp_path / "conf" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "conf" / f"{name}.yaml").write_text(text)
     search = f"hydra.searchpath=[file://{tmp_path}/conf,file://{CURRICULA}]"
     given = []
     monkeypatch.setattr(train, "train", lambda cfg, run_dir: given.append(cfg))
     code, _, err = run("train", search, *words.split(), "hydra.run.dir=run")
     assert code == 0, err
-    for cfg in (given[0], OmegaConf.load("run/.hydra/config.yaml")):
+    _, out, _ = run("train", search, *words.split(), "--cfg", "job")
+    for cfg in (given[0], OmegaConf.load("run/.hydra/config.yaml"), OmegaConf.create(out)):
         assert OmegaConf.select(cfg, key) == expected
 
 

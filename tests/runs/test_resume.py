@@ -11,6 +11,7 @@ import signal
 import pytest
 import torch
 from commands import ITERATION, SETTINGS, after_batch, assert_same, composed
+from loky import cpu_count
 from long import chaos
 from omegaconf import OmegaConf
 
@@ -215,6 +216,14 @@ def test_a_damaged_checkpoint_is_refused_and_a_whole_one_is_named(smoke_run, tmp
         ("curriculum|window", [float("nan")], "window of the checkpoint=nan: expected a number between 0 and 1"),
         ("latest", 3, "latest is 3; expected a validation that a training wrote"),
         ("latest", {"occupancy": [1]}, "occupancy is [1]; expected a number"),
+        ("latest", {str(n): 0 for n in range(300_000)}, "expected a validation that a training wrote"),
+        ("latest", {"\x1b[31m": 0}, "expected a validation that a training wrote"),
+        ("callbacks", 7, "callbacks is 7; expected a dict"), ("ended", "yes", "ended is 'yes'; expected true or"),
+        ("commit", {}, "commit is {}; expected a text or null"), ("versions", None, "versions is None; expected a"),
+        *(
+            (f"config|{path}", {"x": 1}, f"in the checkpoint's config, {path.replace('|', '.')}: there is no key")
+            for path in ("foo", "algo|foo", "evaluation|foo", "warm_start|foo", "hydra")
+        ),
         *(("curriculum", value, "curriculum is") for value in (None, "x", {}, 10**30)),
         ("curriculum|level", 2.5, "level of the checkpoint=2.5: expected a whole number"),
         ("curriculum|frames", -1, "frames of the checkpoint=-1: expected a whole number"),
@@ -242,7 +251,7 @@ def test_a_checkpoint_that_no_training_wrote_is_not_resumed(smoke_run, tmp_path,
     for node in (facts, state):
         for parent in parents:
             node = node.get(parent, {})
-        if leaf in node:
+        if leaf in node or part.startswith("config|") and node:
             node[leaf] = value
             if value is None and node is not facts:
                 del node[leaf]
@@ -270,6 +279,14 @@ def test_the_user_repeats_settings_that_leave_the_machine(key, value, local):
     assert OmegaConf.select(resumed_config("run", facts, [f"{key}={local}"]), key) != value
     _, words = checkpoint_config(OmegaConf.create(config))  # the words that a stopped run prints are enough
     assert OmegaConf.select(resumed_config("run", facts, words.split()), key) == value
+
+
+def test_a_checkpoint_asks_for_no_more_threads_than_there_are(caplog):
+    """A user may."""
+    config = saved_form(composed("experiment=quick", "threads=1024"))
+    facts = {"config": config, "curriculum": {}, "frames": 5, "iteration": 1, "best": 0.5, "latest": {}}
+    assert resumed_config("run", facts, []).threads == cpu_count() and "threads=1024" in caplog.text
+    assert resumed_config("run", facts, ["threads=1024"]).threads == 1024
 
 
 def test_only_the_user_says_what_to_trust():

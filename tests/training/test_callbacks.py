@@ -45,10 +45,13 @@ class Recorder(Callback):
 
 
 class Broken(Callback):
-    def __init__(self, state=None, metric=None):
-        self.state, self.metric = state, metric
+    def __init__(self, state=None, metric=1.0, clear=False, later=None):
+        self.state, self.metric, self.clear, self.later = state, metric, clear, later
 
     def on_batch(self, trainer, metrics):
+        self.state = self.state or self.later
+        if self.clear:
+            metrics.clear()
         metrics["train/broken"] = self.metric
 
     def state_dict(self):
@@ -163,10 +166,17 @@ def test_bad_callbacks_are_one_sentence(node, states, expected):
     assert "\n" not in str(caught.value)
 
 
-def test_a_metric_that_is_no_number_is_named(smoke, tmp_path):
-    words = "+callbacks.mine={_target_: test_callbacks.Broken, metric: many}"
-    with pytest.raises(ValueError, match="callbacks.mine: it logs train/broken='many'; expected a number"):
-        smoke(tmp_path / "run", words)
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ("metric: many", "callbacks.mine: it logs train/broken='many'; expected a number"),
+        ("clear: true", "callbacks.mine: it removes train/reward from the metrics"),
+        ("later: true", "callbacks.mine: its state cannot be saved .* set is not JSON"),
+    ],
+)
+def test_a_callback_that_breaks_a_training_is_named(smoke, tmp_path, settings, expected):
+    with pytest.raises(ValueError, match=expected):
+        smoke(tmp_path / "run", f"+callbacks.mine={{_target_: test_callbacks.Broken, {settings}}}")
 
 
 def test_own_callback(run, monkeypatch, tmp_path):
