@@ -74,7 +74,7 @@ def test_the_state_can_be_read_from_an_observation(problem):
         ({**OWN, "two words": Middle()}, "observation.two words: expected another name; taken are action,"),
         *(({**OWN, key: Middle()}, f"observation.{key}: expected another name") for key in RESERVED),
         ({"middle": Middle()}, "observation.bin_depth=None: expected BinDepth, which is always there"),
-        ({**STANDARD_TERMS, "tote_depth": Middle()}, "observation.tote_depth=<.*>: expected ToteDepth"),
+        ({**STANDARD_TERMS, "tote_depth": Middle()}, "observation.tote_depth=Middle: expected ToteDepth"),
     ],
 )
 def test_bad_terms_are_refused(terms, message):

@@ -91,6 +91,7 @@ def test_a_training_that_a_callback_ends_is_a_complete_one(smoke, tmp_path, capl
     assert (run_dir / "report.html").is_file() and "256 frames: enough" in caplog.text
     (run_dir / ".hydra").mkdir()
     (run_dir / ".hydra" / "config.yaml").write_text("total_frames: 1024\n")
+    (run_dir / ".hydra" / "overrides.yaml").write_text("[]\n")
     assert read_run(run_dir).status == "finished"
     assert resume_run([f"resume={run_dir}", "trust=test_callbacks"]) == rows[-1]["eval/occupancy"]
     assert read_csv(run_dir / "metrics.csv") == rows
