@@ -37,7 +37,7 @@ def ours(seed: int, whole: bool) -> dict:
         whole: run to the end; else only until the last mark is reached.
     """
     with tempfile.TemporaryDirectory() as folder:
-        command = [console_command("pickplace-train"), "experiment=quick", f"seed={seed}"]
+        command = [console_command("pickplace-train"), "experiment=quick", "threads=null", f"seed={seed}"]
         command += ["evaluation_interval=50_000", f"hydra.run.dir={folder}"]
         started, curve = time.perf_counter(), []
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

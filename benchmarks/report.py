@@ -9,7 +9,7 @@ PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 HEAD = """# Performance
 
 Written by `make bench` from `benchmarks/results/`. Times are medians, with the 10th to 90th percentile in brackets.
-Peers run in turn with ours, on an idle machine.
+Peers run in turn with ours, on an idle machine. "All cores" means `threads=null OMP_WAIT_POLICY=ACTIVE`.
 """
 
 

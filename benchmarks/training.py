@@ -43,7 +43,7 @@ def main() -> None:
         with initialize_config_dir(str(conf_dir()), version_base="1.3"):
             # One validation, after the last batch, too short to count.
             overrides = [f"total_frames={FRAMES}", "evaluation_interval=1_000_000_000", "evaluation.episodes=1"]
-            cfg = compose("train", ["experiment=quick", *overrides])
+            cfg = compose("train", ["experiment=quick", "threads=null", *overrides])
         cfg.evaluation.batch_size = 1
         train(cfg, Path(folder))
         rows = read_csv(Path(folder) / "metrics.csv")
