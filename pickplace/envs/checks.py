@@ -57,7 +57,7 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
         rows = rows[rows[:, 4].argsort(stable=True)]
         enough = 2 * (max(cell.effector_size) + cell.max_side)
         cell = replace(cell, tote_size=(min(cell.tote_size[0], enough), min(cell.tote_size[1], enough), height))
-    # Where the end effector can hold an item in the same ways, the same footprints are feasible.
+    # Positions in which the end effector can hold an item in the same ways have the same feasible footprints.
     distinct: dict[bytes, int] = {}
     for numbers in torch.arange(len(rows)).split(max(1, 2**22 // (cell.rotations * cell.num_offsets**2))):
         available, _ = available_offsets(cell, Item(*rows[numbers, :5].unbind(-1)))  # [K, M]

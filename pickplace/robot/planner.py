@@ -105,16 +105,8 @@ class Planner:
         """Return a planner from a checkpoint.
 
         Args:
-            path: a run folder, a checkpoint, or ``pretrained/<name>``.
+            path, device, trust, **sizes: see :func:`~pickplace.policies.restore.load_policy`, as for errors.
             candidates: ``"all"``, or ``K``: how many of the most probable actions are tried.
-            device: where to compute, ``"cpu"`` or ``"cuda"``.
-            trust: your own modules whose classes the checkpoint's config may name.
-            **sizes: settings that differ from the training's, such as ``tote_size=(30, 30, 10)``; see
-                :class:`~pickplace.task.cell.CellSpec`. A fully convolutional policy serves any bin and tote, and any
-                end effector if it was trained with a mask.
-
-        Raises:
-            ValueError: for a checkpoint that cannot be used, or bad sizes.
         """
         trained = load_policy(path, device, trust, **sizes)
         return cls(trained.cell, trained.policy, candidates, trained.terms)

@@ -249,7 +249,7 @@ def read_csv(path) -> list[dict[str, float]]:
 
 
 def parse_csv(text: str, path) -> list[dict[str, float]]:
-    """As :func:`read_csv`, of the file's text."""
+    """Return the rows of a table's text, as :func:`read_csv` does of a file; ``path`` is for errors."""
     lines = text[: text.rfind("\n") + 1].splitlines()  # a killed run may leave an incomplete last line
     rows = []
     table = csv.DictReader(lines or [text])

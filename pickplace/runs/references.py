@@ -67,8 +67,10 @@ def select_groups(content: dict, groups: Collection[str]) -> dict:
 
 def _target_path(text: str, path: tuple) -> tuple:
     """Return the path of the value to which a reference at a path leads."""
-    dots, keys = REFERENCE.fullmatch(text).groups()  # type: ignore[union-attr]
-    return (*(path[: -len(dots)] if dots else ()), *keys.split("."))
+    reference = text[2:-1]  # without the braces
+    keys = reference.lstrip(".")
+    dots = len(reference) - len(keys)
+    return (*(path[:-dots] if dots else ()), *keys.split("."))
 
 
 def _is_reference_to_value(text, path: tuple, root) -> bool:

@@ -46,7 +46,8 @@ def is_whole(value) -> bool:
 
 def is_number(value: Any) -> bool:
     """Return whether a value is a finite real number, and not a bool."""
-    return isinstance(value, Real) and not isinstance(value, bool) and abs(value) <= sys.float_info.max  # type: ignore[operator]
+    is_real = isinstance(value, Real) and not isinstance(value, bool)
+    return is_real and -sys.float_info.max <= value <= sys.float_info.max
 
 
 def whole_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:

@@ -57,7 +57,7 @@ def test_a_run_that_is_killed_and_stopped_equals_an_undisturbed_one(collector, u
     assert saved_frames(run_dir) == 3 * ITERATION  # two more iterations are lost
 
     def stop(_):
-        """As a scheduler does, which sends SIGTERM to the whole group."""
+        """Send SIGTERM to the whole group, like a scheduler."""
         for pid in (*(worker.pid for worker in multiprocessing.active_children()), os.getpid()):
             os.kill(pid, signal.SIGTERM)
 
@@ -107,7 +107,7 @@ def test_a_second_process_is_refused(run, undisturbed, tmp_path):
 
 
 def test_a_job_of_a_sweep_that_is_started_again_goes_on(run, undisturbed, tmp_path):
-    """As after a preemption. With another config it is refused, which is no failure of the run that is there."""
+    """A job goes on after a preemption; with another config it is refused, which is no failure of the run there."""
     whole, killed = undisturbed("single")
     job = shutil.copytree(killed, tmp_path / "sweep" / "seed-0")
     sweep = ["-m", *SETTINGS, "hydra.sweep.dir=sweep", "seed=0"]
