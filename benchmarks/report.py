@@ -53,11 +53,16 @@ def learning(result: dict) -> str:
 
 
 def training(result: dict) -> str:
-    speed = result["frames per second"]["median"]
-    share = ", ".join(f"{part} {value:.0%}" for part, value in result["share"].items())
+    rows = [
+        (f"`{preset}`", f"{row['frames per second']:,.0f}", *(f"{share:.0%}" for share in row["share"].values()))
+        for preset, row in result["trainings"].items()
+    ]
+    parts = " | ".join(next(iter(result["trainings"].values()))["share"])
     return section(
         "Parts of the training time",
-        f"`experiment=quick`, {result['frames']:,} frames: {speed:,.0f} frames/s in the median batch; {share}.",
+        "Frames/s of the median batch, on all cores, and the share of each part. `paper` and `paper_fast` train the "
+        "same network without a mask.",
+        table(f"`experiment=` | frames/s | {parts}", rows),
     )
 
 

@@ -22,6 +22,7 @@ ITERATION = 8 * 16  # frames: env.num_envs * algo.rollout_length of experiment=s
 SETTINGS = [
     "experiment=smoke",
     "env.tote_size=[5,5,3]",
+    "algo.vine_samples=2",
     "curriculum=mixture",  # its sampler draws, so the generators matter
     "curriculum.advance.occupancy=0.3",
     "curriculum.advance.window=10",

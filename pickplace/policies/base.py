@@ -5,6 +5,7 @@ probability of a choice is spread evenly over the flat actions of its class, so 
 of the choice.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
@@ -73,6 +74,17 @@ class Policy(TensorDictModuleBase, ABC):
     def logits(self, observation: Observation) -> Tensor:
         """Return a logit for each choice, float32 ``[N, choices]``."""
 
+    def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
+        """Return the logits of some choices that a mask allows, ``[N, M]``, up to a constant for each row.
+
+        A policy overrides this where it need not compute all logits for it.
+
+        Args:
+            observation: as for :meth:`logits`.
+            choices: int64 ``[N, M]``.
+        """
+        return self.logits(observation).gather(1, choices)
+
     @abstractmethod
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
         """Return a flat action of each choice's class, int64 ``[N]``; drawn evenly when exploring, else the lowest."""
@@ -107,9 +119,12 @@ class Policy(TensorDictModuleBase, ABC):
         """Entries of the observation that :meth:`to_action` may read."""
         return list(dict.fromkeys([*STANDARD_TERMS, *self.in_keys]))
 
-    @property
-    def learning_bytes(self) -> int:
-        """About how many bytes a frame takes in a gradient step; with ``fcn_grasp`` 90 kB at the paper's cell."""
+    def learning_bytes(self, samples: int | None = None) -> int:
+        """Return about how many bytes a frame takes in a gradient step; with ``fcn_grasp`` 90 kB at the paper's cell.
+
+        Args:
+            samples: ``algo.vine_samples``.
+        """
         return 1_250 * self.cell.num_footprints
 
     @property
@@ -157,12 +172,12 @@ class Choice(Categorical):
         return self.logits.argmax(-1)
 
     def sample(self, sample_shape=()):
-        """Sample by the inverse of the distribution function, with one uniform number a row."""
-        if sample_shape:
-            return super().sample(sample_shape)
+        """Sample by the inverse of the distribution function, with one uniform number a sample."""
         edges = self.probs.double().cumsum(-1)
-        uniform = torch.rand(edges.shape[:-1], dtype=torch.float64, device=edges.device) * edges[..., -1]
-        return torch.searchsorted(edges, uniform[..., None], right=True)[..., 0].clamp(max=edges.shape[-1] - 1)
+        shape = (*edges.shape[:-1], math.prod(sample_shape))
+        uniform = torch.rand(shape, dtype=torch.float64, device=edges.device) * edges[..., -1:]
+        drawn = torch.searchsorted(edges, uniform, right=True).clamp(max=edges.shape[-1] - 1)
+        return drawn.movedim(-1, 0).reshape(*sample_shape, *edges.shape[:-1])
 
 
 def pick_one(candidates: Tensor) -> Tensor:
@@ -174,6 +189,21 @@ def pick_one(candidates: Tensor) -> Tensor:
         highest = torch.iinfo(candidates.dtype).max
         index = torch.where(candidates >= 0, candidates, highest).argmin(1, keepdim=True)
     return candidates.gather(1, index)[:, 0]
+
+
+def distinct(choices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return each row's distinct choices.
+
+    Args:
+        choices: int64 ``[N, M]``.
+
+    Returns:
+        row and choice of each, int64 ``[K]``, and the index into them that gives ``choices``, int64 ``[N, M]``.
+    """
+    count = int(choices.amax()) + 1 if choices.numel() else 1
+    row = torch.arange(len(choices), device=choices.device)[:, None]
+    number, back = torch.unique(row * count + choices, return_inverse=True)
+    return number // count, number % count, back
 
 
 def refuse_large_network(make: Callable[[], torch.nn.Module], key: str) -> None:
@@ -220,8 +250,10 @@ def as_actor(policy: Policy) -> ProbabilisticTensorDictSequential:
 
 def as_collection_policy(policy: Policy) -> TensorDictSequential:
     """Return the policy as the collector runs it: choice, log-probability and flat action; logits are dropped."""
-    choose = as_actor(policy)
-    act = TensorDictModule(policy.act, in_keys=[policy.choice_key, *policy.act_keys], out_keys=["action"])
-    return TensorDictSequential(
-        choose, act, selected_out_keys=list(dict.fromkeys([policy.choice_key, "log_prob", "action"]))
-    )
+    keys = list(dict.fromkeys([policy.choice_key, "log_prob", "action"]))
+    return TensorDictSequential(as_actor(policy), act_module(policy), selected_out_keys=keys)
+
+
+def act_module(policy: Policy) -> TensorDictModule:
+    """Return :meth:`Policy.act` as a module: a choice and the observation -> ``action``."""
+    return TensorDictModule(policy.act, in_keys=[policy.choice_key, *policy.act_keys], out_keys=["action"])

@@ -5,10 +5,11 @@ import math
 import torch
 from torch import Tensor, nn
 
-from pickplace.policies.base import MASKED, Policy
+from pickplace.policies.base import MASKED, Policy, distinct
 from pickplace.policies.networks.conv4d import Conv4dPolicy
 from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import action_mask, placing_maps
+from pickplace.task.grasps import split_flat
 from pickplace.task.state import Observation, State
 
 
@@ -41,9 +42,16 @@ class ActionPolicy(Policy):
         logits = needed.new_full(by_pick.shape, MASKED).index_put((row, pick), needed)
         return torch.where(mask, logits.flatten(1), MASKED)
 
-    @property
-    def learning_bytes(self) -> int:
-        """About how many bytes a frame takes in a gradient step, measured at bins and totes of 5x5 to 12x12."""
+    def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
+        # A policy that has learned something draws the same action again and again.
+        row, action, back = distinct(choices)
+        maps = observation["bin_depth"], observation["tote_depth"]
+        return self.network.action_logits(*maps, row, split_flat(self.cell, action))[back]
+
+    def learning_bytes(self, samples: int | None = None) -> int:
+        """Return about how many bytes a frame takes, measured at bins and totes of 5x5 to 12x12."""
+        if samples is not None:
+            return (1 + samples) * 400 * self.network.filters
         sides = (*self.cell.bin_size[:2], *self.cell.tote_size[:2])
         return 8 * self.network.filters * math.prod(side + 2 for side in sides) + self.acting_bytes
 
@@ -94,3 +102,9 @@ class TypicalPolicy(ActionPolicy):
     def scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
         logits = self.join(super().scores(observation))
         return logits if mask is None else torch.where(mask, logits, MASKED)
+
+    # The last layer joins all logits.
+    choice_logits = Policy.choice_logits
+
+    def learning_bytes(self, samples: int | None = None) -> int:
+        return super().learning_bytes()

@@ -71,6 +71,10 @@ class IndividualRlPolicy(PlaceRotationPolicy, ActionPolicy):
     Args: as :class:`~pickplace.policies.fcn4d.ActionPolicy`.
     """
 
+    def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
+        actions = join_pick(self.cell, self._pick(observation)[:, None], choices)
+        return ActionPolicy.choice_logits(self, observation, actions)
+
     def place_scores(self, observation: Observation, pick: Tensor) -> Tensor:
         logits = self.network(observation["bin_depth"], observation["tote_depth"], pick).unflatten(1, (-1, 4))
         return logits[..., : self.cell.rotations].flatten(1)

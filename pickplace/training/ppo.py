@@ -9,6 +9,7 @@ from torchrl.objectives import A2CLoss, ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from pickplace.policies.base import Policy, as_actor
+from pickplace.policies.sampled_softmax import CANDIDATE_KEYS, as_sampled_actor
 from pickplace.training.imitation import Phase, imitation_loss
 
 #: Logged diagnostics, by their names in the loss's output.
@@ -28,16 +29,18 @@ def make_losses(algo: DictConfig, policy: Policy, critic: ValueOperator) -> tupl
     """Make the advantage estimator and the loss that ``algo.loss`` names."""
     # TorchRL leaves out a part whose coefficient is 0 at first; with 1 it is computed, so that it can be logged.
     common = {"entropy_coeff": 1.0, "critic_coeff": 1.0, "loss_critic_type": "l2"}
+    exact = algo.vine_samples is None
+    actor = as_actor(policy) if exact else as_sampled_actor(policy)
     if algo.loss == "ppo":
-        clip = {"clip_epsilon": algo.clip_epsilon, "normalize_advantage": algo.normalize_advantage}
-        loss = ClipPPOLoss(as_actor(policy), critic, **clip, **common)
+        clip = {"clip_epsilon": algo.clip_epsilon, "normalize_advantage": exact and algo.normalize_advantage}
+        loss = ClipPPOLoss(actor, critic, **clip, **common)
     else:
-        loss = A2CLoss(as_actor(policy), critic, **common)
+        loss = A2CLoss(actor, critic, **common)
     loss.entropy_coeff.fill_(float(algo.entropy_coeff))
     loss.critic_coeff.fill_(float(algo.critic_coeff))
-    loss.set_keys(action=policy.choice_key, sample_log_prob="log_prob")
+    loss.set_keys(action=policy.choice_key, sample_log_prob="log_prob" if exact else CANDIDATE_KEYS[1])
     # A2CLoss does not normalise advantages itself.
-    average = algo.loss == "a2c" and algo.normalize_advantage
+    average = algo.loss == "a2c" and algo.normalize_advantage and exact
     advantage = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=critic, average_gae=average, deactivate_vmap=True)
     return advantage, loss
 

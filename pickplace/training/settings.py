@@ -57,6 +57,7 @@ CHECKS = {
     "env.num_envs": partial(whole_number, most=32_768),
     **dict.fromkeys(("algo.rollout_length", "algo.minibatch_size"), whole_number),
     "algo.epochs": partial(whole_number, most=1_000),
+    "algo.vine_samples": _or_null(partial(whole_number, most=10_000)),
     "algo.loss": partial(one_of, choices=("ppo", "a2c")),
     **dict.fromkeys(("algo.mask_infeasible", "algo.normalize_advantage"), flag),
     "planner._target_": _only("policy", "since training validates its own policy"),
@@ -100,10 +101,12 @@ def check_memory(cfg: DictConfig, env: PickPlaceEnv, policy: Policy) -> None:
         ValueError: naming the keys, their values, and the memory.
     """
     cell, masks, slots, steps = env.cell, policy.masks, cfg.env.num_envs, cfg.algo.rollout_length
+    samples = cfg.algo.vine_samples
     frame = 2 * env.observation_bytes + sum(MASKS[name].size(cell) for name in masks) + 200 * cell.num_places
+    frame += 12 * (1 + (samples or 0))
     check_bytes(f"env.num_envs={slots}, algo.rollout_length={steps}", slots * steps * frame, env.device)
     part = min(cfg.algo.minibatch_size, slots * steps)
-    check_bytes(f"algo.minibatch_size={part}", part * policy.learning_bytes, env.device)
+    check_bytes(f"algo.minibatch_size={part}", part * policy.learning_bytes(samples), env.device)
     problem = max(problem_bytes(cell, masks), policy.acting_bytes)
     check_bytes(f"env.num_envs={slots}", slots * problem, env.device)
     check_play(cfg.evaluation, cell, env.device)

@@ -18,6 +18,7 @@ from pickplace.envs.saved_state import check_saved_states
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.evaluation.play import Episodes, play
 from pickplace.policies.base import Policy, as_collection_policy, as_critic, refuse_large_network
+from pickplace.policies.sampled_softmax import CANDIDATE_KEYS, as_sampling_policy
 from pickplace.runs import checkpoint
 from pickplace.runs.machine import use_machine
 from pickplace.runs.provenance import commit, versions
@@ -40,6 +41,7 @@ from pickplace.training.metrics import has_passed, progress_line, validation_met
 from pickplace.training.ppo import add_advantages, learning_rate, make_losses, update
 from pickplace.training.report import REPORT, write_report
 from pickplace.training.settings import check_memory, check_settings
+from pickplace.training.vine import vine_advantages
 from pickplace.views.figures import learning_curve
 
 log = logging.getLogger(__name__)
@@ -145,7 +147,10 @@ class Trainer:
         make_env = partial(
             training_env, self.env_config, self.items, cfg.device, self.policy.masks, cfg.env.num_envs, self.curriculum
         )
-        self.acting = as_collection_policy(self.policy)
+        if algo.vine_samples is None:
+            self.acting = as_collection_policy(self.policy)
+        else:
+            self.acting = as_sampling_policy(self.policy, algo.vine_samples)
         self.advantage, self.loss = make_losses(algo, self.policy, self.critic)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=algo.lr, eps=1e-5)
         if self.resumed:
@@ -246,7 +251,10 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         seen = {*self.policy.in_keys, *self.critic.in_keys}
-        data = batch.select(*seen, self.policy.choice_key, "log_prob", "advantage", "value_target").reshape(-1)
+        drawn = ("log_prob",) if self.algo.vine_samples is None else CANDIDATE_KEYS
+        data = batch.select(*seen, self.policy.choice_key, *drawn, "advantage", "value_target").reshape(-1)
+        if self.algo.vine_samples is not None:
+            data["advantage"] = vine_advantages(batch.reshape(-1), self.policy, self.critic, self.terms, self.algo)
         if phase == Phase.IMITATION:
             data["taught"] = self.warm_start.ask(batch.reshape(-1), self.iteration)
         metrics = update(self.loss, self.optimizer, data, self.algo, self.policy, phase)

@@ -24,11 +24,12 @@ def test_every_preset_runs(name, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == files
 
 
-@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize(("masked", "samples"), [(True, "null"), (False, "null"), (False, 2)])
 @pytest.mark.parametrize("model", options("model"))
-def test_every_model_trains_with_and_without_a_mask(model, masked, tmp_path):
+def test_every_model_trains_with_and_without_a_mask(model, masked, samples, tmp_path):
     algo = ["algo=a2c"] if model == "fcn_grasp" and masked else []  # presets train it with PPO
-    overrides = [f"model={model}", f"algo.mask_infeasible={masked}", "curriculum=none", "logger=none", *algo, *TINY]
+    algo += [f"algo.mask_infeasible={masked}", f"algo.vine_samples={samples}"]
+    overrides = [f"model={model}", "curriculum=none", "logger=none", *algo, *TINY]
     assert 0 <= train(composed(*overrides, "env.rotations=2"), tmp_path) <= 1
 
 
