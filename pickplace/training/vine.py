@@ -16,7 +16,7 @@ from pickplace.policies.base import Policy, distinct
 from pickplace.policies.sampled_softmax import CANDIDATE_KEYS
 from pickplace.task.feasibility import footprint_mask, placing_maps
 from pickplace.task.observation import Term, observe
-from pickplace.task.state import State
+from pickplace.task.state import Item, State
 from pickplace.task.transition import apply
 
 
@@ -41,7 +41,12 @@ def vine_advantages(
 
 
 def _values(
-    frames, items, policy: Policy, critic: ValueOperator, terms: Mapping[str, Term], algo: DictConfig
+    frames: TensorDictBase,
+    items: Item,
+    policy: Policy,
+    critic: ValueOperator,
+    terms: Mapping[str, Term],
+    algo: DictConfig,
 ) -> Tensor:
     """Return the reward of each candidate and the critic's value of what follows, ``[B, 1 + samples, 1]``.
 
