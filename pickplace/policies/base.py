@@ -5,7 +5,6 @@ probability of a choice is spread evenly over the flat actions of its class, so 
 of the choice.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
@@ -172,12 +171,12 @@ class Choice(Categorical):
         return self.logits.argmax(-1)
 
     def sample(self, sample_shape=()):
-        """Sample by the inverse of the distribution function, with one uniform number a sample."""
+        """Sample by the inverse of the distribution function, with one uniform number a row."""
+        if sample_shape:
+            return super().sample(sample_shape)
         edges = self.probs.double().cumsum(-1)
-        shape = (*edges.shape[:-1], math.prod(sample_shape))
-        uniform = torch.rand(shape, dtype=torch.float64, device=edges.device) * edges[..., -1:]
-        drawn = torch.searchsorted(edges, uniform, right=True).clamp(max=edges.shape[-1] - 1)
-        return drawn.movedim(-1, 0).reshape(*sample_shape, *edges.shape[:-1])
+        uniform = torch.rand(edges.shape[:-1], dtype=torch.float64, device=edges.device) * edges[..., -1]
+        return torch.searchsorted(edges, uniform[..., None], right=True)[..., 0].clamp(max=edges.shape[-1] - 1)
 
 
 def pick_one(candidates: Tensor) -> Tensor:
@@ -189,21 +188,6 @@ def pick_one(candidates: Tensor) -> Tensor:
         highest = torch.iinfo(candidates.dtype).max
         index = torch.where(candidates >= 0, candidates, highest).argmin(1, keepdim=True)
     return candidates.gather(1, index)[:, 0]
-
-
-def distinct(choices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return each row's distinct choices.
-
-    Args:
-        choices: int64 ``[N, M]``.
-
-    Returns:
-        row and choice of each, int64 ``[K]``, and the index into them that gives ``choices``, int64 ``[N, M]``.
-    """
-    count = int(choices.amax()) + 1 if choices.numel() else 1
-    row = torch.arange(len(choices), device=choices.device)[:, None]
-    number, back = torch.unique(row * count + choices, return_inverse=True)
-    return number // count, number % count, back
 
 
 def refuse_large_network(make: Callable[[], torch.nn.Module], key: str) -> None:

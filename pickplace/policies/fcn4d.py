@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from pickplace.policies.base import MASKED, Policy, distinct
+from pickplace.policies.base import MASKED, Policy
 from pickplace.policies.networks.conv4d import Conv4dPolicy
 from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import action_mask, placing_maps
@@ -43,10 +43,9 @@ class ActionPolicy(Policy):
         return torch.where(mask, logits.flatten(1), MASKED)
 
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
-        # A policy that has learned something draws the same action again and again.
-        row, action, back = distinct(choices)
         maps = observation["bin_depth"], observation["tote_depth"]
-        return self.network.action_logits(*maps, row, split_flat(self.cell, action))[back]
+        row = torch.arange(len(choices), device=choices.device).repeat_interleave(choices.shape[1])
+        return self.network.action_logits(*maps, row, split_flat(self.cell, choices.flatten())).view(choices.shape)
 
     def learning_bytes(self, samples: int | None = None) -> int:
         """Return about how many bytes a frame takes, measured at bins and totes of 5x5 to 12x12."""

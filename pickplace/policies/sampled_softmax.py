@@ -1,21 +1,25 @@
 """The softmax over a few sampled choices, for a loss whose policy has many choices.
 
 A gradient step through the softmax over all ``N_a`` flat actions computes every logit forward and backward. Here the
-loss computes only those of the *candidates*: the choice that was taken and some more, all drawn from the policy that
-collected (see also :mod:`pickplace.training.vine`). The normaliser of the softmax is estimated from them by
-self-normalised importance sampling (Bengio and Senecal 2008). With ``pi`` the collecting policy, ``l`` the new logits
-and ``m + 1`` candidates ``a_j``::
+loss computes only those of the *candidates*, which the policy that collected draws without replacement (see also
+:mod:`pickplace.training.vine`): the choices with the greatest log-probability plus Gumbel noise (Kool, van Hoof and
+Welling, Stochastic Beams and Where to Find Them, 2019). The first of them is a draw from the policy, and is taken.
 
-    d_j = l(a_j) - log pi(a_j)
-    log pi_new(a_i) = log pi(a_i) + d_i - log(mean_j exp(d_j))
+An expectation under the policy is a weighted mean over the candidates. With ``pi`` the policy that collected and
+``k`` the greatest noisy log-probability that is left out::
 
-At the policy that collected, the expected gradient of the log-probability and of the entropy is ``m / (m + 1)`` times
-the exact one.
+    w_i = pi(a_i) / (1 - exp(-exp(log pi(a_i) - k))), scaled to a sum of 1
+
+So is the normaliser of a new policy with logits ``l``::
+
+    d_i = l(a_i) - log pi(a_i)
+    log pi_new(a_i) = log pi(a_i) + d_i - log(sum_j w_j exp(d_j))
+
+Once every choice is a candidate, all of this is exact.
 """
 
-import math
-
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
@@ -28,11 +32,11 @@ from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.envs.utils import ExplorationType
 
-from pickplace.policies.base import Choice, Policy, act_module
+from pickplace.policies.base import MASKED, Policy, act_module
 
-#: The entries of a frame that the loss reads: the candidates, int64 ``[N, 1 + samples]``, the taken choice first, and
-#: their log-probabilities under the policy that collected, float32 of the same shape.
-CANDIDATE_KEYS = ("candidates", "candidate_log_prob")
+#: The entries of a frame that the loss reads, each ``[N, 1 + samples]``: the candidates, int64, the taken choice first;
+#: their log-probabilities under the policy that collected; and the logarithms of their weights, both float32.
+CANDIDATE_KEYS = ("candidates", "candidate_log_prob", "candidate_log_weight")
 
 
 class SampledSoftmax(Categorical):
@@ -41,11 +45,13 @@ class SampledSoftmax(Categorical):
     Args:
         logits: of the candidates under the new policy, up to a constant, ``[N, 1 + samples]``.
         log_prob: of the candidates under the policy that drew them, same shape.
+        log_weight: logarithms of the candidates' weights, same shape.
     """
 
-    def __init__(self, logits: Tensor, log_prob: Tensor):
-        super().__init__(logits=logits - log_prob, validate_args=False)
-        self.candidate_log_prob = log_prob + self.logits + math.log(logits.shape[-1])
+    def __init__(self, logits: Tensor, log_prob: Tensor, log_weight: Tensor):
+        change = logits - log_prob
+        super().__init__(logits=change + log_weight, validate_args=False)
+        self.candidate_log_prob = logits - (change + log_weight).logsumexp(-1, keepdim=True)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the estimated log-probability of every candidate, ``[N, 1 + samples]``, whatever ``value`` is."""
@@ -54,6 +60,31 @@ class SampledSoftmax(Categorical):
     def entropy(self) -> Tensor:
         """Return the estimated entropy over all choices, ``[N]``; in nats."""
         return -(self.probs * self.candidate_log_prob).sum(-1)
+
+
+def draw_candidates(logits: Tensor, samples: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw choices without replacement; return the three entries of :data:`CANDIDATE_KEYS`.
+
+    Where fewer choices are allowed, the taken one stands again for each that lacks, with a weight of 0.
+
+    Args:
+        logits: of all choices, ``[N, choices]``; :data:`MASKED` for those that a mask forbids.
+        samples: candidates beside the choice that is taken.
+    """
+    lacking = max(0, 2 + samples - logits.shape[1])
+    every = F.pad(logits, (0, lacking), value=MASKED).log_softmax(1)
+    noisy = every - torch.empty_like(every).exponential_().clamp(min=1e-30).log()
+    score, order = noisy.topk(2 + samples)
+    candidates, left_out = order[:, :-1], score[:, -1:]
+    log_prob = every.gather(1, candidates)
+    log_weight = log_prob - (-(log_prob - left_out).exp()).expm1().neg().log()
+    absent = log_prob < MASKED / 2
+    log_weight = log_weight.masked_fill(absent, -torch.inf).log_softmax(1)
+    return (
+        torch.where(absent, candidates[:, :1], candidates),
+        torch.where(absent, log_prob[:, :1], log_prob),
+        log_weight,
+    )
 
 
 class CandidateLogits(TensorDictModuleBase):
@@ -73,7 +104,7 @@ def as_sampled_actor(policy: Policy) -> ProbabilisticTensorDictSequential:
     return ProbabilisticTensorDictSequential(
         CandidateLogits(policy),
         ProbabilisticTensorDictModule(
-            in_keys={"logits": "candidate_logits", "log_prob": CANDIDATE_KEYS[1]},
+            in_keys={"logits": "candidate_logits", "log_prob": CANDIDATE_KEYS[1], "log_weight": CANDIDATE_KEYS[2]},
             out_keys=[policy.choice_key],
             distribution_class=SampledSoftmax,
             default_interaction_type=ExplorationType.RANDOM,
@@ -92,12 +123,10 @@ def as_sampling_policy(policy: Policy, samples: int) -> TensorDictSequential:
     """
 
     def draw(logits: Tensor) -> tuple[Tensor, ...]:
-        choice = Choice(logits)
-        candidates = choice.sample(torch.Size((1 + samples,))).T.contiguous()
-        log_prob = choice.logits.gather(1, candidates)
-        return candidates[:, 0], log_prob[:, 0], candidates, log_prob
+        candidates, log_prob, log_weight = draw_candidates(logits, samples)
+        return candidates[:, 0], log_prob[:, 0], candidates, log_prob, log_weight
 
     keys = [policy.choice_key, "log_prob", *CANDIDATE_KEYS]
-    draw_candidates = TensorDictModule(draw, in_keys=["logits"], out_keys=keys)
+    sampler = TensorDictModule(draw, in_keys=["logits"], out_keys=keys)
     selected = list(dict.fromkeys([*keys, "action"]))
-    return TensorDictSequential(policy, draw_candidates, act_module(policy), selected_out_keys=selected)
+    return TensorDictSequential(policy, sampler, act_module(policy), selected_out_keys=selected)

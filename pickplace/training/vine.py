@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.modules import ValueOperator
 
-from pickplace.policies.base import Policy, distinct
+from pickplace.policies.base import Policy
 from pickplace.policies.sampled_softmax import CANDIDATE_KEYS
 from pickplace.task.feasibility import footprint_mask, placing_maps
 from pickplace.task.observation import Term, observe
@@ -24,20 +24,26 @@ from pickplace.task.transition import apply
 def vine_advantages(
     frames: TensorDictBase, policy: Policy, critic: ValueOperator, terms: Mapping[str, Term], algo: DictConfig
 ) -> Tensor:
-    """Return the advantage of each candidate over the mean of its state, ``[B, 1 + samples, 1]``.
+    """Return the weighted advantage of each candidate over its state's value, ``[B, 1 + samples, 1]``.
+
+    A state's value is the weighted mean over its candidates. The weights of a state have a mean of 1 here, so that the
+    loss, an unweighted mean over candidates, is an expectation under the policy that drew them.
 
     Args:
         frames: observations and candidates, ``[B]``.
         policy: the policy that drew the candidates.
         critic: the value network.
         terms: of the observation, by key.
-        algo: the config group ``algo``; the advantages have unit variance with ``normalize_advantage``.
+        algo: the config group ``algo``; with ``normalize_advantage`` what is returned has a mean square of 1.
     """
     items = State.from_observation(frames).item.rows(torch.randperm(len(frames), device=frames["candidates"].device))
     parts = torch.arange(len(frames), device=items.x.device).split(algo.minibatch_size)
-    advantage = torch.cat([_values(frames[part], items.rows(part), policy, critic, terms, algo) for part in parts])
-    advantage -= advantage.mean(1, keepdim=True)
-    return advantage / advantage.std().clamp(min=1e-6) if algo.normalize_advantage else advantage
+    value = torch.cat([_values(frames[part], items.rows(part), policy, critic, terms, algo) for part in parts])
+    weight = frames[CANDIDATE_KEYS[2]].exp()
+    advantage = (value - (weight * value).sum(1, keepdim=True)) * weight * weight.shape[1]
+    if algo.normalize_advantage:
+        advantage /= advantage.square().mean().sqrt().clamp(min=1e-6)
+    return advantage[..., None]
 
 
 def _values(
@@ -48,18 +54,21 @@ def _values(
     terms: Mapping[str, Term],
     algo: DictConfig,
 ) -> Tensor:
-    """Return the reward of each candidate and the critic's value of what follows, ``[B, 1 + samples, 1]``.
+    """Return the reward of each candidate and the critic's value of what follows, ``[B, 1 + samples]``.
 
     The item that arrives next is another frame's, the same for all candidates of a state. A failure is worth nothing,
     and so is what follows if that item has no feasible action.
     """
-    cell, (row, choice, back) = policy.cell, distinct(frames[CANDIDATE_KEYS[0]])
+    cell, candidates = policy.cell, frames[CANDIDATE_KEYS[0]]
+    row = torch.arange(len(frames), device=candidates.device).repeat_interleave(candidates.shape[1])
     state = State.from_observation(frames).rows(row)
-    step = apply(cell, state, policy.to_action(choice, frames.select(*policy.act_keys)[row]))
+    step = apply(cell, state, policy.to_action(candidates.flatten(), frames.select(*policy.act_keys)[row]))
     after = State(step.heights, state.tote_height, items.rows(row))
     placed = step.failure == 0
     goes_on = placed & footprint_mask(cell, placing_maps(cell, after)).flatten(1).any(1)
-    seen = TensorDict(observe(terms, cell, after, critic.in_keys), [len(row)])
-    following = critic(seen)["state_value"][:, 0]
-    value = placed * state.item.volume * algo.reward_scale + algo.gamma * torch.where(goes_on, following, 0.0)
-    return value[back][..., None]
+    value = placed * state.item.volume * algo.reward_scale
+    if goes_on.any():
+        after = after.rows(goes_on.nonzero()[:, 0])
+        seen = TensorDict(observe(terms, cell, after, critic.in_keys), [len(after.tote_height)])
+        value[goes_on] += algo.gamma * critic(seen)["state_value"][:, 0]
+    return value.view(candidates.shape)

@@ -46,12 +46,12 @@ def test_advantages_are_those_of_single_steps(kind):
         expected.append(torch.where(after["terminated"], 0.0, value)[:, 0])
         assert not (after["failure"] == 7).any()  # a tote with one item takes any other
         env.load_state_dict({key: value.clone() for key, value in saved.items()})
-    expected = torch.stack(expected, 1)
+    expected, weight = torch.stack(expected, 1), frames["candidate_log_weight"].exp()
     assert (expected > 0).any() and (expected == 0).any()
-    torch.testing.assert_close(got, expected - expected.mean(1, keepdim=True))
+    torch.testing.assert_close(got, (expected - (weight * expected).sum(1, keepdim=True)) * weight * 41)
     algo.normalize_advantage = True
     unit = vine_advantages(frames, policy, CRITIC, STANDARD_TERMS, algo)
-    torch.testing.assert_close(unit[..., 0], got / got.std())
+    torch.testing.assert_close(unit[..., 0], got / got.square().mean().sqrt())
 
 
 def test_nothing_follows_where_the_next_item_has_no_place():
@@ -63,5 +63,6 @@ def test_nothing_follows_where_the_next_item_has_no_place():
     frames["tote_height"] = torch.full((24, 1), 2)
     middle, elsewhere = (12 * 25 + 12) * 4, 12 * 25 * 4
     frames["candidates"] = torch.tensor([[middle, elsewhere]]).expand(24, 2).clone()
+    frames["candidate_log_weight"] = torch.tensor([0.5, 0.5]).log().expand(24, 2).clone()
     got = vine_advantages(frames, policy, CRITIC, STANDARD_TERMS, composed(*SETTINGS).algo)
     torch.testing.assert_close(got[..., 0], torch.tensor([[0.25, -0.25]]).expand(24, 2))
