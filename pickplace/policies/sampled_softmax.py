@@ -5,17 +5,17 @@ loss computes only those of the *candidates*, which the policy that collected dr
 :mod:`pickplace.training.vine`): the choices with the greatest log-probability plus Gumbel noise (Kool, van Hoof and
 Welling, Stochastic Beams and Where to Find Them, 2019). The first of them is a draw from the policy, and is taken.
 
-An expectation under the policy is a weighted mean over the candidates. With ``pi`` the policy that collected and
-``k`` the greatest noisy log-probability that is left out::
+An expectation under the policy is estimated by a weighted mean over the candidates. With ``pi`` the policy that
+collected and ``k`` the greatest noisy log-probability that is left out::
 
     w_i = pi(a_i) / (1 - exp(-exp(log pi(a_i) - k))), scaled to a sum of 1
 
-So is the normaliser of a new policy with logits ``l``::
+The normaliser of a new policy with logits ``l`` is such an expectation, too::
 
     d_i = l(a_i) - log pi(a_i)
     log pi_new(a_i) = log pi(a_i) + d_i - log(sum_j w_j exp(d_j))
 
-Once every choice is a candidate, all of this is exact.
+Once every choice is a candidate, all of this is exact. With few, gradients are a little short: by up to a tenth with 9.
 """
 
 import torch
@@ -65,14 +65,15 @@ class SampledSoftmax(Categorical):
 def draw_candidates(logits: Tensor, samples: int) -> tuple[Tensor, Tensor, Tensor]:
     """Draw choices without replacement; return the three entries of :data:`CANDIDATE_KEYS`.
 
-    Where fewer choices are allowed, the taken one stands again for each that lacks, with a weight of 0.
+    Where a mask allows too few, the taken one stands for each that is missing, with a weight of 0.
 
     Args:
         logits: of all choices, ``[N, choices]``; :data:`MASKED` for those that a mask forbids.
-        samples: candidates beside the choice that is taken.
+        samples: candidates beside the choice that is taken; fewer if there are not so many choices.
     """
-    lacking = max(0, 2 + samples - logits.shape[1])
-    every = F.pad(logits, (0, lacking), value=MASKED).log_softmax(1)
+    samples = min(samples, logits.shape[1] - 1)
+    one_more = 2 + samples - logits.shape[1]  # 1 where every choice is a candidate: none is left out
+    every = F.pad(logits, (0, max(one_more, 0)), value=-torch.inf).log_softmax(1)
     noisy = every - torch.empty_like(every).exponential_().clamp(min=1e-30).log()
     score, order = noisy.topk(2 + samples)
     candidates, left_out = order[:, :-1], score[:, -1:]

@@ -92,6 +92,8 @@ def update(loss, optimizer, data: TensorDictBase, algo: DictConfig, policy, phas
     """
     totals: dict[str, Tensor | float] = {}
     steps = 0
+    # TorchRL's means over candidates have no weights, and say nothing about the policy.
+    left_out = set() if algo.vine_samples is None else {"kl_approx", "clip_fraction"}
     for _ in range(algo.epochs):
         for index in torch.randperm(len(data), device=data.device).split(algo.minibatch_size):
             part = data[index]
@@ -110,7 +112,7 @@ def update(loss, optimizer, data: TensorDictBase, algo: DictConfig, policy, phas
                 raise FloatingPointError(f"the loss or its gradient is not finite: {value_ranges({**parts, **part})}.")
             optimizer.step()
             steps += 1
-            present = set(losses.keys())
+            present = set(losses.keys()) - left_out
             diagnostics = {name: losses[key].detach() for key, name in DIAGNOSTICS.items() if key in present}
             for name, value in {**diagnostics, "grad_norm": norm}.items():
                 totals[name] = totals.get(name, 0.0) + value

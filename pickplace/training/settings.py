@@ -103,10 +103,11 @@ def check_memory(cfg: DictConfig, env: PickPlaceEnv, policy: Policy) -> None:
     cell, masks, slots, steps = env.cell, policy.masks, cfg.env.num_envs, cfg.algo.rollout_length
     samples = cfg.algo.vine_samples
     frame = 2 * env.observation_bytes + sum(MASKS[name].size(cell) for name in masks) + 200 * cell.num_places
-    frame += 12 * (1 + (samples or 0))
+    frame += 20 * (1 + (samples or 0))
     check_bytes(f"env.num_envs={slots}, algo.rollout_length={steps}", slots * steps * frame, env.device)
     part = min(cfg.algo.minibatch_size, slots * steps)
-    check_bytes(f"algo.minibatch_size={part}", part * policy.learning_bytes(samples), env.device)
+    learning = policy.learning_bytes(None if cfg.warm_start.frames else samples)  # imitation needs all logits
+    check_bytes(f"algo.minibatch_size={part}", part * learning, env.device)
     problem = max(problem_bytes(cell, masks), policy.acting_bytes)
     check_bytes(f"env.num_envs={slots}", slots * problem, env.device)
     check_play(cfg.evaluation, cell, env.device)

@@ -56,8 +56,9 @@ def _values(
 ) -> Tensor:
     """Return the reward of each candidate and the critic's value of what follows, ``[B, 1 + samples]``.
 
-    The item that arrives next is another frame's, the same for all candidates of a state. A failure is worth nothing,
-    and so is what follows if that item has no feasible action.
+    The item that arrives next is another frame's, the same for all candidates of a state. (Items that ended an episode
+    are in no frame, so the risk of getting stuck is a little too low.) A failure is worth nothing, and so is what
+    follows if that item has no feasible action.
     """
     cell, candidates = policy.cell, frames[CANDIDATE_KEYS[0]]
     row = torch.arange(len(frames), device=candidates.device).repeat_interleave(candidates.shape[1])

@@ -34,8 +34,7 @@ def test_with_every_choice_a_candidate_the_softmax_is_exact(samples):
     old, new = random_logits(3, 6).detach(), random_logits(3, 6)
     candidates, log_prob, log_weight = draw_candidates(old, samples)
     estimated, exact = SampledSoftmax(new.gather(1, candidates) + 3, log_prob, log_weight), Categorical(logits=new)
-    torch.testing.assert_close(log_weight[:, :6].exp(), old.softmax(1).gather(1, candidates[:, :6]))
-    assert (log_weight[:, 6:] == -torch.inf).all() and (candidates[:, 6:] == candidates[:, :1]).all()
+    torch.testing.assert_close(log_weight.exp(), old.softmax(1).gather(1, candidates))
     wanted = exact.logits.gather(1, candidates)
     torch.testing.assert_close(estimated.log_prob(candidates), wanted)
     torch.testing.assert_close(estimated.entropy(), exact.entropy())
@@ -44,10 +43,10 @@ def test_with_every_choice_a_candidate_the_softmax_is_exact(samples):
         torch.testing.assert_close(gradients(got.sum(), new), gradients(want.sum(), new))
 
 
-@pytest.mark.parametrize("samples", [1, 3])
+@pytest.mark.parametrize("samples", [2, 3])
 def test_weighted_means_over_candidates_are_expectations(samples):
     """Nearly so: a scale that makes the weights sum to 1 is itself an estimate."""
-    torch.manual_seed(samples)
+    torch.manual_seed(13)
     logits, value = random_logits(6).detach(), torch.randn(6, dtype=torch.float64)
     candidates, log_prob, log_weight = draw_candidates(logits.expand(200_000, 6), samples)
     assert (candidates.sort(1).values.diff(dim=1) > 0).all()
@@ -58,9 +57,10 @@ def test_weighted_means_over_candidates_are_expectations(samples):
     torch.testing.assert_close(taken.double(), logits.softmax(0), rtol=0, atol=0.005)
 
 
-def test_forbidden_choices_are_no_candidates():
+@pytest.mark.parametrize("samples", [3, 4, 7])
+def test_forbidden_choices_are_no_candidates(samples):
     logits = torch.tensor([[0.0, MASKED, 1.0, MASKED, MASKED], [MASKED, MASKED, MASKED, 0.3, MASKED]])
-    candidates, log_prob, log_weight = draw_candidates(logits, 3)
+    candidates, log_prob, log_weight = draw_candidates(logits, samples)
     assert candidates[0].sort().values.unique().tolist() == [0, 2] and (candidates[1] == 3).all()
     torch.testing.assert_close(log_weight.exp().sum(1), torch.ones(2))
     torch.testing.assert_close(log_weight[0, :2].exp(), logits[0].softmax(0)[candidates[0, :2]])

@@ -24,7 +24,7 @@ def test_every_preset_runs(name, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == files
 
 
-@pytest.mark.parametrize(("masked", "samples"), [(True, "null"), (False, "null"), (False, 2)])
+@pytest.mark.parametrize(("masked", "samples"), [(True, "null"), (True, 2), (False, "null"), (False, 2)])
 @pytest.mark.parametrize("model", options("model"))
 def test_every_model_trains_with_and_without_a_mask(model, masked, samples, tmp_path):
     algo = ["algo=a2c"] if model == "fcn_grasp" and masked else []  # presets train it with PPO

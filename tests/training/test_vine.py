@@ -4,21 +4,31 @@ import pytest
 import torch
 from commands import composed
 from problems import late_state
+from tensordict import TensorDict
+from test_presets import TINY
 from torch import nn
 from torchrl.modules import ValueOperator
 
+from pickplace.policies.base import Policy
 from pickplace.policies.fcn4d import ActionPolicy
 from pickplace.policies.individual import IndividualRlPolicy
-from pickplace.policies.sampled_softmax import as_sampling_policy
+from pickplace.policies.sampled_softmax import CANDIDATE_KEYS, as_sampling_policy, draw_candidates
 from pickplace.task.observation import STANDARD_TERMS
+from pickplace.training import trainer
+from pickplace.training.ppo import make_losses
+from pickplace.training.train import train
 from pickplace.training.vine import vine_advantages
+
+
+def value_by_hand(bin_depth, tote_depth):
+    return 1 + tote_depth.mean((-2, -1))[..., None] + bin_depth.mean((-2, -1))[..., None]
 
 
 class MeanDepth(nn.Module):
     """A value that is computed by hand."""
 
     def forward(self, bin_depth, tote_depth):
-        return 1 + tote_depth.mean((-2, -1))[..., None]
+        return value_by_hand(bin_depth, tote_depth)
 
 
 CRITIC = ValueOperator(MeanDepth(), ["bin_depth", "tote_depth"])
@@ -35,14 +45,16 @@ def drawn(kind, steps):
 
 
 @pytest.mark.parametrize("kind", [ActionPolicy, IndividualRlPolicy])
-def test_advantages_are_those_of_single_steps(kind):
+def test_advantages_are_those_of_single_steps(kind, monkeypatch):
+    """The item that follows is that of the frame before, instead of a frame drawn at random."""
     env, policy, frames = drawn(kind, 1)
+    monkeypatch.setattr(torch, "randperm", lambda count, **_: torch.arange(count).roll(1))
     algo = composed(*SETTINGS).algo
     got = vine_advantages(frames, policy, CRITIC, STANDARD_TERMS, algo)[..., 0]
     saved, expected = {key: value.clone() for key, value in env.state_dict().items()}, []
     for candidate in frames["candidates"].T:
         after = env.step(frames.clone().set("action", policy.to_action(candidate, frames)))["next"]
-        value = 0.5 * after["reward"] + 0.9 * (1 + after["tote_depth"].mean((1, 2))[:, None])
+        value = 0.5 * after["reward"] + 0.9 * value_by_hand(frames["bin_depth"].roll(1, 0), after["tote_depth"])
         expected.append(torch.where(after["terminated"], 0.0, value)[:, 0])
         assert not (after["failure"] == 7).any()  # a tote with one item takes any other
         env.load_state_dict({key: value.clone() for key, value in saved.items()})
@@ -66,3 +78,50 @@ def test_nothing_follows_where_the_next_item_has_no_place():
     frames["candidate_log_weight"] = torch.tensor([0.5, 0.5]).log().expand(24, 2).clone()
     got = vine_advantages(frames, policy, CRITIC, STANDARD_TERMS, composed(*SETTINGS).algo)
     torch.testing.assert_close(got[..., 0], torch.tensor([[0.25, -0.25]]).expand(24, 2))
+
+
+class Fixed(Policy):
+    """The same logits in every state."""
+
+    choice_key = "action"
+    to_action = to_choice = action_log_probs = lambda self, *_: _[0]
+
+    def __init__(self, cell, logits):
+        super().__init__(cell)
+        self.values = nn.Parameter(logits)
+
+    def logits(self, observation):
+        return self.values.expand(len(observation["bin_depth"]), -1)
+
+
+@pytest.mark.parametrize("loss", ["ppo", "a2c"])
+@pytest.mark.parametrize(("samples", "frames", "error"), [(6, 5, 1e-6), (9, 5, 1e-6), (3, 100_000, 0.02)])
+def test_the_loss_has_the_policy_gradient(loss, samples, frames, error):
+    """Of 7 choices: exactly once all are candidates, else on average, a little short."""
+    torch.manual_seed(samples)
+    env, observation = late_state(1)
+    policy, state = Fixed(env.cell, torch.randn(7)), observation[:1].expand(frames)
+    keys = draw_candidates(policy.values.detach().expand(frames, 7), samples)
+    data = TensorDict({**state, **dict(zip(CANDIDATE_KEYS, keys, strict=True))}, [frames])
+    value, weight = torch.randn(7), data["candidate_log_weight"].exp()
+    gain = value[data["candidates"]]
+    data["advantage"] = ((gain - (weight * gain).sum(1, keepdim=True)) * weight * weight.shape[1])[..., None]
+    data["action"], data["value_target"] = data["candidates"][:, 0], torch.zeros(frames, 1)
+    losses = make_losses(composed(f"algo={loss}", "algo.vine_samples=3").algo, policy, CRITIC)[1](data)
+    chance = policy.values.detach().softmax(0)
+    wanted = -chance * (value - (chance * value).sum())
+    got = torch.autograd.grad(losses["loss_objective"], policy.values, retain_graph=True)[0]
+    scale = (got * wanted).sum() / wanted.square().sum()
+    torch.testing.assert_close(got / scale, wanted, rtol=0, atol=error)
+    assert 0.8 < scale < 1 + error and (samples == 3 or scale > 1 - error)
+    (entropy,) = torch.autograd.grad(losses["loss_entropy"], policy.values)
+    torch.testing.assert_close(
+        entropy, 0.002 * chance * (chance.log() - (chance * chance.log()).sum()), rtol=0, atol=max(error, 1e-6) * 0.02
+    )
+
+
+def test_a_training_learns_from_every_candidate(monkeypatch, tmp_path):
+    batches, update = [], trainer.update
+    monkeypatch.setattr(trainer, "update", lambda *args: batches.append(args[2]) or update(*args))
+    train(composed("model=fcn4d", "curriculum=none", "logger=none", "algo.vine_samples=3", *TINY), tmp_path)
+    assert [batch["advantage"].shape for batch in batches] == [(16, 4, 1)]
