@@ -16,7 +16,7 @@ from pickplace.policies.base import Policy
 from pickplace.policies.sampled_softmax import CANDIDATE_KEYS
 from pickplace.task.feasibility import footprint_mask, placing_maps
 from pickplace.task.observation import Term, observe
-from pickplace.task.state import Item, State
+from pickplace.task.state import Failure, Item, State
 from pickplace.task.transition import apply
 
 
@@ -27,23 +27,39 @@ def vine_advantages(
     """Return the weighted advantage of each candidate over its state's value, ``[B, 1 + samples, 1]``.
 
     A state's value is the weighted mean over its candidates. The weights of a state have a mean of 1 here, so that the
-    loss, an unweighted mean over candidates, is an expectation under the policy that drew them.
+    loss, an unweighted mean over candidates, is an expectation under the policy that drew them. There is one exception:
+    a candidate that is better than expected has the square root of its weight, if that is more. By the expectation
+    alone a rare choice would stay rare for long, however good it is; in a natural gradient (Kakade 2002) its step would
+    not depend on its probability at all.
 
     Args:
-        frames: observations and candidates, ``[B]``.
+        frames: observations, candidates and, in ``next``, what the taken choices led to, ``[B]``.
         policy: the policy that drew the candidates.
         critic: the value network.
         terms: of the observation, by key.
         algo: the config group ``algo``; with ``normalize_advantage`` what is returned has a mean square of 1.
     """
-    items = State.from_observation(frames).item.rows(torch.randperm(len(frames), device=frames["candidates"].device))
+    items = _arrivals(frames)
     parts = torch.arange(len(frames), device=items.x.device).split(algo.minibatch_size)
     value = torch.cat([_values(frames[part], items.rows(part), policy, critic, terms, algo) for part in parts])
     weight = frames[CANDIDATE_KEYS[2]].exp()
-    advantage = (value - (weight * value).sum(1, keepdim=True)) * weight * weight.shape[1]
+    advantage = value - (weight * value).sum(1, keepdim=True)
+    weight *= weight.shape[1]
+    advantage *= torch.where(advantage > 0, weight.maximum(weight.sqrt().clamp(max=1)), weight)
     if algo.normalize_advantage:
         advantage /= advantage.square().mean().sqrt().clamp(min=1e-6)
     return advantage[..., None]
+
+
+def _arrivals(frames: TensorDictBase) -> Item:
+    """Return an item for each frame, drawn from those that arrived after a success; without any, the frames' own."""
+    after = frames["next"]
+    placed = (after["failure"] == Failure.NONE) | (after["failure"] == Failure.STUCK)
+    rows = (placed & (after["bin_depth"].flatten(1) > 0).any(1, keepdim=True)).nonzero()[:, 0]
+    if not len(rows):
+        return State.from_observation(frames).item
+    draw = torch.randint(len(rows), (len(frames),), device=rows.device)
+    return State.from_observation(after[rows[draw]]).item
 
 
 def _values(
@@ -56,9 +72,8 @@ def _values(
 ) -> Tensor:
     """Return the reward of each candidate and the critic's value of what follows, ``[B, 1 + samples]``.
 
-    The item that arrives next is another frame's, the same for all candidates of a state. (Items that ended an episode
-    are in no frame, so the risk of getting stuck is a little too low.) A failure is worth nothing, and so is what
-    follows if that item has no feasible action.
+    ``items`` has the item that arrives next, the same for all candidates of a state. A failure is worth nothing, and so
+    is what follows if that item has no feasible action.
     """
     cell, candidates = policy.cell, frames[CANDIDATE_KEYS[0]]
     row = torch.arange(len(frames), device=candidates.device).repeat_interleave(candidates.shape[1])

@@ -36,31 +36,41 @@ SETTINGS = ["algo.gamma=0.9", "algo.reward_scale=0.5", "algo.normalize_advantage
 
 
 def drawn(kind, steps):
-    """Return an environment in the middle of its episodes, a policy, and frames with candidates."""
+    """Return an environment in the middle of its episodes, a policy, and frames with candidates and what followed."""
     torch.manual_seed(0)
     env, observation = late_state(steps, masks=("action",), bin_size=(5, 5, 1), tote_size=(5, 5, 2), num_envs=24)
     policy = kind(env.cell, filters=4, head_std=1.0)
     choices = as_sampling_policy(policy, 40)(observation.clone())
-    return env, policy, observation.clone().update(choices)
+    frames, saved = observation.clone().update(choices), {key: value.clone() for key, value in env.state_dict().items()}
+    frames["next"] = env.step(frames.clone())["next"]
+    env.load_state_dict(saved)
+    return env, policy, frames
 
 
 @pytest.mark.parametrize("kind", [ActionPolicy, IndividualRlPolicy])
 def test_advantages_are_those_of_single_steps(kind, monkeypatch):
-    """The item that follows is that of the frame before, instead of a frame drawn at random."""
+    """The item that follows is that of a frame in turn, instead of one drawn at random."""
     env, policy, frames = drawn(kind, 1)
-    monkeypatch.setattr(torch, "randperm", lambda count, **_: torch.arange(count).roll(1))
+    monkeypatch.setattr(torch, "randint", lambda count, size, **_: torch.arange(*size) % count)
+    arrived = frames["next", "bin_depth"][frames["next", "failure"][:, 0] == 0]
+    assert 1 < len(arrived) < 24
+    arrived = arrived[torch.arange(24) % len(arrived)]
     algo = composed(*SETTINGS).algo
     got = vine_advantages(frames, policy, CRITIC, STANDARD_TERMS, algo)[..., 0]
     saved, expected = {key: value.clone() for key, value in env.state_dict().items()}, []
     for candidate in frames["candidates"].T:
         after = env.step(frames.clone().set("action", policy.to_action(candidate, frames)))["next"]
-        value = 0.5 * after["reward"] + 0.9 * value_by_hand(frames["bin_depth"].roll(1, 0), after["tote_depth"])
+        value = 0.5 * after["reward"] + 0.9 * value_by_hand(arrived, after["tote_depth"])
         expected.append(torch.where(after["terminated"], 0.0, value)[:, 0])
         assert not (after["failure"] == 7).any()  # a tote with one item takes any other
         env.load_state_dict({key: value.clone() for key, value in saved.items()})
-    expected, weight = torch.stack(expected, 1), frames["candidate_log_weight"].exp()
+    expected, weight = torch.stack(expected, 1), frames["candidate_log_weight"].exp().detach()
     assert (expected > 0).any() and (expected == 0).any()
-    torch.testing.assert_close(got, (expected - (weight * expected).sum(1, keepdim=True)) * weight * 41)
+    for gains, weights, advantages in zip(expected, weight, got, strict=True):
+        gains = gains - (weights * gains).sum()
+        shares = [float(w) * 41 for w in weights]
+        shares = [max(w, min(1, w**0.5)) if gain > 0 else w for w, gain in zip(shares, gains, strict=True)]
+        torch.testing.assert_close(advantages, gains * torch.tensor(shares))
     algo.normalize_advantage = True
     unit = vine_advantages(frames, policy, CRITIC, STANDARD_TERMS, algo)
     torch.testing.assert_close(unit[..., 0], got / got.square().mean().sqrt())
