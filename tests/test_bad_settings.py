@@ -159,6 +159,7 @@ LARGE = [
     ("collector=multi_sync collector.workers=128", "collector.workers=128: .*<= 64"),
     (f"{LARGE_FCN4D} env.num_envs=4 algo.vine_samples=9999", "algo.minibatch_size=32: .* GB"),
     ("algo.vine_samples=0", "algo.vine_samples=0"),
+    ("algo.vine_temperature=0", "algo.vine_temperature=0"),
     ("algo.max_grad_norm=0", "algo.max_grad_norm=0"),
     ("algo.reward_scale=0", "algo.reward_scale=0"),
 ]

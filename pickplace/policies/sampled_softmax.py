@@ -1,14 +1,16 @@
 """The softmax over a few sampled choices, for a loss whose policy has many choices.
 
 A gradient step through the softmax over all ``N_a`` flat actions computes every logit forward and backward. Here the
-loss computes only those of the *candidates*, which the policy that collected draws without replacement (see also
-:mod:`pickplace.training.vine`): the choices with the greatest log-probability plus Gumbel noise (Kool, van Hoof and
-Welling, Stochastic Beams and Where to Find Them, 2019). The first of them is a draw from the policy, and is taken.
+loss computes only those of the *candidates* (see also :mod:`pickplace.training.vine`). The first one is a draw from the
+policy that collected, ``pi``, and is taken. The others are drawn without replacement from ``q``, which is ``pi`` at a
+higher temperature, so that rare choices are tried more often: those with the greatest log-probability plus Gumbel noise
+(Kool, van Hoof and Welling, Stochastic Beams and Where to Find Them, 2019).
 
-An expectation under the policy is estimated by a weighted mean over the candidates. With ``pi`` the policy that
-collected and ``k`` the greatest noisy log-probability that is left out::
+An expectation under the policy is estimated by a weighted mean over the candidates. The weight is the probability
+divided by the chance to be a candidate, with ``k`` the greatest noisy log-probability that is left out::
 
-    w_i = pi(a_i) / (1 - exp(-exp(log pi(a_i) - k))), scaled to a sum of 1
+    p_i = 1 - exp(-exp(log q(a_i) - k))
+    w_i = pi(a_i) / (pi(a_i) + (1 - pi(a_i)) p_i), scaled to a sum of 1
 
 The normaliser of a new policy with logits ``l`` is such an expectation, too::
 
@@ -62,30 +64,41 @@ class SampledSoftmax(Categorical):
         return -(self.probs * self.candidate_log_prob).sum(-1)
 
 
-def draw_candidates(logits: Tensor, samples: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw choices without replacement; return the three entries of :data:`CANDIDATE_KEYS`.
+def draw_candidates(logits: Tensor, samples: int, temperature: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw choices, all different; return the three entries of :data:`CANDIDATE_KEYS`.
 
     Where a mask allows too few, the taken one stands for each that is missing, with a weight of 0.
 
     Args:
         logits: of all choices, ``[N, choices]``; :data:`MASKED` for those that a mask forbids.
         samples: candidates beside the choice that is taken; fewer if there are not so many choices.
+        temperature: divides the logits for these candidates; 1: they are drawn from the policy itself.
     """
-    samples = min(samples, logits.shape[1] - 1)
-    one_more = 2 + samples - logits.shape[1]  # 1 where every choice is a candidate: none is left out
-    every = F.pad(logits, (0, max(one_more, 0)), value=-torch.inf).log_softmax(1)
-    noisy = every - torch.empty_like(every).exponential_().clamp(min=1e-30).log()
-    score, order = noisy.topk(2 + samples)
-    candidates, left_out = order[:, :-1], score[:, -1:]
+    count = logits.shape[1]
+    samples = min(samples, count - 1)
+    every = logits.log_softmax(1)
+    taken = _add_noise(every).argmax(1, keepdim=True)
+    others = (every / temperature).scatter(1, taken, -torch.inf)
+    scale = others.logsumexp(1, keepdim=True)
+    noisy = F.pad(_add_noise(others - scale), (0, 1), value=-torch.inf)  # of the one that is left out, if none is
+    score, order = noisy.topk(1 + samples)
+    candidates = torch.cat([taken, order[:, :-1]], 1)
     log_prob = every.gather(1, candidates)
-    log_weight = log_prob - (-(log_prob - left_out).exp()).expm1().neg().log()
+    among_others = -(-(log_prob / temperature - scale - score[:, -1:]).exp()).expm1()
+    chance = log_prob.exp() + (1 - log_prob.exp()) * among_others
     absent = log_prob < MASKED / 2
-    log_weight = log_weight.masked_fill(absent, -torch.inf).log_softmax(1)
+    log_weight = (log_prob - chance.log()).masked_fill(absent, -torch.inf).log_softmax(1)
     return (
         torch.where(absent, candidates[:, :1], candidates),
         torch.where(absent, log_prob[:, :1], log_prob),
         log_weight,
     )
+
+
+def _add_noise(log_prob: Tensor) -> Tensor:
+    """Return log-probabilities plus Gumbel noise: the greatest is a draw, the greatest few are draws without
+    replacement."""
+    return log_prob - torch.empty_like(log_prob).exponential_().clamp(min=1e-30).log()
 
 
 class CandidateLogits(TensorDictModuleBase):
@@ -115,16 +128,16 @@ def as_sampled_actor(policy: Policy) -> ProbabilisticTensorDictSequential:
     )
 
 
-def as_sampling_policy(policy: Policy, samples: int) -> TensorDictSequential:
+def as_sampling_policy(policy: Policy, samples: int, temperature: float) -> TensorDictSequential:
     """Return the policy as the collector runs it: choice, log-probability, flat action and the candidates.
 
     Args:
         policy: the policy.
-        samples: candidates beside the choice that is taken.
+        samples, temperature: as of :func:`draw_candidates`.
     """
 
     def draw(logits: Tensor) -> tuple[Tensor, ...]:
-        candidates, log_prob, log_weight = draw_candidates(logits, samples)
+        candidates, log_prob, log_weight = draw_candidates(logits, samples, temperature)
         return candidates[:, 0], log_prob[:, 0], candidates, log_prob, log_weight
 
     keys = [policy.choice_key, "log_prob", *CANDIDATE_KEYS]

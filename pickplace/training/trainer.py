@@ -150,7 +150,7 @@ class Trainer:
         if algo.vine_samples is None:
             self.acting = as_collection_policy(self.policy)
         else:
-            self.acting = as_sampling_policy(self.policy, algo.vine_samples)
+            self.acting = as_sampling_policy(self.policy, algo.vine_samples, algo.vine_temperature)
         self.advantage, self.loss = make_losses(algo, self.policy, self.critic)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=algo.lr, eps=1e-5)
         if self.resumed:

@@ -27,12 +27,13 @@ def gradients(value: torch.Tensor, logits: torch.Tensor) -> torch.Tensor:
     return torch.autograd.grad(value, logits, retain_graph=True)[0]
 
 
+@pytest.mark.parametrize("temperature", [1.0, 2.0])
 @pytest.mark.parametrize("samples", [5, 8])
-def test_with_every_choice_a_candidate_the_softmax_is_exact(samples):
+def test_with_every_choice_a_candidate_the_softmax_is_exact(samples, temperature):
     """Values and gradients are those of the new policy, whatever the old one was; 8 samples are more than there are."""
     torch.manual_seed(samples)
     old, new = random_logits(3, 6).detach(), random_logits(3, 6)
-    candidates, log_prob, log_weight = draw_candidates(old, samples)
+    candidates, log_prob, log_weight = draw_candidates(old, samples, temperature)
     estimated, exact = SampledSoftmax(new.gather(1, candidates) + 3, log_prob, log_weight), Categorical(logits=new)
     torch.testing.assert_close(log_weight.exp(), old.softmax(1).gather(1, candidates))
     wanted = exact.logits.gather(1, candidates)
@@ -43,12 +44,13 @@ def test_with_every_choice_a_candidate_the_softmax_is_exact(samples):
         torch.testing.assert_close(gradients(got.sum(), new), gradients(want.sum(), new))
 
 
+@pytest.mark.parametrize("temperature", [1.0, 2.0])
 @pytest.mark.parametrize("samples", [2, 3])
-def test_weighted_means_over_candidates_are_expectations(samples):
+def test_weighted_means_over_candidates_are_expectations(samples, temperature):
     """Nearly so: a scale that makes the weights sum to 1 is itself an estimate."""
     torch.manual_seed(13)
     logits, value = random_logits(6).detach(), torch.randn(6, dtype=torch.float64)
-    candidates, log_prob, log_weight = draw_candidates(logits.expand(200_000, 6), samples)
+    candidates, log_prob, log_weight = draw_candidates(logits.expand(200_000, 6), samples, temperature)
     assert (candidates.sort(1).values.diff(dim=1) > 0).all()
     expected = (logits.softmax(0) * value).sum().item()
     mean = (log_weight.exp() * value[candidates]).sum(1).mean()
@@ -57,10 +59,21 @@ def test_weighted_means_over_candidates_are_expectations(samples):
     torch.testing.assert_close(taken.double(), logits.softmax(0), rtol=0, atol=0.005)
 
 
+def test_at_a_high_temperature_rare_choices_are_candidates():
+    torch.manual_seed(0)
+    logits = torch.tensor([12.0, 11.0, 4.0, 2.0, 1.0, 0.0]).expand(20_000, 6)
+    shares = []
+    for temperature in (1.0, 1e3):
+        candidates, _, log_weight = draw_candidates(logits, 2, temperature)
+        shares.append((candidates == 5).any(1).double().mean().item())
+        assert log_weight.exp()[candidates == 5].mean() < 1e-3
+    assert shares[0] < 0.02 and shares[1] == pytest.approx(2 / 5, abs=0.02)
+
+
 @pytest.mark.parametrize("samples", [3, 4, 7])
 def test_forbidden_choices_are_no_candidates(samples):
     logits = torch.tensor([[0.0, MASKED, 1.0, MASKED, MASKED], [MASKED, MASKED, MASKED, 0.3, MASKED]])
-    candidates, log_prob, log_weight = draw_candidates(logits, samples)
+    candidates, log_prob, log_weight = draw_candidates(logits, samples, 1.0)
     assert candidates[0].sort().values.unique().tolist() == [0, 2] and (candidates[1] == 3).all()
     torch.testing.assert_close(log_weight.exp().sum(1), torch.ones(2))
     torch.testing.assert_close(log_weight[0, :2].exp(), logits[0].softmax(0)[candidates[0, :2]])
@@ -110,7 +123,7 @@ def test_logits_of_single_actions_and_their_gradients(dtype):
 def test_the_collector_s_candidates_are_drawn_from_the_policy(kind):
     env, observation = next(iter(random_states(masks=("action", "footprint"), **CELLS[0])))
     policy = small(kind, env.cell)
-    frame = as_sampling_policy(policy, 5)(observation.clone())
+    frame = as_sampling_policy(policy, 5, 2.0)(observation.clone())
     candidates, log_prob, log_weight = (frame[key] for key in CANDIDATE_KEYS)
     assert candidates.shape == log_prob.shape == log_weight.shape == (env.num_envs, 6)
     assert (

@@ -40,7 +40,7 @@ def drawn(kind, steps):
     torch.manual_seed(0)
     env, observation = late_state(steps, masks=("action",), bin_size=(5, 5, 1), tote_size=(5, 5, 2), num_envs=24)
     policy = kind(env.cell, filters=4, head_std=1.0)
-    choices = as_sampling_policy(policy, 40)(observation.clone())
+    choices = as_sampling_policy(policy, 40, 1.0)(observation.clone())
     frames, saved = observation.clone().update(choices), {key: value.clone() for key, value in env.state_dict().items()}
     frames["next"] = env.step(frames.clone())["next"]
     env.load_state_dict(saved)
@@ -111,7 +111,7 @@ def test_the_loss_has_the_policy_gradient(loss, samples, frames, error):
     torch.manual_seed(samples)
     env, observation = late_state(1)
     policy, state = Fixed(env.cell, torch.randn(7)), observation[:1].expand(frames)
-    keys = draw_candidates(policy.values.detach().expand(frames, 7), samples)
+    keys = draw_candidates(policy.values.detach().expand(frames, 7), samples, 1.0)
     data = TensorDict({**state, **dict(zip(CANDIDATE_KEYS, keys, strict=True))}, [frames])
     value, weight = torch.randn(7), data["candidate_log_weight"].exp()
     gain = value[data["candidates"]]
