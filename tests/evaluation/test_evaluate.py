@@ -97,7 +97,7 @@ def test_paired_difference(evaluation):
 
 @pytest.mark.parametrize("word", [
     "env.rotations=2", "env.effector_size=[2,3]", "env.bin_size=[5,4,1]", "env.tote_size=[4,5,1]",
-    "env.pick_rule=overlap", "env.min_support=0.25", "env.strict_support=true",
+    "env.pick_rule=overlap", "env.support=hull", "env.support_margin=0.1",
     "evaluation.seed=1", "evaluation.episodes=3", "evaluation.stream=validation", "items=mixed",
 ])  # fmt: skip
 def test_only_the_same_episodes_are_compared(word, tmp_path):

@@ -1,0 +1,89 @@
+"""Support: whether what an item rests on keeps it stable.
+
+The *supporting cells* are the cells under the footprint that are as high as the highest of them. A rule decides by
+their number, or by their convex hull: an item tilts unless the vertical line through its centre passes the hull.
+
+The hull is never computed. A point lies in a convex polygon if the polygon reaches beyond it along the normal of each
+of its edges. The corners of cells are lattice points, so the edges of every possible hull have one of a few directions.
+A supporting cell reaches beyond the centre along some of their normals, which is a pattern of bits; the item is stable
+if the patterns of its supporting cells cover all of them. That is exact, and costs about as much as counting.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from math import gcd
+
+import torch
+from torch import Tensor
+
+from pickplace.task.cell import CellSpec
+
+BITS = 32  # of a word of a pattern
+
+
+def is_supported(
+    cell: CellSpec, cells: Sequence[Tensor], under: Sequence[Tensor], z: Tensor, w: Tensor, d: Tensor
+) -> Tensor:
+    """Return whether an item is stable where it comes to rest, of the shape of ``z``.
+
+    Args:
+        cell: has the rule, ``cell.support``.
+        cells: for each cell of a square at the footprint's minimum corner its height, int32, all of one shape.
+        under: whether the item covers that cell, bool, broadcastable.
+        z: the height on which the item rests.
+        w, d: the footprint's sides, broadcastable; 0 for no item.
+    """
+    if cell.support == "hull":
+        return _is_in_hull(cells, z, w, d, cell.support_margin)
+    level = torch.zeros_like(z)
+    for height, used in zip(cells, under, strict=True):
+        level += (height == z) & used
+    share, least = level.double() / (w * d), cell.least_support
+    return share > least if cell.support == "more_than_half" else share >= least
+
+
+def _is_in_hull(cells: Sequence[Tensor], z: Tensor, w: Tensor, d: Tensor, margin: float) -> Tensor:
+    """Return whether the item's centre lies in the hull of the supporting cells, further than ``margin`` from its edge."""
+    side = round(len(cells) ** 0.5)
+    stable = torch.ones_like(z, dtype=torch.bool)
+    for patterns, whole in hull_patterns(side, margin):
+        patterns, whole = (table.to(z.device)[..., w.clamp(min=1) - 1, d.clamp(min=1) - 1] for table in (patterns, whole))
+        reached = torch.zeros_like(z)
+        for height, pattern in zip(cells, patterns, strict=True):
+            reached |= torch.where(height == z, pattern, 0)
+        stable &= reached == whole
+    return stable
+
+
+@lru_cache(maxsize=64)
+def hull_patterns(side: int, margin: float) -> list[tuple[Tensor, Tensor]]:
+    """Return the patterns of the cells of every footprint up to ``side x side``, in words of :data:`BITS` normals.
+
+    Args:
+        side: longest side of a footprint, in cells.
+        margin: distance from the centre that a cell has to pass along a normal, in cells.
+
+    Returns:
+        for each word the patterns of the cells, int32 ``[side * side, side, side]`` by cell, width and depth, 0 for
+        cells outside the footprint; and the pattern that covers all normals, int32 ``[side, side]``.
+    """
+    steps = range(-side, side + 1)
+    normals = torch.tensor([(x, y) for x in steps for y in steps if gcd(x, y) == 1])
+    size = torch.arange(1, side + 1)
+    near = torch.arange(side)
+    # Twice the distance from the centre to the near and the far edge of each cell, by cell and size of the footprint.
+    ends = torch.stack([2 * near[:, None] - size, 2 * near[:, None] + 2 - size])  # [2, cell, size]
+    furthest = (normals[:, :, None, None, None] * ends).amax(2)  # [normals, axis, cell, size]
+    along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
+    beyond = along > 2 * margin * normals.double().norm(dim=1).view(-1, 1, 1, 1, 1)
+    inside = near[:, None] < size
+    beyond &= (inside[:, None, :, None] & inside[None, :, None, :])
+    # Only directions of lattice edges that fit the footprint can be edges of a hull in it.
+    edges = (normals.abs()[:, 1, None, None] <= size[:, None]) & (normals.abs()[:, 0, None, None] <= size)
+    words = []
+    for chunk, fits in zip(beyond.split(BITS), edges.split(BITS), strict=True):
+        flags = torch.tensor([1 << bit for bit in range(BITS)])[: len(chunk)]
+        pattern = ((chunk & fits[:, None, None]) * flags.view(-1, 1, 1, 1, 1)).sum(0)
+        whole = (fits * flags.view(-1, 1, 1)).sum(0)
+        words.append((pattern.flatten(0, 1).int(), whole.int()))
+    return words
