@@ -4,12 +4,9 @@ The frame's origin is the container's near corner on its floor, z points up.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-
-from pickplace.task.checks import flag, number
 
 #: Contacts are stiff: a tower of six boxes sinks by 0.02 mm.
 SOLREF, SOLIMP = (0.005, 1.0), (0.99, 0.999, 0.0001, 0.5, 2.0)
@@ -20,48 +17,28 @@ MARGIN = 0.002  # how far above its planned pose an item appears
 Vector = Sequence[float]
 
 
-@dataclass(frozen=True)
-class Material:
-    """What boxes are made of, and how exactly; config group ``physics``.
-
-    Args:
-        friction: sliding friction between all surfaces.
-        density: of the items; kg/m^3.
-        gap: what an item is narrower than planned, along x and y, half of it on each side; m.
-        sleep: let bodies that do not move sleep, which is faster and changes nothing.
-    """
-
-    friction: float = 0.6
-    density: float = 300.0
-    gap: float = 0.001
-    sleep: bool = True
-
-    def __post_init__(self):
-        number("physics.friction", self.friction, 0, 10)
-        number("physics.density", self.density, 1, 1e5)
-        number("physics.gap", self.gap, 0, 0.1)
-        flag("physics.sleep", self.sleep)
-
-
 class Scene:
     """A container and the boxes that were added to it.
 
     Args:
         size: inner sides of the container; m.
-        material: of boxes and walls.
+        friction: sliding friction between all surfaces.
+        density: of the boxes.
+        gap: what a box is narrower than planned, along x and y.
+        sleep: let bodies that do not move sleep.
 
     Attributes:
         model, data: MuJoCo's; new ones after each :meth:`add`.
         planned: centre of each box where it was planned to rest, ``[n, 3]``.
     """
 
-    def __init__(self, size: Vector, material: Material):
-        self.material = material
+    def __init__(self, size: Vector, friction: float, density: float, gap: float, sleep: bool = True):
+        self.friction, self.density, self.gap = friction, density, gap
         self.spec = mujoco.MjSpec()
         option = self.spec.option
         option.timestep, option.cone, option.impratio = TIMESTEP, mujoco.mjtCone.mjCONE_ELLIPTIC, 10
         option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        if material.sleep:
+        if sleep:
             option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
         width, depth, height = size
         self._add_geom(self.spec.worldbody, (width + 2 * WALL, depth + 2 * WALL, WALL), (width / 2, depth / 2, -WALL / 2))
@@ -85,7 +62,7 @@ class Scene:
         self.planned = np.vstack([self.planned, centre])
         body = self.spec.worldbody.add_body(pos=centre + (*shift, MARGIN))
         body.add_freejoint()
-        self._add_geom(body, np.asarray(size, float) - (self.material.gap, self.material.gap, 0), (0, 0, 0))
+        self._add_geom(body, np.asarray(size, float) - (self.gap, self.gap, 0), (0, 0, 0))
         self.model, self.data = self.spec.recompile(self.model, self.data)
 
     def run(self, seconds: float) -> None:
@@ -106,6 +83,6 @@ class Scene:
     def _add_geom(self, body, size: Vector, centre: Vector) -> None:
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX, size=np.asarray(size, float) / 2, pos=centre,
-            friction=[self.material.friction, 0.005, 0.0001], density=self.material.density,
+            friction=[self.friction, 0.005, 0.0001], density=self.density,
             solref=SOLREF, solimp=SOLIMP,
         )  # fmt: skip
