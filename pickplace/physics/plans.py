@@ -51,6 +51,11 @@ class Placement:
     rotation: int | None = None
 
     @property
+    def centre(self) -> Point:
+        """The item's centre at rest."""
+        return tuple(at + side / 2 for at, side in zip(self.corner, self.size, strict=True))
+
+    @property
     def volume(self) -> float:
         """The volume, m^3."""
         return math.prod(self.size)

@@ -7,7 +7,8 @@ import pytest
 
 from pickplace.physics.plans import Placement, Plan
 from pickplace.physics.scene import Scene
-from pickplace.physics.settle import AT_THE_END, Settle, wait
+from pickplace.physics.settle import Settle
+from pickplace.physics.simulation import AT_THE_END, wait
 
 pytest.importorskip("mujoco")
 EXACT = Settle(gap=0.0)
@@ -40,10 +41,11 @@ def test_the_limit_of_the_harmonic_stack(share, ending):
 @pytest.mark.parametrize(("friction", "slides"), [(0.0, True), (0.15, True), (0.2, False), (0.6, False)])
 def test_a_tower_slides_apart_without_friction(friction, slides):
     """On a slope of 10 degrees, whose tangent is 0.176."""
-    scene, slope = Scene((1, 1, 0.5), friction, 300.0, gap=0.0), np.radians(10)
+    scene, slope = Scene(friction, 300.0, gap=0.0), np.radians(10)
+    scene.add_container((1, 1, 0.5))
     scene.spec.option.gravity = [9.81 * np.sin(slope), 0, -9.81 * np.cos(slope)]
     for placement in bricks(0, 0).placements:
-        scene.add(placement.corner, placement.size)
+        scene.add(placement.corner, placement.size, placement.centre)
     scene.run(AT_THE_END)
     assert (scene.shifts[-1] > 0.02) == slides
 
@@ -72,8 +74,9 @@ def test_sleep_changes_no_result_and_processes_neither():
 
 
 def test_a_gap_and_an_error_move_the_boxes():
-    scene = Scene((0.2, 0.2, 0.2), 0.6, 300.0, gap=0.004)
-    scene.add((0.0, 0.0, 0.0), (0.05, 0.05, 0.05), (0.003, 0.0))
+    scene = Scene(0.6, 300.0, gap=0.004)
+    scene.add_container((0.2, 0.2, 0.2))
+    scene.add((0.003, 0.0, 0.002), (0.05, 0.05, 0.05), (0.025, 0.025, 0.025))
     wait(scene)
     assert scene.shifts == pytest.approx([0.003], abs=1e-4) and scene.tilts < 0.1
     assert scene.model.geom_size[-1] == pytest.approx([0.023, 0.023, 0.025])
