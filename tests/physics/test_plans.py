@@ -107,9 +107,12 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     fallen, done = call(path)
     assert (fallen["episode"], fallen["ending"], fallen["lost"]) == (0, "collapsed", 1)
     assert (done["episode"], done["ending"], done["placed"]) == (3, "done", 1)
-    assert call(path, "--max-shift", 9, "--max-tilt", 90, "--no-sleep")[1]["ending"] == "done"
+    assert call(path, "friction=0.5", "sleep=false")[1]["placed"] == 1
     for words, expected in (
-        ((path, "--friction", "-1"), "physics.friction=-1.0: expected a number between 0 and 10"),
+        ((path, "friction=-1"), "physics.friction=-1: expected a number between 0 and 10"),
+        ((path, "fricton=1"), "physics.fricton: there is no key 'fricton' in physics; did you mean 'friction'?"),
+        ((path, "friction"), "friction: expected <key>=<value>"),
+        ((path, "--method", "execute"), "physics=execute: episode 0 has no bin"),
         ((tmp_path / "none.jsonl",), "none.jsonl: No such file"),
     ):
         with pytest.raises(SystemExit, match="2"):
