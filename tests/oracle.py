@@ -87,7 +87,7 @@ def is_stable(rules: Rules, supporting: list[Pair], size: Pair) -> bool:
                     chain.pop()
                 chain.append(point)
             hull += chain[:-1]
-        edges = zip(hull, hull[1:] + hull[:1])
+        edges = zip(hull, hull[1:] + hull[:1], strict=True)
         return all(cross(a, b, size) > 2 * rules.support_margin * dist(a, b) for a, b in edges)
     return {"half": share >= 0.5, "more_than_half": share > 0.5, "full": share == 1}[rules.support]
 

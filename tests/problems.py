@@ -17,7 +17,15 @@ from pickplace.task.items import Uniform
 SIDES, NEVER = st.integers(1, 4), st.just(False)
 
 #: Stability rules and their margins.
-SUPPORTS = [("half", 0.0), ("more_than_half", 0.0), ("full", 0.0), ("hull", 0.0), ("hull", 0.3), (0.0, 0.0), (2 / 3, 0.0)]
+SUPPORTS = [
+    ("half", 0.0),
+    ("more_than_half", 0.0),
+    ("full", 0.0),
+    ("hull", 0.0),
+    ("hull", 0.3),
+    (0.0, 0.0),
+    (2 / 3, 0.0),
+]
 
 
 class Case(NamedTuple):

@@ -59,12 +59,14 @@ def _run(cfg: DictConfig, run_dir: Path) -> float:
     ev = cfg.evaluation
     replay = whole_number("evaluation.replay", ev.get("replay", 0), 0, 1_000)  # evaluation=validation has neither
     gif = flag("evaluation.gif", ev.get("gif", False))
-    make_env, planner, facts = prepare(cfg)
     plans = flag("evaluation.plans", ev.get("plans", False))
-    physics = build("physics", cfg.physics) if cfg.get("physics") else None
+    physics = build("physics", cfg.physics) if cfg.physics else None
+    make_env, planner, facts = prepare(cfg)
     cell = make_env(0, 1).cell
     other = None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), episode_settings(cfg))
-    result, episodes = evaluate(cfg, make_env, planner, facts, record=range(ev.episodes if plans or physics else max(replay, 1)))
+    result, episodes = evaluate(
+        cfg, make_env, planner, facts, record=range(ev.episodes if plans or physics else max(replay, 1))
+    )
     recordings = episodes.recordings
     planned = [plan_of(recording, cell, physics.cell_size if physics else CELL_SIZE) for recording in recordings]
     if physics:

@@ -17,8 +17,8 @@ def main() -> None:
         arguments = parser().parse_args()
         if words := [word for word in arguments.settings if "=" not in word]:
             raise ValueError(f"{words[0]}: expected <key>=<value>, such as friction=0.3.")
-        settings = OmegaConf.to_container(OmegaConf.from_dotlist(arguments.settings))
-        simulation = build("physics", {"_target_": arguments.method, **settings})
+        settings = OmegaConf.from_dotlist([f"_target_={arguments.method}", *arguments.settings])
+        simulation = build("physics", settings)
         for outcome in simulation.carry_out(read_plans(arguments.plans)):
             write_output(json.dumps(asdict(outcome)) + "\n")
 

@@ -41,14 +41,14 @@ Point = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Placement:
-    """One item: where it comes to rest, and how a robot brings it there; in metres."""
+    """One item: where it comes to rest, and how a robot brings it there, if that is planned; in metres and degrees."""
 
     corner: Point
     size: Point
-    item: Point | None = None
-    pick: Point | None = None
-    place: Point | None = None
-    rotation: int | None = None
+    item: Point = ()
+    pick: Point = ()
+    place: Point = ()
+    rotation: int = 0
 
     @property
     def centre(self) -> Point:
@@ -67,8 +67,8 @@ class Plan:
 
     episode: int
     tote: Point
-    bin: Point | None = None
-    effector: Point | None = None
+    bin: Point = ()
+    effector: Point = ()
     placements: list[Placement] = field(default_factory=list)
 
 
@@ -106,10 +106,9 @@ def to_lines(plans: Iterable[Plan]) -> str:
     lines = []
     for plan in plans:
         for placement in plan.placements:
-            values = {"episode": plan.episode, "tote": plan.tote, **vars(placement)}
-            values |= {"bin": plan.bin, "effector": plan.effector}
-            order = [key for key in (*KEYS, *ROBOT_KEYS) if values[key] is not None]
-            lines.append(json.dumps({key: values[key] for key in order}))
+            values = {**vars(plan), **vars(placement)}
+            keys = [*KEYS, *ROBOT_KEYS] if plan.bin else KEYS
+            lines.append(json.dumps({key: values[key] for key in keys}))
     return "".join(f"{line}\n" for line in lines)
 
 
@@ -125,7 +124,7 @@ def read_plans(path: str | Path) -> list[Plan]:
     for number, line in enumerate(read_text(path, MAX_FILE, empty=False).splitlines(), 1):
         where = f"{path}, line {number}"
         values = _read_line(where, line)
-        sizes = {key: values.get(key) for key in ("tote", "bin", "effector")}
+        sizes = {key: values.get(key, ()) for key in ("tote", "bin", "effector")}
         if not plans or plans[-1].episode != values["episode"]:
             if any(plan.episode == values["episode"] for plan in plans):
                 raise ValueError(f"{where}: episode={values['episode']}: expected its lines to follow one another.")
@@ -178,15 +177,12 @@ def _fault(placement: Placement, plan: Plan) -> str:
             return f"leaves the tote: along {name} from {low:g} to {high:g} m, expected 0 to {plan.tote[axis]:g} m"
     below = 0.0
     for number, other in enumerate(plan.placements, 1):
-        shared = [
-            min(corner[axis] + size[axis], other.corner[axis] + other.size[axis]) - max(corner[axis], other.corner[axis])
-            for axis in range(3)
-        ]
+        far, others = ([at + side for at, side in zip(one.corner, one.size, strict=True)] for one in (placement, other))
+        shared = [min(a, b) - max(c, d) for a, b, c, d in zip(far, others, corner, other.corner, strict=True)]
         if min(shared) > TOLERANCE:
             return f"overlaps item {number} of its episode by {1e3 * min(shared):.1f} mm"
-        top = other.corner[2] + other.size[2]
-        if min(shared[:2]) > 0 and top <= corner[2] + TOLERANCE:
-            below = max(below, top)
+        if min(shared[:2]) > 0 and others[2] <= corner[2] + TOLERANCE:
+            below = max(below, others[2])
     if corner[2] - below > TOLERANCE:
         return f"floats {1e3 * (corner[2] - below):.1f} mm above what lies below it"
     return ""

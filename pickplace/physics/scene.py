@@ -5,15 +5,19 @@ The frame's origin is the tote's near corner on its floor; z points up.
 
 from collections.abc import Sequence
 
-import mujoco
 import numpy as np
+
+try:
+    import mujoco
+except ImportError:  # an extra; Simulation says so
+    mujoco = None
 
 #: Contacts and welds are stiff: a tower of six boxes sinks by 0.02 mm.
 STIFF = {"solref": (0.005, 1.0), "solimp": (0.99, 0.999, 0.0001, 0.5, 2.0)}
 TIMESTEP = 0.002
 WALL = 0.01  # thickness of floor and walls
 
-Vector = Sequence[float]
+Vector = Sequence[float] | np.ndarray
 
 
 class Scene:
@@ -41,15 +45,12 @@ class Scene:
             option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
         self.boxes: list = []
         self.planned = np.zeros((0, 3))
-        self.compile()
+        self.model = self.spec.compile()
+        self.data = mujoco.MjData(self.model)
 
     def compile(self) -> None:
         """Make the model anew, in the state in which it is."""
-        if self.spec.worldbody.geoms:
-            self.model, self.data = self.spec.recompile(self.model, self.data)
-        else:
-            self.model = self.spec.compile()
-            self.data = mujoco.MjData(self.model)
+        self.model, self.data = self.spec.recompile(self.model, self.data)
 
     def add_container(self, size: Vector, origin: Vector = (0.0, 0.0)) -> None:
         """Add floor and walls around the inner sides ``size``, with the near corner at ``origin``."""

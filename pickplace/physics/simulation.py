@@ -8,15 +8,13 @@ from importlib.util import find_spec
 from math import prod
 from multiprocessing import get_context
 from time import process_time
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from pickplace.physics.plans import Plan
+from pickplace.physics.plans import Placement, Plan
+from pickplace.physics.scene import Scene
 from pickplace.task.checks import flag, number, whole_number
-
-if TYPE_CHECKING:
-    from pickplace.physics.scene import Scene
 
 #: An item is at rest below these speeds; m/s and rad/s.
 STILL = np.repeat((0.002, 0.02), 3)
@@ -91,13 +89,12 @@ class Simulation(ABC):
             raise ValueError(f"physics={self.name}: MuJoCo is missing; pip install 'pickplace[physics]'.")
 
     @abstractmethod
-    def place_all(self, plan: Plan, errors: np.ndarray) -> Iterator[tuple["Scene", Loss | None]]:
-        """Yield the scene, and what was lost, after each placement.
+    def make_scene(self, plan: Plan) -> Scene:
+        """Return the scene before the first placement."""
 
-        Args:
-            plan: the plan.
-            errors: of the placements along x and y, m, ``[n, 2]``.
-        """
+    @abstractmethod
+    def place(self, scene, placement: Placement, error: np.ndarray) -> Loss | None:
+        """Place the next item, with an error along x and y, m, ``[2]``; return the loss if there is one."""
 
     def carry_out(self, plans: Iterable[Plan]) -> Iterator[Outcome]:
         """Yield the outcome of each plan."""
@@ -111,34 +108,34 @@ class Simulation(ABC):
         """Return the outcome of a plan."""
         started, count = process_time(), len(plan.placements)
         errors = self.noise * np.random.default_rng((self.seed, plan.episode)).standard_normal((count, 2))
-        loss, placed, scene = None, 0, None
-        for scene, loss in self.place_all(plan, errors):
-            if loss is not None:
+        scene, loss, placed = self.make_scene(plan), None, 0
+        for placement, error in zip(plan.placements, errors, strict=True):
+            if loss := self.place(scene, placement, error) or self.find_collapsed(scene):
                 break
             placed += 1
-        if loss is None and scene is not None:
+        else:
             scene.run(AT_THE_END)
             loss = self.find_collapsed(scene)
-        shifts = [] if scene is None else np.delete(scene.shifts[:placed], [loss.item] if loss and loss.item < placed else [])
+        kept = [number for number in range(placed) if loss is None or number != loss.item]
         return Outcome(
-            plan.episode, loss.reason if loss else "done", loss.item if loss else None, placed if loss else None,
-            placed, sum(placement.volume for placement in plan.placements[:placed]) / prod(plan.tote),
-            float(np.max(shifts, initial=0.0)), process_time() - started,
-        )  # fmt: skip
+            episode=plan.episode,
+            ending=loss.reason if loss else "done",
+            lost=loss.item if loss else None,
+            during=placed if loss else None,
+            placed=placed,
+            occupancy=sum(placement.volume for placement in plan.placements[:placed]) / prod(plan.tote),
+            drift=float(scene.shifts[kept].max(initial=0.0)),
+            cpu_seconds=process_time() - started,
+        )
 
-    def find_collapsed(self, scene: "Scene", count: int | None = None) -> Loss | None:
-        """Return the item that has moved furthest, if it or its tilt is beyond what is allowed.
-
-        Args:
-            scene: the scene.
-            count: number of items to look at, the first ones; None: all.
-        """
-        shifts, tilts = scene.shifts[:count], scene.tilts[:count]
+    def find_collapsed(self, scene: Scene) -> Loss | None:
+        """Return the item that has moved furthest of those that have moved or tilted too far, if any has."""
+        shifts, tilts = scene.shifts, scene.tilts
         lost = (shifts > self.max_shift * self.cell_size) | (tilts > self.max_tilt)
         return Loss("collapsed", int(np.where(lost, shifts, -1).argmax())) if lost.any() else None
 
 
-def wait(scene: "Scene") -> None:
+def wait(scene: Scene) -> None:
     """Let time pass until all items are at rest, or :data:`LONGEST`."""
     scene.run(SHORTEST)
     for _ in range(round((LONGEST - SHORTEST) / CHUNK)):

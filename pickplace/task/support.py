@@ -43,11 +43,11 @@ def is_supported(
 
 
 def _is_in_hull(cells: Sequence[Tensor], z: Tensor, w: Tensor, d: Tensor, margin: float) -> Tensor:
-    """Return whether the item's centre lies in the hull of the supporting cells, further than ``margin`` from its edge."""
+    """Return whether the item's centre lies inside the hull, further than ``margin`` from its edge."""
     side = round(len(cells) ** 0.5)
-    stable = torch.ones_like(z, dtype=torch.bool)
+    stable, sizes = torch.ones_like(z, dtype=torch.bool), (w.clamp(min=1) - 1, d.clamp(min=1) - 1)
     for patterns, whole in hull_patterns(side, margin):
-        patterns, whole = (table.to(z.device)[..., w.clamp(min=1) - 1, d.clamp(min=1) - 1] for table in (patterns, whole))
+        patterns, whole = (table.to(z.device)[..., *sizes] for table in (patterns, whole))
         reached = torch.zeros_like(z)
         for height, pattern in zip(cells, patterns, strict=True):
             reached |= torch.where(height == z, pattern, 0)
@@ -77,7 +77,7 @@ def hull_patterns(side: int, margin: float) -> list[tuple[Tensor, Tensor]]:
     along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
     beyond = along > 2 * margin * normals.double().norm(dim=1).view(-1, 1, 1, 1, 1)
     inside = near[:, None] < size
-    beyond &= (inside[:, None, :, None] & inside[None, :, None, :])
+    beyond &= inside[:, None, :, None] & inside[None, :, None, :]
     # Only directions of lattice edges that fit the footprint can be edges of a hull in it.
     edges = (normals.abs()[:, 1, None, None] <= size[:, None]) & (normals.abs()[:, 0, None, None] <= size)
     words = []

@@ -60,7 +60,9 @@ def test_what_the_rules_call_feasible_is_carried_out(settings):
     """Random play with every rotation and grasp: each item comes to lie where the rules say."""
 
     def make_env(first, count):
-        return PickPlaceEnv(num_envs=count, tote_size=(5, 4, 2), support="more_than_half", first_episode=first, **settings)
+        return PickPlaceEnv(
+            num_envs=count, tote_size=(5, 4, 2), support="more_than_half", first_episode=first, **settings
+        )
 
     cell = make_env(0, 1).cell
     episodes = play(make_env, RandomFeasible(cell, seed=1), 6, 6, record=range(6))

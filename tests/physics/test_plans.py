@@ -14,7 +14,14 @@ from pickplace.task.state import Failure
 from pickplace.views.recording import Move, Recording
 
 LINE = {"episode": 0, "tote": [0.3, 0.3, 0.2], "corner": [0.0, 0.0, 0.0], "size": [0.1, 0.1, 0.05]}
-ROBOT = {"bin": [0.25, 0.25, 0.05], "item": [0, 0], "effector": [0.15, 0.15], "pick": [0.1, 0.1], "place": [0.1, 0.1], "rotation": 90}
+ROBOT = {
+    "bin": [0.25, 0.25, 0.05],
+    "item": [0, 0],
+    "effector": [0.15, 0.15],
+    "pick": [0.1, 0.1],
+    "place": [0.1, 0.1],
+    "rotation": 90,
+}
 
 
 def written(path, *lines):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pickplace.physics.execute import Execute
 from pickplace.physics.plans import Placement, Plan
 from pickplace.physics.scene import Scene
 from pickplace.physics.settle import Settle
@@ -25,7 +26,9 @@ def bricks(*overhangs, length=0.1, height=0.05):
     return plan(*[((x, 0.4, number * height), (length, 0.1, height)) for number, x in enumerate(at)])
 
 
-@pytest.mark.parametrize(("overhang", "ending"), [(0.3, "done"), (0.49, "done"), (0.51, "collapsed"), (0.7, "collapsed")])
+@pytest.mark.parametrize(
+    ("overhang", "ending"), [(0.3, "done"), (0.49, "done"), (0.51, "collapsed"), (0.7, "collapsed")]
+)
 @pytest.mark.parametrize("length", [0.06, 0.2])
 def test_a_brick_with_half_of_it_in_the_air_falls(overhang, ending, length):
     outcome = EXACT.carry_out_one(bricks(overhang * length, length=length))
@@ -51,13 +54,23 @@ def test_a_tower_slides_apart_without_friction(friction, slides):
 
 
 def test_an_episode_ends_at_the_first_loss():
-    boxes = [((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)), ((0.07, 0.0, 0.1), (0.1, 0.1, 0.1)), ((0.3, 0.3, 0.0), (0.1, 0.1, 0.1))]
+    boxes = [
+        ((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)),
+        ((0.07, 0.0, 0.1), (0.1, 0.1, 0.1)),
+        ((0.3, 0.3, 0.0), (0.1, 0.1, 0.1)),
+    ]
     outcome = EXACT.carry_out_one(plan(*boxes, tote=(0.5, 0.5, 0.5)))
     assert (outcome.ending, outcome.lost, outcome.during, outcome.placed) == ("collapsed", 1, 1, 1)
     assert outcome.occupancy == pytest.approx(0.1**3 / 0.5**3) and outcome.drift < 1e-3
     outcome = EXACT.carry_out_one(plan(*boxes[::2], tote=(0.5, 0.5, 0.5)))
     assert (outcome.ending, outcome.lost, outcome.during, outcome.placed) == ("done", None, None, 2)
     assert outcome.occupancy == pytest.approx(2 * 0.1**3 / 0.5**3)
+
+
+@pytest.mark.parametrize("simulation", [Settle(), Execute()], ids=lambda simulation: simulation.name)
+def test_an_episode_without_placements(simulation):
+    outcome = simulation.carry_out_one(Plan(2, (0.3, 0.3, 0.3), (0.25, 0.25, 0.05), (0.15, 0.15)))
+    assert (outcome.episode, outcome.ending, outcome.placed, outcome.occupancy) == (2, "done", 0, 0)
 
 
 def test_sleep_changes_no_result_and_processes_neither():

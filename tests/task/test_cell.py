@@ -21,8 +21,10 @@ from pickplace.task.cell import CELL_SETTINGS, Limits, cell_from_settings, refer
         ({"effector_size": (3, 3, 1)}, r"effector_size=\(3, 3, 1\)"),
         *(({"rotations": value}, f"rotations={value}: expected 1, 2, 3 or 4") for value in (5, 4.0)),
         ({"pick_rule": "grab"}, "pick_rule='grab': expected 'contain' or 'overlap'"),
-        *(({"support": value}, f"support={value!r}: expected 'half' or .* 'full' or a number between 0 and 1")
-          for value in (1.5, -0.1, "most", True)),
+        *(
+            ({"support": value}, f"support={value!r}: expected 'half' or .* 'full' or a number between 0 and 1")
+            for value in (1.5, -0.1, "most", True)
+        ),
         ({"support": "hull", "support_margin": -1}, "support_margin=-1: .* between 0 and 100"),
         ({"support_margin": 0.5}, "support_margin=0.5: expected 0, or support=hull"),
         *(({"height_unit": value}, f"height_unit={value}: .* between 0.001 and 1000") for value in (1e-4, 2000)),
