@@ -11,7 +11,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from pickplace.evaluation.play import Episodes, MakeEnv, check_episode_settings, check_play, decision_latency, play
 from pickplace.evaluation.statistics import paired_difference, summarise, summarise_physics
-from pickplace.physics.plans import CELL_SIZE, PLANS, plan_of, to_lines
+from pickplace.physics.plans import CELL_SIZE, PLANS, to_lines
+from pickplace.physics.recorded import plan_of
 from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import own_modules, trusted_config
@@ -68,10 +69,14 @@ def _run(cfg: DictConfig, run_dir: Path) -> float:
         cfg, make_env, planner, facts, record=range(ev.episodes if plans or physics else max(replay, 1))
     )
     recordings = episodes.recordings
-    planned = [plan_of(recording, cell, physics.cell_size if physics else CELL_SIZE) for recording in recordings]
+    size = physics.cell_size if physics else CELL_SIZE
+    planned = [plan_of(recording, cell, size) for recording in recordings] if plans or physics else []
     if physics:
-        log.info("carrying out %s episodes with physics=%s", f"{len(planned):,}", physics.name)
-        outcomes = list(physics.carry_out(planned))
+        outcomes = []
+        for outcome in physics.carry_out(planned):
+            outcomes.append(outcome)
+            if len(outcomes) % 10 == 0 or len(outcomes) == len(planned):
+                log.info("physics=%s: %s of %s episodes", physics.name, f"{len(outcomes):,}", f"{len(planned):,}")
         settings = {key: value for key, value in resolved(cfg.physics).items() if key != "_target_"}
         result["physics"] = {"method": physics.name, "settings": settings, **summarise_physics(outcomes)}
     if other:

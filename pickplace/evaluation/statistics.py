@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pickplace.evaluation.play import Episodes
-from pickplace.physics.simulation import Outcome
+from pickplace.physics.outcome import Outcome
 from pickplace.task.state import Failure
 
 

@@ -4,23 +4,34 @@ import argparse
 import json
 from dataclasses import asdict
 
-from omegaconf import OmegaConf
-
-from pickplace.physics.plans import read_plans
 from pickplace.runs.errors import one_sentence, write_output
-from pickplace.runs.registry import build
 
 
 def main() -> None:
     """Entry point of ``pickplace-physics``."""
     with one_sentence():
-        arguments = parser().parse_args()
-        if words := [word for word in arguments.settings if "=" not in word]:
-            raise ValueError(f"{words[0]}: expected <key>=<value>, such as friction=0.3.")
-        settings = OmegaConf.from_dotlist([f"_target_={arguments.method}", *arguments.settings])
-        simulation = build("physics", settings)
-        for outcome in simulation.carry_out(read_plans(arguments.plans)):
-            write_output(json.dumps(asdict(outcome)) + "\n")
+        run(parser().parse_intermixed_args())
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Carry out the plans that the command line names, and print the outcomes."""
+    from omegaconf import OmegaConf  # not before help is answered
+    from yaml import YAMLError
+
+    from pickplace.physics.plans import read_plans
+    from pickplace.runs.registry import build
+
+    for word in arguments.settings:
+        key, equals, _ = word.partition("=")
+        if not equals or not key.isidentifier() or key == "_target_":
+            raise ValueError(f"{word}: expected <key>=<value>, such as friction=0.3.")
+    try:
+        settings = OmegaConf.from_dotlist(arguments.settings)
+    except YAMLError as error:
+        raise ValueError(f"{' '.join(arguments.settings)}: expected <key>=<value>, such as friction=0.3.") from error
+    simulation = build("physics", {**OmegaConf.to_container(settings), "_target_": arguments.method})  # type: ignore
+    for outcome in simulation.carry_out(read_plans(arguments.plans)):
+        write_output(json.dumps(asdict(outcome)) + "\n")
 
 
 def parser() -> argparse.ArgumentParser:

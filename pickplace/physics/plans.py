@@ -7,7 +7,7 @@ A line has the keys
 * ``corner``: near corner of the item at rest in the tote, ``[x, y, z]``, from the tote's near corner on its floor.
 * ``size``: sides of the item as it lies in the tote, ``[w, d, h]``.
 
-which is all that ``settle`` needs, and for a robot
+which is all that ``settle`` needs, and for a robot (of these only their types are checked)
 
 * ``bin``: inner sides of the bin, ``[w, d, h]``; ``item``: near corner of the item in the bin, ``[x, y]``.
 * ``effector``: sides of the end effector as it hangs over the bin, ``[w, d]``.
@@ -21,16 +21,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pickplace.task.cell import CellSpec
 from pickplace.task.checks import excerpt, is_number, is_whole
 from pickplace.task.files import read_text
-from pickplace.views.recording import Recording
 
 PLANS = "plans.jsonl"
 CELL_SIZE = 0.05  # side of a cell unless a robot cell says otherwise, m
-TOLERANCE = 1e-4  # by which boxes may overlap or float, m: of rounding
-MAX_LENGTH = 100.0  # of anything, m
-MAX_FILE = 2**28  # bytes
+TOLERANCE = 1e-4  # distance by which boxes may overlap or float, for rounding; m
+MAX_LENGTH = 100.0  # greatest length or coordinate, m
+MAX_FILE = 2**28  # greatest size of a file, bytes
 
 #: Keys of every line, and further ones for a robot, with the number of their values; 0: one number.
 KEYS = {"episode": 0, "tote": 3, "corner": 3, "size": 3}
@@ -62,7 +60,7 @@ class Placement:
 
 
 @dataclass(frozen=True)
-class Plan:
+class EpisodePlan:
     """The placements of an episode, in order; in metres."""
 
     episode: int
@@ -72,36 +70,7 @@ class Plan:
     placements: list[Placement] = field(default_factory=list)
 
 
-def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> Plan:
-    """Return the plan of a recorded episode; ``cell_size`` is the side of a cell in metres."""
-
-    def metres(values, heights: bool = False) -> Point:
-        """Lengths in cells, of which the last is a height if ``heights``, in metres."""
-        scales = [1.0] * len(values)
-        if heights:
-            scales[-1] = cell.height_unit
-        # Rounded to nanometres: 0.15000000000000002 would only be harder to read.
-        return tuple(round(value * scale * cell_size, 9) for value, scale in zip(values, scales, strict=True))
-
-    def middle(corner, sides) -> Point:
-        return metres([at + side / 2 for at, side in zip(corner, sides, strict=True)])
-
-    tote = metres((*cell.tote_size[:2], recording.tote_height), heights=True)
-    plan = Plan(recording.episode, tote, metres(cell.bin_size, heights=True), metres(cell.effector_size))
-    for move in recording.moves:
-        if not move.failure:
-            x, y, w, d = move.footprint
-            shape = cell.effectors[move.rotation % 2]
-            placement = Placement(
-                metres((x, y, move.z), heights=True), metres((w, d, move.item[4]), heights=True),
-                metres(move.item[:2]), middle(move.pick, cell.effector_size), middle(move.place, shape[:2]),
-                90 * move.rotation,
-            )  # fmt: skip
-            plan.placements.append(placement)
-    return plan
-
-
-def to_lines(plans: Iterable[Plan]) -> str:
+def to_lines(plans: Iterable[EpisodePlan]) -> str:
     """Return plans as the text of a ``plans.jsonl``."""
     lines = []
     for plan in plans:
@@ -112,7 +81,7 @@ def to_lines(plans: Iterable[Plan]) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def read_plans(path: str | Path) -> list[Plan]:
+def read_plans(path: str | Path) -> list[EpisodePlan]:
     """Return the plans of a ``plans.jsonl``.
 
     Raises:
@@ -120,15 +89,15 @@ def read_plans(path: str | Path) -> list[Plan]:
             there: it leaves the tote, overlaps another one, or has nothing below it.
         OSError: if the file cannot be read.
     """
-    plans: list[Plan] = []
-    for number, line in enumerate(read_text(path, MAX_FILE, empty=False).splitlines(), 1):
+    plans: list[EpisodePlan] = []
+    for number, line in enumerate(read_text(path, MAX_FILE).splitlines(), 1):
         where = f"{path}, line {number}"
         values = _read_line(where, line)
         sizes = {key: values.get(key, ()) for key in ("tote", "bin", "effector")}
         if not plans or plans[-1].episode != values["episode"]:
             if any(plan.episode == values["episode"] for plan in plans):
                 raise ValueError(f"{where}: episode={values['episode']}: expected its lines to follow one another.")
-            plans.append(Plan(values["episode"], **sizes))
+            plans.append(EpisodePlan(values["episode"], **sizes))
         for key, value in sizes.items():
             if getattr(plans[-1], key) != value:
                 raise ValueError(f"{where}: {key}: expected the same in all lines of episode {values['episode']}.")
@@ -155,8 +124,8 @@ def _read_line(where: str, line: str) -> dict:
         raise ValueError(f"{where}: {missing[0]}: missing; expected {', '.join(needed)}.")
     for key, value in values.items():
         if not known[key]:
-            if not is_whole(value) or (key == "rotation" and value not in (0, 90, 180, 270)):
-                expected = "0, 90, 180 or 270" if key == "rotation" else "a whole number"
+            if not is_whole(value) or value < 0 or (key == "rotation" and value not in (0, 90, 180, 270)):
+                expected = "0, 90, 180 or 270" if key == "rotation" else "a whole number >= 0"
                 raise ValueError(f"{where}: {key}={excerpt(value)}: expected {expected}.")
             continue
         is_side = key in ("tote", "size", "bin", "effector")
@@ -168,7 +137,7 @@ def _read_line(where: str, line: str) -> dict:
     return values
 
 
-def _fault(placement: Placement, plan: Plan) -> str:
+def _fault(placement: Placement, plan: EpisodePlan) -> str:
     """Return why the item cannot lie where it is planned; empty if it can."""
     size, corner = placement.size, placement.corner
     for axis, name in enumerate("xyz"):

@@ -9,6 +9,8 @@ import numpy as np
 
 try:
     import mujoco
+
+    mujoco.set_mju_user_warning(lambda *_: None)  # else it writes MUJOCO_LOG.TXT; `diverged` tells what matters
 except ImportError:  # an extra; Simulation says so
     mujoco = None
 
@@ -26,7 +28,7 @@ class Scene:
     Args:
         friction: sliding friction between all surfaces.
         density: of the boxes.
-        gap: what a box is narrower than planned, along x and y.
+        gap: total narrowing of a box along x and along y.
         sleep: let bodies that do not move sleep.
 
     Attributes:
@@ -43,6 +45,7 @@ class Scene:
         option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         if sleep:
             option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+            option.sleep_tolerance = 1e-5  # m/s; with MuJoCo's own of 1e-3 an item that begins to tilt falls asleep
         self.boxes: list = []
         self.planned = np.zeros((0, 3))
         self.model = self.spec.compile()
@@ -71,7 +74,7 @@ class Scene:
             planned: centre of the box where it is planned to rest.
         """
         self.planned = np.vstack([self.planned, planned])
-        body = self.spec.worldbody.add_body(pos=np.add(corner, np.divide(size, 2)))
+        body = self.spec.worldbody.add_body(name=f"item{len(self.boxes)}", pos=np.add(corner, np.divide(size, 2)))
         body.add_freejoint()
         self.add_geom(body, np.subtract(size, (self.gap, self.gap, 0)))
         self.boxes.append(body)
@@ -86,6 +89,11 @@ class Scene:
     def run(self, seconds: float) -> None:
         """Let time pass."""
         mujoco.mj_step(self.model, self.data, nstep=round(seconds / TIMESTEP))
+
+    @property
+    def diverged(self) -> bool:
+        """Whether the simulation has become impossible: forces or speeds without bounds, or too many contacts."""
+        return bool(self.data.warning.number[: mujoco.mjtWarning.mjWARN_BADCTRL].any())
 
     @property
     def speeds(self) -> np.ndarray:

@@ -5,11 +5,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from pickplace.physics.plans import Placement, Plan
+from pickplace.physics.outcome import Loss
+from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.physics.scene import Scene
-from pickplace.physics.simulation import Loss, Simulation, wait
+from pickplace.physics.simulation import Simulation, wait
 
-HEIGHT = 0.002  # above its planned pose in which an item appears, m
+DROP_HEIGHT = 0.002  # height above its planned pose at which an item appears, m
 
 
 @dataclass(frozen=True)
@@ -18,12 +19,12 @@ class Settle(Simulation):
 
     name: ClassVar[str] = "settle"
 
-    def make_scene(self, plan: Plan) -> Scene:
+    def make_scene(self, plan: EpisodePlan) -> Scene:
         scene = Scene(self.friction, self.density, self.gap, self.sleep)
         scene.add_container(plan.tote)
         return scene
 
     def place(self, scene: Scene, placement: Placement, error: np.ndarray) -> Loss | None:
-        scene.add(np.add(placement.corner, (*error, HEIGHT)), placement.size, placement.centre)
+        scene.add(np.add(placement.corner, (*error, DROP_HEIGHT)), placement.size, placement.centre)
         wait(scene)
         return None

@@ -1,45 +1,27 @@
-"""What ``settle`` and ``execute`` have in common: options, losses, and outcomes."""
+"""The base class of ``settle`` and ``execute``: options, the first loss, and the outcome."""
 
+import signal
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from importlib.util import find_spec
 from math import prod
 from multiprocessing import get_context
 from time import process_time
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
-from pickplace.physics.plans import Placement, Plan
-from pickplace.physics.scene import Scene
+from pickplace.physics.outcome import Loss, Outcome
+from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement
+from pickplace.physics.scene import Scene, mujoco
 from pickplace.task.checks import flag, number, whole_number
 
-#: An item is at rest below these speeds; m/s and rad/s.
-STILL = np.repeat((0.002, 0.02), 3)
-CHUNK, SHORTEST, LONGEST, AT_THE_END = 0.02, 0.06, 1.0, 1.0  # seconds between looks, and for items to come to rest
-
-
-class Loss(NamedTuple):
-    """The first loss of an episode."""
-
-    reason: str
-    item: int  # number of the item, from 0
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The end of an episode that was carried out."""
-
-    episode: int
-    ending: str  # "done", or the reason of the first loss
-    lost: int | None  # number of the lost item, from 0
-    during: int | None  # number of the placement during which it was lost; the number of placements: at the end
-    placed: int  # items placed before the loss
-    occupancy: float  # share of the tote that they fill
-    drift: float  # greatest distance of a placed item that was not lost from its planned pose, m
-    cpu_seconds: float
+#: Linear and angular speeds below which an item is at rest; m/s and rad/s.
+REST_SPEEDS = np.repeat((0.002, 0.02), 3)
+#: Time for items to come to rest after a placement, at least and at most, and at the end of an episode; s.
+MIN_WAIT, MAX_WAIT, FINAL_WAIT = 0.06, 1.0, 1.0
+LOOK = 0.02  # time between two looks at the speeds, s
 
 
 @dataclass(frozen=True)
@@ -47,13 +29,15 @@ class Simulation(ABC):
     """Options that every simulation has.
 
     An episode ends at the first loss. ``collapsed``: an item has moved or tilted too far from its planned pose.
+    ``diverged``: the simulation has become impossible.
 
     Args:
-        cell_size: side of a cell; m.
+        cell_size: side of a cell, the unit of ``max_shift``; m.
         friction: sliding friction between all surfaces.
         density: of the items; kg/m^3.
-        gap: what an item is narrower than planned, along x and y; m.
-        noise: standard deviation of the error of a placement along x and along y; m.
+        gap: total narrowing of an item along x and along y; m.
+        noise: standard deviation of the error of a placement along x and along y; m. With ``settle`` an error of
+            more than half the gap may put an item into its neighbour.
         max_shift: distance beyond which an item is lost, in cells.
         max_tilt: angle beyond which an item is lost; degrees.
         sleep: let bodies that do not move sleep, which is faster and changes nothing.
@@ -61,7 +45,7 @@ class Simulation(ABC):
         workers: processes, each with an episode of its own.
     """
 
-    cell_size: float = 0.05
+    cell_size: float = CELL_SIZE
     friction: float = 0.6
     density: float = 300.0
     gap: float = 0.001
@@ -85,37 +69,49 @@ class Simulation(ABC):
         flag("physics.sleep", self.sleep)
         whole_number("physics.seed", self.seed, 0)
         whole_number("physics.workers", self.workers, 1, 64)
-        if find_spec("mujoco") is None:
+        if self.gap > self.cell_size / 2:
+            raise ValueError(f"physics.gap={self.gap:g}: expected at most half of a cell, {self.cell_size / 2:g}.")
+        if mujoco is None:
             raise ValueError(f"physics={self.name}: MuJoCo is missing; pip install 'pickplace[physics]'.")
 
     @abstractmethod
-    def make_scene(self, plan: Plan) -> Scene:
+    def make_scene(self, plan: EpisodePlan) -> Scene:
         """Return the scene before the first placement."""
 
     @abstractmethod
     def place(self, scene, placement: Placement, error: np.ndarray) -> Loss | None:
         """Place the next item, with an error along x and y, m, ``[2]``; return the loss if there is one."""
 
-    def carry_out(self, plans: Iterable[Plan]) -> Iterator[Outcome]:
+    def carry_out(self, plans: Iterable[EpisodePlan]) -> Iterator[Outcome]:
         """Yield the outcome of each plan."""
         if self.workers == 1:
             yield from map(self.carry_out_one, plans)
         else:
-            with ProcessPoolExecutor(self.workers, get_context("spawn")) as pool:
+            # Ctrl-C reaches all processes; this one ends the others.
+            ignore = signal.SIGINT, signal.SIG_IGN
+            with ProcessPoolExecutor(self.workers, get_context("spawn"), signal.signal, ignore) as pool:
                 yield from pool.map(self.carry_out_one, plans)
 
-    def carry_out_one(self, plan: Plan) -> Outcome:
-        """Return the outcome of a plan."""
+    def carry_out_one(self, plan: EpisodePlan) -> Outcome:
+        """Return the outcome of a plan.
+
+        Raises:
+            ValueError: for an item or an end effector that is hardly wider than the gap.
+        """
+        for index, size in enumerate([placement.size for placement in plan.placements], 1):
+            if min(size[:2]) < 2 * self.gap:
+                expected = f"expected sides of at least twice physics.gap, {2 * self.gap:g} m"
+                raise ValueError(f"episode {plan.episode}, item {index}: {min(size[:2]):g} m wide; {expected}.")
         started, count = process_time(), len(plan.placements)
         errors = self.noise * np.random.default_rng((self.seed, plan.episode)).standard_normal((count, 2))
         scene, loss, placed = self.make_scene(plan), None, 0
         for placement, error in zip(plan.placements, errors, strict=True):
-            if loss := self.place(scene, placement, error) or self.find_collapsed(scene):
+            if loss := self.place(scene, placement, error) or self.find_loss(scene):
                 break
             placed += 1
         else:
-            scene.run(AT_THE_END)
-            loss = self.find_collapsed(scene)
+            scene.run(FINAL_WAIT)
+            loss = self.find_loss(scene)
         kept = [number for number in range(placed) if loss is None or number != loss.item]
         return Outcome(
             episode=plan.episode,
@@ -123,22 +119,24 @@ class Simulation(ABC):
             lost=loss.item if loss else None,
             during=placed if loss else None,
             placed=placed,
-            occupancy=sum(placement.volume for placement in plan.placements[:placed]) / prod(plan.tote),
+            occupancy=min(1.0, sum(placement.volume for placement in plan.placements[:placed]) / prod(plan.tote)),
             drift=float(scene.shifts[kept].max(initial=0.0)),
             cpu_seconds=process_time() - started,
         )
 
-    def find_collapsed(self, scene: Scene) -> Loss | None:
+    def find_loss(self, scene: Scene) -> Loss | None:
         """Return the item that has moved furthest of those that have moved or tilted too far, if any has."""
+        if scene.diverged:
+            return Loss("diverged", len(scene.boxes) - 1)
         shifts, tilts = scene.shifts, scene.tilts
         lost = (shifts > self.max_shift * self.cell_size) | (tilts > self.max_tilt)
         return Loss("collapsed", int(np.where(lost, shifts, -1).argmax())) if lost.any() else None
 
 
 def wait(scene: Scene) -> None:
-    """Let time pass until all items are at rest, or :data:`LONGEST`."""
-    scene.run(SHORTEST)
-    for _ in range(round((LONGEST - SHORTEST) / CHUNK)):
-        if (np.abs(scene.speeds) < STILL).all():
+    """Let time pass until all items are at rest, or :data:`MAX_WAIT`."""
+    scene.run(MIN_WAIT)
+    for _ in range(round((MAX_WAIT - MIN_WAIT) / LOOK)):
+        if (np.abs(scene.speeds) < REST_SPEEDS).all():
             return
-        scene.run(CHUNK)
+        scene.run(LOOK)

@@ -11,8 +11,7 @@ from pickplace.task.checks import excerpt, is_number, is_whole, number, one_of, 
 
 PICK_RULES = ("contain", "overlap")
 
-#: Stability rules, and the least share of the footprint that rests on the highest cells below it.
-SUPPORT_RULES = {"half": 0.5, "more_than_half": 0.5, "hull": 0.0, "full": 1.0}
+SUPPORT_RULES = ("half", "more_than_half", "hull", "full")
 
 #: Greatest side of a grid or height, in cells or height units, and greatest side of an end effector.
 MAX_SIDE, MAX_EFFECTOR = 2_000, 64
@@ -159,11 +158,6 @@ class CellSpec:
     def num_actions(self) -> int:
         """``N_a``, the number of flat actions."""
         return self.num_picks * self.num_places * self.rotations
-
-    @property
-    def least_support(self) -> float:
-        """The least share of the footprint that must rest on the highest cells below it."""
-        return SUPPORT_RULES[self.support] if isinstance(self.support, str) else self.support
 
     @property
     def parities(self) -> int:

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from pickplace import CellSpec
 from pickplace.physics import command
-from pickplace.physics.plans import KEYS, ROBOT_KEYS, Placement, Plan, plan_of, read_plans, to_lines
+from pickplace.physics.plans import KEYS, ROBOT_KEYS, EpisodePlan, Placement, read_plans, to_lines
+from pickplace.physics.recorded import plan_of
 from pickplace.task.state import Failure
 from pickplace.views.recording import Move, Recording
 
@@ -39,10 +40,10 @@ def test_a_recorded_episode_in_metres(tmp_path):
     ]
     plan = plan_of(Recording(7, 18, moves), cell, 0.04)
     first = Placement((0, 0.08, 0), (0.04, 0.08, 0.05), (0.08, 0.04), (0.1, 0.04), (0.04, 0.1), 90)
-    assert plan == Plan(7, (0.24, 0.24, 0.18), (0.2, 0.2, 0.03), (0.12, 0.08), [first, plan.placements[1]])
+    assert plan == EpisodePlan(7, (0.24, 0.24, 0.18), (0.2, 0.2, 0.03), (0.12, 0.08), [first, plan.placements[1]])
     assert plan.placements[1].corner == (0, 0.08, 0.05) and plan.placements[1].rotation == 0
     path = tmp_path / "plans.jsonl"
-    path.write_text(to_lines([plan, Plan(8, (1.0, 1.0, 1.0), placements=[Placement((0, 0, 0), (1, 1, 1))])]))
+    path.write_text(to_lines([plan, EpisodePlan(8, (1.0, 1.0, 1.0), placements=[Placement((0, 0, 0), (1, 1, 1))])]))
     assert list(map(json.loads, path.read_text().splitlines()))[0].keys() == {*KEYS, *ROBOT_KEYS}
     back = read_plans(path)
     assert back[0] == plan and back[1].placements == [Placement((0, 0, 0), (1, 1, 1))]
@@ -58,7 +59,7 @@ def test_a_recorded_episode_in_metres(tmp_path):
     ({"corner": [0, 0]}, "corner=.*expected 3 coordinates"),
     ({"size": [0.1, 0, 0.1]}, "size=.*expected 3 lengths above 0, in metres"),
     ({"size": "large"}, "size='large': expected 3 lengths"),
-    ({"episode": 0.5}, "episode=0.5: expected a whole number"),
+    *(({"episode": value}, f"episode={value}: expected a whole number >= 0") for value in (0.5, -1)),
     ({"tote": [0.3, 0.3, 0.3]}, "tote: expected the same in all lines of episode 0"),
     ({"volume": 1}, "'volume': there is no such key; expected episode, tote, corner, size, bin"),
     ({"pick": [0, 0]}, "bin: missing; expected episode, tote, corner, size, bin"),
@@ -72,7 +73,6 @@ def test_a_bad_line_is_refused(change, words, tmp_path):
 
 
 @pytest.mark.parametrize(("text", "words"), [
-    ("", "0 bytes; expected a file with content"),
     ("corner\n", r"line 1: expected an object in JSON \("),
     ("[1]\n", "line 1: got list, expected an object with episode, tote, corner, size"),
     (json.dumps({"episode": 1}) + "\n", "line 1: tote: missing; expected episode, tote, corner, size"),
@@ -81,6 +81,11 @@ def test_another_file_is_refused(text, words, tmp_path):
     (tmp_path / "plans.jsonl").write_text(text)
     with pytest.raises(ValueError, match=words):
         read_plans(tmp_path / "plans.jsonl")
+
+
+def test_an_episode_without_placements_has_no_line(tmp_path):
+    (tmp_path / "plans.jsonl").write_text(to_lines([EpisodePlan(0, (1.0, 1.0, 1.0))]))
+    assert read_plans(tmp_path / "plans.jsonl") == []
 
 
 def test_the_lines_of_an_episode_follow_one_another(tmp_path):
@@ -118,10 +123,15 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     for words, expected in (
         ((path, "friction=-1"), "physics.friction=-1: expected a number between 0 and 10"),
         ((path, "fricton=1"), "physics.fricton: there is no key 'fricton' in physics; did you mean 'friction'?"),
-        ((path, "friction"), "friction: expected <key>=<value>"),
-        ((path, "--method", "execute"), "physics=execute: episode 0 has no bin"),
+        *(((path, word), f"{word}: expected <key>=<value>") for word in ("friction", "friction=[1", "_target_=x")),
+        ((path, "--method", "execute", "friction=0.3"), "physics=execute: episode 0 has no bin"),
+        ((path, "gap=0.02", "cell_size=1"), None),
+        ((path, "gap=0.06", "cell_size=1"), "episode 0, item 1: 0.1 m wide; expected sides of at least twice physics"),
         ((tmp_path / "none.jsonl",), "none.jsonl: No such file"),
     ):
+        if expected is None:
+            assert len(call(*words)) == 2
+            continue
         with pytest.raises(SystemExit, match="2"):
             call(*words)
         err = capsys.readouterr().err

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pickplace.physics import simulation
 from pickplace.physics.execute import Execute
-from pickplace.physics.plans import Placement, Plan
+from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.physics.scene import Scene
 from pickplace.physics.settle import Settle
-from pickplace.physics.simulation import AT_THE_END, wait
+from pickplace.physics.simulation import FINAL_WAIT, wait
 
 pytest.importorskip("mujoco")
 EXACT = Settle(gap=0.0)
@@ -17,7 +18,7 @@ EXACT = Settle(gap=0.0)
 
 def plan(*boxes, tote=(1.0, 1.0, 0.5)):
     """Return a plan of boxes ``(corner, size)``."""
-    return Plan(0, tote, placements=[Placement(corner, size) for corner, size in boxes])
+    return EpisodePlan(0, tote, placements=[Placement(corner, size) for corner, size in boxes])
 
 
 def bricks(*overhangs, length=0.1, height=0.05):
@@ -49,7 +50,7 @@ def test_a_tower_slides_apart_without_friction(friction, slides):
     scene.spec.option.gravity = [9.81 * np.sin(slope), 0, -9.81 * np.cos(slope)]
     for placement in bricks(0, 0).placements:
         scene.add(placement.corner, placement.size, placement.centre)
-    scene.run(AT_THE_END)
+    scene.run(FINAL_WAIT)
     assert (scene.shifts[-1] > 0.02) == slides
 
 
@@ -67,16 +68,16 @@ def test_an_episode_ends_at_the_first_loss():
     assert outcome.occupancy == pytest.approx(2 * 0.1**3 / 0.5**3)
 
 
-@pytest.mark.parametrize("simulation", [Settle(), Execute()], ids=lambda simulation: simulation.name)
-def test_an_episode_without_placements(simulation):
-    outcome = simulation.carry_out_one(Plan(2, (0.3, 0.3, 0.3), (0.25, 0.25, 0.05), (0.15, 0.15)))
+@pytest.mark.parametrize("method", [Settle(), Execute()], ids=lambda method: method.name)
+def test_an_episode_without_placements(method):
+    outcome = method.carry_out_one(EpisodePlan(2, (0.3, 0.3, 0.3), (0.25, 0.25, 0.05), (0.15, 0.15)))
     assert (outcome.episode, outcome.ending, outcome.placed, outcome.occupancy) == (2, "done", 0, 0)
 
 
 def test_sleep_changes_no_result_and_processes_neither():
     """Columns of bricks with random overhangs, some of which fall."""
-    random, plans = np.random.default_rng(0), []
-    for episode in range(6):
+    random, plans = np.random.default_rng(0), [bricks(0.1, length=0.2, height=0.2)]  # exactly half: it tilts slowly
+    for episode in range(1, 7):
         plans.append(replace(bricks(*random.uniform(-0.045, 0.045, 5)), episode=episode))
     results = []
     for settings in ({"sleep": False}, {"sleep": True}, {"workers": 2}):
@@ -84,6 +85,20 @@ def test_sleep_changes_no_result_and_processes_neither():
         results.append([(one.episode, one.ending, one.lost, one.during, one.occupancy) for one in outcomes])
     assert results[0] == results[1] == results[2]
     assert len({ending for _, ending, *_ in results[0]}) == 2
+
+
+def test_a_simulation_that_diverges_is_told():
+    scene = Scene(0.6, 300.0, gap=0.0)
+    scene.add((0.0, 0.0, 0.0), (0.1, 0.1, 0.1), (0.05, 0.05, 0.05))
+    scene.data.qvel[:] = np.nan
+    scene.run(0.01)
+    assert EXACT.find_loss(scene) == ("diverged", 0)
+
+
+def test_without_mujoco(monkeypatch):
+    monkeypatch.setattr(simulation, "mujoco", None)
+    with pytest.raises(ValueError, match="physics=settle: MuJoCo is missing; pip install"):
+        Settle()
 
 
 def test_a_gap_and_an_error_move_the_boxes():
@@ -97,8 +112,8 @@ def test_a_gap_and_an_error_move_the_boxes():
 
 
 @pytest.mark.parametrize(("key", "value"), [
-    ("cell_size", 0), ("friction", -1), ("density", "heavy"), ("gap", float("nan")), ("noise", 1), ("max_shift", None),
-    ("max_tilt", 91), ("sleep", 1), ("seed", -1), ("workers", 0),
+    ("cell_size", 0), ("gap", 0.03), ("friction", -1), ("density", "heavy"), ("gap", float("nan")), ("noise", 1),
+    ("max_shift", None), ("max_tilt", 91), ("sleep", 1), ("seed", -1), ("workers", 0),
 ])  # fmt: skip
 def test_impossible_settings_are_refused(key, value):
     with pytest.raises(ValueError, match=f"physics.{key}=.*expected"):
