@@ -30,6 +30,11 @@ def plan() -> None:
     _run("pickplace.robot.json_lines", "pickplace.robot.planner")
 
 
+def physics() -> None:
+    """Entry point of ``pickplace-physics``, see :mod:`pickplace.physics.command`."""
+    _run("pickplace.physics.command")
+
+
 def _run(module: str, *needed: str, config_name: str | None = None) -> None:
     """Import a command and run it. While it is imported, and after it has ended, Ctrl-C ends the process quietly.
 

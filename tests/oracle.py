@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import chain, product
+from math import dist
 
 SUCCESS, PICK_MISS, BIN_COLLISION, TOTE_COLLISION, OVERFLOW, ITEM_COLLISION, UNSTABLE, STUCK, OUT_OF_REACH = range(9)
 
@@ -25,8 +26,8 @@ class Rules:
     effector_size: Pair = (3, 3)
     rotations: int = 4
     pick_rule: str = "contain"
-    min_support: float = 0.5
-    strict_support: bool = False
+    support: str | float = "half"
+    support_margin: float = 0.0
     pick_ok: list[bool] | None = None  # for each pick cell; None: no limits on the robot
     lowest_top: list[Grid] | None = None  # for each rotation and place cell
     highest_top: list[Grid] | None = None
@@ -68,6 +69,32 @@ def corner_for(reference_at: Pair, size: Pair) -> Pair:
 def cells(corner: Pair, size: Pair) -> list[Pair]:
     """Every cell of a rectangle, inside a grid or not."""
     return list(product(range(corner[0], corner[0] + size[0]), range(corner[1], corner[1] + size[1])))
+
+
+def is_stable(rules: Rules, supporting: list[Pair], size: Pair) -> bool:
+    """Whether an item of this size rests stably on these cells, counted from its corner."""
+    share = len(supporting) / (size[0] * size[1])
+    if not isinstance(rules.support, str):
+        return share >= rules.support
+    if rules.support == "hull":
+        # The hull's corners counter-clockwise, in half cells, so that the centre has whole coordinates.
+        corners = sorted({(2 * (x + a), 2 * (y + b)) for x, y in supporting for a in (0, 1) for b in (0, 1)})
+        hull: list[Pair] = []
+        for points in (corners, corners[::-1]):
+            chain: list[Pair] = []
+            for point in points:
+                while len(chain) > 1 and cross(chain[-2], chain[-1], point) <= 0:
+                    chain.pop()
+                chain.append(point)
+            hull += chain[:-1]
+        edges = zip(hull, hull[1:] + hull[:1], strict=True)
+        return all(cross(a, b, size) > 2 * rules.support_margin * dist(a, b) for a, b in edges)
+    return {"half": share >= 0.5, "more_than_half": share > 0.5, "full": share == 1}[rules.support]
+
+
+def cross(a: Pair, b: Pair, c: Pair) -> int:
+    """Twice the area of a triangle, positive if its corners run counter-clockwise."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 def inside(cell: Pair, grid: Grid) -> bool:
@@ -142,8 +169,8 @@ class Oracle:
         if any(heights[x][y] > top for x, y in effector if inside((x, y), heights)):
             return ITEM_COLLISION, None
 
-        support = sum(heights[x][y] == z for x, y in footprint) / len(footprint)
-        if support <= rules.min_support if rules.strict_support else support < rules.min_support:
+        x, y = footprint[0]
+        if not is_stable(rules, [(a - x, b - y) for a, b in footprint if heights[a][b] == z], size):
             return UNSTABLE, None
 
         if rules.pick_ok is not None:

@@ -16,6 +16,17 @@ from pickplace.task.items import Uniform
 
 SIDES, NEVER = st.integers(1, 4), st.just(False)
 
+#: Stability rules and their margins.
+SUPPORTS = [
+    ("half", 0.0),
+    ("more_than_half", 0.0),
+    ("full", 0.0),
+    ("hull", 0.0),
+    ("hull", 0.3),
+    (0.0, 0.0),
+    (2 / 3, 0.0),
+]
+
 
 class Case(NamedTuple):
     """The state of a problem: height of the tote, heights ``[W_T, D_T]`` in it, and ``(x, y, w, d, h)`` in the bin."""
@@ -35,7 +46,7 @@ def state_of(*cases: Case) -> State:
 def oracle_of(cell: CellSpec, case: Case) -> Oracle:
     """Return a case as the oracle sees it."""
     tables = {} if cell.limits is None else {key: value.tolist() for key, value in vars(cell.limits).items()}
-    names = ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "min_support", "strict_support")
+    names = ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "support", "support_margin")
     rules = Rules(**{name: getattr(cell, name) for name in names}, **tables)
     return Oracle(rules, case.rim, case.item[2:], case.item[:2], case.heights.tolist())
 
@@ -55,10 +66,10 @@ def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=NEVER, 
     effector = draw(effector_sides), draw(effector_sides)
     bin_w, bin_d, tote_w, tote_d = (draw(st.integers(least, most)) for least, most in ((2, 5), (2, 4), (3, 5), (2, 4)))
     rule = draw(st.sampled_from(["contain", "overlap"]))
-    support, strict = draw(st.sampled_from([(0.5, False), (0.0, False), (0.75, True), (0.5, True), (1.0, False)]))
+    support, margin = draw(st.sampled_from(SUPPORTS))
     cell = CellSpec(
         (bin_w, bin_d, draw(st.sampled_from([1, 2, 1, 3]))), (tote_w, tote_d, 6), effector,
-        draw(st.sampled_from(rotations)), rule, support, strict,
+        draw(st.sampled_from(rotations)), rule, support, margin,
     )  # fmt: skip
     if draw(limited):
         cell = replace(cell, limits=random_limits(cell, draw(st.integers(0, 999))))
@@ -81,7 +92,7 @@ SETTINGS = [
     {"num_envs": 8, "rotations": 2, "tote_size": (4, 3, 1)},
     {"num_envs": 4, "tote_size": (7, 5, 4), "effector_size": (4, 2), "bin_size": (6, 4, 2), "rotations": 3},
     {"num_envs": 4, "tote_size": (5, 6, 3), "effector_size": (2, 3), "pick_rule": "overlap", "rotations": 2},
-    {"num_envs": 4, "tote_size": (5, 5, 4), "items": Uniform((1, 2), (1, 3), (1, 2)), "strict_support": True},
+    {"num_envs": 4, "tote_size": (5, 5, 4), "items": Uniform((1, 2), (1, 3), (1, 2)), "support": "more_than_half"},
 ]
 
 

@@ -15,6 +15,7 @@ from hydra import compose, initialize_config_dir
 
 import pickplace
 from pickplace import Planner
+from pickplace.physics import command as physics
 from pickplace.robot import json_lines
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.registry import build
@@ -84,8 +85,8 @@ def check_command(command, search, words, is_new):
 @each_page
 def test_commands_compose_and_reach_their_last_height(page, monkeypatch):
     for path, command, words in commands_of(page):
-        if command == "plan":
-            json_lines.parser().parse_args(words)
+        if command in ("plan", "physics"):
+            (json_lines if command == "plan" else physics).parser().parse_args(words)
             continue
         monkeypatch.syspath_prepend(str(ROOT / path))
         search = ()

@@ -40,7 +40,9 @@ def test_commands_of_the_wheel_from_another_directory(wheel, tmp_path):
     site = tmp_path / "site"
     zipfile.ZipFile(wheel).extractall(site)
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-    assert scripts == {f"pickplace-{name}": f"pickplace.cli:{name}" for name in ("train", "evaluate", "plan")}
+    assert scripts == {
+        f"pickplace-{name}": f"pickplace.cli:{name}" for name in ("train", "evaluate", "plan", "physics")
+    }
     words = ["checkpoint=pretrained/r1", "evaluation.episodes=2", "evaluation.latency_decisions=0", "hydra.run.dir=run"]
     code = (
         f"import sys; sys.path.insert(0, {str(site)!r}); import pickplace.cli as cli; "

@@ -10,7 +10,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from pickplace.evaluation.play import Episodes, MakeEnv, check_episode_settings, check_play, decision_latency, play
-from pickplace.evaluation.statistics import paired_difference, summarise
+from pickplace.evaluation.statistics import paired_difference, summarise, summarise_physics
+from pickplace.physics.plans import CELL_SIZE, PLANS, to_lines
+from pickplace.physics.recorded import plan_of
 from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import own_modules, trusted_config
@@ -58,10 +60,25 @@ def _run(cfg: DictConfig, run_dir: Path) -> float:
     ev = cfg.evaluation
     replay = whole_number("evaluation.replay", ev.get("replay", 0), 0, 1_000)  # evaluation=validation has neither
     gif = flag("evaluation.gif", ev.get("gif", False))
+    plans = flag("evaluation.plans", ev.get("plans", False))
+    physics = build("physics", cfg.physics) if cfg.physics else None
     make_env, planner, facts = prepare(cfg)
     cell = make_env(0, 1).cell
     other = None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), episode_settings(cfg))
-    result, episodes = evaluate(cfg, make_env, planner, facts, record=range(max(replay, 1)))
+    result, episodes = evaluate(
+        cfg, make_env, planner, facts, record=range(ev.episodes if plans or physics else max(replay, 1))
+    )
+    recordings = episodes.recordings
+    size = physics.cell_size if physics else CELL_SIZE
+    planned = [plan_of(recording, cell, size) for recording in recordings] if plans or physics else []
+    if physics:
+        outcomes = []
+        for outcome in physics.carry_out(planned):
+            outcomes.append(outcome)
+            if len(outcomes) % 10 == 0 or len(outcomes) == len(planned):
+                log.info("physics=%s: %s of %s episodes", physics.name, f"{len(outcomes):,}", f"{len(planned):,}")
+        settings = {key: value for key, value in resolved(cfg.physics).items() if key != "_target_"}
+        result["physics"] = {"method": physics.name, "settings": settings, **summarise_physics(outcomes)}
     if other:
         result["paired_difference"] = paired_difference(result, other)
     table = evaluation_table(result)
@@ -69,16 +86,18 @@ def _run(cfg: DictConfig, run_dir: Path) -> float:
     texts = {EVALUATION: json.dumps(result, indent=1, default=to_json), "evaluation.md": table}
     if replay:
         title = f"{cfg.checkpoint or planner.name}, {ev.stream} stream, seed {ev.seed}"
-        texts["replay.html"] = page(episodes.recordings, cell, title)
+        texts["replay.html"] = page(recordings[:replay], cell, title)
+    if plans:
+        texts[PLANS] = to_lines(planned)
     try:
         for name, text in texts.items():
             with replaced_file(run_dir / name) as new:
                 new.write_text(text, encoding="utf-8")
         with replaced_file(run_dir / "tote.png") as new:
-            picture(episodes.recordings[0], cell, new)
+            picture(recordings[0], cell, new)
         if gif:
             with replaced_file(run_dir / "replay.gif") as new:
-                animation(episodes.recordings[0], cell, new)
+                animation(recordings[0], cell, new)
     except OSError as error:
         raise ValueError(f"{sentence(error)} The table above and the files that are there are whole.") from error
     log.info("run folder: %s", run_dir)

@@ -1,11 +1,14 @@
 """Statistics of episodes: means, confidence intervals, paired differences."""
 
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
 
 import torch
 from torch import Tensor
 
 from pickplace.evaluation.play import Episodes
+from pickplace.physics.outcome import Outcome
 from pickplace.task.state import Failure
 
 
@@ -40,6 +43,34 @@ def summarise(result: Episodes) -> dict:
         "failures": dict(sorted(reasons.items())),
         "feasible_action_share": result.feasible_share,
     }
+
+
+def summarise_physics(outcomes: Sequence[Outcome]) -> dict:
+    """Return the figures of ``evaluation.json`` that come from carrying out the episodes in a physics engine."""
+    occupancy = torch.tensor([outcome.occupancy for outcome in outcomes], dtype=torch.float64)
+    done = torch.tensor([outcome.ending == "done" for outcome in outcomes])
+    low, high = proportion95(int(done.sum()), len(done))
+    return {
+        "carried_out": {"mean": float(done.double().mean()), "ci95": [low, high]},
+        "occupancy": {
+            "mean": float(occupancy.mean()),
+            "ci95": list(confidence95(occupancy)),
+            "per_episode": occupancy.tolist(),
+        },
+        "endings": dict(sorted(Counter(outcome.ending for outcome in outcomes).items())),
+        "drift": max(outcome.drift for outcome in outcomes),
+        "cpu_seconds": sum(outcome.cpu_seconds for outcome in outcomes) / len(outcomes),
+        "episodes": [asdict(outcome) for outcome in outcomes],
+    }
+
+
+def proportion95(successes: int, count: int) -> tuple[float, float]:
+    """Return the 95% confidence interval of a share, by Clopper and Pearson; it has a width at 0 and at 1, too."""
+    from scipy.stats import beta
+
+    low = beta.ppf(0.025, successes, count - successes + 1) if successes else 0.0
+    high = beta.ppf(0.975, successes + 1, count - successes) if successes < count else 1.0
+    return float(low), float(high)
 
 
 def paired_difference(result: dict, other: dict) -> dict:

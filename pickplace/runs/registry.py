@@ -80,6 +80,7 @@ REGISTRY: dict[str, dict[str, str]] = {
         "mlflow": "pickplace.runs.loggers.MlflowLogger",
         "none": "pickplace.runs.loggers.NoLogger",
     },
+    "physics": {"settle": "pickplace.physics.settle.Settle", "execute": "pickplace.physics.execute.Execute"},
     "planner": PLANNERS,
     "warm_start.teacher": PLANNERS,
 }

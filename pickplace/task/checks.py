@@ -84,10 +84,11 @@ def flag(key: str, value) -> bool:
     return value
 
 
-def one_of(key: str, value, choices) -> str:
-    """Return ``value`` if it is a text among the choices."""
+def one_of(key: str, value, choices, alternative: str | None = None) -> str:
+    """Return ``value`` if it is a text among the choices; the message names an alternative, if there is one."""
     if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{key}={excerpt(value)}: expected {' or '.join(map(repr, choices))}.")
+        expected = [*map(repr, choices), *([alternative] if alternative else [])]
+        raise ValueError(f"{key}={excerpt(value)}: expected {' or '.join(expected)}.")
     return value
 
 

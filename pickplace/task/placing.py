@@ -9,11 +9,12 @@ from torch import Tensor
 from pickplace.task.cell import CellSpec
 from pickplace.task.maps import FAR, NEVER, is_under, surround, windows
 from pickplace.task.state import State
+from pickplace.task.support import is_supported
 
 
 # ---------------------------------------------------------------------- the checks of a placement, one function each
-def rest(cells: Sequence[Tensor], under: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Return the height on which an item comes to rest, and how many cells below it have that height.
+def rest(cells: Sequence[Tensor], under: Sequence[Tensor]) -> Tensor:
+    """Return the height on which an item comes to rest.
 
     Loops over cells, so that the inner loops run over whole maps, which is fast.
 
@@ -24,16 +25,7 @@ def rest(cells: Sequence[Tensor], under: Sequence[Tensor]) -> tuple[Tensor, Tens
     z = torch.full((), NEVER, dtype=cells[0].dtype, device=cells[0].device)
     for height, used in zip(cells, under, strict=True):
         z = torch.maximum(z, torch.where(used, height, NEVER))
-    level = torch.zeros_like(z)
-    for height, used in zip(cells, under, strict=True):
-        level += (height == z) & used
-    return z, level
-
-
-def is_supported(cell: CellSpec, level: Tensor, area: Tensor) -> Tensor:
-    """Return whether ``level`` supporting cells under a footprint of ``area`` cells keep the item stable."""
-    share = level.double() / area
-    return share > cell.min_support if cell.strict_support else share >= cell.min_support
+    return z
 
 
 def overflows(top: Tensor, tote_height: Tensor) -> Tensor:
@@ -57,9 +49,10 @@ def resting_top(cell: CellSpec, state: State) -> Tensor:
     padded = surround(state.heights.permute(1, 2, 0), (0, side - 1, 0, side - 1), FAR)
     w, d = (torch.stack(pair)[: cell.parities] for pair in ((item.w, item.d), (item.d, item.w)))
     w, d = w[:, None, None], d[:, None, None]  # [Q, 1, 1, N]
-    z, level = rest(windows(padded, side).flatten(0, 1).unbind(0), is_under(w, d, side).unbind(0))
+    cells, under = windows(padded, side).flatten(0, 1).unbind(0), is_under(w, d, side).unbind(0)
+    z = rest(cells, under)
     top = z + item.h.to(z.dtype)
-    good = is_supported(cell, level, w * d) & ~overflows(top, state.tote_height) & ~item.is_empty
+    good = is_supported(cell, cells, under, z, w, d) & ~overflows(top, state.tote_height) & ~item.is_empty
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2)
 
 

@@ -18,8 +18,9 @@ from pickplace.task.grasps import (
     turned_size,
 )
 from pickplace.task.maps import is_under, rectangle, squares
-from pickplace.task.placing import is_supported, is_within_reach, overflows, rest
+from pickplace.task.placing import is_within_reach, overflows, rest
 from pickplace.task.state import Failure, State
+from pickplace.task.support import is_supported
 
 
 class Step(NamedTuple):
@@ -53,14 +54,15 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     # Placing.
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
     side, reach = cell.max_side, max(ee_w, ee_d)
-    z, level = rest(squares(heights, x, y, side).unbind(0), is_under(w, d, side).unbind(0))
+    cells, under = squares(heights, x, y, side).unbind(0), is_under(w, d, side).unbind(0)
+    z = rest(cells, under)
     top = z.long() + item.h
     highest = torch.where(is_under(wide, deep, reach), squares(heights, left, front, reach), 0).amax(0)
     item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)
     effector_leaves = is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d)
 
     checks = [  # from the last to the first, so that the first failure has the last word
-        (Failure.UNSTABLE, ~is_supported(cell, level, w * d)),
+        (Failure.UNSTABLE, ~is_supported(cell, cells, under, z, w, d)),
         (Failure.ITEM_COLLISION, ~is_clear(top, highest)),
         (Failure.OVERFLOW, overflows(top, tote_height)),
         (Failure.TOTE_COLLISION, item_leaves | (effector_leaves & ~is_clear(top, tote_height))),

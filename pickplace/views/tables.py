@@ -18,6 +18,13 @@ def evaluation_table(result: dict) -> str:
         ("episodes ended by", failures),
         ("feasible actions", f"{result['feasible_action_share']:.2%} of all, mean over decisions"),
     ]
+    if physics := result.get("physics"):
+        share, carried = physics["carried_out"], physics["occupancy"]
+        low, high = share["ci95"]
+        text = f"{share['mean']:.1%} of the episodes to their end (95% interval {low:.1%} to {high:.1%})"
+        rows.append((f"physics, {physics['method']}", text))
+        low, high = carried["ci95"]
+        rows.append(("occupancy carried out", f"{carried['mean']:.4f} (95% interval {low:.4f} to {high:.4f})"))
     if paired := result.get("paired_difference"):
         low, high = paired["ci95"]
         text = f"{paired['mean']:+.4f} (95% interval of the paired difference {low:+.4f} to {high:+.4f})"

@@ -7,6 +7,7 @@ from random import Random
 import pytest
 import torch
 from oracle import SUCCESS, Oracle, Rules, can_always_start
+from problems import SUPPORTS
 from tensordict import TensorDict
 
 from pickplace import PickPlaceEnv
@@ -14,7 +15,6 @@ from pickplace.task.cell import Limits
 from pickplace.task.items import Kinds
 
 NUM_ENVS, STEPS = (1, 6, 12, 24), 25  # per configuration: 25 to 600 transitions
-SUPPORTS = (0.0, 0.25, 1 / 3, 0.5, 0.6, 2 / 3, 0.75, 1.0)
 
 
 def draw_config(rng: Random):
@@ -28,7 +28,7 @@ def draw_config(rng: Random):
     wide, deep, height = rng.randint(2, 6), rng.randint(2, 6), max(h for _, _, h in kinds) + rng.randint(0, 4)
     rules = Rules(
         (*bin_sides, rng.randint(1, 3)), (wide, deep, height), effector, rng.randint(1, 4), pick_rule,
-        min_support=rng.choice(SUPPORTS), strict_support=rng.random() < 0.3,
+        **dict(zip(("support", "support_margin"), rng.choice(SUPPORTS), strict=True)),
     )  # fmt: skip
     if rng.random() < 0.4:  # limits that seldom leave an item nowhere to go
         lowest, highest = (

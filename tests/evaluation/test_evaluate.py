@@ -1,6 +1,7 @@
 """``pickplace-evaluate``: what it writes, what it compares, and planners of the user's own."""
 
 import json
+from dataclasses import asdict
 
 import numpy
 import pytest
@@ -11,6 +12,8 @@ from untrained import write_checkpoint
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.evaluation.evaluate import episode_settings, read_comparison
 from pickplace.evaluation.play import play
+from pickplace.physics.plans import read_plans
+from pickplace.physics.settle import Settle
 from pickplace.planners.heuristics import JointDBL
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.views.tables import evaluation_table
@@ -77,6 +80,29 @@ def test_evaluation_of_a_checkpoint(evaluation, tmp_path):
     assert found["planner_settings"]["simulations"] == 8 and "mean_tree_depth" in found
 
 
+def test_physics_and_plans(evaluation, tmp_path):
+    """A table that says what was carried out, and plans with which ``pickplace-physics`` comes to the same."""
+    pytest.importorskip("mujoco")
+    settings = ["planner=joint_dbl", "items=mixed", *SMALL, "env.tote_size=[6,6,4]", "evaluation.episodes=4"]
+    physics = ["physics=settle", "physics.friction=0.5", "physics.cell_size=0.04", "evaluation.plans=true"]
+    result = evaluation(*settings, *physics)
+    found, plans = result["physics"], read_plans(result["path"].parent / "plans.jsonl")
+    assert (found["method"], found["settings"]["friction"]) == ("settle", 0.5)
+    assert sum(found["endings"].values()) == len(plans) == 4 and plans[0].tote == (0.24, 0.24, 0.16)
+    share = found["endings"].get("done", 0) / 4
+    assert found["carried_out"]["mean"] == share and f"{share:.1%} of the episodes to their end" in result["out"]
+    outcomes = [asdict(outcome) for outcome in Settle(friction=0.5, cell_size=0.04).carry_out(plans)]
+    for ours, theirs, by_rules in zip(outcomes, found["episodes"], result["occupancy"]["per_episode"], strict=True):
+        assert ours | {"cpu_seconds": 0} == theirs | {"cpu_seconds": 0}
+        assert theirs["occupancy"] <= by_rules + 1e-9
+        assert theirs["ending"] != "done" or theirs["occupancy"] == pytest.approx(by_rules)
+    mean = sum(outcome["occupancy"] for outcome in outcomes) / 4
+    assert found["occupancy"]["mean"] == pytest.approx(mean) and f"{mean:.4f}" in result["out"]
+    assert len(found["occupancy"]["per_episode"]) == 4 and found["drift"] == max(one["drift"] for one in outcomes)
+    assert "physics" not in evaluation(*settings) and not list(tmp_path.glob("MUJOCO*"))
+    evaluation(*settings, "physics=settle", "physics.gap=1", refused="physics.gap=1: expected a number between 0 and")
+
+
 def test_items_of_a_checkpoint_and_other_ones(evaluation):
     """A key of the checkpoint's items is not one of the command's own items."""
     arguments = ["checkpoint=pretrained/mixed", *SMALL, "env.tote_size=[6,6,1]", "evaluation.episodes=2"]
@@ -97,7 +123,7 @@ def test_paired_difference(evaluation):
 
 @pytest.mark.parametrize("word", [
     "env.rotations=2", "env.effector_size=[2,3]", "env.bin_size=[5,4,1]", "env.tote_size=[4,5,1]",
-    "env.pick_rule=overlap", "env.min_support=0.25", "env.strict_support=true",
+    "env.pick_rule=overlap", "env.support=hull", "env.support_margin=0.1",
     "evaluation.seed=1", "evaluation.episodes=3", "evaluation.stream=validation", "items=mixed",
 ])  # fmt: skip
 def test_only_the_same_episodes_are_compared(word, tmp_path):

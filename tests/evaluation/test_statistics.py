@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pickplace.evaluation.statistics import confidence95, paired_difference
+from pickplace.evaluation.statistics import confidence95, paired_difference, proportion95
 
 
 def test_confidence_interval_by_hand():
@@ -18,6 +18,13 @@ def test_confidence_interval_by_hand():
     assert confidence95(torch.tensor([0.0, 0.0, 0.04]))[0] == 0.0
     low, high = confidence95(torch.tensor([0.01, -0.01, 0.01]), least=-1.0)
     assert -1 < low < 0 < high
+
+
+def test_interval_of_a_share_by_hand():
+    """At 0 of n the upper limit u has (1 - u)^n = 0.025; the middle value is from tables of Clopper and Pearson."""
+    assert proportion95(0, 20) == pytest.approx((0.0, 1 - 0.025 ** (1 / 20)))
+    assert proportion95(20, 20) == pytest.approx((0.025 ** (1 / 20), 1.0))
+    assert proportion95(3, 10) == pytest.approx((0.0667, 0.6525), abs=1e-4)
 
 
 def test_paired_difference_by_hand():

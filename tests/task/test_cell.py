@@ -21,8 +21,12 @@ from pickplace.task.cell import CELL_SETTINGS, Limits, cell_from_settings, refer
         ({"effector_size": (3, 3, 1)}, r"effector_size=\(3, 3, 1\)"),
         *(({"rotations": value}, f"rotations={value}: expected 1, 2, 3 or 4") for value in (5, 4.0)),
         ({"pick_rule": "grab"}, "pick_rule='grab': expected 'contain' or 'overlap'"),
-        *(({"min_support": value}, f"min_support={value}: .* between 0 and 1") for value in (1.5, -0.1)),
-        ({"strict_support": 1}, "strict_support=1: expected true or false"),
+        *(
+            ({"support": value}, f"support={value!r}: expected 'half' or .* 'full' or a number between 0 and 1")
+            for value in (1.5, -0.1, "most", True)
+        ),
+        ({"support": "hull", "support_margin": -1}, "support_margin=-1: .* between 0 and 100"),
+        ({"support_margin": 0.5}, "support_margin=0.5: expected 0, or support=hull"),
         *(({"height_unit": value}, f"height_unit={value}: .* between 0.001 and 1000") for value in (1e-4, 2000)),
         ({"longest_side": 0}, "longest_side=0: expected a whole number >= 1"),
         ({"tote_sizes": (6, 6, 5)}, r"tote_sizes=\(6, 6, 5\): expected one of bin_size, tote_size, .*, height_unit"),
@@ -36,7 +40,7 @@ def test_impossible_settings_are_refused(settings, message):
 def test_every_setting_reaches_the_cell_of_the_environment():
     given = {
         "bin_size": [4, 6, 2], "tote_size": [5, 7, 6], "effector_size": [2, 4], "rotations": 3, "pick_rule": "overlap",
-        "min_support": 0.25, "strict_support": True, "height_unit": 0.5,
+        "support": "hull", "support_margin": 0.25, "height_unit": 0.5,
     }  # fmt: skip
     assert tuple(given) == CELL_SETTINGS
     cell = PickPlaceEnv(num_envs=1, **given).cell

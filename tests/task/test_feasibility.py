@@ -1,16 +1,18 @@
 """Masks, the single step and the plain-Python oracle agree on random cells, with and without limits on the robot."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from oracle import SUCCESS, UNSTABLE
 from problems import oracle_of, problems, state_of
+from scipy.spatial import ConvexHull
 
 from pickplace import CellSpec, Failure, Item, State
-from pickplace.task.cell import Limits
+from pickplace.task.cell import Limits, reference_cell
 from pickplace.task.feasibility import (
     action_footprints,
     action_mask,
@@ -112,25 +114,64 @@ def test_limits_by_hand():
     assert heuristic_pick(replace(cell, limits=limits), state.item) != pick
 
 
-@pytest.mark.parametrize(("width", "length", "shift"), [(2, 4, 1), (3, 6, 1), (3, 6, 2), (5, 9, 2), (7, 9, 2)])
-def test_support_is_compared_exactly_in_float64(width, length, shift):
-    """One item lies in a tote one cell deep; the next one lies on it, some cells further on."""
-    share = (width - shift) / width
-    up, down = torch.tensor(share, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)
-    limits = {
-        (share, False): SUCCESS,
-        (share, True): UNSTABLE,
-        (torch.nextafter(up, up + 1).item(), False): UNSTABLE,
-        (torch.nextafter(up, down).item(), True): SUCCESS,
-    }
-    heights = (torch.arange(length) < width).int()[None, :, None]
-    state = State(heights, torch.tensor([2]), Item(*torch.tensor([[0, 0, width, 1, 1]]).unbind(1)))
-    pick = (width - 1) // 2
-    action = torch.tensor([pick * length + pick + shift])
-    for (min_support, strict), expected in limits.items():
-        cell = CellSpec((width, 1, 1), (length, 1, 2), (width, 1), 1, "contain", min_support, strict)
-        assert apply(cell, state, action).failure.item() == expected, (min_support, strict)
-        assert action_mask(cell, placing_maps(cell, state))[0, action].item() == (expected == SUCCESS)
+def rest_on(heights, item, support, margin=0.0):
+    """Return the failure of an item that is set down on the near corner of a tote of these heights."""
+    (w, d, h), (wide, deep) = item, heights.shape
+    cell = CellSpec((w, d, h), (wide, deep, 9), (w, d), 1, "contain", support, margin)
+    state = State(heights.int()[None], torch.tensor([9]), Item(*torch.tensor([[0, 0, *item]]).unbind(1)))
+    pick = reference_cell(w) * d + reference_cell(d)
+    action = torch.tensor([pick * wide * deep + reference_cell(w) * deep + reference_cell(d)])
+    failure = apply(cell, state, action).failure.item()
+    assert action_mask(cell, placing_maps(cell, state))[0, action].item() == (failure == SUCCESS)
+    return failure
+
+
+@pytest.mark.parametrize(("width", "held"), [(2, 1), (3, 2), (5, 3), (7, 5), (9, 3)])
+def test_shares_are_compared_exactly_in_float64(width, held):
+    """Some of the cells below a long item are one cell high."""
+    share, heights = held / width, (torch.arange(width) < held).int()[:, None]
+    expected = {share: SUCCESS, math.nextafter(share, 1): UNSTABLE, "full": UNSTABLE}
+    expected |= {"half": SUCCESS if 2 * held >= width else UNSTABLE}
+    expected |= {"more_than_half": SUCCESS if 2 * held > width else UNSTABLE}
+    for support, failure in expected.items():
+        assert rest_on(heights, (width, 1, 1), support) == failure, support
+
+
+@pytest.mark.parametrize(("cells", "size", "distance"), [
+    ([(0, 0)], (2, 1), 0.0),  # the centre is above the edge of the cell
+    ([(1, 0)], (3, 1), 0.5),  # the middle cell alone
+    ([(0, 0), (1, 1)], (2, 2), math.sqrt(0.5)),  # two opposite corners
+    ([(0, 0), (1, 0), (0, 1)], (2, 2), math.sqrt(0.5)),  # all but a corner
+    ([(0, 0), (1, 0), (2, 0)], (3, 2), 0.0),  # half, all on one side
+    ([(0, 0), (2, 1)], (3, 2), 1.5 / math.sqrt(5)),  # the edge from (1, 0) to (3, 1) is nearest
+    ([(0, 0), (1, 0), (0, 1), (0, 2)], (3, 3), 0.5 / math.sqrt(5)),  # the edge from (2, 1) to (1, 3)
+])  # fmt: skip
+def test_a_hull_by_hand(cells, size, distance):
+    """The centre lies this far inside the hull of the supporting cells."""
+    heights = torch.zeros(size)
+    for x, y in cells:
+        heights[x, y] = 2
+    item = (*size, 1)
+    assert rest_on(heights, item, "hull") == (SUCCESS if distance > 0 else UNSTABLE)
+    if distance > 0:
+        assert rest_on(heights, item, "hull", distance - 1e-6) == SUCCESS
+        assert rest_on(heights, item, "hull", distance + 1e-6) == UNSTABLE
+
+
+@settings(max_examples=200)
+@given(st.data())
+def test_the_hull_rule_equals_scipys_hull(data):
+    w, d = data.draw(st.integers(1, 7)), data.draw(st.integers(1, 7))
+    held = data.draw(st.lists(st.tuples(st.integers(0, w - 1), st.integers(0, d - 1)), min_size=1, unique=True))
+    margin = data.draw(st.sampled_from([0.0, 0.1, 0.25, 0.5, 1.3]))
+    heights = torch.zeros(w, d)
+    for x, y in held:
+        heights[x, y] = 3
+    corners = [(x + a, y + b) for x, y in held for a in (0, 1) for b in (0, 1)]
+    outside = (ConvexHull(corners).equations @ [w / 2, d / 2, 1]).max()  # minus the distance to the hull's edge
+    assume(abs(outside + margin) > 1e-9 or margin == 0)
+    expected = SUCCESS if outside < -margin - 1e-9 else UNSTABLE
+    assert rest_on(heights, (w, d, 1), "hull", margin) == expected
 
 
 @settings(max_examples=50)
@@ -149,7 +190,7 @@ def test_the_heuristic_pick_has_the_least_offset(problem):
 
 
 def test_an_empty_bin_has_no_feasible_action():
-    cell, nothing = CellSpec(pick_rule="overlap", min_support=0.0), torch.zeros(2, dtype=torch.int64)
+    cell, nothing = CellSpec(pick_rule="overlap", support=0.0), torch.zeros(2, dtype=torch.int64)
     item = Item(nothing, nothing, nothing, nothing, nothing)
     maps = placing_maps(cell, State(torch.zeros(2, 6, 6).int(), nothing + 5, item))
     assert not all_grasps(cell, item)[0].any() and not action_mask(cell, maps).any()

@@ -1,0 +1,1 @@
+"""Plans carried out in MuJoCo, which knows none of our rules."""

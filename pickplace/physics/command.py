@@ -1,0 +1,55 @@
+"""The ``pickplace-physics`` command: carry out the plans of a ``plans.jsonl``, one line of JSON for each episode."""
+
+import argparse
+import json
+from dataclasses import asdict
+
+from pickplace.runs.errors import one_sentence, write_output
+
+
+def main() -> None:
+    """Entry point of ``pickplace-physics``."""
+    with one_sentence():
+        run(parser().parse_intermixed_args())
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Carry out the plans that the command line names, and print the outcomes."""
+    from omegaconf import OmegaConf  # not before help is answered
+    from yaml import YAMLError
+
+    from pickplace.physics.plans import read_plans
+    from pickplace.runs.registry import build
+
+    for word in arguments.settings:
+        key, equals, _ = word.partition("=")
+        if not equals or not key.isidentifier() or key == "_target_":
+            raise ValueError(f"{word}: expected <key>=<value>, such as friction=0.3.")
+    try:
+        settings = OmegaConf.from_dotlist(arguments.settings)
+    except YAMLError as error:
+        raise ValueError(f"{' '.join(arguments.settings)}: expected <key>=<value>, such as friction=0.3.") from error
+    simulation = build("physics", {**OmegaConf.to_container(settings), "_target_": arguments.method})  # type: ignore
+    for outcome in simulation.carry_out(read_plans(arguments.plans)):
+        write_output(json.dumps(asdict(outcome)) + "\n")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    options = argparse.ArgumentParser(
+        prog="pickplace-physics",
+        description="Carry out plans in MuJoCo. Prints a line of JSON for each episode: whether an item was lost, "
+        "which one, during which placement, and what was placed before.",
+        epilog="The file's format, the settings, and what is simulated: docs/physics.md",
+    )
+    options.add_argument("plans", help="plans.jsonl: one placement a line, in metres")
+    options.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="settings, such as friction=0.3 workers=2")
+    options.add_argument(
+        "--method", choices=("settle", "execute"), default="settle",
+        help="items appear at their places, or a gantry brings them from the bin (default %(default)s)",
+    )  # fmt: skip
+    return options
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,221 @@
+"""``execute``: a gantry with a suction plate carries each item from the bin to the tote."""
+
+from dataclasses import dataclass
+from math import pi
+from typing import ClassVar
+
+import numpy as np
+
+from pickplace.physics.outcome import Loss
+from pickplace.physics.plans import EpisodePlan, Placement
+from pickplace.physics.scene import STIFF, TIMESTEP, WALL, Scene, mujoco
+from pickplace.physics.simulation import Simulation, wait
+
+HEADROOM = 0.02  # distance between what is carried and the rims, m
+TURNING_SPEED = 4.0  # greatest speed of the hinge, rad/s
+STIFFNESS = 2e5, 2e3  # stiffness of the drives of the slides, N/m, and of the hinge, N m/rad
+SLOW_WAY = 0.03  # length of the slow part of a way down, its last, and of a way up, its first; m
+SETTLING_TIME = 0.05  # time for the plate to come to rest, s
+REACH = 0.0005  # distance by which a lip can be drawn out, m
+WAKING_FORCE = 1e-6  # force that wakes a body, N
+STEPS_PER_LOOK = 2  # steps of the simulation between two looks at contacts and forces
+
+
+@dataclass(frozen=True)
+class Execute(Simulation):
+    """A gantry carries each item (config ``physics=execute``): over the bin, down, suction, up, over the rim while it
+    turns, down, release, up.
+
+    Losses besides ``collapsed``: ``dropped``, the plate reached no item or lost it; ``effector_contact``, the plate
+    touched a wall or another item; ``wedged``, the item is not where it was planned to be at its release.
+
+    Args:
+        plate_thickness: thickness of the end effector; m.
+        plate_mass: mass of the end effector; kg.
+        lip: length of the suction cup's lip, between plate and item; m.
+        release_height: of an item above its planned pose when it is released; m.
+        suction: force along any direction that the suction bears; N.
+        contact_force: force on the plate from which on a contact counts; N.
+        tolerance: greatest error of an item's position at release; m.
+        speed: greatest speed of the plate; m/s.
+        slow_speed: the same on its last centimetres down and its first ones up; m/s.
+    """
+
+    plate_thickness: float = 0.01
+    plate_mass: float = 2.0
+    lip: float = 0.001
+    release_height: float = 0.0005
+    suction: float = 100.0
+    contact_force: float = 5.0
+    tolerance: float = 0.005
+    speed: float = 1.0
+    slow_speed: float = 0.2
+
+    name: ClassVar[str] = "execute"
+    limits: ClassVar[dict[str, tuple[float, float]]] = Simulation.limits | {
+        "plate_thickness": (1e-3, 1), "plate_mass": (0.2, 50), "lip": (0, 0.01), "release_height": (0, 0.1),
+        "suction": (0, 1e5), "contact_force": (0, 1e5), "tolerance": (1e-4, 1), "speed": (0.01, 5),
+        "slow_speed": (0.01, 5),
+    }  # fmt: skip
+
+    def make_scene(self, plan: EpisodePlan) -> "Gantry":
+        if not (plan.bin and plan.effector):
+            raise ValueError(f"physics=execute: episode {plan.episode} has no bin; expected plans with all keys.")
+        if min(plan.effector) < 2 * self.gap:
+            expected = f"expected sides of at least twice physics.gap, {2 * self.gap:g} m"
+            raise ValueError(f"episode {plan.episode}: the end effector is {min(plan.effector):g} m wide; {expected}.")
+        return Gantry(self, plan)
+
+    def place(self, gantry: "Gantry", placement: Placement, error: np.ndarray) -> Loss | None:
+        height = placement.size[2]
+        gantry.add((*(gantry.origin + placement.item), 0.0), bin_size(placement), placement.centre)
+        high = gantry.rim + height + HEADROOM  # of the plate's lower face, so that the item below it clears the rims
+        low = placement.corner[2] + height + self.lip + self.release_height
+        pick, place = gantry.origin + placement.pick, placement.place + error
+        turn = placement.rotation / 180 * pi
+        loss = (
+            gantry.travel((*pick, high, 0.0))
+            or gantry.lower((*pick, height + self.lip, 0.0))
+            or gantry.grip()
+            or gantry.lift(high)
+            or gantry.travel((*place, high, turn))
+            or gantry.lower((*place, low, turn))
+        )
+        expected = placement.centre + np.array((*error, self.release_height))
+        if loss is None and np.linalg.norm(gantry.centre - expected) > self.tolerance:
+            loss = Loss("wedged", len(gantry.boxes) - 1)
+        if loss is None:
+            gantry.release()
+            loss = gantry.lift(high)
+            wait(gantry)
+        return loss
+
+
+def bin_size(placement: Placement) -> tuple[float, ...]:
+    """Return the sides of an item as it lies in the bin."""
+    w, d, h = placement.size
+    return (d, w, h) if placement.rotation % 180 else (w, d, h)
+
+
+class Gantry(Scene):
+    """Tote, bin, and a plate on three slides and a hinge, whose drives follow a path.
+
+    Args:
+        options: of the simulation.
+        plan: has the sizes.
+
+    Attributes:
+        origin: near corner of the bin, ``[2]``.
+        rim: height of the higher one of tote and bin.
+        goal: commanded centre of the plate's lower face and its turn, m and rad, ``[4]``.
+        holding: whether the plate holds the item that was added last.
+    """
+
+    def __init__(self, options: Execute, plan: EpisodePlan):
+        super().__init__(options.friction, options.density, options.gap, options.sleep)
+        self.options, self.holding = options, False
+        self.weld: mujoco.MjsEquality
+        # So far apart that an end effector that hangs over a wall of one hits no wall of the other.
+        distance = 2 * WALL + 2 * max(plan.effector) + 0.1
+        self.origin, self.rim = np.array((plan.tote[0] + distance, 0.0)), max(plan.tote[2], plan.bin[2])
+        self.add_container(plan.tote)
+        self.add_container(plan.bin, self.origin)
+        self._add_plate(plan.effector)
+        self.compile()
+        self.goal = np.array((*self.origin, 2 * self.rim, 0.0))
+        self.data.qpos[:4] = self.data.ctrl[:4] = self.goal
+
+    def _add_plate(self, size) -> None:
+        sides = (*np.subtract(size, self.gap), self.options.plate_thickness)
+        self.plate = self.spec.worldbody.add_body(name="plate", gravcomp=1.0)
+        geom = self.add_geom(self.plate, sides, (0, 0, sides[2] / 2))
+        geom.density = self.options.plate_mass / float(np.prod(sides))
+        for axis, name in enumerate(("x", "y", "z")):
+            self.plate.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.eye(3)[axis])
+        self.plate.add_joint(name="turn", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 0, 1), armature=0.01)
+        for joint in self.plate.joints:
+            drive = self.spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            drive.set_to_position(kp=STIFFNESS[joint.name == "turn"], dampratio=1.0)
+
+    def add(self, corner, size, planned) -> None:
+        if self.boxes:
+            self.weld.name2 = f"item{len(self.boxes)}"
+        else:
+            kinds = {"type": mujoco.mjtEq.mjEQ_WELD, "objtype": mujoco.mjtObj.mjOBJ_BODY}
+            self.weld = self.spec.add_equality(**kinds, name1="plate", name2="item0", active=False, **STIFF)
+        super().add(corner, size, planned)
+        self.data.ctrl[:] = self.goal
+
+    @property
+    def centre(self) -> np.ndarray:
+        """The centre of the item that was added last, m, ``[3]``."""
+        return self.data.xpos[self.boxes[-1].id]
+
+    def travel(self, goal, speed: float | None = None) -> Loss | None:
+        """Move the plate along a line, from rest to rest; return the first loss on the way.
+
+        Args:
+            goal: as :attr:`goal`.
+            speed: greatest speed; None: the fast one.
+        """
+        start, way = self.goal, np.subtract(goal, self.goal)
+        seconds = 1.5 * max(np.linalg.norm(way[:3]) / (speed or self.options.speed), abs(way[3]) / TURNING_SPEED)
+        count = 1 + round(seconds / TIMESTEP / STEPS_PER_LOOK)
+        for step in range(1, count + 1):
+            share = step / count
+            self.data.ctrl[:] = self.goal = start + way * share**2 * (3 - 2 * share)
+            if loss := self._step():
+                return loss
+        return None
+
+    def lower(self, goal) -> Loss | None:
+        """Move the plate down, the last centimetres slowly, and let it come to rest."""
+        x, y, z, turn = goal
+        loss = self.travel((x, y, z + SLOW_WAY, turn)) or self.travel(goal, self.options.slow_speed)
+        for _ in range(round(SETTLING_TIME / TIMESTEP / STEPS_PER_LOOK)):
+            loss = loss or self._step()
+        return loss
+
+    def lift(self, z: float) -> Loss | None:
+        """Move the plate up, the first centimetres slowly."""
+        x, y, low, turn = self.goal
+        return self.travel((x, y, low + SLOW_WAY, turn), self.options.slow_speed) or self.travel((x, y, z, turn))
+
+    def grip(self) -> Loss | None:
+        """Suck the item in the bin; return the loss if the lip does not reach it."""
+        plate, item, geoms = self.plate.id, self.boxes[-1].id, (self.plate.geoms[0].id, self.boxes[-1].geoms[0].id)
+        if mujoco.mj_geomDistance(self.model, self.data, *geoms, 0.1, None) > self.options.lip + REACH:
+            return Loss("dropped", len(self.boxes) - 1)
+        offset = self.data.xmat[plate].reshape(3, 3).T @ (self.data.xpos[item] - self.data.xpos[plate])
+        inverse, relative = np.zeros(4), np.zeros(4)
+        mujoco.mju_negQuat(inverse, self.data.xquat[plate])
+        mujoco.mju_mulQuat(relative, inverse, self.data.xquat[item])
+        self.model.eq_data[self.weld.id, :11] = (0, 0, 0, *offset, *relative, 1.0)
+        self.data.eq_active[self.weld.id] = self.holding = True
+        return None
+
+    def release(self) -> None:
+        """Let go of the item."""
+        self.data.eq_active[self.weld.id] = self.holding = False
+        self.data.xfrc_applied[self.boxes[-1].id, 2] = -WAKING_FORCE  # else it would sleep on in the air
+        mujoco.mj_step(self.model, self.data)
+        self.data.xfrc_applied[self.boxes[-1].id, 2] = 0.0
+
+    def _step(self) -> Loss | None:
+        """Let a little time pass; return what was lost in it."""
+        number, before = len(self.boxes) - 1, self.speeds[-1, :3].copy()
+        mujoco.mj_step(self.model, self.data, nstep=STEPS_PER_LOOK)
+        plate, item = self.plate.geoms[0].id, self.boxes[-1]
+        pairs, force, total = self.data.contact.geom, np.zeros(6), 0.0
+        for index in np.nonzero((pairs == plate).any(1))[0]:
+            if not self.holding or item.geoms[0].id not in pairs[index]:
+                mujoco.mj_contactForce(self.model, self.data, index, force)
+                total += abs(force[0])
+        if total > self.options.contact_force:
+            return Loss("effector_contact", number)
+        if self.holding:
+            # From the motion: with drives that are integrated implicitly, the weld's force is not what it transmits.
+            acceleration = (self.speeds[-1, :3] - before) / (STEPS_PER_LOOK * TIMESTEP) - self.model.opt.gravity
+            if self.model.body_mass[item.id] * np.linalg.norm(acceleration) > self.options.suction:
+                return Loss("dropped", number)
+        return None

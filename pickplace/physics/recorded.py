@@ -1,0 +1,31 @@
+"""Plans of recorded episodes."""
+
+from pickplace.physics.plans import EpisodePlan, Placement, Point
+from pickplace.task.cell import CellSpec
+from pickplace.views.recording import Recording
+
+
+def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePlan:
+    """Return the plan of a recorded episode; ``cell_size`` is the side of a cell in metres."""
+
+    def metres(*values: float) -> Point:
+        """Lengths in cells, of which a third one is a height, in metres."""
+        scales = (cell_size, cell_size, cell_size * cell.height_unit)
+        # Rounded to nanometres: 0.15000000000000002 would only be harder to read.
+        return tuple(round(value * scale, 9) for value, scale in zip(values, scales, strict=False))
+
+    def middle(corner, sides) -> Point:
+        return metres(*(at + side / 2 for at, side in zip(corner, sides, strict=True)))
+
+    tote = metres(*cell.tote_size[:2], recording.tote_height)
+    plan = EpisodePlan(recording.episode, tote, metres(*cell.bin_size), metres(*cell.effector_size))
+    for move in recording.moves:
+        if not move.failure:
+            x, y, w, d = move.footprint
+            shape = cell.effectors[move.rotation % 2]
+            placement = Placement(
+                metres(x, y, move.z), metres(w, d, move.item[4]), metres(*move.item[:2]),
+                middle(move.pick, cell.effector_size), middle(move.place, shape[:2]), 90 * move.rotation,
+            )  # fmt: skip
+            plan.placements.append(placement)
+    return plan

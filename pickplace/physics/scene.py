@@ -1,0 +1,115 @@
+"""Containers and boxes as a MuJoCo model; in metres, kilograms and seconds.
+
+The frame's origin is the tote's near corner on its floor; z points up.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+try:
+    import mujoco
+
+    mujoco.set_mju_user_warning(lambda *_: None)  # else it writes MUJOCO_LOG.TXT; `diverged` tells what matters
+except ImportError:  # an extra; Simulation says so
+    mujoco = None
+
+#: Contacts and welds are stiff: a tower of six boxes sinks by 0.02 mm.
+STIFF = {"solref": (0.005, 1.0), "solimp": (0.99, 0.999, 0.0001, 0.5, 2.0)}
+TIMESTEP = 0.002
+WALL = 0.01  # thickness of floor and walls
+
+Vector = Sequence[float] | np.ndarray
+
+
+class Scene:
+    """Containers, and the boxes that were added to them.
+
+    Args:
+        friction: sliding friction between all surfaces.
+        density: of the boxes.
+        gap: total narrowing of a box along x and along y.
+        sleep: let bodies that do not move sleep.
+
+    Attributes:
+        spec, model, data: MuJoCo's; the latter two are new ones after each :meth:`add`.
+        boxes: MuJoCo's body of each box.
+        planned: centre of each box where it is planned to rest, ``[n, 3]``.
+    """
+
+    def __init__(self, friction: float, density: float, gap: float, sleep: bool = True):
+        self.friction, self.density, self.gap = friction, density, gap
+        self.spec = mujoco.MjSpec()
+        option = self.spec.option
+        option.timestep, option.cone, option.impratio = TIMESTEP, mujoco.mjtCone.mjCONE_ELLIPTIC, 10
+        option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        if sleep:
+            option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+            option.sleep_tolerance = 1e-5  # m/s; with MuJoCo's own of 1e-3 an item that begins to tilt falls asleep
+        self.boxes: list = []
+        self.planned = np.zeros((0, 3))
+        self.model = self.spec.compile()
+        self.data = mujoco.MjData(self.model)
+
+    def compile(self) -> None:
+        """Make the model anew, in the state in which it is."""
+        self.model, self.data = self.spec.recompile(self.model, self.data)
+
+    def add_container(self, size: Vector, origin: Vector = (0.0, 0.0)) -> None:
+        """Add floor and walls around the inner sides ``size``, with the near corner at ``origin``."""
+        (width, depth, height), (x, y) = size, origin
+        outer, middle = width + 2 * WALL, (x + width / 2, y + depth / 2)
+        self.add_geom(self.spec.worldbody, (outer, depth + 2 * WALL, WALL), (*middle, -WALL / 2))
+        for at in (x - WALL / 2, x + width + WALL / 2):
+            self.add_geom(self.spec.worldbody, (WALL, depth + 2 * WALL, height), (at, middle[1], height / 2))
+        for at in (y - WALL / 2, y + depth + WALL / 2):
+            self.add_geom(self.spec.worldbody, (width, WALL, height), (middle[0], at, height / 2))
+
+    def add(self, corner: Vector, size: Vector, planned: Vector) -> None:
+        """Add a box.
+
+        Args:
+            corner: its near corner now.
+            size: its planned sides.
+            planned: centre of the box where it is planned to rest.
+        """
+        self.planned = np.vstack([self.planned, planned])
+        body = self.spec.worldbody.add_body(name=f"item{len(self.boxes)}", pos=np.add(corner, np.divide(size, 2)))
+        body.add_freejoint()
+        self.add_geom(body, np.subtract(size, (self.gap, self.gap, 0)))
+        self.boxes.append(body)
+        self.compile()
+
+    def add_geom(self, body, size: Vector, centre: Vector = (0.0, 0.0, 0.0)):
+        """Add a box-shaped surface to a body."""
+        friction = [self.friction, 0.005, 0.0001]
+        box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": np.divide(size, 2), "pos": centre}
+        return body.add_geom(**box, friction=friction, density=self.density, **STIFF)
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        mujoco.mj_step(self.model, self.data, nstep=round(seconds / TIMESTEP))
+
+    @property
+    def diverged(self) -> bool:
+        """Whether the simulation has become impossible: forces or speeds without bounds, or too many contacts."""
+        return bool(self.data.warning.number[: mujoco.mjtWarning.mjWARN_BADCTRL].any())
+
+    @property
+    def speeds(self) -> np.ndarray:
+        """The velocity of each box, linear and angular, ``[n, 6]``; m/s and rad/s."""
+        return self.data.qvel[-6 * len(self.boxes) :].reshape(-1, 6)
+
+    @property
+    def shifts(self) -> np.ndarray:
+        """The distance of each box's centre from where it is planned to rest, ``[n]``."""
+        return np.linalg.norm(self.data.xpos[self._ids] - self.planned, axis=1)
+
+    @property
+    def tilts(self) -> np.ndarray:
+        """The angle between each box's axis and the vertical, ``[n]``; degrees."""
+        return np.degrees(np.arccos(np.clip(self.data.xmat[self._ids, 8], -1, 1)))
+
+    @property
+    def _ids(self) -> list[int]:
+        return [body.id for body in self.boxes]

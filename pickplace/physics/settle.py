@@ -1,0 +1,30 @@
+"""``settle``: items appear a little above their planned poses, one after the other, and come to rest."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from pickplace.physics.outcome import Loss
+from pickplace.physics.plans import EpisodePlan, Placement
+from pickplace.physics.scene import Scene
+from pickplace.physics.simulation import Simulation, wait
+
+DROP_HEIGHT = 0.002  # height above its planned pose at which an item appears, m
+
+
+@dataclass(frozen=True)
+class Settle(Simulation):
+    """Items appear 2 mm above their planned poses and come to rest, one after the other (config ``physics=settle``)."""
+
+    name: ClassVar[str] = "settle"
+
+    def make_scene(self, plan: EpisodePlan) -> Scene:
+        scene = Scene(self.friction, self.density, self.gap, self.sleep)
+        scene.add_container(plan.tote)
+        return scene
+
+    def place(self, scene: Scene, placement: Placement, error: np.ndarray) -> Loss | None:
+        scene.add(np.add(placement.corner, (*error, DROP_HEIGHT)), placement.size, placement.centre)
+        wait(scene)
+        return None

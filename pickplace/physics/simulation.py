@@ -1,0 +1,142 @@
+"""The base class of ``settle`` and ``execute``: options, the first loss, and the outcome."""
+
+import signal
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from math import prod
+from multiprocessing import get_context
+from time import process_time
+from typing import ClassVar
+
+import numpy as np
+
+from pickplace.physics.outcome import Loss, Outcome
+from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement
+from pickplace.physics.scene import Scene, mujoco
+from pickplace.task.checks import flag, number, whole_number
+
+#: Linear and angular speeds below which an item is at rest; m/s and rad/s.
+REST_SPEEDS = np.repeat((0.002, 0.02), 3)
+#: Time for items to come to rest after a placement, at least and at most, and at the end of an episode; s.
+MIN_WAIT, MAX_WAIT, FINAL_WAIT = 0.06, 1.0, 1.0
+LOOK = 0.02  # time between two looks at the speeds, s
+
+
+@dataclass(frozen=True)
+class Simulation(ABC):
+    """Options that every simulation has.
+
+    An episode ends at the first loss. ``collapsed``: an item has moved or tilted too far from its planned pose.
+    ``diverged``: the simulation has become impossible.
+
+    Args:
+        cell_size: side of a cell, the unit of ``max_shift``; m.
+        friction: sliding friction between all surfaces.
+        density: of the items; kg/m^3.
+        gap: total narrowing of an item along x and along y; m.
+        noise: standard deviation of the error of a placement along x and along y; m. With ``settle`` an error of
+            more than half the gap may put an item into its neighbour.
+        max_shift: distance beyond which an item is lost, in cells.
+        max_tilt: angle beyond which an item is lost; degrees.
+        sleep: let bodies that do not move sleep, which is faster and changes nothing.
+        seed: of the errors of placement.
+        workers: processes, each with an episode of its own.
+    """
+
+    cell_size: float = CELL_SIZE
+    friction: float = 0.6
+    density: float = 300.0
+    gap: float = 0.001
+    noise: float = 0.0
+    max_shift: float = 0.25
+    max_tilt: float = 14.0
+    sleep: bool = True
+    seed: int = 0
+    workers: int = 1
+
+    name: ClassVar[str]
+    #: Least and greatest value of each option that is a number.
+    limits: ClassVar[dict[str, tuple[float, float]]] = {
+        "cell_size": (1e-3, 10), "friction": (0, 10), "density": (1, 1e5), "gap": (0, 0.1), "noise": (0, 0.1),
+        "max_shift": (1e-3, 10), "max_tilt": (0.1, 90),
+    }  # fmt: skip
+
+    def __post_init__(self):
+        for key, (least, most) in self.limits.items():
+            number(f"physics.{key}", getattr(self, key), least, most)
+        flag("physics.sleep", self.sleep)
+        whole_number("physics.seed", self.seed, 0)
+        whole_number("physics.workers", self.workers, 1, 64)
+        if self.gap > self.cell_size / 2:
+            raise ValueError(f"physics.gap={self.gap:g}: expected at most half of a cell, {self.cell_size / 2:g}.")
+        if mujoco is None:
+            raise ValueError(f"physics={self.name}: MuJoCo is missing; pip install 'pickplace[physics]'.")
+
+    @abstractmethod
+    def make_scene(self, plan: EpisodePlan) -> Scene:
+        """Return the scene before the first placement."""
+
+    @abstractmethod
+    def place(self, scene, placement: Placement, error: np.ndarray) -> Loss | None:
+        """Place the next item, with an error along x and y, m, ``[2]``; return the loss if there is one."""
+
+    def carry_out(self, plans: Iterable[EpisodePlan]) -> Iterator[Outcome]:
+        """Yield the outcome of each plan."""
+        if self.workers == 1:
+            yield from map(self.carry_out_one, plans)
+        else:
+            # Ctrl-C reaches all processes; this one ends the others.
+            ignore = signal.SIGINT, signal.SIG_IGN
+            with ProcessPoolExecutor(self.workers, get_context("spawn"), signal.signal, ignore) as pool:
+                yield from pool.map(self.carry_out_one, plans)
+
+    def carry_out_one(self, plan: EpisodePlan) -> Outcome:
+        """Return the outcome of a plan.
+
+        Raises:
+            ValueError: for an item or an end effector that is hardly wider than the gap.
+        """
+        for index, size in enumerate([placement.size for placement in plan.placements], 1):
+            if min(size[:2]) < 2 * self.gap:
+                expected = f"expected sides of at least twice physics.gap, {2 * self.gap:g} m"
+                raise ValueError(f"episode {plan.episode}, item {index}: {min(size[:2]):g} m wide; {expected}.")
+        started, count = process_time(), len(plan.placements)
+        errors = self.noise * np.random.default_rng((self.seed, plan.episode)).standard_normal((count, 2))
+        scene, loss, placed = self.make_scene(plan), None, 0
+        for placement, error in zip(plan.placements, errors, strict=True):
+            if loss := self.place(scene, placement, error) or self.find_loss(scene):
+                break
+            placed += 1
+        else:
+            scene.run(FINAL_WAIT)
+            loss = self.find_loss(scene)
+        kept = [number for number in range(placed) if loss is None or number != loss.item]
+        return Outcome(
+            episode=plan.episode,
+            ending=loss.reason if loss else "done",
+            lost=loss.item if loss else None,
+            during=placed if loss else None,
+            placed=placed,
+            occupancy=min(1.0, sum(placement.volume for placement in plan.placements[:placed]) / prod(plan.tote)),
+            drift=float(scene.shifts[kept].max(initial=0.0)),
+            cpu_seconds=process_time() - started,
+        )
+
+    def find_loss(self, scene: Scene) -> Loss | None:
+        """Return the item that has moved furthest of those that have moved or tilted too far, if any has."""
+        if scene.diverged:
+            return Loss("diverged", len(scene.boxes) - 1)
+        shifts, tilts = scene.shifts, scene.tilts
+        lost = (shifts > self.max_shift * self.cell_size) | (tilts > self.max_tilt)
+        return Loss("collapsed", int(np.where(lost, shifts, -1).argmax())) if lost.any() else None
+
+
+def wait(scene: Scene) -> None:
+    """Let time pass until all items are at rest, or :data:`MAX_WAIT`."""
+    scene.run(MIN_WAIT)
+    for _ in range(round((MAX_WAIT - MIN_WAIT) / LOOK)):
+        if (np.abs(scene.speeds) < REST_SPEEDS).all():
+            return
+        scene.run(LOOK)

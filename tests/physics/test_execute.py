@@ -1,0 +1,92 @@
+"""A gantry carries items: what it must touch is told, and what the rules call feasible it carries out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pickplace import PickPlaceEnv
+from pickplace.evaluation.play import play
+from pickplace.physics.execute import Execute
+from pickplace.physics.plans import EpisodePlan, Placement
+from pickplace.physics.recorded import plan_of
+from pickplace.planners.heuristics import RandomFeasible
+
+pytest.importorskip("mujoco")
+BIN, EFFECTOR = (0.25, 0.25, 0.05), (0.15, 0.15)
+
+
+def carry(*placements, tote=(0.3, 0.3, 0.25), **settings):
+    return Execute(**settings).carry_out_one(EpisodePlan(0, tote, BIN, EFFECTOR, list(placements)))
+
+
+def placed(corner, size, ahead=(0.0, 0.0)):
+    """Return the placement of an item below the middle of the plate, or of a plate that is further along."""
+    middle = [side / 2 + step for side, step in zip(size, ahead, strict=False)]
+    pick, place = ([at + half for at, half in zip(start, middle, strict=False)] for start in ((0.1, 0.1), corner))
+    return Placement(corner, size, (0.1, 0.1), tuple(pick), tuple(place), 0)
+
+
+TALL, LOW = ((0.0, 0.1, 0.0), (0.1, 0.1, 0.1)), ((0.1, 0.1, 0.0), (0.1, 0.1, 0.05))
+
+
+@pytest.mark.parametrize(("placements", "ending", "during"), [
+    ([placed(*TALL, (0.03, 0)), placed(*LOW, (0.026, 0))], "done", None),  # a millimetre beside the tall one
+    ([placed(*TALL, (0.03, 0)), placed(*LOW, (0.02, 0))], "effector_contact", 1),  # 5 mm over the tall one
+    ([placed(*TALL)], "effector_contact", 0),  # over the wall, below the rim
+    ([placed((0.0, 0.1, 0.0), (0.1, 0.1, 0.25))], "done", None),  # over the wall, level with it
+    ([replace(placed(*LOW), pick=(0.0, 0.0))], "dropped", 0),  # the plate is not above the item
+    ([replace(placed(*LOW), place=(0.16, 0.15))], "wedged", 0),  # a centimetre beside where it was planned
+])  # fmt: skip
+def test_cases_by_hand(placements, ending, during):
+    outcome = carry(*placements)
+    assert (outcome.ending, outcome.during, outcome.lost) == (ending, during, during)
+    assert outcome.placed == (len(placements) if during is None else during) and outcome.drift < 1e-3
+
+
+@pytest.mark.parametrize(("suction", "ending"), [(2.0, "dropped"), (50.0, "done")])
+def test_a_heavy_item_needs_suction(suction, ending):
+    """0.1 x 0.1 x 0.05 m of 2,000 kg/m^3 weigh 9.8 N."""
+    assert carry(placed(*LOW), density=2000.0, suction=suction).ending == ending
+
+
+def test_plans_without_a_bin_are_refused():
+    with pytest.raises(ValueError, match="episode 3 has no bin; expected plans with all keys"):
+        Execute().carry_out_one(EpisodePlan(3, (0.3, 0.3, 0.3), placements=[Placement((0, 0, 0), (0.1, 0.1, 0.1))]))
+
+
+@pytest.mark.parametrize("settings", [
+    {}, {"effector_size": (3, 2), "bin_size": (4, 5, 2)}, {"effector_size": (6, 5), "tote_size": (6, 6, 1)},
+    {"pick_rule": "overlap", "bin_size": (5, 5, 3), "effector_size": (2, 2)},
+])  # fmt: skip
+def test_what_the_rules_call_feasible_is_carried_out(settings):
+    """Random play with every rotation and grasp: each item comes to lie where the rules say."""
+
+    def make_env(first, count):
+        return PickPlaceEnv(
+            num_envs=count, support="more_than_half", first_episode=first, **{"tote_size": (5, 4, 2), **settings}
+        )
+
+    cell = make_env(0, 1).cell
+    episodes = play(make_env, RandomFeasible(cell, seed=1), 6, 6, record=range(6))
+    plans = [plan_of(recording, cell, 0.05) for recording in episodes.recordings]
+    assert {placement.rotation for plan in plans for placement in plan.placements} == {0, 90, 180, 270}
+    for outcome, plan, occupancy in zip(
+        Execute(cell_size=0.05).carry_out(plans), plans, episodes.occupancy, strict=True
+    ):
+        assert (outcome.ending, outcome.placed) == ("done", len(plan.placements)), outcome
+        assert outcome.occupancy == pytest.approx(float(occupancy)) and outcome.drift < 1e-3
+
+
+def test_errors_of_placement_reach_the_tote():
+    boxes = [placed((0.1, 0.1, 0.0), (0.05, 0.05, 0.05)), placed((0.2, 0.2, 0.0), (0.05, 0.05, 0.05))]
+    exact, noisy = (carry(*boxes, noise=noise, tote=(0.4, 0.4, 0.25)) for noise in (0.0, 0.003))
+    errors = 0.003 * np.random.default_rng((0, 0)).standard_normal((2, 2))
+    assert exact.drift < 1e-4 and noisy.drift == pytest.approx(np.linalg.norm(errors, axis=1).max(), abs=2e-4)
+
+
+def test_sleep_changes_no_result():
+    plan = [placed(*TALL, (0.03, 0)), placed(*LOW, (0.026, 0)), placed((0.1, 0.1, 0.05), (0.1, 0.1, 0.05), (0.026, 0))]
+    awake, asleep = (carry(*plan, sleep=sleep) for sleep in (False, True))
+    assert replace(awake, drift=0, cpu_seconds=0) == replace(asleep, drift=0, cpu_seconds=0)
+    assert awake.drift == pytest.approx(asleep.drift, abs=1e-5)

@@ -1,0 +1,138 @@
+"""Plans as files: what an evaluation writes, what is read back, and what is refused."""
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pickplace import CellSpec
+from pickplace.physics import command
+from pickplace.physics.plans import KEYS, ROBOT_KEYS, EpisodePlan, Placement, read_plans, to_lines
+from pickplace.physics.recorded import plan_of
+from pickplace.task.state import Failure
+from pickplace.views.recording import Move, Recording
+
+LINE = {"episode": 0, "tote": [0.3, 0.3, 0.2], "corner": [0.0, 0.0, 0.0], "size": [0.1, 0.1, 0.05]}
+ROBOT = {
+    "bin": [0.25, 0.25, 0.05],
+    "item": [0, 0],
+    "effector": [0.15, 0.15],
+    "pick": [0.1, 0.1],
+    "place": [0.1, 0.1],
+    "rotation": 90,
+}
+
+
+def written(path, *lines):
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return path
+
+
+def test_a_recorded_episode_in_metres(tmp_path):
+    """Cells of 4 cm, heights of 1 cm; by hand."""
+    cell = CellSpec((5, 5, 3), (6, 6, 20), (3, 2), height_unit=0.25)
+    moves = [
+        Move((2, 1, 2, 1, 5), (1, 0), (0, 1), 1, (0, 2, 1, 2), 0, Failure.NONE),
+        Move((0, 0, 1, 1, 4), (0, 0), (0, 0), 0, (0, 2, 1, 1), 5, Failure.NONE),
+        Move((0, 0, 1, 1, 4), (0, 0), (5, 5), 0, (5, 5, 1, 1), 0, Failure.TOTE_COLLISION),
+    ]
+    plan = plan_of(Recording(7, 18, moves), cell, 0.04)
+    first = Placement((0, 0.08, 0), (0.04, 0.08, 0.05), (0.08, 0.04), (0.1, 0.04), (0.04, 0.1), 90)
+    assert plan == EpisodePlan(7, (0.24, 0.24, 0.18), (0.2, 0.2, 0.03), (0.12, 0.08), [first, plan.placements[1]])
+    assert plan.placements[1].corner == (0, 0.08, 0.05) and plan.placements[1].rotation == 0
+    path = tmp_path / "plans.jsonl"
+    path.write_text(to_lines([plan, EpisodePlan(8, (1.0, 1.0, 1.0), placements=[Placement((0, 0, 0), (1, 1, 1))])]))
+    assert list(map(json.loads, path.read_text().splitlines()))[0].keys() == {*KEYS, *ROBOT_KEYS}
+    back = read_plans(path)
+    assert back[0] == plan and back[1].placements == [Placement((0, 0, 0), (1, 1, 1))]
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    ({"corner": [0.25, 0, 0]}, "the item leaves the tote: along x from 0.25 to 0.35 m, expected 0 to 0.3 m"),
+    ({"corner": [0, 0, 0.16]}, "the item leaves the tote: along z"),
+    ({"corner": [0.05, 0.02, 0.03]}, "the item overlaps item 1 of its episode by 20.0 mm"),
+    ({"corner": [0.05, 0.02, 0.06]}, "the item floats 10.0 mm above what lies below it"),
+    ({"corner": [0.1, 0.0, 0.05]}, "the item floats 50.0 mm"),
+    ({"corner": [0, 0, math.nan]}, r"corner=\[0, 0, nan\]: expected 3 coordinates, in metres"),
+    ({"corner": [0, 0]}, "corner=.*expected 3 coordinates"),
+    ({"size": [0.1, 0, 0.1]}, "size=.*expected 3 lengths above 0, in metres"),
+    ({"size": "large"}, "size='large': expected 3 lengths"),
+    *(({"episode": value}, f"episode={value}: expected a whole number >= 0") for value in (0.5, -1)),
+    ({"tote": [0.3, 0.3, 0.3]}, "tote: expected the same in all lines of episode 0"),
+    ({"volume": 1}, "'volume': there is no such key; expected episode, tote, corner, size, bin"),
+    ({"pick": [0, 0]}, "bin: missing; expected episode, tote, corner, size, bin"),
+    ({**ROBOT, "rotation": 45}, "rotation=45: expected 0, 90, 180 or 270"),
+])  # fmt: skip
+def test_a_bad_line_is_refused(change, words, tmp_path):
+    path = written(tmp_path / "plans.jsonl", LINE, LINE | {"corner": [0.1, 0.1, 0]} | change)
+    with pytest.raises(ValueError, match=f"plans.jsonl, line 2: {words}") as error:
+        read_plans(path)
+    assert str(error.value).count("\n") == 0
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("corner\n", r"line 1: expected an object in JSON \("),
+    ("[1]\n", "line 1: got list, expected an object with episode, tote, corner, size"),
+    (json.dumps({"episode": 1}) + "\n", "line 1: tote: missing; expected episode, tote, corner, size"),
+])  # fmt: skip
+def test_another_file_is_refused(text, words, tmp_path):
+    (tmp_path / "plans.jsonl").write_text(text)
+    with pytest.raises(ValueError, match=words):
+        read_plans(tmp_path / "plans.jsonl")
+
+
+def test_an_episode_without_placements_has_no_line(tmp_path):
+    (tmp_path / "plans.jsonl").write_text(to_lines([EpisodePlan(0, (1.0, 1.0, 1.0))]))
+    assert read_plans(tmp_path / "plans.jsonl") == []
+
+
+def test_the_lines_of_an_episode_follow_one_another(tmp_path):
+    path = written(tmp_path / "plans.jsonl", LINE, LINE | {"episode": 1}, LINE | {"corner": [0.1, 0, 0]})
+    with pytest.raises(ValueError, match="line 3: episode=0: expected its lines to follow one another"):
+        read_plans(path)
+
+
+VALUES = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.lists(st.floats(), max_size=4)
+
+
+@given(st.dictionaries(st.sampled_from([*KEYS, *ROBOT_KEYS, "x"]), VALUES))
+def test_any_line_is_read_or_refused_in_a_sentence(tmp_path_factory, values):
+    path = written(tmp_path_factory.mktemp("plans") / "plans.jsonl", LINE | values)
+    try:
+        read_plans(path)
+    except ValueError as error:
+        assert str(error).endswith(".") and "line 1" in str(error)
+
+
+def test_the_command(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("mujoco")
+    tower = [LINE | {"corner": [0.06 * level, 0, 0.05 * level]} for level in range(2)]
+    path = written(tmp_path / "plans.jsonl", *tower, LINE | {"episode": 3})
+
+    def call(*words):
+        monkeypatch.setattr("sys.argv", ["pickplace-physics", *map(str, words)])
+        command.main()
+        return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+    fallen, done = call(path)
+    assert (fallen["episode"], fallen["ending"], fallen["lost"]) == (0, "collapsed", 1)
+    assert (done["episode"], done["ending"], done["placed"]) == (3, "done", 1)
+    assert call(path, "friction=0.5", "sleep=false")[1]["placed"] == 1
+    for words, expected in (
+        ((path, "friction=-1"), "physics.friction=-1: expected a number between 0 and 10"),
+        ((path, "fricton=1"), "physics.fricton: there is no key 'fricton' in physics; did you mean 'friction'?"),
+        *(((path, word), f"{word}: expected <key>=<value>") for word in ("friction", "friction=[1", "_target_=x")),
+        ((path, "--method", "execute", "friction=0.3"), "physics=execute: episode 0 has no bin"),
+        ((path, "gap=0.02", "cell_size=1"), None),
+        ((path, "gap=0.06", "cell_size=1"), "episode 0, item 1: 0.1 m wide; expected sides of at least twice physics"),
+        ((tmp_path / "none.jsonl",), "none.jsonl: No such file"),
+    ):
+        if expected is None:
+            assert len(call(*words)) == 2
+            continue
+        with pytest.raises(SystemExit, match="2"):
+            call(*words)
+        err = capsys.readouterr().err
+        assert expected in err and err.count("\n") == 1
