@@ -45,7 +45,7 @@ class Scene:
         option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         if sleep:
             option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
-            option.sleep_tolerance = 1e-5  # m/s; with MuJoCo's own of 1e-3 an item that begins to tilt falls asleep
+            option.sleep_tolerance = 2e-4  # m/s; with MuJoCo's own of 1e-3 an item that begins to tilt falls asleep
         self.boxes: list = []
         self.planned = np.zeros((0, 3))
         self.model = self.spec.compile()
