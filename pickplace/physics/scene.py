@@ -45,7 +45,9 @@ class Scene:
         option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         if sleep:
             option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
-            option.sleep_tolerance = 2e-4  # m/s; with MuJoCo's own of 1e-3 an item that begins to tilt falls asleep
+            option.sleep_tolerance = (
+                2e-4  # m/s; with MuJoCo's own, 1e-3, items fall asleep while they begin to tilt or to fall
+            )
         self.boxes: list = []
         self.planned = np.zeros((0, 3))
         self.model = self.spec.compile()

@@ -50,6 +50,11 @@ def test_a_heavy_item_needs_suction(suction, ending):
     assert carry(placed(*LOW), density=2000.0, suction=suction).ending == ending
 
 
+def test_a_light_contact_does_not_count():
+    heavy_handed = [placed(*TALL, (0.03, 0)), placed(*LOW, (0.02, 0))]  # 5 mm over the tall one
+    assert carry(*heavy_handed, contact_force=1e5).ending != "effector_contact"
+
+
 def test_plans_without_a_bin_are_refused():
     with pytest.raises(ValueError, match="episode 3 has no bin; expected plans with all keys"):
         Execute().carry_out_one(EpisodePlan(3, (0.3, 0.3, 0.3), placements=[Placement((0, 0, 0), (0.1, 0.1, 0.1))]))
