@@ -16,6 +16,7 @@ TURNING_SPEED = 4.0  # greatest speed of the hinge, rad/s
 STIFFNESS = 2e5, 2e3  # stiffness of the drives of the slides, N/m, and of the hinge, N m/rad
 SLOW_WAY = 0.03  # length of the slow part of a way down, its last, and of a way up, its first; m
 SETTLING_TIME = 0.05  # time for the plate to come to rest, s
+WAKING_FORCE = 1e-6  # force that wakes a body, N
 REACH = 0.0005  # distance by which a lip can be drawn out, m
 STEPS_PER_LOOK = 2  # steps of the simulation between two looks at contacts and forces
 
@@ -196,6 +197,9 @@ class Gantry(Scene):
     def release(self) -> None:
         """Let go of the item."""
         self.data.eq_active[self.weld.id] = self.holding = False
+        self.data.xfrc_applied[self.boxes[-1].id, 2] = -WAKING_FORCE  # else it could sleep on in the air
+        mujoco.mj_step(self.model, self.data)
+        self.data.xfrc_applied[self.boxes[-1].id, 2] = 0.0
 
     def _step(self) -> Loss | None:
         """Let a little time pass; return what was lost in it."""
