@@ -40,7 +40,7 @@ class Simulation(ABC):
             more than half the gap may put an item into its neighbour.
         max_shift: distance beyond which an item is lost, in cells.
         max_tilt: angle beyond which an item is lost; degrees.
-        sleep: let bodies that do not move sleep, which is faster and changes nothing.
+        sleep: let bodies that hardly move sleep, which is faster.
         seed: of the errors of placement.
         workers: processes, each with an episode of its own.
     """
