@@ -26,10 +26,10 @@ def run(arguments: argparse.Namespace) -> None:
         if not equals or not key.isidentifier() or key == "_target_":
             raise ValueError(f"{word}: expected <key>=<value>, such as friction=0.3.")
     try:
-        settings = OmegaConf.from_dotlist(arguments.settings)
+        settings = OmegaConf.from_dotlist([*arguments.settings, f"_target_={arguments.method}"])
     except YAMLError as error:
         raise ValueError(f"{' '.join(arguments.settings)}: expected <key>=<value>, such as friction=0.3.") from error
-    simulation = build("physics", {**OmegaConf.to_container(settings), "_target_": arguments.method})  # type: ignore
+    simulation = build("physics", settings)
     for outcome in simulation.carry_out(read_plans(arguments.plans)):
         write_output(json.dumps(asdict(outcome)) + "\n")
 

@@ -61,9 +61,7 @@ class Execute(Simulation):
     def make_scene(self, plan: EpisodePlan) -> "Gantry":
         if not (plan.bin and plan.effector):
             raise ValueError(f"physics=execute: episode {plan.episode} has no bin; expected plans with all keys.")
-        if min(plan.effector) < 2 * self.gap:
-            expected = f"expected sides of at least twice physics.gap, {2 * self.gap:g} m"
-            raise ValueError(f"episode {plan.episode}: the end effector is {min(plan.effector):g} m wide; {expected}.")
+        self.check_width(f"episode {plan.episode}, end effector", plan.effector)
         return Gantry(self, plan)
 
     def place(self, gantry: "Gantry", placement: Placement, error: np.ndarray) -> Loss | None:

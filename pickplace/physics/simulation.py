@@ -2,7 +2,7 @@
 
 import signal
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from math import prod
@@ -99,9 +99,7 @@ class Simulation(ABC):
             ValueError: for an item or an end effector that is hardly wider than the gap.
         """
         for index, size in enumerate([placement.size for placement in plan.placements], 1):
-            if min(size[:2]) < 2 * self.gap:
-                expected = f"expected sides of at least twice physics.gap, {2 * self.gap:g} m"
-                raise ValueError(f"episode {plan.episode}, item {index}: {min(size[:2]):g} m wide; {expected}.")
+            self.check_width(f"episode {plan.episode}, item {index}", size)
         started, count = process_time(), len(plan.placements)
         errors = self.noise * np.random.default_rng((self.seed, plan.episode)).standard_normal((count, 2))
         scene, loss, placed = self.make_scene(plan), None, 0
@@ -123,6 +121,12 @@ class Simulation(ABC):
             drift=float(scene.shifts[kept].max(initial=0.0)),
             cpu_seconds=process_time() - started,
         )
+
+    def check_width(self, name: str, size: Sequence[float]) -> None:
+        """Refuse what is hardly wider than the gap, with a ``ValueError`` that names it."""
+        if min(size[:2]) < 2 * self.gap:
+            expected = f"expected sides of at least twice physics.gap, {2 * self.gap:g} m"
+            raise ValueError(f"{name}: {min(size[:2]):g} m wide; {expected}.")
 
     def find_loss(self, scene: Scene) -> Loss | None:
         """Return the item that has moved furthest of those that have moved or tilted too far, if any has."""

@@ -6,8 +6,8 @@ their number, or by their convex hull: an item tilts unless the vertical line th
 The hull is never computed. A point lies in a convex polygon if the polygon reaches beyond it along the normal of each
 of its edges. The corners of cells are lattice points, so the edges of every possible hull have one of a few directions.
 A supporting cell reaches beyond the centre along some of their normals, which is a pattern of bits; the item is stable
-if the patterns of its supporting cells cover all of them. That is exact, and as fast as
-counting for items of up to 3 cells.
+if the patterns of its supporting cells cover all of them. That is exact, and as fast as counting for items of up to 3
+cells.
 """
 
 from collections.abc import Sequence
