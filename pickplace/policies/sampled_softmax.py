@@ -41,6 +41,11 @@ from pickplace.policies.base import MASKED, Policy, act_module
 CANDIDATE_KEYS = ("candidates", "candidate_log_prob", "candidate_log_weight")
 
 
+#: Greatest growth of a candidate's probability that the loss sees, as a logarithm. More can only befall what had next
+#: to no probability and so next to no weight; its ratio of probabilities would overflow.
+MAX_GROWTH = 30.0
+
+
 class SampledSoftmax(Categorical):
     """The distribution of a policy, estimated at candidates that an earlier policy drew.
 
@@ -53,11 +58,12 @@ class SampledSoftmax(Categorical):
     def __init__(self, logits: Tensor, log_prob: Tensor, log_weight: Tensor):
         change = logits - log_prob
         super().__init__(logits=change + log_weight, validate_args=False)
+        self.earlier_log_prob = log_prob
         self.candidate_log_prob = logits - (change + log_weight).logsumexp(-1, keepdim=True)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the estimated log-probability of every candidate, ``[N, 1 + samples]``, whatever ``value`` is."""
-        return self.candidate_log_prob
+        return self.candidate_log_prob.minimum(self.earlier_log_prob + MAX_GROWTH)
 
     def entropy(self) -> Tensor:
         """Return the estimated entropy over all choices, ``[N]``; in nats."""

@@ -44,6 +44,14 @@ def test_with_every_choice_a_candidate_the_softmax_is_exact(samples, temperature
         torch.testing.assert_close(gradients(got.sum(), new), gradients(want.sum(), new))
 
 
+def test_a_choice_that_had_no_probability_may_become_likely():
+    """Its ratio of probabilities would overflow; a mask that leaves few choices makes such candidates."""
+    log_prob = torch.tensor([[0.0, -170.0]])
+    grown = SampledSoftmax(torch.tensor([[0.0, 1.0]]), log_prob, log_prob)
+    assert (grown.log_prob(None) - log_prob).exp().isfinite().all()
+    torch.testing.assert_close(grown.entropy(), Categorical(logits=torch.tensor([[0.0, 1.0]])).entropy())
+
+
 @pytest.mark.parametrize("temperature", [1.0, 2.0])
 @pytest.mark.parametrize("samples", [2, 3])
 def test_weighted_means_over_candidates_are_expectations(samples, temperature):
