@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from pickplace.evaluation.play import Episodes, MakeEnv, check_episode_settings, check_play, decision_latency, play
 from pickplace.evaluation.statistics import paired_difference, summarise, summarise_physics
 from pickplace.physics.plans import CELL_SIZE, PLANS, to_lines
-from pickplace.physics.recorded import plan_of
+from pickplace.physics.recorded import carried_out, plan_of
 from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import own_modules, trusted_config
@@ -66,15 +66,17 @@ def _run(cfg: DictConfig, run_dir: Path) -> float:
     cell = make_env(0, 1).cell
     other = None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), episode_settings(cfg))
     result, episodes = evaluate(
-        cfg, make_env, planner, facts, record=range(ev.episodes if plans or physics else max(replay, 1))
+        cfg, make_env, planner, facts, ev.episodes if plans or physics else max(replay, 1), heat_maps=replay
     )
     recordings = episodes.recordings
     size = physics.cell_size if physics else CELL_SIZE
     planned = [plan_of(recording, cell, size) for recording in recordings] if plans or physics else []
     if physics:
         outcomes = []
-        for outcome in physics.carry_out(planned):
+        for outcome in physics.carry_out(planned, record=range(replay)):
             outcomes.append(outcome)
+            if outcome.motion:
+                recordings[outcome.episode].carried_out = carried_out(outcome, size)
             if len(outcomes) % 10 == 0 or len(outcomes) == len(planned):
                 log.info("physics=%s: %s of %s episodes", physics.name, f"{len(outcomes):,}", f"{len(planned):,}")
         settings = {key: value for key, value in resolved(cfg.physics).items() if key != "_target_"}
@@ -85,7 +87,8 @@ def _run(cfg: DictConfig, run_dir: Path) -> float:
     log.info("\n%s", table)  # before anything is written: the disk may be full
     texts = {EVALUATION: json.dumps(result, indent=1, default=to_json), "evaluation.md": table}
     if replay:
-        title = f"{cfg.checkpoint or planner.name}, {ev.stream} stream, seed {ev.seed}"
+        how = f", carried out by {physics.name}" if physics else ""
+        title = f"{cfg.checkpoint or planner.name}, {ev.stream} stream, seed {ev.seed}{how}"
         texts["replay.html"] = page(recordings[:replay], cell, title)
     if plans:
         texts[PLANS] = to_lines(planned)
@@ -175,17 +178,18 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
 
 
 def evaluate(
-    cfg: DictConfig, make_env: MakeEnv, planner: BatchPlanner, facts: dict, record=()
+    cfg: DictConfig, make_env: MakeEnv, planner: BatchPlanner, facts: dict, record: int = 0, heat_maps: int = 0
 ) -> tuple[dict, Episodes]:
     """Evaluate a planner as the config group ``evaluation`` says; return the content of ``evaluation.json``, too.
 
     Args:
         cfg, make_env, planner, facts: as of :func:`prepare`.
-        record: as of :func:`~pickplace.evaluation.play.play`.
+        record: how many episodes to record, the first ones.
+        heat_maps: how many of these with heat maps.
     """
     ev = cfg.evaluation
     log.info("%s episodes to play with %s", f"{ev.episodes:,}", planner.name)
-    result = play(make_env, planner, ev.episodes, ev.batch_size, record)
+    result = play(make_env, planner, ev.episodes, ev.batch_size, range(record), range(heat_maps))
     report = {
         "planner": planner.name,
         **facts,

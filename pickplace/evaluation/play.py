@@ -50,12 +50,12 @@ class _Batch:
     Args:
         env: the environment.
         first: number of the first slot's episode.
-        record: numbers of the episodes to record.
+        record, heat_maps: as of :func:`play`.
     """
 
-    def __init__(self, env: PickPlaceEnv, first: int, record: Collection[int]):
+    def __init__(self, env: PickPlaceEnv, first: int, record: Collection[int], heat_maps: Collection[int]):
         count, device = env.num_envs, env.device
-        self.env = env
+        self.env, self.heat_maps = env, heat_maps
         self.running = torch.ones(count, dtype=torch.bool, device=device)
         self.occupancy = torch.zeros(count, dtype=torch.float64, device=device)
         self.items_placed = torch.zeros(count, dtype=torch.int64, device=device)
@@ -73,12 +73,14 @@ class _Batch:
 
     def record(self, planner: BatchPlanner, action: Tensor) -> None:
         """Add the moves that the actions are about to make to the recordings of running episodes."""
-        slots = [slot for slot in self.recordings if self.running[slot]]
-        if slots:
-            state = self.env.state.rows(slots)
-            moves = record_moves(self.env.cell, planner, self.observation[slots], state, action[slots])
-            for slot, move in zip(slots, moves, strict=True):
-                self.recordings[slot].moves.append(move)
+        running = [slot for slot in self.recordings if self.running[slot]]
+        for with_heat in (True, False):
+            slots = [slot for slot in running if (self.recordings[slot].episode in self.heat_maps) == with_heat]
+            if slots:
+                state = self.env.state.rows(slots)
+                moves = record_moves(self.env.cell, planner, self.observation[slots], state, action[slots], with_heat)
+                for slot, move in zip(slots, moves, strict=True):
+                    self.recordings[slot].moves.append(move)
 
     def step(self, action: Tensor) -> None:
         """Step the environment, and keep the results of the episodes that end.
@@ -132,6 +134,7 @@ def play(
     episodes: int,
     batch_size: int,
     record: Collection[int] = (),
+    heat_maps: Collection[int] | None = None,
 ) -> Episodes:
     """Play episodes ``0 .. episodes - 1``, each in a slot of its own, to their ends, and count them all.
 
@@ -143,12 +146,19 @@ def play(
         batch_size: episodes played side by side. It changes no result, except with a planner that draws random
             numbers: it has one generator for all episodes of a batch.
         record: numbers of the episodes to record move by move.
+        heat_maps: those of them to record with the planner's heat maps, which take time; None: all.
     """
+    heat_maps = record if heat_maps is None else heat_maps
     feasible, decisions, seconds = 0.0, 0, 0.0
     parts: list[dict[str, Tensor]] = []
     recordings: list[Recording] = []
     for first in range(0, episodes, batch_size):
-        batch = _Batch(make_env(first, min(batch_size, episodes - first)), first, record)
+        batch = _Batch(
+            make_env(first, min(batch_size, episodes - first)),
+            first,
+            record,
+            record if heat_maps is None else heat_maps,
+        )
         while batch.running.any():
             feasible += batch.feasible_shares()
             decisions += int(batch.running.sum())

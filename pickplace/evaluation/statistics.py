@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
 
 import torch
 from torch import Tensor
@@ -60,7 +59,7 @@ def summarise_physics(outcomes: Sequence[Outcome]) -> dict:
         "endings": dict(sorted(Counter(outcome.ending for outcome in outcomes).items())),
         "drift": max(outcome.drift for outcome in outcomes),
         "cpu_seconds": sum(outcome.cpu_seconds for outcome in outcomes) / len(outcomes),
-        "episodes": [asdict(outcome) for outcome in outcomes],
+        "episodes": [outcome.facts() for outcome in outcomes],
     }
 
 

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-from dataclasses import asdict
 
 from pickplace.runs.errors import one_sentence, write_output
 
@@ -31,7 +30,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise ValueError(f"{' '.join(arguments.settings)}: expected <key>=<value>, such as friction=0.3.") from error
     simulation = build("physics", settings)
     for outcome in simulation.carry_out(read_plans(arguments.plans)):
-        write_output(json.dumps(asdict(outcome)) + "\n")
+        write_output(json.dumps(outcome.facts()) + "\n")
 
 
 def parser() -> argparse.ArgumentParser:

@@ -66,11 +66,11 @@ class Execute(Simulation):
 
     def place(self, gantry: "Gantry", placement: Placement, error: np.ndarray) -> Loss | None:
         height = placement.size[2]
-        gantry.add((*(gantry.origin + placement.item), 0.0), bin_size(placement), placement.centre)
+        gantry.add((*(gantry.bin + placement.item), 0.0), bin_size(placement), placement.centre)
         high = gantry.rim + height + HEADROOM  # of the plate's lower face, so that the item below it clears the rims
         low = placement.corner[2] + height + self.lip + self.release_height
-        pick, place = gantry.origin + placement.pick, placement.place + error
-        turn = placement.rotation / 180 * pi
+        pick, place = gantry.bin + placement.pick, placement.place + error
+        turn = ((placement.rotation + 90) % 360 - 90) / 180 * pi  # the short way round
         loss = (
             gantry.travel((*pick, high, 0.0))
             or gantry.lower((*pick, height + self.lip, 0.0))
@@ -103,7 +103,6 @@ class Gantry(Scene):
         plan: has the sizes.
 
     Attributes:
-        origin: near corner of the bin, ``[2]``.
         rim: height of the higher one of tote and bin.
         goal: commanded centre of the plate's lower face and its turn, m and rad, ``[4]``.
         holding: whether the plate holds the item that was added last.
@@ -115,12 +114,13 @@ class Gantry(Scene):
         self.weld: mujoco.MjsEquality
         # So far apart that an end effector that hangs over a wall of one hits no wall of the other.
         distance = 2 * WALL + 2 * max(plan.effector) + 0.1
-        self.origin, self.rim = np.array((plan.tote[0] + distance, 0.0)), max(plan.tote[2], plan.bin[2])
+        self.bin = np.array((-plan.bin[0] - distance, (plan.tote[1] - plan.bin[1]) / 2))
+        self.rim = max(plan.tote[2], plan.bin[2])
         self.add_container(plan.tote)
-        self.add_container(plan.bin, self.origin)
+        self.add_container(plan.bin, self.bin)
         self._add_plate(plan.effector)
         self.compile()
-        self.goal = np.array((*self.origin, 2 * self.rim, 0.0))
+        self.goal = np.array((*self.bin, 2 * self.rim, 0.0))
         self.data.qpos[:4] = self.data.ctrl[:4] = self.goal
 
     def _add_plate(self, size) -> None:
@@ -196,13 +196,15 @@ class Gantry(Scene):
         """Let go of the item."""
         self.data.eq_active[self.weld.id] = self.holding = False
         self.data.xfrc_applied[self.boxes[-1].id, 2] = -WAKING_FORCE  # else it could sleep on in the air
-        mujoco.mj_step(self.model, self.data)
+        self.step(1)
         self.data.xfrc_applied[self.boxes[-1].id, 2] = 0.0
 
     def _step(self) -> Loss | None:
         """Let a little time pass; return what was lost in it."""
         number, before = len(self.boxes) - 1, self.speeds[-1, :3].copy()
-        mujoco.mj_step(self.model, self.data, nstep=STEPS_PER_LOOK)
+        self.step(STEPS_PER_LOOK)
+        if self.diverged:
+            return Loss("diverged", number)
         plate, item = self.plate.geoms[0].id, self.boxes[-1]
         pairs, force, total = self.data.contact.geom, np.zeros(6), 0.0
         for index in np.nonzero((pairs == plate).any(1))[0]:

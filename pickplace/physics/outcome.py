@@ -1,7 +1,9 @@
 """The end of an episode that was carried out."""
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple
+
+from pickplace.views.motion import Motion
 
 
 class Loss(NamedTuple):
@@ -13,7 +15,7 @@ class Loss(NamedTuple):
 
 @dataclass(frozen=True)
 class Outcome:
-    """The end of an episode that was carried out, as ``pickplace-physics`` prints it."""
+    """The end of an episode that was carried out."""
 
     episode: int
     ending: str  # "done", or the reason of the first loss
@@ -23,3 +25,8 @@ class Outcome:
     occupancy: float  # share of the tote that they fill
     drift: float  # greatest distance of a placed item that was not lost from its planned pose, m
     cpu_seconds: float
+    motion: Motion | None = field(default=None, repr=False)  # of an episode that was to be recorded
+
+    def facts(self) -> dict[str, Any]:
+        """Return all but the motion, as ``pickplace-physics`` prints it."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "motion"}

@@ -1,8 +1,20 @@
-"""Plans of recorded episodes."""
+"""Plans of recorded episodes, and how they were carried out."""
 
+from pickplace.physics.outcome import Outcome
 from pickplace.physics.plans import EpisodePlan, Placement, Point
 from pickplace.task.cell import CellSpec
+from pickplace.views.motion import CarriedOut
 from pickplace.views.recording import Recording
+
+#: What the reader of a replay is told: a sentence about the lost item, and a word or two.
+ENDINGS = {
+    "done": ("Carried out: every item stayed in its place.", "carried out"),
+    "collapsed": ("Item {} left its place.", "item {} left its place"),
+    "effector_contact": ("The gripper hit something with item {}.", "gripper hit something"),
+    "wedged": ("Item {} was not in its place when it was released.", "item {} wedged"),
+    "dropped": ("Item {} was dropped.", "item {} dropped"),
+    "diverged": ("The simulation became impossible.", "simulation diverged"),
+}
 
 
 def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePlan:
@@ -29,3 +41,11 @@ def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePl
             )  # fmt: skip
             plan.placements.append(placement)
     return plan
+
+
+def carried_out(outcome: Outcome, cell_size: float) -> CarriedOut:
+    """Return what a replay shows of an outcome with its motion; ``cell_size`` is the side of a cell in metres."""
+    assert outcome.motion is not None
+    number = None if outcome.lost is None else outcome.lost + 1
+    ending, label = (text.format(number) for text in ENDINGS[outcome.ending])
+    return CarriedOut(ending, label, outcome.lost, outcome.placed, outcome.occupancy, cell_size, outcome.motion)

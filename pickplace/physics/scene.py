@@ -4,8 +4,11 @@ The frame's origin is the tote's near corner on its floor; z points up.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+
+from pickplace.views.motion import INTERVAL, Motion
 
 try:
     import mujoco
@@ -33,9 +36,14 @@ class Scene:
 
     Attributes:
         spec, model, data: MuJoCo's; the latter two are new ones after each :meth:`add`.
-        boxes: MuJoCo's body of each box.
+        boxes, plate: MuJoCo's body of each box, and of the end effector if there is one.
+        bin: near corner of the bin, if there is one.
         planned: centre of each box where it is planned to rest, ``[n, 3]``.
+        motion: records the poses, if there is one.
     """
+
+    plate: Any = None
+    bin: Any = None
 
     def __init__(self, friction: float, density: float, gap: float, sleep: bool = True):
         self.friction, self.density, self.gap = friction, density, gap
@@ -49,6 +57,8 @@ class Scene:
             option.sleep_tolerance = 5e-4
         self.boxes: list = []
         self.planned = np.zeros((0, 3))
+        self.motion: Motion | None = None
+        self._next_picture = 0.0  # s
         self.model = self.spec.compile()
         self.data = mujoco.MjData(self.model)
 
@@ -80,6 +90,8 @@ class Scene:
         self.add_geom(body, np.subtract(size, (self.gap, self.gap, 0)))
         self.boxes.append(body)
         self.compile()
+        if self.motion:
+            self.record()
 
     def add_geom(self, body, size: Vector, centre: Vector = (0.0, 0.0, 0.0)):
         """Add a box-shaped surface to a body."""
@@ -89,7 +101,25 @@ class Scene:
 
     def run(self, seconds: float) -> None:
         """Let time pass."""
-        mujoco.mj_step(self.model, self.data, nstep=round(seconds / TIMESTEP))
+        self.step(round(seconds / TIMESTEP))
+
+    def step(self, count: int) -> None:
+        """Let time steps pass."""
+        if self.motion is None:
+            mujoco.mj_step(self.model, self.data, nstep=count)
+            return
+        for _ in range(count):
+            if self.data.time >= self._next_picture:
+                self.record()
+            mujoco.mj_step(self.model, self.data)
+
+    def record(self) -> None:
+        """Add a picture to the motion."""
+        assert self.motion is not None
+        mujoco.mj_kinematics(self.model, self.data)  # of what was added since the last step, too
+        poses = np.hstack([self.data.xpos, self.data.xquat])
+        self.motion.add(poses[self._ids], None if self.plate is None else poses[self.plate.id])
+        self._next_picture = self.data.time + INTERVAL
 
     @property
     def diverged(self) -> bool:

@@ -2,7 +2,7 @@
 
 import signal
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from math import prod
@@ -16,11 +16,13 @@ from pickplace.physics.outcome import Loss, Outcome
 from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement
 from pickplace.physics.scene import Scene, mujoco
 from pickplace.task.checks import flag, number, whole_number
+from pickplace.views.motion import Motion
 
 #: Linear and angular speeds below which an item is at rest; m/s and rad/s.
 REST_SPEEDS = np.repeat((0.002, 0.02), 3)
 #: Time for items to come to rest after a placement, at least and at most, and at the end of an episode; s.
 MIN_WAIT, MAX_WAIT, FINAL_WAIT = 0.06, 1.0, 1.0
+AFTERMATH = 1.0  # time that a recorded motion goes on after a collapse, s
 LOOK = 0.02  # time between two looks at the speeds, s
 
 
@@ -82,18 +84,19 @@ class Simulation(ABC):
     def place(self, scene, placement: Placement, error: np.ndarray) -> Loss | None:
         """Place the next item, with an error along x and y, m, ``[2]``; return the loss if there is one."""
 
-    def carry_out(self, plans: Iterable[EpisodePlan]) -> Iterator[Outcome]:
-        """Yield the outcome of each plan."""
+    def carry_out(self, plans: Sequence[EpisodePlan], record: Collection[int] = ()) -> Iterator[Outcome]:
+        """Yield the outcome of each plan; with the motion, for the episodes in ``record``."""
+        recorded = [plan.episode in record for plan in plans]
         if self.workers == 1:
-            yield from map(self.carry_out_one, plans)
+            yield from map(self.carry_out_one, plans, recorded)
         else:
             # Ctrl-C reaches all processes; this one ends the others.
             ignore = signal.SIGINT, signal.SIG_IGN
             with ProcessPoolExecutor(self.workers, get_context("spawn"), signal.signal, ignore) as pool:
-                yield from pool.map(self.carry_out_one, plans)
+                yield from pool.map(self.carry_out_one, plans, recorded)
 
-    def carry_out_one(self, plan: EpisodePlan) -> Outcome:
-        """Return the outcome of a plan.
+    def carry_out_one(self, plan: EpisodePlan, record: bool = False) -> Outcome:
+        """Return the outcome of a plan; with the motion, if ``record``.
 
         Raises:
             ValueError: for an item or an end effector that is hardly wider than the gap.
@@ -103,15 +106,18 @@ class Simulation(ABC):
         started, count = process_time(), len(plan.placements)
         errors = self.noise * np.random.default_rng((self.seed, plan.episode)).standard_normal((count, 2))
         scene, loss, placed = self.make_scene(plan), None, 0
+        scene.motion = Motion(None if scene.bin is None else tuple(scene.bin.tolist())) if record else None
         for placement, error in zip(plan.placements, errors, strict=True):
             if loss := self.place(scene, placement, error) or self.find_loss(scene):
                 break
             placed += 1
+            if scene.motion:
+                scene.motion.ends.append(scene.motion.pictures)
         else:
             scene.run(FINAL_WAIT)
             loss = self.find_loss(scene)
         kept = [number for number in range(placed) if loss is None or number != loss.item]
-        return Outcome(
+        outcome = Outcome(
             episode=plan.episode,
             ending=loss.reason if loss else "done",
             lost=loss.item if loss else None,
@@ -120,7 +126,14 @@ class Simulation(ABC):
             occupancy=min(1.0, sum(placement.volume for placement in plan.placements[:placed]) / prod(plan.tote)),
             drift=float(scene.shifts[kept].max(initial=0.0)),
             cpu_seconds=process_time() - started,
+            motion=scene.motion,
         )
+        if scene.motion:
+            if loss and loss.reason == "collapsed":
+                scene.run(AFTERMATH)
+            scene.record()
+            scene.motion.ends = [*scene.motion.ends[: count - 1], scene.motion.pictures]
+        return outcome
 
     def check_width(self, name: str, size: Sequence[float]) -> None:
         """Refuse what is hardly wider than the gap, with a ``ValueError`` that names it."""

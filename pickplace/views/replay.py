@@ -13,6 +13,7 @@ import numpy as np
 
 from pickplace.task.cell import CellSpec
 from pickplace.task.state import Failure
+from pickplace.views.motion import CarriedOut
 from pickplace.views.recording import FULL, Box, Recording
 from pickplace.views.scene import draw_scene, item_colours
 
@@ -30,8 +31,10 @@ def page(recordings: list[Recording], cell: CellSpec, title: str) -> str:
     """
     colours = item_colours([box for recording in recordings for box in recording.boxes + _items_not_placed(recording)])
     kinds = {f"{w},{d},{_cells(h, cell)}": colour for (w, d, h), colour in colours.items()}
+    carried_out = [recording.carried_out for recording in recordings if recording.carried_out]
     data = {
         "title": title,
+        "binAt": _bin_corner(carried_out[0]) if carried_out else None,
         "bin": [*cell.bin_size[:2], _cells(cell.bin_size[2], cell)],
         "tote": cell.tote_size[:2],
         "effector": cell.effector_size,
@@ -74,13 +77,14 @@ def _episode(recording: Recording, cell: CellSpec) -> dict:
     """Return an episode for the page; all lengths are in cells."""
     heat = [move.heat for move in recording.moves if move.heat is not None]
     ending = recording.describe_ending(cell.num_places)
+    carried_out = recording.carried_out
     # One flat list a move: 5 of the item, 2 pick, 2 place, rotation, 4 of the footprint, z, failure code.
     moves = [
         [*_item(move.item, cell), *move.pick, *move.place, move.rotation, *move.footprint, _cells(move.z, cell),
          int(move.failure)]
         for move in recording.moves
     ]  # fmt: skip
-    return {
+    facts = {
         "episode": recording.episode,
         "height": _cells(recording.tote_height, cell),
         "occupancy": recording.occupancy,
@@ -92,6 +96,38 @@ def _episode(recording: Recording, cell: CellSpec) -> dict:
         "moves": moves,
         "heat": base64.b64encode(np.stack(heat).tobytes()).decode() if heat else None,
     }
+    return facts if carried_out is None else facts | _physics(carried_out, ending)
+
+
+def _physics(carried_out: CarriedOut, ending: str) -> dict:
+    """Return what physics changes in an episode for the page, and its motion."""
+    lost, motion = carried_out.lost is not None, carried_out.motion
+    return {
+        "occupancy": carried_out.occupancy,
+        "ending": carried_out.ending if lost else f"{carried_out.ending} {ending}".strip(),
+        "label": carried_out.label,
+        "failed": lost,
+        "stuck": False,
+        "motion": {
+            "lost": carried_out.lost,
+            "placed": carried_out.placed,
+            "ends": motion.ends,
+            "plate": _poses(motion.plate, carried_out.cell_size),
+            "boxes": [_poses(poses, carried_out.cell_size) for poses in motion.boxes],
+        },
+    }
+
+
+def _poses(poses: list[tuple[float, ...]], cell_size: float) -> list[int]:
+    """Return poses as one list: 8 numbers each, positions in 1/1000 of a cell, and quaternions times 1000."""
+    scale = np.array([1, *[1000 / cell_size] * 3, *[1000] * 4])
+    return np.rint(np.array(poses).reshape(-1, 8) * scale).astype(int).ravel().tolist()
+
+
+def _bin_corner(carried_out: CarriedOut) -> list[float] | None:
+    """Return where the bin stands, in cells from the tote's corner, if there is one."""
+    corner = carried_out.motion.bin
+    return None if corner is None else [round(at / carried_out.cell_size, 6) for at in corner]
 
 
 def _item(item: tuple[int, int, int, int, int], cell: CellSpec) -> list[int | float]:

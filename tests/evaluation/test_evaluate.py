@@ -1,7 +1,6 @@
 """``pickplace-evaluate``: what it writes, what it compares, and planners of the user's own."""
 
 import json
-from dataclasses import asdict
 
 import numpy
 import pytest
@@ -91,7 +90,7 @@ def test_physics_and_plans(evaluation, tmp_path):
     assert sum(found["endings"].values()) == len(plans) == 4 and plans[0].tote == (0.24, 0.24, 0.16)
     share = found["endings"].get("done", 0) / 4
     assert found["carried_out"]["mean"] == share and f"{share:.1%} of the episodes to their end" in result["out"]
-    outcomes = [asdict(outcome) for outcome in Settle(friction=0.5, cell_size=0.04).carry_out(plans)]
+    outcomes = [outcome.facts() for outcome in Settle(friction=0.5, cell_size=0.04).carry_out(plans)]
     for ours, theirs, by_rules in zip(outcomes, found["episodes"], result["occupancy"]["per_episode"], strict=True):
         assert ours | {"cpu_seconds": 0} == theirs | {"cpu_seconds": 0}
         assert theirs["occupancy"] <= by_rules + 1e-9

@@ -93,6 +93,21 @@ def test_sleep_changes_no_result_and_processes_neither():
     assert len({ending for _, ending, *_ in results[0]}) == 2
 
 
+def test_a_recorded_motion_is_what_happened_and_changes_nothing():
+    """A brick lies still after its fall of 2 mm; the next one turns over its edge and falls to the floor."""
+    falling = bricks(0.07)
+    recorded, bare = EXACT.carry_out_one(falling, record=True), EXACT.carry_out_one(falling)
+    motion = recorded.motion
+    assert recorded.facts() | {"cpu_seconds": 0} == bare.facts() | {"cpu_seconds": 0} and bare.motion is None
+    assert (recorded.ending, recorded.lost, motion.bin, motion.plate) == ("collapsed", 1, None, [])
+    assert len(motion.ends) == 2 and motion.ends[1] == motion.pictures
+    still, lost = (np.array(poses) for poses in motion.boxes)
+    assert still[0] == pytest.approx([0, 0.35, 0.45, 0.027, 1, 0, 0, 0], abs=1e-4)
+    assert still[-1, 1:4] == pytest.approx(falling.placements[0].centre, abs=1e-3)
+    assert lost[0, 0] == motion.ends[0] and lost[0, 1:4] == pytest.approx([0.42, 0.45, 0.077], abs=1e-4)
+    assert lost[-1, 3] < 0.06 and (np.diff(lost[:, 0]) > 0).all()  # the motion goes on to the floor
+
+
 def test_a_simulation_that_diverges_is_told():
     scene = Scene(0.6, 300.0, gap=0.0)
     scene.add((0.0, 0.0, 0.0), (0.1, 0.1, 0.1), (0.05, 0.05, 0.05))

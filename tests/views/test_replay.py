@@ -17,6 +17,7 @@ from pickplace.evaluation.play import play
 from pickplace.planners.heuristics import JointDBL, UniformRandom
 from pickplace.task.items import Kinds, Uniform
 from pickplace.views import replay
+from pickplace.views.motion import CarriedOut, Motion
 from pickplace.views.recording import Move, Recording
 
 ODD = {"bin_size": (4, 6, 2), "tote_size": (5, 7, 3), "effector_size": (2, 3), "rotations": 3, "height_unit": 0.25}
@@ -225,6 +226,48 @@ def test_page_shows_a_failure_in_place(browser, tmp_path, planner):
     assert state()["shown"] == len(failing.boxes) == len(failing.moves) - 1
     assert browser.find_element("id", "ending").get_attribute("class") == "bad"
     assert browser.find_element("id", "heat-label").is_displayed() == (planner == "K=1")
+    assert errors(browser) == []
+
+
+def test_page_shows_what_physics_did(browser, tmp_path):
+    """Two items, the second of which is lost: poses between two pictures, and the words."""
+    moves = [Move((0, 0, 2, 1, 1), (0, 0), (0, 0), n, (x, 0, *size), 0, Failure.NONE)
+             for n, (x, size) in enumerate(((0, (2, 1)), (3, (1, 2))))]  # fmt: skip
+    turned = (0.5**0.5, 0, 0, 0.5**0.5)
+    first = [(0, -0.3, 0.05, 0.025, 1, 0, 0, 0), (4, 0.05, 0.025, 0.025, 1, 0, 0, 0)]
+    second = [(5, -0.3, 0.05, 0.025, 1, 0, 0, 0), (9, 0.2, 0.1, 0.025, *turned)]
+    plate = [(0, -0.3, 0.05, 0.3, 1, 0, 0, 0), (8, -0.3, 0.05, 0.3, *turned)]
+    motion = Motion((-0.5, 0.1), 10, plate, [first, second], [5, 10])
+    carried_out = CarriedOut("Item 2 left its place.", "item 2 left its place", 1, 1, 0.25, 0.05, motion)
+    recording = Recording(0, 5, moves, Failure.STUCK, None, 0.5, carried_out)
+    path = written(tmp_path, [recording], CellSpec())
+    assert unpack(path.read_text())["binAt"] == [-10, 2]
+    state = open_page(browser, path)
+    browser.execute_script(WATCH + "document.getElementById('seek').step = 'any'")
+
+    def poses(moment):
+        """The visible boxes and the gripper: position and turn about z."""
+        browser.execute_script(
+            "window.scene = null; const s = document.getElementById('seek'); s.value = arguments[0]; s.oninput()",
+            moment,
+        )
+        wait_until(browser, "!!window.scene")
+        return browser.execute_script(
+            "const all = scene.children.find(o => o.isGroup && o.children.some(c => c.userData.poses)).children;"
+            "const arm = scene.children.find(o => o.isGroup && o.children.some(c => c.isInstancedMesh));"
+            "return [...all.filter(o => o.visible), arm].map(o => [...o.position.toArray(), o.rotation.z])"
+        )
+
+    assert poses(0.2) == [pytest.approx([-6, 1, 0.5, 0], abs=2e-3), pytest.approx([-6, 1, 5.72, 0], abs=2e-3)]  # 1
+    assert poses(0.7)[0] == pytest.approx([-2.5, 0.75, 0.5, 0], abs=2e-3)  # 3.5: half of the way since 3
+    lies, brought, arm = poses(1.7)  # 8.5
+    assert lies == pytest.approx([1, 0.5, 0.5, 0], abs=2e-3)
+    assert brought == pytest.approx([-1, 1.5, 0.5, np.pi / 4], abs=4e-3) and arm[3] == pytest.approx(
+        np.pi / 2, abs=2e-3
+    )
+    assert poses(2)[1] == pytest.approx([4, 2, 0.5, np.pi / 2], abs=2e-3)
+    assert (state()["ending"], state()["percent"]) == ("Item 2 left its place.", "25.0%")
+    assert browser.find_element("id", "which").text == "1 item placed"
     assert errors(browser) == []
 
 

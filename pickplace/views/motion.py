@@ -1,0 +1,67 @@
+"""How a physics engine carried out an episode: the poses of the bodies, picture by picture."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+INTERVAL = 0.05  # time between two pictures, s
+STILL = np.repeat((1e-4, 1e-3), (3, 4))  # change below which a body has not moved: position, m, and quaternion
+
+
+@dataclass
+class Motion:
+    """Recorded poses.
+
+    A pose is a picture's number, a position in m, and a quaternion ``(w, x, y, z)``. Poses of pictures in which a body
+    has not moved are left out.
+
+    Attributes:
+        bin: near corner of the bin, ``[2]``, m; None without a gantry.
+        pictures: number of pictures, :data:`INTERVAL` apart.
+        plate: poses of the end effector: of the middle of its lower face.
+        boxes: poses of each box: of its middle.
+        ends: number of pictures when each placement had ended.
+    """
+
+    bin: tuple[float, float] | None = None
+    pictures: int = 0
+    plate: list[tuple[float, ...]] = field(default_factory=list)
+    boxes: list[list[tuple[float, ...]]] = field(default_factory=list)
+    ends: list[int] = field(default_factory=list)
+
+    def add(self, boxes: np.ndarray, plate: np.ndarray | None) -> None:
+        """Add a picture.
+
+        Args:
+            boxes: position and quaternion of every box, ``[n, 7]``.
+            plate: those of the end effector, ``[7]``, if there is one.
+        """
+        self.boxes += [[] for _ in range(len(boxes) - len(self.boxes))]
+        bodies = list(zip(self.boxes, boxes, strict=True))
+        for poses, pose in bodies if plate is None else [*bodies, (self.plate, plate)]:
+            if not poses or (np.abs(pose - poses[-1][1:]) > STILL).any():
+                poses.append((self.pictures, *pose.tolist()))
+        self.pictures += 1
+
+
+@dataclass
+class CarriedOut:
+    """The end of an episode that a physics engine carried out.
+
+    Attributes:
+        ending: what was lost, or that nothing was; a sentence.
+        label: the same in a word or two.
+        lost: number of the lost item, from 0.
+        placed: items placed before it.
+        occupancy: share of the tote that they fill.
+        cell_size: side of a cell, m.
+        motion: the poses.
+    """
+
+    ending: str
+    label: str
+    lost: int | None
+    placed: int
+    occupancy: float
+    cell_size: float
+    motion: Motion
