@@ -21,7 +21,7 @@ from pickplace.runs.errors import sentence
 from pickplace.runs.folder import EVALUATION, claim, refuse_occupied
 from pickplace.runs.hydra_app import apply_overrides, command
 from pickplace.runs.machine import use_machine
-from pickplace.runs.provenance import commit, imitated_planner, versions
+from pickplace.runs.provenance import commit, first_weights, imitated_planner, versions
 from pickplace.runs.registry import build
 from pickplace.task.cell import CELL_SETTINGS
 from pickplace.task.checks import excerpt, flag, is_name, is_number, whole_number
@@ -173,6 +173,7 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
         "trained": {"frames": saved["frames"], "seed": merged.seed, "commit": saved["commit"]},
         "mask_in_training": merged.algo.mask_infeasible,
         "warm_start": imitated_planner(saved["config"]),
+        "first_weights": first_weights(saved["config"]),
     }
     return (cfg, state, resolved(trained.env)), facts
 

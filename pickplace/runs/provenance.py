@@ -52,3 +52,10 @@ def imitated_planner(cfg: dict) -> str | None:
     teacher = warm_start.get("teacher")
     name = teacher.get("_target_") if isinstance(teacher, Mapping) else None
     return name if is_name(name) else None
+
+
+def first_weights(cfg: dict) -> str | None:
+    """Return the checkpoint with whose weights a run with this saved config, unchecked, began, or None."""
+    warm_start = cfg.get("warm_start")
+    path = warm_start.get("weights") if isinstance(warm_start, Mapping) else None
+    return path if isinstance(path, str) else None

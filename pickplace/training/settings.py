@@ -51,7 +51,7 @@ CHECKS = {
     **dict.fromkeys(("model.actor", "model.critic"), _node),
     "callbacks": _or_null(_group),
     "warm_start.teacher": _or_null(_node),
-    "warm_start.checkpoint": _or_null(_text),
+    **dict.fromkeys(("warm_start.checkpoint", "warm_start.weights"), _or_null(_text)),
     **dict.fromkeys(("warm_start.frames", "warm_start.critic_frames"), partial(whole_number, least=0)),
     **dict.fromkeys(("total_frames", "evaluation_interval", "checkpoint_interval", "progress_interval"), whole_number),
     "env.num_envs": partial(whole_number, most=32_768),

@@ -103,6 +103,9 @@ class Trainer:
         make_actor = partial(
             build, "model.actor", cfg.model.actor, cell=self.cell, mask_infeasible=self.algo.mask_infeasible
         )
+        self._first_state: dict = self.state
+        if not self.resumed and cfg.warm_start.weights is not None:
+            self._read_first_weights(cfg.warm_start.weights)
         self.policy: Policy = self._restored("policy", make_actor)
         for warning in self.policy.check_sizes():
             log.warning(warning)
@@ -112,10 +115,25 @@ class Trainer:
         self.critic = self._restored("critic", lambda: as_critic(make_critic()))
         check_memory(cfg, probe, self.policy)
 
+    def _read_first_weights(self, path: str) -> None:
+        """Read the checkpoint with whose weights a new training begins."""
+        try:
+            folder = checkpoint.locate(path)
+            self._first_state, facts = checkpoint.read(folder)
+        except checkpoint.CheckpointError as error:
+            raise checkpoint.CheckpointError(f"warm_start.weights: {error}") from error
+        log.info("beginning with the weights of %s, after %s frames", folder, f"{facts['frames']:,}")
+
     def _restored(self, key: str, make) -> Any:
-        """Make a module, with the checkpoint's weights if the run is resumed."""
+        """Make a module, with the weights of the checkpoint that the run continues or begins with, if it has them."""
         refuse_large_network(make, f"model.{'actor' if key == 'policy' else key}")
-        module = checkpoint.restore(make, self.state.get(key, {}), key) if self.resumed else make()
+        has_weights = self.resumed or key in self._first_state
+        try:
+            module = checkpoint.restore(make, self._first_state.get(key, {}), key) if has_weights else make()
+        except checkpoint.CheckpointError as error:
+            if self.resumed:
+                raise
+            raise checkpoint.CheckpointError(f"warm_start.weights={self.cfg.warm_start.weights}: {error}") from error
         return module.to(self.device)
 
     def _make_curriculum(self) -> None:

@@ -36,6 +36,8 @@ def evaluation_table(result: dict) -> str:
         rows.append(("checkpoint", f"{result['checkpoint']} ({trained['frames']:,} frames, seed {trained['seed']})"))
         if result.get("warm_start"):
             rows.append(("warm start", f"imitated {result['warm_start']}"))
+        if result.get("first_weights"):
+            rows.append(("began with weights", result["first_weights"]))
     if "candidates" in result:
         rows.append(("mask; candidates K", f"{_describe_masks(result)}; {result['candidates']}"))
     rows = [(_escape(name), _escape(value)) for name, value in rows]

@@ -222,3 +222,28 @@ def test_a_learner_expects_nothing_after_the_end_of_a_recording(smoke, tmp_path,
     ended, target = (torch.cat([b[key].flatten() for b in batches]) for key in (("next", "truncated"), "value_target"))
     assert ended.sum() > 20
     torch.testing.assert_close(target[ended], torch.full_like(target[ended], 2 * 0.25))  # 2 cells, by reward_scale
+
+
+def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path):
+    """For another tote; a critic that is not among the weights begins anew."""
+    words = ["threads=1", "env.num_envs=8", "algo.minibatch_size=16", "env.tote_size=[6,5,2]", "total_frames=64"]
+    begun = Trainer(composed(*words, "warm_start.weights=pretrained/r4"), tmp_path)
+    state, _ = checkpoint.read(checkpoint.locate("pretrained/r4"))
+    for key, module in (("policy", begun.policy), ("critic", begun.critic)):
+        assert module.state_dict().keys() == state[key].keys()
+        assert all(torch.equal(value, state[key][name]) for name, value in module.state_dict().items())
+    assert begun.frames == 0 and not begun.resumed
+    bare = Trainer(composed(*words, "model=fcn4d", "warm_start.weights=pretrained/fcn4d"), tmp_path)
+    assert "critic" not in checkpoint.read(checkpoint.locate("pretrained/fcn4d"))[0]
+    assert bare.critic.module.value[0].in_features == 64 * (25 + 30) + 2
+
+
+@pytest.mark.parametrize(("weights", "complaint"), [
+    ("pretrained/unknown", "the package ships no such weights; expected pretrained/fcn4d"),
+    ("outputs/nowhere", "no checkpoint there"),
+    ("pretrained/fcn4d", "The checkpoint's policy does not fit these settings"),
+    (3, "=3: expected a text"),
+])  # fmt: skip
+def test_weights_that_do_not_serve_are_refused(weights, complaint, tmp_path):
+    with pytest.raises(ValueError, match=f"warm_start.weights.*{complaint}"):
+        Trainer(composed("experiment=smoke", f"warm_start.weights={weights}"), tmp_path)
