@@ -7,7 +7,9 @@ planned, is supported, and a feasible action sets it down there.
 """
 
 import json
+import math
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -17,7 +19,7 @@ from pickplace.evaluation.statistics import confidence95
 from pickplace.runs.provenance import commit
 from pickplace.task.feasibility import footprint_mask, placing_maps
 from pickplace.task.maps import NEVER
-from pickplace.task.state import State
+from pickplace.task.state import Item, State
 
 
 def py3dbp(size, turns: bool):
@@ -55,19 +57,25 @@ def rectpack(size, turns: bool):
     return place
 
 
+def planned_placements(env: PickPlaceEnv, packer) -> Iterator[tuple[Item, int, int, int, int, int]]:
+    """Yield each item of the environment's first episode, and where it is planned to go: x, y, z and its sides."""
+    place, volume = packer(env.cell.tote_size, env.cell.rotations > 1), math.prod(env.cell.tote_size)
+    for step in range(volume):
+        address = [torch.tensor([value]) for value in (0, env.first_episode, step)]
+        item = env.items.sample("test", *address, env.cell.bin_size)
+        if (planned := place(*(int(part) for part in (item.w, item.d, item.h)))) is None:
+            return
+        yield item, *planned
+
+
 def replay(env: PickPlaceEnv, packer) -> tuple[list[str], float, float]:
     """Return what became of each placement, the planned occupancy, and the occupancy before the first failure."""
     cell, outcomes, filled, executed = env.cell, [], 0, None
-    volume = cell.num_places * cell.tote_size[2]
+    volume = math.prod(cell.tote_size)
     env.reset()
-    place, heights, tote_height = packer(cell.tote_size, cell.rotations > 1), env.heights.clone(), env.tote_height
-    for step in range(volume):
-        address = [torch.tensor([value]) for value in (0, env.first_episode, step)]
-        item = env.items.sample("test", *address, cell.bin_size)
+    heights, tote_height = env.heights.clone(), env.tote_height
+    for item, x, y, z, wide, deep in planned_placements(env, packer):
         w, d, h = (int(part) for part in (item.w, item.d, item.h))
-        if (planned := place(w, d, h)) is None:
-            break
-        x, y, z, wide, deep = planned
         turned, under = int((wide, deep) != (w, d)), heights[0, x : x + wide, y : y + deep]
         maps = placing_maps(cell, State(heights, tote_height, item))
         if int(under.max()) != z:

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from pickplace.evaluation.play import Episodes, MakeEnv, check_episode_settings, check_play, decision_latency, play
 from pickplace.evaluation.statistics import paired_difference, summarise, summarise_physics
 from pickplace.physics.plans import CELL_SIZE, PLANS, to_lines
-from pickplace.physics.recorded import carried_out, plan_of
+from pickplace.physics.recorded import motion_for_replay, plan_of
 from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import own_modules, trusted_config
@@ -76,7 +76,7 @@ def _run(cfg: DictConfig, run_dir: Path) -> float:
         for outcome in physics.carry_out(planned, record=range(replay)):
             outcomes.append(outcome)
             if outcome.motion:
-                recordings[outcome.episode].carried_out = carried_out(outcome, size)
+                recordings[outcome.episode].carried_out = motion_for_replay(outcome, size)
             if len(outcomes) % 10 == 0 or len(outcomes) == len(planned):
                 log.info("physics=%s: %s of %s episodes", physics.name, f"{len(outcomes):,}", f"{len(planned):,}")
         settings = {key: value for key, value in resolved(cfg.physics).items() if key != "_target_"}

@@ -78,7 +78,8 @@ class _Batch:
             slots = [slot for slot in running if (self.recordings[slot].episode in self.heat_maps) == with_heat]
             if slots:
                 state = self.env.state.rows(slots)
-                moves = record_moves(self.env.cell, planner, self.observation[slots], state, action[slots], with_heat)
+                decided = planner if with_heat else None
+                moves = record_moves(self.env.cell, decided, self.observation[slots], state, action[slots])
                 for slot, move in zip(slots, moves, strict=True):
                     self.recordings[slot].moves.append(move)
 
@@ -153,12 +154,7 @@ def play(
     parts: list[dict[str, Tensor]] = []
     recordings: list[Recording] = []
     for first in range(0, episodes, batch_size):
-        batch = _Batch(
-            make_env(first, min(batch_size, episodes - first)),
-            first,
-            record,
-            record if heat_maps is None else heat_maps,
-        )
+        batch = _Batch(make_env(first, min(batch_size, episodes - first)), first, record, heat_maps)
         while batch.running.any():
             feasible += batch.feasible_shares()
             decisions += int(batch.running.sum())

@@ -120,7 +120,7 @@ class Gantry(Scene):
         self.add_container(plan.bin, self.bin)
         self._add_plate(plan.effector)
         self.compile()
-        self.goal = np.array((*self.bin, 2 * self.rim, 0.0))
+        self.goal = np.array((*(self.bin + np.divide(plan.bin[:2], 2)), self.rim + HEADROOM, 0.0))
         self.data.qpos[:4] = self.data.ctrl[:4] = self.goal
 
     def _add_plate(self, size) -> None:

@@ -10,9 +10,9 @@ from pickplace.views.recording import Recording
 ENDINGS = {
     "done": ("Carried out: every item stayed in its place.", "carried out"),
     "collapsed": ("Item {} left its place.", "item {} left its place"),
-    "effector_contact": ("The gripper hit something with item {}.", "gripper hit something"),
+    "effector_contact": ("The gripper hit something while it moved item {}.", "gripper hit something"),
     "wedged": ("Item {} was not in its place when it was released.", "item {} wedged"),
-    "dropped": ("Item {} was dropped.", "item {} dropped"),
+    "dropped": ("The suction did not hold item {}.", "item {} not held"),
     "diverged": ("The simulation became impossible.", "simulation diverged"),
 }
 
@@ -43,9 +43,11 @@ def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePl
     return plan
 
 
-def carried_out(outcome: Outcome, cell_size: float) -> CarriedOut:
-    """Return what a replay shows of an outcome with its motion; ``cell_size`` is the side of a cell in metres."""
+def motion_for_replay(outcome: Outcome, cell_size: float) -> CarriedOut:
+    """Return what a replay shows of an outcome and its motion; ``cell_size`` is the side of a cell in metres."""
     assert outcome.motion is not None
     number = None if outcome.lost is None else outcome.lost + 1
-    ending, label = (text.format(number) for text in ENDINGS[outcome.ending])
+    ending, label = (
+        text.format(number) for text in ENDINGS.get(outcome.ending, (f"Item {{}}: {outcome.ending}.", outcome.ending))
+    )
     return CarriedOut(ending, label, outcome.lost, outcome.placed, outcome.occupancy, cell_size, outcome.motion)

@@ -2,7 +2,7 @@
 
 import signal
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from math import prod
@@ -84,8 +84,9 @@ class Simulation(ABC):
     def place(self, scene, placement: Placement, error: np.ndarray) -> Loss | None:
         """Place the next item, with an error along x and y, m, ``[2]``; return the loss if there is one."""
 
-    def carry_out(self, plans: Sequence[EpisodePlan], record: Collection[int] = ()) -> Iterator[Outcome]:
+    def carry_out(self, plans: Iterable[EpisodePlan], record: Collection[int] = ()) -> Iterator[Outcome]:
         """Yield the outcome of each plan; with the motion, for the episodes in ``record``."""
+        plans = list(plans)
         recorded = [plan.episode in record for plan in plans]
         if self.workers == 1:
             yield from map(self.carry_out_one, plans, recorded)

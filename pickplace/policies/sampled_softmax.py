@@ -41,8 +41,8 @@ from pickplace.policies.base import MASKED, Policy, act_module
 CANDIDATE_KEYS = ("candidates", "candidate_log_prob", "candidate_log_weight")
 
 
-#: Greatest growth of a candidate's probability that the loss sees, as a logarithm. More can only befall what had next
-#: to no probability and so next to no weight; its ratio of probabilities would overflow.
+#: Greatest growth of a candidate's probability that the loss sees, as a logarithm: a greater ratio could overflow. Only
+#: a choice whose probability was below exp(-30) can grow more, and its weight is as small.
 MAX_GROWTH = 30.0
 
 

@@ -118,22 +118,24 @@ def unflatten(tensors: dict[str, Tensor], facts: dict) -> dict:
     return tree
 
 
-def locate(path, prefer: str = "best") -> Path:
+def locate(path, prefer: str = "best", key: str | None = None) -> Path:
     """Return the checkpoint folder that a user means.
 
     Args:
         path: a run folder (then its ``checkpoints/<prefer>``), a checkpoint, or ``pretrained/<name>``: weights that
             the package ships, unless the working directory has a folder of that name.
         prefer: ``"best"``; or ``"last"`` to resume a run, from ``best`` if it was killed before its first ``last``.
+        key: the setting that names the path, for messages; None: ``checkpoint``, or ``resume`` with ``"last"``.
 
     Raises:
         CheckpointError: if there is none.
     """
+    key = key or ("resume" if prefer == "last" else "checkpoint")
     parts = Path(path).parts
     if len(parts) == 2 and parts[0] == "pretrained" and not Path(path).exists():
         if not (PRETRAINED / parts[1] / FACTS).is_file():
             names = ", ".join(f"pretrained/{folder.parent.name}" for folder in sorted(PRETRAINED.glob(f"*/{FACTS}")))
-            raise CheckpointError(f"checkpoint={str(path)!r}: the package ships no such weights; expected {names}.")
+            raise CheckpointError(f"{key}={str(path)!r}: the package ships no such weights; expected {names}.")
         return PRETRAINED / parts[1]
     path = Path(path).absolute()
     preferred = ("last", "best") if prefer == "last" else (prefer,)
@@ -141,7 +143,6 @@ def locate(path, prefer: str = "best") -> Path:
         for candidate in (folder, folder.with_name(f".{folder.name}.old")):
             if (candidate / FACTS).is_file():
                 return candidate
-    key = "resume" if prefer == "last" else "checkpoint"
     for other in (path / "checkpoints" / name for name in ("last", PREVIOUS)):
         if (other / FACTS).is_file():
             raise CheckpointError(f"{key}={str(path)!r}: no {prefer} checkpoint there; expected {key}={other}.")

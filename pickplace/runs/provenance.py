@@ -1,4 +1,4 @@
-"""Origin of a result: versions, commit, and the planner that a policy imitated."""
+"""Origin of a result: versions, commit, and what a training began with."""
 
 import platform
 import subprocess
@@ -10,7 +10,7 @@ import torch
 import torchrl
 
 import pickplace
-from pickplace.task.checks import is_name
+from pickplace.task.checks import is_name, short_text
 
 
 def versions() -> dict[str, str]:
@@ -55,7 +55,7 @@ def imitated_planner(cfg: dict) -> str | None:
 
 
 def first_weights(cfg: dict) -> str | None:
-    """Return the checkpoint with whose weights a run with this saved config, unchecked, began, or None."""
+    """Return the checkpoint with whose weights a run began, or None; ``cfg`` is its saved config, unchecked."""
     warm_start = cfg.get("warm_start")
     path = warm_start.get("weights") if isinstance(warm_start, Mapping) else None
-    return path if isinstance(path, str) else None
+    return short_text(path) if isinstance(path, str) else None

@@ -103,37 +103,38 @@ class Trainer:
         make_actor = partial(
             build, "model.actor", cfg.model.actor, cell=self.cell, mask_infeasible=self.algo.mask_infeasible
         )
-        self._first_state: dict = self.state
-        if not self.resumed and cfg.warm_start.weights is not None:
-            self._read_first_weights(cfg.warm_start.weights)
-        self.policy: Policy = self._restored("policy", make_actor)
+        weights = self.state if self.resumed else self._first_weights()
+        self.policy: Policy = self._restored("policy", make_actor, weights)
         for warning in self.policy.check_sizes():
             log.warning(warning)
         self.planner = build("planner", cfg.planner, cell=self.cell, policy=self.policy)
         self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, self.items, self.terms, cfg.seed, cfg.trust)
         make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
-        self.critic = self._restored("critic", lambda: as_critic(make_critic()))
+        self.critic = self._restored("critic", lambda: as_critic(make_critic()), weights)
         check_memory(cfg, probe, self.policy)
 
-    def _read_first_weights(self, path: str) -> None:
-        """Read the checkpoint with whose weights a new training begins."""
-        try:
-            folder = checkpoint.locate(path)
-            self._first_state, facts = checkpoint.read(folder)
-        except checkpoint.CheckpointError as error:
-            raise checkpoint.CheckpointError(f"warm_start.weights: {error}") from error
-        log.info("beginning with the weights of %s, after %s frames", folder, f"{facts['frames']:,}")
+    def _first_weights(self) -> dict:
+        """Return the networks with whose weights a new training begins; empty without ``warm_start.weights``."""
+        if (path := self.cfg.warm_start.weights) is None:
+            return {}
+        state, facts = checkpoint.read(checkpoint.locate(path, key="warm_start.weights"))
+        log.info("beginning with the weights of %s, after %s frames", path, f"{facts['frames']:,}")
+        return state
 
-    def _restored(self, key: str, make) -> Any:
-        """Make a module, with the weights of the checkpoint that the run continues or begins with, if it has them."""
+    def _restored(self, key: str, make, weights: dict) -> Any:
+        """Make a module, with the weights of the checkpoint that the run continues or begins with."""
         refuse_large_network(make, f"model.{'actor' if key == 'policy' else key}")
-        has_weights = self.resumed or key in self._first_state
         try:
-            module = checkpoint.restore(make, self._first_state.get(key, {}), key) if has_weights else make()
+            module = checkpoint.restore(make, weights.get(key, {}), key) if weights else make()
         except checkpoint.CheckpointError as error:
             if self.resumed:
                 raise
-            raise checkpoint.CheckpointError(f"warm_start.weights={self.cfg.warm_start.weights}: {error}") from error
+            if key == "policy":
+                raise checkpoint.CheckpointError(
+                    f"warm_start.weights={self.cfg.warm_start.weights}: {error}"
+                ) from error
+            log.warning("warm_start.weights: the critic begins anew. %s", error)
+            module = make()
         return module.to(self.device)
 
     def _make_curriculum(self) -> None:

@@ -47,7 +47,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         if self._recording is not None and self.action_space.contains(action):
             env, actions = self._env, torch.as_tensor([int(action)], device=self._env.device)
             observation = TensorDict({"tote_height": env.tote_height[:, None].clone()}, [1], device=env.device)
-            self._recording.moves += record_moves(env.cell, None, observation, env.state, actions, False)
+            self._recording.moves += record_moves(env.cell, None, observation, env.state, actions)
         result = super().step(action)
         _, _, terminated, truncated, info = result
         if self._recording is not None and (terminated or truncated):

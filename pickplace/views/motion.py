@@ -17,7 +17,7 @@ class Motion:
 
     Attributes:
         bin: near corner of the bin, ``[2]``, m; None without a gantry.
-        pictures: number of pictures, :data:`INTERVAL` apart.
+        pictures: number of pictures, at most :data:`INTERVAL` apart.
         plate: poses of the end effector: of the middle of its lower face.
         boxes: poses of each box: of its middle.
         ends: number of pictures when each placement had ended.

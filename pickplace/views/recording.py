@@ -78,22 +78,19 @@ class Recording:
         return FULL if full else self.ending.sentence
 
 
-def record_moves(
-    cell: CellSpec, planner, observation: TensorDictBase, state: State, action: Tensor, heat_maps: bool
-) -> list[Move]:
+def record_moves(cell: CellSpec, planner, observation: TensorDictBase, state: State, action: Tensor) -> list[Move]:
     """Return the moves that actions make, one for each row.
 
     Args:
         cell: the sizes.
-        planner: the planner that decided.
+        planner: the planner that decided; its ``heat_map`` is recorded if it has one.
         observation: what the planner saw, ``[N]``.
         state: the states before the moves.
         action: int64 ``[N]``.
-        heat_maps: also record the planner's ``heat_map``, if it has one.
     """
     step = apply(cell, state, action)
     x_bin, y_bin, x_tote, y_tote, rotation = (part.tolist() for part in split_action(cell, action))
-    heat = planner.heat_map(observation) if heat_maps and hasattr(planner, "heat_map") else None
+    heat = planner.heat_map(observation) if hasattr(planner, "heat_map") else None
     if heat is not None:
         heat = (255 * heat / heat.amax((1, 2), keepdim=True).clamp(min=1e-30)).round().byte().cpu().numpy()
     ref_x, ref_y = (reference_cell(side) for side in cell.effector_size)

@@ -96,18 +96,18 @@ def _episode(recording: Recording, cell: CellSpec) -> dict:
         "moves": moves,
         "heat": base64.b64encode(np.stack(heat).tobytes()).decode() if heat else None,
     }
-    return facts if carried_out is None else facts | _physics(carried_out, ending)
+    return facts if carried_out is None else facts | _physics(carried_out, facts)
 
 
-def _physics(carried_out: CarriedOut, ending: str) -> dict:
-    """Return what physics changes in an episode for the page, and its motion."""
+def _physics(carried_out: CarriedOut, facts: dict) -> dict:
+    """Return what physics changes in the facts of an episode for the page, and its motion."""
     lost, motion = carried_out.lost is not None, carried_out.motion
     return {
         "occupancy": carried_out.occupancy,
-        "ending": carried_out.ending if lost else f"{carried_out.ending} {ending}".strip(),
-        "label": carried_out.label,
-        "failed": lost,
-        "stuck": False,
+        "ending": carried_out.ending if lost else f"{carried_out.ending} {facts['ending']}".strip(),
+        "label": carried_out.label if lost else facts["label"],
+        "failed": lost or facts["failed"],
+        "stuck": facts["stuck"] and not lost,
         "motion": {
             "lost": carried_out.lost,
             "placed": carried_out.placed,

@@ -225,7 +225,7 @@ def test_a_learner_expects_nothing_after_the_end_of_a_recording(smoke, tmp_path,
 
 
 def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path):
-    """For another tote; a critic that is not among the weights begins anew."""
+    """For another tote; a critic that is not among the weights, or does not fit, begins anew."""
     words = ["threads=1", "env.num_envs=8", "algo.minibatch_size=16", "env.tote_size=[6,5,2]", "total_frames=64"]
     begun = Trainer(composed(*words, "warm_start.weights=pretrained/r4"), tmp_path)
     state, _ = checkpoint.read(checkpoint.locate("pretrained/r4"))
@@ -236,6 +236,8 @@ def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path):
     bare = Trainer(composed(*words, "model=fcn4d", "warm_start.weights=pretrained/fcn4d"), tmp_path)
     assert "critic" not in checkpoint.read(checkpoint.locate("pretrained/fcn4d"))[0]
     assert bare.critic.module.value[0].in_features == 64 * (25 + 30) + 2
+    narrow = Trainer(composed(*words, "model.critic.hidden=8", "warm_start.weights=pretrained/r4"), tmp_path)
+    assert all(map(torch.equal, narrow.policy.parameters(), begun.policy.parameters()))
 
 
 @pytest.mark.parametrize(("weights", "complaint"), [

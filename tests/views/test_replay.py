@@ -6,6 +6,7 @@ import re
 import shutil
 import time
 import zlib
+from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
@@ -266,8 +267,20 @@ def test_page_shows_what_physics_did(browser, tmp_path):
         np.pi / 2, abs=2e-3
     )
     assert poses(2)[1] == pytest.approx([4, 2, 0.5, np.pi / 2], abs=2e-3)
-    assert (state()["ending"], state()["percent"]) == ("Item 2 left its place.", "25.0%")
+    assert (state()["ending"], state()["percent"]) == ("Item 2 left its place.", "1.1%")
     assert browser.find_element("id", "which").text == "1 item placed"
+    assert browser.find_element("id", "legend").text.endswith("the lost item")
+    assert errors(browser) == []
+
+    # What the rules forbid is not carried out, and stays a failure.
+    failing = replace(moves[1], failure=Failure.TOTE_COLLISION)
+    kept = CarriedOut(
+        "Carried out.", "carried out", None, 1, 2 / 180, 0.05, Motion((-0.5, 0.1), 5, plate, [first], [5])
+    )
+    recording = Recording(0, 5, [moves[0], failing], Failure.TOTE_COLLISION, None, 2 / 180, kept)
+    state = open_page(browser, written(tmp_path, [recording], CellSpec()), "#step=9")
+    assert state()["ending"] == f"Carried out. {Failure.TOTE_COLLISION.sentence}"
+    assert browser.find_element("id", "ending").get_attribute("class") == "bad" and state()["moves"] == 1
     assert errors(browser) == []
 
 

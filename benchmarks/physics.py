@@ -1,0 +1,222 @@
+"""Measure what a physics engine keeps of plans: python benchmarks/physics.py
+
+Plans of the test stream are carried out by `settle` or `execute`. A row of docs/results/physics.csv is a set of totes:
+
+- each stability rule, 200 totes at friction 0.6 and a gap of 1 mm, and 50 at other values, one changed at a time;
+- methods with and without joint planning, 100 totes, `execute`.
+
+Rows that are there are not computed again, so the run can be stopped and started again. To use several cores, start
+several runs with different --match; each kind of items has plans of its own. Prints the tables of docs/physics.md.
+"""
+
+import argparse
+import csv
+import fcntl
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from pickplace import PickPlaceEnv
+from pickplace.evaluation.statistics import confidence95, proportion95
+from pickplace.physics.execute import Execute
+from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement, read_plans
+from pickplace.physics.settle import Settle
+
+ROOT = Path(__file__).parents[1]
+TABLE, RUNS = ROOT / "docs" / "results" / "physics.csv", ROOT / "outputs" / "physics"
+ITEMS = {"kinds": "6x6x5", "mixed": "8x8x8", "tall": "6x6x5"}
+RULES = ("half", "more_than_half", "hull", "full")
+OF_METHODS = "hull"  # the rule under which methods are compared
+#: What decides, as words for pickplace-evaluate; rectpack plans places alone.
+METHODS = {
+    "rectpack": None,
+    "individual_heuristic": ["planner=individual_heuristic"],
+    "individual_grasp": ["checkpoint=outputs/reproduce/train/individual_grasp-R{R}-s0", "planner.candidates=all"],
+    "joint_dbl": ["planner=joint_dbl"],
+    "fcn_grasp": ["checkpoint=pretrained/r{R}"],
+    "random": ["planner=random"],
+}
+
+
+class Cell(NamedTuple):
+    """What a row of the table is about."""
+
+    items: str
+    tote: str
+    method: str
+    R: int
+    support: str
+    simulation: str  # settle or execute
+    friction: float = 0.6
+    gap_mm: float = 1.0
+
+    @property
+    def name(self) -> str:
+        return "-".join(map(str, self))
+
+    @property
+    def folder(self) -> Path:
+        """The run folder of the evaluation that plans."""
+        return RUNS / f"{self.method}-{self.items}-{self.tote}-R{self.R}-{self.support}"
+
+
+FIGURES = ("totes", "lost", "planned", "planned_low", "planned_high", "kept", "kept_low", "kept_high", "cpu_seconds")
+
+
+def wanted() -> Iterator[tuple[Cell, int]]:
+    """Yield all cells and their numbers of totes, the most important ones first."""
+    for method in ("joint_dbl", "random"):
+        for items, tote in ITEMS.items():
+            for rule in RULES:
+                yield Cell(items, tote, method, 4, rule, "settle"), 200
+    for rotations in (1, 4):
+        for method in list(METHODS)[:-1]:
+            yield Cell("kinds", "6x6x5", method, rotations, OF_METHODS, "execute"), 100
+    for friction, gap in ((0.3, 1.0), (0.9, 1.0), (0.6, 0.0), (0.6, 3.0)):
+        for items, tote in ITEMS.items():
+            for rule in RULES:
+                yield Cell(items, tote, "joint_dbl", 4, rule, "settle", friction, gap), 50
+
+
+def read() -> dict[Cell, dict[str, float]]:
+    """Return the figures of the table's rows."""
+    if not TABLE.is_file():
+        return {}
+    rows = {}
+    with TABLE.open(newline="") as file:
+        for row in csv.DictReader(file):
+            values = [kind(row[key]) for key, kind in Cell.__annotations__.items()]
+            rows[Cell(*values)] = {key: float(row[key]) for key in FIGURES}
+    return rows
+
+
+def write(cell: Cell, figures: dict) -> None:
+    """Add a row to the table; several processes may do so."""
+    with (RUNS / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        rows = read() | {cell: figures}
+        part = TABLE.with_suffix(".part")
+        with part.open("w", newline="") as file:
+            table = csv.DictWriter(file, [*Cell._fields, *FIGURES], lineterminator="\n")
+            table.writeheader()
+            table.writerows(key._asdict() | rows[key] for key in sorted(rows))
+        part.replace(TABLE)
+
+
+def plan(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
+    """Return the occupancy by the rules, and the plans, of episodes; they are played unless that was done before."""
+    if (words := METHODS[cell.method]) is None:
+        return pack_without_gripper(cell, totes)
+    if not (cell.folder / "plans.jsonl").is_file():
+        command = [
+            str(Path(sys.executable).with_name("pickplace-evaluate")), *(word.format(R=cell.R) for word in words),
+            f"items={cell.items}", f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"env.rotations={cell.R}",
+            f"env.support={cell.support}", "evaluation.episodes=200", "evaluation.plans=true", "evaluation.replay=0",
+            "evaluation.latency_decisions=0", "threads=1", f"hydra.run.dir={cell.folder}",
+        ]  # fmt: skip
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
+    occupancy = json.loads((cell.folder / "evaluation.json").read_text())["occupancy"]["per_episode"][:totes]
+    plans = {one.episode: one for one in read_plans(cell.folder / "plans.jsonl")}
+    empty = replace(next(iter(plans.values())), placements=[])  # an episode without placements has no line
+    return occupancy, [plans.get(number, replace(empty, episode=number)) for number in range(totes)]
+
+
+def pack_without_gripper(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
+    """Return what rectpack plans, which knows no gripper; it is held over the middle of each item."""
+    from placement_only import planned_placements, rectpack
+
+    occupancy, plans = [], []
+    for episode in range(totes):
+        size = [int(side) for side in cell.tote.split("x")]
+        env = PickPlaceEnv(tote_size=size, rotations=cell.R, num_envs=1, stream="test", first_episode=episode, masks=())
+        metres = [[side * CELL_SIZE for side in sides] for sides in (size, env.cell.bin_size, env.cell.effector_size)]
+        placements, volume = [], 0
+        for item, x, y, z, wide, deep in planned_placements(env, rectpack):
+            corner = tuple(at * CELL_SIZE for at in (x, y, z))
+            sides = tuple(side * CELL_SIZE for side in (wide, deep, int(item.h)))
+            lies = tuple(int(at) * CELL_SIZE for at in (item.x, item.y))
+            pick = tuple(at + int(side) * CELL_SIZE / 2 for at, side in zip(lies, (item.w, item.d), strict=True))
+            place = tuple(at + side / 2 for at, side in zip(corner[:2], sides[:2], strict=True))
+            turned = (wide, deep) != (int(item.w), int(item.d))
+            placements.append(Placement(corner, sides, lies, pick, place, 90 * turned))
+            volume += wide * deep * int(item.h)
+        occupancy.append(volume / (size[0] * size[1] * size[2]))
+        plans.append(EpisodePlan(episode, *map(tuple, metres), placements))
+    return occupancy, plans
+
+
+def measure(cell: Cell, totes: int) -> dict[str, float]:
+    """Return the figures of a cell."""
+    planned, plans = plan(cell, totes)
+    simulation = {"settle": Settle, "execute": Execute}[cell.simulation](friction=cell.friction, gap=cell.gap_mm / 1e3)
+    outcomes = list(simulation.carry_out(plans))
+    figures = {"totes": totes, "lost": sum(outcome.ending != "done" for outcome in outcomes)}
+    for name, values in (("planned", planned), ("kept", [outcome.occupancy for outcome in outcomes])):
+        occupancy = torch.tensor(values, dtype=torch.float64)
+        low, high = confidence95(occupancy)
+        figures |= {name: float(occupancy.mean()), f"{name}_low": low, f"{name}_high": high}
+    figures["cpu_seconds"] = sum(outcome.cpu_seconds for outcome in outcomes) / totes
+    return {key: round(value, 4) for key, value in figures.items()}
+
+
+# ---------------------------------------------------------------------- tables
+def share(row: dict) -> str:
+    """Return how many totes lost an item."""
+    low, high = proportion95(int(row["lost"]), int(row["totes"]))
+    return f"{row['lost']:.0f} of {row['totes']:.0f} ({low:.1%} to {high:.1%})"
+
+
+def interval(row: dict, name: str) -> str:
+    """Return a mean occupancy and its interval."""
+    return f"{row[name]:.3f} ({row[f'{name}_low']:.3f} to {row[f'{name}_high']:.3f})"
+
+
+def tables() -> str:
+    """Return the tables of docs/physics.md."""
+    rows = read()
+    lines = ["| items, tote | planner | `env.support=` | totes that lost an item | occupancy | carried out |"]
+    lines.append("|---|---|---|---|---|---|")
+    for cell in dict(wanted()):
+        if cell in rows and cell.simulation == "settle" and (cell.friction, cell.gap_mm) == (0.6, 1.0):
+            row, about = rows[cell], f"{cell.items}, {cell.tote} | `{cell.method}` | `{cell.support}`"
+            lines.append(f"| {about} | {share(row)} | {interval(row, 'planned')} | {interval(row, 'kept')} |")
+    conditions = [(0.3, 1.0), (0.9, 1.0), (0.6, 0.0), (0.6, 3.0)]
+    names = " | ".join(f"friction {friction:g}, gap {gap:g} mm" for friction, gap in conditions)
+    lines += ["", f"| items, tote | `env.support=` | {names} |", "|---|---|---|---|---|---|"]
+    for items, tote in ITEMS.items():
+        for rule in RULES:
+            cells = [Cell(items, tote, "joint_dbl", 4, rule, "settle", *condition) for condition in conditions]
+            counts = [f"{rows[cell]['lost']:.0f}" if cell in rows else "" for cell in cells]
+            lines.append(f"| {items}, {tote} | `{rule}` | {' | '.join(counts)} |")
+    lines += ["", "| R | method | totes carried out | occupancy planned | carried out |", "|---|---|---|---|---|"]
+    for cell in dict(wanted()):
+        if cell in rows and cell.simulation == "execute":
+            row = rows[cell]
+            done = f"{row['totes'] - row['lost']:.0f} of {row['totes']:.0f}"
+            planned, kept = interval(row, "planned"), interval(row, "kept")
+            lines.append(f"| {cell.R} | `{cell.method}` | {done} | {planned} | {kept} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--match", default="", help="only cells in whose name this regular expression is found")
+    arguments = parser.parse_args()
+    RUNS.mkdir(parents=True, exist_ok=True)
+    for cell, totes in wanted():
+        if re.search(arguments.match, cell.name) and cell not in read():
+            figures = measure(cell, totes)
+            write(cell, figures)
+            sys.stdout.write(f"{cell.name}: {figures['lost']:.0f} of {totes} lost an item\n")
+    sys.stdout.write(tables() + "\n")
+
+
+if __name__ == "__main__":
+    main()
