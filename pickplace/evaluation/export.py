@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import tensordict  # noqa: F401  its import computes numbers, which it cannot on the device "meta" below
 import torch
 from omegaconf import DictConfig, OmegaConf
 
