@@ -46,7 +46,7 @@ METHODS = {
 
 
 class Cell(NamedTuple):
-    """What a row of the table is about."""
+    """The settings of a row of the table: what is packed, who plans, and what carries it out."""
 
     items: str
     tote: str
@@ -208,10 +208,11 @@ def tables() -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--match", default="", help="only cells in whose name this regular expression is found")
+    parser.add_argument("--again", action="store_true", help="also compute rows that are there")
     arguments = parser.parse_args()
     RUNS.mkdir(parents=True, exist_ok=True)
     for cell, totes in wanted():
-        if re.search(arguments.match, cell.name) and cell not in read():
+        if re.search(arguments.match, cell.name) and (arguments.again or cell not in read()):
             figures = measure(cell, totes)
             write(cell, figures)
             sys.stdout.write(f"{cell.name}: {figures['lost']:.0f} of {totes} lost an item\n")

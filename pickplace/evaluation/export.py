@@ -8,14 +8,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import tensordict  # noqa: F401  its import computes numbers, which it cannot on the device "meta" below
 import torch
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import trusted_config
 from pickplace.runs.errors import one_sentence
-from pickplace.runs.registry import build
+from pickplace.runs.registry import build, find
 from pickplace.task.cell import CELL_SETTINGS, cell_from_settings
 from pickplace.task.files import read_text
 
@@ -60,6 +59,7 @@ def critic_serves_any_tote(cfg: DictConfig) -> bool:
     """
     env: Any = OmegaConf.to_container(cfg.env, resolve=True)
     cell = cell_from_settings({key: env[key] for key in CELL_SETTINGS if key in env})
+    find("model.critic", cfg.model.critic._target_)  # imports it, which the device "meta" does not allow
     with torch.device("meta"):
         return getattr(build("model.critic", cfg.model.critic, cell=cell), "any_size", False)
 
