@@ -32,8 +32,8 @@ from pickplace.physics.settle import Settle
 ROOT = Path(__file__).parents[1]
 TABLE, RUNS = ROOT / "docs" / "results" / "physics.csv", ROOT / "outputs" / "physics"
 ITEMS = {"kinds": "6x6x5", "mixed": "8x8x8", "tall": "6x6x5"}
-RULES = ("half", "more_than_half", "hull", "full")
-OF_METHODS = "hull"  # the rule under which methods are compared
+RULES = ("half", "more_than_half", "hull", "bearing", "bearing+0.25", "full")  # and env.support_margin after the +
+OF_METHODS = "bearing+0.25"  # the rule under which methods are compared
 #: What decides, as words for pickplace-evaluate; rectpack plans places alone.
 METHODS = {
     "rectpack": None,
@@ -115,11 +115,13 @@ def plan(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
     if (words := METHODS[cell.method]) is None:
         return pack_without_gripper(cell, totes)
     if not (cell.folder / "plans.jsonl").is_file():
+        rule, _, margin = cell.support.partition("+")
         command = [
             str(Path(sys.executable).with_name("pickplace-evaluate")), *(word.format(R=cell.R) for word in words),
             f"items={cell.items}", f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"env.rotations={cell.R}",
-            f"env.support={cell.support}", "evaluation.episodes=200", "evaluation.plans=true", "evaluation.replay=0",
-            "evaluation.latency_decisions=0", "threads=1", f"hydra.run.dir={cell.folder}",
+            f"env.support={rule}", f"env.support_margin={margin or 0}", "evaluation.episodes=200",
+            "evaluation.plans=true", "evaluation.replay=0", "evaluation.latency_decisions=0", "threads=1",
+            f"hydra.run.dir={cell.folder}",
         ]  # fmt: skip
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
     occupancy = json.loads((cell.folder / "evaluation.json").read_text())["occupancy"]["per_episode"][:totes]

@@ -19,7 +19,7 @@ from pickplace.evaluation.statistics import confidence95
 from pickplace.runs.provenance import commit
 from pickplace.task.feasibility import footprint_mask, placing_maps
 from pickplace.task.maps import NEVER
-from pickplace.task.state import Item, State
+from pickplace.task.state import Item, State, surface_from
 
 
 def py3dbp(size, turns: bool):
@@ -73,11 +73,11 @@ def replay(env: PickPlaceEnv, packer) -> tuple[list[str], float, float]:
     cell, outcomes, filled, executed = env.cell, [], 0, None
     volume = math.prod(cell.tote_size)
     env.reset()
-    heights, tote_height = env.heights.clone(), env.tote_height
+    heights, tote_height = env.state.heights, env.tote_height
     for item, x, y, z, wide, deep in planned_placements(env, packer):
         w, d, h = (int(part) for part in (item.w, item.d, item.h))
         turned, under = int((wide, deep) != (w, d)), heights[0, x : x + wide, y : y + deep]
-        maps = placing_maps(cell, State(heights, tote_height, item))
+        maps = placing_maps(cell, State(surface_from(heights), tote_height, item))
         if int(under.max()) != z:
             outcome = "rests_elsewhere"
         elif maps.top[0, turned, x, y] == NEVER:  # it fits, so its support is too small
@@ -103,7 +103,7 @@ def main() -> None:
     count = int(settings.get("evaluation.episodes", 100))
     played = []
     for episode in range(count):
-        env = PickPlaceEnv(**cell, num_envs=1, stream="test", seed=0, first_episode=episode)
+        env = PickPlaceEnv(**cell, support="half", num_envs=1, stream="test", seed=0, first_episode=episode)
         played.append(replay(env, {"py3dbp": py3dbp, "rectpack": rectpack}[settings["packer"]]))
     shares = [outcomes.count("executed") / len(outcomes) for outcomes, _, _ in played]
     reached = [executed for _, _, executed in played]

@@ -14,6 +14,7 @@ from matplotlib.patches import FancyBboxPatch, Rectangle
 
 from pickplace import CellSpec, Failure, Item, State
 from pickplace.task.grasps import join_action
+from pickplace.task.state import surface_from
 from pickplace.task.transition import apply
 
 INK, GREY, PAPER = "#263238", "#9aa3ab", "#eef1f3"
@@ -29,7 +30,7 @@ def try_grip(cell: CellSpec, pick, place):
     item = Item(*(torch.tensor([value]) for value in (*ITEM_AT, *ITEM_SIZE)))
     numbers = (x * side + y for (x, y), side in ((pick, cell.bin_size[1]), (place, cell.tote_size[1])))
     action = join_action(cell, *(torch.tensor([number]) for number in (*numbers, 0)))
-    step = apply(cell, State(heights, torch.tensor([HEIGHT]), item), action)
+    step = apply(cell, State(surface_from(heights), torch.tensor([HEIGHT]), item), action)
     return Failure(int(step.failure)), int(step.top), step.footprint[0, :2].tolist()
 
 

@@ -76,20 +76,24 @@ def is_stable(rules: Rules, supporting: list[Pair], size: Pair) -> bool:
     share = len(supporting) / (size[0] * size[1])
     if not isinstance(rules.support, str):
         return share >= rules.support
-    if rules.support == "hull":
-        # The hull's corners counter-clockwise, in half cells, so that the centre has whole coordinates.
-        corners = sorted({(2 * (x + a), 2 * (y + b)) for x, y in supporting for a in (0, 1) for b in (0, 1)})
-        hull: list[Pair] = []
-        for points in (corners, corners[::-1]):
-            chain: list[Pair] = []
-            for point in points:
-                while len(chain) > 1 and cross(chain[-2], chain[-1], point) <= 0:
-                    chain.pop()
-                chain.append(point)
-            hull += chain[:-1]
-        edges = zip(hull, hull[1:] + hull[:1], strict=True)
-        return all(cross(a, b, size) > 2 * rules.support_margin * dist(a, b) for a, b in edges)
+    if rules.support in ("hull", "bearing"):
+        edges = hull_edges(supporting)
+        return bool(edges) and all(cross(a, b, size) > 2 * rules.support_margin * dist(a, b) for a, b in edges)
     return {"half": share >= 0.5, "more_than_half": share > 0.5, "full": share == 1}[rules.support]
+
+
+def hull_edges(supporting: list[Pair]) -> list[tuple[Pair, Pair]]:
+    """The edges of the convex hull of cells, counter-clockwise; in half cells, so that centres are whole."""
+    corners = sorted({(2 * (x + a), 2 * (y + b)) for x, y in supporting for a in (0, 1) for b in (0, 1)})
+    hull: list[Pair] = []
+    for points in (corners, corners[::-1]):
+        chain: list[Pair] = []
+        for point in points:
+            while len(chain) > 1 and cross(chain[-2], chain[-1], point) <= 0:
+                chain.pop()
+            chain.append(point)
+        hull += chain[:-1]
+    return list(zip(hull, hull[1:] + hull[:1], strict=True))
 
 
 def cross(a: Pair, b: Pair, c: Pair) -> int:
@@ -105,7 +109,8 @@ def inside(cell: Pair, grid: Grid) -> bool:
 class Oracle:
     """One environment: an episode's tote and the item that waits in the bin.
 
-    `item` is `(w, d, h)` and `position` the bin cell of its corner; `heights` is `[W_T][D_T]`.
+    `item` is `(w, d, h)` and `position` the bin cell of its corner; `heights` is `[W_T][D_T]`, and so is `bearing`,
+    1 where a cell bears weight.
     """
 
     rules: Rules
@@ -114,10 +119,12 @@ class Oracle:
     position: Pair
     heights: Grid = field(default_factory=list)
     volume: int = 0
+    bearing: Grid = field(default_factory=list)
 
     def __post_init__(self):
         wide, deep, _ = self.rules.tote_size
         self.heights = self.heights or [[0] * deep for _ in range(wide)]
+        self.bearing = self.bearing or [[1] * deep for _ in range(wide)]
 
     def bin_depth(self) -> Grid:
         """Height above the bin's floor, `[W_B][D_B]`."""
@@ -170,7 +177,8 @@ class Oracle:
             return ITEM_COLLISION, None
 
         x, y = footprint[0]
-        if not is_stable(rules, [(a - x, b - y) for a, b in footprint if heights[a][b] == z], size):
+        supporting = [(a, b) for a, b in footprint if heights[a][b] == z and self.bearing[a][b]]
+        if not is_stable(rules, [(a - x, b - y) for a, b in supporting], size):
             return UNSTABLE, None
 
         if rules.pick_ok is not None:
@@ -182,6 +190,21 @@ class Oracle:
         for x, y in footprint:
             after[x][y] = top
         return SUCCESS, after
+
+    def bearing_after(self, action: int) -> Grid:
+        """Where the tote bears weight after an action that succeeds: what is inside the hull of what supports it."""
+        after = [column[:] for column in self.bearing]
+        if self.rules.support != "bearing":
+            return after
+        heights = self.try_action(action)[1]
+        grid = cells((0, 0), self.rules.tote_size[:2])
+        footprint = [(x, y) for x, y in grid if heights[x][y] != self.heights[x][y]]
+        z = heights[footprint[0][0]][footprint[0][1]] - self.item[2]
+        edges = hull_edges([(x, y) for x, y in footprint if self.heights[x][y] == z and self.bearing[x][y]])
+        for x, y in footprint:
+            corners = [(2 * (x + a), 2 * (y + b)) for a in (0, 1) for b in (0, 1)]
+            after[x][y] = int(all(cross(a, b, corner) >= 0 for a, b in edges for corner in corners))
+        return after
 
     def full_mask(self) -> list[bool]:
         """For each of the `N_a` flat actions, whether it would succeed."""
@@ -200,6 +223,7 @@ class Oracle:
         if failure != SUCCESS:
             return 0, True, failure
         reward = self.item[0] * self.item[1] * self.item[2]
+        self.bearing = self.bearing_after(action)
         self.heights, self.volume = after, self.volume + reward
         self.item, self.position = next_item, next_position
         stuck = not self.has_feasible_action(try_first)

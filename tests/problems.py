@@ -13,6 +13,7 @@ from pickplace import CellSpec, Item, PickPlaceEnv, State
 from pickplace.planners.heuristics import RandomFeasible
 from pickplace.task.cell import Limits
 from pickplace.task.items import Uniform
+from pickplace.task.state import surface_from
 
 SIDES, NEVER = st.integers(1, 4), st.just(False)
 
@@ -23,24 +24,30 @@ SUPPORTS = [
     ("full", 0.0),
     ("hull", 0.0),
     ("hull", 0.3),
+    ("bearing", 0.0),
+    ("bearing", 0.2),
     (0.0, 0.0),
     (2 / 3, 0.0),
 ]
 
 
 class Case(NamedTuple):
-    """The state of a problem: height of the tote, heights ``[W_T, D_T]`` in it, and ``(x, y, w, d, h)`` in the bin."""
+    """The state of a problem: height of the tote, heights ``[W_T, D_T]`` in it, where they bear weight, and
+    ``(x, y, w, d, h)`` in the bin."""
 
     rim: int
     heights: np.ndarray
+    bearing: np.ndarray
     item: tuple[int, int, int, int, int]
 
 
 def state_of(*cases: Case) -> State:
     """Return cases as the state of a batch."""
-    heights = torch.from_numpy(np.stack([case.heights for case in cases])).int()
+    heights, bearing = (
+        torch.from_numpy(np.stack([getattr(case, key) for case in cases])) for key in ("heights", "bearing")
+    )
     items = torch.tensor([case.item for case in cases])
-    return State(heights, torch.tensor([case.rim for case in cases]), Item(*items.unbind(1)))
+    return State(surface_from(heights, bearing), torch.tensor([case.rim for case in cases]), Item(*items.unbind(1)))
 
 
 def oracle_of(cell: CellSpec, case: Case) -> Oracle:
@@ -48,7 +55,7 @@ def oracle_of(cell: CellSpec, case: Case) -> Oracle:
     tables = {} if cell.limits is None else {key: value.tolist() for key, value in vars(cell.limits).items()}
     names = ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "support", "support_margin")
     rules = Rules(**{name: getattr(cell, name) for name in names}, **tables)
-    return Oracle(rules, case.rim, case.item[2:], case.item[:2], case.heights.tolist())
+    return Oracle(rules, case.rim, case.item[2:], case.item[:2], case.heights.tolist(), bearing=case.bearing.tolist())
 
 
 def random_limits(cell: CellSpec, seed: int) -> Limits:
@@ -81,7 +88,9 @@ def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=NEVER, 
         rim = draw(st.integers(2, 6))
         levels = [0, *draw(st.lists(st.integers(0, rim), max_size=3))]
         heights = np.random.default_rng(draw(st.integers(0, 999))).choice(levels, size=(tote_w, tote_d))
-        cases.append(Case(rim, heights, item))
+        weak = draw(st.sampled_from([0.0, 0.3])) * (support == "bearing")
+        bearing = (np.random.default_rng(draw(st.integers(0, 999))).random((tote_w, tote_d)) >= weak).astype(int)
+        cases.append(Case(rim, heights, bearing, item))
     return cell, cases
 
 
@@ -93,6 +102,7 @@ SETTINGS = [
     {"num_envs": 4, "tote_size": (7, 5, 4), "effector_size": (4, 2), "bin_size": (6, 4, 2), "rotations": 3},
     {"num_envs": 4, "tote_size": (5, 6, 3), "effector_size": (2, 3), "pick_rule": "overlap", "rotations": 2},
     {"num_envs": 4, "tote_size": (5, 5, 4), "items": Uniform((1, 2), (1, 3), (1, 2)), "support": "more_than_half"},
+    {"num_envs": 4, "tote_size": (6, 6, 6), "items": Uniform((1, 3), (1, 3), (1, 2)), "support": "bearing"},
 ]
 
 
@@ -114,7 +124,8 @@ def late_state(steps=8, **settings):
 def results_by_hand(env, observation, row: int) -> dict[int, tuple[int, int, int, int, int]]:
     """Return every feasible flat action of a problem, in plain Python: ``{action: (top, y, x, w, d)}``, of where the
     item comes to lie."""
-    case = Case(int(env.tote_height[row]), env.heights[row].numpy(), tuple(env.item[row].tolist()))
+    heights, bearing = env.state.heights[row].numpy(), env.state.bearing[row].int().numpy()
+    case = Case(int(env.tote_height[row]), heights, bearing, tuple(env.item[row].tolist()))
     plain, found = oracle_of(env.cell, case), {}
     for action in observation["action_mask"][row].nonzero()[:, 0].tolist():
         failure, after = plain.try_action(action)

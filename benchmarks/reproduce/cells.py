@@ -10,6 +10,7 @@ DEFINITIONS = Path(__file__).with_name("definitions.yaml")
 #: The override that an axis sets. Of `method` there is none: it only stands in names.
 AXES = {"R": "env.rotations", "tote": "env.tote_size", "K": "planner.candidates", "seed": "seed", "items": "items"}
 AXES |= {"env": "env", "planner": "planner", "packer": "packer", "mask": "planner.mask", "method": ""}
+PAPERS_RULE = "env.support=half"
 AXES |= {"simulations": "planner.simulations", "samples": "planner.samples"}
 
 
@@ -38,7 +39,8 @@ def expand(entry: dict, command: str) -> list[Cell]:
         set_ = {axis: f"[{value.replace('x', ',')}]" if axis == "tote" else value for axis, value in point.items()}
         if command == "pickplace-evaluate":  # all play the same episodes: the seed is that of the training
             set_.pop("seed", None)
-        overrides = [f"{AXES[axis]}={value}" for axis, value in set_.items() if AXES[axis]]
+        overrides = [] if "packer" in point else [PAPERS_RULE]
+        overrides += [f"{AXES[axis]}={value}" for axis, value in set_.items() if AXES[axis]]
         overrides += entry.get("set", "").split()
         training = entry["training"].format(**point) if "training" in entry else None
         program = "placement_only.py" if "packer" in point else command

@@ -10,7 +10,7 @@ from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import footprint_mask, placing_maps
 from pickplace.task.grasps import available_offsets
 from pickplace.task.items import ItemDistribution
-from pickplace.task.state import Item, State
+from pickplace.task.state import EMPTY, Item, State
 
 MAX_POSITIONS = 2_000_000  # of items in the bin, all kinds together, that are checked one by one
 
@@ -69,7 +69,7 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
             distinct.setdefault(keys[index].tobytes(), int(numbers[index]))
     for chunk in rows[list(distinct.values())].split(max(1, min(1024, 2**24 // cell.num_footprints))):
         item = Item(*chunk[:, :5].unbind(-1))
-        empty = torch.zeros(len(chunk), *cell.tote_size[:2], dtype=torch.int32)
+        empty = torch.full((len(chunk), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
         maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), item))
         feasible = footprint_mask(cell, maps).flatten(1).any(1)
         if not feasible.all():

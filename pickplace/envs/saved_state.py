@@ -41,18 +41,20 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
             raise CheckpointError(f"The checkpoint's environment is of no use: {key}: expected {expected}.")
 
     cell = env.cell
-    heights, tote_height, volume, steps = (saved[key] for key in ("heights", "tote_height", "volume", "steps"))
+    surface, tote_height, volume, steps = (saved[key] for key in ("surface", "tote_height", "volume", "steps"))
     episode, seed = saved["episode"], saved["item_seed"]
     low, high = env.min_tote_height, cell.tote_size[2]
     check("tote_height", (tote_height >= low) & (tote_height <= high), f"{low} to {high}")
-    check("heights", (heights >= 0) & (heights <= tote_height[:, None, None]), "0 to tote_height")
+    state = State(surface, tote_height, Item(*saved["item"].unbind(-1)))
+    heights = state.heights
+    check("surface", (heights >= 0) & (heights <= tote_height[:, None, None]), "heights of 0 to tote_height")
     check("volume", (volume >= 0) & (volume <= heights.sum((1, 2))), "at most the volume below the surface")
     check("steps", (steps >= 0) & (steps <= volume), "at most one for each unit of volume")
     check("episode", episode >= 0, "at least 0")
     check("item_seed", (seed >= 0) & (seed < MAX_SEED), "at least 0 and below 2**62")
     item = env.items.sample(env.stream, seed.expand_as(episode), episode, steps, cell.bin_size)
     check("item", saved["item"] == torch.stack(item, -1), "the item of this episode and step")
-    seen = observe(STANDARD_TERMS, cell, State(heights, tote_height, Item(*item)))
+    seen = observe(STANDARD_TERMS, cell, state)
     seen["occupancy"] = (volume / cell.tote_volume(tote_height))[:, None]
     seen |= {key: torch.zeros(len(steps), 1) for key in ("failure", "done", "terminated", "truncated")}
     for key, value in seen.items():

@@ -17,7 +17,7 @@ from pickplace.task.checks import check_bytes, excerpt, one_of, whole_number
 from pickplace.task.feasibility import PlacingMaps, action_mask, footprint_mask, placing_maps
 from pickplace.task.items import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.task.observation import Term, check_terms, observe
-from pickplace.task.state import Failure, Item, State
+from pickplace.task.state import EMPTY, Failure, Item, State
 from pickplace.task.transition import apply
 
 CACHE_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes
@@ -48,6 +48,7 @@ class PickPlaceEnv(EnvBase):
     Observation space:
         * ``bin_depth``, float32 ``[N, W_B, D_B]``: height above the bin's floor, 0 where empty.
         * ``tote_depth``, float32 ``[N, W_T, D_T]``: remaining height, ``H_T - height``.
+        * ``tote_bearing``, float32 ``[N, W_T, D_T]``: 1 where the cell bears weight; all 1 unless ``support=bearing``.
         * ``tote_height``, int64 ``[N, 1]``: ``H_T`` of the running episode.
         * further terms, see ``observation``.
         * ``action_mask``, bool ``[N, N_a]``: True where and only where the action would succeed.
@@ -73,7 +74,7 @@ class PickPlaceEnv(EnvBase):
         device: where the tensors live.
         stream: family of item streams, ``"train"``, ``"validation"`` or ``"test"``; they never meet.
         masks: which masks to emit, any of ``"action"`` and ``"footprint"``.
-        observation: what the agent sees, :class:`~pickplace.task.observation.Term` by key; by default the three depth
+        observation: what the agent sees, :class:`~pickplace.task.observation.Term` by key; by default the four
             terms above, which are always among them.
         first_episode: number of the episode that slot 0 plays first; slot ``i`` plays ``first_episode + i``.
         episode_stride: after an episode a slot plays the one that comes this much later; by default ``num_envs``.
@@ -129,7 +130,7 @@ class PickPlaceEnv(EnvBase):
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
 
         # All run-time state, in buffers, so that state_dict() has it.
-        self.register_buffer("heights", zeros(*cell.tote_size[:2], dtype=torch.int32))
+        self.register_buffer("surface", zeros(*cell.tote_size[:2], dtype=torch.int32) + EMPTY)
         self.register_buffer("tote_height", zeros() + cell.tote_size[2])
         self.register_buffer("item", zeros(5))  # x, y, w, d, h
         self.register_buffer("volume", zeros())
@@ -218,7 +219,7 @@ class PickPlaceEnv(EnvBase):
         if bool((rows & ((height < low) | (height > high))).any()):
             bad = height[rows & ((height < low) | (height > high))][0].item()
             raise ValueError(f"tote_height={bad}: expected between {low} (the tallest item) and {high} (tote_size[2]).")
-        self.heights.masked_fill_(rows[:, None, None], 0)
+        self.surface.masked_fill_(rows[:, None, None], EMPTY)
         self.tote_height.copy_(torch.where(rows, height, self.tote_height))
         self.volume.masked_fill_(rows, 0)
         self.steps.masked_fill_(rows, 0)
@@ -240,7 +241,7 @@ class PickPlaceEnv(EnvBase):
         step = apply(self.cell, state, action)
         placed = step.failure == 0
         gained = torch.where(placed, state.item.volume, 0)
-        self.heights.copy_(step.heights)
+        self.surface.copy_(step.surface)
         self.volume.add_(gained)
         self.steps.add_(placed)
         arriving = self._arriving()
@@ -273,7 +274,7 @@ class PickPlaceEnv(EnvBase):
     @property
     def state(self) -> State:
         """The state of all problems."""
-        return State(self.heights, self.tote_height, self.current_item)
+        return State(self.surface, self.tote_height, self.current_item)
 
     @property
     def exact_occupancy(self) -> Tensor:
@@ -296,22 +297,22 @@ class PickPlaceEnv(EnvBase):
             return
         index = slice(None) if len(numbers) == len(rows) else numbers
         make = self._masks_of_empty_totes if empty and self.device.type == "cpu" else self._masks_of
-        masks = make(self.heights[index], self.tote_height[index], self.item[index])
+        masks = make(self.surface[index], self.tote_height[index], self.item[index])
         self.feasible[index] = _any(next(iter(masks.values())))
         for name in self.masks:
             self._store(f"{name}_mask", index, masks[name])
 
-    def _masks_of(self, heights: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
+    def _masks_of(self, surface: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
         """Return the masks that are emitted, or ``footprint``, bool ``[M, ...]``, of problems ``[M, ...]``."""
-        maps = placing_maps(self.cell, State(heights, tote_height, Item(*item.unbind(-1))))
+        maps = placing_maps(self.cell, State(surface, tote_height, Item(*item.unbind(-1))))
         return {name: MASKS[name].make(self.cell, maps) for name in self.masks or ("footprint",)}
 
-    def _masks_of_empty_totes(self, heights: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
+    def _masks_of_empty_totes(self, surface: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
         """Return the same as :meth:`_masks_of`; episodes begin in few ways, so what was computed is kept."""
         keys = [tuple(key) for key in torch.cat([item, tote_height[:, None]], 1).tolist()]
         if unseen := {key: row for row, key in enumerate(keys) if key not in self._starts}:
             rows = torch.tensor(list(unseen.values()))
-            masks = self._masks_of(heights[rows], tote_height[rows], item[rows])
+            masks = self._masks_of(surface[rows], tote_height[rows], item[rows])
             if len(self._starts) * sum(mask.shape[1] for mask in masks.values()) > CACHE_BYTES:
                 self._starts = {key: self._starts[key] for key in keys if key in self._starts}
             # Copies, since a view would keep all of its batch in memory.

@@ -61,7 +61,7 @@ class _Batch:
         self.items_placed = torch.zeros(count, dtype=torch.int64, device=device)
         self.failure = torch.zeros(count, dtype=torch.int64, device=device)
         self.observation = env.reset()
-        self.final_heights, self.tote_height = env.heights.clone(), env.tote_height.clone()
+        self.final_heights, self.tote_height = env.state.heights, env.tote_height.clone()
         heights = enumerate(env.tote_height.tolist())
         self.recordings = {slot: Recording(first + slot, high) for slot, high in heights if first + slot in record}
 
@@ -102,7 +102,7 @@ class _Batch:
         self.occupancy = torch.where(ended, occupancy, self.occupancy)
         self.items_placed = torch.where(ended, env.steps, self.items_placed)
         self.failure = torch.where(ended, after["failure"][:, 0], self.failure)
-        self.final_heights = torch.where(ended[:, None, None], env.heights, self.final_heights)
+        self.final_heights = torch.where(ended[:, None, None], env.state.heights, self.final_heights)
         for slot, recording in self.recordings.items():
             if ended[slot]:
                 recording.ending, recording.occupancy = Failure(int(self.failure[slot])), float(occupancy[slot])

@@ -80,8 +80,8 @@ class Lookahead:
         streams = self.candidates * self.samples * 2 ** (self.rounds - 1)
         check_bytes(
             f"planner.candidates={self.candidates}, planner.samples={self.samples}, planner.rounds={self.rounds}",
-            len(state.heights) * streams * 16 * self.cell.num_footprints,
-            state.heights.device,
+            len(state.surface) * streams * 16 * self.cell.num_footprints,
+            state.surface.device,
         )
         maps = placing_maps(self.cell, state)
         logits = self.policy.footprint_logits(observation, footprint_mask(self.cell, maps).flatten(1))
@@ -111,7 +111,7 @@ class Lookahead:
             row, column = open_.nonzero(as_tuple=True)
             if len(row) == 0:
                 break
-            after = put_down(self.cell, state.heights[row], maps.rows(row), choice[row, column])
+            after = put_down(self.cell, state.surface[row], maps.rows(row), choice[row, column])
             volume = self._play_out(after, state.tote_height[row], row, streams, self.horizon)  # [rows, streams]
             first = volume[(column == 0).nonzero()[:, 0]]  # one for each problem that is open
             problem = torch.unique_consecutive(row, return_inverse=True)[1]
@@ -141,44 +141,44 @@ class Lookahead:
             return best
         both = row.repeat_interleave(2)  # the policy's own choice and the candidate, on the same items
         column = torch.stack([torch.zeros_like(row), best[row]], 1).flatten()
-        after = put_down(self.cell, state.heights[both], maps.rows(both), choice[both, column])
+        after = put_down(self.cell, state.surface[both], maps.rows(both), choice[both, column])
         volume = self._play_out(after, state.tote_height[both], both, self.samples, None).mean(1)
         gain = volume[1::2] - volume[::2]
         return best.index_put((row,), torch.where(gain > 0, best[row], 0))
 
-    def _play_out(self, heights: Tensor, tote_height: Tensor, problem: Tensor, streams: int, horizon) -> Tensor:
+    def _play_out(self, surface: Tensor, tote_height: Tensor, problem: Tensor, streams: int, horizon) -> Tensor:
         """Return the volume that the policy goes on to place, float64 ``[M, streams]``.
 
         Args:
-            heights: int32 ``[M, W_T, D_T]``.
+            surface: int32 ``[M, W_T, D_T]``.
             problem: int64 ``[M]``; equal ones meet equal items.
             horizon: items after which the critic judges the state; None: played out to the end.
         """
         cell, policy = self.cell, self.policy
         keys = [*policy.in_keys, *getattr(self.critic, "in_keys", ())]
         self._decisions += 1
-        heights, tote_height, problem = (x.repeat_interleave(streams, 0) for x in (heights, tote_height, problem))
-        stream = torch.arange(len(heights), device=heights.device) % streams
+        surface, tote_height, problem = (x.repeat_interleave(streams, 0) for x in (surface, tote_height, problem))
+        stream = torch.arange(len(surface), device=surface.device) % streams
         # The address of an imagined item: the planner's seed, this call, the problem and the stream.
         seed = problem * 1_000_003 + self._decisions * 7_919 + self.seed
-        volume = torch.zeros(len(heights), dtype=torch.float64, device=heights.device)
-        row = torch.arange(len(heights), device=heights.device)
+        volume = torch.zeros(len(surface), dtype=torch.float64, device=surface.device)
+        row = torch.arange(len(surface), device=surface.device)
         step = 0
         while len(row):
             item = self.items.sample("train", seed[row], stream[row], torch.full_like(row, step), cell.bin_size)
-            maps = placing_maps(cell, State(heights, tote_height[row], item))
+            maps = placing_maps(cell, State(surface, tote_height[row], item))
             mask = footprint_mask(cell, maps).flatten(1)
             going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]
             if len(going) < len(row):
-                row, heights, mask, maps = row[going], heights[going], mask[going], maps.rows(going)
+                row, surface, mask, maps = row[going], surface[going], mask[going], maps.rows(going)
                 item = maps.item
             if len(row) == 0:
                 break
-            observation = observe(self.terms, cell, State(heights, tote_height[row], item), keys)
+            observation = observe(self.terms, cell, State(surface, tote_height[row], item), keys)
             if step == horizon:
                 volume[row] += self.critic(observation)[:, 0].double()
                 break
-            heights = put_down(cell, heights, maps, policy.footprint_logits(observation, mask).argmax(1))
+            surface = put_down(cell, surface, maps, policy.footprint_logits(observation, mask).argmax(1))
             volume[row] += item.volume.double()
             step += 1
         return volume.view(-1, streams)

@@ -21,7 +21,7 @@ MAX_NODES = 1_000_000  # of all trees of a decision
 class _Node:
     """A tote and the item that has arrived."""
 
-    heights: Tensor  # int32 [W_T, D_T]
+    surface: Tensor  # int32 [W_T, D_T], of the tote
     item: Tensor  # int64 [5]
     untried: list[int] | None  # actions in random order, of which the last comes first; None: all N_a flat actions
     edges: dict[int, "_Edge"] = field(default_factory=dict)
@@ -36,7 +36,7 @@ class _Edge:
     visits: int = 0
     total: float = 0.0  # of the returns
     volume: int = 0  # that the action places
-    heights: Tensor | None = None  # what it leaves; None until it is simulated, and where it fails
+    surface: Tensor | None = None  # what it leaves; None until it is simulated, and where it fails
     failed: bool = False
     bins: list[_Node] = field(default_factory=list)
 
@@ -124,7 +124,7 @@ class MCTS:
         while (edge := self._choose(node)) is not None:
             edge.visits += 1
             path.append(edge)
-            if edge.heights is None or len(edge.bins) < int(edge.visits**self.widening):
+            if edge.surface is None or len(edge.bins) < int(edge.visits**self.widening):
                 break
             node = edge.bins[self._random.integers(len(edge.bins))]
         self._walks += 1
@@ -157,17 +157,17 @@ class MCTS:
         """
         walks = [walk for walk in walks if walk[1]]
         last = [(problem, path[-1]) for problem, path, over in walks if not over and not path[-1].failed]
-        self._carry_out([(problem, edge) for problem, edge in last if edge.heights is None], tote_height)
-        going = {  # the walks that go on, and the heights that they leave
-            number: path[-1].heights
+        self._carry_out([(problem, edge) for problem, edge in last if edge.surface is None], tote_height)
+        going = {  # the walks that go on, and the surface that they leave
+            number: path[-1].surface
             for number, (_, path, over) in enumerate(walks)
-            if not over and path[-1].heights is not None
+            if not over and path[-1].surface is not None
         }
         returns = torch.zeros(len(walks), dtype=torch.float64)
         if going:
             height = tote_height[[walks[number][0] for number in going]]
-            heights = torch.stack(list(going.values()))
-            arrived = State(heights, height, self._arriving(len(going)))
+            surface = torch.stack(list(going.values()))
+            arrived = State(surface, height, self._arriving(len(going)))
             nodes = self._nodes(arrived)
             for number, node in zip(going, nodes, strict=True):
                 walks[number][1][-1].bins.append(node)
@@ -182,28 +182,28 @@ class MCTS:
         if not tried:
             return
         cell, height = self.cell, tote_height[[problem for problem, _ in tried]]
-        heights = torch.stack([edge.node.heights for _, edge in tried])
+        surface = torch.stack([edge.node.surface for _, edge in tried])
         item = Item(*torch.stack([edge.node.item for _, edge in tried]).unbind(1))
-        state = State(heights, height, item)
+        state = State(surface, height, item)
         action = torch.tensor([edge.action for _, edge in tried])
         if self.mask:
-            after = put_down(cell, heights, placing_maps(cell, state), action)
+            after = put_down(cell, surface, placing_maps(cell, state), action)
             failed = [False] * len(tried)
         else:
             step = apply(cell, state, action)
-            after, failed = step.heights, (step.failure > 0).tolist()
+            after, failed = step.surface, (step.failure > 0).tolist()
         for (_, edge), left, bad, volume in zip(tried, after, failed, item.volume.tolist(), strict=True):
             edge.failed = bad
             if not bad:
-                edge.heights, edge.volume = left, volume
+                edge.surface, edge.volume = left, volume
 
     def _nodes(self, state: State) -> list[_Node]:
         """Return new nodes, with the actions to try."""
-        untried = [None] * len(state.heights)
+        untried = [None] * len(state.surface)
         if self.mask:
             mask = footprint_mask(self.cell, placing_maps(self.cell, state)).flatten(1).numpy()
             untried = [self._random.permutation(row.nonzero()[0]).tolist() for row in mask]
-        return [_Node(*parts) for parts in zip(state.heights, torch.stack(state.item, 1), untried, strict=True)]
+        return [_Node(*parts) for parts in zip(state.surface, torch.stack(state.item, 1), untried, strict=True)]
 
     def _arriving(self, count: int) -> Item:
         """Return bins from the item distribution, each drawn once."""
@@ -214,22 +214,22 @@ class MCTS:
 
     def _play_out(self, state: State) -> Tensor:
         """Return the volume that uniformly random actions place until the episode ends, float64 ``[M]``."""
-        cell, count = self.cell, len(state.heights)
+        cell, count = self.cell, len(state.surface)
         volume, row = torch.zeros(count, dtype=torch.float64), torch.arange(count)
         while True:
-            heights, tote_height, item = state
+            surface, tote_height, item = state
             if self.mask:
                 maps = placing_maps(cell, state)
                 mask = footprint_mask(cell, maps).flatten(1)
                 draw = torch.from_numpy(self._random.random(mask.shape, dtype=np.float32))
                 going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]
-                heights = put_down(cell, heights, maps, torch.where(mask, draw, -1.0).argmax(1))
+                surface = put_down(cell, surface, maps, torch.where(mask, draw, -1.0).argmax(1))
             else:
-                action = torch.from_numpy(self._random.integers(cell.num_actions, size=len(heights)))
+                action = torch.from_numpy(self._random.integers(cell.num_actions, size=len(surface)))
                 step = apply(cell, state, action)
-                heights, going = step.heights, (step.failure == 0).nonzero()[:, 0]
+                surface, going = step.surface, (step.failure == 0).nonzero()[:, 0]
             row = row[going]
             volume[row] += item.volume[going].double()
             if len(row) == 0:
                 return volume
-            state = State(heights[going], tote_height[going], self._arriving(len(row)))
+            state = State(surface[going], tote_height[going], self._arriving(len(row)))

@@ -92,6 +92,15 @@ class Lengths:
         return torch.from_numpy(whole.astype(np.int64))
 
 
+def flags_of_map(name: str, values, grid: tuple[int, int]) -> Tensor:
+    """Return a map of 0 and 1, int64 ``grid``; arguments and errors as of :meth:`Lengths.units_of_map`."""
+    array = _as_array(name, values, grid)
+    if (bad := (array != 0) & (array != 1)).any():
+        x, y = np.argwhere(bad)[0].tolist()
+        raise DepthMapError(f"{name}[{x}, {y}]: got {array[x, y]:g}, expected 0 or 1.")
+    return torch.from_numpy(array.astype(np.int64))
+
+
 def checked_number(name: str, value, wanted: str, accepts: Callable[[float], bool]) -> float:
     """Return a value as a finite number that ``accepts`` accepts; ``wanted`` describes such numbers."""
     try:

@@ -20,7 +20,16 @@ MAX_LINE = 2**24  # greatest length of a request, in bytes
 MAX_MAP = 2**26  # greatest size of a .npy file, in bytes
 
 #: Keys of a request; ``id`` comes back as it is.
-REQUEST_KEYS = ("id", "bin_depth", "tote_depth", "tote_height", "cell_size", "tolerance", "alternatives")
+REQUEST_KEYS = (
+    "id",
+    "bin_depth",
+    "tote_depth",
+    "tote_height",
+    "cell_size",
+    "tolerance",
+    "alternatives",
+    "tote_bearing",
+)
 
 
 def main() -> None:
@@ -42,6 +51,7 @@ def parser() -> argparse.ArgumentParser:
     add("checkpoint", help="a run folder, a checkpoint, or pretrained/<name>")
     add("--bin", metavar="NPY", help="depth map [W_B, D_B]: height above the bin's floor")
     add("--tote", metavar="NPY", help="depth map [W_T, D_T]: remaining height, from surface to rim")
+    add("--tote-bearing", metavar="NPY", help="map [W_T, D_T]: tote_bearing of the plan before; default: all 1")
     add("--tote-height", type=float, metavar="H", help="height of the tote's rim; default: that of --tote-size")
     add("--cell-size", type=float, metavar="M", help="side of a cell in metres, if the maps are in metres")
     add(
@@ -89,11 +99,12 @@ def run(args: argparse.Namespace) -> None:
     defaults = {key: getattr(args, key) for key in ("tote_height", "cell_size", "tolerance", "alternatives")}
     planner.check_settings(**defaults)  # now, not in the answer to each request
     if args.bin is not None:
-        maps = {"bin_depth": read_map(args.bin), "tote_depth": read_map(args.tote)}
+        files = {"bin_depth": args.bin, "tote_depth": args.tote, "tote_bearing": args.tote_bearing}
+        maps = {key: read_map(path) for key, path in files.items() if path is not None}
         try:
             result = plan_as_dict(planner, args.time, **maps, **defaults)
         except DepthMapError as error:
-            file = args.tote if str(error).startswith("tote_depth") else args.bin
+            file = next((path for key, path in files.items() if str(error).startswith(key)), args.bin)
             raise DepthMapError(f"{file}: {error}") from error
         write_output(json.dumps(result, indent=1) + "\n")
         return

@@ -17,14 +17,14 @@ from pickplace.planners.base import decide
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy
 from pickplace.policies.restore import load_policy
-from pickplace.robot.depth_maps import DepthMapError, Lengths, check_one_cuboid
+from pickplace.robot.depth_maps import DepthMapError, Lengths, check_one_cuboid, flags_of_map
 from pickplace.task.cell import CellSpec, reference_cell
 from pickplace.task.checks import excerpt, is_whole
 from pickplace.task.feasibility import action_footprints, action_mask, footprint_mask, placing_maps
 from pickplace.task.grasps import split_action
 from pickplace.task.maps import FAR
 from pickplace.task.observation import Term, check_terms, observe
-from pickplace.task.state import Failure, State
+from pickplace.task.state import EMPTY, Failure, State
 from pickplace.task.transition import Step, apply
 
 MAX_ALTERNATIVES = 100_000  # greatest number of choices that a plan may report
@@ -72,6 +72,8 @@ class Plan:
     occupancy_after: float
     alternatives: list[Alternative]  #: the most probable choices, best first
     reasons: dict[str, int] | None  #: if stuck or impossible: how many of all flat actions fail for each reason
+    #: with ``support="bearing"``: 1 where the tote bears weight once the item rests, for the next call; else None
+    tote_bearing: list[list[int]] | None
 
     def as_dict(self) -> dict:
         """Return the plan as plain values, ready for JSON."""
@@ -120,6 +122,7 @@ class Planner:
         cell_size: float | None = None,
         tolerance: float = 0.25,
         alternatives: int = 10,
+        tote_bearing=None,
     ) -> Plan:
         """Return where to pick the one item in the bin, where to place it and how to turn it.
 
@@ -132,13 +135,15 @@ class Planner:
             tolerance: how far, in height units, a measured height may be from a whole number of them; below 0.5.
             alternatives: how many of the most probable choices to report, and the chosen one if it is further down;
                 0 is fastest. Where no action is feasible, planning takes longest: all are simulated for the reasons.
+            tote_bearing: with ``support="bearing"``, ``[W_T, D_T]``, 1 where a cell bears weight, else 0: what the
+                plan before this one returned; None: every cell bears weight.
 
         Raises:
             DepthMapError: for a map of another shape or type, a value that is not finite, out of range or too far from
                 a whole number of height units, an empty bin, or anything but one cuboid in it; it names the cell.
         """
         lengths, height = self.check_settings(tote_height, cell_size, tolerance, alternatives)
-        state = self._read_state(bin_depth, tote_depth, height, lengths)
+        state = self._read_state(bin_depth, tote_depth, tote_bearing, height, lengths)
         observation = observe(self.terms, self.cell, state)
         status, action, step = self._decide(observation, state)
         capacity = self.cell.tote_volume(int(state.tote_height))
@@ -155,6 +160,7 @@ class Planner:
             occupancy_after=before if action is None else before + int(state.item.volume) / capacity,
             alternatives=self._alternatives(observation, state, action, alternatives),
             reasons=self._reasons(state) if status in ("stuck", "impossible") else None,
+            tote_bearing=self._bearing(state.surface if step is None else step.surface),
         )
         return plan if action is None or step is None else self._add_poses(plan, action, step, lengths)
 
@@ -170,7 +176,7 @@ class Planner:
             raise DepthMapError(f"alternatives={excerpt(alternatives)}: {expected}")
         return lengths, self.cell.tote_size[2] if tote_height is None else lengths.units_of_tote_height(tote_height)
 
-    def _read_state(self, bin_depth, tote_depth, height: int, lengths: Lengths) -> State:
+    def _read_state(self, bin_depth, tote_depth, tote_bearing, height: int, lengths: Lengths) -> State:
         """Return the state that measured maps show; ``height`` is the tote's, in height units."""
         cell = self.cell
         bin_map = lengths.units_of_map("bin_depth", bin_depth, cell.bin_size[:2], FAR)
@@ -182,9 +188,18 @@ class Planner:
                 f"bin_depth: the item is {longest} cells long, longer than any in training; expected at most "
                 f"{cell.max_side}."
             )
+        bearing = torch.ones_like(tote_map)
+        if tote_bearing is not None:
+            bearing = flags_of_map("tote_bearing", tote_bearing, cell.tote_size[:2])
+            if cell.support != "bearing" and not bearing.all():
+                raise DepthMapError(f"tote_bearing: got a 0 with support={cell.support}, expected support=bearing.")
         device = next(self._planner.policy.parameters()).device
-        measured = {"bin_depth": bin_map.float(), "tote_depth": tote_map, "tote_height": torch.tensor(height)}
+        measured = {"bin_depth": bin_map.float(), "tote_depth": tote_map, "tote_bearing": bearing}
+        measured["tote_height"] = torch.tensor(height)
         return State.from_observation({key: value[None].to(device) for key, value in measured.items()})
+
+    def _bearing(self, surface: Tensor) -> list[list[int]] | None:
+        return (surface[0] & 1).tolist() if self.cell.support == "bearing" else None
 
     def _decide(self, observation, state: State) -> tuple[str, Tensor | None, Step | None]:
         """Return the status, and if an action was found that succeeds, the action and its effect."""
@@ -192,7 +207,7 @@ class Planner:
             action = decide(self._planner, self.cell, observation)
             step = apply(self.cell, state, action)
             return ("ok", action, step) if int(step.failure[0]) == 0 else ("rejected", None, None)
-        empty = state._replace(heights=torch.zeros_like(state.heights))
+        empty = state._replace(surface=torch.full_like(state.surface, EMPTY))
         return "stuck" if _any_feasible(self.cell, empty) else "impossible", None, None
 
     def _add_poses(self, plan: Plan, action: Tensor, step: Step, lengths: Lengths) -> Plan:
@@ -281,7 +296,7 @@ class Planner:
 
     def _reasons(self, state: State) -> dict[str, int]:
         """Return how many of all flat actions fail for each reason."""
-        codes = self._simulate(state, torch.arange(self.cell.num_actions, device=state.heights.device))
+        codes = self._simulate(state, torch.arange(self.cell.num_actions, device=state.surface.device))
         counts = codes.bincount(minlength=len(Failure)).tolist()
         return {failure.name.lower(): counts[failure] for failure in Failure if counts[failure]}
 

@@ -36,6 +36,7 @@ REGISTRY: dict[str, dict[str, str]] = {
     "env.observation.*": {
         "bin_depth": "pickplace.task.observation.BinDepth",
         "tote_depth": "pickplace.task.observation.ToteDepth",
+        "tote_bearing": "pickplace.task.observation.ToteBearing",
         "tote_height": "pickplace.task.observation.ToteHeight",
     },
     "items": {

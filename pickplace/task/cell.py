@@ -11,7 +11,8 @@ from pickplace.task.checks import excerpt, is_number, is_whole, number, one_of, 
 
 PICK_RULES = ("contain", "overlap")
 
-SUPPORT_RULES = ("half", "more_than_half", "hull", "full")
+HULL_RULES = ("hull", "bearing")
+SUPPORT_RULES = ("half", "more_than_half", "hull", "bearing", "full")
 
 #: Greatest side of a grid or height, in cells or height units, and greatest side of an end effector.
 MAX_SIDE, MAX_EFFECTOR = 2_000, 64
@@ -80,8 +81,11 @@ class CellSpec:
         pick_rule: ``"contain"`` (the end effector covers the whole item) or ``"overlap"`` (one shared cell is enough).
         support: the stability rule, on the cells below the footprint that are as high as the highest of them:
             ``"half"`` (at least half of the footprint), ``"more_than_half"``, ``"full"``, ``"hull"`` (the item's
-            centre lies inside their convex hull), or a number, the least share of the footprint.
-        support_margin: of ``"hull"``: distance from the hull's edge that the centre must exceed, in cells.
+            centre lies inside their convex hull), ``"bearing"`` (the same, and a cell of another item counts only
+            where it lies inside the hull of that item's own supporting cells), or a number, the least share of the
+            footprint.
+        support_margin: of ``"hull"`` and ``"bearing"``: distance from the hull's edge that the centre must exceed, in
+            cells.
         height_unit: length of a height unit, in sides of a cell. The rules only count units; what converts heights to
             lengths (the robot's planner, the replay page) multiplies by it.
         longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and under
@@ -97,8 +101,8 @@ class CellSpec:
     effector_size: tuple[int, int] = (3, 3)
     rotations: int = 4
     pick_rule: str = "contain"
-    support: str | float = "half"
-    support_margin: float = 0.0
+    support: str | float = "bearing"
+    support_margin: float = 0.25
     height_unit: float = 1.0
     longest_side: int | None = field(default=None, metadata={"derived": True})
     limits: Limits | None = field(default=None, compare=False, metadata={"derived": True})
@@ -115,8 +119,6 @@ class CellSpec:
         if isinstance(self.support, str) or not is_number(self.support) or not 0 <= self.support <= 1:
             one_of("support", self.support, SUPPORT_RULES, "a number between 0 and 1")
         number("support_margin", self.support_margin, 0, 100)
-        if self.support_margin and self.support != "hull":
-            raise ValueError(f"support_margin={self.support_margin:g}: expected 0, or support=hull.")
         object.__setattr__(self, "height_unit", float(number("height_unit", self.height_unit, 1e-3, 1e3)))
         if self.longest_side is not None:
             whole_number("longest_side", self.longest_side)

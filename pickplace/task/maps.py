@@ -43,19 +43,19 @@ def rectangle(grid: Sequence[int], x: Tensor, y: Tensor, w: Tensor, d: Tensor) -
     return in_x[:, None] & in_y
 
 
-def squares(heights: Tensor, x: Tensor, y: Tensor, side: int) -> Tensor:
-    """Return a square of cells of each height map, ``[side * side, N]``, row by row.
+def squares(surface: Tensor, x: Tensor, y: Tensor, side: int) -> Tensor:
+    """Return a square of cells of each surface, ``[side * side, N]``, row by row.
 
     Args:
-        heights: ``[N, W, D]``.
-        x, y: int64 ``[N]``, the square's minimum corner. Cells outside the map get the height of the nearest cell.
+        surface: ``[N, W, D]``.
+        x, y: int64 ``[N]``, the square's minimum corner. Cells outside the map get the value of the nearest cell.
         side: of the square, in cells.
     """
-    _, wide, deep = heights.shape
+    _, wide, deep = surface.shape
     step = torch.arange(side, device=x.device)[:, None]
     column, row = (x + step).clamp_(0, wide - 1), (y + step).clamp_(0, deep - 1)  # [side, N]
     index = (column * deep)[:, None] + row
-    return heights.flatten(1).t().gather(0, index.flatten(0, 1))
+    return surface.flatten(1).t().gather(0, index.flatten(0, 1))
 
 
 def is_under(w: Tensor, d: Tensor, side: int) -> Tensor:

@@ -62,6 +62,16 @@ class ToteDepth(Term):
         return depth_from_heights(state.heights, state.tote_height)
 
 
+class ToteBearing(Term):
+    """1 where a cell of the tote bears weight, else 0, float32 ``[N, W_T, D_T]``; all 1 unless ``support=bearing``."""
+
+    def bounds(self, cell, tallest):
+        return Bounds(0, 1, cell.tote_size[:2])
+
+    def value(self, cell, state):
+        return state.bearing.float()
+
+
 class ToteHeight(Term):
     """Height ``H_T`` of the episode's tote, int64 ``[N, 1]``; height units."""
 
@@ -76,6 +86,7 @@ class ToteHeight(Term):
 STANDARD_TERMS: Mapping[str, Term] = {
     "bin_depth": BinDepth(),
     "tote_depth": ToteDepth(),
+    "tote_bearing": ToteBearing(),
     "tote_height": ToteHeight(),
 }
 
@@ -111,7 +122,8 @@ def check_terms(terms: Mapping[str, Term] | None) -> dict[str, Term]:
     """Return the terms of an observation, the standard ones first; None gives those alone.
 
     Raises:
-        ValueError: naming the key, for something else than a term, a key that is taken, or a standard term that lacks.
+        ValueError: naming the key, for something else than a term, a key that is taken, or another term for a standard
+            one.
     """
     if terms is None:
         return dict(STANDARD_TERMS)
@@ -124,10 +136,10 @@ def check_terms(terms: Mapping[str, Term] | None) -> dict[str, Term]:
         if not isinstance(key, str) or key in RESERVED or not key.isidentifier():
             raise ValueError(f"{place}: expected another name; taken are {', '.join(RESERVED)}.")
     for key, term in STANDARD_TERMS.items():
-        if type(found := terms.get(key)) is not type(term):
+        if type(found := terms.get(key, term)) is not type(term):
             expected = f"{type(term).__name__}, which is always there"
             raise ValueError(f"observation.{key}={excerpt(found)}: expected {expected}.")
-    return {key: terms[key] for key in (*STANDARD_TERMS, *(key for key in terms if key not in STANDARD_TERMS))}
+    return {**STANDARD_TERMS, **terms}
 
 
 def observe(

@@ -1,4 +1,7 @@
-"""Placing: how high an item rests on a footprint, whether it is stable there, and what the end effector must clear."""
+"""Placing: how high an item rests on a footprint, whether it is stable there, and what the end effector must clear.
+
+Surfaces, see :func:`~pickplace.task.state.surface_from`, are halved where heights are needed.
+"""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -8,7 +11,7 @@ from torch import Tensor
 
 from pickplace.task.cell import CellSpec
 from pickplace.task.maps import FAR, NEVER, is_under, surround, windows
-from pickplace.task.state import State
+from pickplace.task.state import State, surface_from
 from pickplace.task.support import is_supported
 
 
@@ -19,13 +22,13 @@ def rest(cells: Sequence[Tensor], under: Sequence[Tensor]) -> Tensor:
     Loops over cells, so that the inner loops run over whole maps, which is fast.
 
     Args:
-        cells: for each cell of a square at the footprint's minimum corner its height, int32, all of one shape.
+        cells: for each cell of a square at the footprint's minimum corner its surface, int32, all of one shape.
         under: whether the item covers that cell, bool, broadcastable.
     """
-    z = torch.full((), NEVER, dtype=cells[0].dtype, device=cells[0].device)
-    for height, used in zip(cells, under, strict=True):
-        z = torch.maximum(z, torch.where(used, height, NEVER))
-    return z
+    highest = torch.full((), NEVER, dtype=cells[0].dtype, device=cells[0].device)
+    for surface, used in zip(cells, under, strict=True):
+        highest = torch.maximum(highest, torch.where(used, surface, NEVER))
+    return highest >> 1
 
 
 def overflows(top: Tensor, tote_height: Tensor) -> Tensor:
@@ -46,7 +49,7 @@ def resting_top(cell: CellSpec, state: State) -> Tensor:
     too small.
     """
     side, item = cell.max_side, state.item
-    padded = surround(state.heights.permute(1, 2, 0), (0, side - 1, 0, side - 1), FAR)
+    padded = surround(state.surface.permute(1, 2, 0), (0, side - 1, 0, side - 1), FAR)
     w, d = (torch.stack(pair)[: cell.parities] for pair in ((item.w, item.d), (item.d, item.w)))
     w, d = w[:, None, None], d[:, None, None]  # [Q, 1, 1, N]
     cells, under = windows(padded, side).flatten(0, 1).unbind(0), is_under(w, d, side).unbind(0)
@@ -61,14 +64,14 @@ def clearance(cell: CellSpec, state: State) -> Tensor:
 
     That is the highest tote cell under the end effector; where it leaves the tote, the rim.
     """
-    (tote_w, tote_d, _), heights = cell.tote_size, state.heights
-    maps = heights.new_empty(cell.parities, tote_w, tote_d, len(heights))
-    rim = state.tote_height.to(heights.dtype)
+    (tote_w, tote_d, _), surface = cell.tote_size, state.surface
+    maps = surface.new_empty(cell.parities, tote_w, tote_d, len(surface))
+    rim = surface_from(state.tote_height)
     for parity, shape in enumerate(cell.effectors):
         after_x, after_y = shape.width - 1 - shape.ref_x, shape.depth - 1 - shape.ref_y
-        walled = surround(heights.permute(1, 2, 0), (shape.ref_x, after_x, shape.ref_y, after_y), rim)
+        walled = surround(surface.permute(1, 2, 0), (shape.ref_x, after_x, shape.ref_y, after_y), rim)
         # The maximum over a rectangle is a maximum along one axis, then along the other.
         for axis, size, grid in ((0, shape.width, tote_w), (1, shape.depth, tote_d)):
             walled = reduce(torch.maximum, [walled.narrow(axis, i, grid) for i in range(size)])
-        maps[parity] = walled
+        maps[parity] = walled >> 1
     return maps.permute(3, 0, 1, 2)

@@ -1,4 +1,4 @@
-"""The state of a problem: the item in the bin, the heights in the tote, and why an episode ended."""
+"""The state of a problem: the item in the bin, the surface in the tote, and why an episode ended."""
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
@@ -9,6 +9,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from pickplace.task.maps import rectangle
+
+EMPTY = 1  # surface of an empty tote, see `surface_from`
 
 #: An observation ``[N]``: a TensorDict, or a dict of its entries.
 Observation: TypeAlias = TensorDictBase | Mapping[str, Tensor]
@@ -81,24 +83,48 @@ class Item(NamedTuple):
 class State(NamedTuple):
     """Everything that the rules need to know of ``N`` problems."""
 
-    heights: Tensor  # int32 [N, W_T, D_T]: height of the surface in the tote
+    surface: Tensor  # int32 [N, W_T, D_T]: of what the tote holds, see `surface_from`
     tote_height: Tensor  # int64 [N]: height of the episode's tote, H_T
     item: Item  # what lies in the bin
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "State":
-        """Return the state that ``bin_depth``, ``tote_depth`` and ``tote_height`` of an observation ``[N]`` show."""
+        """Return the state that the standard terms of an observation ``[N]`` show."""
         tote_height = observation["tote_height"].reshape(-1)
         heights = heights_from_depth(observation["tote_depth"], tote_height)
-        return cls(heights, tote_height, item_from_depth(observation["bin_depth"]))
+        surface = surface_from(heights, observation["tote_bearing"])
+        return cls(surface, tote_height, item_from_depth(observation["bin_depth"]))
+
+    @property
+    def heights(self) -> Tensor:
+        """The height of each cell of the tote, int32 ``[N, W_T, D_T]``."""
+        return self.surface >> 1
+
+    @property
+    def bearing(self) -> Tensor:
+        """Whether each cell of the tote bears weight, bool ``[N, W_T, D_T]``."""
+        return (self.surface & 1).bool()
 
     def rows(self, index) -> "State":
         """Return the state of some problems, by their numbers, which may come up more than once."""
-        return State(self.heights[index], self.tote_height[index], self.item.rows(index))
+        return State(self.surface[index], self.tote_height[index], self.item.rows(index))
 
     def repeat(self, count: int) -> "State":
         """Return each problem ``count`` times, one copy after the other."""
-        return self.rows(torch.arange(len(self.heights), device=self.heights.device).repeat_interleave(count))
+        return self.rows(torch.arange(len(self.surface), device=self.surface.device).repeat_interleave(count))
+
+
+def surface_from(heights: Tensor, bearing: Tensor | int = 1) -> Tensor:
+    """Return twice the heights, and one more where a cell bears weight: int32 of the same shape.
+
+    The two stay in one number, because the rules ask about them together: the cells that support an item are those
+    with the greatest possible value under it.
+
+    Args:
+        heights: whole numbers.
+        bearing: bool, or 0 and 1, of that shape; by default every cell bears weight.
+    """
+    return 2 * heights.int() + (bearing if isinstance(bearing, int) else bearing.int())
 
 
 def depth_from_heights(heights: Tensor, tote_height: Tensor) -> Tensor:

@@ -1,13 +1,16 @@
-"""Support: whether what an item rests on keeps it stable.
+"""Support: whether what an item rests on keeps it stable, and where it may bear weight itself.
 
-The *supporting cells* are the cells under the footprint that are as high as the highest of them. A rule decides by
-their number, or by their convex hull: an item tilts unless the vertical line through its centre passes the hull.
+The *supporting cells* are the cells under the footprint that are as high as the highest of them, and bear weight. A
+rule decides by their number, or by their convex hull: an item tilts unless the vertical line through its centre passes
+the hull. With ``bearing`` the top of an item bears weight only above the hull of its own supporting cells. Then
+whatever is put on it presses inside that hull, down to the floor, and no item tips the pile below it. With every other rule all
+cells bear weight.
 
-The hull is never computed. A point lies in a convex polygon if the polygon reaches beyond it along the normal of each
-of its edges. The corners of cells are lattice points, so the edges of every possible hull have one of a few directions.
-A supporting cell reaches beyond the centre along some of their normals, which is a pattern of bits; the item is stable
-if the patterns of its supporting cells cover all of them. That is exact, and as fast as counting for items of up to 3
-cells.
+The hull is never computed. A point lies in a convex polygon if the polygon reaches as far along the normal of each of
+its edges. The corners of cells are lattice points, so the edges of every possible hull have one of a few directions.
+For the centre, a supporting cell reaches beyond it along some of their normals, which is a pattern of bits; the item is
+stable if the patterns of its supporting cells cover all of them. That is exact, and as fast as counting for items of
+up to 3 cells.
 """
 
 from collections.abc import Sequence
@@ -17,11 +20,12 @@ from math import gcd
 import torch
 from torch import Tensor
 
-from pickplace.task.cell import CellSpec
+from pickplace.task.cell import HULL_RULES, CellSpec
+from pickplace.task.state import surface_from
 
 BITS = 32  # normals in a word of a pattern
 LEAST_SUPPORT: dict = {"half": 0.5, "full": 1.0}  # share of the footprint, of rules that have a name
-MAX_HULL_SIDE = 16  # longest side of an item with the hull rule, in cells: the tables grow with its sixth power
+MAX_HULL_SIDE = 16  # longest side of an item with the rules of the hull, in cells: the tables grow with its sixth power
 
 
 def is_supported(
@@ -31,33 +35,72 @@ def is_supported(
 
     Args:
         cell: has the rule, ``cell.support``.
-        cells: for each cell of a square at the footprint's minimum corner its height, int32, all of one shape.
+        cells: for each cell of a square at the footprint's minimum corner its surface, int32, all of one shape.
         under: whether the item covers that cell, bool, broadcastable.
-        z: the height on which the item rests.
+        z: the height on which the item rests, int32.
         w, d: the footprint's sides, broadcastable; 0 for no item.
     """
-    if cell.support == "hull":
-        return _is_in_hull(cells, z, w, d, cell.support_margin)
-    level = torch.zeros_like(z)
-    for height, used in zip(cells, under, strict=True):
-        level += (height == z) & used
-    share = level.double() / (w * d)
+    supporting = surface_from(z)
+    if cell.support in HULL_RULES:
+        return _is_in_hull(cells, supporting, w, d, cell.support_margin)
+    count = torch.zeros_like(z)
+    for surface, used in zip(cells, under, strict=True):
+        count += (surface == supporting) & used
+    share = count.double() / (w * d)
     if cell.support == "more_than_half":
         return share > 0.5
     return share >= LEAST_SUPPORT.get(cell.support, cell.support)
 
 
-def _is_in_hull(cells: Sequence[Tensor], z: Tensor, w: Tensor, d: Tensor, margin: float) -> Tensor:
+def _is_in_hull(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor, margin: float) -> Tensor:
     """Return whether the item's centre lies inside the hull, further than ``margin`` from its edge."""
     side = round(len(cells) ** 0.5)
-    stable, sizes = torch.ones_like(z, dtype=torch.bool), (w.clamp(min=1) - 1, d.clamp(min=1) - 1)
-    for patterns, whole in hull_patterns(side, margin, z.device):
+    stable, sizes = torch.ones_like(supporting, dtype=torch.bool), (w.clamp(min=1) - 1, d.clamp(min=1) - 1)
+    for patterns, whole in hull_patterns(side, margin, supporting.device):
         patterns, whole = patterns[:, *sizes], whole[sizes]
-        reached = torch.zeros_like(z)
-        for height, pattern in zip(cells, patterns, strict=True):
-            reached |= torch.where(height == z, pattern, 0)
+        reached = torch.zeros_like(supporting)
+        for surface, pattern in zip(cells, patterns, strict=True):
+            reached |= torch.where(surface == supporting, pattern, 0)
         stable &= reached == whole
     return stable
+
+
+def bears(cells: Tensor, under: Tensor, z: Tensor) -> Tensor:
+    """Return where the top of an item bears weight, with ``bearing``: the cells inside the hull of its supporting ones.
+
+    Args:
+        cells: int32 ``[side * side, N]``, as of :func:`is_supported`.
+        under: bool ``[side * side, N]``.
+        z: int32 ``[N]``.
+
+    Returns:
+        bool ``[side * side, N]``
+    """
+    inside, supporting = under.clone(), (cells == surface_from(z)) & under
+    for along in _extents(round(len(cells) ** 0.5), cells.device):
+        reached = torch.where(supporting, along[:, :, None], along.min() - 1).amax(1, keepdim=True)  # [normals, 1, N]
+        inside &= (along[:, :, None] <= reached).all(0)
+    return inside
+
+
+@lru_cache(maxsize=64)
+def _extents(side: int, device: torch.device) -> list[Tensor]:
+    """Return how far the cells of a square reach along normals, from its corner: int64 ``[BITS, side * side]`` each."""
+    near = torch.arange(side)
+    furthest = _furthest(_normals(side), torch.stack([near, near + 1])[..., None])[..., 0]  # [normals, axis, cell]
+    along = furthest[:, 0, :, None] + furthest[:, 1, None, :]
+    return [part.to(device) for part in along.flatten(1).split(BITS)]
+
+
+def _normals(side: int) -> Tensor:
+    """Return the normals of all edges that a hull of cells of a square can have, int64 ``[normals, 2]``."""
+    steps = range(-side, side + 1)
+    return torch.tensor([(x, y) for x in steps for y in steps if gcd(x, y) == 1])
+
+
+def _furthest(normals: Tensor, ends: Tensor) -> Tensor:
+    """Return the greater product of each normal's parts ``[normals, axis]`` with the two ends ``[2, ...]``."""
+    return (normals[:, :, None, None, None] * ends).amax(2)
 
 
 @lru_cache(maxsize=64)
@@ -77,17 +120,17 @@ def hull_patterns(side: int, margin: float, device: torch.device) -> list[tuple[
         ValueError: for a side beyond :data:`MAX_HULL_SIDE`.
     """
     if side > MAX_HULL_SIDE:
-        raise ValueError(f"support='hull': items may be {side} cells long; expected at most {MAX_HULL_SIDE}.")
-    steps = range(-side, side + 1)
-    normals = torch.tensor([(x, y) for x in steps for y in steps if gcd(x, y) == 1])
+        raise ValueError(
+            f"items may be {side} cells long; with support=hull and bearing expected at most {MAX_HULL_SIDE}."
+        )
     size, near = torch.arange(1, side + 1), torch.arange(side)
     # Twice the distance from the centre to the near and the far edge of each cell, by cell and size of the footprint.
     ends = torch.stack([2 * near[:, None] - size, 2 * near[:, None] + 2 - size])  # [2, cell, size]
     inside = near[:, None] < size
     inside = inside[:, None, :, None] & inside[None, :, None, :]  # [x, y, w, d]
     words = []
-    for chunk in normals.split(BITS):
-        furthest = (chunk[:, :, None, None, None] * ends).amax(2)  # [normals, axis, cell, size]
+    for chunk in _normals(side).split(BITS):
+        furthest = _furthest(chunk, ends)  # [normals, axis, cell, size]
         along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
         beyond = along > 2 * margin * chunk.double().norm(dim=1).view(-1, 1, 1, 1, 1)
         # Only directions of lattice edges that fit the footprint can be edges of a hull in it.

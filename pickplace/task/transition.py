@@ -19,17 +19,22 @@ from pickplace.task.grasps import (
 )
 from pickplace.task.maps import is_under, rectangle, squares
 from pickplace.task.placing import is_within_reach, overflows, rest
-from pickplace.task.state import Failure, State
-from pickplace.task.support import is_supported
+from pickplace.task.state import Failure, State, surface_from
+from pickplace.task.support import bears, is_supported
 
 
 class Step(NamedTuple):
     """The effect of one action."""
 
-    heights: Tensor  # int32 [N, W_T, D_T]
+    surface: Tensor  # int32 [N, W_T, D_T], see State
     failure: Tensor  # int64 [N]
     top: Tensor  # int64 [N]: height of the item's top, meaningful without failure
     footprint: Tensor  # int64 [N, 4]: x, y, w, d of the footprint in the tote
+
+    @property
+    def heights(self) -> Tensor:
+        """The height of each cell of the tote, int32 ``[N, W_T, D_T]``."""
+        return self.surface >> 1
 
 
 def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
@@ -38,7 +43,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     Args:
         action: int64 ``[N]``, the flat index, in ``[0, N_a)``.
     """
-    (heights, tote_height, item), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.effector_size
+    (surface, tote_height, item), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.effector_size
     x_bin, y_bin, x_tote, y_tote, rotation = split_action(cell, action)
     odd = rotation % 2 == 1
 
@@ -54,10 +59,10 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     # Placing.
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
     side, reach = cell.max_side, max(ee_w, ee_d)
-    cells, under = squares(heights, x, y, side).unbind(0), is_under(w, d, side).unbind(0)
+    cells, under = squares(surface, x, y, side).unbind(0), is_under(w, d, side).unbind(0)
     z = rest(cells, under)
     top = z.long() + item.h
-    highest = torch.where(is_under(wide, deep, reach), squares(heights, left, front, reach), 0).amax(0)
+    highest = torch.where(is_under(wide, deep, reach), squares(surface, left, front, reach), 0).amax(0) >> 1
     item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)
     effector_leaves = is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d)
 
@@ -76,20 +81,40 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     failure = torch.zeros_like(action)
     for kind, failed in checks:
         failure = torch.where(failed, int(kind), failure)
-    placed = rectangle((tote_w, tote_d), x, y, w, d) & (failure == 0)
-    after = torch.where(placed, top.to(heights.dtype), heights.permute(1, 2, 0))
-    return Step(after.permute(2, 0, 1).contiguous(), failure, top, torch.stack([x, y, w, d], -1))
+    footprint = torch.stack([x, y, w, d], -1)
+    after = _with_item(cell, surface, footprint, z, torch.where(failure == 0, item.h, 0))
+    return Step(after, failure, top, footprint)
 
 
-def put_down(cell: CellSpec, heights: Tensor, maps: PlacingMaps, footprint: Tensor) -> Tensor:
+def put_down(cell: CellSpec, surface: Tensor, maps: PlacingMaps, footprint: Tensor) -> Tensor:
     """Return the tote after a success that leaves the item in a given footprint, int32 ``[N, W_T, D_T]``.
 
     Args:
-        heights: int32 ``[N, W_T, D_T]``, of which ``maps`` were made.
+        surface: int32 ``[N, W_T, D_T]``, of which ``maps`` were made.
         footprint: int64 ``[N]``, index ``(parity * W_T + x) * D_T + y``, one that some action reaches.
     """
     parity, x, y = split_footprint(cell.tote_size, footprint)
     w, d = turned_size(maps.item, parity == 1)
-    inside = rectangle(cell.tote_size[:2], x, y, w, d)
-    top = maps.top.flatten(1).gather(1, footprint[:, None])[:, 0]
-    return torch.where(inside, top, heights.permute(1, 2, 0)).permute(2, 0, 1).contiguous()
+    z = maps.top.flatten(1).gather(1, footprint[:, None])[:, 0] - maps.item.h
+    return _with_item(cell, surface, torch.stack([x, y, w, d], -1), z, maps.item.h)
+
+
+def _with_item(cell: CellSpec, surface: Tensor, footprint: Tensor, z: Tensor, height: Tensor) -> Tensor:
+    """Return the tote with an item in it, int32 ``[N, W_T, D_T]``.
+
+    Args:
+        surface: int32 ``[N, W_T, D_T]``.
+        footprint: int64 ``[N, 4]``: x, y, w, d.
+        z: the height on which it rests, ``[N]``.
+        height: of the item, int64 ``[N]``; 0 for no item.
+    """
+    (x, y, w, d), side, grid = footprint.unbind(-1), cell.max_side, cell.tote_size[:2]
+    top = surface_from(z + height)
+    if cell.support == "bearing":
+        top = surface_from(z + height, bears(squares(surface, x, y, side), is_under(w, d, side), z))  # [side * side, N]
+        corner = zip(grid, (x, y), strict=True)
+        column, row = (torch.arange(size, device=x.device)[:, None] - start for size, start in corner)
+        index = (column.clamp(0, side - 1) * side)[:, None] + row.clamp(0, side - 1)  # [W_T, D_T, N]
+        top = top.gather(0, index.flatten(0, 1)).unflatten(0, grid)
+    inside = rectangle(grid, x, y, w, d) & (height > 0)
+    return torch.where(inside, top, surface.permute(1, 2, 0)).permute(2, 0, 1).contiguous()

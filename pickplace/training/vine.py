@@ -79,7 +79,7 @@ def _values(
     row = torch.arange(len(frames), device=candidates.device).repeat_interleave(candidates.shape[1])
     state = State.from_observation(frames).rows(row)
     step = apply(cell, state, policy.to_action(candidates.flatten(), frames.select(*policy.act_keys)[row]))
-    after = State(step.heights, state.tote_height, items.rows(row))
+    after = State(step.surface, state.tote_height, items.rows(row))
     placed = step.failure == 0
     goes_on = placed & footprint_mask(cell, placing_maps(cell, after)).flatten(1).any(1)
     value = placed * state.item.volume * algo.reward_scale

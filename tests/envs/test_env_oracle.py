@@ -27,7 +27,7 @@ def draw_config(rng: Random):
     kinds = {tuple(rng.randint(1, most) for most in (*limit, 3)) for _ in range(rng.randint(1, 5))}
     wide, deep, height = rng.randint(2, 6), rng.randint(2, 6), max(h for _, _, h in kinds) + rng.randint(0, 4)
     rules = Rules(
-        (*bin_sides, rng.randint(1, 3)), (wide, deep, height), effector, rng.randint(1, 4), pick_rule,
+        (*bin_sides, rng.choice((1, 2, 3, 3))), (wide, deep, height), effector, rng.randint(1, 4), pick_rule,
         **dict(zip(("support", "support_margin"), rng.choice(SUPPORTS), strict=True)),
     )  # fmt: skip
     if rng.random() < 0.4:  # limits that seldom leave an item nowhere to go
@@ -58,6 +58,7 @@ def read_item(bin_depth):
 def compare_maps(oracle, observation, row):
     assert observation["bin_depth"][row].tolist() == oracle.bin_depth()
     assert observation["tote_depth"][row].tolist() == oracle.tote_depth()
+    assert observation["tote_bearing"][row].tolist() == oracle.bearing
     assert observation["tote_height"][row].item() == oracle.tote_height
 
 

@@ -34,7 +34,7 @@ from pickplace.policies.fcn_grasp import FootprintPolicy  # noqa: E402
 from pickplace.robot import json_lines  # noqa: E402
 from pickplace.runs import checkpoint  # noqa: E402
 from pickplace.task.feasibility import action_mask, footprint_mask, placing_maps  # noqa: E402
-from pickplace.task.state import item_from_depth  # noqa: E402
+from pickplace.task.state import EMPTY, item_from_depth, surface_from  # noqa: E402
 from pickplace.task.transition import apply  # noqa: E402
 from pickplace.training import train  # noqa: E402
 
@@ -243,7 +243,7 @@ def json_line(draw: random.Random, folder: Path) -> None:
     depths = (np.round(np.array(request[key], dtype=float) / unit).astype(int) for key in ("bin_depth", "tote_depth"))
     bin_depth, tote_depth = (torch.from_numpy(values)[None] for values in depths)
     item = item_from_depth(bin_depth.float())
-    check_plan(planner.cell, State((rim - tote_depth).int(), torch.tensor([rim]), item), reply)
+    check_plan(planner.cell, State(surface_from(rim - tote_depth), torch.tensor([rim]), item), reply)
 
 
 def check_plan(cell: CellSpec, state: State, plan: dict) -> None:
@@ -252,7 +252,7 @@ def check_plan(cell: CellSpec, state: State, plan: dict) -> None:
     if plan["status"] in ("ok", "rejected"):
         assert feasible.any()
     else:
-        empty = state._replace(heights=torch.zeros_like(state.heights))
+        empty = state._replace(surface=torch.full_like(state.surface, EMPTY))
         fits_empty = footprint_mask(cell, placing_maps(cell, empty)).any()
         assert not feasible.any() and plan["status"] == ("stuck" if fits_empty else "impossible")
     if plan["status"] == "ok":

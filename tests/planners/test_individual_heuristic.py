@@ -12,6 +12,7 @@ from pickplace import CellSpec, Item, PickPlaceEnv, State
 from pickplace.planners.individual import IndividualHeuristic, corner_footprints
 from pickplace.task.feasibility import placing_maps
 from pickplace.task.grasps import heuristic_pick
+from pickplace.task.state import surface_from
 from pickplace.task.transition import apply
 
 
@@ -37,7 +38,7 @@ def test_corners_of_maximal_rectangles(seed, wide, deep, steps):
     cell = CellSpec(tote_size=(wide, deep, 6))
     heights = torch.randint(steps, (3, wide, deep), generator=generator).int()
     w, d, h = (torch.randint(1, 3, (3,), generator=generator) for _ in range(3))
-    maps = placing_maps(cell, State(heights, torch.full((3,), 6), Item(w * 0, w * 0, w, d, h)))
+    maps = placing_maps(cell, State(surface_from(heights), torch.full((3,), 6), Item(w * 0, w * 0, w, d, h)))
     found = corner_footprints(cell, heights, maps)
     for n in range(3):
         free = {z: list(maximal_rectangles((heights[n] <= z).tolist())) for z in range(steps)}

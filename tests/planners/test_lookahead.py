@@ -12,6 +12,7 @@ from pickplace.policies.fcn_grasp import FootprintPolicy
 from pickplace.policies.restore import restore_critic
 from pickplace.runs import checkpoint
 from pickplace.task.items import Kinds, Recorded
+from pickplace.task.state import EMPTY
 
 
 def untrained(cell):
@@ -30,8 +31,8 @@ def search_of(env, critic=None, **settings):
 def played_out(search, problem, streams, horizon=None):
     """Return what the search expects of empty totes, ``[problems, streams]``."""
     count = len(problem)
-    heights, rims = torch.zeros(count, 4, 4, dtype=torch.int32), torch.ones(count, dtype=torch.int64)
-    return search._play_out(heights, rims, torch.tensor(problem), streams, horizon)
+    empty, rims = torch.full((count, 4, 4), EMPTY, dtype=torch.int32), torch.ones(count, dtype=torch.int64)
+    return search._play_out(empty, rims, torch.tensor(problem), streams, horizon)
 
 
 def test_equal_candidates_meet_equal_items_and_each_call_others():

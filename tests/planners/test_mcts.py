@@ -38,7 +38,7 @@ def searched(mask, simulations, rollouts=True):
     make = search._nodes
     search._nodes = lambda *args: roots.append(make(*args)) or roots[-1]
     if not rollouts:
-        search._play_out = lambda state: torch.zeros(len(state.heights), dtype=torch.float64)
+        search._play_out = lambda state: torch.zeros(len(state.surface), dtype=torch.float64)
     search.decide(env.reset())
     return roots[0][0]
 
@@ -129,7 +129,7 @@ def test_the_most_visited_action_is_played():
     env = make_env(masks=("footprint",))
     state = env.reset()
     often, lucky = state["footprint_mask"][0].nonzero()[:2, 0].tolist()
-    search, root = search_of(env, 1), _Node(env.heights[0], env.item[0], [])
+    search, root = search_of(env, 1), _Node(env.surface[0], env.item[0], [])
     root.edges = {lucky: _Edge(root, lucky, 2, 1.9), often: _Edge(root, often, 90, 45.0)}
     search._nodes, search._walk_down = lambda *_: [root], lambda _: ([], True)
     reaching = actions_reaching(env.cell, placing_maps(env.cell, env.state), torch.tensor([often]))[0]

@@ -9,6 +9,7 @@ from untrained import write_checkpoint
 from pickplace import CellSpec, load_policy
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import as_collection_policy
+from pickplace.task.observation import STANDARD_TERMS
 
 SIZES = {"env.tote_size": (4, 4, 2), "env.bin_size": (4, 4, 1)}
 
@@ -27,7 +28,7 @@ def test_it_plays_the_best_feasible_action_and_draws_as_in_training(policy):
     assert data.shape[1] > 2 and policy.out_keys == ["action"] and "logits" not in data
     for seen in (data[:, 0], data[:, 2]):
         assert torch.equal(seen["action"], PolicyPlanner(policy.cell, policy.policy).decide(seen))
-    bare = data.select("bin_depth", "tote_depth", "tote_height")  # no mask is needed, and any batch size is served
+    bare = data.select(*STANDARD_TERMS)  # no mask is needed, and any batch size is served
     assert torch.equal(policy(bare)["action"], data["action"])
     assert torch.equal(policy(bare[3, 1])["action"], data["action"][3, 1])
     with set_exploration_type(ExplorationType.RANDOM):

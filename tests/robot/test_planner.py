@@ -30,13 +30,16 @@ def planner():
 @given(problems(), st.sampled_from(["all", 1, 7]), st.booleans(), st.integers(0, 5))
 def test_plans_agree_with_the_oracle_and_with_plane_geometry(problem, candidates, mask, seed):
     cell, (case,) = problem
-    rim, heights, item = case
+    rim, heights, bearing, item = case
     x, y, w, d, h = item
     bin_depth = np.zeros(cell.bin_size[:2])
     bin_depth[x : x + w, y : y + d] = h
     policy = untrained_policy(cell, mask, seed)
-    result = Planner(cell, policy, candidates).plan(bin_depth, rim - heights, rim, alternatives=6)
-    oracle, empty = oracle_of(cell, case), oracle_of(cell, case._replace(heights=np.zeros_like(heights)))
+    result = Planner(cell, policy, candidates).plan(bin_depth, rim - heights, rim, alternatives=6, tote_bearing=bearing)
+    oracle, empty = (
+        oracle_of(cell, case),
+        oracle_of(cell, case._replace(heights=np.zeros_like(heights), bearing=np.ones_like(heights))),
+    )
     codes = [oracle.try_action(action)[0] for action in range(cell.num_actions)]
     assert result.item == dict(zip("xywdh", item, strict=True))
     assert result.occupancy_before == pytest.approx(heights.sum() / heights.size / rim)
@@ -48,6 +51,8 @@ def test_plans_agree_with_the_oracle_and_with_plane_geometry(problem, candidates
     nothing = "stuck" if any(empty.try_action(action)[0] == 0 for action in range(cell.num_actions)) else "impossible"
     assert result.status == ("ok" if ok else "rejected" if feasible else nothing)
     assert result.action == (action if ok else None)
+    left = oracle.bearing_after(action) if ok else bearing.tolist()
+    assert result.tote_bearing == (left if cell.support == "bearing" else None)
     names = {failure: Failure(failure).name.lower() for failure in set(codes)}
     assert result.reasons == (None if feasible else {names[code]: count for code, count in Counter(codes).items()})
 

@@ -236,9 +236,9 @@ def test_a_damaged_checkpoint_is_refused_and_a_whole_one_is_named(smoke_run, tmp
         ("optimizer", {"zzz": torch.zeros(1)}, "optimizer has 'zzz'; expected numbers below"),
         ("optimizer|0|step", torch.tensor(float("inf")), "optimizer is of no use: 0|step holds values"),
         ("critic", None, "critic does not fit"),
-        ("collector", None, "environment|heights is missing"),
+        ("collector", None, "environment|surface is missing"),
         ("collector|carried|footprint_mask", None, "carried|footprint_mask is missing, expected bool"),
-        ("collector|environment|heights", torch.zeros(8, 4, 4), "of shape (8, 4, 4), expected int32"),
+        ("collector|environment|surface", torch.zeros(8, 4, 4), "of shape (8, 4, 4), expected int32"),
         ("policy", torch.zeros(3), "no policy"),
     ],
 )  # fmt: skip

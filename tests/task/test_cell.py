@@ -26,7 +26,6 @@ from pickplace.task.cell import CELL_SETTINGS, Limits, cell_from_settings, refer
             for value in (1.5, -0.1, "most", True)
         ),
         ({"support": "hull", "support_margin": -1}, "support_margin=-1: .* between 0 and 100"),
-        ({"support_margin": 0.5}, "support_margin=0.5: expected 0, or support=hull"),
         *(({"height_unit": value}, f"height_unit={value}: .* between 0.001 and 1000") for value in (1e-4, 2000)),
         ({"longest_side": 0}, "longest_side=0: expected a whole number >= 1"),
         ({"tote_sizes": (6, 6, 5)}, r"tote_sizes=\(6, 6, 5\): expected one of bin_size, tote_size, .*, height_unit"),

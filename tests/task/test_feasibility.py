@@ -23,6 +23,7 @@ from pickplace.task.feasibility import (
     placing_maps,
 )
 from pickplace.task.grasps import all_grasps, heuristic_pick
+from pickplace.task.state import EMPTY, surface_from
 from pickplace.task.transition import apply, put_down
 
 
@@ -41,7 +42,9 @@ def test_masks_equal_the_step_and_the_oracle(problem):
         step = apply(cell, state.rows(torch.full_like(actions, row)), actions)
         assert step.failure.tolist() == [failure for failure, _ in tried]
         assert step.heights[mask].tolist() == [after for failure, after in tried if failure == SUCCESS]
-        assert (step.heights[~mask] == state.heights[row]).all()
+        assert (step.surface[~mask] == state.surface[row]).all()
+        bearing = [plain.bearing_after(action) for action in mask.nonzero()[:, 0].tolist()]
+        assert (step.surface[mask] & 1).tolist() == bearing
         assert torch.equal(mask, step.failure == 0)
         # What each success leaves is its footprint; the distinct ones are those of the mask.
         x, y, w, d = step.footprint[mask].unbind(1)
@@ -58,8 +61,8 @@ def test_masks_equal_the_step_and_the_oracle(problem):
         assert torch.equal(footprints[row][reaching], each[index])
         first = first_action_reaching(cell, maps.rows(same), each)
         assert torch.equal(first, torch.where(found >= 0, found, cell.num_actions).amin(1))
-        after = put_down(cell, state.heights[same], maps.rows(same), each)
-        assert torch.equal(after, step.heights[first])
+        after = put_down(cell, state.surface[same], maps.rows(same), each)
+        assert torch.equal(after, step.surface[first])
 
 
 @settings(max_examples=40)
@@ -95,7 +98,7 @@ def test_limits_by_hand():
     """One of each: a pick out of reach, and an item's top too low and too high, in one rotation at one place cell."""
     cell = CellSpec()
     item = (1, 1, 2, 1, 1)
-    state = State(torch.zeros(1, 6, 6).int(), torch.tensor([5]), Item(*torch.tensor([item]).unbind(1)))
+    state = State(torch.full((1, 6, 6), EMPTY).int(), torch.tensor([5]), Item(*torch.tensor([item]).unbind(1)))
     actions = torch.arange(cell.num_actions)
     before = apply(cell, state.repeat(len(actions)), actions).failure.view(5, 5, 6, 6, 4)
     limits = open_limits(cell)
@@ -118,7 +121,7 @@ def rest_on(heights, item, support, margin=0.0):
     """Return the failure of an item that is set down on the near corner of a tote of these heights."""
     (w, d, h), (wide, deep) = item, heights.shape
     cell = CellSpec((w, d, h), (wide, deep, 9), (w, d), 1, "contain", support, margin)
-    state = State(heights.int()[None], torch.tensor([9]), Item(*torch.tensor([[0, 0, *item]]).unbind(1)))
+    state = State(surface_from(heights)[None], torch.tensor([9]), Item(*torch.tensor([[0, 0, *item]]).unbind(1)))
     pick = reference_cell(w) * d + reference_cell(d)
     action = torch.tensor([pick * wide * deep + reference_cell(w) * deep + reference_cell(d)])
     failure = apply(cell, state, action).failure.item()

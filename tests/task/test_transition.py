@@ -25,7 +25,7 @@ def results(cell, case):
 def test_raising_the_floor_and_the_rim_changes_nothing(problem, by):
     cell, (case,) = problem
     failure, after = results(cell, case)
-    raised, above = results(cell, Case(case.rim + by, case.heights + by, case.item))
+    raised, above = results(cell, case._replace(rim=case.rim + by, heights=case.heights + by))
     assert (failure == raised).all() and (after + by == above).all()
 
 
@@ -36,7 +36,9 @@ def test_a_mirrored_problem_has_the_mirrored_results(problem):
     cell, (case,) = problem
     failure, after = results(cell, case)
     x, y, w, d, h = case.item
-    flipped, seen = results(cell, Case(case.rim, case.heights[::-1], (cell.bin_size[0] - x - w, y, w, d, h)))
+    flipped, seen = results(
+        cell, Case(case.rim, case.heights[::-1], case.bearing[::-1], (cell.bin_size[0] - x - w, y, w, d, h))
+    )
     backwards = [-rotation % 4 for rotation in range(cell.rotations)]
     assert (failure == flipped[::-1, :, ::-1][..., backwards]).all()
     assert (after == seen[::-1, :, ::-1][..., backwards, ::-1, :]).all()
@@ -50,7 +52,7 @@ def quarter(cell, case):
         cell.rotations, cell.pick_rule, cell.support, cell.support_margin,
     )  # fmt: skip
     x, y, w, d, h = case.item
-    return turned, Case(case.rim, np.rot90(case.heights), (bin_d - y - d, x, d, w, h))
+    return turned, Case(case.rim, np.rot90(case.heights), np.rot90(case.bearing), (bin_d - y - d, x, d, w, h))
 
 
 @settings(max_examples=50)

@@ -57,7 +57,7 @@ def test_the_policy_can_do_what_is_taught_as_the_teacher_does(name, states):
     assert known.all() if "individual" not in name else 0 < known.sum() < 64
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         own = policy.to_action(taught.clamp(min=0), td)
-    theirs, ours = (apply(env.cell, env.state, action).heights for action in (JointDBL(env.cell).decide(td), own))
+    theirs, ours = (apply(env.cell, env.state, action).surface for action in (JointDBL(env.cell).decide(td), own))
     assert torch.equal(theirs[known], ours[known])
 
 
