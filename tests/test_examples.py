@@ -111,7 +111,13 @@ def test_own_observation(example):
     given = [f"checkpoint={folder}", "trust=own_observation", *EVALUATION]
     for planner in (["planner=lookahead", "planner.samples=2", "planner.candidates=2"], []):
         ours = example("evaluate", "own_observation", *given, *planner)
-        assert list(ours["env"]["observation"]) == ["bin_depth", "tote_depth", "tote_height", "pit_depth"]
+        assert list(ours["env"]["observation"]) == [
+            "bin_depth",
+            "tote_depth",
+            "tote_bearing",
+            "tote_height",
+            "pit_depth",
+        ]
     assert ours["occupancy"]["mean"] > 0.2 and any("pits" in name for name in weights)
     for load in (Planner.load, load_policy):
         with pytest.raises(ValueError, match=r"own_observation\.P"):

@@ -3,8 +3,8 @@
 The *supporting cells* are the cells under the footprint that are as high as the highest of them, and bear weight. A
 rule decides by their number, or by their convex hull: an item tilts unless the vertical line through its centre passes
 the hull. With ``bearing`` the top of an item bears weight only above the hull of its own supporting cells. Then
-whatever is put on it presses inside that hull, down to the floor, and no item tips the pile below it. With every other rule all
-cells bear weight.
+whatever is put on it presses inside that hull, down to the floor, and no item tips the pile below it. With every other
+rule all cells bear weight.
 
 The hull is never computed. A point lies in a convex polygon if the polygon reaches as far along the normal of each of
 its edges. The corners of cells are lattice points, so the edges of every possible hull have one of a few directions.

@@ -67,7 +67,7 @@ def test_it_is_better_than_its_policy_and_a_critic_that_errs_does_not_make_it_wo
         return -100.0 * (observation["tote_depth"] == 0).flatten(1).sum(1, keepdim=True)
 
     def pack(planner):
-        return occupancies(planner, make_env(32, (4, 4, 2)))
+        return occupancies(planner, make_env(64, (4, 4, 2)))
 
     env, settings = make_env(1, (4, 4, 2)), {"candidates": 8, "samples": 16, "rounds": 1}
     alone = pack(PolicyPlanner(env.cell, untrained(env.cell)))
@@ -125,7 +125,8 @@ def test_the_critic_of_a_checkpoint_judges_in_cells():
     critic = restore_critic(cfg, CellSpec(), state, facts["config"]["env"])
     bins = torch.zeros(1, 5, 5)
     bins[0, 1:3, 2] = 1.0
+    tote = torch.ones(1, 6, 6)
     empty, full = (
-        critic({"bin_depth": bins, "tote_depth": torch.full((1, 6, 6), depth)}).item() for depth in (5.0, 0.0)
+        critic({"bin_depth": bins, "tote_depth": depth * tote, "tote_bearing": tote}).item() for depth in (5.0, 0.0)
     )
     assert 100 < empty < 185 and abs(full) < 10

@@ -11,10 +11,11 @@ from problems import late_state
 
 from pickplace import CellSpec
 from pickplace.policies.base import MASKED, as_collection_policy
-from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy
+from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy, depths_and_bearing
 from pickplace.policies.networks.critics import PooledCritic
 from pickplace.policies.networks.footprint_fcn import FootprintFcn, matrix_dtype
-from pickplace.task.items import Kinds
+from pickplace.runs import checkpoint
+from pickplace.task.items import Kinds, Uniform
 from pickplace.task.state import item_from_depth
 
 FLOAT = {"head_std": 1.0, "compute_dtype": "float32"}
@@ -27,18 +28,22 @@ def random_maps(seed, batch, bin_size, tote_size):
     for one in bins:
         x, y = (int(torch.randint(0, side, (), generator=generator)) for side in bin_size)
         one[x : x + 2, y : y + 1 + x % 3] = float(torch.randint(1, 5, (), generator=generator))
-    return bins, torch.randint(0, 8, (batch, *tote_size), generator=generator).float()
+    totes = torch.randint(0, 8, (batch, *tote_size), generator=generator).float()
+    return bins, totes, torch.randint(0, 2, totes.shape, generator=generator).float()
 
 
-def by_hand(network, item, tote_depth, parity, x, y):
-    """Return the network's scores of one footprint of one problem, read cell by cell off the depth map."""
+def by_hand(network, item, tote_depth, bearing, parity, x, y):
+    """Return the network's scores of one footprint of one problem, read cell by cell off the maps."""
     side, reach, (w, d, h) = network.receptive_field, network.reach, item
     wide, long = tote_depth.shape
 
-    def depth(i, j):
-        """Return it at (i, j) along the item's own axes from the footprint's corner; None outside the tote."""
+    def at(i, j):
+        """Return the cell at (i, j) along the item's own axes from the footprint's corner; None outside the tote."""
         cell = (x + j, y + i) if parity else (x + i, y + j)
-        return int(tote_depth[cell]) if 0 <= cell[0] < wide and 0 <= cell[1] < long else None
+        return cell if 0 <= cell[0] < wide and 0 <= cell[1] < long else None
+
+    def depth(i, j):
+        return None if at(i, j) is None else int(tote_depth[at(i, j)])
 
     first = [side // 2 - (size - 1) // 2 for size in (w, d)]
     rest = min(depth(i, j) for i in range(w) for j in range(d))
@@ -59,6 +64,10 @@ def by_hand(network, item, tote_depth, parity, x, y):
     counts = ((rest - h + 1, network.headroom_bins), (clipped, network.depth_range))
     ones += [max(0, min(value, most - 1)) for value, most in counts]
     weight, out = network.patch.weight.unflatten(1, (-1, network.planes)), network.patch.bias
+    patch = itertools.product(*(range(-begin, side - begin) for begin in first))
+    for position, cell in enumerate(at(*corner) for corner in patch):
+        if bearing is not None and cell is not None and not bearing[cell]:
+            out = out + network.weak[:, position]
     for position, plane in enumerate(ones):
         if plane is not None:
             out = out + weight[:, position, plane]
@@ -73,21 +82,24 @@ def by_hand(network, item, tote_depth, parity, x, y):
     sizes=st.tuples(st.integers(1, 4), st.integers(1, 6), st.integers(1, 3), st.integers(1, 4)),
     headroom_bins=st.sampled_from([None, 1, 3, 12]),
     deeper=st.sampled_from([0, 0, 100, 900_000]),
+    marked=st.booleans(),
 )
-def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes, headroom_bins, deeper):
+def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes, headroom_bins, deeper, marked):
     clip, levels, reach, items = sizes
     torch.manual_seed(seed)
     network = FootprintFcn(3, 8, field, 6, clip, levels, reach, items, headroom_bins=headroom_bins, **FLOAT)
-    bins, totes = random_maps(seed, 2, (4, 6), tote)
+    network.weak.data.normal_()
+    bins, totes, bearing = random_maps(seed, 2, (4, 6), tote)
     totes += deeper  # depths are kept in 16 bits
-    scores = network(bins, totes, 2)
+    bearing = bearing if marked else [None, None]
+    scores = network(bins, totes, bearing if marked else None, 2)
     assert scores.shape == (2, 2, *tote, 3)
     item, found, expected = item_from_depth(bins), [], []
     for n, parity in itertools.product(range(2), range(2)):
         w, d, h = (int(part[n]) for part in item[2:])
         wide, deep = (d, w) if parity else (w, d)
         for x, y in itertools.product(range(tote[0] - wide + 1), range(tote[1] - deep + 1)):
-            expected.append(by_hand(network, (w, d, h), totes[n], parity, x, y))
+            expected.append(by_hand(network, (w, d, h), totes[n], bearing[n], parity, x, y))
             found.append(scores[n, parity, x, y])
     torch.testing.assert_close(torch.stack(found), torch.stack(expected), rtol=1e-4, atol=1e-4)
 
@@ -97,10 +109,10 @@ def test_only_what_the_mask_allows_is_computed_and_it_is_the_same(rotations, mon
     env, state = late_state(tote_size=(7, 5, 3), rotations=rotations, masks=("action", "footprint"))
     policy, mask = FootprintPolicy(env.cell, **FLOAT), state["footprint_mask"]
     asked, at = [], policy.network.at
-    monkeypatch.setattr(policy.network, "at", lambda *args: asked.append(len(args[2])) or at(*args))
+    monkeypatch.setattr(policy.network, "at", lambda *args: asked.append(len(args[3])) or at(*args))
     logits = policy.logits(state)
     assert asked == [int(mask.sum())] and asked[0] < mask.numel()
-    everywhere = policy.network(state["bin_depth"], state["tote_depth"], env.cell.parities).flatten(1)
+    everywhere = policy.network(*depths_and_bearing(env.cell, state), env.cell.parities).flatten(1)
     torch.testing.assert_close(logits, torch.where(mask, everywhere, MASKED))
     logits.logsumexp(1).sum().backward()
     assert all(parameter.grad is not None for parameter in policy.parameters())
@@ -127,7 +139,7 @@ def test_without_a_mask_every_grasp_has_the_score_of_its_footprint(rotations, ef
     policy, count = GraspPolicy(env.cell, filters=8, **FLOAT), env.cell.num_offsets
     policy.outside.data.fill_(7.0)
     logits = policy.class_scores(state).flatten(1)
-    scores = policy.network(state["bin_depth"], state["tote_depth"], env.cell.parities)
+    scores = policy.network(*depths_and_bearing(env.cell, state), env.cell.parities)
     for parity, (_, _, ref_x, ref_y) in enumerate(env.cell.effectors):
         for ox, oy, x, y in itertools.product(range(count), range(count), range(4), range(5)):
             fx, fy = x - ref_x + ox, y - ref_y + oy
@@ -170,7 +182,7 @@ def test_the_critic_adds_up_what_each_column_will_hold(seed, field, tote):
     critic = PooledCritic(4, field, 6, tote_clip=2, depth_range=4, item_range=3, compute_dtype="float32")
     for parameter in critic.parameters():
         parameter.requires_grad_(False).normal_(generator=generator)
-    bins, totes = random_maps(seed, 2, (4, 6), tote)
+    bins, totes, bearing = random_maps(seed, 2, (4, 6), tote)
     item, half = item_from_depth(bins), field // 2
     for n in range(2):
         shift, total = max(int(totes[n].max()) - 2, 0), 0.0
@@ -184,11 +196,28 @@ def test_the_critic_adds_up_what_each_column_will_hold(seed, field, tote):
                 if 0 <= x + i < tote[0] and 0 <= y + j < tote[1]:
                     level = max(0, min(2 - (int(totes[n, x + i, y + j]) - shift), 3))
                     out = out + critic.around.weight[:, level, i + half, j + half]
+                    if not bearing[n, x + i, y + j]:
+                        out = out + critic.weak[:, 0, i + half, j + half]
             share, more = critic.head(F.relu(critic.hidden(F.relu(out))))
             total += (share * room + more / 5).item()
-        assert float(critic(bins, totes)[n]) == pytest.approx(total, rel=1e-4, abs=1e-4)
-    several = critic(bins.view(2, 1, 4, 6), totes.view(2, 1, *tote))  # any leading dimensions
-    torch.testing.assert_close(several, critic(bins, totes).view(2, 1, 1), rtol=1e-4, atol=1e-4)
+        assert float(critic(bins, totes, bearing)[n]) == pytest.approx(total, rel=1e-4, abs=1e-4)
+    several = critic(
+        bins.view(2, 1, 4, 6), totes.view(2, 1, *tote), bearing.view(2, 1, *tote)
+    )  # any leading dimensions
+    torch.testing.assert_close(several, critic(bins, totes, bearing).view(2, 1, 1), rtol=1e-4, atol=1e-4)
+
+
+def test_weights_that_are_older_than_the_marks_serve():
+    """They give the scores that they gave, as if every cell bore weight."""
+    env, state = late_state(tote_size=(6, 6, 6), items=Uniform((1, 3), (1, 3), (1, 2)), masks=("action", "footprint"))
+    policy = FootprintPolicy(env.cell, **FLOAT)
+    older = {key: value for key, value in policy.state_dict().items() if key != "network.weak"}
+    restored = checkpoint.restore(lambda: FootprintPolicy(env.cell, **FLOAT), older, "policy")
+    assert not state["tote_bearing"].all()
+    assert torch.equal(restored.logits(state), policy.logits(state.set("tote_bearing", torch.ones(16, 6, 6))))
+    del older["network.patch.bias"]
+    with pytest.raises(checkpoint.CheckpointError, match="patch.bias is missing"):
+        checkpoint.restore(lambda: FootprintPolicy(env.cell, **FLOAT), older, "policy")
 
 
 @pytest.mark.parametrize("make", [FootprintFcn, PooledCritic])

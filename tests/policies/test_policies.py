@@ -148,7 +148,8 @@ def test_weights_serve_fewer_rotations_and_other_totes(kind):
     for rotations, tote in ((1, (6, 6, 5)), (3, (6, 6, 5)), (2, (7, 9, 4))):
         fewer = kind(CellSpec(rotations=rotations, tote_size=tote, longest_side=2), **POLICIES[kind])
         fewer.load_state_dict(policy.state_dict())
-        seen = {"bin_depth": observation["bin_depth"], "tote_depth": torch.full((2, *tote[:2]), float(tote[2]))}
+        empty = torch.ones(2, *tote[:2])
+        seen = {"bin_depth": observation["bin_depth"], "tote_depth": tote[2] * empty, "tote_bearing": empty}
         found = fewer.action_log_probs(seen)
         assert found.shape == (2, fewer.cell.num_actions)
         if tote == (6, 6, 5) and kind is ActionPolicy:

@@ -105,7 +105,7 @@ def test_advantages_are_normalised_where_the_config_says_so(collected, algo, wan
 def test_a_step_follows_what_its_phase_learns_from(phase, limit, collected):
     """The policy from reward or its teacher, the critic always; no further than the greatest norm of a gradient."""
     policy, data = deepcopy(collected[0]), collected[1].reshape(-1)
-    critic = ValueOperator(PooledCritic(filters=8, hidden=8, compute_dtype="float32"), OBSERVED)
+    critic = ValueOperator(PooledCritic(filters=8, hidden=8, compute_dtype="float32"), [*PooledCritic.in_keys])
     settings = ["algo.entropy_coeff=0.3", "algo.epochs=1", "algo.minibatch_size=64"]
     cfg = composed(*settings, f"algo.max_grad_norm={limit}").algo
     advantage, loss = make_losses(cfg, policy, critic)

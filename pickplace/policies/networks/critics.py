@@ -25,10 +25,11 @@ class PooledCritic(nn.Module):
         tote_clip, depth_range, item_range, compute_dtype: as in :class:`FootprintFcn`.
 
     Shapes:
-        ``bin_depth [..., W_B, D_B]``, ``tote_depth [..., W_T, D_T]`` -> ``[..., 1]``.
+        ``bin_depth [..., W_B, D_B]``, ``tote_depth`` and ``tote_bearing [..., W_T, D_T]`` -> ``[..., 1]``.
     """
 
     any_size = True
+    in_keys = ("bin_depth", "tote_depth", "tote_bearing")
 
     def __init__(
         self,
@@ -50,6 +51,7 @@ class PooledCritic(nn.Module):
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
         self.compute_dtype = one_of("model.critic.compute_dtype", compute_dtype, DTYPES)
         self.around = nn.Conv2d(depth_range, filters, receptive_field, padding=receptive_field // 2)
+        self.weak = nn.Parameter(torch.zeros(filters, 1, receptive_field, receptive_field))  # see FootprintFcn
         self.item = nn.Linear(3 * item_range, filters, bias=False)
         self.room = nn.Parameter(torch.zeros(filters))
         self.hidden = nn.Linear(filters, hidden)
@@ -57,15 +59,17 @@ class PooledCritic(nn.Module):
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor, tote_bearing: Tensor) -> Tensor:
         batch = tote_depth.shape[:-2]
-        bin_depth, tote_depth = bin_depth.flatten(0, -3), tote_depth.flatten(0, -3)
+        bin_depth, tote_depth, bearing = (maps.flatten(0, -3) for maps in (bin_depth, tote_depth, tote_bearing))
         levels = depth_levels(tote_depth, self.tote_clip, self.depth_range)
         planes = one_hot(levels.flatten(1), self.depth_range).view(-1, self.depth_range, *levels.shape[1:])
         room = tote_depth[..., None] / 5
         dtype = matrix_dtype(self.compute_dtype, tote_depth.device.type)
         with torch.autocast(tote_depth.device.type, dtype, enabled=dtype != torch.float32):
-            x = self.around(planes.to(dtype, memory_format=torch.channels_last)).permute(0, 2, 3, 1)
+            x = self.around(planes.to(dtype, memory_format=torch.channels_last))
+            x = x + F.conv2d(1 - bearing[:, None].to(dtype), self.weak, padding="same")
+            x = x.permute(0, 2, 3, 1)
             x = x + self.item(item_code(bin_depth, self.item_range).to(dtype))[:, None, None]
             x = x + room.to(dtype) * self.room.to(dtype)
             x = F.relu(self.hidden(F.relu(x)))

@@ -30,7 +30,8 @@ class FootprintFcn(nn.Module):
     footprint, the height above the top that the item would have; under it, the depth of the hole that it would close;
     nothing outside the tote. After the patch come the item's width, depth and height, the headroom above its top (too
     little, none, or how much), and how far above the deepest place of the tote it rests (the clipped depth of
-    eq. 4), one-hot each.
+    eq. 4), one-hot each. Cells that bear no weight are marked, too; what the marks do is learned from zero, so that
+    weights that were trained without them serve.
 
     Args:
         out_channels: scores of each footprint.
@@ -80,46 +81,56 @@ class FootprintFcn(nn.Module):
         inputs = self.planes * (receptive_field**2 + 5)
         check_inputs(f"model.actor.receptive_field={receptive_field}, {self.planes} planes", inputs)
         self.patch = nn.Linear(inputs, filters)
+        self.weak = nn.Parameter(torch.zeros(filters, receptive_field**2))
         self.hidden = nn.Linear(filters, hidden)
         self.head = nn.Linear(hidden, out_channels)
         nn.init.normal_(self.head.weight, std=head_std)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, bin_depth: Tensor, tote_depth: Tensor, parities: int) -> Tensor:
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor | None, parities: int) -> Tensor:
         """Return scores of all footprints, float32 ``[N, parities, W_T, D_T, out_channels]``, in the tote or not.
 
         Args:
             bin_depth, tote_depth: ``[N, W_B, D_B]``, ``[N, W_T, D_T]``.
+            bearing: 1 where a cell of the tote bears weight, else 0, ``[N, W_T, D_T]``; None: all do.
             parities: 1, or 2 to turn the footprints too.
         """
         count = parities * tote_depth[0].numel()
         index = torch.arange(len(tote_depth) * count, device=tote_depth.device)
-        out = self.at(bin_depth, tote_depth, index // count, index % count)
+        out = self.at(bin_depth, tote_depth, bearing, index // count, index % count)
         return out.view(len(tote_depth), parities, *tote_depth.shape[1:], -1)
 
-    def at(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, footprint: Tensor) -> Tensor:
+    def at(
+        self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor | None, row: Tensor, footprint: Tensor
+    ) -> Tensor:
         """Return the scores of some footprints only, float32 ``[M, out_channels]``.
 
         Args:
+            bin_depth, tote_depth, bearing: as in :meth:`forward`.
             row: int64 ``[M]``, which problem.
             footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
         """
         at_once = CHUNK_BYTES // (4 * self.patch.in_features)
         if len(row) > at_once and not torch.is_grad_enabled():  # of large totes: a part at a time, to save memory
             parts = zip(row.split(at_once), footprint.split(at_once), strict=True)
-            return torch.cat([self.at(bin_depth, tote_depth, *part) for part in parts])
+            return torch.cat([self.at(bin_depth, tote_depth, bearing, *part) for part in parts])
         dtype, count = matrix_dtype(self.compute_dtype, tote_depth.device.type), len(row)
         lower = dtype != torch.float32
         if lower:
             padding = next((-count % step for beyond, step in PADDED_ROWS if count > beyond), 0)
             row, footprint = (F.pad(index, (0, padding)) for index in (row, footprint))
-        x = self._inputs(bin_depth, tote_depth, row, footprint, dtype)
+        x, weak = self._inputs(bin_depth, tote_depth, bearing, row, footprint, dtype)
         with torch.autocast(tote_depth.device.type, dtype, enabled=lower):
-            x = F.relu(self.hidden(F.relu(self.patch(x))))
+            x = self.patch(x)
+            x = x if weak is None else x + F.linear(weak, self.weak)
+            x = F.relu(self.hidden(F.relu(x)))
         return self.head(x.float())[:count]  # in full: scores that differ a little must not be rounded to a tie
 
-    def _inputs(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, footprint: Tensor, dtype) -> Tensor:
-        """Return the input of the first layer, ``[M, inputs]``: one-hot, cell by cell, then the five codes."""
+    def _inputs(
+        self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor | None, row: Tensor, footprint: Tensor, dtype
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return the inputs of the first layer: ``[M, inputs]``, one-hot, cell by cell, then the five codes; and marks,
+        ``[M, side * side]``."""
         side, reach = self.receptive_field, self.reach
         _, wide, long = tote_depth.shape
         item = item_from_depth(bin_depth)
@@ -138,7 +149,9 @@ class FootprintFcn(nn.Module):
         deepest = depth.amax((1, 2)).clamp(min=self.tote_clip)[row]
         depth = F.pad(depth, (margin,) * 4, value=OUTSIDE)
         corner = (row * (wide + 2 * margin) + x) * stride + y
-        seen = depth.flatten()[steps[turned.long()] + corner[:, None]]  # [M, side * side]
+        cells = steps[turned.long()] + corner[:, None]  # [M, side * side]
+        seen = depth.flatten()[cells]
+        weak = None if bearing is None else F.pad(1 - bearing, (margin,) * 4).flatten()[cells].to(dtype)
         under = self._under(bin_depth.shape[1:], row.device)[item.w[row], item.d[row]]
         rest = torch.where(under, seen, FAR_DOWN).amin(1)  # depth of what the item rests on
         headroom = rest - item.h[row].to(torch.int16)  # above its top
@@ -154,7 +167,7 @@ class FootprintFcn(nn.Module):
         ]
         level = torch.cat([level, torch.stack(codes, 1)], 1)
         planes = torch.eye(self.planes + 1, self.planes, dtype=dtype, device=row.device)
-        return F.embedding(level.int(), planes).flatten(1)
+        return F.embedding(level.int(), planes).flatten(1), weak
 
     def _under(self, bin_size, device: torch.device) -> Tensor:
         """Return which cells of a patch lie under an item of ``w x d``, bool ``[W_B + 1, D_B + 1, side * side]``."""
