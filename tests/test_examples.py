@@ -15,6 +15,7 @@ from pickplace.robot import json_lines
 from pickplace.runs import checkpoint
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.registry import build
+from pickplace.task.observation import STANDARD_TERMS
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "docs" / "examples"
@@ -111,13 +112,7 @@ def test_own_observation(example):
     given = [f"checkpoint={folder}", "trust=own_observation", *EVALUATION]
     for planner in (["planner=lookahead", "planner.samples=2", "planner.candidates=2"], []):
         ours = example("evaluate", "own_observation", *given, *planner)
-        assert list(ours["env"]["observation"]) == [
-            "bin_depth",
-            "tote_depth",
-            "tote_bearing",
-            "tote_height",
-            "pit_depth",
-        ]
+        assert list(ours["env"]["observation"]) == [*STANDARD_TERMS, "pit_depth"]
     assert ours["occupancy"]["mean"] > 0.2 and any("pits" in name for name in weights)
     for load in (Planner.load, load_policy):
         with pytest.raises(ValueError, match=r"own_observation\.P"):

@@ -43,19 +43,22 @@ def rectangle(grid: Sequence[int], x: Tensor, y: Tensor, w: Tensor, d: Tensor) -
     return in_x[:, None] & in_y
 
 
-def squares(surface: Tensor, x: Tensor, y: Tensor, side: int) -> Tensor:
-    """Return a square of cells of each surface, ``[side * side, N]``, row by row.
+def square_cells(grid: Sequence[int], x: Tensor, y: Tensor, side: int) -> Tensor:
+    """Return the flat cells of a square, int64 ``[side * side, N]``, row by row.
 
     Args:
-        surface: ``[N, W, D]``.
-        x, y: int64 ``[N]``, the square's minimum corner. Cells outside the map get the value of the nearest cell.
+        grid: ``(W, D)``.
+        x, y: int64 ``[N]``, the square's minimum corner. Cells outside the grid become the nearest cell.
         side: of the square, in cells.
     """
-    _, wide, deep = surface.shape
-    step = torch.arange(side, device=x.device)[:, None]
+    (wide, deep), step = grid, torch.arange(side, device=x.device)[:, None]
     column, row = (x + step).clamp_(0, wide - 1), (y + step).clamp_(0, deep - 1)  # [side, N]
-    index = (column * deep)[:, None] + row
-    return surface.flatten(1).t().gather(0, index.flatten(0, 1))
+    return ((column * deep)[:, None] + row).flatten(0, 1)
+
+
+def squares(surface: Tensor, x: Tensor, y: Tensor, side: int) -> Tensor:
+    """Return a square of cells of each surface ``[N, W, D]``, ``[side * side, N]``; arguments of `square_cells`."""
+    return surface.flatten(1).t().gather(0, square_cells(surface.shape[1:], x, y, side))
 
 
 def is_under(w: Tensor, d: Tensor, side: int) -> Tensor:

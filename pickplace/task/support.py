@@ -7,7 +7,7 @@ whatever is put on it presses inside that hull, down to the floor, and no item t
 rule all cells bear weight.
 
 The hull is never computed. A point lies in a convex polygon if the polygon reaches as far along the normal of each of
-its edges. The corners of cells are lattice points, so the edges of every possible hull have one of a few directions.
+its edges. Those of a hull of cells are parallel to the axes, or to a line from one cell to another: a few directions.
 For the centre, a supporting cell reaches beyond it along some of their normals, which is a pattern of bits; the item is
 stable if the patterns of its supporting cells cover all of them. That is exact, and as fast as counting for items of
 up to 3 cells.
@@ -58,9 +58,9 @@ def _is_in_hull(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tenso
     stable, sizes = torch.ones_like(supporting, dtype=torch.bool), (w.clamp(min=1) - 1, d.clamp(min=1) - 1)
     for patterns, whole in hull_patterns(side, margin, supporting.device):
         patterns, whole = patterns[:, *sizes], whole[sizes]
-        reached = torch.zeros_like(supporting)
+        reached = torch.zeros_like(supporting, dtype=patterns.dtype)
         for surface, pattern in zip(cells, patterns, strict=True):
-            reached |= torch.where(surface == supporting, pattern, 0)
+            reached |= (surface == supporting) * pattern
         stable &= reached == whole
     return stable
 
@@ -85,16 +85,17 @@ def bears(cells: Tensor, under: Tensor, z: Tensor) -> Tensor:
 
 @lru_cache(maxsize=64)
 def _extents(side: int, device: torch.device) -> list[Tensor]:
-    """Return how far the cells of a square reach along normals, from its corner: int64 ``[BITS, side * side]`` each."""
+    """Return how far the cells of a square reach along normals, from its corner: int32 ``[BITS, side * side]`` each."""
     near = torch.arange(side)
     furthest = _furthest(_normals(side), torch.stack([near, near + 1])[..., None])[..., 0]  # [normals, axis, cell]
     along = furthest[:, 0, :, None] + furthest[:, 1, None, :]
-    return [part.to(device) for part in along.flatten(1).split(BITS)]
+    return [part.int().to(device) for part in along.flatten(1).split(BITS)]
 
 
 def _normals(side: int) -> Tensor:
     """Return the normals of all edges that a hull of cells of a square can have, int64 ``[normals, 2]``."""
-    steps = range(-side, side + 1)
+    furthest = max(side - 1, 1)
+    steps = range(-furthest, furthest + 1)
     return torch.tensor([(x, y) for x in steps for y in steps if gcd(x, y) == 1])
 
 
@@ -113,8 +114,8 @@ def hull_patterns(side: int, margin: float, device: torch.device) -> list[tuple[
         device: place of the tables.
 
     Returns:
-        for each word the patterns of the cells, int32 ``[side * side, side, side]`` by cell, width and depth, 0 for
-        cells outside the footprint; and the pattern that covers all normals, int32 ``[side, side]``.
+        for each word the patterns of the cells, ``[side * side, side, side]`` by cell, width and depth, 0 for cells
+        outside the footprint; and the pattern that covers all normals, ``[side, side]``; of 8, 16 or 32 bits.
 
     Raises:
         ValueError: for a side beyond :data:`MAX_HULL_SIDE`.
@@ -133,10 +134,12 @@ def hull_patterns(side: int, margin: float, device: torch.device) -> list[tuple[
         furthest = _furthest(chunk, ends)  # [normals, axis, cell, size]
         along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
         beyond = along > 2 * margin * chunk.double().norm(dim=1).view(-1, 1, 1, 1, 1)
-        # Only directions of lattice edges that fit the footprint can be edges of a hull in it.
-        fits = (chunk.abs()[:, 1, None, None] <= size[:, None]) & (chunk.abs()[:, 0, None, None] <= size)
+        # No edge has the direction from one cell to another that is not in the footprint.
+        x, y = chunk.abs()[:, :, None, None].unbind(1)
+        fits = ((y < size[:, None]) & (x < size)) | (x + y == 1)
         flags = torch.tensor([1 << bit for bit in range(BITS)])[: len(chunk)]
         pattern = ((beyond & inside & fits[:, None, None]) * flags.view(-1, 1, 1, 1, 1)).sum(0)
         whole = (fits * flags.view(-1, 1, 1)).sum(0)
-        words.append((pattern.flatten(0, 1).int().to(device), whole.int().to(device)))
+        dtype = torch.uint8 if len(chunk) <= 8 else torch.int16 if len(chunk) <= 16 else torch.int32
+        words.append((pattern.flatten(0, 1).to(device, dtype), whole.to(device, dtype)))
     return words

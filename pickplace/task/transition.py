@@ -17,7 +17,7 @@ from pickplace.task.grasps import (
     turn,
     turned_size,
 )
-from pickplace.task.maps import is_under, rectangle, squares
+from pickplace.task.maps import is_under, rectangle, square_cells, squares
 from pickplace.task.placing import is_within_reach, overflows, rest
 from pickplace.task.state import Failure, State, surface_from
 from pickplace.task.support import bears, is_supported
@@ -109,12 +109,10 @@ def _with_item(cell: CellSpec, surface: Tensor, footprint: Tensor, z: Tensor, he
         height: of the item, int64 ``[N]``; 0 for no item.
     """
     (x, y, w, d), side, grid = footprint.unbind(-1), cell.max_side, cell.tote_size[:2]
-    top = surface_from(z + height)
-    if cell.support == "bearing":
-        top = surface_from(z + height, bears(squares(surface, x, y, side), is_under(w, d, side), z))  # [side * side, N]
-        corner = zip(grid, (x, y), strict=True)
-        column, row = (torch.arange(size, device=x.device)[:, None] - start for size, start in corner)
-        index = (column.clamp(0, side - 1) * side)[:, None] + row.clamp(0, side - 1)  # [W_T, D_T, N]
-        top = top.gather(0, index.flatten(0, 1)).unflatten(0, grid)
     inside = rectangle(grid, x, y, w, d) & (height > 0)
-    return torch.where(inside, top, surface.permute(1, 2, 0)).permute(2, 0, 1).contiguous()
+    after = torch.where(inside, surface_from(z + height), surface.permute(1, 2, 0)).flatten(0, 1)  # [W_T * D_T, N]
+    if cell.support == "bearing":
+        cells, under = square_cells(grid, x, y, side), is_under(w, d, side) & (height > 0)
+        weak = under & ~bears(surface.flatten(1).t().gather(0, cells), under, z)
+        after.scatter_add_(0, cells, -weak.int())
+    return after.t().unflatten(1, grid).contiguous()

@@ -201,9 +201,7 @@ def test_the_critic_adds_up_what_each_column_will_hold(seed, field, tote):
             share, more = critic.head(F.relu(critic.hidden(F.relu(out))))
             total += (share * room + more / 5).item()
         assert float(critic(bins, totes, bearing)[n]) == pytest.approx(total, rel=1e-4, abs=1e-4)
-    several = critic(
-        bins.view(2, 1, 4, 6), totes.view(2, 1, *tote), bearing.view(2, 1, *tote)
-    )  # any leading dimensions
+    several = critic(*(maps[:, None] for maps in (bins, totes, bearing)))  # any leading dimensions
     torch.testing.assert_close(several, critic(bins, totes, bearing).view(2, 1, 1), rtol=1e-4, atol=1e-4)
 
 

@@ -1,8 +1,10 @@
 """Masks, the single step and the plain-Python oracle agree on random cells, with and without limits on the robot."""
 
+import itertools
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import assume, given, settings
@@ -24,6 +26,7 @@ from pickplace.task.feasibility import (
 )
 from pickplace.task.grasps import all_grasps, heuristic_pick
 from pickplace.task.state import EMPTY, surface_from
+from pickplace.task.support import bears
 from pickplace.task.transition import apply, put_down
 
 
@@ -175,6 +178,35 @@ def test_the_hull_rule_equals_scipys_hull(data):
     assume(abs(outside + margin) > 1e-9 or margin == 0)
     expected = SUCCESS if outside < -margin - 1e-9 else UNSTABLE
     assert rest_on(heights, (w, d, 1), "hull", margin) == expected
+
+
+@settings(max_examples=200)
+@given(st.data())
+def test_an_item_bears_weight_inside_scipys_hull(data):
+    w, d = data.draw(st.integers(1, 7)), data.draw(st.integers(1, 7))
+    held = data.draw(st.lists(st.tuples(st.integers(0, w - 1), st.integers(0, d - 1)), min_size=1, unique=True))
+    square = list(itertools.product(range(max(w, d)), repeat=2))
+    cells = surface_from(torch.tensor([[int(corner in held)] for corner in square]))
+    under = torch.tensor([[x < w and y < d] for x, y in square])
+    hull = ConvexHull([(x + a, y + b) for x, y in held for a in (0, 1) for b in (0, 1)]).equations
+    corners = np.array([[(x + a, y + b, 1) for a in (0, 1) for b in (0, 1)] for x, y in square])
+    expected = under[:, 0].numpy() & ((corners @ hull.T).max((1, 2)) < 1e-9)
+    assert bears(cells, under, torch.ones(1, dtype=torch.int32))[:, 0].tolist() == expected.tolist()
+
+
+@pytest.mark.parametrize(("support", "third"), [("hull", SUCCESS), ("bearing", UNSTABLE)])
+def test_a_pile_that_leans_over(support, third):
+    """Bricks of three cells, each one cell further. The third one would have the upper two balance on an edge."""
+    cell = CellSpec((3, 1, 1), (6, 1, 9), (3, 1), 1, "contain", support, 0.25)
+    item = Item(*torch.tensor([[0, 0, 3, 1, 1]]).unbind(1))
+    state, failures = State(torch.full((1, 6, 1), EMPTY, dtype=torch.int32), torch.tensor([9]), item), []
+    for middle in (1, 2, 3):
+        step = apply(cell, state, torch.tensor([6 + middle]))  # picked in the middle
+        failures.append(int(step.failure))
+        state = state._replace(surface=step.surface)
+    assert failures == [SUCCESS, SUCCESS, third]
+    weak = state.bearing[0, :, 0].logical_not().nonzero()[:, 0].tolist()
+    assert weak == ([3] if support == "bearing" else [])  # where the second brick sticks out
 
 
 @settings(max_examples=50)
