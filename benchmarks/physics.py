@@ -3,10 +3,12 @@
 Plans of the test stream are carried out by `settle` or `execute`. A row of docs/results/physics.csv is a set of totes:
 
 - each stability rule, 200 totes at friction 0.6 and a gap of 1 mm, and 50 at other values, one changed at a time;
-- methods with and without joint planning, 100 totes, `execute`.
+- methods with and without joint planning, 100 totes, `execute`;
+- the trained policy on 27 kinds of items, 50 totes, `execute`, with errors of placement, other gaps and frictions.
 
 Rows that are there are not computed again, so the run can be stopped and started again. To use several cores, start
-several runs with different --match; each kind of items has plans of its own. Prints the tables of docs/physics.md.
+several runs with different --match; each kind of items has plans of its own. Prints the tables of docs/physics.md,
+and draws docs/physics.png.
 """
 
 import argparse
@@ -21,6 +23,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import matplotlib.pyplot as plt
+import numpy as np
 import torch
 
 from pickplace import PickPlaceEnv
@@ -40,9 +44,18 @@ METHODS = {
     "individual_heuristic": ["planner=individual_heuristic"],
     "individual_grasp": ["checkpoint=outputs/reproduce/train/individual_grasp-R{R}-s0", "planner.candidates=all"],
     "joint_dbl": ["planner=joint_dbl"],
-    "fcn_grasp": ["checkpoint=pretrained/r{R}"],
+    "fcn_grasp": ["checkpoint=pretrained/{weights}"],
     "random": ["planner=random"],
 }
+
+
+#: Panels of the figure: what varies, the legend, and friction, gap and noise of each point.
+ROBUSTNESS = (
+    ("error of placement, standard deviation, mm", "gap 1 mm", [(0.6, 1.0, noise) for noise in (0.0, 0.5, 1.0, 2.0)]),
+    ("error of placement, standard deviation, mm", "gap 4 mm", [(0.6, 4.0, n) for n in (0.0, 0.5, 1.0, 2.0, 3.0, 5.0)]),
+    ("gap, mm", "no error", [(0.6, gap, 0.0) for gap in (0.0, 1.0, 2.0, 3.0, 4.0)]),
+    ("friction", "gap 1 mm", [(friction, 1.0, 0.0) for friction in (0.3, 0.6, 0.9)]),
+)
 
 
 class Cell(NamedTuple):
@@ -56,6 +69,7 @@ class Cell(NamedTuple):
     simulation: str  # settle or execute
     friction: float = 0.6
     gap_mm: float = 1.0
+    noise_mm: float = 0.0
 
     @property
     def name(self) -> str:
@@ -79,6 +93,8 @@ def wanted() -> Iterator[tuple[Cell, int]]:
     for rotations in (1, 4):
         for method in list(METHODS)[:-1]:
             yield Cell("kinds", "6x6x5", method, rotations, OF_METHODS, "execute"), 100
+    for condition in dict.fromkeys(point for _, _, points in ROBUSTNESS for point in points):
+        yield Cell("mixed", "8x8x8", "fcn_grasp", 4, OF_METHODS, "execute", *condition), 50
     for friction, gap in ((0.3, 1.0), (0.9, 1.0), (0.6, 0.0), (0.6, 3.0)):
         for items, tote in ITEMS.items():
             for rule in RULES:
@@ -116,8 +132,10 @@ def plan(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
         return pack_without_gripper(cell, totes)
     if not (cell.folder / "plans.jsonl").is_file():
         rule, _, margin = cell.support.partition("+")
+        weights = "mixed" if cell.items == "mixed" else f"r{cell.R}"
         command = [
-            str(Path(sys.executable).with_name("pickplace-evaluate")), *(word.format(R=cell.R) for word in words),
+            str(Path(sys.executable).with_name("pickplace-evaluate")),
+            *(word.format(R=cell.R, weights=weights) for word in words),
             f"items={cell.items}", f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"env.rotations={cell.R}",
             f"env.support={rule}", f"env.support_margin={margin or 0}", "evaluation.episodes=200",
             "evaluation.plans=true", "evaluation.replay=0", "evaluation.latency_decisions=0", "threads=1",
@@ -157,7 +175,8 @@ def pack_without_gripper(cell: Cell, totes: int) -> tuple[list[float], list[Epis
 def measure(cell: Cell, totes: int) -> dict[str, float]:
     """Return the figures of a cell."""
     planned, plans = plan(cell, totes)
-    simulation = {"settle": Settle, "execute": Execute}[cell.simulation](friction=cell.friction, gap=cell.gap_mm / 1e3)
+    settings = {"friction": cell.friction, "gap": cell.gap_mm / 1e3, "noise": cell.noise_mm / 1e3}
+    simulation = {"settle": Settle, "execute": Execute}[cell.simulation](**settings)
     outcomes = list(simulation.carry_out(plans))
     figures = {"totes": totes, "lost": sum(outcome.ending != "done" for outcome in outcomes)}
     for name, values in (("planned", planned), ("kept", [outcome.occupancy for outcome in outcomes])):
@@ -199,12 +218,36 @@ def tables() -> str:
             lines.append(f"| {items}, {tote} | `{rule}` | {' | '.join(counts)} |")
     lines += ["", "| R | method | totes carried out | occupancy planned | carried out |", "|---|---|---|---|---|"]
     for cell in dict(wanted()):
-        if cell in rows and cell.simulation == "execute":
+        if cell in rows and cell.simulation == "execute" and cell.items == "kinds":
             row = rows[cell]
             done = f"{row['totes'] - row['lost']:.0f} of {row['totes']:.0f}"
             planned, kept = interval(row, "planned"), interval(row, "kept")
             lines.append(f"| {cell.R} | `{cell.method}` | {done} | {planned} | {kept} |")
     return "\n".join(lines)
+
+
+def figure() -> None:
+    """Draw how errors of placement, gaps and friction change what a gantry carries out, in docs/physics.png."""
+    rows, names = read(), list(dict.fromkeys(name for name, _, _ in ROBUSTNESS))
+    chart, panels = plt.subplots(1, len(names), figsize=(11, 3.2), sharey=True, layout="constrained")
+    for name, label, points in ROBUSTNESS:
+        cells = [Cell("mixed", "8x8x8", "fcn_grasp", 4, OF_METHODS, "execute", *point) for point in points]
+        if missing := [cell.name for cell in cells if cell not in rows]:
+            sys.stdout.write(f"no figure: {missing[0]} is not measured\n")
+            return
+        axis = {"gap, mm": 1, "friction": 0}.get(name, 2)
+        totes = [round(rows[cell]["totes"]) for cell in cells]
+        done = [count - round(rows[cell]["lost"]) for cell, count in zip(cells, totes, strict=True)]
+        share = np.divide(done, totes)
+        bounds = np.array([proportion95(*pair) for pair in zip(done, totes, strict=True)])
+        error = abs(bounds - share[:, None]).T
+        panel = panels[names.index(name)]
+        panel.errorbar([point[axis] for point in points], share, error, marker="o", capsize=3, label=label)
+        panel.set(xlabel=name, ylim=(-0.02, 1.05))
+        panel.legend(loc="lower left", frameon=False)
+        panel.grid(alpha=0.3)
+    panels[0].set_ylabel("share of totes carried out")
+    chart.savefig(ROOT / "docs" / "physics.png", dpi=130)
 
 
 def main() -> None:
@@ -219,6 +262,7 @@ def main() -> None:
             write(cell, figures)
             sys.stdout.write(f"{cell.name}: {figures['lost']:.0f} of {totes} lost an item\n")
     sys.stdout.write(tables() + "\n")
+    figure()
 
 
 if __name__ == "__main__":

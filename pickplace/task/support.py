@@ -65,7 +65,7 @@ def _is_in_hull(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tenso
     return stable
 
 
-def bears(cells: Tensor, under: Tensor, z: Tensor) -> Tensor:
+def bearing_cells(cells: Tensor, under: Tensor, z: Tensor) -> Tensor:
     """Return where the top of an item bears weight, with ``bearing``: the cells inside the hull of its supporting ones.
 
     Args:

@@ -20,7 +20,7 @@ from pickplace.task.grasps import (
 from pickplace.task.maps import is_under, rectangle, square_cells, squares
 from pickplace.task.placing import is_within_reach, overflows, rest
 from pickplace.task.state import Failure, State, surface_from
-from pickplace.task.support import bears, is_supported
+from pickplace.task.support import bearing_cells, is_supported
 
 
 class Step(NamedTuple):
@@ -113,6 +113,6 @@ def _with_item(cell: CellSpec, surface: Tensor, footprint: Tensor, z: Tensor, he
     after = torch.where(inside, surface_from(z + height), surface.permute(1, 2, 0)).flatten(0, 1)  # [W_T * D_T, N]
     if cell.support == "bearing":
         cells, under = square_cells(grid, x, y, side), is_under(w, d, side) & (height > 0)
-        weak = under & ~bears(surface.flatten(1).t().gather(0, cells), under, z)
+        weak = under & ~bearing_cells(surface.flatten(1).t().gather(0, cells), under, z)
         after.scatter_add_(0, cells, -weak.int())
     return after.t().unflatten(1, grid).contiguous()

@@ -26,7 +26,7 @@ from pickplace.task.feasibility import (
 )
 from pickplace.task.grasps import all_grasps, heuristic_pick
 from pickplace.task.state import EMPTY, surface_from
-from pickplace.task.support import bears
+from pickplace.task.support import bearing_cells
 from pickplace.task.transition import apply, put_down
 
 
@@ -191,7 +191,7 @@ def test_an_item_bears_weight_inside_scipys_hull(data):
     hull = ConvexHull([(x + a, y + b) for x, y in held for a in (0, 1) for b in (0, 1)]).equations
     corners = np.array([[(x + a, y + b, 1) for a in (0, 1) for b in (0, 1)] for x, y in square])
     expected = under[:, 0].numpy() & ((corners @ hull.T).max((1, 2)) < 1e-9)
-    assert bears(cells, under, torch.ones(1, dtype=torch.int32))[:, 0].tolist() == expected.tolist()
+    assert bearing_cells(cells, under, torch.ones(1, dtype=torch.int32))[:, 0].tolist() == expected.tolist()
 
 
 @pytest.mark.parametrize(("support", "third"), [("hull", SUCCESS), ("bearing", UNSTABLE)])
