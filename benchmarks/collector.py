@@ -13,6 +13,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from pickplace import PickPlaceEnv, State
 from pickplace.task.feasibility import actions_reaching, placing_maps
+from pickplace.task.observation import STANDARD_TERMS
 from pickplace.training.collectors import single
 from pickplace.training.curriculum import Current, Curriculum, NoAdvance
 
@@ -37,7 +38,7 @@ def measure(batch: int, mask: str) -> dict:
 
     env = make()
     cell = env.base_env.cell
-    keys = [f"{mask}_mask", "bin_depth", "tote_depth", "tote_height"]
+    keys = [f"{mask}_mask", *STANDARD_TERMS]
 
     def act(*values):
         observation = dict(zip(keys, values, strict=True))

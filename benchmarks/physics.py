@@ -42,7 +42,7 @@ OF_METHODS = "bearing+0.25"  # the rule under which methods are compared
 METHODS = {
     "rectpack": None,
     "individual_heuristic": ["planner=individual_heuristic"],
-    "individual_grasp": ["checkpoint=outputs/reproduce/train/individual_grasp-R{R}-s0", "planner.candidates=all"],
+    "individual_grasp": ["checkpoint=outputs/physics/train/individual_grasp-R{R}"],  # trained here, see `plan`
     "joint_dbl": ["planner=joint_dbl"],
     "fcn_grasp": ["checkpoint=pretrained/{weights}"],
     "random": ["planner=random"],
@@ -133,19 +133,27 @@ def plan(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
     if not (cell.folder / "plans.jsonl").is_file():
         rule, _, margin = cell.support.partition("+")
         weights = "mixed" if cell.items == "mixed" else f"r{cell.R}"
-        command = [
-            str(Path(sys.executable).with_name("pickplace-evaluate")),
-            *(word.format(R=cell.R, weights=weights) for word in words),
+        trained = RUNS / "train" / f"individual_grasp-R{cell.R}"
+        if cell.method == "individual_grasp" and not trained.exists():
+            training = ["experiment=quick", "model=individual_grasp", "curriculum.advance.max_frames_per_level=50_000"]
+            run("pickplace-train", *training, f"env.rotations={cell.R}", f"hydra.run.dir={trained}")
+        run(
+            "pickplace-evaluate", *(word.format(R=cell.R, weights=weights) for word in words),
             f"items={cell.items}", f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"env.rotations={cell.R}",
             f"env.support={rule}", f"env.support_margin={margin or 0}", "evaluation.episodes=200",
             "evaluation.plans=true", "evaluation.replay=0", "evaluation.latency_decisions=0", "threads=1",
             f"hydra.run.dir={cell.folder}",
-        ]  # fmt: skip
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
+        )  # fmt: skip
     occupancy = json.loads((cell.folder / "evaluation.json").read_text())["occupancy"]["per_episode"][:totes]
     plans = {one.episode: one for one in read_plans(cell.folder / "plans.jsonl")}
     empty = replace(next(iter(plans.values())), placements=[])  # an episode without placements has no line
     return occupancy, [plans.get(number, replace(empty, episode=number)) for number in range(totes)]
+
+
+def run(program: str, *words: str) -> None:
+    """Run a command of the package."""
+    command = [str(Path(sys.executable).with_name(program)), *words]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
 
 
 def pack_without_gripper(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
@@ -202,7 +210,7 @@ def interval(row: dict, name: str) -> str:
 def tables() -> str:
     """Return the tables of docs/physics.md."""
     rows = read()
-    lines = ["| items, tote | planner | `env.support=` | totes that lost an item | occupancy | carried out |"]
+    lines = ["| items, tote | planner | rule | totes that lost an item | occupancy | carried out |"]
     lines.append("|---|---|---|---|---|---|")
     for cell in dict(wanted()):
         if cell in rows and cell.simulation == "settle" and (cell.friction, cell.gap_mm) == (0.6, 1.0):
@@ -210,7 +218,7 @@ def tables() -> str:
             lines.append(f"| {about} | {share(row)} | {interval(row, 'planned')} | {interval(row, 'kept')} |")
     conditions = [(0.3, 1.0), (0.9, 1.0), (0.6, 0.0), (0.6, 3.0)]
     names = " | ".join(f"friction {friction:g}, gap {gap:g} mm" for friction, gap in conditions)
-    lines += ["", f"| items, tote | `env.support=` | {names} |", "|---|---|---|---|---|---|"]
+    lines += ["", f"| items, tote | rule | {names} |", "|---|---|---|---|---|---|"]
     for items, tote in ITEMS.items():
         for rule in RULES:
             cells = [Cell(items, tote, "joint_dbl", 4, rule, "settle", *condition) for condition in conditions]

@@ -90,7 +90,7 @@ def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=NEVER, 
         heights = np.random.default_rng(draw(st.integers(0, 999))).choice(levels, size=(tote_w, tote_d))
         weak = draw(st.sampled_from([0.0, 0.3])) * (support == "bearing")
         bearing = (np.random.default_rng(draw(st.integers(0, 999))).random((tote_w, tote_d)) >= weak).astype(int)
-        cases.append(Case(rim, heights, bearing, item))
+        cases.append(Case(rim, heights, np.where(heights == 0, 1, bearing), item))
     return cell, cases
 
 

@@ -318,7 +318,7 @@ def test_a_full_disk_is_named(run, tmp_path, monkeypatch, command, owner, functi
     ("part", "index", "value", "words"),
     [
         ("surface", 0, -1, "surface: expected heights of 0 to tote_height"), ("surface", 0, 19, "surface: expected"),
-        ("surface", 0, 0, "the carried tote_bearing"),
+        ("surface", 0, 0, "surface: expected cells that bear weight"),
         ("tote_height", 0, 0, "tote_height: expected"), ("volume", 0, -1, "volume"), ("volume", 0, 10**9, "volume"),
         ("steps", 0, -1, "steps"), ("steps", 0, 10**9, "steps"), ("episode", 0, -1, "episode"),
         ("item", (0, 0), 99, "item: expected"), ("item", (0, 4), -1, "item: expected"),

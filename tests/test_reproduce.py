@@ -31,8 +31,8 @@ def test_an_entry_stands_for_every_combination_of_its_axes():
     entry = {"name": "m-R{R}-s{seed}", "training": "t-s{seed}", "R": [1, 4], "seed": [0], "tote": ["6x6x5"]}
     made = cells.expand({**entry, "set": "a=1"}, "pickplace-evaluate")
     assert [cell.name for cell in made] == ["m-R1-s0", "m-R4-s0"] and made[1].training == "t-s0"
-    assert made[1].overrides == ("env.rotations=4", "env.tote_size=[6,6,5]", "a=1")
-    assert cells.expand({"name": "t-s{seed}", "seed": [3]}, "pickplace-train")[0].overrides == ("seed=3",)
+    assert made[1].overrides == ("env.support=half", "env.rotations=4", "env.tote_size=[6,6,5]", "a=1")
+    assert cells.expand({"name": "t-s{seed}", "seed": [3]}, "pickplace-train")[0].overrides[1:] == ("seed=3",)
     with pytest.raises(ValueError, match="gird"):
         cells.expand({"name": "m", "gird": [1]}, "pickplace-train")
 

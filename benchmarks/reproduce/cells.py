@@ -10,8 +10,9 @@ DEFINITIONS = Path(__file__).with_name("definitions.yaml")
 #: The override that an axis sets. Of `method` there is none: it only stands in names.
 AXES = {"R": "env.rotations", "tote": "env.tote_size", "K": "planner.candidates", "seed": "seed", "items": "items"}
 AXES |= {"env": "env", "planner": "planner", "packer": "packer", "mask": "planner.mask", "method": ""}
-PAPERS_RULE = "env.support=half"
 AXES |= {"simulations": "planner.simulations", "samples": "planner.samples"}
+#: All cells have the paper's rule for stability.
+PAPERS_RULE = "env.support=half"
 
 
 @dataclass(frozen=True)

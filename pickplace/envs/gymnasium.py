@@ -73,6 +73,7 @@ class PickPlaceGymEnv(gymnasium.Env):
     |---|---|---|
     | `bin_depth` | `(W_B, D_B)` float32 | height above the bin's floor, 0 where empty; height units |
     | `tote_depth` | `(W_T, D_T)` float32 | remaining height up to the rim; height units |
+    | `tote_bearing` | `(W_T, D_T)` float32 | 1 where the cell bears weight, else 0; all 1 unless `support=bearing` |
     | `tote_height` | `(1,)` int64 | height of the episode's tote; height units |
 
     and what `observation=` adds (see `PickPlaceEnv`).

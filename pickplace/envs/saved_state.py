@@ -48,6 +48,8 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     state = State(surface, tote_height, Item(*saved["item"].unbind(-1)))
     heights = state.heights
     check("surface", (heights >= 0) & (heights <= tote_height[:, None, None]), "heights of 0 to tote_height")
+    bearing = state.bearing | ((heights > 0) & (cell.support == "bearing"))
+    check("surface", bearing, "cells that bear weight")
     check("volume", (volume >= 0) & (volume <= heights.sum((1, 2))), "at most the volume below the surface")
     check("steps", (steps >= 0) & (steps <= volume), "at most one for each unit of volume")
     check("episode", episode >= 0, "at least 0")

@@ -49,6 +49,7 @@ class Policy(TensorDictModuleBase, ABC):
     Attributes:
         choice_key: name of the choice in the TensorDict.
         in_keys: entries of the observation that :meth:`logits` reads.
+        map_keys: entries of the observation that its network reads.
         masks: masks that the environment must emit for training it, of ``"action"`` and ``"footprint"``.
         excludes: what :meth:`action_log_probs` gives probability 0 by construction; None if nothing.
         ranks_footprints: whether it chooses among all footprints, by ``footprint_logits(observation, mask)``.
@@ -56,6 +57,7 @@ class Policy(TensorDictModuleBase, ABC):
     """
 
     choice_key: str
+    map_keys: tuple[str, ...] = DEPTH_KEYS
     masks: tuple[str, ...] = ()
     excludes: str | None = None
     ranks_footprints = False
@@ -67,7 +69,7 @@ class Policy(TensorDictModuleBase, ABC):
         self.cell = cell
         if masks is not None:
             self.masks = masks
-        self.in_keys, self.out_keys = [*DEPTH_KEYS, *(f"{mask}_mask" for mask in self.masks)], ["logits"]
+        self.in_keys, self.out_keys = [*self.map_keys, *(f"{mask}_mask" for mask in self.masks)], ["logits"]
 
     @abstractmethod
     def logits(self, observation: Observation) -> Tensor:

@@ -18,11 +18,7 @@ from pickplace.task.grasps import class_index, footprint_index, is_outside, join
 from pickplace.task.state import Observation, State, item_from_depth
 from pickplace.task.transition import apply
 
-
-def depths_and_bearing(cell: CellSpec, observation: Observation) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return the depth maps, and where the tote bears weight if not every cell does."""
-    bearing = observation["tote_bearing"] if cell.support == "bearing" else None
-    return observation["bin_depth"], observation["tote_depth"], bearing
+MAP_KEYS = ("bin_depth", "tote_depth", "tote_bearing")
 
 
 def count_ways(cell: CellSpec, footprint: Tensor, allowed: Tensor) -> Tensor:
@@ -47,6 +43,7 @@ class FootprintPolicy(Policy):
     """
 
     choice_key = "footprint"
+    map_keys = MAP_KEYS
     masks: tuple[str, ...] = ("footprint",)
     excludes: str | None = "failed picks and footprints outside the tote"
     ranks_footprints = True
@@ -54,8 +51,6 @@ class FootprintPolicy(Policy):
 
     def __init__(self, cell: CellSpec, **network):
         super().__init__(cell)
-        if cell.support == "bearing":
-            self.in_keys = ["tote_bearing", *self.in_keys]
         self.network = FootprintFcn(**network)
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
@@ -65,7 +60,8 @@ class FootprintPolicy(Policy):
             row: int64 ``[M]``, index of the problem.
             footprint: int64 ``[M]``, index ``(parity * W_T + x) * D_T + y``.
         """
-        return self.network.at(*depths_and_bearing(self.cell, observation), row, footprint)[:, 0]
+        bins, totes, bearing = (observation[key] for key in MAP_KEYS)
+        return self.network.at(bins, totes, bearing, row, footprint)[:, 0]
 
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
         """Return logits of the footprints that a mask ``[N, Q * W_T * D_T]`` allows; the others are not computed."""
@@ -119,12 +115,11 @@ class GraspPolicy(Policy):
     """
 
     choice_key = "grasp"
+    map_keys = MAP_KEYS
     scored: Tensor  # see `_scored`
 
     def __init__(self, cell: CellSpec, **network):
         super().__init__(cell)
-        if cell.support == "bearing":
-            self.in_keys = ["tote_bearing", *self.in_keys]
         self.classes = cell.parities * cell.num_offsets**2
         self.network = FootprintFcn(cell.num_offsets**2, **network)
         self.miss, self.outside = (nn.Parameter(torch.zeros(())) for _ in range(2))
@@ -152,7 +147,8 @@ class GraspPolicy(Policy):
 
     def class_scores(self, observation: Observation) -> Tensor:
         """Return a logit for every (grasp class, place cell), ``[N, C, W_T * D_T]``."""
-        scores = self.network(*depths_and_bearing(self.cell, observation), self.cell.parities).flatten(1)
+        bins, totes, bearing = (observation[key] for key in MAP_KEYS)
+        scores = self.network(bins, totes, bearing, self.cell.parities).flatten(1)
         return torch.cat([scores, self.outside.expand(len(scores), 1)], 1)[:, self.scored]
 
     def _choices(self, observation: Observation) -> tuple[Tensor, Tensor, Tensor]:

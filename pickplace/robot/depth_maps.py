@@ -94,7 +94,7 @@ class Lengths:
 
 def flags_of_map(name: str, values, grid: tuple[int, int]) -> Tensor:
     """Return a map of 0 and 1, int64 ``grid``; arguments and errors as of :meth:`Lengths.units_of_map`."""
-    array = _as_array(name, values, grid)
+    array = _as_array(name, values, grid, "biuf")
     if (bad := (array != 0) & (array != 1)).any():
         x, y = np.argwhere(bad)[0].tolist()
         raise DepthMapError(f"{name}[{x}, {y}]: got {array[x, y]:g}, expected 0 or 1.")
@@ -126,8 +126,8 @@ def check_one_cuboid(bin_map: Tensor, unit_name: str) -> None:
         )
 
 
-def _as_array(name: str, values, grid: tuple[int, int]) -> np.ndarray:
-    """Return a map as a numpy array of numbers in the shape of the grid."""
+def _as_array(name: str, values, grid: tuple[int, int], kinds: str = "iuf") -> np.ndarray:
+    """Return a map as a numpy array in the shape of the grid; ``kinds`` are those of numpy's types."""
     try:
         if isinstance(values, Tensor):
             values = values.detach().cpu()
@@ -139,7 +139,7 @@ def _as_array(name: str, values, grid: tuple[int, int]) -> np.ndarray:
         raise DepthMapError(
             f"{name}: got shape {list(array.shape)}, expected {list(grid)}, the grid that the planner was loaded for."
         )
-    if array.dtype.kind not in "iuf":
+    if array.dtype.kind not in kinds:
         raise DepthMapError(f"{name}: got values of type {array.dtype}, expected numbers.")
     if isinstance(values, np.ma.MaskedArray) and np.ma.getmaskarray(values).any():
         x, y = np.argwhere(np.ma.getmaskarray(values))[0].tolist()

@@ -21,14 +21,8 @@ MAX_MAP = 2**26  # greatest size of a .npy file, in bytes
 
 #: Keys of a request; ``id`` comes back as it is.
 REQUEST_KEYS = (
-    "id",
-    "bin_depth",
-    "tote_depth",
-    "tote_height",
-    "cell_size",
-    "tolerance",
-    "alternatives",
-    "tote_bearing",
+    *("id", "bin_depth", "tote_depth", "tote_bearing"),
+    *("tote_height", "cell_size", "tolerance", "alternatives"),
 )
 
 
@@ -89,6 +83,8 @@ def run(args: argparse.Namespace) -> None:
     if (args.bin is None) != (args.tote is None):
         missing = "--bin" if args.bin is None else "--tote"
         raise ValueError(f"{missing}: no file; expected both --bin and --tote, or neither to read JSON lines.")
+    if args.tote_bearing is not None and args.tote is None:
+        raise ValueError(f"--tote-bearing={args.tote_bearing}: expected --bin and --tote, too.")
     if sys.stdout is None or (sys.stdin is None and args.bin is None):
         raise ValueError("standard input or output is closed; expected requests and a place for the plans.")
     use_threads("--threads", args.threads)

@@ -191,6 +191,7 @@ class Planner:
         bearing = torch.ones_like(tote_map)
         if tote_bearing is not None:
             bearing = flags_of_map("tote_bearing", tote_bearing, cell.tote_size[:2])
+            bearing = torch.where(tote_map == height, 1, bearing)  # the floor bears weight; this may be another tote
             if cell.support != "bearing" and not bearing.all():
                 raise DepthMapError(f"tote_bearing: got a 0 with support={cell.support}, expected support=bearing.")
         device = next(self._planner.policy.parameters()).device

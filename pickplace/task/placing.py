@@ -49,7 +49,7 @@ def resting_top(cell: CellSpec, state: State) -> Tensor:
     too small.
     """
     side, item = cell.max_side, state.item
-    padded = surround(state.surface.permute(1, 2, 0), (0, side - 1, 0, side - 1), FAR)
+    padded = surround(state.surface.permute(1, 2, 0), (0, side - 1, 0, side - 1), 2 * FAR)
     w, d = (torch.stack(pair)[: cell.parities] for pair in ((item.w, item.d), (item.d, item.w)))
     w, d = w[:, None, None], d[:, None, None]  # [Q, 1, 1, N]
     cells, under = windows(padded, side).flatten(0, 1).unbind(0), is_under(w, d, side).unbind(0)

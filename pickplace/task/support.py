@@ -55,7 +55,7 @@ def is_supported(
 def _is_in_hull(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor, margin: float) -> Tensor:
     """Return whether the item's centre lies inside the hull, further than ``margin`` from its edge."""
     side = round(len(cells) ** 0.5)
-    stable, sizes = torch.ones_like(supporting, dtype=torch.bool), (w.clamp(min=1) - 1, d.clamp(min=1) - 1)
+    stable, sizes = torch.ones_like(supporting, dtype=torch.bool), (w.clamp(1, side) - 1, d.clamp(1, side) - 1)
     for patterns, whole in hull_patterns(side, margin, supporting.device):
         patterns, whole = patterns[:, *sizes], whole[sizes]
         reached = torch.zeros_like(supporting, dtype=patterns.dtype)
@@ -87,7 +87,8 @@ def bearing_cells(cells: Tensor, under: Tensor, z: Tensor) -> Tensor:
 def _extents(side: int, device: torch.device) -> list[Tensor]:
     """Return how far the cells of a square reach along normals, from its corner: int32 ``[BITS, side * side]`` each."""
     near = torch.arange(side)
-    furthest = _furthest(_normals(side), torch.stack([near, near + 1])[..., None])[..., 0]  # [normals, axis, cell]
+    ends = torch.stack([near, near + 1])[..., None]
+    furthest = _greater_products(_normals(side), ends)[..., 0]  # [normals, axis, cell]
     along = furthest[:, 0, :, None] + furthest[:, 1, None, :]
     return [part.int().to(device) for part in along.flatten(1).split(BITS)]
 
@@ -99,7 +100,7 @@ def _normals(side: int) -> Tensor:
     return torch.tensor([(x, y) for x in steps for y in steps if gcd(x, y) == 1])
 
 
-def _furthest(normals: Tensor, ends: Tensor) -> Tensor:
+def _greater_products(normals: Tensor, ends: Tensor) -> Tensor:
     """Return the greater product of each normal's parts ``[normals, axis]`` with the two ends ``[2, ...]``."""
     return (normals[:, :, None, None, None] * ends).amax(2)
 
@@ -131,7 +132,7 @@ def hull_patterns(side: int, margin: float, device: torch.device) -> list[tuple[
     inside = inside[:, None, :, None] & inside[None, :, None, :]  # [x, y, w, d]
     words = []
     for chunk in _normals(side).split(BITS):
-        furthest = _furthest(chunk, ends)  # [normals, axis, cell, size]
+        furthest = _greater_products(chunk, ends)  # [normals, axis, cell, size]
         along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
         beyond = along > 2 * margin * chunk.double().norm(dim=1).view(-1, 1, 1, 1, 1)
         # No edge has the direction from one cell to another that is not in the footprint.

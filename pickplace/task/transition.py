@@ -82,7 +82,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     for kind, failed in checks:
         failure = torch.where(failed, int(kind), failure)
     footprint = torch.stack([x, y, w, d], -1)
-    after = _with_item(cell, surface, footprint, z, torch.where(failure == 0, item.h, 0))
+    after = _add_item(cell, surface, footprint, z, torch.where(failure == 0, item.h, 0))
     return Step(after, failure, top, footprint)
 
 
@@ -96,10 +96,10 @@ def put_down(cell: CellSpec, surface: Tensor, maps: PlacingMaps, footprint: Tens
     parity, x, y = split_footprint(cell.tote_size, footprint)
     w, d = turned_size(maps.item, parity == 1)
     z = maps.top.flatten(1).gather(1, footprint[:, None])[:, 0] - maps.item.h
-    return _with_item(cell, surface, torch.stack([x, y, w, d], -1), z, maps.item.h)
+    return _add_item(cell, surface, torch.stack([x, y, w, d], -1), z, maps.item.h)
 
 
-def _with_item(cell: CellSpec, surface: Tensor, footprint: Tensor, z: Tensor, height: Tensor) -> Tensor:
+def _add_item(cell: CellSpec, surface: Tensor, footprint: Tensor, z: Tensor, height: Tensor) -> Tensor:
     """Return the tote with an item in it, int32 ``[N, W_T, D_T]``.
 
     Args:

@@ -44,7 +44,7 @@ SLOW_REFERENCE = {
 def test_reference_figures(planner, items, tote, rotations, mean, error, episodes):
     """Within two standard errors of the difference."""
     sizes = {"tote_size": tote, "rotations": rotations, "items": items}
-    env = PickPlaceEnv(num_envs=episodes, masks=(), stream="test", **sizes)
+    env = PickPlaceEnv(num_envs=episodes, masks=(), stream="test", support="half", **sizes)
     occupancy = occupancies(planner(env.cell), env)
     variance = float(occupancy.var())
     theirs = error**2 if error else variance / 100 + 0.01**2 / 12

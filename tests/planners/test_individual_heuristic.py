@@ -54,7 +54,7 @@ def test_corners_of_maximal_rectangles(seed, wide, deep, steps):
 
 @pytest.mark.parametrize(("rotations", "reference"), [(1, 0.569), (3, 0.922)])
 def test_every_cell_meets_the_reference(rotations, reference):
-    env = PickPlaceEnv(rotations=rotations, num_envs=250, masks=(), stream="test", seed=5)
+    env = PickPlaceEnv(rotations=rotations, num_envs=250, masks=(), stream="test", seed=5, support="half")
     occupancy = occupancies(IndividualHeuristic(env.cell, "cells"), env)
     error = float(occupancy.std() / len(occupancy) ** 0.5)
     assert abs(float(occupancy.mean()) - reference) < 3 * error + 0.0005

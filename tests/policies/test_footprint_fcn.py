@@ -11,7 +11,7 @@ from problems import late_state
 
 from pickplace import CellSpec
 from pickplace.policies.base import MASKED, as_collection_policy
-from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy, depths_and_bearing
+from pickplace.policies.fcn_grasp import MAP_KEYS, FootprintPolicy, GraspPolicy
 from pickplace.policies.networks.critics import PooledCritic
 from pickplace.policies.networks.footprint_fcn import FootprintFcn, matrix_dtype
 from pickplace.runs import checkpoint
@@ -66,7 +66,7 @@ def by_hand(network, item, tote_depth, bearing, parity, x, y):
     weight, out = network.patch.weight.unflatten(1, (-1, network.planes)), network.patch.bias
     patch = itertools.product(*(range(-begin, side - begin) for begin in first))
     for position, cell in enumerate(at(*corner) for corner in patch):
-        if bearing is not None and cell is not None and not bearing[cell]:
+        if cell is not None and not bearing[cell]:
             out = out + network.weak[:, position]
     for position, plane in enumerate(ones):
         if plane is not None:
@@ -82,17 +82,15 @@ def by_hand(network, item, tote_depth, bearing, parity, x, y):
     sizes=st.tuples(st.integers(1, 4), st.integers(1, 6), st.integers(1, 3), st.integers(1, 4)),
     headroom_bins=st.sampled_from([None, 1, 3, 12]),
     deeper=st.sampled_from([0, 0, 100, 900_000]),
-    marked=st.booleans(),
 )
-def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes, headroom_bins, deeper, marked):
+def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes, headroom_bins, deeper):
     clip, levels, reach, items = sizes
     torch.manual_seed(seed)
     network = FootprintFcn(3, 8, field, 6, clip, levels, reach, items, headroom_bins=headroom_bins, **FLOAT)
     network.weak.data.normal_()
     bins, totes, bearing = random_maps(seed, 2, (4, 6), tote)
     totes += deeper  # depths are kept in 16 bits
-    bearing = bearing if marked else [None, None]
-    scores = network(bins, totes, bearing if marked else None, 2)
+    scores = network(bins, totes, bearing, 2)
     assert scores.shape == (2, 2, *tote, 3)
     item, found, expected = item_from_depth(bins), [], []
     for n, parity in itertools.product(range(2), range(2)):
@@ -112,7 +110,7 @@ def test_only_what_the_mask_allows_is_computed_and_it_is_the_same(rotations, mon
     monkeypatch.setattr(policy.network, "at", lambda *args: asked.append(len(args[3])) or at(*args))
     logits = policy.logits(state)
     assert asked == [int(mask.sum())] and asked[0] < mask.numel()
-    everywhere = policy.network(*depths_and_bearing(env.cell, state), env.cell.parities).flatten(1)
+    everywhere = policy.network(*(state[key] for key in MAP_KEYS), env.cell.parities).flatten(1)
     torch.testing.assert_close(logits, torch.where(mask, everywhere, MASKED))
     logits.logsumexp(1).sum().backward()
     assert all(parameter.grad is not None for parameter in policy.parameters())
@@ -139,7 +137,7 @@ def test_without_a_mask_every_grasp_has_the_score_of_its_footprint(rotations, ef
     policy, count = GraspPolicy(env.cell, filters=8, **FLOAT), env.cell.num_offsets
     policy.outside.data.fill_(7.0)
     logits = policy.class_scores(state).flatten(1)
-    scores = policy.network(*depths_and_bearing(env.cell, state), env.cell.parities)
+    scores = policy.network(*(state[key] for key in MAP_KEYS), env.cell.parities)
     for parity, (_, _, ref_x, ref_y) in enumerate(env.cell.effectors):
         for ox, oy, x, y in itertools.product(range(count), range(count), range(4), range(5)):
             fx, fy = x - ref_x + ox, y - ref_y + oy

@@ -87,12 +87,12 @@ class FootprintFcn(nn.Module):
         nn.init.normal_(self.head.weight, std=head_std)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor | None, parities: int) -> Tensor:
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, parities: int) -> Tensor:
         """Return scores of all footprints, float32 ``[N, parities, W_T, D_T, out_channels]``, in the tote or not.
 
         Args:
             bin_depth, tote_depth: ``[N, W_B, D_B]``, ``[N, W_T, D_T]``.
-            bearing: 1 where a cell of the tote bears weight, else 0, ``[N, W_T, D_T]``; None: all do.
+            bearing: 1 where a cell of the tote bears weight, else 0, ``[N, W_T, D_T]``.
             parities: 1, or 2 to turn the footprints too.
         """
         count = parities * tote_depth[0].numel()
@@ -100,9 +100,7 @@ class FootprintFcn(nn.Module):
         out = self.at(bin_depth, tote_depth, bearing, index // count, index % count)
         return out.view(len(tote_depth), parities, *tote_depth.shape[1:], -1)
 
-    def at(
-        self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor | None, row: Tensor, footprint: Tensor
-    ) -> Tensor:
+    def at(self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor) -> Tensor:
         """Return the scores of some footprints only, float32 ``[M, out_channels]``.
 
         Args:
@@ -121,14 +119,12 @@ class FootprintFcn(nn.Module):
             row, footprint = (F.pad(index, (0, padding)) for index in (row, footprint))
         x, weak = self._inputs(bin_depth, tote_depth, bearing, row, footprint, dtype)
         with torch.autocast(tote_depth.device.type, dtype, enabled=lower):
-            x = self.patch(x)
-            x = x if weak is None else x + F.linear(weak, self.weak)
-            x = F.relu(self.hidden(F.relu(x)))
+            x = F.relu(self.hidden(F.relu(self.patch(x) + F.linear(weak, self.weak))))
         return self.head(x.float())[:count]  # in full: scores that differ a little must not be rounded to a tie
 
     def _inputs(
-        self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor | None, row: Tensor, footprint: Tensor, dtype
-    ) -> tuple[Tensor, Tensor | None]:
+        self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor, dtype
+    ) -> tuple[Tensor, Tensor]:
         """Return the inputs of the first layer: ``[M, inputs]``, one-hot, cell by cell, then the five codes; and marks,
         ``[M, side * side]``."""
         side, reach = self.receptive_field, self.reach
@@ -151,7 +147,7 @@ class FootprintFcn(nn.Module):
         corner = (row * (wide + 2 * margin) + x) * stride + y
         cells = steps[turned.long()] + corner[:, None]  # [M, side * side]
         seen = depth.flatten()[cells]
-        weak = None if bearing is None else F.pad(1 - bearing, (margin,) * 4).flatten()[cells].to(dtype)
+        weak = F.pad(1 - bearing, (margin,) * 4).flatten()[cells].to(dtype)
         under = self._under(bin_depth.shape[1:], row.device)[item.w[row], item.d[row]]
         rest = torch.where(under, seen, FAR_DOWN).amin(1)  # depth of what the item rests on
         headroom = rest - item.h[row].to(torch.int16)  # above its top
