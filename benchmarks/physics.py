@@ -109,7 +109,7 @@ def read() -> dict[Cell, dict[str, float]]:
     with TABLE.open(newline="") as file:
         for row in csv.DictReader(file):
             values = [kind(row[key]) for key, kind in Cell.__annotations__.items()]
-            rows[Cell(*values)] = {key: float(row[key]) for key in FIGURES}
+            rows[Cell(*values)] = {key: (int if key in ("totes", "lost") else float)(row[key]) for key in FIGURES}
     return rows
 
 
@@ -198,8 +198,8 @@ def measure(cell: Cell, totes: int) -> dict[str, float]:
 # ---------------------------------------------------------------------- tables
 def share(row: dict) -> str:
     """Return how many totes lost an item."""
-    low, high = proportion95(int(row["lost"]), int(row["totes"]))
-    return f"{row['lost']:.0f} of {row['totes']:.0f} ({low:.1%} to {high:.1%})"
+    low, high = proportion95(row["lost"], row["totes"])
+    return f"{row['lost']} of {row['totes']} ({low:.1%} to {high:.1%})"
 
 
 def interval(row: dict, name: str) -> str:
@@ -222,13 +222,13 @@ def tables() -> str:
     for items, tote in ITEMS.items():
         for rule in RULES:
             cells = [Cell(items, tote, "joint_dbl", 4, rule, "settle", *condition) for condition in conditions]
-            counts = [f"{rows[cell]['lost']:.0f}" if cell in rows else "" for cell in cells]
+            counts = [str(rows[cell]['lost']) if cell in rows else "" for cell in cells]
             lines.append(f"| {items}, {tote} | `{rule}` | {' | '.join(counts)} |")
     lines += ["", "| R | method | totes carried out | occupancy planned | carried out |", "|---|---|---|---|---|"]
     for cell in dict(wanted()):
         if cell in rows and cell.simulation == "execute" and cell.items == "kinds":
             row = rows[cell]
-            done = f"{row['totes'] - row['lost']:.0f} of {row['totes']:.0f}"
+            done = f"{row['totes'] - row['lost']} of {row['totes']}"
             planned, kept = interval(row, "planned"), interval(row, "kept")
             lines.append(f"| {cell.R} | `{cell.method}` | {done} | {planned} | {kept} |")
     return "\n".join(lines)
@@ -244,8 +244,8 @@ def figure() -> None:
             sys.stdout.write(f"no figure: {missing[0]} is not measured\n")
             return
         axis = {"gap, mm": 1, "friction": 0}.get(name, 2)
-        totes = [round(rows[cell]["totes"]) for cell in cells]
-        done = [count - round(rows[cell]["lost"]) for cell, count in zip(cells, totes, strict=True)]
+        totes = [rows[cell]["totes"] for cell in cells]
+        done = [count - rows[cell]["lost"] for cell, count in zip(cells, totes, strict=True)]
         share = np.divide(done, totes)
         bounds = np.array([proportion95(*pair) for pair in zip(done, totes, strict=True)])
         error = abs(bounds - share[:, None]).T
@@ -268,7 +268,7 @@ def main() -> None:
         if re.search(arguments.match, cell.name) and (arguments.again or cell not in read()):
             figures = measure(cell, totes)
             write(cell, figures)
-            sys.stdout.write(f"{cell.name}: {figures['lost']:.0f} of {totes} lost an item\n")
+            sys.stdout.write(f"{cell.name}: {figures['lost']} of {totes} lost an item\n")
     sys.stdout.write(tables() + "\n")
     figure()
 
