@@ -116,7 +116,7 @@ def test_every_leaf_of_an_evaluation(name):
 def test_every_argument_of_the_environment(key, value):
     if key in ("items", "observation", "episode_stride") and value is None:
         return
-    if (key, value) in (("seed", 0), ("first_episode", 0), ("masks", [])):
+    if (key, value) in (("seed", 0), ("first_episode", 0), ("masks", []), ("observation", {})):
         PickPlaceEnv(**{"num_envs": 1, key: value}).reset()
         return
     with pytest.raises(ValueError, match=f"^{key}") as caught:

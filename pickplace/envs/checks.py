@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from pickplace.task.cell import CellSpec
+from pickplace.task.cell import HULL_RULES, CellSpec
 from pickplace.task.feasibility import footprint_mask, placing_maps
 from pickplace.task.grasps import available_offsets
 from pickplace.task.items import ItemDistribution
@@ -50,7 +50,10 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
                 f"bin_size={[*cell.bin_size]}: the kinds of items have more than {MAX_POSITIONS:,} positions in the "
                 "bin; expected a smaller bin, or fewer kinds."
             )
-    description, cell = cell.describe(), replace(cell, longest_side=int(items.sizes[:, :2].max()))
+    description = cell.describe()
+    if cell.support in HULL_RULES:
+        description += f", support={cell.support}, support_margin={cell.support_margin:g}"
+    cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
     rows = torch.tensor([(*item, kind) for item, kind in problems.items()])
     if cell.limits is None:
         # The lower an item, the harder to clear the rim; and what is far from all walls of the tote is alike.

@@ -139,7 +139,7 @@ def run(curriculum, batches, frames=0):
     """Return the logs after each batch, and the frames played; half of the episodes are at the level."""
     history = []
     for new, episodes in batches:
-        frames += new
+        frames += max(new, len(episodes))  # an episode takes a frame at least
         heights = [curriculum.level if i % 2 else height for i, (height, _) in enumerate(episodes)]
         occupancy = torch.tensor([o for _, o in episodes], dtype=torch.float32)
         history.append(curriculum.update(torch.tensor(heights, dtype=torch.int64), occupancy, frames))
