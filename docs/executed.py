@@ -1,6 +1,6 @@
 """Film docs/executed.gif, the first moves and the last ones of a replay that physics carried out:
 
-pickplace-evaluate checkpoint=pretrained/mixed physics=execute env.support=hull hydra.run.dir=outputs/executed
+pickplace-evaluate checkpoint=pretrained/mixed physics=execute hydra.run.dir=outputs/executed
 python docs/executed.py outputs/executed/replay.html
 """
 
