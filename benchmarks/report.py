@@ -10,6 +10,7 @@ HEAD = """# Performance
 
 Written by `make bench` from `benchmarks/results/`. Times are medians, with the 10th to 90th percentile in brackets.
 Peers run in turn with ours, on an idle machine. "All cores" means `threads=null OMP_WAIT_POLICY=ACTIVE`.
+The figures are of `env=paper`, the default when they were measured.
 """
 
 
