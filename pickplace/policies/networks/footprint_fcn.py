@@ -17,8 +17,9 @@ OUTSIDE = -1000  # the depth of a cell that is not in the tote
 FAR_DOWN = 10_000  # deeper than any tote
 
 #: What the rows of a bf16 product are rounded up to, beyond how many: one is prepared and kept for each number of rows,
-#: which takes time and memory. A single decision has few, and is not slowed down.
-PADDED_ROWS = ((4096, 512), (64, 64))
+#: which takes time and memory. Few rows are rounded up, too: a product of few adds up in another order, and near ties
+#: would be decided by the size of the batch.
+PADDED_ROWS = ((4096, 512), (0, 64))
 
 
 class FootprintFcn(nn.Module):
