@@ -222,7 +222,7 @@ def tables() -> str:
     for items, tote in ITEMS.items():
         for rule in RULES:
             cells = [Cell(items, tote, "joint_dbl", 4, rule, "settle", *condition) for condition in conditions]
-            counts = [str(rows[cell]['lost']) if cell in rows else "" for cell in cells]
+            counts = [str(rows[cell]["lost"]) if cell in rows else "" for cell in cells]
             lines.append(f"| {items}, {tote} | `{rule}` | {' | '.join(counts)} |")
     lines += ["", "| R | method | totes carried out | occupancy planned | carried out |", "|---|---|---|---|---|"]
     for cell in dict(wanted()):
