@@ -47,8 +47,9 @@ METHODS = {
     "fcn_grasp": ["checkpoint=pretrained/{weights}"],
     "random": ["planner=random"],
 }
-
-
+COMPARED = [name for name in METHODS if name != "random"]
+#: Friction and gap of the second table.
+CONDITIONS = ((0.3, 1.0), (0.9, 1.0), (0.6, 0.0), (0.6, 3.0))
 #: Panels of the figure: what varies, the legend, and friction, gap and noise of each point.
 ROBUSTNESS = (
     ("error of placement, standard deviation, mm", "gap 1 mm", [(0.6, 1.0, noise) for noise in (0.0, 0.5, 1.0, 2.0)]),
@@ -91,11 +92,11 @@ def wanted() -> Iterator[tuple[Cell, int]]:
             for rule in RULES:
                 yield Cell(items, tote, method, 4, rule, "settle"), 200
     for rotations in (1, 4):
-        for method in list(METHODS)[:-1]:
+        for method in COMPARED:
             yield Cell("kinds", "6x6x5", method, rotations, OF_METHODS, "execute"), 100
     for condition in dict.fromkeys(point for _, _, points in ROBUSTNESS for point in points):
         yield Cell("mixed", "8x8x8", "fcn_grasp", 4, OF_METHODS, "execute", *condition), 50
-    for friction, gap in ((0.3, 1.0), (0.9, 1.0), (0.6, 0.0), (0.6, 3.0)):
+    for friction, gap in CONDITIONS:
         for items, tote in ITEMS.items():
             for rule in RULES:
                 yield Cell(items, tote, "joint_dbl", 4, rule, "settle", friction, gap), 50
@@ -216,12 +217,11 @@ def tables() -> str:
         if cell in rows and cell.simulation == "settle" and (cell.friction, cell.gap_mm) == (0.6, 1.0):
             row, about = rows[cell], f"{cell.items}, {cell.tote} | `{cell.method}` | `{cell.support}`"
             lines.append(f"| {about} | {share(row)} | {interval(row, 'planned')} | {interval(row, 'kept')} |")
-    conditions = [(0.3, 1.0), (0.9, 1.0), (0.6, 0.0), (0.6, 3.0)]
-    names = " | ".join(f"friction {friction:g}, gap {gap:g} mm" for friction, gap in conditions)
+    names = " | ".join(f"friction {friction:g}, gap {gap:g} mm" for friction, gap in CONDITIONS)
     lines += ["", f"| items, tote | rule | {names} |", "|---|---|---|---|---|---|"]
     for items, tote in ITEMS.items():
         for rule in RULES:
-            cells = [Cell(items, tote, "joint_dbl", 4, rule, "settle", *condition) for condition in conditions]
+            cells = [Cell(items, tote, "joint_dbl", 4, rule, "settle", *condition) for condition in CONDITIONS]
             counts = [str(rows[cell]["lost"]) if cell in rows else "" for cell in cells]
             lines.append(f"| {items}, {tote} | `{rule}` | {' | '.join(counts)} |")
     lines += ["", "| R | method | totes carried out | occupancy planned | carried out |", "|---|---|---|---|---|"]

@@ -192,7 +192,7 @@ class Oracle:
         return SUCCESS, after
 
     def bearing_after(self, action: int) -> Grid:
-        """Where the tote bears weight after an action that succeeds: what is inside the hull of what supports it."""
+        """1 for each cell that bears weight after an action that succeeds; of an item: inside its support's hull."""
         after = [column[:] for column in self.bearing]
         if self.rules.support != "bearing":
             return after

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from pickplace.policies.base import MASKED, Policy, pick_one
-from pickplace.policies.networks.footprint_fcn import FootprintFcn
+from pickplace.policies.networks.footprint_fcn import MAP_KEYS, FootprintFcn
 from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import (
     action_footprints,
@@ -17,8 +17,6 @@ from pickplace.task.feasibility import (
 from pickplace.task.grasps import class_index, footprint_index, is_outside, join_action, pick_classes, split_flat
 from pickplace.task.state import Observation, State, item_from_depth
 from pickplace.task.transition import apply
-
-MAP_KEYS = ("bin_depth", "tote_depth", "tote_bearing")
 
 
 def count_ways(cell: CellSpec, footprint: Tensor, allowed: Tensor) -> Tensor:

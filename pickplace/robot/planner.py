@@ -160,7 +160,7 @@ class Planner:
             occupancy_after=before if action is None else before + int(state.item.volume) / capacity,
             alternatives=self._alternatives(observation, state, action, alternatives),
             reasons=self._reasons(state) if status in ("stuck", "impossible") else None,
-            tote_bearing=self._bearing(state.surface if step is None else step.surface),
+            tote_bearing=self._bearing(state if step is None else state._replace(surface=step.surface)),
         )
         return plan if action is None or step is None else self._add_poses(plan, action, step, lengths)
 
@@ -199,8 +199,9 @@ class Planner:
         measured["tote_height"] = torch.tensor(height)
         return State.from_observation({key: value[None].to(device) for key, value in measured.items()})
 
-    def _bearing(self, surface: Tensor) -> list[list[int]] | None:
-        return (surface[0] & 1).tolist() if self.cell.support == "bearing" else None
+    def _bearing(self, state: State) -> list[list[int]] | None:
+        """Return where the tote bears weight, if the rule asks for it."""
+        return state.bearing[0].int().tolist() if self.cell.support == "bearing" else None
 
     def _decide(self, observation, state: State) -> tuple[str, Tensor | None, Step | None]:
         """Return the status, and if an action was found that succeeds, the action and its effect."""

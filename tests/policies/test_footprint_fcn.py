@@ -11,9 +11,9 @@ from problems import late_state
 
 from pickplace import CellSpec
 from pickplace.policies.base import MASKED, as_collection_policy
-from pickplace.policies.fcn_grasp import MAP_KEYS, FootprintPolicy, GraspPolicy
+from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy
 from pickplace.policies.networks.critics import PooledCritic
-from pickplace.policies.networks.footprint_fcn import FootprintFcn, matrix_dtype
+from pickplace.policies.networks.footprint_fcn import MAP_KEYS, FootprintFcn, matrix_dtype
 from pickplace.runs import checkpoint
 from pickplace.task.items import Kinds, Uniform
 from pickplace.task.state import item_from_depth

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from pickplace.policies.networks.conv4d import Conv4dCritic
 from pickplace.policies.networks.depth import depth_levels, item_code, one_hot
-from pickplace.policies.networks.footprint_fcn import DTYPES, MAX_LEVELS, matrix_dtype
+from pickplace.policies.networks.footprint_fcn import DTYPES, MAP_KEYS, MAX_LEVELS, matrix_dtype
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import MAX_WIDTH, check_inputs, odd_number, one_of, whole_number
 
@@ -29,7 +29,7 @@ class PooledCritic(nn.Module):
     """
 
     any_size = True
-    in_keys = ("bin_depth", "tote_depth", "tote_bearing")
+    in_keys = MAP_KEYS
 
     def __init__(
         self,

@@ -10,6 +10,8 @@ from pickplace.task.checks import MAX_WIDTH, check_inputs, number, odd_number, o
 from pickplace.task.grasps import split_footprint
 from pickplace.task.state import item_from_depth
 
+#: Entries of the observation that the networks of ``fcn_grasp`` read.
+MAP_KEYS = ("bin_depth", "tote_depth", "tote_bearing")
 DTYPES = ("auto", "float32", "bfloat16")
 CHUNK_BYTES = 2**29  # inputs of the first layer that are held at a time when gradients are off
 MAX_LEVELS = 255  # levels are uint8
