@@ -32,20 +32,22 @@ class ActionPolicy(Policy):
 
     def scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
         """Return logits ``[N, N_a]``, of the actions that a mask allows if there is one."""
-        bin_depth, tote_depth, rotations = observation["bin_depth"], observation["tote_depth"], self.cell.rotations
+        maps, rotations = (observation["bin_depth"], observation["tote_depth"]), self.cell.rotations
         if mask is None:
-            return self.network(bin_depth, tote_depth).unflatten(1, (-1, 4))[..., :rotations].flatten(1)
-        # Pick cells from which nothing can be picked need no logits: most of them, and most of the arithmetic.
-        by_pick = mask.unflatten(1, (self.cell.num_picks, -1))
-        row, pick = by_pick.any(2).nonzero(as_tuple=True)
-        needed = self.network(bin_depth[row], tote_depth[row], pick).unflatten(1, (-1, 4))[..., :rotations].flatten(1)
-        logits = needed.new_full(by_pick.shape, MASKED).index_put((row, pick), needed)
+            return self.network(*maps).unflatten(1, (-1, 4))[..., :rotations].flatten(1)
+        # Pairs of a pick and a place that allow nothing need no logits: nine of ten, and as much of the arithmetic.
+        by_pair = mask.unflatten(1, (-1, rotations))
+        row, pair = by_pair.any(2).nonzero(as_tuple=True)
+        cells = pair // self.cell.num_places, pair % self.cell.num_places
+        needed = self.network.pair_logits(*maps, row, *cells)[:, :rotations]
+        logits = needed.new_full(by_pair.shape, MASKED).index_put((row, pair), needed)
         return torch.where(mask, logits.flatten(1), MASKED)
 
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
         maps = observation["bin_depth"], observation["tote_depth"]
         row = torch.arange(len(choices), device=choices.device).repeat_interleave(choices.shape[1])
-        return self.network.action_logits(*maps, row, split_flat(self.cell, choices.flatten())).view(choices.shape)
+        pick, place, rotation = split_flat(self.cell, choices.flatten())
+        return self.network.pair_logits(*maps, row, pick, place).gather(1, rotation[:, None]).view(choices.shape)
 
     def learning_bytes(self, samples: int | None = None) -> int:
         """Return about how many bytes a frame takes, measured at bins and totes of 5x5 to 12x12."""

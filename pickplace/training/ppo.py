@@ -1,6 +1,7 @@
 """PPO and A2C: advantages, loss, learning rate and the epochs over one batch."""
 
 import torch
+import torch.nn.functional as F
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -67,6 +68,21 @@ def add_advantages(batch: TensorDictBase, advantage: GAE, reward_scale: float) -
     batch["next", "reward"] = batch["next", "reward"] * reward_scale
     batch["next", "terminated"] |= is_bin_empty(batch["next"])
     advantage(batch)
+
+
+def of_taken_choice(advantage: Tensor, candidates: int, normalize: bool) -> Tensor:
+    """Return advantages ``[B, candidates, 1]`` of which only the first, that of the taken choice, is not 0.
+
+    It is scaled so that a loss that is a mean over candidates is one over the taken choices.
+
+    Args:
+        advantage: GAE's, ``[B, 1]``.
+        candidates: ``1 + algo.vine_samples``.
+        normalize: to zero mean and unit variance first.
+    """
+    if normalize:
+        advantage = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
+    return F.pad(candidates * advantage[:, None], (0, 0, 0, candidates - 1))
 
 
 def is_bin_empty(state: TensorDictBase) -> Tensor:

@@ -59,6 +59,7 @@ CHECKS = {
     "algo.epochs": partial(whole_number, most=1_000),
     "algo.vine_samples": _or_null(partial(whole_number, most=10_000)),
     "algo.vine_temperature": partial(number, least=0.01, most=100.0),
+    "algo.advantages": partial(one_of, choices=("vine", "gae")),
     "algo.loss": partial(one_of, choices=("ppo", "a2c")),
     **dict.fromkeys(("algo.mask_infeasible", "algo.normalize_advantage"), flag),
     "planner._target_": _only("policy", "since training validates its own policy"),

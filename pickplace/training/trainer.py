@@ -38,7 +38,7 @@ from pickplace.training.collectors import refuse_other_workers, rng_state, set_r
 from pickplace.training.curriculum import Curriculum, push_level
 from pickplace.training.imitation import Phase, WarmStart
 from pickplace.training.metrics import has_passed, progress_line, validation_metrics
-from pickplace.training.ppo import add_advantages, learning_rate, make_losses, update
+from pickplace.training.ppo import add_advantages, learning_rate, make_losses, of_taken_choice, update
 from pickplace.training.report import REPORT, write_report
 from pickplace.training.settings import check_memory, check_settings
 from pickplace.training.vine import vine_advantages
@@ -272,7 +272,10 @@ class Trainer:
         seen = {*self.policy.in_keys, *self.critic.in_keys}
         drawn = ("log_prob",) if self.algo.vine_samples is None else CANDIDATE_KEYS
         data = batch.select(*seen, self.policy.choice_key, *drawn, "advantage", "value_target").reshape(-1)
-        if self.algo.vine_samples is not None:
+        if self.algo.vine_samples is not None and self.algo.advantages == "gae":
+            count = data["candidates"].shape[1]
+            data["advantage"] = of_taken_choice(data["advantage"], count, self.algo.normalize_advantage)
+        elif self.algo.vine_samples is not None:
             data["advantage"] = vine_advantages(batch.reshape(-1), self.policy, self.critic, self.terms, self.algo)
         if phase == Phase.IMITATION:
             data["taught"] = self.warm_start.ask(batch.reshape(-1), self.iteration)

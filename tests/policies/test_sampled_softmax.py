@@ -114,9 +114,9 @@ def test_logits_of_single_actions_and_their_gradients(dtype):
     torch.manual_seed(0)
     network = Conv4dPolicy(3, filters=5, compute_dtype=dtype, head_std=0.5)
     bins, totes = torch.randint(0, 2, (70, 4, 3)).float(), torch.randint(0, 4, (70, 5, 6)).float()
-    actions = [torch.randint(0, count, (280,)) for count in (12, 30, 3)]  # more windows than computed at once
-    row, weights = torch.randint(0, 70, (280,)), torch.rand(280)
-    single = network.action_logits(bins, totes, row, actions)
+    actions = [torch.randint(0, count, (1_080,)) for count in (12, 30, 3)]  # more pairs than computed at once
+    row, weights = torch.randint(0, 70, (1_080,)), torch.rand(1_080)
+    single = network.pair_logits(bins, totes, row, *actions[:2]).gather(1, actions[2][:, None])[:, 0]
     every = network(bins, totes).view(70, 12, 30, 3)[row, *actions]
     tolerance = {"float32": 1e-5, "bfloat16": 3e-2}[dtype]
     torch.testing.assert_close(single, every, rtol=tolerance, atol=tolerance)
@@ -125,6 +125,18 @@ def test_logits_of_single_actions_and_their_gradients(dtype):
         strict=True,
     ):
         torch.testing.assert_close(ours, wanted, rtol=tolerance, atol=tolerance * wanted.abs().max().item())
+
+
+def test_logits_of_a_pair_are_the_same_in_any_batch():
+    torch.manual_seed(0)
+    network = Conv4dPolicy(4, compute_dtype="bfloat16", head_std=0.3)
+    maps = torch.randint(0, 2, (9, 5, 5)).float(), torch.randint(0, 6, (9, 6, 6)).float()
+    index = [torch.randint(0, count, (700,)) for count in (9, 25, 36)]
+    with torch.no_grad():
+        every = network.pair_logits(*maps, *index)
+        for count in (1, 3, 70, 513):
+            few = network.pair_logits(*maps, *(part[:count] for part in index))
+            torch.testing.assert_close(few, every[:count], rtol=0, atol=0)
 
 
 @every_policy

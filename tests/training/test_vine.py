@@ -15,7 +15,7 @@ from pickplace.policies.individual import IndividualRlPolicy
 from pickplace.policies.sampled_softmax import CANDIDATE_KEYS, as_sampling_policy, draw_candidates
 from pickplace.task.observation import STANDARD_TERMS
 from pickplace.training import trainer
-from pickplace.training.ppo import make_losses
+from pickplace.training.ppo import make_losses, of_taken_choice
 from pickplace.training.train import train
 from pickplace.training.vine import vine_advantages
 
@@ -130,8 +130,35 @@ def test_the_loss_has_the_policy_gradient(loss, samples, frames, error):
     )
 
 
-def test_a_training_learns_from_every_candidate(monkeypatch, tmp_path):
+@pytest.mark.parametrize("loss", ["ppo", "a2c"])
+def test_with_every_choice_a_candidate_and_gae_the_loss_is_the_exact_one(loss):
+    """Gradients equal those of TorchRL's loss over all logits, also where the policy has changed since."""
+    torch.manual_seed(0)
+    env, observation = late_state(1)
+    frames, earlier = 64, torch.randn(7).log_softmax(0)
+    policy, gae = Fixed(env.cell, earlier + 0.3 * torch.randn(7)), torch.randn(frames, 1)
+    keys = draw_candidates(earlier.expand(frames, 7), 6, 1.0)
+    data = TensorDict({**observation[:1].expand(frames), **dict(zip(CANDIDATE_KEYS, keys, strict=True))}, [frames])
+    data["action"], data["value_target"], data["advantage"] = keys[0][:, 0], torch.zeros(frames, 1), gae
+    data["log_prob"] = keys[1][:, 0]
+    gradients = []
+    for samples in (None, 6):
+        algo = composed(f"algo={loss}", f"algo.vine_samples={samples or 'null'}").algo
+        if samples:
+            data["advantage"] = of_taken_choice(gae, 1 + samples, algo.normalize_advantage)
+        elif loss == "a2c":  # GAE itself normalises there
+            data["advantage"] = (gae - gae.mean()) / gae.std()
+        losses = make_losses(algo, policy, CRITIC)[1](data)
+        total = losses["loss_objective"] + losses["loss_entropy"]
+        gradients += torch.autograd.grad(total, policy.values)
+    torch.testing.assert_close(*gradients)
+
+
+@pytest.mark.parametrize(("advantages", "counted"), [("vine", 4), ("gae", 1)])
+def test_a_training_learns_from_every_candidate_or_the_taken_one(advantages, counted, monkeypatch, tmp_path):
     batches, update = [], trainer.update
     monkeypatch.setattr(trainer, "update", lambda *args: batches.append(args[2]) or update(*args))
-    train(composed("model=fcn4d", "curriculum=none", "logger=none", "algo.vine_samples=3", *TINY), tmp_path)
+    settings = ["curriculum=none", "logger=none", "algo.vine_samples=3", f"algo.advantages={advantages}"]
+    train(composed("model=fcn4d", *settings, *TINY), tmp_path)
     assert [batch["advantage"].shape for batch in batches] == [(16, 4, 1)]
+    assert batches[0]["advantage"][:, :counted].all() and not batches[0]["advantage"][:, counted:].any()

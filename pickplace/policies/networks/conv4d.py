@@ -9,7 +9,7 @@ How the 4D convolutions are computed, exactly and without a 4D kernel:
   With pick x outermost in memory, before the batch, each tap's input is a contiguous slice and nothing is
   copied.
 * **Head.** ``1x1x1x1`` is a matrix product over the channels.
-* **Single actions.** Only the 5x5 windows that a logit sees are computed: matrix products with the whole kernel.
+* **Single pairs** of a pick and a place. Only what their logits see is computed: matrix products with the whole kernel.
 
 The parameters are those of the 4D convolutions, though only sums over taps of the first kernel matter. A
 kernel stored as these sums would compute the same, but start and learn differently: its initial scale would
@@ -30,7 +30,8 @@ from pickplace.task.checks import MAX_WIDTH, number, number_or_null, one_of, who
 BIN_PADDING, TOTE_PADDING = -1.0, 0.0
 DTYPES = ("float32", "bfloat16")
 MAX_DEPTH = 10_000  # height units; deeper than any tote
-WINDOWS_AT_ONCE = 128  # on a CPU, whose caches hold the hidden activations of so many; twice as fast as 4,608
+PAIRS_AT_ONCE = {"cpu": 512, "cuda": 65_536}  # a CPU's caches hold the hidden activations of so many
+PADDED_PAIRS = 64  # their number is rounded up to a multiple; see PADDED_ROWS in footprint_fcn.py
 
 
 def check_clips(place: str, bin_clip: float | None, tote_clip: float | None, floor: float | None) -> None:
@@ -126,36 +127,37 @@ class Conv4dPolicy(nn.Module):
         """
         return self._compute(bin_depth, tote_depth, pick, self._logits).flatten(tote_depth.dim() - 2)
 
-    def action_logits(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, actions: Sequence[Tensor]) -> Tensor:
-        """Return the logits of single actions, each from its 5x5 windows of the maps.
+    def pair_logits(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, pick: Tensor, place: Tensor) -> Tensor:
+        """Return the logits of single pairs of a pick and a place, each from its 5x5 windows of the maps.
 
-        An action takes 1/900 of the arithmetic of `forward` at a 5x5 bin and a 6x6 tote.
+        A pair takes 1/900 of the arithmetic of `forward` at a 5x5 bin and a 6x6 tote.
 
         Args:
             bin_depth: as in `forward`, ``[N, W_B, D_B]``.
             tote_depth: as in `forward`, ``[N, W_T, D_T]``.
-            row: the problem of each action, int64 ``[M]``.
-            actions: flat pick cells, flat place cells and rotations, each int64 ``[M]``.
+            row: the problem of each pair, int64 ``[M]``.
+            pick, place: flat cells of each pair, int64 ``[M]``.
 
         Returns:
-            ``[M]``
+            ``[M, rotations]``
         """
-        pick, place, rotation = actions
-        bins = self._windows(self._prepare(bin_depth, self.bin_clip, BIN_PADDING), row, pick)
-        totes = self._windows(self._prepare(tote_depth, self.tote_clip, TOTE_PADDING), row, place)
-        at_once = WINDOWS_AT_ONCE if bins.device.type == "cpu" else max(len(bins), 1)
+        count = len(row)
+        row, pick, place = (F.pad(index, (0, -count % PADDED_PAIRS)) for index in (row, pick, place))
+        bins = self._prepare(bin_depth, self.bin_clip, BIN_PADDING)
+        totes = self._prepare(tote_depth, self.tote_clip, TOTE_PADDING)
+        first = [part.permute(0, 2, 3, 1).flatten(0, 2) for part in self._first_layer(bins, totes)]
+        at_once = PAIRS_AT_ONCE[row.device.type]
+        patches = _patches(bin_depth, row, pick).split(at_once), _patches(tote_depth, row, place).split(at_once)
         # [filters, place tap * pick tap * filters]
         kernel = self.second.weight.to(self._dtype).permute(0, 4, 5, 2, 3, 1).flatten(1)
         bias = self.second.bias.to(self._dtype)
         parts = []
-        for b, t in zip(bins.split(at_once), totes.split(at_once), strict=True):
-            from_bin, from_tote = (
-                part.permute(0, 2, 3, 1).flatten(1, 2).contiguous() for part in self._first_layer(b, t)
-            )
+        for patch in zip(*patches, strict=True):
+            from_bin, from_tote = map(F.embedding, patch, first)
             hidden = (from_tote[:, :, None] + from_bin[:, None]).relu_().flatten(1)
             parts.append(F.linear(hidden, kernel, bias).relu_())
         features = torch.cat(parts).to(self.head.weight.dtype)
-        return (features * self.head.weight.flatten(1)[rotation]).sum(1) + self.head.bias[rotation]
+        return F.linear(features, self.head.weight.flatten(1), self.head.bias)[:count]
 
     def features(self, bin_depth: Tensor, tote_depth: Tensor, pick: Tensor | None = None) -> Tensor:
         """Return activations after the last ``3x3x3x3`` convolution's ReLU, float32. Arguments as in `forward`.
@@ -262,6 +264,22 @@ class Conv4dPolicy(nn.Module):
     def _logits(self, bins: Tensor, totes: Tensor) -> Tensor:
         hidden = self._hidden(bins, totes).to(bins.dtype)
         return F.linear(hidden, self.head.weight.flatten(1), self.head.bias).transpose(0, 1)
+
+
+def _patches(maps: Tensor, row: Tensor, cell: Tensor) -> Tensor:
+    """Return which outputs of the first layer, ``[N, W + 2, D + 2]`` flat, are under the 3x3 taps around cells.
+
+    Args:
+        maps: ``[N, W, D]``, for its sizes.
+        row, cell: map and flat cell, int64 ``[M]``.
+
+    Returns:
+        int64 ``[M, 9]``
+    """
+    wide, long = maps.shape[-2] + 2, maps.shape[-1] + 2
+    tap = torch.arange(3, device=row.device)
+    corner = (row * wide + cell // (long - 2)) * long + cell % (long - 2)
+    return corner[:, None] + (tap[:, None] * long + tap).flatten()
 
 
 class Conv4dCritic(nn.Module):
