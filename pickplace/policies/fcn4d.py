@@ -51,8 +51,9 @@ class ActionPolicy(Policy):
 
     def learning_bytes(self, samples: int | None = None) -> int:
         """Return about how many bytes a frame takes, measured at bins and totes of 5x5 to 12x12."""
-        if samples is not None:
-            return (1 + samples) * 400 * self.network.filters
+        if samples is not None or self.masks:
+            pairs = 5 * self.cell.num_places if samples is None else 1 + samples  # an item is picked from some 5 cells
+            return 400 * self.network.filters * pairs
         sides = (*self.cell.bin_size[:2], *self.cell.tote_size[:2])
         return 8 * self.network.filters * math.prod(side + 2 for side in sides) + self.acting_bytes
 

@@ -70,6 +70,10 @@ class FootprintPolicy(Policy):
     def logits(self, observation: Observation) -> Tensor:
         return self.footprint_logits(observation, observation["footprint_mask"])
 
+    def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
+        row = torch.arange(len(choices), device=choices.device).repeat_interleave(choices.shape[1])
+        return self.scores(observation, row, choices.flatten()).view(choices.shape)
+
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
         maps = placing_maps(self.cell, State.from_observation(observation))
         return pick_one(actions_reaching(self.cell, maps, choice))
