@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from common import interleave, save, use_one_core
 
-from pickplace import CellSpec, PickPlaceEnv
-from pickplace.policies.fcn4d import ActionPolicy
+from pickplace import PickPlaceEnv
+from pickplace.policies.fcn4d import FEW_PLACES, ActionPolicy
 from pickplace.policies.networks.depth import clip_depth, pad_depth
 
 CASES = {"5x5 bin, 6x6 tote, batch 64": ((6, 6, 5), 64, 5), "5x5 bin, 30x30 tote, batch 1": ((30, 30, 5), 1, 5)}
@@ -47,13 +47,9 @@ def matrix_product(dtype: torch.dtype, size: int = 2048):
     return lambda: a @ b, 2 * size**3
 
 
-def operations(cell: CellSpec, filters: int, picks: float) -> float:
-    """Return the arithmetic operations of one state's logits in the second layer and the head.
-
-    Args:
-        picks: number of pick cells that are computed.
-    """
-    return 2 * picks * cell.num_places * filters * (filters * 3**4 + 4)
+def operations(filters: int, pairs: float) -> float:
+    """Return the arithmetic operations of so many pairs of a pick and a place, in the second layer and the head."""
+    return 2 * pairs * filters * (filters * 3**4 + 4)
 
 
 def states(tote_size, batch: int):
@@ -105,16 +101,18 @@ def measure(tote_size, batch: int, repeats: int) -> dict:
     for times in list(row.values()):
         for figures in times.values():
             figures["ratio"] = times["naive"]["ms"] / figures["ms"]
-    picks = float(mask.unflatten(1, (cell.num_picks, -1)).any(2).sum(1).double().mean())
+    picks, places = cell.num_picks, cell.num_places
+    group = cell.rotations if places <= FEW_PLACES else places * cell.rotations  # logits computed together
+    needed = float(mask.unflatten(1, (-1, group)).any(2).sum(1).double().mean()) * group / cell.rotations
     for dtype, (_, work) in products.items():
         reference = work / row["forward"].pop(f"matrix product, {dtype}")["ms"]  # operations a millisecond
         row[f"GFLOPS of a matrix product, {dtype}"] = reference / 1e6
-        for name, count in (("all actions", cell.num_picks), ("masked", picks)):
+        for name, count in (("all actions", picks * places), ("masked", needed)):
             figures = row["forward"][f"{name}, {dtype}"]
-            done = batch * operations(cell, network.filters, count) / figures["ms"]
+            done = batch * operations(network.filters, count) / figures["ms"]
             figures["share of matrix product"] = done / reference
     row["peak MiB, forward"] = peak_memory(calls)
-    row["pick cells that allow something"] = round(picks, 2)
+    row["pairs of a pick and a place, masked"] = round(needed, 2)
     return row
 
 

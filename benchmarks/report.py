@@ -137,7 +137,7 @@ def conv4d(result: dict) -> str:
         parts += [f"{title}:", table(head, rows)]
     return section(
         "`fcn4d` against a naive 4D convolution",
-        "*Masked*: logits of pick cells with a feasible action only. *Of peak*: operations a second, as a share of a "
+        "*Masked*: logits of what a mask allows only. *Of peak*: operations a second, as a share of a "
         "2048x2048 matrix product's of the same type. *MiB*: peak of a forward pass, beyond inputs and weights.",
         *parts,
     )

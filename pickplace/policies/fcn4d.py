@@ -12,6 +12,8 @@ from pickplace.task.feasibility import action_mask, placing_maps
 from pickplace.task.grasps import split_flat
 from pickplace.task.state import Observation, State
 
+FEW_PLACES = 64  # up to 8x8, single pairs of a pick and a place are faster than all places of a pick
+
 
 class ActionPolicy(Policy):
     """Chooses among all ``N_a`` flat actions (config ``model=fcn4d``; Sec. III of the paper).
@@ -35,12 +37,17 @@ class ActionPolicy(Policy):
         maps, rotations = (observation["bin_depth"], observation["tote_depth"]), self.cell.rotations
         if mask is None:
             return self.network(*maps).unflatten(1, (-1, 4))[..., :rotations].flatten(1)
-        # Pairs of a pick and a place that allow nothing need no logits: nine of ten, and as much of the arithmetic.
-        by_pair = mask.unflatten(1, (-1, rotations))
-        row, pair = by_pair.any(2).nonzero(as_tuple=True)
-        cells = pair // self.cell.num_places, pair % self.cell.num_places
-        needed = self.network.pair_logits(*maps, row, *cells)[:, :rotations]
-        logits = needed.new_full(by_pair.shape, MASKED).index_put((row, pair), needed)
+        # Most logits are not needed, nor is most of the arithmetic. In a small tote few places are feasible for a pick.
+        if self.cell.num_places <= FEW_PLACES:
+            groups = mask.unflatten(1, (-1, rotations))
+            index = row, pair = groups.any(2).nonzero(as_tuple=True)
+            needed = self.network.pair_logits(*maps, row, pair // self.cell.num_places, pair % self.cell.num_places)
+        else:
+            groups = mask.unflatten(1, (self.cell.num_picks, -1))
+            index = row, pick = groups.any(2).nonzero(as_tuple=True)
+            needed = self.network(maps[0][row], maps[1][row], pick)
+        needed = needed.unflatten(1, (-1, 4))[..., :rotations].flatten(1)
+        logits = needed.new_full(groups.shape, MASKED).index_put(index, needed)
         return torch.where(mask, logits.flatten(1), MASKED)
 
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
@@ -51,9 +58,8 @@ class ActionPolicy(Policy):
 
     def learning_bytes(self, samples: int | None = None) -> int:
         """Return about how many bytes a frame takes, measured at bins and totes of 5x5 to 12x12."""
-        if samples is not None or self.masks:
-            pairs = 5 * self.cell.num_places if samples is None else 1 + samples  # an item is picked from some 5 cells
-            return 400 * self.network.filters * pairs
+        if samples is not None:
+            return (1 + samples) * 400 * self.network.filters
         sides = (*self.cell.bin_size[:2], *self.cell.tote_size[:2])
         return 8 * self.network.filters * math.prod(side + 2 for side in sides) + self.acting_bytes
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pickplace import CellSpec
+from pickplace.policies import fcn4d
 from pickplace.policies.base import MASKED
 from pickplace.policies.fcn4d import ActionPolicy, TypicalPolicy
 from pickplace.policies.networks.conv4d import Conv4dCritic, Conv4dPolicy
@@ -174,8 +175,10 @@ def test_bad_settings_are_refused(make, message):
 
 @pytest.mark.parametrize("rotations", [1, 3, 4])
 @pytest.mark.parametrize("empty_row", [False, True])
-def test_a_masked_policy_computes_only_what_it_needs_and_the_same(rotations, empty_row):
-    """With a mask, pick cells that allow nothing are left out: values and gradients stay as with all of them."""
+@pytest.mark.parametrize("few_places", [0, 64])
+def test_a_masked_policy_computes_only_what_it_needs_and_the_same(rotations, empty_row, few_places, monkeypatch):
+    """With a mask, picks or pairs that allow nothing are left out: values and gradients stay as with all of them."""
+    monkeypatch.setattr(fcn4d, "FEW_PLACES", few_places)
     cell = CellSpec(bin_size=(4, 5, 1), tote_size=(5, 6, 3), rotations=rotations)
     torch.manual_seed(0)
     policy = ActionPolicy(cell, True, filters=6, head_std=0.3)
