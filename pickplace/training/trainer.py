@@ -272,11 +272,12 @@ class Trainer:
         seen = {*self.policy.in_keys, *self.critic.in_keys}
         drawn = ("log_prob",) if self.algo.vine_samples is None else CANDIDATE_KEYS
         data = batch.select(*seen, self.policy.choice_key, *drawn, "advantage", "value_target").reshape(-1)
-        if self.algo.vine_samples is not None and self.algo.advantages == "gae":
-            count = data["candidates"].shape[1]
-            data["advantage"] = of_taken_choice(data["advantage"], count, self.algo.normalize_advantage)
-        elif self.algo.vine_samples is not None:
-            data["advantage"] = vine_advantages(batch.reshape(-1), self.policy, self.critic, self.terms, self.algo)
+        if self.algo.vine_samples is not None:
+            if self.algo.advantages == "vine":
+                data["advantage"] = vine_advantages(batch.reshape(-1), self.policy, self.critic, self.terms, self.algo)
+            else:
+                count = data[CANDIDATE_KEYS[0]].shape[1]
+                data["advantage"] = of_taken_choice(data["advantage"], count, self.algo.normalize_advantage)
         if phase == Phase.IMITATION:
             data["taught"] = self.warm_start.ask(batch.reshape(-1), self.iteration)
         metrics = update(self.loss, self.optimizer, data, self.algo, self.policy, phase)
