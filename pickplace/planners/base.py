@@ -1,5 +1,6 @@
 """The protocol of planners, and the arguments that they are made with."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
@@ -11,9 +12,10 @@ from pickplace.policies.restore import restore_critic, restore_policy
 from pickplace.runs.errors import sentence
 from pickplace.runs.registry import find
 from pickplace.task.cell import CellSpec
+from pickplace.task.feasibility import PlacingMaps, placing_maps
 from pickplace.task.items import ItemDistribution
 from pickplace.task.observation import Term
-from pickplace.task.state import Observation
+from pickplace.task.state import Observation, State
 
 
 @runtime_checkable
@@ -37,6 +39,33 @@ class BatchPlanner(Protocol):
     def decide(self, observation: Observation) -> Tensor:
         """Return flat actions, int64 ``[N]``."""
         ...
+
+
+class MapPlanner(ABC):
+    """A planner that chooses among the actions that given maps allow, so that it serves a robot, too.
+
+    Attributes:
+        cell: the sizes.
+    """
+
+    cell: CellSpec
+
+    @abstractmethod
+    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
+        """Return flat actions, int64 ``[N]``, feasible ones where there are any.
+
+        Args:
+            cell: the sizes; for a robot heights are counted in another unit, and there may be limits.
+            state: heights in that unit.
+            maps: what decides which actions succeed.
+            observation: what a policy sees, in the height units of its training.
+        """
+
+    @torch.no_grad()
+    def decide(self, observation: Observation) -> Tensor:
+        """Return flat actions, int64 ``[N]``."""
+        state = State.from_observation(observation)
+        return self.choose(self.cell, state, placing_maps(self.cell, state), observation)
 
 
 def decide(planner: BatchPlanner, cell: CellSpec, observation: Observation) -> Tensor:

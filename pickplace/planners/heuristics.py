@@ -3,14 +3,15 @@
 import torch
 from torch import Tensor
 
+from pickplace.planners.base import MapPlanner
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import number
 from pickplace.task.feasibility import (
+    PlacingMaps,
     action_mask,
     actions_reaching,
     first_action_reaching,
     footprint_mask,
-    placing_maps,
 )
 from pickplace.task.items import check_seed
 from pickplace.task.maps import FAR
@@ -43,7 +44,7 @@ class UniformRandom:
         return draw.to(depth.device)
 
 
-class RandomFeasible:
+class RandomFeasible(MapPlanner):
     """Uniform over the feasible flat actions.
 
     Args:
@@ -60,18 +61,23 @@ class RandomFeasible:
     def decide(self, observation: Observation) -> Tensor:
         """Return flat actions, int64 ``[N]``."""
         mask = observation.get("action_mask", None)
-        if mask is None:
-            mask = action_mask(self.cell, placing_maps(self.cell, State.from_observation(observation)))
+        return super().decide(observation) if mask is None else self._draw(mask)
+
+    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
+        return self._draw(action_mask(cell, maps))
+
+    def _draw(self, mask: Tensor) -> Tensor:
+        """Return one of the actions that a mask ``[N, N_a]`` allows, int64 ``[N]``."""
         if self._generator is None:
             self._generator = torch.Generator(mask.device).manual_seed(self.seed)
         # The k-th feasible action, k uniform: exact for any N_a, unlike a float32 multinomial.
         rank = mask.cumsum(1, dtype=torch.int32)
         draw = torch.rand(len(mask), dtype=torch.float64, device=mask.device, generator=self._generator)
         wanted = (draw * rank[:, -1]).int() + 1
-        return torch.searchsorted(rank, wanted[:, None])[:, 0].clamp(max=self.cell.num_actions - 1)
+        return torch.searchsorted(rank, wanted[:, None])[:, 0].clamp(max=mask.shape[1] - 1)
 
 
-class JointDBL:
+class JointDBL(MapPlanner):
     """Deepest-bottom-left over all feasible (pick, place, rotation) triples; not in the paper, and strong.
 
     Minimises (height of the item's top, footprint y, footprint x); ties go to the lowest flat index.
@@ -85,10 +91,8 @@ class JointDBL:
     def __init__(self, cell: CellSpec):
         self.cell = cell
 
-    def decide(self, observation: Observation) -> Tensor:
-        """Return flat actions, int64 ``[N]``."""
-        cell, (tote_w, tote_d, _) = self.cell, self.cell.tote_size
-        maps = placing_maps(cell, State.from_observation(observation))
+    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
+        tote_w, tote_d, _ = cell.tote_size
         feasible = footprint_mask(cell, maps)  # [N, Q, W_T, D_T]
         x = torch.arange(tote_w, device=feasible.device)[:, None]
         y = torch.arange(tote_d, device=feasible.device)
@@ -106,7 +110,7 @@ class JointDBL:
         return action[:, 0].clamp(max=highest - 1)
 
 
-class Corner:
+class Corner(MapPlanner):
     """Keeps the item's top low and its footprint near the tote's first corner; not in the paper.
 
     Minimises ``height_weight * top + x + y`` of the footprint over everything that is feasible; ties go to the lowest
@@ -122,10 +126,7 @@ class Corner:
     def __init__(self, cell: CellSpec, height_weight: float = 10):
         self.cell, self.height_weight = cell, number("planner.height_weight", height_weight)
 
-    def decide(self, observation: Observation) -> Tensor:
-        """Return flat actions, int64 ``[N]``."""
-        cell = self.cell
-        maps = placing_maps(cell, State.from_observation(observation))
+    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         feasible = footprint_mask(cell, maps)
         x, y = (torch.arange(side, device=feasible.device) for side in cell.tote_size[:2])
         cost = self.height_weight * maps.top + x[:, None] + y

@@ -3,10 +3,11 @@
 import torch
 from torch import Tensor
 
+from pickplace.planners.base import MapPlanner
 from pickplace.planners.heuristics import dbl_order
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import one_of
-from pickplace.task.feasibility import PlacingMaps, action_footprints, action_mask, placing_maps
+from pickplace.task.feasibility import PlacingMaps, action_footprints, action_mask
 from pickplace.task.grasps import heuristic_pick, join_pick, select_pick, split_footprint
 from pickplace.task.maps import FAR
 from pickplace.task.state import Observation, State
@@ -14,7 +15,7 @@ from pickplace.task.state import Observation, State
 CANDIDATES = ("corners", "cells")
 
 
-class IndividualHeuristic:
+class IndividualHeuristic(MapPlanner):
     """Heuristic pick, then deepest-bottom-left over the corners of the tote's free rectangles.
 
     A candidate is a footprint in a corner of a maximal rectangle (MaxRects, Jylanki 2010) of the cells that are not
@@ -32,10 +33,7 @@ class IndividualHeuristic:
     def __init__(self, cell: CellSpec, candidates: str = "corners"):
         self.cell, self.candidates = cell, one_of("planner.candidates", candidates, CANDIDATES)
 
-    def decide(self, observation: Observation) -> Tensor:
-        """Return flat actions, int64 ``[N]``."""
-        cell, state = self.cell, State.from_observation(observation)
-        maps = placing_maps(cell, state)
+    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         pick = heuristic_pick(cell, state.item)
         footprint = select_pick(cell, action_footprints(cell, state.item), pick)
         succeeds = select_pick(cell, action_mask(cell, maps), pick)

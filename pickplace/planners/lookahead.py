@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import MASKED
 from pickplace.policies.fcn_grasp import FootprintPolicy
 from pickplace.task.cell import CellSpec
@@ -10,11 +11,12 @@ from pickplace.task.checks import check_bytes, number, whole_number
 from pickplace.task.feasibility import PlacingMaps, first_action_reaching, footprint_mask, placing_maps
 from pickplace.task.items import ItemDistribution, check_seed, search_items
 from pickplace.task.observation import STANDARD_TERMS, observe
+from pickplace.task.placing import unchecked_top
 from pickplace.task.state import Observation, State
 from pickplace.task.transition import put_down
 
 
-class Lookahead:
+class Lookahead(MapPlanner):
     """Plays out the policy's most probable choices, and departs from the policy only where a gain is certain enough.
 
     Each candidate is followed by the policy itself, on the same imagined item streams as the others (common random
@@ -74,22 +76,21 @@ class Lookahead:
         self.seed, self._decisions = check_seed(seed, "planner.seed"), 0
 
     @torch.no_grad()
-    def decide(self, observation: Observation) -> Tensor:
-        """Return flat actions, int64 ``[N]``."""
-        state = State.from_observation(observation)
+    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         streams = self.candidates * self.samples * 2 ** (self.rounds - 1)
         check_bytes(
             f"planner.candidates={self.candidates}, planner.samples={self.samples}, planner.rounds={self.rounds}",
             len(state.surface) * streams * 16 * self.cell.num_footprints,
             state.surface.device,
         )
-        maps = placing_maps(self.cell, state)
-        logits = self.policy.footprint_logits(observation, footprint_mask(self.cell, maps).flatten(1))
+        logits = self.policy.footprint_logits(observation, footprint_mask(cell, maps).flatten(1))
         # Of equals the first, as the policy itself plays.
         value, choice = torch.sort(logits, dim=1, descending=True, stable=True)
         value, choice = value[:, : self.candidates], choice[:, : self.candidates]
-        best = self._best(state, maps, choice, value > MASKED / 2)
-        return first_action_reaching(self.cell, maps, choice.gather(1, best[:, None])[:, 0])
+        seen = State.from_observation(observation)  # what is imagined goes on from there
+        tops = maps._replace(top=unchecked_top(self.cell, seen), item=seen.item)
+        best = self._best(seen, tops, choice, value > MASKED / 2)
+        return first_action_reaching(cell, maps, choice.gather(1, best[:, None])[:, 0])
 
     def evaluation_facts(self) -> dict:
         """Return the same facts as of a policy's planner: the best of all feasible actions is played."""

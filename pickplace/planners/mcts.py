@@ -6,11 +6,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pickplace.planners.base import MapPlanner
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import flag, number, whole_number
-from pickplace.task.feasibility import first_action_reaching, footprint_mask, placing_maps
+from pickplace.task.feasibility import PlacingMaps, action_mask, first_action_reaching, footprint_mask, placing_maps
 from pickplace.task.items import ItemDistribution, check_seed, search_items
 from pickplace.task.observation import STANDARD_TERMS
+from pickplace.task.placing import unchecked_top
 from pickplace.task.state import Item, Observation, State
 from pickplace.task.transition import apply, put_down
 
@@ -41,7 +43,7 @@ class _Edge:
     bins: list[_Node] = field(default_factory=list)
 
 
-class MCTS:
+class MCTS(MapPlanner):
     """UCT with decision nodes and sampled bin nodes, and uniform rollouts; the most visited action is played.
 
     Each simulation walks down by UCB1, tries one action that has not been tried, samples the bin that arrives, and
@@ -89,9 +91,21 @@ class MCTS:
 
     def decide(self, observation: Observation) -> Tensor:
         """Return flat actions, int64 ``[N]``."""
-        cell, device = self.cell, observation["tote_depth"].device
-        state = State.from_observation({key: observation[key].cpu() for key in STANDARD_TERMS})
-        roots, tote_height = self._nodes(state), state.tote_height
+        state, maps = _on_cpu(observation), None
+        if self.mask:
+            maps = placing_maps(self.cell, state)
+        return self._search(state, self._nodes(state), self.cell, maps).to(observation["tote_depth"].device)
+
+    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
+        item = Item(*(part.cpu() for part in maps.item))
+        seen, maps = _on_cpu(observation), PlacingMaps(maps.top.cpu(), maps.clearance.cpu(), item)
+        mask = footprint_mask(cell, maps).flatten(1) if self.mask else action_mask(cell, maps)
+        roots = self._nodes(seen, mask)
+        return self._search(seen, roots, cell, maps).to(observation["tote_depth"].device)
+
+    def _search(self, state: State, roots: list["_Node"], cell: CellSpec, maps: PlacingMaps | None) -> Tensor:
+        """Return the most visited action of each root, int64 ``[N]``; ``cell`` and ``maps`` are of the true problem."""
+        tote_height = state.tote_height
         if self.simulations * len(roots) > MAX_NODES:
             raise ValueError(
                 f"planner.simulations={self.simulations}: for {len(roots)} problems at once the trees would have more "
@@ -108,8 +122,9 @@ class MCTS:
         best = [max(root.edges.values(), key=lambda edge: (edge.visits, edge.total), default=None) for root in roots]
         chosen = torch.tensor([0 if edge is None else edge.action for edge in best])
         if self.mask:
-            chosen = first_action_reaching(cell, placing_maps(cell, state), chosen)
-        return chosen.to(device)
+            assert maps is not None
+            chosen = first_action_reaching(cell, maps, chosen)
+        return chosen
 
     def statistics(self) -> dict[str, float]:
         """Return the mean number of actions on a walk down the tree, over all searches so far."""
@@ -187,7 +202,8 @@ class MCTS:
         state = State(surface, height, item)
         action = torch.tensor([edge.action for _, edge in tried])
         if self.mask:
-            after = put_down(cell, surface, placing_maps(cell, state), action)
+            tops = unchecked_top(cell, state)
+            after = put_down(cell, surface, PlacingMaps(tops, tops, item), action)
             failed = [False] * len(tried)
         else:
             step = apply(cell, state, action)
@@ -197,12 +213,13 @@ class MCTS:
             if not bad:
                 edge.surface, edge.volume = left, volume
 
-    def _nodes(self, state: State) -> list[_Node]:
-        """Return new nodes, with the actions to try."""
+    def _nodes(self, state: State, mask: Tensor | None = None) -> list[_Node]:
+        """Return new nodes, with the actions to try: those of a mask, or that the rules allow."""
         untried = [None] * len(state.surface)
-        if self.mask:
-            mask = footprint_mask(self.cell, placing_maps(self.cell, state)).flatten(1).numpy()
-            untried = [self._random.permutation(row.nonzero()[0]).tolist() for row in mask]
+        if self.mask and mask is None:
+            mask = footprint_mask(self.cell, placing_maps(self.cell, state)).flatten(1)
+        if mask is not None:
+            untried = [self._random.permutation(row.nonzero()[0]).tolist() for row in mask.numpy()]
         return [_Node(*parts) for parts in zip(state.surface, torch.stack(state.item, 1), untried, strict=True)]
 
     def _arriving(self, count: int) -> Item:
@@ -233,3 +250,8 @@ class MCTS:
             if len(row) == 0:
                 return volume
             state = State(surface[going], tote_height[going], self._arriving(len(row)))
+
+
+def _on_cpu(observation: Observation) -> State:
+    """Return the state that an observation shows, on the CPU."""
+    return State.from_observation({key: observation[key].cpu() for key in STANDARD_TERMS})

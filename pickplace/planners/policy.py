@@ -6,15 +6,16 @@ import torch
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import Policy
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import check_bytes, excerpt, is_whole
-from pickplace.task.feasibility import action_mask, placing_maps
+from pickplace.task.feasibility import PlacingMaps, action_mask, placing_maps
 from pickplace.task.state import Observation, State
 from pickplace.task.transition import apply
 
 
-class PolicyPlanner:
+class PolicyPlanner(MapPlanner):
     """Tries the policy's most probable actions in a forward simulation and plays the first that succeeds (Sec. III).
 
     Args:
@@ -45,6 +46,16 @@ class PolicyPlanner:
         succeeds = (step.failure.view_as(tried) == 0) & (score > -torch.inf)
         first = succeeds.int().argmax(1, keepdim=True)  # 0, the most probable, if none
         return tried.gather(1, first)[:, 0]
+
+    @torch.no_grad()
+    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
+        policy = self.policy.within(cell)
+        if self.candidates == "all":
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                return policy.best_feasible(observation, maps)
+        score, tried = policy.action_log_probs(observation).topk(min(self.candidates, cell.num_actions), dim=1)
+        succeeds = action_mask(cell, maps).gather(1, tried) & (score > -torch.inf)
+        return tried.gather(1, succeeds.int().argmax(1, keepdim=True))[:, 0]
 
     def evaluation_facts(self) -> dict:
         """Return ``K`` and the mask with which actions are chosen: True, False, or what the policy never chooses."""

@@ -7,6 +7,8 @@ of the choice.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from copy import copy
+from typing import Self
 
 import torch
 from tensordict import TensorDictBase
@@ -23,7 +25,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ValueOperator
 
 from pickplace.task.cell import CellSpec
-from pickplace.task.feasibility import action_mask, placing_maps
+from pickplace.task.feasibility import PlacingMaps, action_mask, placing_maps
 from pickplace.task.maps import FAR
 from pickplace.task.observation import STANDARD_TERMS
 from pickplace.task.state import Observation, State
@@ -102,14 +104,31 @@ class Policy(TensorDictModuleBase, ABC):
         """Write ``logits`` into the observation."""
         return observation.set("logits", self.logits(observation))
 
-    def best_feasible(self, observation: Observation) -> Tensor:
+    def best_feasible(self, observation: Observation, maps: PlacingMaps | None = None) -> Tensor:
         """Return the most probable feasible action, int64 ``[N]``.
 
         If a policy has probability for none of the feasible ones, its most probable action is returned, and fails.
+
+        Args:
+            observation: what the networks see.
+            maps: what decides which actions are feasible; None: that of the state that the observation shows.
         """
         score = self.action_log_probs(observation)
-        feasible = action_mask(self.cell, placing_maps(self.cell, State.from_observation(observation)))
-        return torch.where(feasible, score, score - FAR).argmax(1)
+        return torch.where(self.feasible(observation, maps), score, score - FAR).argmax(1)
+
+    def feasible(self, observation: Observation, maps: PlacingMaps | None) -> Tensor:
+        """Return the mask over flat actions, bool ``[N, N_a]``; arguments as of :meth:`best_feasible`."""
+        return action_mask(self.cell, self.maps_of(observation) if maps is None else maps)
+
+    def maps_of(self, observation: Observation) -> PlacingMaps:
+        """Return what decides which actions succeed in the state that an observation shows."""
+        return placing_maps(self.cell, State.from_observation(observation))
+
+    def within(self, cell: CellSpec) -> Self:
+        """Return this policy, with the same networks, for a cell that differs in its limits only."""
+        other = copy(self)
+        other.cell = cell
+        return other
 
     def act(self, choice: Tensor, *values: Tensor) -> Tensor:
         """Return :meth:`to_action` for the entries :attr:`act_keys` of an observation, in that order."""

@@ -8,9 +8,9 @@ from torch import Tensor, nn
 from pickplace.policies.base import MASKED, Policy
 from pickplace.policies.networks.conv4d import Conv4dPolicy
 from pickplace.task.cell import CellSpec
-from pickplace.task.feasibility import action_mask, placing_maps
+from pickplace.task.feasibility import PlacingMaps
 from pickplace.task.grasps import split_flat
-from pickplace.task.state import Observation, State
+from pickplace.task.state import Observation
 
 FEW_PLACES = 64  # up to 8x8, single pairs of a pick and a place are faster than all places of a pick
 
@@ -79,9 +79,8 @@ class ActionPolicy(Policy):
     def action_log_probs(self, observation: Observation) -> Tensor:
         return self.scores(observation).log_softmax(-1)
 
-    def best_feasible(self, observation: Observation) -> Tensor:
-        feasible = action_mask(self.cell, placing_maps(self.cell, State.from_observation(observation)))
-        return self.scores(observation, feasible).argmax(1)
+    def best_feasible(self, observation: Observation, maps: PlacingMaps | None = None) -> Tensor:
+        return self.scores(observation, self.feasible(observation, maps)).argmax(1)
 
 
 class TypicalPolicy(ActionPolicy):

@@ -8,11 +8,11 @@ from pickplace.policies.base import MASKED, Policy, pick_one
 from pickplace.policies.networks.footprint_fcn import MAP_KEYS, FootprintFcn
 from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import (
+    PlacingMaps,
     action_footprints,
     actions_reaching,
     first_action_reaching,
     footprint_mask,
-    placing_maps,
 )
 from pickplace.task.grasps import class_index, footprint_index, is_outside, join_action, pick_classes, split_flat
 from pickplace.task.state import Observation, State, item_from_depth
@@ -75,8 +75,7 @@ class FootprintPolicy(Policy):
         return self.scores(observation, row, choices.flatten()).view(choices.shape)
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        maps = placing_maps(self.cell, State.from_observation(observation))
-        return pick_one(actions_reaching(self.cell, maps, choice))
+        return pick_one(actions_reaching(self.cell, self.maps_of(observation), choice))
 
     def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
         state = State.from_observation(observation)
@@ -97,8 +96,8 @@ class FootprintPolicy(Policy):
         share = logits.log_softmax(-1) - ways.clamp(min=1).log()
         return torch.where(footprint >= 0, share.gather(1, footprint.clamp(min=0)), MASKED)
 
-    def best_feasible(self, observation: Observation) -> Tensor:
-        maps = placing_maps(self.cell, State.from_observation(observation))
+    def best_feasible(self, observation: Observation, maps: PlacingMaps | None = None) -> Tensor:
+        maps = self.maps_of(observation) if maps is None else maps
         mask = footprint_mask(self.cell, maps).flatten(1)  # found without a look at the N_a actions one by one
         choice = self.footprint_logits(observation, mask).argmax(1)
         return first_action_reaching(self.cell, maps, choice)

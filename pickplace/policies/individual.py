@@ -9,9 +9,9 @@ from pickplace.policies.base import MASKED, Policy, pick_one
 from pickplace.policies.fcn4d import ActionPolicy
 from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy, count_ways
 from pickplace.task.cell import CellSpec
-from pickplace.task.feasibility import action_footprints, action_mask, placing_maps
+from pickplace.task.feasibility import PlacingMaps, action_footprints
 from pickplace.task.grasps import heuristic_pick, join_pick, pick_classes, select_pick
-from pickplace.task.state import Observation, State, item_from_depth
+from pickplace.task.state import Observation, item_from_depth
 
 EXCLUDES = "every pick but the heuristic one"
 
@@ -126,9 +126,6 @@ class IndividualFootprintPolicy(FootprintPolicy):
     def logits(self, observation: Observation) -> Tensor:
         return self._masked_logits(observation, observation["action_mask"])
 
-    def _feasible(self, observation: Observation) -> Tensor:
-        return action_mask(self.cell, placing_maps(self.cell, State.from_observation(observation)))
-
     def _action(self, choice: Tensor, observation: Observation, mask: Tensor) -> Tensor:
         pick, footprint, allowed = self._reached(observation, mask)
         number = torch.arange(footprint.shape[1], device=choice.device)
@@ -136,10 +133,10 @@ class IndividualFootprintPolicy(FootprintPolicy):
         return join_pick(self.cell, pick, place_rotation.clamp(min=0))
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        return self._action(choice, observation, self._feasible(observation))
+        return self._action(choice, observation, self.feasible(observation, None))
 
-    def best_feasible(self, observation: Observation) -> Tensor:
-        mask = self._feasible(observation)
+    def best_feasible(self, observation: Observation, maps: PlacingMaps | None = None) -> Tensor:
+        mask = self.feasible(observation, maps)
         return self._action(self._masked_logits(observation, mask).argmax(1), observation, mask)
 
     def action_log_probs(self, observation: Observation) -> Tensor:

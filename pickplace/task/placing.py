@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pickplace.task.cell import CellSpec
 from pickplace.task.maps import FAR, NEVER, is_under, surround, windows
-from pickplace.task.state import State, surface_from
+from pickplace.task.state import Item, State, surface_from
 from pickplace.task.support import is_supported
 
 
@@ -48,15 +48,42 @@ def resting_top(cell: CellSpec, state: State) -> Tensor:
     It is ``NEVER`` where the item cannot rest: the footprint leaves the tote, the top passes the rim, or the support is
     too small.
     """
-    side, item = cell.max_side, state.item
-    padded = surround(state.surface.permute(1, 2, 0), (0, side - 1, 0, side - 1), 2 * FAR)
-    w, d = (torch.stack(pair)[: cell.parities] for pair in ((item.w, item.d), (item.d, item.w)))
-    w, d = w[:, None, None], d[:, None, None]  # [Q, 1, 1, N]
-    cells, under = windows(padded, side).flatten(0, 1).unbind(0), is_under(w, d, side).unbind(0)
+    item, (w, d) = state.item, footprint_sizes(cell, state.item)
+    cells, under = footprint_cells(cell, state.surface, w, d)
     z = rest(cells, under)
     top = z + item.h.to(z.dtype)
     good = is_supported(cell, cells, under, z, w, d) & ~overflows(top, state.tote_height) & ~item.is_empty
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2)
+
+
+def unchecked_top(cell: CellSpec, state: State) -> Tensor:
+    """Return the height of the item's top for every footprint in the tote, stable or not; as :func:`resting_top`."""
+    z = rest(*footprint_cells(cell, state.surface, *footprint_sizes(cell, state.item)))
+    return (z + state.item.h.to(z.dtype)).permute(3, 0, 1, 2)
+
+
+def footprint_sizes(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:
+    """Return width and depth of the item's footprint in each parity, int64 ``[Q, 1, 1, N]`` each."""
+    w, d = (torch.stack(pair)[: cell.parities, None, None] for pair in ((item.w, item.d), (item.d, item.w)))
+    return w, d
+
+
+def footprint_cells(
+    cell: CellSpec, surface: Tensor, w: Tensor, d: Tensor
+) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Return the cells of a square at every footprint's minimum corner, and whether the item covers them.
+
+    Args:
+        surface: int32 ``[N, W_T, D_T]``.
+        w, d: as of :func:`footprint_sizes`.
+
+    Returns:
+        for each cell of the square its surface, int32 ``[W_T, D_T, N]``, beyond any height outside the tote; and bool
+        ``[Q, 1, 1, N]``.
+    """
+    side = cell.max_side
+    padded = surround(surface.permute(1, 2, 0), (0, side - 1, 0, side - 1), 2 * FAR)
+    return windows(padded, side).flatten(0, 1).unbind(0), is_under(w, d, side).unbind(0)
 
 
 def clearance(cell: CellSpec, state: State) -> Tensor:

@@ -46,10 +46,12 @@ def is_supported(
     count = torch.zeros_like(z)
     for surface, used in zip(cells, under, strict=True):
         count += (surface == supporting) & used
-    share = count.double() / (w * d)
-    if cell.support == "more_than_half":
-        return share > 0.5
-    return share >= LEAST_SUPPORT.get(cell.support, cell.support)
+    return is_share_enough(cell.support, count.double() / (w * d))
+
+
+def is_share_enough(rule: str | float, share: Tensor) -> Tensor:
+    """Return whether a supported share of the footprint, float64, keeps an item stable by a rule without a hull."""
+    return share > 0.5 if rule == "more_than_half" else share >= LEAST_SUPPORT.get(rule, rule)
 
 
 def _is_in_hull(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor, margin: float) -> Tensor:

@@ -1,0 +1,220 @@
+"""Placing by measured maps: the rules for a surface that no grid of items made.
+
+A measured height is right to within some number of height units, and a cell of the grid need not be level. So the maps
+are finer than the grid: each cell is a square of *patches*, with the least and the greatest height in each. What must
+not be hit counts with its greatest height; what shall support an item, with its least. Footprints, offsets and actions
+stay those of the grid, and every comparison is one of the rules' own.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pickplace.task.cell import HULL_RULES, CellSpec
+from pickplace.task.feasibility import PlacingMaps
+from pickplace.task.grasps import footprint_index, grasp, is_clear, is_outside, split_action, turn, turned_size
+from pickplace.task.maps import FAR, NEVER
+from pickplace.task.placing import clearance, footprint_cells, footprint_sizes, is_within_reach, overflows, rest
+from pickplace.task.state import Failure, Item, State, surface_from
+from pickplace.task.support import is_share_enough
+
+DIRECTIONS = 128  # in which the hull of what supports an item is looked at
+#: Least distance of an item's centre from the hull's edge, in patches: as far as a patch may be covered in part.
+PATCH_MARGIN = 1.5
+
+
+class MeasuredTote(NamedTuple):
+    """A tote as it was measured; heights in height units of the cell."""
+
+    highest: Tensor  # int32 [k W_T, k D_T]: greatest height of each patch, rounded up
+    lowest: Tensor  # int32 [k W_T, k D_T]: least height, rounded down
+    bears: Tensor  # bool [W_T, D_T]: whether a cell bears weight, as plans before have it
+    height: int  # H_T, of the rim
+    accuracy: int  # greatest error of a height
+
+    def state(self, cell: CellSpec, item: Item, slack: int = 0) -> State:
+        """Return the state on the grid, with the greatest height of each cell; all lower by ``slack``."""
+        patches = self.highest.shape[0] // cell.tote_size[0]
+        heights = self.highest.unflatten(0, (-1, patches)).unflatten(2, (-1, patches)).amax((1, 3))
+        height = torch.tensor([self.height - slack], device=heights.device)
+        return State(surface_from((heights - slack).clamp(min=0), self.bears)[None], height, item)
+
+
+class MeasuredMaps(NamedTuple):
+    """What decides which actions succeed, and why others fail; of one problem."""
+
+    maps: PlacingMaps
+    rest: Tensor  # int32 [Q, W_T, D_T]: height on which an item comes to rest
+    stable: Tensor  # bool [Q, W_T, D_T]
+    highest_top: int  # greatest top that does not pass the rim
+    rim: int  # least top at which the end effector passes the rim
+
+
+def measured_maps(cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[float, float]) -> MeasuredMaps:
+    """Return everything that decides which actions succeed in a measured tote.
+
+    An item may be ``accuracy`` higher than measured, and so may what it rests on. So it is released twice that above
+    its top, and the end effector is there when it must clear what is beside the item.
+
+    Args:
+        cell: the sizes; heights are in small units, such as millimetres.
+        item: of one problem; its width and depth in whole cells, rounded up.
+        sides: its width and depth, in cells, as measured.
+    """
+    slack = tote.accuracy
+    state = tote.state(cell, item)
+    w, d = footprint_sizes(cell, item)
+    z = rest(*footprint_cells(cell, state.surface, w, d))[..., 0]  # [Q, W_T, D_T]
+    stable = torch.stack([_is_stable(cell, tote, item, sides, parity, z[parity]) for parity in range(cell.parities)])
+    top = z + item.h.to(z.dtype)
+    highest = tote.height - 2 * slack
+    good = stable & ~overflows(top, torch.tensor(highest)) & (z < FAR)
+    free = clearance(cell, tote.state(cell, item, slack)._replace(tote_height=torch.tensor([highest])))
+    return MeasuredMaps(PlacingMaps(torch.where(good, top, NEVER)[None], free, item), z, stable, highest, highest)
+
+
+class _Contact(NamedTuple):
+    """The patches wholly under an item at each place."""
+
+    supports: Tensor  # bool [W, D, patches]: of footprints inside the tote
+    along: Tensor  # float64 [DIRECTIONS, patches]: how far a patch reaches from the item's centre; patches
+    cells: Tensor  # int64 [patches]: cell of the footprint in which it lies, row by row
+    slack: float  # by which a direction between two others may differ; patches
+    touched: float  # number of patches that the item covers, in part too
+
+
+def _contact(
+    cell: CellSpec, tote: MeasuredTote, footprint: tuple[int, int], sides: tuple[float, float], z: Tensor
+) -> _Contact:
+    """Return what supports an item of ``sides`` in the middle of footprints ``[W, D]`` that rest on heights ``z``."""
+    count = tote.highest.shape[0] // cell.tote_size[0]
+    spans = []
+    for size, side in zip(footprint, sides, strict=True):
+        low, high = (size - side) / 2 * count, (size + side) / 2 * count
+        spans.append((math.ceil(low - 1e-6), math.floor(high + 1e-6)))
+    (x0, x1), (y0, y1) = spans
+    near = [torch.arange(*span, dtype=torch.float64, device=z.device) for span in spans]
+    shape = tuple(z.shape)
+    if x1 <= x0 or y1 <= y0:  # an item that is narrower than a patch
+        empty = torch.zeros(*shape, 0, dtype=torch.bool, device=z.device)
+        return _Contact(empty, near[0].new_zeros(DIRECTIONS, 0), torch.zeros(0, dtype=torch.int64), 0.0, 1.0)
+    under = tote.lowest[x0:, y0:].unfold(0, x1 - x0, count).unfold(1, y1 - y0, count)[: shape[0], : shape[1]]
+    number = [(part.long() // count) for part in near]
+    cells = (number[0][:, None] * footprint[1] + number[1]).flatten()
+    # A cell bears weight, or not, as a whole.
+    x, y = (torch.arange(size, device=z.device)[:, None] + part for size, part in zip(shape, number, strict=True))
+    bears = tote.bears[x[:, None, :, None], y[None, :, None, :]].flatten(2)
+    supports = (under.flatten(2) >= (z - 2 * tote.accuracy)[..., None]) & bears
+    angle = torch.arange(DIRECTIONS, dtype=torch.float64, device=z.device) * (2 * math.pi / DIRECTIONS)
+    reach = []
+    for part, size, direction in zip(near, footprint, (angle.cos(), angle.sin()), strict=True):
+        begin = part - size * count / 2
+        reach.append(torch.maximum(begin * direction[:, None], (begin + 1) * direction[:, None]))
+    along = (reach[0][:, :, None] + reach[1][:, None, :]).flatten(1)
+    slack = math.hypot(*sides) * count / 2 * math.sin(math.pi / DIRECTIONS)
+    touched = math.prod(side * count for side in sides)
+    return _Contact(supports, along, cells, slack, touched)
+
+
+def _oriented(item: Item, sides: tuple[float, float], parity: int) -> tuple[tuple[int, int], tuple[float, float]]:
+    """Return the footprint's sides in whole cells and the item's own sides, in a parity."""
+    footprint = int(item.w), int(item.d)
+    return (footprint[::-1], sides[::-1]) if parity else (footprint, sides)
+
+
+def _is_stable(
+    cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[float, float], parity: int, z: Tensor
+) -> Tensor:
+    """Return whether the item is stable on every footprint of a parity, bool ``[W_T, D_T]``."""
+    footprint, sides = _oriented(item, sides, parity)
+    stable = torch.zeros_like(z, dtype=torch.bool)
+    inside = slice(0, max(0, len(z) - footprint[0] + 1)), slice(0, max(0, z.shape[1] - footprint[1] + 1))
+    z = z[inside]
+    if not z.numel():
+        return stable
+    contact = _contact(cell, tote, footprint, sides, z)
+    on_floor = z <= 2 * tote.accuracy  # the one surface that has no gaps
+    flags = contact.supports
+    full = flags.all(-1) & (flags.shape[-1] > 0)
+    if cell.support in HULL_RULES:
+        count = tote.highest.shape[0] // cell.tote_size[0]
+        margin = max(cell.support_margin * count, PATCH_MARGIN if count > 1 else 0.0) + contact.slack
+        reached = flags.double() @ (contact.along > margin).double().t()  # [W, D, directions]
+        enough = (reached > 0).all(-1)
+    else:
+        enough = is_share_enough(cell.support, flags.sum(-1).double() / contact.touched)
+    stable[inside] = on_floor | full | enough
+    return stable
+
+
+def bearing_after(
+    cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[float, float], maps: MeasuredMaps, footprint: int
+) -> Tensor:
+    """Return where the tote bears weight once the item lies on a footprint, bool ``[W_T, D_T]``.
+
+    Args:
+        footprint: index ``(parity * W_T + x) * D_T + y``.
+    """
+    tote_w, tote_d, _ = cell.tote_size
+    parity, x, y = footprint // (tote_w * tote_d), footprint // tote_d % tote_w, footprint % tote_d
+    size, sides = _oriented(item, sides, parity)
+    z = maps.rest[parity, x : x + 1, y : y + 1]
+    count = tote.highest.shape[0] // tote_w
+    shifted = tote._replace(lowest=tote.lowest[x * count :, y * count :], bears=tote.bears[x:, y:])
+    contact = _contact(cell, shifted, size, sides, z)
+    flags = contact.supports[0, 0]
+    held = torch.ones_like(flags)
+    if not flags.all() and int(z) > 2 * tote.accuracy:
+        reached = torch.where(flags, contact.along, -FAR).amax(1, keepdim=True)
+        held = (contact.along <= reached + 1e-9).all(0)
+    # A cell bears weight if all patches of it that are under the item do; one value a cell must cover it.
+    weak = torch.zeros(size[0] * size[1], dtype=torch.int64).index_add_(0, contact.cells, (~held).long()) > 0
+    covered = torch.zeros_like(weak).index_fill_(0, contact.cells, True)
+    after = tote.bears.clone()
+    after[x : x + size[0], y : y + size[1]] = (covered & ~weak).view(size)
+    return after
+
+
+def failures(cell: CellSpec, measured: MeasuredMaps, action: Tensor, bin_clear: Tensor) -> Tensor:
+    """Return the failure codes of flat actions, int64 ``[A]``, in the order of the rules' checks.
+
+    Args:
+        cell: with the limits of the robot.
+        action: int64 ``[A]``.
+        bin_clear: bool ``[P]``, whether the end effector hits no wall of the bin at each pick cell.
+    """
+    (maps, z, stable, highest, rim), (tote_w, tote_d, _) = measured, cell.tote_size
+    x_bin, y_bin, x_tote, y_tote, rotation = split_action(cell, action)
+    item = Item(*(part.expand(len(action)) for part in maps.item))
+    picked = grasp(cell, item, x_bin, y_bin)
+    turned = zip(*turn(picked.near_x, picked.near_y, picked.back_x, picked.back_y)[: cell.rotations], strict=True)
+    offset_x, offset_y = (torch.stack(offsets).gather(0, rotation[None])[0] for offsets in turned)
+    parity = rotation % 2
+    w, d = turned_size(item, parity == 1)
+    shape = torch.tensor(cell.effectors, device=action.device)[parity]  # [A, 4]
+    left, front = x_tote - shape[:, 2], y_tote - shape[:, 3]
+    x, y = left + offset_x, front + offset_y
+    item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)
+    effector_leaves = is_outside(left, shape[:, 0], tote_w) | is_outside(front, shape[:, 1], tote_d)
+    footprint = footprint_index(cell.tote_size, parity, x.clamp(0, tote_w - 1), y.clamp(0, tote_d - 1))
+    place = footprint_index(cell.tote_size, parity, x_tote, y_tote)
+    top = z.flatten()[footprint] + item.h
+    pick = x_bin * cell.bin_size[1] + y_bin
+    checks = [  # from the last to the first, so that the first failure has the last word
+        (Failure.UNSTABLE, ~stable.flatten()[footprint]),
+        (Failure.ITEM_COLLISION, ~is_clear(top, maps.clearance.flatten()[place])),
+        (Failure.OVERFLOW, overflows(top, torch.tensor(highest))),
+        (Failure.TOTE_COLLISION, item_leaves | (effector_leaves & ~is_clear(top, rim))),
+        (Failure.BIN_COLLISION, ~bin_clear[pick]),
+        (Failure.PICK_MISS, ~picked.grips),
+    ]
+    if cell.limits is not None:
+        limits, number = cell.limits.on(action.device), footprint_index(cell.tote_size, rotation, x_tote, y_tote)
+        reached = is_within_reach(limits.lowest_top.flatten()[number], limits.highest_top.flatten()[number], top)
+        checks.insert(0, (Failure.OUT_OF_REACH, ~limits.pick_ok[pick] & bin_clear[pick] | ~reached))
+    failure = torch.zeros_like(action)
+    for kind, failed in checks:
+        failure = torch.where(failed, int(kind), failure)
+    return failure
