@@ -375,7 +375,7 @@ def plan(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("flag", [
-    "--tolerance=0.7", "--cell-size=-1", "--cell-size=nan", "--alternatives=-1", "--tote-height=1e9",
+    "--accuracy=0.7", "--cell-size=-1", "--cell-size=nan", "--alternatives=-1", "--tote-height=1e9",
     f"--alternatives={10**20}",
     "--tote-height=2.5", "--candidates=0", "--rotations=5", "--threads=-1",
 ])  # fmt: skip

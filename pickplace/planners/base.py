@@ -1,7 +1,7 @@
 """The protocol of planners, and the arguments that they are made with."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -46,8 +46,10 @@ class MapPlanner(ABC):
 
     Attributes:
         cell: the sizes.
+        name: as of :class:`BatchPlanner`.
     """
 
+    name: str
     cell: CellSpec
 
     @abstractmethod
@@ -68,14 +70,19 @@ class MapPlanner(ABC):
         return self.choose(self.cell, state, placing_maps(self.cell, state), observation)
 
 
-def decide(planner: BatchPlanner, cell: CellSpec, observation: Observation) -> Tensor:
+def decide(
+    planner: BatchPlanner, cell: CellSpec, observation: Observation, choose: Callable[..., Tensor] | None = None
+) -> Tensor:
     """Return a planner's flat actions, int64 ``[N]``.
+
+    Args:
+        choose: a function of the observation to call in place of the planner's ``decide``.
 
     Raises:
         ValueError: for anything else, naming the planner's class and what its ``decide`` returned or raised.
     """
     try:
-        action, count = planner.decide(observation), len(observation["bin_depth"])
+        action, count = (choose or planner.decide)(observation), len(observation["bin_depth"])
     except ValueError:
         raise
     except Exception as error:

@@ -143,6 +143,13 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     return TrainedPolicy(policy.to(usable_device(device)), check_terms(terms or None), cfg)
 
 
+def load_critic(path, trained: TrainedPolicy) -> "RestoredCritic | None":
+    """Return the critic of the checkpoint of a policy that :func:`load_policy` returned; None if it does not serve."""
+    state, _ = checkpoint.read(checkpoint.locate(path))
+    env = cast(dict, OmegaConf.to_container(trained.config.env, resolve=True))
+    return restore_critic(trained.config, trained.cell, state, env)
+
+
 @dataclass(frozen=True)
 class RestoredCritic:
     """A function from observations to values ``[N, 1]``, in cells times height units."""

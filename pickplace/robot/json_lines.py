@@ -20,10 +20,8 @@ MAX_LINE = 2**24  # greatest length of a request, in bytes
 MAX_MAP = 2**26  # greatest size of a .npy file, in bytes
 
 #: Keys of a request; ``id`` comes back as it is.
-REQUEST_KEYS = (
-    *("id", "bin_depth", "tote_depth", "tote_bearing"),
-    *("tote_height", "cell_size", "tolerance", "alternatives"),
-)
+SETTINGS = ("tote_height", "cell_size", "accuracy", "clearance", "alternatives")
+REQUEST_KEYS = ("id", "bin_depth", "items", "tote_depth", "tote_bearing", *SETTINGS)
 
 
 def main() -> None:
@@ -38,20 +36,23 @@ def parser() -> argparse.ArgumentParser:
         prog="pickplace-plan",
         description="Plan one pick and one place. With --bin and --tote: one plan, as JSON. Without them: read one "
         'request a line from standard input, {"bin_depth": [[...]], "tote_depth": [[...]]}, and answer each with a '
-        "plan in one line; a bad request is answered with an error, and the process goes on.",
+        'plan in one line; "items": [{"x": .., "y": .., "w": .., "d": .., "h": .., "yaw": ..}] may stand for '
+        "bin_depth. A bad request is answered with an error, and the process goes on.",
         epilog="Maps, frames of reference and errors: docs/robot.md",
     )
     add = options.add_argument
-    add("checkpoint", help="a run folder, a checkpoint, or pretrained/<name>")
-    add("--bin", metavar="NPY", help="depth map [W_B, D_B]: height above the bin's floor")
-    add("--tote", metavar="NPY", help="depth map [W_T, D_T]: remaining height, from surface to rim")
+    add("checkpoint", nargs="?", help="a run folder, a checkpoint, or pretrained/<name>")
+    add("--planner", metavar="NAME", help="what decides, such as joint_dbl or lookahead; default: the policy")
+    add("--bin", metavar="NPY", help="depth map [W_B, D_B] or finer: height above the bin's floor")
+    add("--tote", metavar="NPY", help="depth map [W_T, D_T] or finer: remaining height, from surface to rim")
     add("--tote-bearing", metavar="NPY", help="map [W_T, D_T]: tote_bearing of the plan before; default: all 1")
     add("--tote-height", type=float, metavar="H", help="height of the tote's rim; default: that of --tote-size")
     add("--cell-size", type=float, metavar="M", help="side of a cell in metres, if the maps are in metres")
-    add(
-        "--tolerance", type=float, metavar="T", default=0.25,
-        help="greatest error of a measured height, in height units (default %(default)s)",
-    )  # fmt: skip
+    for key, what in (
+        ("accuracy", "greatest error of a measured height, in metres"),
+        ("clearance", "least distance of an item from what stands beside it, in metres"),
+    ):
+        add(f"--{key}", type=float, metavar="M", default=0.005, help=f"{what} (default %(default)s)")
     add("--candidates", metavar="K", default="all", help="number of most probable actions tried, or all (the default)")
     add(
         "--alternatives", type=int, metavar="N", default=10,
@@ -79,6 +80,7 @@ def run(args: argparse.Namespace) -> None:
     """
     from pickplace.robot.planner import DepthMapError, Planner  # here, so that --help need not wait for torch
     from pickplace.runs.machine import use_threads
+    from pickplace.task.cell import CellSpec
 
     if (args.bin is None) != (args.tote is None):
         missing = "--bin" if args.bin is None else "--tote"
@@ -91,8 +93,14 @@ def run(args: argparse.Namespace) -> None:
     sizes = {key: getattr(args, key) for key in ("bin_size", "tote_size", "effector_size", "rotations")}
     sizes = {key: value for key, value in sizes.items() if value is not None}
     candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates
-    planner = Planner.load(args.checkpoint, candidates=candidates, device=args.device, trust=args.trust, **sizes)
-    defaults = {key: getattr(args, key) for key in ("tote_height", "cell_size", "tolerance", "alternatives")}
+    if args.checkpoint is not None:
+        options = {"candidates": candidates, "device": args.device, "trust": args.trust, "planner": args.planner}
+        planner = Planner.load(args.checkpoint, **options, **sizes)
+    elif args.planner is not None:
+        planner = Planner(CellSpec(**sizes), planner=args.planner)
+    else:
+        raise ValueError("checkpoint: missing; expected a checkpoint, or --planner joint_dbl or the like.")
+    defaults = {key: getattr(args, key) for key in SETTINGS}
     planner.check_settings(**defaults)  # now, not in the answer to each request
     if args.bin is not None:
         files = {"bin_depth": args.bin, "tote_depth": args.tote, "tote_bearing": args.tote_bearing}
@@ -140,14 +148,28 @@ def answer(planner: "Planner", line: bytes, defaults: dict, print_latency: bool 
             reply["id"] = request.pop("id")
         if unknown := sorted(set(request) - set(REQUEST_KEYS)):
             raise ValueError(f"{unknown[0][:40]}: there is no such key; expected any of {', '.join(REQUEST_KEYS)}.")
-        for key in ("bin_depth", "tote_depth"):
+        for key in ("tote_depth",) if "items" in request else ("bin_depth", "tote_depth"):
             if key not in request:
                 raise ValueError(f"{key}: missing; expected a depth map as a list of rows.")
+        if "items" in request:
+            request["items"] = read_boxes(request["items"])
         return {**reply, **plan_as_dict(planner, print_latency, **{**defaults, **request})}
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         return {**reply, "error": f"the line is not JSON: {error}."}
     except ValueError as error:
         return {**reply, "error": sentence(error)}
+
+
+def read_boxes(items) -> list:
+    """Return the boxes of a request's ``items``."""
+    from pickplace.robot.measure import Box
+
+    if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
+        raise ValueError("items: expected a list of objects with x, y, w, d, h and, if it is turned, yaw.")
+    try:
+        return [Box(**item) for item in items]
+    except TypeError as error:
+        raise ValueError("items[0]: expected the keys x, y, w, d, h and, if it is turned, yaw.") from error
 
 
 def finite_float(text: str) -> float:

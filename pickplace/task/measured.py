@@ -24,6 +24,10 @@ DIRECTIONS = 128  # in which the hull of what supports an item is looked at
 #: Least distance of an item's centre from the hull's edge, in patches: as far as a patch may be covered in part.
 PATCH_MARGIN = 1.5
 
+#: Patches whose measured heights differ by up to so many errors of a height are taken to be level: the two errors, and
+#: one for the greatest of many values.
+LEVEL = 3
+
 
 class MeasuredTote(NamedTuple):
     """A tote as it was measured; heights in height units of the cell."""
@@ -68,6 +72,8 @@ def measured_maps(cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[f
     w, d = footprint_sizes(cell, item)
     z = rest(*footprint_cells(cell, state.surface, w, d))[..., 0]  # [Q, W_T, D_T]
     stable = torch.stack([_is_stable(cell, tote, item, sides, parity, z[parity]) for parity in range(cell.parities)])
+    if int(item.w) == int(item.d):  # one footprint to the masks, whichever way the item lies in it
+        stable = stable.all(0).expand_as(stable)
     top = z + item.h.to(z.dtype)
     highest = tote.height - 2 * slack
     good = stable & ~overflows(top, torch.tensor(highest)) & (z < FAR)
@@ -83,6 +89,7 @@ class _Contact(NamedTuple):
     cells: Tensor  # int64 [patches]: cell of the footprint in which it lies, row by row
     slack: float  # by which a direction between two others may differ; patches
     touched: float  # number of patches that the item covers, in part too
+    fewest: int  # number of patches along its shorter side
 
 
 def _contact(
@@ -95,19 +102,20 @@ def _contact(
         low, high = (size - side) / 2 * count, (size + side) / 2 * count
         spans.append((math.ceil(low - 1e-6), math.floor(high + 1e-6)))
     (x0, x1), (y0, y1) = spans
-    near = [torch.arange(*span, dtype=torch.float64, device=z.device) for span in spans]
-    shape = tuple(z.shape)
+    shape, device = tuple(z.shape), z.device
     if x1 <= x0 or y1 <= y0:  # an item that is narrower than a patch
-        empty = torch.zeros(*shape, 0, dtype=torch.bool, device=z.device)
-        return _Contact(empty, near[0].new_zeros(DIRECTIONS, 0), torch.zeros(0, dtype=torch.int64), 0.0, 1.0)
+        none = torch.zeros(0, dtype=torch.int64, device=device)
+        along = torch.zeros(DIRECTIONS, 0, dtype=torch.float64, device=device)
+        return _Contact(none.bool().expand(*shape, 0), along, none, 0.0, 1.0, 0)
+    near = [torch.arange(*span, dtype=torch.float64, device=device) for span in spans]
     under = tote.lowest[x0:, y0:].unfold(0, x1 - x0, count).unfold(1, y1 - y0, count)[: shape[0], : shape[1]]
     number = [(part.long() // count) for part in near]
     cells = (number[0][:, None] * footprint[1] + number[1]).flatten()
     # A cell bears weight, or not, as a whole.
-    x, y = (torch.arange(size, device=z.device)[:, None] + part for size, part in zip(shape, number, strict=True))
+    x, y = (torch.arange(size, device=device)[:, None] + part for size, part in zip(shape, number, strict=True))
     bears = tote.bears[x[:, None, :, None], y[None, :, None, :]].flatten(2)
-    supports = (under.flatten(2) >= (z - 2 * tote.accuracy)[..., None]) & bears
-    angle = torch.arange(DIRECTIONS, dtype=torch.float64, device=z.device) * (2 * math.pi / DIRECTIONS)
+    supports = (under.flatten(2) >= (z - LEVEL * tote.accuracy)[..., None]) & bears
+    angle = torch.arange(DIRECTIONS, dtype=torch.float64, device=device) * (2 * math.pi / DIRECTIONS)
     reach = []
     for part, size, direction in zip(near, footprint, (angle.cos(), angle.sin()), strict=True):
         begin = part - size * count / 2
@@ -115,7 +123,7 @@ def _contact(
     along = (reach[0][:, :, None] + reach[1][:, None, :]).flatten(1)
     slack = math.hypot(*sides) * count / 2 * math.sin(math.pi / DIRECTIONS)
     touched = math.prod(side * count for side in sides)
-    return _Contact(supports, along, cells, slack, touched)
+    return _Contact(supports, along, cells, slack, touched, min(x1 - x0, y1 - y0))
 
 
 def _oriented(item: Item, sides: tuple[float, float], parity: int) -> tuple[tuple[int, int], tuple[float, float]]:
@@ -135,11 +143,13 @@ def _is_stable(
     if not z.numel():
         return stable
     contact = _contact(cell, tote, footprint, sides, z)
-    on_floor = z <= 2 * tote.accuracy  # the one surface that has no gaps
+    on_floor = z <= LEVEL * tote.accuracy  # the one surface that has no gaps
     flags = contact.supports
-    full = flags.all(-1) & (flags.shape[-1] > 0)
+    # Two patches along both sides: something then carries each quarter of the item, though a patch may be covered in
+    # part. (With one value a cell only cells that are level bear weight.)
+    count = tote.highest.shape[0] // cell.tote_size[0]
+    full = flags.all(-1) & (contact.fewest >= (2 if count > 1 else 1))
     if cell.support in HULL_RULES:
-        count = tote.highest.shape[0] // cell.tote_size[0]
         margin = max(cell.support_margin * count, PATCH_MARGIN if count > 1 else 0.0) + contact.slack
         reached = flags.double() @ (contact.along > margin).double().t()  # [W, D, directions]
         enough = (reached > 0).all(-1)
@@ -166,7 +176,7 @@ def bearing_after(
     contact = _contact(cell, shifted, size, sides, z)
     flags = contact.supports[0, 0]
     held = torch.ones_like(flags)
-    if not flags.all() and int(z) > 2 * tote.accuracy:
+    if not flags.all() and int(z) > LEVEL * tote.accuracy:
         reached = torch.where(flags, contact.along, -FAR).amax(1, keepdim=True)
         held = (contact.along <= reached + 1e-9).all(0)
     # A cell bears weight if all patches of it that are under the item do; one value a cell must cover it.

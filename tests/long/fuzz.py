@@ -42,8 +42,8 @@ SECONDS, BYTES = 20, 1.5e9
 #: Printed by a training and by an evaluation when they have begun.
 BEGUN = ("frames to train", "episodes to play")
 SMOKE = ["experiment=smoke", "threads=1", "total_frames=256", "evaluation.episodes=2"]
-DEFAULTS = {"tote_height": None, "cell_size": None, "tolerance": 0.25, "alternatives": 3}
-REQUEST_KEYS = ("id", "bin_depth", "tote_depth", "tote_height", "cell_size", "tolerance", "alternatives", "more")
+DEFAULTS = {"tote_height": None, "cell_size": None, "accuracy": 0.005, "clearance": 0.005, "alternatives": 3}
+REQUEST_KEYS = ("id", "bin_depth", "items", "tote_depth", "accuracy", "clearance", "more", *DEFAULTS)
 #: Values in place of good ones.
 VALUES = [
     None, True, False, 0, -0.0, -1, 0.5, 2, 7, 1e-320, 1e308, -1e308, 2**31, 2**53 + 1, 2**63, 2**64, 10**400, "", "x",
@@ -191,7 +191,7 @@ def maps(draw: random.Random, folder: Path) -> None:
     request = damage(draw, good_request(draw, CellSpec()))
     report([repr(request)[:300]])
     if draw.random() < 0.5:
-        flags = draw.choice(([], [], ["--tolerance", "0.7"], ["--cell-size", "-1"], ["--tote-height", "1e9"]))
+        flags = draw.choice(([], [], ["--accuracy", "0.7"], ["--cell-size", "-1"], ["--tote-height", "1e9"]))
         plan_maps(draw, folder, "pretrained/r4", flags, request)
         return
     values = {key: as_array(draw, request.get(key)) for key in ("bin_depth", "tote_depth")}
@@ -238,9 +238,10 @@ def json_line(draw: random.Random, folder: Path) -> None:
         assert set(reply) <= {"id", "error"}
         raise SystemExit(_sentence(reply["error"]))
     request = json.loads(line)
-    unit = request.get("cell_size") or 1.0
-    rim = round((request.get("tote_height") or planner.cell.tote_size[2] * unit) / unit)
-    depths = (np.round(np.array(request[key], dtype=float) / unit).astype(int) for key in ("bin_depth", "tote_depth"))
+    if request.get("cell_size"):
+        return  # in metres; tests/robot/test_measured.py checks those
+    rim = round(request.get("tote_height") or planner.cell.tote_size[2])
+    depths = (np.round(np.array(request[key], dtype=float)).astype(int) for key in ("bin_depth", "tote_depth"))
     bin_depth, tote_depth = (torch.from_numpy(values)[None] for values in depths)
     item = item_from_depth(bin_depth.float())
     check_plan(planner.cell, State(surface_from(rim - tote_depth), torch.tensor([rim]), item), reply)

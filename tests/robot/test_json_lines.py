@@ -46,7 +46,7 @@ def command(monkeypatch, capsys, tmp_path):
         (["pretrained/r4", "--threads", "0"], "--threads=0"),
         (["pretrained/r4", "--rotations", "7"], "rotations=7"),
         (["pretrained/r4", "--device", "tpu"], "tpu"),
-        ([], "checkpoint; expected the arguments that --help shows"),
+        ([], "checkpoint: missing; expected a checkpoint, or --planner"),
         (["pretrained/r4", "more"], "unrecognized arguments: more"),
     ],
 )
@@ -87,7 +87,7 @@ def test_command_answers_json_lines_and_survives_bad_ones(command):
 
 def test_command_hands_every_option_on(command, tmp_path):
     item = np.zeros((5, 4))
-    item[1:3, 2] = 1.1
+    item[1:3, 2] = 0.9
     np.save(tmp_path / "bin.npy", item * 0.05)
     np.save(tmp_path / "tote.npy", np.full((7, 6), 0.2))
     arguments = ["pretrained/r4", "--bin", "bin.npy", "--tote", "tote.npy", "--cell-size", 0.05, "--candidates", 10]
@@ -97,18 +97,24 @@ def test_command_hands_every_option_on(command, tmp_path):
     assert code == 0 and err.startswith("planned in ") and err.endswith(" ms\n")
     plan = json.loads(out)
     assert plan["status"] == "ok" and plan["rotation_degrees"] == 0 and len(plan["alternatives"]) in (1, 2)
-    assert plan["occupancy_after"] == pytest.approx(2 / (7 * 6 * 4))
+    assert plan["occupancy_after"] == pytest.approx(0.9 * 2 / (7 * 6 * 4))
     assert plan["pick"]["center"][:2] == pytest.approx([0.1, 0.125], abs=0.025)  # two cells of an effector cover both
-    assert "within 0.05" in command(*arguments, "--tolerance", 0.05)[2]
+    assert plan["place"]["center"][2] == pytest.approx(0.045 + 2 * 0.005)  # released twice the accuracy above its top
+    exact = json.loads(command(*arguments, "--accuracy", 0, "--clearance", 0.001)[1])
+    assert exact["place"]["center"][2] == pytest.approx(0.045)
+    assert "accuracy=0.5" in command(*arguments, "--accuracy", 0.5)[2]
+    searching = json.loads(command(*arguments, "--planner", "joint_dbl")[1])
+    assert searching["status"] == "ok" and searching["alternatives"] == [] and searching["place"]["cell"] == [0, 0]
 
 
 def test_a_request_has_the_last_word(command):
     """Over what the command line says for all."""
     plain = {"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist()}
-    metric = {"bin_depth": (ITEM * 0.05).tolist(), "tote_depth": (EMPTY * 0.05).tolist(), "cell_size": 0.05}
+    metric = {"items": [{"x": 0.1, "y": 0.125, "w": 0.09, "d": 0.04, "h": 0.05}], "cell_size": 0.05}
+    metric["tote_depth"] = (EMPTY * 0.05).tolist()
     low = {"bin_depth": ITEM.tolist(), "tote_depth": (EMPTY - 3).tolist(), "tote_height": 2, "alternatives": 2}
     lines = "\n".join(json.dumps(request) for request in (plain, metric, low)).encode()
-    code, out, err = command("pretrained/r4", "--cell-size", 1, "--alternatives", 0, lines=lines)
+    code, out, err = command("pretrained/r4", "--accuracy", 0, "--alternatives", 0, lines=lines)
     replies = [json.loads(line) for line in out.splitlines()]
     assert code == 0 and [reply.get("status") for reply in replies] == ["ok"] * 3, err
     assert replies[1]["pick"]["center"] == pytest.approx([0.05 * length for length in replies[0]["pick"]["center"]])

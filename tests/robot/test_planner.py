@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from dataclasses import replace
 from math import cos, radians, sin
 
 import numpy as np
@@ -14,6 +15,7 @@ from untrained import untrained_policy, write_checkpoint
 
 from pickplace import CellSpec, DepthMapError, Failure, Planner
 from pickplace.planners.policy import PolicyPlanner
+from pickplace.robot.planner import Box
 from pickplace.task.observation import STANDARD_TERMS, observe
 
 EMPTY = np.full((6, 6), 5)
@@ -85,31 +87,25 @@ def test_plans_agree_with_the_oracle_and_with_plane_geometry(problem, candidates
 
 
 @pytest.mark.parametrize("height_unit", [1.0, 0.5])
-def test_every_length_is_in_metres(height_unit):
-    """Lengths along x and y are multiples of the cell's side, heights of the height unit."""
+def test_whole_cells_in_metres_give_the_plan_of_whole_cells(height_unit):
+    """With maps that are exact, lengths along x and y are multiples of the cell's side, heights of the height unit."""
     cell, unit = CellSpec(height_unit=height_unit), 0.05 * height_unit
     planner = Planner(cell, untrained_policy(cell))
     low = EMPTY - 2  # something two units high lies everywhere
-    noise = np.random.default_rng(0).uniform(-0.24, 0.24, (2, 6, 6))
-    maps = (ITEM + noise[0, :5, :5]) * unit, torch.from_numpy((low + noise[1]) * unit)
-    plain, metric = planner.plan(ITEM, low), planner.plan(*maps, 5.02 * unit, cell_size=0.05)
-    assert metric.action == plain.action and metric.status == "ok"
+    ones = np.ones((6, 6))
+    exact = {"cell_size": 0.05, "accuracy": 0, "tote_bearing": ones}
+    plain, metric = planner.plan(ITEM, low), planner.plan(ITEM * unit, torch.from_numpy(low * unit), 5 * unit, **exact)
+    assert metric.action == plain.action and metric.status == "ok" and metric.tote_bearing == plain.tote_bearing
     assert plain.drop_height == 2 and metric.drop_height == pytest.approx(2 * unit)
     for pose, other in ((plain.pick, metric.pick), (plain.place, metric.place)):
-        assert other.cell == pose.cell
+        assert other.cell == pose.cell and other.yaw == pose.yaw
         assert other.center == pytest.approx(np.multiply(pose.center, [0.05, 0.05, unit]))
     assert json.loads(json.dumps(metric.as_dict()))["place"]["cell"] == list(metric.place.cell)
-    assert (metric.item["h"], metric.occupancy_before) == (1, pytest.approx(0.4))
-
-
-def test_only_rounding_goes_beyond_the_tolerance(planner):
-    high = np.where(ITEM, 3, 0)
-    exact = planner.plan(high, EMPTY, tolerance=0)
-    assert 0.15 / 0.05 != 3 and planner.plan(high * 0.05, EMPTY * 0.05, 5 * 0.05, 0.05, 0).action == exact.action
-    deep = (EMPTY * 0 + 117).astype(np.float32) * np.float32(0.05)
-    assert planner.plan(high * 0.05, deep, 200 * 0.05, 0.05, 0).status == "ok"
-    with pytest.raises(DepthMapError, match="within 0"):
-        planner.plan(high * 1.00001, EMPTY, tolerance=0)
+    assert (metric.item, metric.occupancy_before) == (plain.item, pytest.approx(0.4))
+    assert metric.occupancy_after == pytest.approx(plain.occupancy_after)
+    assert [other.rejected for other in metric.alternatives] == [other.rejected for other in plain.alternatives]
+    full = planner.plan(ITEM * unit, ones * 0, 5 * unit, **exact), planner.plan(ITEM, ones * 0)
+    assert full[0].reasons == full[1].reasons and full[0].status == "stuck"
 
 
 def test_stuck_in_this_tote_or_in_any(planner):
@@ -141,6 +137,13 @@ def changed(array, cell, value, dtype=float):
     return array
 
 
+BOX = Box(0.1, 0.1, 0.12, 0.08, 0.06)
+
+
+def boxes(*items):
+    return {"bin_depth": None, "items": list(items), "tote_depth": EMPTY * 0.05, "cell_size": 0.05}
+
+
 TWO_ITEMS = changed(ITEM, (4, 4), 1)
 BAD = [
     ({"bin_depth": ITEM[:4]}, "bin_depth: got shape [4, 5], expected [5, 5]"),
@@ -155,24 +158,40 @@ BAD = [
     ({"bin_depth": np.ma.masked_equal(ITEM, 1)}, "bin_depth[1, 2]: got a masked value, expected a measured one."),
     ({"tote_depth": EMPTY.T[:, :5]}, "tote_depth: got shape [6, 5], expected [6, 6]"),
     ({"tote_depth": changed(EMPTY, (3, 1), 6)}, "tote_depth[3, 1]: got 6 cells, expected 0 to 5 cells"),
-    ({"tote_depth": EMPTY * 0.05 + 0.02, "bin_depth": ITEM * 0.05, "cell_size": 0.05},
-     "tote_depth[0, 0]: got 5.4 cells (0.27 m), expected a whole number of cells, within 0.25"),
+    ({"tote_depth": EMPTY * 0.05 + 0.04, "bin_depth": ITEM * 0.05, "cell_size": 0.05},
+     "tote_depth[0, 0]: got 0.29 m, expected -0.02 to 0.27 m"),
+    ({"tote_depth": EMPTY * 0.05, "bin_depth": np.full((10, 10), 0.05), "cell_size": 0.05, "items": []}, "got both"),
+    ({"tote_depth": EMPTY * 0.05, "bin_depth": np.zeros((7, 7)), "cell_size": 0.05}, "or a multiple of it"),
+    ({"tote_depth": np.full((12, 12), 5)}, "expected [6, 6]; finer maps are in metres, with cell_size"),
+    ({"bin_depth": None}, "bin_depth: missing; expected a depth map"),
+    ({"tote_depth": None}, "tote_depth: missing"),
+    ({"bin_depth": None, "items": [BOX]}, "cell_size=None: expected metres, as of items"),
+    (boxes(), "items=[]: expected a list of one Box"),
+    (boxes(BOX, BOX), "expected a list of one Box"),
+    (boxes(replace(BOX, h=0)), "items[0].h=0: expected a length of at least 0.001 m"),
+    (boxes(replace(BOX, yaw=float("nan"))), "items[0].yaw=nan: expected a finite number"),
+    (boxes(replace(BOX, x=0.3)), "items[0].x=0.3: expected 0 to 0.25 m, in the bin"),
+    (boxes(replace(BOX, w=0.25)), "items[0].w=0.25: with its clearance it takes 6 cells; expected at most 5"),
+    ({"accuracy": -1}, "accuracy=-1: expected metres, 0 to 0.1"),
+    ({"clearance": 2}, "clearance=2: expected metres, 0 to 0.1"),
+    ({"cell_size": 0.05, "tote_height": 3}, "tote_height=3: expected metres, 0.001 to 2"),
     ({"cell_size": "5cm"}, "cell_size='5cm': expected a length"),
-    ({"cell_size": 1e-320}, "cell_size=1e-320: expected a length in metres, 1e-6 to 1e6"),
+    ({"cell_size": 1e-320}, "cell_size=1e-320: expected a length in metres, 0.001 to 10"),
     ({"tote_height": 0}, "tote_height=0: expected a whole number of cells, 1 to 1048575"),
     ({"tote_height": 10**400}, "tote_height=1000"),
-    ({"tolerance": 0.5}, "tolerance=0.5: expected a number of cells >= 0 and < 0.5"),
     ({"alternatives": -1}, "alternatives=-1: expected a whole number >= 0"),
 ]  # fmt: skip
 
 
-METRES = {"bin_depth": ITEM * 0.025, "tote_depth": EMPTY * 0.025, "cell_size": 0.05, "tolerance": 0.1}
 HALVES = [
-    ({"tote_depth": EMPTY * 0.025 + 0.01}, "got 5.4 height units (0.135 m), expected a whole number of height units"),
-    ({"tote_depth": EMPTY * 0.05}, "got 10 height units (0.25 m), expected 0 to 5 height units"),
-    ({"tote_height": 0.13}, "expected a whole number of height units, 1 to 1048575, within 0.1, in metres"),
+    (
+        {"tote_depth": EMPTY * 1.1},
+        "got 5.5 height units, expected a whole number of height units; measured heights are",
+    ),
+    ({"tote_depth": EMPTY * 2}, "got 10 height units, expected 0 to 5 height units"),
+    ({"tote_height": 0.13}, "expected a whole number of height units, 1 to 1048575"),
 ]
-CASES = [(1.0, *case) for case in BAD] + [(0.5, METRES | given, message) for given, message in HALVES]
+CASES = [(1.0, *case) for case in BAD] + [(0.5, *case) for case in HALVES]
 
 
 @pytest.mark.parametrize(("unit", "given", "message"), CASES)

@@ -1,0 +1,239 @@
+"""Measured boxes, depth maps and lengths: checked, and counted in whole height units."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pickplace.task.checks import excerpt, is_number
+
+#: A length is taken for the whole number of units that it is so close to: three cells of 0.05 m are not exactly 0.15 m
+#: in binary fractions.
+ROUNDING = 1e-6
+MILLIMETRE = 1e-3  # height unit of measured maps, m
+MAX_PATCHES = 8  # greatest number of patches along a cell; finer maps are reduced to it
+MAX_LENGTH = 1e3  # greatest length of a bin or tote, m
+
+
+class DepthMapError(ValueError):
+    """A depth map, or an argument beside it, that cannot be planned with; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A measured cuboid that stands in the bin; in metres and degrees, in the bin's frame."""
+
+    x: float  #: of its centre
+    y: float
+    w: float  #: side along x, before it is turned by the yaw
+    d: float  #: side along y
+    h: float  #: height of its top above the bin's floor
+    yaw: float = 0.0  #: turn about the vertical axis, counter-clockwise seen from above
+
+    def upright(self) -> "Box":
+        """Return the same cuboid with a yaw above -45 and at most 45 degrees."""
+        quarters = math.ceil(self.yaw / 90 - 0.5 - 1e-9)
+        w, d = (self.d, self.w) if quarters % 2 else (self.w, self.d)
+        return replace(self, w=w, d=d, yaw=self.yaw - 90 * quarters)
+
+
+def checked_number(name: str, value, wanted: str, accepts: Callable[[float], bool]) -> float:
+    """Return a value as a finite number that ``accepts`` accepts; ``wanted`` describes such numbers."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = float("nan")
+    if isinstance(value, (bool, np.bool_, str, bytes)) or not np.isfinite(number) or not accepts(number):
+        raise DepthMapError(f"{name}={excerpt(value)}: expected {wanted}.")
+    return number
+
+
+def checked_box(items, bin_sides: Sequence[float]) -> Box:
+    """Return the one measured item, which stands in the bin.
+
+    Raises:
+        DepthMapError: for anything else.
+    """
+    if not isinstance(items, (list, tuple)) or len(items) != 1 or not isinstance(items[0], Box):
+        raise DepthMapError(f"items={excerpt(items)}: expected a list of one Box.")
+    (box,) = items
+    for key, value in vars(box).items():
+        if not is_number(value) or abs(value) > MAX_LENGTH or (key in "wdh" and value < MILLIMETRE):
+            expected = "a length of at least 0.001 m" if key in "wdh" else "a finite number"
+            raise DepthMapError(f"items[0].{key}={excerpt(value)}: expected {expected}.")
+    for key, side in zip("xy", bin_sides, strict=True):
+        if not 0 <= getattr(box, key) <= side:
+            raise DepthMapError(f"items[0].{key}={getattr(box, key):g}: expected 0 to {side:g} m, in the bin.")
+    return box.upright()
+
+
+def as_array(name: str, values, grid: Sequence[int], kinds: str = "iuf") -> np.ndarray:
+    """Return a map as a numpy array; ``kinds`` are those of numpy's types.
+
+    Args:
+        grid: the shape; or each side a whole multiple of it, the same multiple.
+    """
+    try:
+        if isinstance(values, Tensor):
+            values = values.detach().cpu()
+            values = values.float() if values.dtype == torch.bfloat16 else values  # numpy has no bfloat16
+        array = np.asarray(values)
+    except (TypeError, ValueError) as error:
+        raise DepthMapError(f"{name}: expected an array of {grid[0]}x{grid[1]} numbers ({error}).") from error
+    fine = array.ndim == 2 and array.size and array.shape[0] * grid[1] == array.shape[1] * grid[0]
+    if not fine or array.shape[0] % grid[0]:
+        raise DepthMapError(
+            f"{name}: got shape {list(array.shape)}, expected {list(grid)}, the grid that the planner was loaded for, "
+            "or a multiple of it."
+        )
+    if array.dtype.kind not in kinds:
+        raise DepthMapError(f"{name}: got values of type {array.dtype}, expected numbers.")
+    if isinstance(values, np.ma.MaskedArray) and np.ma.getmaskarray(values).any():
+        x, y = np.argwhere(np.ma.getmaskarray(values))[0].tolist()
+        raise DepthMapError(f"{name}[{x}, {y}]: got a masked value, expected a measured one.")
+    return array
+
+
+def whole_map(name: str, values, grid: Sequence[int], highest: int, unit_name: str) -> Tensor:
+    """Return a map of whole height units, int64 ``grid``.
+
+    Args:
+        name: the argument's name, for messages.
+        values: numpy, torch or lists.
+        grid: the expected shape.
+        highest: the greatest value.
+
+    Raises:
+        DepthMapError: naming the first cell that is out of range, or no whole number.
+    """
+    array = as_array(name, values, grid)
+    if array.shape != tuple(grid):
+        expected = f"{list(grid)}; finer maps are in metres, with cell_size"
+        raise DepthMapError(f"{name}: got shape {list(array.shape)}, expected {expected}.")
+    with np.errstate(all="ignore"):
+        units = array.astype(np.float64)
+        whole = np.round(units)
+        near = np.abs(units - whole) <= ROUNDING * np.maximum(1, np.abs(units))  # False for NaN
+        inside = (whole >= 0) & (whole <= highest)
+    if not (near & inside).all():
+        x, y = np.argwhere(~(near & inside))[0].tolist()
+        wanted = f"0 to {highest} {unit_name}" if near[x, y] else f"a whole number of {unit_name}"
+        hint = "" if near[x, y] else "; measured heights are in metres, with cell_size"
+        raise DepthMapError(f"{name}[{x}, {y}]: got {units[x, y]:g} {unit_name}, expected {wanted}{hint}.")
+    return torch.from_numpy(whole.astype(np.int64))
+
+
+def metric_map(name: str, values, grid: Sequence[int], least: float, most: float) -> np.ndarray:
+    """Return a map of metres, float64, in the shape of the grid or finer.
+
+    Args:
+        least, most: the range of its values, m.
+
+    Raises:
+        DepthMapError: naming the first value that is out of range.
+    """
+    array = as_array(name, values, grid).astype(np.float64)
+    bad = ~((array >= least - ROUNDING) & (array <= most + ROUNDING))  # True for NaN
+    if bad.any():
+        x, y = np.argwhere(bad)[0].tolist()
+        raise DepthMapError(f"{name}[{x}, {y}]: got {array[x, y]:g} m, expected {least:g} to {most:g} m.")
+    return array
+
+
+def patches(array: np.ndarray, grid: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the greatest and the least value of each patch of a map, at most :data:`MAX_PATCHES` along a cell."""
+    along = array.shape[0] // grid[0]
+    count = max(part for part in range(1, MAX_PATCHES + 1) if along % part == 0)
+    step = along // count
+    blocks = array.reshape(grid[0] * count, step, grid[1] * count, step)
+    return blocks.max((1, 3)), blocks.min((1, 3))
+
+
+def whole_units(lengths, unit: float, up: bool) -> Tensor:
+    """Return lengths in whole units, int32, rounded up or down."""
+    units = np.asarray(lengths, dtype=np.float64) / unit
+    return torch.from_numpy(np.asarray(np.ceil(units - ROUNDING) if up else np.floor(units + ROUNDING))).int()
+
+
+def flags_of_map(name: str, values, grid: Sequence[int]) -> Tensor:
+    """Return a map of 0 and 1, int64 ``grid``; errors as of :func:`whole_map`."""
+    array = as_array(name, values, grid, "biuf")
+    if (bad := (array != 0) & (array != 1)).any() or array.shape != tuple(grid):
+        x, y = np.argwhere(bad)[0].tolist() if bad.any() else (0, 0)
+        found = f"[{x}, {y}]: got {array[x, y]:g}" if bad.any() else f": got shape {list(array.shape)}"
+        raise DepthMapError(f"{name}{found}, expected {'0 or 1' if bad.any() else list(grid)}.")
+    return torch.from_numpy(array.astype(np.int64))
+
+
+def box_of_map(heights: np.ndarray, side: float, accuracy: float) -> tuple[Box, float]:
+    """Return the one cuboid that a bin's map shows, and the side of a value's square.
+
+    Args:
+        heights: above the bin's floor, m.
+        side: of a value's square, m.
+        accuracy: greatest error of a height, m.
+
+    Raises:
+        DepthMapError: for an empty bin, or something else than one cuboid.
+    """
+    filled = heights > max(2 * accuracy, MILLIMETRE / 2)
+    if not filled.any():
+        raise DepthMapError("bin_depth: got no cell above 0, expected one item.")
+    where = np.argwhere(filled)
+    corners = np.unique(np.concatenate([where + step for step in ((0, 0), (0, 1), (1, 0), (1, 1))]), axis=0)
+    x, y, w, d, yaw = smallest_rectangle(corners * side)
+    box = Box(x, y, w, d, float(heights.max()), yaw)
+    # All that lies well inside the rectangle must be the item's top.
+    centre = (np.indices(heights.shape).transpose(1, 2, 0) + 0.5) * side - (x, y)
+    turn = math.radians(yaw)
+    along = np.abs(centre @ [math.cos(turn), math.sin(turn)]), np.abs(centre @ [-math.sin(turn), math.cos(turn)])
+    border = 0.0 if yaw == 0 else side
+    inside = (along[0] < w / 2 - border) & (along[1] < d / 2 - border)
+    if (bad := inside & (heights < box.h - 2 * accuracy - ROUNDING)).any():
+        i, j = np.argwhere(bad)[0].tolist()
+        raise DepthMapError(
+            f"bin_depth[{i}, {j}]: got {heights[i, j]:g} m, expected {box.h:g} m: one cuboid, {w:g} x {d:g} m with its "
+            f"centre at [{x:g}, {y:g}]."
+        )
+    return box.upright(), side
+
+
+def smallest_rectangle(points: np.ndarray) -> tuple[float, float, float, float, float]:
+    """Return the smallest rectangle around points ``[M, 2]``: centre, sides, and yaw in degrees, in [0, 90).
+
+    One along the axes is returned if it is hardly larger: the squares of a map show a straight edge as steps.
+    """
+    hull = _convex_hull(points)
+    edges = np.roll(hull, -1, 0) - hull
+    best = None
+    for angle in [0.0, *(np.arctan2(edges[:, 1], edges[:, 0]) % (math.pi / 2)).tolist()]:
+        axes = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+        turned = hull @ axes.T
+        low, high = turned.min(0), turned.max(0)
+        area = float(np.prod(high - low))
+        if best is None or area < 0.9 * best[0] or (area < best[0] and best[4] != 0.0):
+            centre = (low + high) / 2 @ axes
+            best = (area, *centre.tolist(), (high - low).tolist(), angle)
+    assert best is not None
+    _, x, y, (w, d), angle = best
+    return x, y, w, d, math.degrees(angle)
+
+
+def _convex_hull(points: np.ndarray) -> np.ndarray:
+    """Return the corners of the convex hull, counter-clockwise (monotone chain)."""
+    ordered = sorted(map(tuple, points.tolist()))
+    hull: list = []
+    for sequence in (ordered, ordered[::-1]):
+        part: list = []
+        for x, y in sequence:
+            while len(part) > 1:
+                (ax, ay), (bx, by) = part[-2:]
+                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 1e-15:
+                    break
+                part.pop()
+            part.append((x, y))
+        hull += part[:-1]
+    return np.array(hull)

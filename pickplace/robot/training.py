@@ -1,0 +1,53 @@
+"""What a policy was trained with, and what lies outside of it."""
+
+from dataclasses import dataclass
+
+from omegaconf import DictConfig
+
+from pickplace.task.cell import CellSpec
+from pickplace.task.items import ItemDistribution
+from pickplace.task.state import Item
+
+
+@dataclass(frozen=True)
+class Training:
+    """The items and the sizes of a policy's training.
+
+    Attributes:
+        kinds: every size ``(w, d, h)`` of its items, in cells and height units.
+        tote_size: greatest tote, ``(W_T, D_T, H_T)``.
+        effector_size: ``(W_E, D_E)``.
+        support: its stability rule.
+    """
+
+    kinds: frozenset[tuple[int, int, int]]
+    tote_size: tuple[int, ...]
+    effector_size: tuple[int, ...]
+    support: str | float
+
+    @classmethod
+    def of(cls, config: DictConfig, items: ItemDistribution) -> "Training":
+        """Return what a checkpoint's config says."""
+        kinds = frozenset((int(w), int(d), int(h)) for w, d, h in items.sizes.tolist())
+        env = config.env
+        return cls(kinds, tuple(env.tote_size), tuple(env.effector_size), env.get("support", "half"))
+
+    def warnings(self, cell: CellSpec, item: Item) -> list[str]:
+        """Return a sentence for each thing that the policy never met: the item, the tote, the effector, the rule."""
+        found = []
+        w, d, h = (int(part) for part in item[2:])
+        if not {(w, d, h), (d, w, h)} & self.kinds:
+            longest = [max(kind[axis] for kind in self.kinds) for axis in range(3)]
+            found.append(f"item of {w}x{d}x{h} cells: the policy met other sizes, up to {_sides(longest)}.")
+        if self.tote_size[:2] != cell.tote_size[:2] or cell.tote_size[2] > self.tote_size[2]:
+            found.append(f"tote of {_sides(cell.tote_size)} cells: the policy met {_sides(self.tote_size)}.")
+        if sorted(self.effector_size) != sorted(cell.effector_size):
+            sizes = _sides(cell.effector_size), _sides(self.effector_size)
+            found.append(f"end effector of {sizes[0]} cells: the policy met {sizes[1]}.")
+        if self.support != cell.support:
+            found.append(f"support={cell.support}: the policy met support={self.support}.")
+        return found
+
+
+def _sides(sizes) -> str:
+    return "x".join(map(str, sizes))

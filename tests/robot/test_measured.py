@@ -1,0 +1,163 @@
+"""Plans from measured maps and boxes, against plane geometry: what is called `ok` must be so."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from scenes import Scene, fault, random_scene
+
+from pickplace import CellSpec, DepthMapError, Planner
+from pickplace.robot.measure import box_of_map
+from pickplace.robot.planner import Box
+
+CELL, TOTE = 0.05, (0.3, 0.3, 0.25)
+SIZES = {"tote_size": (6, 6, 5)}
+NOISE = 0.002
+
+
+def make_planner(name: str) -> Planner:
+    return Planner(CellSpec(**SIZES), planner=name) if name == "joint_dbl" else Planner.load(name, **SIZES)
+
+
+def plan_of(planner: Planner, scene: Scene, draw: np.random.Generator, along: int = 5, **settings):
+    """A plan from a map with ``along`` values along a cell and from a measured box, both with noise."""
+    noise = draw.uniform(-NOISE, NOISE, (6 * along, 6 * along))
+    box = Box(*scene.centre, *scene.item[:2], scene.item[2] + draw.uniform(-NOISE, NOISE), scene.yaw)
+    maps = scene.tote_map(round(along / CELL), noise)
+    settings = {"accuracy": NOISE, "alternatives": 0} | settings
+    return planner.plan(items=[box], tote_depth=maps, cell_size=CELL, **settings)
+
+
+def count_faults(name: str, scenes: int, seed: int, along: int = 5) -> Counter:
+    planner, draw, found = make_planner(name), np.random.default_rng(seed), Counter()
+    for _ in range(scenes):
+        scene = random_scene(draw, TOTE)
+        plan = plan_of(planner, scene, draw, along)
+        found[(fault(scene, plan) or "ok") if plan.status == "ok" else plan.status] += 1
+    return found
+
+
+@pytest.mark.parametrize("along", [1, 2, 5, 8])
+def test_no_plan_that_is_ok_goes_wrong(along):
+    found = count_faults("joint_dbl", 200, along, along)
+    assert set(found) <= {"ok", "stuck", "impossible"} and found["ok"] > 20, found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pretrained/r4", "pretrained/mixed", "joint_dbl"])
+def test_no_plan_that_is_ok_goes_wrong_in_20_000_scenes(name):
+    found = count_faults(name, 20_000, 100)
+    assert set(found) <= {"ok", "stuck", "impossible"} and found["ok"] > 10_000, found
+
+
+@pytest.mark.parametrize("name", ["pretrained/r4", "pretrained/mixed", "joint_dbl"])
+def test_a_closed_loop_fills_totes_with_boxes_of_any_position(name):
+    """120x80x60 mm, 2 mm noise: 12 of the 24 that lie in the tote in four layers, or more; `slow` plays 50 totes."""
+    placed = [play(make_planner(name), np.random.default_rng(seed)) for seed in range(3)]
+    assert min(placed) >= 12, placed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pretrained/r4", "pretrained/mixed", "joint_dbl"])
+def test_a_closed_loop_fills_50_totes(name):
+    planner = make_planner(name)
+    placed = [play(planner, np.random.default_rng(seed)) for seed in range(50)]
+    assert min(placed) >= 10 and np.mean(placed) > 15, placed
+
+
+def play(planner: Planner, draw: np.random.Generator) -> int:
+    """Fill a tote; return the number of boxes."""
+    boxes: list = []
+    bearing = None
+    while True:
+        centre, yaw = tuple(draw.uniform(0.073, 0.177, 2)), draw.uniform(-180, 180)
+        scene = Scene((0.25, 0.25, 0.05), TOTE, (0.15, 0.15), (0.12, 0.08, 0.06), centre, yaw, boxes)
+        plan = plan_of(planner, scene, draw, tote_bearing=bearing)
+        if plan.status != "ok":
+            assert plan.status == "stuck" and sum(plan.reasons.values()) == planner.cell.num_actions
+            return len(boxes)
+        assert fault(scene, plan) is None
+        scene.carry_out(plan)
+        bearing = plan.tote_bearing
+
+
+def test_few_boxes_are_refused():
+    """At most 2% of 200 boxes of 120x80x60 mm at free positions in the bin, with an empty tote."""
+    planner, draw, refused = make_planner("pretrained/r4"), np.random.default_rng(1), 0
+    for _ in range(200):
+        centre = tuple(draw.uniform(0.073, 0.177, 2))
+        scene = Scene((0.25, 0.25, 0.05), TOTE, (0.15, 0.15), (0.12, 0.08, 0.06), centre, draw.uniform(-180, 180))
+        plan = plan_of(planner, scene, draw)
+        refused += plan.status != "ok"
+        assert plan.status != "ok" or fault(scene, plan) is None
+    assert refused <= 4
+
+
+def test_an_item_is_read_from_a_fine_map():
+    """The rectangle holds the item, and is hardly larger; turned, or parallel to the walls."""
+    draw, side = np.random.default_rng(3), 0.25 / 250
+    centres = (np.indices((250, 250)).transpose(1, 2, 0) + 0.5) * side
+    for yaw in (0.0, 90.0, 30.0, -70.0, *draw.uniform(-180, 180, 10)):
+        x, y, turn = *draw.uniform(0.08, 0.17, 2), np.radians(yaw)
+        away = centres - (x, y)
+        along = np.abs(away @ [np.cos(turn), np.sin(turn)]), np.abs(away @ [-np.sin(turn), np.cos(turn)])
+        heights = np.where((along[0] < 0.06) & (along[1] < 0.04), 0.06, 0.0) + draw.uniform(0, 0.002, (250, 250))
+        box, _ = box_of_map(heights, side, 0.002)
+        assert np.hypot(box.x - x, box.y - y) < 0.003 and 0.06 <= box.h <= 0.062
+        expected = Box(x, y, 0.12, 0.08, 0.06, yaw).upright()
+        if abs(expected.yaw) > 10 and abs(expected.yaw) < 44:
+            assert box.yaw == pytest.approx(expected.yaw, abs=2)
+        assert sorted((box.w, box.d)) == pytest.approx([0.08, 0.12], abs=0.016 if abs(expected.yaw) < 10 else 0.006)
+
+
+def test_two_items_that_are_seen_as_such_are_refused():
+    heights = np.zeros((50, 50))
+    heights[10:20, 10:20] = 0.06
+    heights[22:30, 10:20] = 0.06
+    planner = make_planner("joint_dbl")
+    with pytest.raises(DepthMapError, match=r"bin_depth\[20, 10\]: got 0 m, expected 0.06 m: one cuboid, 0.1 x 0.05 m"):
+        planner.plan(heights, np.full((6, 6), 0.25), cell_size=CELL)
+    heights[20:22, 10:20] = 0.04  # a lower one between them
+    with pytest.raises(DepthMapError, match="got 0.04 m, expected 0.06 m"):
+        planner.plan(heights, np.full((6, 6), 0.25), cell_size=CELL)
+
+
+def test_a_robot_that_turns_nothing():
+    planner = Planner(CellSpec(rotations=1), planner="joint_dbl")
+    flat = {"tote_depth": np.full((6, 6), 0.25), "cell_size": CELL}
+    plan = planner.plan(items=[Box(0.1, 0.1, 0.08, 0.12, 0.06, yaw=180)], **flat)
+    assert plan.status == "ok" and plan.rotation_degrees == 0
+    with pytest.raises(DepthMapError, match=r"items\[0\].yaw=30: expected 0 with rotations=1"):
+        planner.plan(items=[Box(0.1, 0.1, 0.08, 0.12, 0.06, yaw=30)], **flat)
+
+
+@pytest.mark.parametrize("name", ["joint_dbl", "corner", "random", "individual_heuristic", "lookahead", "mcts"])
+def test_any_planner_serves_a_robot(name):
+    flat = {"tote_depth": np.full((30, 30), 0.25), "cell_size": CELL, "alternatives": 0}
+    scene = Scene((0.25, 0.25, 0.05), TOTE, (0.15, 0.15), (0.12, 0.08, 0.06), (0.11, 0.12), 20.0)
+    if name in ("joint_dbl", "corner", "random", "individual_heuristic"):
+        planner = Planner(CellSpec(**SIZES), planner=name)
+    else:
+        planner = Planner.load("pretrained/mixed", planner=name, **SIZES)
+    plan = planner.plan(items=[Box(*scene.centre, *scene.item, scene.yaw)], **flat)
+    assert plan.status == "ok" and fault(scene, plan) is None
+    assert plan.rotation_degrees % 90 == pytest.approx(70)
+
+
+def test_warnings_name_what_lies_outside_the_training():
+    flat = {"cell_size": CELL, "alternatives": 0}
+    planner = Planner.load("pretrained/r4", tote_size=(7, 6, 5), effector_size=(4, 4))
+    plan = planner.plan(items=[Box(0.1, 0.1, 0.12, 0.08, 0.06)], tote_depth=np.full((7, 6), 0.25), **flat)
+    assert [warning.partition(" cells")[0] for warning in plan.warnings] == [
+        "item of 3x2x1", "tote of 7x6x5", "end effector of 4x4",
+    ]  # fmt: skip
+    known = Planner.load("pretrained/r4").plan(
+        items=[Box(0.1, 0.1, 0.09, 0.04, 0.05)], tote_depth=np.full((6, 6), 0.25), **flat
+    )
+    assert known.warnings == []
+    with pytest.raises(ValueError, match="planner='uniform': it does not choose among|does not choose among feasible"):
+        Planner(CellSpec(), planner="uniform")
+    with pytest.raises(ValueError, match="policy=None: expected a policy"):
+        Planner(CellSpec())
+    with pytest.raises(ValueError, match="items=None: planner='mcts' needs it"):
+        Planner(CellSpec(), planner="mcts")
