@@ -221,7 +221,7 @@ def read_metric(
     if cell.rotations == 1 and abs(box.yaw) > ROUNDING:
         raise DepthMapError(f"items[0].yaw={box.yaw:g}: expected 0 with rotations=1: this robot turns nothing.")
     height = check_tote_height(cell, cell.tote_size[2] * unit if tote_height is None else tote_height, cell_size)
-    rim = int(whole_units(height, MILLIMETRE, up=False))
+    rim, over_rim = (int(whole_units(height, MILLIMETRE, up)) for up in (False, True))
 
     # The tote.
     beyond = max(4 * accuracy, 0.01)  # a floor or a rim that noise puts a little out of range
@@ -233,7 +233,7 @@ def read_metric(
     bears = _read_bearing(cell, tote_bearing, on_floor).bool()
     if tote_bearing is None and count == 1:
         bears = on_floor  # one value a cell does not tell whether the cell is level
-    tote = MeasuredTote(high.to(device), low.to(device), bears.to(device), rim, slack)
+    tote = MeasuredTote(high.to(device), low.to(device), bears.to(device), rim, over_rim, slack)
 
     # The item, at whole cells of a grid that lies along it.
     sides = box.w / cell_size, box.d / cell_size

@@ -35,7 +35,8 @@ class MeasuredTote(NamedTuple):
     highest: Tensor  # int32 [k W_T, k D_T]: greatest height of each patch, rounded up
     lowest: Tensor  # int32 [k W_T, k D_T]: least height, rounded down
     bears: Tensor  # bool [W_T, D_T]: whether a cell bears weight, as plans before have it
-    height: int  # H_T, of the rim
+    height: int  # of the rim, rounded down: no item may be higher
+    rim: int  # of the rim, rounded up: the end effector passes over it
     accuracy: int  # greatest error of a height
 
     def state(self, cell: CellSpec, item: Item, slack: int = 0) -> State:
@@ -77,8 +78,9 @@ def measured_maps(cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[f
     top = z + item.h.to(z.dtype)
     highest = tote.height - 2 * slack
     good = stable & ~overflows(top, torch.tensor(highest)) & (z < FAR)
-    free = clearance(cell, tote.state(cell, item, slack)._replace(tote_height=torch.tensor([highest])))
-    return MeasuredMaps(PlacingMaps(torch.where(good, top, NEVER)[None], free, item), z, stable, highest, highest)
+    over_rim = tote.rim - 2 * slack
+    free = clearance(cell, tote.state(cell, item, slack)._replace(tote_height=torch.tensor([over_rim], device=z.device)))
+    return MeasuredMaps(PlacingMaps(torch.where(good, top, NEVER)[None], free, item), z, stable, highest, over_rim)
 
 
 class _Contact(NamedTuple):

@@ -47,9 +47,13 @@ class Scene:
 
 
 def random_scene(draw: np.random.Generator, tote: tuple[float, float, float]) -> Scene:
-    """A bin with one box, turned at random or not, and up to a dozen boxes dropped into the tote at random."""
+    """A bin with one box, turned at random or not, and up to a dozen boxes dropped into the tote at random.
+
+    Some totes are hardly higher than the item, or too low for it.
+    """
     item = tuple(draw.uniform((0.02, 0.02, 0.02), (0.14, 0.14, 0.1)))
     yaw = float(draw.choice((0, draw.uniform(-180, 180))))
+    tote = (*tote[:2], float(draw.choice((tote[2], tote[2], item[2] + draw.uniform(-0.005, 0.01)))))
     scene = Scene((0.25, 0.25, 0.05), tote, (0.15, 0.15), item, tuple(draw.uniform(0.07, 0.18, 2)), yaw)
     for _ in range(draw.integers(0, 12)):
         size = draw.uniform((0.02, 0.02, 0.02), (0.15, 0.15, 0.08))

@@ -25,7 +25,7 @@ def plan_of(planner: Planner, scene: Scene, draw: np.random.Generator, along: in
     box = Box(*scene.centre, *scene.item[:2], scene.item[2] + draw.uniform(-NOISE, NOISE), scene.yaw)
     maps = scene.tote_map(round(along / CELL), noise)
     settings = {"accuracy": NOISE, "alternatives": 0} | settings
-    return planner.plan(items=[box], tote_depth=maps, cell_size=CELL, **settings)
+    return planner.plan(items=[box], tote_depth=maps, tote_height=scene.tote[2], cell_size=CELL, **settings)
 
 
 def count_faults(name: str, scenes: int, seed: int, along: int = 5) -> Counter:
