@@ -135,13 +135,13 @@ class Gantry(Scene):
             drive = self.spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             drive.set_to_position(kp=STIFFNESS[joint.name == "turn"], dampratio=1.0)
 
-    def add(self, corner, size, planned) -> None:
+    def add(self, corner, size, planned, yaw=0.0) -> None:
         if self.boxes:
             self.weld.name2 = f"item{len(self.boxes)}"
         else:
             kinds = {"type": mujoco.mjtEq.mjEQ_WELD, "objtype": mujoco.mjtObj.mjOBJ_BODY}
             self.weld = self.spec.add_equality(**kinds, name1="plate", name2="item0", active=False, **STIFF)
-        super().add(corner, size, planned)
+        super().add(corner, size, planned, yaw)
         self.data.ctrl[:] = self.goal
 
     @property

@@ -76,16 +76,19 @@ class Scene:
         for at in (y - WALL / 2, y + depth + WALL / 2):
             self.add_geom(self.spec.worldbody, (width, WALL, height), (middle[0], at, height / 2))
 
-    def add(self, corner: Vector, size: Vector, planned: Vector) -> None:
+    def add(self, corner: Vector, size: Vector, planned: Vector, yaw: float = 0.0) -> None:
         """Add a box.
 
         Args:
-            corner: its near corner now.
+            corner: its near corner now, before it is turned about its centre.
             size: its planned sides.
             planned: centre of the box where it is planned to rest.
+            yaw: its turn, rad.
         """
         self.planned = np.vstack([self.planned, planned])
-        body = self.spec.worldbody.add_body(name=f"item{len(self.boxes)}", pos=np.add(corner, np.divide(size, 2)))
+        turn = np.array((np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)))
+        centre = np.add(corner, np.divide(size, 2))
+        body = self.spec.worldbody.add_body(name=f"item{len(self.boxes)}", pos=centre, quat=turn)
         body.add_freejoint()
         self.add_geom(body, np.subtract(size, (self.gap, self.gap, 0)))
         self.boxes.append(body)

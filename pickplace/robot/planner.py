@@ -17,6 +17,7 @@ from pickplace.planners.base import MapPlanner, decide
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy
 from pickplace.policies.restore import load_critic, load_policy
+from pickplace.robot.camera import ToteMap
 from pickplace.robot.measure import Box, DepthMapError, checked_number
 from pickplace.robot.problem import Pose, Problem, check_tote_height, read_grid, read_metric
 from pickplace.robot.training import Training
@@ -151,6 +152,7 @@ class Planner:
         alternatives: int = 10,
         tote_bearing=None,
         items: Sequence[Box] | None = None,
+        tote: ToteMap | None = None,
     ) -> Plan:
         """Return where to pick the one item in the bin, where to place it and how to turn it.
 
@@ -170,6 +172,7 @@ class Planner:
                 plan before this one returned; None: every cell bears weight. In metres, of a map with one value a
                 cell, only the floor does then: nothing tells whether a cell is level.
             items: instead of ``bin_depth``: a list of one :class:`Box`, in metres.
+            tote: instead of ``tote_depth``: what a :class:`~pickplace.robot.camera.Camera` sees.
 
         Raises:
             DepthMapError: for a map of another shape or type, a value that is not finite or out of range, an empty
@@ -177,17 +180,22 @@ class Planner:
         """
         self.check_settings(tote_height, cell_size, accuracy, clearance, alternatives)
         device = torch.device("cpu") if self.policy is None else next(self.policy.parameters()).device
-        if tote_depth is None:
-            raise DepthMapError("tote_depth: missing; expected a depth map.")
+        if (tote_depth is None) == (tote is None):
+            got = "neither" if tote is None else "both"
+            raise DepthMapError(f"tote_depth, tote: got {got}, expected one of the two.")
         if cell_size is None:
-            if items is not None or bin_depth is None:
-                got = "bin_depth: missing; expected a depth map" if items is None else "cell_size=None: expected metres"
-                raise DepthMapError(f"{got}{'' if items is None else ', as of items'}.")
+            for key, given in (("items", items), ("tote", tote)):
+                if given is not None:
+                    raise DepthMapError(
+                        f"cell_size=None: expected the side of a cell in metres, as {key} are measured."
+                    )
+            if bin_depth is None:
+                raise DepthMapError("bin_depth: missing; expected a depth map.")
             problem = read_grid(self.cell, bin_depth, tote_depth, tote_height, tote_bearing, device)
         else:
             problem = read_metric(
-                self.cell, cell_size, accuracy, clearance, bin_depth, items, tote_depth, tote_height, tote_bearing,
-                device,
+                self.cell, cell_size, accuracy, clearance, bin_depth, items, tote if tote_depth is None else tote_depth,
+                tote_height, tote_bearing, device,
             )  # fmt: skip
         observation = observe(self.terms, self.cell, problem.seen)
         status, action = self._decide(problem, observation)

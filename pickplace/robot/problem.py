@@ -7,11 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pickplace.robot.camera import ToteMap
 from pickplace.robot.measure import (
     MILLIMETRE,
     ROUNDING,
     Box,
     DepthMapError,
+    as_array,
     box_of_map,
     checked_box,
     checked_number,
@@ -224,9 +226,12 @@ def read_metric(
     rim, over_rim = (int(whole_units(height, MILLIMETRE, up)) for up in (False, True))
 
     # The tote.
-    beyond = max(4 * accuracy, 0.01)  # a floor or a rim that noise puts a little out of range
-    depth = metric_map("tote_depth", tote_depth, grid, -beyond, height + beyond)
-    highest, lowest = patches(height - depth, grid)
+    if isinstance(tote_depth, ToteMap):
+        highest, lowest = (as_array("tote", part, grid) for part in (tote_depth.highest, tote_depth.lowest))
+    else:
+        beyond = max(4 * accuracy, 0.01)  # a floor or a rim that noise puts a little out of range
+        depth = metric_map("tote_depth", tote_depth, grid, -beyond, height + beyond)
+        highest, lowest = patches(height - depth, grid)
     high, low = (whole_units(part.clip(0, None), MILLIMETRE, up) for part, up in ((highest, True), (lowest, False)))
     count = len(high) // grid[0]
     on_floor = (high <= LEVEL * slack).unflatten(0, (-1, count)).unflatten(2, (-1, count)).all(3).all(1)

@@ -79,7 +79,9 @@ def measured_maps(cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[f
     highest = tote.height - 2 * slack
     good = stable & ~overflows(top, torch.tensor(highest)) & (z < FAR)
     over_rim = tote.rim - 2 * slack
-    free = clearance(cell, tote.state(cell, item, slack)._replace(tote_height=torch.tensor([over_rim], device=z.device)))
+    free = clearance(
+        cell, tote.state(cell, item, slack)._replace(tote_height=torch.tensor([over_rim], device=z.device))
+    )
     return MeasuredMaps(PlacingMaps(torch.where(good, top, NEVER)[None], free, item), z, stable, highest, over_rim)
 
 

@@ -1,0 +1,269 @@
+"""From depth images to what the planner takes: the heights in a tote, and the items in a bin.
+
+A depth image ``[rows, columns]`` holds distances along the optical axis, in metres; 0 or NaN where nothing is known. In
+the camera's frame x points to the right of the image, y down and z forward. Single wrong values are removed by a
+median of 3x3 pixels. What must not be hit is widened by a pixel, what may support an item is narrowed by one.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+from scipy import ndimage
+
+from pickplace.robot.measure import MAX_PATCHES, Box, DepthMapError, smallest_rectangle
+from pickplace.task.cell import CellSpec
+
+#: Greatest share of a tote that the camera may not see.
+MOST_UNSEEN = 0.25
+#: Greatest share of the inside of its rectangle that an item's top leaves free, and the width of what is not inside, in
+#: pixels.
+MOST_MISSING, BORDER = 0.01, 2.5
+#: Fewest pixels along a cell.
+LEAST_PIXELS = 2
+#: Pixels of the smallest thing in a bin that counts.
+LEAST_ITEM = 9
+
+
+@dataclass(frozen=True)
+class ToteMap:
+    """What a camera sees in a tote: the greatest and the least height in each patch, ``[k W_T, k D_T]``; metres."""
+
+    highest: np.ndarray
+    lowest: np.ndarray
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera above a bin or a tote.
+
+    Args:
+        fx, fy: focal lengths; pixels.
+        cx, cy: where the optical axis meets the image; pixels, from the centre of the first one.
+        pose: ``[4, 4]``, from the camera's frame to that of the bin or the tote: its last column is the camera's
+            position, in metres.
+
+    Raises:
+        ValueError: for a focal length that is not above 0, or a pose that is no rotation and translation.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    pose: np.ndarray
+
+    def __post_init__(self):
+        for key in ("fx", "fy"):
+            if not 0 < getattr(self, key) < math.inf:
+                raise ValueError(f"camera.{key}={getattr(self, key)}: expected a number of pixels above 0.")
+        pose = np.asarray(self.pose, dtype=np.float64)
+        object.__setattr__(self, "pose", pose)
+        good = pose.shape == (4, 4) and np.isfinite(pose).all() and np.allclose(pose[3], (0, 0, 0, 1))
+        turn = pose[:3, :3] if good else np.zeros((3, 3))
+        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) or np.linalg.det(turn) < 0:
+            raise ValueError("camera.pose: expected [4, 4]: a rotation, a position in metres, and the row 0 0 0 1.")
+        if turn[2, 2] > -0.5:
+            raise ValueError(
+                "camera.pose: the camera does not look down: its z axis, the optical axis, should point to -z of the "
+                "bin or tote; expected the pose of the camera in that frame, not the inverse."
+            )
+
+    @classmethod
+    def looking_down(cls, centre: Sequence[float], height: float, focal: float, shape: Sequence[int]) -> "Camera":
+        """Return a camera that looks straight down; its image's right is +x, and its top is +y.
+
+        Args:
+            centre: position above the bin or tote, ``(x, y)``; m.
+            height: above its floor; m.
+            focal: both focal lengths; pixels.
+            shape: of its images, ``(rows, columns)``.
+        """
+        pose = np.diag((1.0, -1.0, -1.0, 1.0))
+        pose[:3, 3] = (*centre, height)
+        return cls(focal, focal, (shape[1] - 1) / 2, (shape[0] - 1) / 2, pose)
+
+    def points(self, depth) -> np.ndarray:
+        """Return the position of every pixel in the frame of the bin or tote, ``[rows, columns, 3]``; NaN if unknown.
+
+        Raises:
+            DepthMapError: for an image that is none, or not in metres.
+        """
+        image = np.asarray(depth)
+        if image.ndim != 2 or min(image.shape) < 3 or image.dtype.kind not in "fiu":
+            found = f"shape {list(image.shape)} of {image.dtype}"
+            raise DepthMapError(f"depth: got {found}, expected an image of distances, [rows, columns].")
+        image = np.where(image > 0, image, np.nan).astype(np.float64)  # NaN is not above 0
+        image[~np.isfinite(image)] = np.nan
+        if np.isnan(image).all():
+            raise DepthMapError("depth: got no distance above 0; expected metres, and 0 or NaN where nothing is known.")
+        if np.nanmedian(image) > 20:
+            far = np.nanmedian(image)
+            raise DepthMapError(f"depth: got distances of {far:g}, expected metres; divide millimetres by 1000.")
+        row, column = np.indices(image.shape)
+        rays = np.stack([(column - self.cx) / self.fx, (row - self.cy) / self.fy, np.ones(image.shape)], -1)
+        return (rays * image[..., None]) @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+    def pixel(self, height: float = 0.0) -> float:
+        """Return the side of a pixel's square at a height above the floor, in metres."""
+        return (self.pose[2, 3] - height) / min(self.fx, self.fy)
+
+    def tote_map(self, depth, cell: CellSpec, cell_size: float, tote_height: float | None = None) -> ToteMap:
+        """Return the heights in the tote, for ``planner.plan(tote=...)``.
+
+        Where the camera sees nothing there may be as much as beside it, and it supports nothing.
+
+        Args:
+            depth: an image.
+            cell: the sizes.
+            cell_size: side of a cell, m.
+            tote_height: of the rim, m; None: that of ``cell.tote_size``.
+
+        Raises:
+            DepthMapError: for an image that does not show the tote, or too little of it.
+        """
+        sides = [side * cell_size for side in cell.tote_size[:2]]
+        rim = cell.tote_size[2] * cell.height_unit * cell_size if tote_height is None else tote_height
+        pixel = self.pixel()
+        if pixel * LEAST_PIXELS > cell_size:
+            wide = cell_size / pixel
+            raise DepthMapError(f"depth: a cell is {wide:.1f} pixels wide, expected at least {LEAST_PIXELS}.")
+        points = self._inside(depth, sides, rim, "tote")
+        along = min(MAX_PATCHES, int(cell_size / (LEAST_PIXELS * pixel)))
+        shape = [side * along for side in cell.tote_size[:2]]
+        known = ~np.isnan(points[..., 2])
+        around = {"size": 3, "mode": "nearest"}
+        high = ndimage.maximum_filter(np.where(known, points[..., 2], -np.inf), **around)
+        low = ndimage.minimum_filter(np.where(known, points[..., 2], np.inf), **around)
+        patch = (points[known][:, :2] * along / cell_size).astype(int).clip(0, np.array(shape) - 1)
+        highest, lowest = np.full(shape, -np.inf), np.full(shape, np.inf)
+        np.maximum.at(highest, tuple(patch.T), high[known])
+        np.minimum.at(lowest, tuple(patch.T), low[known])
+        unseen = np.isinf(highest)
+        if unseen.mean() > MOST_UNSEEN:
+            raise DepthMapError(
+                f"depth: {unseen.mean():.0%} of the tote are not seen, expected {MOST_UNSEEN:.0%} at most."
+            )
+        holes, count = ndimage.label(unseen, np.ones((3, 3)))
+        for number in range(1, count + 1):
+            hole = holes == number
+            border = ndimage.binary_dilation(hole, np.ones((3, 3))) & ~unseen
+            highest[hole], lowest[hole] = highest[border].max(), 0.0
+        return ToteMap(highest.clip(0, None), lowest.clip(0, None))
+
+    def items(
+        self, depth, cell: CellSpec, cell_size: float, labels=None, accuracy: float = 0.005, sizes=None
+    ) -> list[Box]:
+        """Return the items in the bin.
+
+        Args:
+            depth: an image.
+            cell: the sizes.
+            cell_size: side of a cell, m.
+            labels: an image of whole numbers, 0 for the background, another one for each item; None: items are told
+                apart by steps of the depth.
+            accuracy: greatest error of a height, m.
+            sizes: known sizes of items, ``(w, d, h)`` in metres, if they are known. Two items that touch and are
+                equally high look like one to a depth image; with their sizes this is noticed.
+
+        Raises:
+            DepthMapError: for an image that does not show the bin, or something that could be two items.
+        """
+        sides = [side * cell_size for side in cell.bin_size[:2]]
+        points = self._inside(depth, sides, cell.bin_size[2] * cell.height_unit * cell_size, "bin")
+        height = np.nan_to_num(points[..., 2], nan=0.0)
+        above = height > max(3 * accuracy, 0.005)
+        if labels is None:
+            step = 4 * accuracy + self.pixel()
+            flat = ndimage.maximum_filter(height, 3) - ndimage.minimum_filter(height, 3) < step
+            segments, count = ndimage.label(above & flat)
+        else:
+            labels = np.asarray(labels)
+            if labels.shape != above.shape or labels.dtype.kind not in "iu":
+                found = f"shape {list(labels.shape)} of {labels.dtype}"
+                raise DepthMapError(f"labels: got {found}, expected whole numbers, {list(above.shape)} as of depth.")
+            numbers, segments = np.unique(np.where(above, labels, 0), return_inverse=True)
+            segments, count = segments.reshape(above.shape), len(numbers) - 1
+        boxes = []
+        for number in range(1, count + 1):
+            segment = segments == number
+            if segment.sum() >= LEAST_ITEM:
+                boxes.append(self._box(points, segment, narrowed=labels is None))
+        for box in boxes:
+            _check_reading(box, sizes, 2 * self.pixel() + 2 * accuracy)
+        return boxes
+
+    def _inside(self, depth, sides: Sequence[float], rim: float, name: str) -> np.ndarray:
+        """Return the points between the walls, median-filtered, NaN elsewhere, ``[rows, columns, 3]``."""
+        points = self.points(depth)
+        heights = points[..., 2]
+        filled = np.where(np.isnan(heights), np.nanmax(heights), heights)
+        heights = np.where(np.isnan(heights), np.nan, ndimage.median_filter(filled, 3, mode="nearest"))
+        points = np.concatenate([points[..., :2], heights[..., None]], -1)
+        wall = max(2 * self.pixel(), 0.004)  # what is seen of the walls is none of the contents
+        x, y = points[..., 0], points[..., 1]
+        within = (x > wall) & (x < sides[0] - wall) & (y > wall) & (y < sides[1] - wall)
+        if within.sum() < 0.5 * (sides[0] / self.pixel()) * (sides[1] / self.pixel()) * (1 - MOST_UNSEEN):
+            raise DepthMapError(
+                f"depth: {within.sum()} pixels lie inside the {name}, which is too few; expected the whole {name} in "
+                "the image: check the camera's pose, its focal lengths, and the unit of the image."
+            )
+        middle = float(np.median(heights[within]))
+        if not -0.05 < middle < rim + 0.5:
+            raise DepthMapError(
+                f"depth: the {name} is seen at a height of {middle:.3f} m, expected 0 to {rim:g} m: check the camera's "
+                "pose, which is relative to the floor, and the unit of the image."
+            )
+        return np.where(within[..., None], points, np.nan)
+
+    def _box(self, points: np.ndarray, segment: np.ndarray, narrowed: bool) -> Box:
+        """Return the cuboid whose top fills a segment, bool ``[rows, columns]``."""
+        height = float(np.quantile(points[segment][:, 2], 0.95))
+        pixel = self.pixel(height)
+        x, y, w, d, yaw = smallest_rectangle(points[segment][:, :2])
+        # Every pixel that shows a place well inside the rectangle must show the top.
+        away, turn = self._at_height(segment.shape, height) - (x, y), math.radians(yaw)
+        along = np.abs(away @ (math.cos(turn), math.sin(turn))), np.abs(away @ (-math.sin(turn), math.cos(turn)))
+        inside = (along[0] < w / 2 - BORDER * pixel) & (along[1] < d / 2 - BORDER * pixel)
+        grown = (3 if narrowed else 1) * pixel  # what the steps' filter took off, and half a pixel on each side
+        if inside.any() and (missing := 1 - segment[inside].mean()) > MOST_MISSING:
+            raise DepthMapError(
+                f"depth: what lies at [{x:.3f}, {y:.3f}] leaves {missing:.0%} of its rectangle of {w + grown:.3f} x "
+                f"{d + grown:.3f} m free: it could be two items that touch, or one that is no cuboid; separate them, "
+                "or pass labels."
+            )
+        return Box(x, y, float(w + grown), float(d + grown), height, yaw).upright()
+
+    def _at_height(self, shape: tuple[int, ...], height: float) -> np.ndarray:
+        """Return where the ray of every pixel passes a height, ``[rows, columns, 2]``."""
+        row, column = np.indices(shape)
+        rays = np.stack([(column - self.cx) / self.fx, (row - self.cy) / self.fy, np.ones(shape)], -1)
+        rays = rays @ self.pose[:3, :3].T
+        return self.pose[:2, 3] + rays[..., :2] * ((height - self.pose[2, 3]) / rays[..., 2])[..., None]
+
+
+def _check_reading(box: Box, sizes, tolerance: float) -> None:
+    """Refuse a box that could be two items of known sizes, or is none; both readings are named."""
+    if sizes is None:
+        return
+    known = [(w, d, h) for a, b, h in sizes for w, d in {(a, b), (b, a)}]
+
+    def is_like(w: float, d: float) -> bool:
+        return abs(box.w - w) <= tolerance and abs(box.d - d) <= tolerance
+
+    tall = [(w, d) for w, d, h in known if abs(box.h - h) <= tolerance]
+    one = [(w, d) for w, d in tall if is_like(w, d)]
+    two = [
+        (a, b)
+        for a, b in combinations_with_replacement(tall, 2)
+        if (is_like(a[0] + b[0], a[1]) and a[1] == b[1]) or (is_like(a[0], a[1] + b[1]) and a[0] == b[0])
+    ]
+    found = f"depth: what lies at [{box.x:.3f}, {box.y:.3f}], {box.w:.3f} x {box.d:.3f} x {box.h:.3f} m,"
+    if two:
+        pair = " and ".join(f"{w:g} x {d:g}" for w, d in two[0])
+        single = f"one item of {one[0][0]:g} x {one[0][1]:g} m or " if one else ""
+        raise DepthMapError(f"{found} is {single}two of {pair} m that touch; separate them, or pass labels.")
+    if not one:
+        raise DepthMapError(f"{found} is no item of the given sizes.")

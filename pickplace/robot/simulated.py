@@ -1,0 +1,155 @@
+"""A robot cell in MuJoCo, end to end: two depth cameras, the planner, and a gantry that does what the plan says.
+
+Nothing but the depth images tells the planner what is in bin and tote. They are computed from rays, so no OpenGL is
+needed.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pickplace.physics.execute import HEADROOM, Execute, Gantry
+from pickplace.physics.outcome import Loss
+from pickplace.physics.plans import EpisodePlan
+from pickplace.physics.scene import mujoco
+from pickplace.physics.simulation import wait
+from pickplace.robot.camera import Camera
+from pickplace.robot.planner import Plan, Planner
+
+ABOVE = 1.2  # height of the cameras above the floors, m
+IMAGE = (240, 320)  # rows and columns of a depth image
+TOO_FAR = 10.0  # distance at which a ray ends, m
+
+
+@dataclass
+class Filled:
+    """What became of a tote."""
+
+    sizes: list[tuple[float, float, float]] = field(default_factory=list)  # of the items in it, m
+    loss: Loss | None = None
+    last: Plan | None = None  # the plan that was not carried out: no place was left
+
+    @property
+    def volume(self) -> float:
+        """The volume of the items, m^3."""
+        return sum(math.prod(size) for size in self.sizes)
+
+
+class SimulatedCell:
+    """Bin, tote, cameras and gantry.
+
+    Args:
+        planner: decides.
+        cell_size: side of a cell, m.
+        noise: standard deviation of every value of the depth images, m.
+        accuracy, clearance: of :meth:`Planner.plan`, m.
+        seed: of the noise.
+        **options: of :class:`~pickplace.physics.execute.Execute`.
+    """
+
+    def __init__(
+        self, planner: Planner, cell_size: float = 0.05, noise: float = 0.002, accuracy: float = 0.005,
+        clearance: float = 0.005, seed: int = 0, **options,
+    ):  # fmt: skip
+        self.planner, self.cell_size, self.noise = planner, cell_size, noise
+        self.accuracy, self.clearance = accuracy, clearance
+        self.draw = np.random.default_rng(seed)
+        # The cup gives way by as much as heights may be wrong. The plate is narrower than its cells by the clearance.
+        options = {"lip": 2 * accuracy, "gap": 2 * clearance, **options}
+        self.simulation = Execute(cell_size=cell_size, **options)
+        cell = planner.cell
+        scale = (cell_size, cell_size, cell_size * cell.height_unit)
+        self.bin, self.tote = (tuple(np.multiply(size, scale)) for size in (cell.bin_size, cell.tote_size))
+        effector = tuple(np.multiply(cell.effector_size, cell_size))
+        self.gantry: Gantry = self.simulation.make_scene(EpisodePlan(0, self.tote, self.bin, effector))
+        focal = 0.8 * IMAGE[0] * ABOVE / (max(*self.bin[:2], *self.tote[:2]) + 0.1)
+        self.cameras = {
+            name: Camera.looking_down((sides[0] / 2, sides[1] / 2), ABOVE, focal, IMAGE)
+            for name, sides in (("bin", self.bin), ("tote", self.tote))
+        }
+        self.plan: Plan | None = None
+
+    def fill(self, items: Sequence[tuple]) -> Filled:
+        """Fill the tote with the items that arrive one by one, until one finds no place.
+
+        Args:
+            items: size ``(w, d, h)``, centre in the bin ``(x, y)`` in metres, and yaw in degrees, of each.
+        """
+        filled, bearing = Filled(), None
+        for size, centre, yaw in items:
+            self._arrive(size, centre, yaw)
+            plan = self.look_and_plan(bearing)
+            if plan.status != "ok":
+                filled.last = plan
+                break
+            if loss := self.carry_out(plan, size):
+                filled.loss = loss
+                break
+            filled.sizes.append(tuple(size))
+            bearing = plan.tote_bearing
+        return filled
+
+    def look_and_plan(self, tote_bearing=None) -> Plan:
+        """Return the plan for what the cameras see."""
+        cell, cell_size = self.planner.cell, self.cell_size
+        images = {name: self.depth_image(name) for name in self.cameras}
+        items = self.cameras["bin"].items(images["bin"], cell, cell_size, accuracy=self.accuracy)
+        tote = self.cameras["tote"].tote_map(images["tote"], cell, cell_size)
+        self.plan = self.planner.plan(
+            items=items, tote=tote, cell_size=cell_size, accuracy=self.accuracy, clearance=self.clearance,
+            tote_bearing=tote_bearing, alternatives=0,
+        )  # fmt: skip
+        return self.plan
+
+    def carry_out(self, plan: Plan, size: Sequence[float]) -> Loss | None:
+        """Do what a plan says; return the loss if there is one."""
+        assert plan.pick is not None and plan.place is not None and plan.rotation_degrees is not None
+        gantry, high = self.gantry, self.gantry.rim + size[2] + HEADROOM
+        start, turn = (math.radians(angle) for angle in (plan.pick.yaw, plan.rotation_degrees))
+        turn = (turn + math.pi / 2) % (2 * math.pi) - math.pi / 2  # the short way round
+        pick, place = np.array(plan.pick.center), np.array(plan.place.center)
+        x, y = gantry.centre[:2] - gantry.bin - pick[:2]
+        planned = place[:2] + (x * math.cos(turn) - y * math.sin(turn), x * math.sin(turn) + y * math.cos(turn))
+        gantry.planned[-1] = (*planned, plan.drop_height + size[2] / 2)
+        over_bin = gantry.bin + pick[:2]
+        loss = (
+            gantry.travel((*over_bin, high, start))
+            or gantry.lower((*over_bin, pick[2], start))
+            or gantry.grip()
+            or gantry.lift(high)
+            or gantry.travel((*place[:2], high, start + turn))
+            or gantry.lower((*place, start + turn))
+        )
+        if loss is None and np.linalg.norm(gantry.centre[:2] - planned) > self.simulation.tolerance:
+            loss = Loss("wedged", len(gantry.boxes) - 1)
+        if loss is None:
+            gantry.release()
+            loss = gantry.lift(high)
+            wait(gantry)
+        return loss or self.simulation.find_loss(gantry)
+
+    def depth_image(self, name: str) -> np.ndarray:
+        """Return what a camera measures, ``"bin"`` or ``"tote"``, m; the gantry is out of the way."""
+        gantry, camera = self.gantry, self.cameras[name]
+        mujoco.mj_forward(gantry.model, gantry.data)
+        row, column = np.indices(IMAGE)
+        rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(IMAGE)], -1)
+        length = np.linalg.norm(rays, axis=-1)
+        directions = (rays / length[..., None]) @ camera.pose[:3, :3].T
+        origin = camera.pose[:3, 3] + ((*gantry.bin, 0.0) if name == "bin" else 0.0)
+        count, hit = length.size, np.zeros(length.size, dtype=np.int32)
+        distance = np.zeros(count)
+        arguments = (origin, directions.ravel(), None, 1, gantry.plate.id, hit, distance, None, count, TOO_FAR)
+        mujoco.mj_multiRay(gantry.model, gantry.data, *arguments)
+        depth = np.where(hit >= 0, distance, np.nan).reshape(IMAGE) / length
+        return depth + self.draw.normal(0, self.noise, IMAGE)
+
+    def _arrive(self, size, centre, yaw: float) -> None:
+        """Put an item into the bin, and let it come to rest."""
+        gap = (self.simulation.gap, self.simulation.gap, 0.0)  # what the simulation takes off
+        corner = (*(self.gantry.bin + centre - np.add(size, gap)[:2] / 2), 0.0)
+        middle = np.array((*(self.gantry.bin + centre), size[2] / 2))
+        self.gantry.add(corner, np.add(size, gap), middle, math.radians(yaw))
+        wait(self.gantry)  # a wall of the bin may push it

@@ -1,0 +1,146 @@
+"""Depth images of boxes, computed ray by ray in plain numpy, and what the camera code reads from them."""
+
+import numpy as np
+import pytest
+
+from pickplace import CellSpec, DepthMapError
+from pickplace.robot.camera import Camera
+from pickplace.robot.planner import Box, Planner
+
+CELL, SIZE = CellSpec(), 0.05
+BIN, TOTE = (0.25, 0.25, 0.05), (0.3, 0.3, 0.25)
+SHAPE = (240, 320)
+
+
+def camera(room=TOTE, height=1.2, focal=500.0) -> Camera:
+    return Camera.looking_down((room[0] / 2, room[1] / 2), height, focal, SHAPE)
+
+
+def image(eye: Camera, boxes, room=TOTE, noise=0.0, seed=0, walls=True) -> np.ndarray:
+    """Distances along the optical axis to the floor, the walls around ``room`` and the boxes, each with a yaw."""
+    row, column = np.indices(SHAPE)
+    rays = np.stack([(column - eye.cx) / eye.fx, (row - eye.cy) / eye.fy, np.ones(SHAPE)], -1) @ eye.pose[:3, :3].T
+    origin = eye.pose[:3, 3]
+    depth = -origin[2] / rays[..., 2]  # the floor
+    w, d, h = room
+    around = [(-0.005, d / 2, 0.01, d + 0.02), (w + 0.005, d / 2, 0.01, d + 0.02), (w / 2, -0.005, w, 0.01),
+              (w / 2, d + 0.005, w, 0.01)]  # fmt: skip
+    for x, y, wide, deep, low, high, yaw in [
+        *boxes, *([(*wall, 0.0, h, 0.0) for wall in around] if walls else [])
+    ]:  # fmt: skip
+        turn = np.radians(yaw)
+        axes = np.array([[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+        start, way = axes @ (origin - (x, y, (low + high) / 2)), rays @ axes.T
+        half = np.array([wide, deep, high - low]) / 2
+        with np.errstate(divide="ignore"):
+            ends = np.stack([(-half - start) / way, (half - start) / way])
+        enter, leave = ends.min(0).max(-1), ends.max(0).min(-1)
+        depth = np.where(enter < leave, np.minimum(depth, enter), depth)
+    return depth + np.random.default_rng(seed).normal(0, noise, SHAPE)
+
+
+def box_of(size, x, y, yaw=0.0, low=0.0):
+    return x, y, *size[:2], low, low + size[2], yaw
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_an_item_is_measured(seed):
+    draw = np.random.default_rng(seed)
+    size, centre, yaw = (
+        draw.uniform((0.05, 0.05, 0.03), (0.13, 0.11, 0.1)),
+        draw.uniform(0.1, 0.15, 2),
+        draw.uniform(-180, 180),
+    )
+    shown = image(camera(BIN), [box_of(size, *centre, yaw)], BIN, 0.002, seed)
+    (box,) = camera(BIN).items(shown, CELL, SIZE)
+    true = Box(*centre, *size, yaw).upright()
+    assert np.hypot(box.x - centre[0], box.y - centre[1]) < 0.003 and abs(box.h - size[2]) < 0.004
+    if abs(abs(true.yaw) - 45) > 4 and box.yaw != 0:
+        assert abs(box.yaw - true.yaw) < 2.5
+        assert -0.001 < box.w - true.w < 0.007 and -0.001 < box.d - true.d < 0.007
+
+
+def test_a_tote_is_measured_and_hidden_places_count_as_high_as_what_hides_them():
+    boxes = [box_of((0.12, 0.08, 0.2), 0.08, 0.06), box_of((0.1, 0.1, 0.06), 0.2, 0.2, 20.0)]
+    eye = camera()
+    shown = image(eye, boxes, noise=0.002)
+    shown[3:6, 3:6] = 0  # not measured
+    shown[150, 200] = 0.4  # a flying pixel
+    found = eye.tote_map(shown, CELL, SIZE)
+    along = len(found.highest) // 6
+    centre = (np.indices(found.highest.shape).transpose(1, 2, 0) + 0.5) * SIZE / along
+    true = np.zeros(found.highest.shape)
+    for x, y, w, d, _, high, yaw in boxes:
+        turn, away = np.radians(yaw), centre - (x, y)
+        inside = (abs(away @ (np.cos(turn), np.sin(turn))) < w / 2) & (
+            abs(away @ (-np.sin(turn), np.cos(turn))) < d / 2
+        )
+        true = np.where(inside, np.maximum(true, high), true)
+    assert (found.highest >= true - 0.004).all(), "something in the tote is not seen"
+    assert (found.lowest <= true + 0.004).all(), "something that is not there would support an item"
+    assert found.highest.max() < 0.21 and (found.highest < true + 0.006).mean() > 0.8
+    # The outer side of the high box is hidden from the camera; the patch beside it counts as high.
+    hidden = found.highest[int(0.01 / SIZE * along), int(0.06 / SIZE * along)]
+    assert hidden > 0.19
+
+
+def test_steps_or_labels_tell_items_apart():
+    two = [box_of((0.08, 0.08, 0.06), 0.07, 0.1), box_of((0.08, 0.06, 0.05), 0.18, 0.15)]
+    eye = camera(BIN)
+    shown = image(eye, two, BIN, 0.001)
+    found = sorted(eye.items(shown, CELL, SIZE), key=lambda box: box.x)
+    assert [round(box.h, 2) for box in found] == [0.06, 0.05]
+    touching = [box_of((0.1, 0.08, 0.06), 0.07, 0.1), box_of((0.1, 0.08, 0.06), 0.17, 0.1)]
+    shown = image(eye, touching, BIN, 0.001)
+    (one,) = eye.items(shown, CELL, SIZE)  # that is what the image shows
+    assert one.w == pytest.approx(0.2, abs=0.006)
+    with pytest.raises(
+        DepthMapError, match=r"is two of 0.1 x 0.08 and 0.1 x 0.08 m that touch; separate them, or pass"
+    ):
+        eye.items(shown, CELL, SIZE, sizes=[(0.1, 0.08, 0.06)])
+    with pytest.raises(DepthMapError, match=r"is one item of 0.2 x 0.08 m or two of 0.1 x 0.08 and 0.1 x 0.08 m"):
+        eye.items(shown, CELL, SIZE, sizes=[(0.1, 0.08, 0.06), (0.08, 0.2, 0.06)])
+    with pytest.raises(DepthMapError, match="is no item of the given sizes"):
+        eye.items(shown, CELL, SIZE, sizes=[(0.1, 0.1, 0.06)])
+    left = eye.points(shown)[..., 0] < 0.12
+    labelled = eye.items(shown, CELL, SIZE, labels=np.where(left, 1, 2))
+    assert [box.w for box in labelled] == pytest.approx([0.1, 0.1], abs=0.006)
+    shifted = [touching[0], box_of((0.1, 0.08, 0.06), 0.17, 0.12)]
+    with pytest.raises(DepthMapError, match="it could be two items that touch, or one that is no cuboid"):
+        eye.items(image(eye, shifted, BIN, 0.001), CELL, SIZE)
+    with pytest.raises(DepthMapError, match=r"items=.*: expected a list of one Box"):
+        Planner(CELL, planner="joint_dbl").plan(items=labelled, tote_depth=np.full((6, 6), 0.25), cell_size=SIZE)
+
+
+def test_what_is_no_image_of_the_tote_is_refused():
+    eye = camera()
+    shown = image(eye, [])
+    for bad, message in (
+        (shown * np.nan, "got no distance above 0"), (shown * 1000, "expected metres; divide millimetres by 1000"),
+        (shown[0], "expected an image of distances"), (shown.astype(bool), "expected an image of distances"),
+        (shown + 0.5, "the tote is seen at a height of -0.500 m"),
+        (shown - 1.0, "the tote is seen at a height of 1.000 m"),
+    ):  # fmt: skip
+        with pytest.raises(DepthMapError, match=message):
+            eye.tote_map(bad, CELL, SIZE)
+    with pytest.raises(DepthMapError, match="which is too few; expected the whole tote in the image"):
+        Camera.looking_down((1.0, 0.0), 1.2, 500.0, SHAPE).tote_map(shown, CELL, SIZE)
+    with pytest.raises(DepthMapError, match="a cell is 0.8 pixels wide, expected at least 2"):
+        camera(focal=20.0).tote_map(image(camera(focal=20.0), []), CELL, SIZE)
+    dark = shown.copy()
+    dark[:, :150] = 0
+    with pytest.raises(DepthMapError, match="too few|are not seen"):
+        eye.tote_map(dark, CELL, SIZE)
+    with pytest.raises(ValueError, match="camera.pose: the camera does not look down"):
+        Camera(500, 500, 160, 120, np.eye(4))
+    with pytest.raises(ValueError, match="camera.pose: expected .4, 4."):
+        Camera(500, 500, 160, 120, np.ones((4, 4)))
+    with pytest.raises(ValueError, match="camera.fx=0"):
+        Camera(0, 500, 160, 120, np.eye(4))
+    with pytest.raises(DepthMapError, match="labels: got shape"):
+        camera(BIN).items(image(camera(BIN), [], BIN), CELL, SIZE, labels=np.zeros((3, 3)))
+    found = eye.tote_map(shown, CELL, SIZE)
+    with pytest.raises(
+        DepthMapError, match="cell_size=None: expected the side of a cell in metres, as tote are measured"
+    ):
+        Planner(CELL, planner="joint_dbl").plan(np.zeros((5, 5)), tote=found)
