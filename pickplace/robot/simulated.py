@@ -105,7 +105,7 @@ class SimulatedCell:
 
     def carry_out(self, plan: Plan, size: Sequence[float]) -> Loss | None:
         """Do what a plan says; return the loss if there is one."""
-        assert plan.pick is not None and plan.place is not None and plan.rotation_degrees is not None
+        assert plan.pick and plan.place and plan.rotation_degrees is not None and plan.drop_height is not None
         gantry, high = self.gantry, self.gantry.rim + size[2] + HEADROOM
         start, turn = (math.radians(angle) for angle in (plan.pick.yaw, plan.rotation_degrees))
         turn = (turn + math.pi / 2) % (2 * math.pi) - math.pi / 2  # the short way round
