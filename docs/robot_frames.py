@@ -10,11 +10,10 @@ from matplotlib.patches import Arc, Rectangle
 from pickplace import Planner
 
 INK, GREY, ITEM, PLACED, GRIPPER = "#263238", "#9aa3ab", "#e69f00", "#56b4e9", "#c2410c"
-CELL = 0.05  # metres
 
 # A state in which the item has to be turned: it fills a gap that lies the other way.
 bin_depth = np.zeros((5, 5))
-bin_depth[1:3, 2] = CELL
+bin_depth[1:3, 2] = 1
 heights = np.array([
     [2, 5, 5, 5, 5, 5],
     [5, 5, 5, 5, 5, 5],
@@ -25,10 +24,10 @@ heights = np.array([
 ])  # fmt: skip
 HEIGHT = 5
 planner = Planner.load("pretrained/r4")
-plan = planner.plan(bin_depth, (HEIGHT - heights) * CELL, cell_size=CELL)
-turn, ee = plan.rotation_degrees, planner.cell.effector_size
+plan = planner.plan(bin_depth, HEIGHT - heights)  # in cells; drawn in metres
+turn, ee = int(plan.rotation_degrees), planner.cell.effector_size
 x, y, w, d, h = (plan.item[key] for key in "xywdh")
-pick, place = np.array(plan.pick.center) / CELL, np.array(plan.place.center) / CELL
+pick, place = np.array(plan.pick.center), np.array(plan.place.center)
 quarter = turn // 90
 arm = np.array([x + w / 2, y + d / 2]) - pick[:2]
 for _ in range(quarter):
@@ -88,7 +87,7 @@ row = int(landed[1] - size[1] / 2)
 side_axes.set_title(f"tote, cut at y = {row + 0.5:g} cells", color=INK, fontsize="large")
 for i, height in enumerate(heights[:, row]):
     side_axes.add_patch(Rectangle((i, 0), 1, height, fc=PLACED, ec=INK, lw=0.8))
-left, drop, top = landed[0] - size[0] / 2, plan.drop_height / CELL, place[2]
+left, drop, top = landed[0] - size[0] / 2, plan.drop_height, place[2]
 side_axes.add_patch(Rectangle((left, drop), size[0], h, fc=ITEM, ec=INK, lw=1.2, zorder=3))
 corner = place[0] - turned_ee[0] / 2
 side_axes.add_patch(Rectangle((corner, top), turned_ee[0], 0.18, fc=GRIPPER, ec=INK, lw=0.8, zorder=3))

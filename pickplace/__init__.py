@@ -15,7 +15,9 @@ import gymnasium  # noqa: E402
 if TYPE_CHECKING:
     from pickplace.envs.torchrl import PickPlaceEnv
     from pickplace.policies.restore import load_policy
-    from pickplace.robot.planner import DepthMapError, Plan, Planner
+    from pickplace.robot.camera import Camera
+    from pickplace.robot.measure import Box, DepthMapError
+    from pickplace.robot.planner import Plan, Planner
     from pickplace.task.cell import CellSpec
     from pickplace.task.state import Failure, Item, State
 
@@ -31,8 +33,10 @@ __version__ = "0.1.0"
 
 #: The module of each public name; it is imported when it is asked for, since torch and torchrl take seconds.
 _MODULES = {
+    "Box": "robot.measure",
+    "Camera": "robot.camera",
     "CellSpec": "task.cell",
-    "DepthMapError": "robot.planner",
+    "DepthMapError": "robot.measure",
     "Failure": "task.state",
     "Item": "task.state",
     "PickPlaceEnv": "envs.torchrl",
@@ -42,8 +46,8 @@ _MODULES = {
     "load_policy": "policies.restore",
 }
 __all__ = [
-    "CellSpec", "DepthMapError", "Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "State", "__version__",
-    "load_policy",
+    "Box", "Camera", "CellSpec", "DepthMapError", "Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "State",
+    "__version__", "load_policy",
 ]  # fmt: skip
 
 
