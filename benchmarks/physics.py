@@ -252,7 +252,7 @@ def figure() -> None:
         panel = panels[names.index(name)]
         panel.errorbar([point[axis] for point in points], share, error, marker="o", capsize=3, label=label)
         panel.set(xlabel=name, ylim=(-0.02, 1.05))
-        panel.legend(loc="lower left", frameon=False)
+        panel.legend(loc="center right", frameon=False)
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("share of totes carried out")
     chart.savefig(ROOT / "docs" / "physics.png", dpi=130)
