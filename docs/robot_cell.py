@@ -16,16 +16,16 @@ SIDE, STEPS = 0.05, 9  # m; items in the tote when the picture is taken
 planner = Planner.load("pretrained/mixed", tote_size=(6, 6, 5))
 cell, draw = SimulatedCell(planner, seed=4), np.random.default_rng(4)
 bearing = None
-for _ in range(STEPS + 1):
+for number in range(STEPS + 1):
     size, turn = (0.12, 0.08, 0.06), draw.uniform(-np.pi, np.pi)
     cos, sin = abs(np.cos(turn)), abs(np.sin(turn))
     half = np.array((size[0] * cos + size[1] * sin, size[0] * sin + size[1] * cos)) / 2 + 0.001
-    cell._arrive(size, draw.uniform(half, 0.25 - half), np.degrees(turn))
+    cell.arrive(size, draw.uniform(half, 0.25 - half), np.degrees(turn))
     images = {name: cell.depth_image(name) for name in ("bin", "tote")}
     plan = cell.look_and_plan(bearing)
     assert plan.status == "ok", plan
     tote = cell.cameras["tote"].tote_map(images["tote"], planner.cell, SIDE)
-    if _ < STEPS:
+    if number < STEPS:
         assert cell.carry_out(plan, size) is None
         bearing = plan.tote_bearing
 

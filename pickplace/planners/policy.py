@@ -49,7 +49,7 @@ class PolicyPlanner(MapPlanner):
 
     @torch.no_grad()
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        policy = self.policy.within(cell)
+        policy = self.policy.with_cell(cell)
         if self.candidates == "all":
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 return policy.best_feasible(observation, maps)

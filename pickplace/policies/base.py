@@ -124,7 +124,7 @@ class Policy(TensorDictModuleBase, ABC):
         """Return what decides which actions succeed in the state that an observation shows."""
         return placing_maps(self.cell, State.from_observation(observation))
 
-    def within(self, cell: CellSpec) -> Self:
+    def with_cell(self, cell: CellSpec) -> Self:
         """Return this policy, with the same networks, for a cell that differs in its limits only."""
         other = copy(self)
         other.cell = cell

@@ -13,23 +13,21 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy import ndimage
 
-from pickplace.robot.measure import MAX_PATCHES, Box, DepthMapError, smallest_rectangle
+from pickplace.robot.measure import MAX_PATCHES, SNAPPED, Box, DepthMapError, is_inside, smallest_rectangle
 from pickplace.task.cell import CellSpec
 
 #: Greatest share of a tote that the camera may not see.
 MOST_UNSEEN = 0.25
-#: Greatest share of the inside of its rectangle that an item's top leaves free, and the width of what is not inside, in
-#: pixels.
-MOST_MISSING, BORDER = 0.01, 2.5
+MOST_MISSING = 0.01  # greatest share of the inside of its rectangle that an item's top leaves free
+BORDER = 2.5  # width of the part of the rectangle that is not its inside, pixels
 #: Fewest pixels along a cell.
 LEAST_PIXELS = 2
-#: Pixels of the smallest thing in a bin that counts.
-LEAST_ITEM = 9
+MIN_ITEM_PIXELS = 9  # pixels of the smallest thing in a bin that counts
 
 
 @dataclass(frozen=True)
 class ToteMap:
-    """What a camera sees in a tote: the greatest and the least height in each patch, ``[k W_T, k D_T]``; metres."""
+    """The greatest and the least height in each patch of a tote, ``[k W_T, k D_T]``; metres."""
 
     highest: np.ndarray
     lowest: np.ndarray
@@ -102,9 +100,13 @@ class Camera:
         if np.nanmedian(image) > 20:
             far = np.nanmedian(image)
             raise DepthMapError(f"depth: got distances of {far:g}, expected metres; divide millimetres by 1000.")
-        row, column = np.indices(image.shape)
-        rays = np.stack([(column - self.cx) / self.fx, (row - self.cy) / self.fy, np.ones(image.shape)], -1)
-        return (rays * image[..., None]) @ self.pose[:3, :3].T + self.pose[:3, 3]
+        return self.rays(image.shape) * image[..., None] + self.pose[:3, 3]
+
+    def rays(self, shape: Sequence[int]) -> np.ndarray:
+        """Return the way along every pixel's ray that goes one metre along the optical axis, ``[rows, columns, 3]``."""
+        row, column = np.indices(shape)
+        rays = np.stack([(column - self.cx) / self.fx, (row - self.cy) / self.fy, np.ones(shape)], -1)
+        return rays @ self.pose[:3, :3].T
 
     def pixel(self, height: float = 0.0) -> float:
         """Return the side of a pixel's square at a height above the floor, in metres."""
@@ -134,9 +136,8 @@ class Camera:
         along = min(MAX_PATCHES, int(cell_size / (LEAST_PIXELS * pixel)))
         shape = [side * along for side in cell.tote_size[:2]]
         known = ~np.isnan(points[..., 2])
-        around = {"size": 3, "mode": "nearest"}
-        high = ndimage.maximum_filter(np.where(known, points[..., 2], -np.inf), **around)
-        low = ndimage.minimum_filter(np.where(known, points[..., 2], np.inf), **around)
+        high = ndimage.maximum_filter(np.where(known, points[..., 2], -np.inf), 3)
+        low = ndimage.minimum_filter(np.where(known, points[..., 2], np.inf), 3)
         patch = (points[known][:, :2] * along / cell_size).astype(int).clip(0, np.array(shape) - 1)
         highest, lowest = np.full(shape, -np.inf), np.full(shape, np.inf)
         np.maximum.at(highest, tuple(patch.T), high[known])
@@ -146,15 +147,22 @@ class Camera:
             raise DepthMapError(
                 f"depth: {unseen.mean():.0%} of the tote are not seen, expected {MOST_UNSEEN:.0%} at most."
             )
-        holes, count = ndimage.label(unseen, np.ones((3, 3)))
+        # At the walls the nearest place that is seen; there the camera sees the wall, not what is beside it.
+        border = np.ones(shape, dtype=bool)
+        edge = math.ceil(self._wall() * along / cell_size)
+        border[edge:-edge, edge:-edge] = False
+        holes, count = ndimage.label(unseen & ~border, np.ones((3, 3)))
         for number in range(1, count + 1):
             hole = holes == number
-            border = ndimage.binary_dilation(hole, np.ones((3, 3))) & ~unseen
-            highest[hole], lowest[hole] = highest[border].max(), 0.0
+            around = ndimage.binary_dilation(hole, np.ones((3, 3))) & ~unseen
+            highest[hole], lowest[hole] = highest[around].max(initial=rim if not around.any() else 0.0), 0.0
+        at_wall = np.isinf(highest)
+        nearest = ndimage.distance_transform_edt(at_wall, return_distances=False, return_indices=True)
+        highest, lowest = highest[tuple(nearest)], np.where(at_wall, 0.0, lowest)
         return ToteMap(highest.clip(0, None), lowest.clip(0, None))
 
     def items(
-        self, depth, cell: CellSpec, cell_size: float, labels=None, accuracy: float = 0.005, sizes=None
+        self, depth, cell: CellSpec, cell_size: float, labels=None, accuracy: float = 0.003, sizes=None
     ) -> list[Box]:
         """Return the items in the bin.
 
@@ -184,12 +192,19 @@ class Camera:
             if labels.shape != above.shape or labels.dtype.kind not in "iu":
                 found = f"shape {list(labels.shape)} of {labels.dtype}"
                 raise DepthMapError(f"labels: got {found}, expected whole numbers, {list(above.shape)} as of depth.")
-            numbers, segments = np.unique(np.where(above, labels, 0), return_inverse=True)
-            segments, count = segments.reshape(above.shape), len(numbers) - 1
+            numbers, segments = np.unique(np.where(above & (labels > 0), labels, 0), return_inverse=True)
+            segments, count = segments.reshape(above.shape) + (numbers[0] != 0), len(numbers) - (numbers[0] == 0)
+            known = ndimage.binary_dilation(labels > 0, np.ones((3, 3)), iterations=2)
+            if (left := above & ~known & ~np.isnan(points[..., 2])).sum() >= MIN_ITEM_PIXELS:
+                row, column = np.argwhere(left)[0].tolist()
+                raise DepthMapError(
+                    f"labels[{row}, {column}]: got 0, but something {height[row, column]:.3f} m high lies there; "
+                    "expected a label for each item."
+                )
         boxes = []
         for number in range(1, count + 1):
             segment = segments == number
-            if segment.sum() >= LEAST_ITEM:
+            if segment.sum() >= MIN_ITEM_PIXELS:
                 boxes.append(self._box(points, segment, narrowed=labels is None))
         for box in boxes:
             _check_reading(box, sizes, 2 * self.pixel() + 2 * accuracy)
@@ -202,7 +217,7 @@ class Camera:
         filled = np.where(np.isnan(heights), np.nanmax(heights), heights)
         heights = np.where(np.isnan(heights), np.nan, ndimage.median_filter(filled, 3, mode="nearest"))
         points = np.concatenate([points[..., :2], heights[..., None]], -1)
-        wall = max(2 * self.pixel(), 0.004)  # what is seen of the walls is none of the contents
+        wall = self._wall()
         x, y = points[..., 0], points[..., 1]
         within = (x > wall) & (x < sides[0] - wall) & (y > wall) & (y < sides[1] - wall)
         if within.sum() < 0.5 * (sides[0] / self.pixel()) * (sides[1] / self.pixel()) * (1 - MOST_UNSEEN):
@@ -218,15 +233,18 @@ class Camera:
             )
         return np.where(within[..., None], points, np.nan)
 
+    def _wall(self) -> float:
+        """Return the distance from a wall up to which a point may be one of the wall, not of the contents; m."""
+        return max(2 * self.pixel(), 0.004)
+
     def _box(self, points: np.ndarray, segment: np.ndarray, narrowed: bool) -> Box:
         """Return the cuboid whose top fills a segment, bool ``[rows, columns]``."""
         height = float(np.quantile(points[segment][:, 2], 0.95))
         pixel = self.pixel(height)
         x, y, w, d, yaw = smallest_rectangle(points[segment][:, :2])
         # Every pixel that shows a place well inside the rectangle must show the top.
-        away, turn = self._at_height(segment.shape, height) - (x, y), math.radians(yaw)
-        along = np.abs(away @ (math.cos(turn), math.sin(turn))), np.abs(away @ (-math.sin(turn), math.cos(turn)))
-        inside = (along[0] < w / 2 - BORDER * pixel) & (along[1] < d / 2 - BORDER * pixel)
+        border = BORDER * pixel + SNAPPED * max(w, d) * (yaw == 0)
+        inside = is_inside(self._at_height(segment.shape, height), (x, y), (w - 2 * border, d - 2 * border), yaw)
         grown = (3 if narrowed else 1) * pixel  # what the steps' filter took off, and half a pixel on each side
         if inside.any() and (missing := 1 - segment[inside].mean()) > MOST_MISSING:
             raise DepthMapError(
@@ -238,9 +256,7 @@ class Camera:
 
     def _at_height(self, shape: tuple[int, ...], height: float) -> np.ndarray:
         """Return where the ray of every pixel passes a height, ``[rows, columns, 2]``."""
-        row, column = np.indices(shape)
-        rays = np.stack([(column - self.cx) / self.fx, (row - self.cy) / self.fy, np.ones(shape)], -1)
-        rays = rays @ self.pose[:3, :3].T
+        rays = self.rays(shape)
         return self.pose[:2, 3] + rays[..., :2] * ((height - self.pose[2, 3]) / rays[..., 2])[..., None]
 
 

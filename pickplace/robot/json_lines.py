@@ -48,11 +48,11 @@ def parser() -> argparse.ArgumentParser:
     add("--tote-bearing", metavar="NPY", help="map [W_T, D_T]: tote_bearing of the plan before; default: all 1")
     add("--tote-height", type=float, metavar="H", help="height of the tote's rim; default: that of --tote-size")
     add("--cell-size", type=float, metavar="M", help="side of a cell in metres, if the maps are in metres")
-    for key, what in (
-        ("accuracy", "greatest error of a measured height, in metres"),
-        ("clearance", "least distance of an item from what stands beside it, in metres"),
+    for key, default, what in (
+        ("accuracy", 0.003, "greatest error of a measured height, in metres"),
+        ("clearance", 0.005, "least distance of an item from what stands beside it, in metres"),
     ):
-        add(f"--{key}", type=float, metavar="M", default=0.005, help=f"{what} (default %(default)s)")
+        add(f"--{key}", type=float, metavar="M", default=default, help=f"{what} (default %(default)s)")
     add("--candidates", metavar="K", default="all", help="number of most probable actions tried, or all (the default)")
     add(
         "--alternatives", type=int, metavar="N", default=10,
@@ -97,6 +97,8 @@ def run(args: argparse.Namespace) -> None:
         options = {"candidates": candidates, "device": args.device, "trust": args.trust, "planner": args.planner}
         planner = Planner.load(args.checkpoint, **options, **sizes)
     elif args.planner is not None:
+        if candidates != "all":
+            raise ValueError(f"--candidates={args.candidates}: only a policy has candidates; expected a checkpoint.")
         planner = Planner(CellSpec(**sizes), planner=args.planner)
     else:
         raise ValueError("checkpoint: missing; expected a checkpoint, or --planner joint_dbl or the like.")

@@ -15,7 +15,9 @@ from pickplace.task.checks import excerpt, is_number
 ROUNDING = 1e-6
 MILLIMETRE = 1e-3  # height unit of measured maps, m
 MAX_PATCHES = 8  # greatest number of patches along a cell; finer maps are reduced to it
-MAX_LENGTH = 1e3  # greatest length of a bin or tote, m
+MAX_VALUE = 1e3  # greatest coordinate of a box, m, and greatest yaw, degrees
+#: Width of the border of an item that is taken to be parallel to the walls, as a share of its side: sine of a degree.
+SNAPPED = 0.02
 
 
 class DepthMapError(ValueError):
@@ -57,11 +59,15 @@ def checked_box(items, bin_sides: Sequence[float]) -> Box:
     Raises:
         DepthMapError: for anything else.
     """
-    if not isinstance(items, (list, tuple)) or len(items) != 1 or not isinstance(items[0], Box):
+    if not isinstance(items, (list, tuple)) or not all(isinstance(item, Box) for item in items):
         raise DepthMapError(f"items={excerpt(items)}: expected a list of one Box.")
+    if len(items) != 1:
+        raise DepthMapError(
+            f"items: got {len(items)} boxes, expected one: {'an empty bin' if not items else 'too many'}."
+        )
     (box,) = items
     for key, value in vars(box).items():
-        if not is_number(value) or abs(value) > MAX_LENGTH or (key in "wdh" and value < MILLIMETRE):
+        if not is_number(value) or abs(value) > MAX_VALUE or (key in "wdh" and value < MILLIMETRE):
             expected = "a length of at least 0.001 m" if key in "wdh" else "a finite number"
             raise DepthMapError(f"items[0].{key}={excerpt(value)}: expected {expected}.")
     for key, side in zip("xy", bin_sides, strict=True):
@@ -146,10 +152,15 @@ def metric_map(name: str, values, grid: Sequence[int], least: float, most: float
 def patches(array: np.ndarray, grid: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the greatest and the least value of each patch of a map, at most :data:`MAX_PATCHES` along a cell."""
     along = array.shape[0] // grid[0]
-    count = max(part for part in range(1, MAX_PATCHES + 1) if along % part == 0)
-    step = along // count
-    blocks = array.reshape(grid[0] * count, step, grid[1] * count, step)
-    return blocks.max((1, 3)), blocks.min((1, 3))
+    count = min(along, MAX_PATCHES)
+    highest = lowest = array
+    for axis, cells in enumerate(grid):
+        edges = np.arange(cells * count) * along  # over `count`: where a patch begins, in values
+        # A value that lies in two patches belongs to both.
+        parts = np.stack([edges // count, -(-(edges + along) // count)], 1)
+        highest = np.stack([highest.take(range(*part), axis).max(axis) for part in parts], axis)
+        lowest = np.stack([lowest.take(range(*part), axis).min(axis) for part in parts], axis)
+    return highest, lowest
 
 
 def whole_units(lengths, unit: float, up: bool) -> Tensor:
@@ -168,13 +179,21 @@ def flags_of_map(name: str, values, grid: Sequence[int]) -> Tensor:
     return torch.from_numpy(array.astype(np.int64))
 
 
-def box_of_map(heights: np.ndarray, side: float, accuracy: float) -> tuple[Box, float]:
-    """Return the one cuboid that a bin's map shows, and the side of a value's square.
+def is_inside(points: np.ndarray, centre: Sequence[float], sides: Sequence[float], yaw: float) -> np.ndarray:
+    """Return which of the points ``[..., 2]`` lie in a rectangle with a yaw in degrees, bool ``[...]``."""
+    turn, away = math.radians(yaw), points - centre
+    along = away @ (math.cos(turn), math.sin(turn)), away @ (-math.sin(turn), math.cos(turn))
+    return (np.abs(along[0]) < sides[0] / 2) & (np.abs(along[1]) < sides[1] / 2)
+
+
+def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: bool = False) -> Box:
+    """Return the one cuboid that a bin's map shows.
 
     Args:
         heights: above the bin's floor, m.
         side: of a value's square, m.
         accuracy: greatest error of a height, m.
+        is_cell_map: whether the map has one value a cell: then the item is all cells in which it lies.
 
     Raises:
         DepthMapError: for an empty bin, or something else than one cuboid.
@@ -187,24 +206,22 @@ def box_of_map(heights: np.ndarray, side: float, accuracy: float) -> tuple[Box, 
     x, y, w, d, yaw = smallest_rectangle(corners * side)
     box = Box(x, y, w, d, float(heights.max()), yaw)
     # All that lies well inside the rectangle must be the item's top.
-    centre = (np.indices(heights.shape).transpose(1, 2, 0) + 0.5) * side - (x, y)
-    turn = math.radians(yaw)
-    along = np.abs(centre @ [math.cos(turn), math.sin(turn)]), np.abs(centre @ [-math.sin(turn), math.cos(turn)])
-    border = 0.0 if yaw == 0 else side
-    inside = (along[0] < w / 2 - border) & (along[1] < d / 2 - border)
+    centres = (np.indices(heights.shape).transpose(1, 2, 0) + 0.5) * side
+    border = 0.0 if is_cell_map else side + SNAPPED * max(w, d) * (yaw == 0)
+    inside = is_inside(centres, (x, y), (w - 2 * border, d - 2 * border), yaw)
     if (bad := inside & (heights < box.h - 2 * accuracy - ROUNDING)).any():
         i, j = np.argwhere(bad)[0].tolist()
         raise DepthMapError(
             f"bin_depth[{i}, {j}]: got {heights[i, j]:g} m, expected {box.h:g} m: one cuboid, {w:g} x {d:g} m with its "
             f"centre at [{x:g}, {y:g}]."
         )
-    return box.upright(), side
+    return box.upright()
 
 
 def smallest_rectangle(points: np.ndarray) -> tuple[float, float, float, float, float]:
     """Return the smallest rectangle around points ``[M, 2]``: centre, sides, and yaw in degrees, in [0, 90).
 
-    One along the axes is returned if it is hardly larger: the squares of a map show a straight edge as steps.
+    One along the axes is returned if it is hardly larger, as it is for a turn of a degree.
     """
     hull = _convex_hull(points)
     edges = np.roll(hull, -1, 0) - hull
@@ -214,7 +231,7 @@ def smallest_rectangle(points: np.ndarray) -> tuple[float, float, float, float, 
         turned = hull @ axes.T
         low, high = turned.min(0), turned.max(0)
         area = float(np.prod(high - low))
-        if best is None or area < 0.9 * best[0] or (area < best[0] and best[4] != 0.0):
+        if best is None or area < 0.97 * best[0] or (area < best[0] and best[4] != 0.0):
             centre = (low + high) / 2 @ axes
             best = (area, *centre.tolist(), (high - low).tolist(), angle)
     assert best is not None

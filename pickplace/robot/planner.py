@@ -63,7 +63,8 @@ class Plan:
     box: Box | None  #: the item as it was measured, in metres; None without cell_size
     pick: Pose | None  #: in the bin's frame
     place: Pose | None  #: in the tote's frame; the end effector lets go there
-    rotation_degrees: float | None  #: counter-clockwise seen from above, between pick and place
+    #: turn between pick and place, counter-clockwise seen from above, -45 to 315; the shorter way round is as good
+    rotation_degrees: float | None
     drop_height: float | None  #: height of the item's underside above the tote's floor once it rests
     action: int | None  #: flat index
     occupancy_before: float  #: share of the tote's volume below the surface that the depth map shows, 0 to 1
@@ -114,7 +115,9 @@ class Planner:
             needs = getattr(maker, "needs", ())
             for key in ("policy", "items"):
                 if key in needs and given[key] is None:
-                    raise ValueError(f"{key}=None: planner={planner!r} needs it.")
+                    raise ValueError(
+                        f"{key}=None: planner={planner!r} needs it; Planner.load has it from a checkpoint."
+                    )
             planner = maker(cell=cell, **{key: given[key] for key in given if key in needs})
         if not isinstance(planner, MapPlanner):
             raise ValueError(
@@ -147,7 +150,7 @@ class Planner:
         tote_depth=None,
         tote_height=None,
         cell_size: float | None = None,
-        accuracy: float = 0.005,
+        accuracy: float = 0.003,
         clearance: float = 0.005,
         alternatives: int = 10,
         tote_bearing=None,
@@ -164,7 +167,7 @@ class Planner:
             tote_height: height of the tote's rim above its floor; None: that of ``cell.tote_size``.
             cell_size: side of a cell in metres, if the maps and ``tote_height`` are in metres; None: they are whole
                 numbers of height units, as in training.
-            accuracy: greatest error of a measured height, m: three standard deviations of the noise.
+            accuracy: greatest error of a measured height, m.
             clearance: least distance that an item keeps from what stands beside it, on each side; m.
             alternatives: how many of the most probable choices to report, and the chosen one if it is further down;
                 0 is fastest. Where no action is feasible, planning takes longest: all are simulated for the reasons.
@@ -252,7 +255,7 @@ class Planner:
         if count == 0 or not isinstance(self._planner, PolicyPlanner):
             return []
         cell, policy, candidates = problem.cell, self._planner.policy, self._planner.candidates
-        log_probs = policy.within(cell).action_log_probs(observation)[0]
+        log_probs = policy.with_cell(cell).action_log_probs(observation)[0]
         if candidates == "all" and policy.ranks_footprints:
             actions, probability = self._probable_footprints(log_probs, problem, chosen, count)
         else:

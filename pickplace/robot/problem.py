@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from pickplace.robot.camera import ToteMap
@@ -25,9 +26,9 @@ from pickplace.robot.measure import (
 )
 from pickplace.task.cell import MAX_SIDE, CellSpec, Limits, reference_cell
 from pickplace.task.feasibility import PlacingMaps, footprint_mask, placing_maps
-from pickplace.task.grasps import split_action
+from pickplace.task.grasps import carry, footprint_index, split_action
 from pickplace.task.maps import FAR
-from pickplace.task.measured import LEVEL, MeasuredMaps, MeasuredTote, bearing_after, failures, measured_maps
+from pickplace.task.measured import MeasuredMaps, MeasuredTote, bearing_after, failures, floor_height, measured_maps
 from pickplace.task.state import EMPTY, Item, State, item_from_depth, surface_from
 from pickplace.task.transition import apply
 
@@ -153,9 +154,8 @@ class MeasuredProblem(Problem):
         return int(self.measured.rest.flatten()[self._footprint(action)] + self.state.item.h)
 
     def _footprint(self, action: Tensor) -> int:
-        x, y, w, _ = (int(part) for part in apply(self.cell, self.state, action).footprint[0])
-        parity = int(split_action(self.cell, action)[4]) % self.cell.parities
-        return (parity * self.cell.tote_size[0] + x) * self.cell.tote_size[1] + y
+        carried = carry(self.cell, self.state.item, action)
+        return int(footprint_index(self.cell.tote_size, carried.rotation % 2, carried.x, carried.y))
 
 
 def effector_centres(cell: CellSpec, item: Item, centre: tuple[float, float], yaw: float, side: float) -> np.ndarray:
@@ -217,6 +217,8 @@ def read_metric(
     tote_bearing, device,
 ) -> MeasuredProblem:  # fmt: skip
     """Return the problem of maps and boxes in metres; arguments and errors as of :meth:`Planner.plan`."""
+    if cell.pick_rule != "contain":
+        raise DepthMapError(f"cell_size={cell_size:g}: with pick_rule={cell.pick_rule} expected None, whole cells.")
     grid, unit = cell.tote_size[:2], cell_size * cell.height_unit
     slack = math.ceil(accuracy / MILLIMETRE - ROUNDING)
     box, clearance = _read_box(cell, cell_size, accuracy, clearance, bin_depth, items)
@@ -234,7 +236,7 @@ def read_metric(
         highest, lowest = patches(height - depth, grid)
     high, low = (whole_units(part.clip(0, None), MILLIMETRE, up) for part, up in ((highest, True), (lowest, False)))
     count = len(high) // grid[0]
-    on_floor = (high <= LEVEL * slack).unflatten(0, (-1, count)).unflatten(2, (-1, count)).all(3).all(1)
+    on_floor = (high <= floor_height(slack)).unflatten(0, (-1, count)).unflatten(2, (-1, count)).all(3).all(1)
     bears = _read_bearing(cell, tote_bearing, on_floor).bool()
     if tote_bearing is None and count == 1:
         bears = on_floor  # one value a cell does not tell whether the cell is level
@@ -255,7 +257,6 @@ def read_metric(
         for at, size, most_cells in zip((box.x, box.y), whole, cell.bin_size[:2], strict=True)
     ]
     item = Item(*(torch.tensor([part], device=device) for part in (*corner, *whole, h)))
-    _check_longest(cell, item)
 
     ratio = unit / MILLIMETRE
     free = replace(
@@ -264,7 +265,7 @@ def read_metric(
     centres = effector_centres(free, item, (box.x, box.y), box.yaw, cell_size)
     above_walls = box.h - accuracy >= cell.bin_size[2] * unit - ROUNDING
     clear = torch.from_numpy(above_walls | _misses_walls(centres, cell, box.yaw, cell_size)).to(device)
-    limited = replace(free, limits=_limits(cell, clear, ratio))
+    limited = replace(free, limits=_limits(cell, clear, centres / cell_size, ratio, 2 * slack))
     measured = measured_maps(limited, tote, item, sides)
     # What a policy sees: heights as in training.
     state, seen_rim = tote.state(limited, item), max(1, round(rim / ratio))
@@ -287,8 +288,9 @@ def _read_box(cell: CellSpec, side: float, accuracy: float, clearance: float, bi
     if items is not None:
         return checked_box(items, bin_sides), clearance
     heights = metric_map("bin_depth", bin_depth, cell.bin_size[:2], -max(4 * accuracy, 0.01), MAX_SIDE * MILLIMETRE)
-    box, step = box_of_map(heights, side * cell.bin_size[0] / len(heights), accuracy)
-    return box, clearance if step < side - ROUNDING else 0.0
+    is_cell_map = len(heights) == cell.bin_size[0]
+    box = box_of_map(heights, side * cell.bin_size[0] / len(heights), accuracy, is_cell_map)
+    return box, 0.0 if is_cell_map else clearance
 
 
 def _misses_walls(centres: np.ndarray, cell: CellSpec, yaw: float, side: float) -> np.ndarray:
@@ -299,16 +301,32 @@ def _misses_walls(centres: np.ndarray, cell: CellSpec, yaw: float, side: float) 
     return ((centres >= reach - ROUNDING) & (centres <= far - reach + ROUNDING)).all(1)
 
 
-def _limits(cell: CellSpec, bin_clear: Tensor, ratio: float) -> Limits:
-    """Return the limits of the robot, with tops in millimetres, and the picks at which no wall is hit."""
+def _limits(cell: CellSpec, bin_clear: Tensor, centres: np.ndarray, ratio: float, release: int) -> Limits:
+    """Return the limits of the robot, with tops in millimetres, and the picks at which no wall is hit.
+
+    Args:
+        bin_clear: bool ``[P]``.
+        centres: of the end effector in the bin at each pick cell, in cells, ``[P, 2]``. They lie between the pick cells
+            of ``cell.limits``, all of which must be allowed.
+        ratio: millimetres of a height unit.
+        release: height of the suction face above the item's planned top when it lets go, mm.
+    """
     device = bin_clear.device
     if cell.limits is None:
         places = torch.zeros(cell.rotations, *cell.tote_size[:2], dtype=torch.int64, device=device)
         return Limits(bin_clear, places, places + FAR)
-    limits = cell.limits.on(device)
-    lowest = (limits.lowest_top * ratio).ceil().long()
-    highest = (limits.highest_top.clamp(max=FAR) * ratio).floor().clamp(max=FAR).long()
-    return Limits(limits.pick_ok & bin_clear, lowest, highest)
+    limits, (bin_w, bin_d, _) = cell.limits.on(device), cell.bin_size
+    allowed = F.pad(limits.pick_ok.view(bin_w, bin_d), (1, 1, 1, 1), value=False).cpu().numpy()
+    at = [centres[:, axis] - side / 2 + reference_cell(side) for axis, side in enumerate(cell.effector_size)]
+    pick_ok = bin_clear.clone()
+    for round_x in (np.floor, np.ceil):
+        for round_y in (np.floor, np.ceil):
+            x, y = (part.round(6) for part in at)
+            x, y = round_x(x).clip(-1, bin_w).astype(int) + 1, round_y(y).clip(-1, bin_d).astype(int) + 1
+            pick_ok &= torch.from_numpy(allowed[x, y]).to(device)
+    lowest = (limits.lowest_top * ratio - release).ceil().long()
+    highest = (limits.highest_top.clamp(max=FAR) * ratio - release).floor().clamp(max=FAR).long()
+    return Limits(pick_ok, lowest, highest)
 
 
 def _check_one_cuboid(bin_map: Tensor, unit_name: str) -> None:
@@ -329,8 +347,10 @@ def _check_longest(cell: CellSpec, item: Item) -> None:
     """Refuse an item that is longer than the tables of grasps hold."""
     longest = max(int(item.w), int(item.d))
     if cell.pick_rule == "overlap" and longest > cell.max_side:
-        expected = f"longer than any in training; expected at most {cell.max_side}."
-        raise DepthMapError(f"bin_depth: the item is {longest} cells long, {expected}")
+        raise DepthMapError(
+            f"bin_depth: the item is {longest} cells long, longer than any in training; expected at most "
+            f"{cell.max_side}."
+        )
 
 
 def _read_bearing(cell: CellSpec, tote_bearing, on_floor: Tensor) -> Tensor:

@@ -18,14 +18,14 @@ from pickplace.physics.simulation import wait
 from pickplace.robot.camera import Camera
 from pickplace.robot.planner import Plan, Planner
 
-ABOVE = 1.2  # height of the cameras above the floors, m
+CAMERA_HEIGHT = 1.2  # above the floors, m
 IMAGE = (240, 320)  # rows and columns of a depth image
-TOO_FAR = 10.0  # distance at which a ray ends, m
+RAY_LENGTH = 10.0  # m
 
 
 @dataclass
 class Filled:
-    """What became of a tote."""
+    """A tote that was filled, and why it was not filled further."""
 
     sizes: list[tuple[float, float, float]] = field(default_factory=list)  # of the items in it, m
     loss: Loss | None = None
@@ -50,7 +50,7 @@ class SimulatedCell:
     """
 
     def __init__(
-        self, planner: Planner, cell_size: float = 0.05, noise: float = 0.002, accuracy: float = 0.005,
+        self, planner: Planner, cell_size: float = 0.05, noise: float = 0.002, accuracy: float = 0.003,
         clearance: float = 0.005, seed: int = 0, **options,
     ):  # fmt: skip
         self.planner, self.cell_size, self.noise = planner, cell_size, noise
@@ -64,9 +64,9 @@ class SimulatedCell:
         self.bin, self.tote = (tuple(np.multiply(size, scale)) for size in (cell.bin_size, cell.tote_size))
         effector = tuple(np.multiply(cell.effector_size, cell_size))
         self.gantry: Gantry = self.simulation.make_scene(EpisodePlan(0, self.tote, self.bin, effector))
-        focal = 0.8 * IMAGE[0] * ABOVE / (max(*self.bin[:2], *self.tote[:2]) + 0.1)
+        focal = 0.8 * IMAGE[0] * CAMERA_HEIGHT / (max(*self.bin[:2], *self.tote[:2]) + 0.1)
         self.cameras = {
-            name: Camera.looking_down((sides[0] / 2, sides[1] / 2), ABOVE, focal, IMAGE)
+            name: Camera.looking_down((sides[0] / 2, sides[1] / 2), CAMERA_HEIGHT, focal, IMAGE)
             for name, sides in (("bin", self.bin), ("tote", self.tote))
         }
         self.plan: Plan | None = None
@@ -79,7 +79,7 @@ class SimulatedCell:
         """
         filled, bearing = Filled(), None
         for size, centre, yaw in items:
-            self._arrive(size, centre, yaw)
+            self.arrive(size, centre, yaw)
             plan = self.look_and_plan(bearing)
             if plan.status != "ok":
                 filled.last = plan
@@ -134,19 +134,18 @@ class SimulatedCell:
         """Return what a camera measures, ``"bin"`` or ``"tote"``, m; the gantry is out of the way."""
         gantry, camera = self.gantry, self.cameras[name]
         mujoco.mj_forward(gantry.model, gantry.data)
-        row, column = np.indices(IMAGE)
-        rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(IMAGE)], -1)
+        rays = camera.rays(IMAGE)
         length = np.linalg.norm(rays, axis=-1)
-        directions = (rays / length[..., None]) @ camera.pose[:3, :3].T
+        directions = rays / length[..., None]
         origin = camera.pose[:3, 3] + ((*gantry.bin, 0.0) if name == "bin" else 0.0)
         count, hit = length.size, np.zeros(length.size, dtype=np.int32)
         distance = np.zeros(count)
-        arguments = (origin, directions.ravel(), None, 1, gantry.plate.id, hit, distance, None, count, TOO_FAR)
+        arguments = (origin, directions.ravel(), None, 1, gantry.plate.id, hit, distance, None, count, RAY_LENGTH)
         mujoco.mj_multiRay(gantry.model, gantry.data, *arguments)
         depth = np.where(hit >= 0, distance, np.nan).reshape(IMAGE) / length
         return depth + self.draw.normal(0, self.noise, IMAGE)
 
-    def _arrive(self, size, centre, yaw: float) -> None:
+    def arrive(self, size, centre, yaw: float) -> None:
         """Put an item into the bin, and let it come to rest."""
         gap = (self.simulation.gap, self.simulation.gap, 0.0)  # what the simulation takes off
         corner = (*(self.gantry.bin + centre - np.add(size, gap)[:2] / 2), 0.0)

@@ -1,4 +1,4 @@
-"""What a policy was trained with, and what lies outside of it."""
+"""The items and sizes of a policy's training, and warnings about what lies outside of them."""
 
 from dataclasses import dataclass
 

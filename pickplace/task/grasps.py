@@ -101,6 +101,34 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor) -> Grasp:
     return Grasp(gripped & ~item.is_empty, collides, unreachable, near_x, near_y, back_x, back_y)
 
 
+class Carried(NamedTuple):
+    """The rectangles of item and end effector over the tote, int64 ``[A]`` each, before anything is checked."""
+
+    picked: Grasp
+    rotation: Tensor
+    left: Tensor  # minimum corner and sides of the turned end effector
+    front: Tensor
+    wide: Tensor
+    deep: Tensor
+    x: Tensor  # minimum corner and sides of the item
+    y: Tensor
+    w: Tensor
+    d: Tensor
+
+
+def carry(cell: CellSpec, item: Item, action: Tensor) -> Carried:
+    """Return where flat actions ``[A]`` bring items, of which there are ``[A]``."""
+    (ee_w, ee_d), (x_bin, y_bin, x_tote, y_tote, rotation) = cell.effector_size, split_action(cell, action)
+    odd = rotation % 2 == 1
+    picked = grasp(cell, item, x_bin, y_bin)
+    turned = zip(*turn(picked.near_x, picked.near_y, picked.back_x, picked.back_y)[: cell.rotations], strict=True)
+    offset_x, offset_y = (torch.stack(offsets).gather(0, rotation[None])[0] for offsets in turned)
+    w, d = turned_size(item, odd)
+    wide, deep = torch.where(odd, ee_d, ee_w), torch.where(odd, ee_w, ee_d)
+    left, front = x_tote - reference_cell(wide), y_tote - reference_cell(deep)
+    return Carried(picked, rotation, left, front, wide, deep, left + offset_x, front + offset_y, w, d)
+
+
 # ---------------------------------------------------------------------- flat indices
 def split_flat(cell: CellSpec, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return pick cell, place cell (flat each) and rotation of a flat action."""

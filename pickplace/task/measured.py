@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pickplace.task.cell import HULL_RULES, CellSpec
 from pickplace.task.feasibility import PlacingMaps
-from pickplace.task.grasps import footprint_index, grasp, is_clear, is_outside, split_action, turn, turned_size
+from pickplace.task.grasps import carry, footprint_index, is_clear, is_outside, split_action
 from pickplace.task.maps import FAR, NEVER
 from pickplace.task.placing import clearance, footprint_cells, footprint_sizes, is_within_reach, overflows, rest
 from pickplace.task.state import Failure, Item, State, surface_from
@@ -24,9 +24,15 @@ DIRECTIONS = 128  # in which the hull of what supports an item is looked at
 #: Least distance of an item's centre from the hull's edge, in patches: as far as a patch may be covered in part.
 PATCH_MARGIN = 1.5
 
-#: Patches whose measured heights differ by up to so many errors of a height are taken to be level: the two errors, and
-#: one for the greatest of many values.
-LEVEL = 3
+
+def level_step(accuracy: int) -> int:
+    """Return by how much two measured heights of a level surface may differ: both errors, and a unit for rounding."""
+    return 2 * accuracy + 1
+
+
+def floor_height(accuracy: int) -> int:
+    """Return the greatest height that the tote's floor may seem to have."""
+    return accuracy + 1
 
 
 class MeasuredTote(NamedTuple):
@@ -48,7 +54,7 @@ class MeasuredTote(NamedTuple):
 
 
 class MeasuredMaps(NamedTuple):
-    """What decides which actions succeed, and why others fail; of one problem."""
+    """The maps that decide which actions succeed, and why others fail; of one problem."""
 
     maps: PlacingMaps
     rest: Tensor  # int32 [Q, W_T, D_T]: height on which an item comes to rest
@@ -118,7 +124,7 @@ def _contact(
     # A cell bears weight, or not, as a whole.
     x, y = (torch.arange(size, device=device)[:, None] + part for size, part in zip(shape, number, strict=True))
     bears = tote.bears[x[:, None, :, None], y[None, :, None, :]].flatten(2)
-    supports = (under.flatten(2) >= (z - LEVEL * tote.accuracy)[..., None]) & bears
+    supports = (under.flatten(2) >= (z - level_step(tote.accuracy))[..., None]) & bears
     angle = torch.arange(DIRECTIONS, dtype=torch.float64, device=device) * (2 * math.pi / DIRECTIONS)
     reach = []
     for part, size, direction in zip(near, footprint, (angle.cos(), angle.sin()), strict=True):
@@ -147,18 +153,19 @@ def _is_stable(
     if not z.numel():
         return stable
     contact = _contact(cell, tote, footprint, sides, z)
-    on_floor = z <= LEVEL * tote.accuracy  # the one surface that has no gaps
+    on_floor = z <= floor_height(tote.accuracy)  # the one surface that has no gaps
     flags = contact.supports
     # Two patches along both sides: something then carries each quarter of the item, though a patch may be covered in
     # part. (With one value a cell only cells that are level bear weight.)
     count = tote.highest.shape[0] // cell.tote_size[0]
     full = flags.all(-1) & (contact.fewest >= (2 if count > 1 else 1))
-    if cell.support in HULL_RULES:
-        margin = max(cell.support_margin * count, PATCH_MARGIN if count > 1 else 0.0) + contact.slack
-        reached = flags.double() @ (contact.along > margin).double().t()  # [W, D, directions]
-        enough = (reached > 0).all(-1)
-    else:
-        enough = is_share_enough(cell.support, flags.sum(-1).double() / contact.touched)
+    # By every rule the centre must be above what carries the item: a patch that is covered in part counts as whole.
+    margin = cell.support_margin * count if cell.support in HULL_RULES else 0.0
+    margin = max(margin, PATCH_MARGIN if count > 1 else 0.0) + contact.slack
+    reached = flags.double() @ (contact.along > margin).double().t()  # [W, D, directions]
+    enough = (reached > 0).all(-1)
+    if cell.support not in HULL_RULES:
+        enough &= is_share_enough(cell.support, flags.sum(-1).double() / contact.touched)
     stable[inside] = on_floor | full | enough
     return stable
 
@@ -180,11 +187,16 @@ def bearing_after(
     contact = _contact(cell, shifted, size, sides, z)
     flags = contact.supports[0, 0]
     held = torch.ones_like(flags)
-    if not flags.all() and int(z) > LEVEL * tote.accuracy:
+    if not flags.all() and int(z) > floor_height(tote.accuracy):
         reached = torch.where(flags, contact.along, -FAR).amax(1, keepdim=True)
         held = (contact.along <= reached + 1e-9).all(0)
     # A cell bears weight if all patches of it that are under the item do; one value a cell must cover it.
-    weak = torch.zeros(size[0] * size[1], dtype=torch.int64).index_add_(0, contact.cells, (~held).long()) > 0
+    weak = (
+        torch.zeros(size[0] * size[1], dtype=torch.int64, device=flags.device).index_add_(
+            0, contact.cells, (~held).long()
+        )
+        > 0
+    )
     covered = torch.zeros_like(weak).index_fill_(0, contact.cells, True)
     after = tote.bears.clone()
     after[x : x + size[0], y : y + size[1]] = (covered & ~weak).view(size)
@@ -200,18 +212,12 @@ def failures(cell: CellSpec, measured: MeasuredMaps, action: Tensor, bin_clear: 
         bin_clear: bool ``[P]``, whether the end effector hits no wall of the bin at each pick cell.
     """
     (maps, z, stable, highest, rim), (tote_w, tote_d, _) = measured, cell.tote_size
-    x_bin, y_bin, x_tote, y_tote, rotation = split_action(cell, action)
+    x_bin, y_bin, x_tote, y_tote, _ = split_action(cell, action)
     item = Item(*(part.expand(len(action)) for part in maps.item))
-    picked = grasp(cell, item, x_bin, y_bin)
-    turned = zip(*turn(picked.near_x, picked.near_y, picked.back_x, picked.back_y)[: cell.rotations], strict=True)
-    offset_x, offset_y = (torch.stack(offsets).gather(0, rotation[None])[0] for offsets in turned)
+    picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action)
     parity = rotation % 2
-    w, d = turned_size(item, parity == 1)
-    shape = torch.tensor(cell.effectors, device=action.device)[parity]  # [A, 4]
-    left, front = x_tote - shape[:, 2], y_tote - shape[:, 3]
-    x, y = left + offset_x, front + offset_y
     item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)
-    effector_leaves = is_outside(left, shape[:, 0], tote_w) | is_outside(front, shape[:, 1], tote_d)
+    effector_leaves = is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d)
     footprint = footprint_index(cell.tote_size, parity, x.clamp(0, tote_w - 1), y.clamp(0, tote_d - 1))
     place = footprint_index(cell.tote_size, parity, x_tote, y_tote)
     top = z.flatten()[footprint] + item.h

@@ -5,16 +5,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.cell import CellSpec, reference_cell
+from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import PlacingMaps
 from pickplace.task.grasps import (
+    carry,
     footprint_index,
-    grasp,
     is_clear,
     is_outside,
     split_action,
     split_footprint,
-    turn,
     turned_size,
 )
 from pickplace.task.maps import is_under, rectangle, square_cells, squares
@@ -44,19 +43,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
         action: int64 ``[N]``, the flat index, in ``[0, N_a)``.
     """
     (surface, tote_height, item), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.effector_size
-    x_bin, y_bin, x_tote, y_tote, rotation = split_action(cell, action)
-    odd = rotation % 2 == 1
-
-    # Picking and turning.
-    picked = grasp(cell, item, x_bin, y_bin)
-    turned = zip(*turn(picked.near_x, picked.near_y, picked.back_x, picked.back_y)[: cell.rotations], strict=True)
-    offset_x, offset_y = (torch.stack(offsets).gather(0, rotation[None])[0] for offsets in turned)
-    w, d = turned_size(item, odd)
-    wide, deep = torch.where(odd, ee_d, ee_w), torch.where(odd, ee_w, ee_d)  # the turned end effector
-    left, front = x_tote - reference_cell(wide), y_tote - reference_cell(deep)  # its min corner in the tote
-    x, y = left + offset_x, front + offset_y
-
-    # Placing.
+    picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action)
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
     side, reach = cell.max_side, max(ee_w, ee_d)
     cells, under = squares(surface, x, y, side).unbind(0), is_under(w, d, side).unbind(0)
@@ -75,6 +62,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
         (Failure.PICK_MISS, ~picked.grips),
     ]
     if cell.limits is not None and picked.unreachable is not None:
+        _, _, x_tote, y_tote, _ = split_action(cell, action)
         limits, number = cell.limits.on(action.device), footprint_index(cell.tote_size, rotation, x_tote, y_tote)
         lowest, highest_top = limits.lowest_top.flatten()[number], limits.highest_top.flatten()[number]
         checks.insert(0, (Failure.OUT_OF_REACH, picked.unreachable | ~is_within_reach(lowest, highest_top, top)))

@@ -42,7 +42,7 @@ SECONDS, BYTES = 20, 1.5e9
 #: Printed by a training and by an evaluation when they have begun.
 BEGUN = ("frames to train", "episodes to play")
 SMOKE = ["experiment=smoke", "threads=1", "total_frames=256", "evaluation.episodes=2"]
-DEFAULTS = {"tote_height": None, "cell_size": None, "accuracy": 0.005, "clearance": 0.005, "alternatives": 3}
+DEFAULTS = {"tote_height": None, "cell_size": None, "accuracy": 0.003, "clearance": 0.005, "alternatives": 3}
 REQUEST_KEYS = ("id", "bin_depth", "items", "tote_depth", "accuracy", "clearance", "more", *DEFAULTS)
 #: Values in place of good ones.
 VALUES = [

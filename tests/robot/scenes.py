@@ -6,7 +6,6 @@ from math import cos, radians, sin
 import numpy as np
 
 EPSILON = 1e-6  # m
-FAR_BELOW = 0.03  # what lies further below the highest thing under an item does not carry it; m
 
 
 @dataclass
@@ -51,13 +50,15 @@ def random_scene(draw: np.random.Generator, tote: tuple[float, float, float]) ->
 
     Some totes are hardly higher than the item, or too low for it.
     """
-    item = tuple(draw.uniform((0.02, 0.02, 0.02), (0.14, 0.14, 0.1)))
+    item = tuple(draw.uniform((0.02, 0.02, 0.02), (0.14, 0.14, 0.1)).round(draw.choice((2, 6))))
     yaw = float(draw.choice((0, draw.uniform(-180, 180))))
     tote = (*tote[:2], float(draw.choice((tote[2], tote[2], item[2] + draw.uniform(-0.005, 0.01)))))
     scene = Scene((0.25, 0.25, 0.05), tote, (0.15, 0.15), item, tuple(draw.uniform(0.07, 0.18, 2)), yaw)
     for _ in range(draw.integers(0, 12)):
-        size = draw.uniform((0.02, 0.02, 0.02), (0.15, 0.15, 0.08))
+        size = draw.uniform((0.02, 0.02, 0.004), (0.15, 0.15, 0.08))
         corner = draw.uniform((0, 0), np.array(tote[:2]) - size[:2])
+        if draw.random() < 0.3:  # hardly more than whole centimetres
+            size[:2], corner = size[:2].round(2) + 0.001, corner.round(2).clip(0, np.array(tote[:2]) - size[:2] - 0.01)
         scene.drop(corner, corner + size[:2], size[2])
     return scene
 
@@ -70,8 +71,11 @@ def rectangle(centre, sides, yaw) -> np.ndarray:
     return np.array(centre) + half @ axes
 
 
-def fault(scene: Scene, plan) -> str | None:
-    """What goes wrong when a robot does exactly what the plan says; None if nothing does."""
+def fault(scene: Scene, plan, accuracy: float = 0.002) -> str | None:
+    """What goes wrong when a robot does exactly what the plan says; None if nothing does.
+
+    What lies further below the highest thing under an item than heights may be wrong does not carry it.
+    """
     w, d, h = scene.item
     pick, place = np.array(plan.pick.center), np.array(plan.place.center)
     # Over the bin.
@@ -96,7 +100,7 @@ def fault(scene: Scene, plan) -> str | None:
         return "the item is pressed into what is below it"
     if rest + h > scene.tote[2] + EPSILON:
         return "the item passes the rim"
-    if place[2] - h > rest + 0.05:
+    if place[2] - h > rest + 5 * accuracy + 0.002:
         return "the item falls"
     if any(overlaps(box, effector.min(0), effector.max(0)) and box[4] > place[2] + EPSILON for box in scene.boxes):
         return "the effector hits an item"
@@ -104,7 +108,7 @@ def fault(scene: Scene, plan) -> str | None:
         return "the effector hits the tote's wall"
     # What carries it.
     if rest > 0:
-        touching = [box for box in below if box[4] >= rest - FAR_BELOW]
+        touching = [box for box in below if box[4] >= rest - 4 * accuracy - 0.002]
         points = np.concatenate([
             [(max(x0, low[0]), max(y0, low[1])), (max(x0, low[0]), min(y1, high[1])),
              (min(x1, high[0]), max(y0, low[1])), (min(x1, high[0]), min(y1, high[1]))]

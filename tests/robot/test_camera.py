@@ -84,6 +84,13 @@ def test_a_tote_is_measured_and_hidden_places_count_as_high_as_what_hides_them()
     assert hidden > 0.19
 
 
+def test_a_high_item_at_a_wall_does_not_raise_the_other_walls():
+    for focal in (380.0, 450.0, 600.0):
+        eye = camera(focal=focal)
+        found = eye.tote_map(image(eye, [box_of((0.1, 0.1, 0.2), 0.06, 0.06)]), CELL, SIZE)
+        assert found.highest[:, -1].max() < 0.02 and found.highest[-1].max() < 0.02
+
+
 def test_steps_or_labels_tell_items_apart():
     two = [box_of((0.08, 0.08, 0.06), 0.07, 0.1), box_of((0.08, 0.06, 0.05), 0.18, 0.15)]
     eye = camera(BIN)
@@ -105,10 +112,12 @@ def test_steps_or_labels_tell_items_apart():
     left = eye.points(shown)[..., 0] < 0.12
     labelled = eye.items(shown, CELL, SIZE, labels=np.where(left, 1, 2))
     assert [box.w for box in labelled] == pytest.approx([0.1, 0.1], abs=0.006)
+    with pytest.raises(DepthMapError, match=r"labels\[.*\]: got 0, but something 0.06. m high lies there"):
+        eye.items(shown, CELL, SIZE, labels=np.where(left, 1, 0))
     shifted = [touching[0], box_of((0.1, 0.08, 0.06), 0.17, 0.12)]
     with pytest.raises(DepthMapError, match="it could be two items that touch, or one that is no cuboid"):
         eye.items(image(eye, shifted, BIN, 0.001), CELL, SIZE)
-    with pytest.raises(DepthMapError, match=r"items=.*: expected a list of one Box"):
+    with pytest.raises(DepthMapError, match="items: got 2 boxes, expected one"):
         Planner(CELL, planner="joint_dbl").plan(items=labelled, tote_depth=np.full((6, 6), 0.25), cell_size=SIZE)
 
 
