@@ -107,8 +107,9 @@ def fault(scene: Scene, plan, accuracy: float = 0.002) -> str | None:
     if place[2] < scene.tote[2] - EPSILON and not within(effector, scene.tote):
         return "the effector hits the tote's wall"
     # What carries it.
-    if rest > 0:
-        touching = [box for box in below if box[4] >= rest - 4 * accuracy - 0.002]
+    level = rest - 4 * accuracy - 0.002
+    if level > 0:  # else the floor does, too
+        touching = [box for box in below if box[4] >= level]
         points = np.concatenate([
             [(max(x0, low[0]), max(y0, low[1])), (max(x0, low[0]), min(y1, high[1])),
              (min(x1, high[0]), max(y0, low[1])), (min(x1, high[0]), min(y1, high[1]))]
