@@ -38,6 +38,11 @@ def corners(centre, sides, yaw):
     return 1e3 * (np.array(centre) + half @ axes)
 
 
+def outline(axes, centre, sides, yaw, colour, style="-", label=None):
+    """Draw a rectangle; lengths in metres, the yaw in degrees."""
+    axes.add_patch(Polygon(corners(centre, sides, yaw), fill=False, ec=colour, lw=2.5, ls=style, label=label))
+
+
 figure = Figure(figsize=(13, 4.3), layout="constrained")
 FigureCanvasAgg(figure)
 image_axes, bin_axes, tote_axes = figure.subplots(1, 3, width_ratios=[1.15, 1, 1])
@@ -52,19 +57,10 @@ heights = cell.cameras["bin"].points(images["bin"])
 bin_axes.set_title("the item that was found, and the pick", color=INK)
 inside = (heights[..., :2] > 0).all(-1) & (heights[..., :2] < 0.25).all(-1)
 bin_axes.scatter(*(1e3 * heights[inside][:, :2].T), c=heights[inside][:, 2], s=1.5, cmap="Greys", marker="s")
-bin_axes.add_patch(Polygon(corners((box.x, box.y), (box.w, box.d), box.yaw), fill=False, ec=ITEM, lw=2.5, label="item"))
-bin_axes.add_patch(
-    Polygon(
-        corners(plan.pick.center[:2], effector, plan.pick.yaw),
-        fill=False,
-        ec=GRIPPER,
-        lw=2.5,
-        ls="--",
-        label="end effector",
-    )
-)
+outline(bin_axes, (box.x, box.y), (box.w, box.d), box.yaw, ITEM, label="item")
+outline(bin_axes, plan.pick.center[:2], effector, plan.pick.yaw, GRIPPER, "--", "end effector")
+outline(bin_axes, (0.125, 0.125), (0.25, 0.25), 0, INK)
 bin_axes.set(xlim=(-60, 310), ylim=(-60, 310), xlabel="x, mm", ylabel="y, mm")
-bin_axes.add_patch(Polygon(corners((0.125, 0.125), (0.25, 0.25), 0), fill=False, ec=INK, lw=1.5))
 
 tote_axes.set_title("heights in the tote, and the place", color=INK)
 extent = (0, 300, 0, 300)
@@ -75,19 +71,8 @@ arm = np.array((box.x, box.y)) - plan.pick.center[:2]
 centre = plan.place.center[:2] + np.array(
     (arm[0] * np.cos(turn) - arm[1] * np.sin(turn), arm[0] * np.sin(turn) + arm[1] * np.cos(turn))
 )
-tote_axes.add_patch(
-    Polygon(corners(centre, (box.w, box.d), box.yaw + plan.rotation_degrees), fill=False, ec=ITEM, lw=2.5, label="item")
-)
-tote_axes.add_patch(
-    Polygon(
-        corners(plan.place.center[:2], effector, plan.place.yaw),
-        fill=False,
-        ec=GRIPPER,
-        lw=2.5,
-        ls="--",
-        label="end effector",
-    )
-)
+outline(tote_axes, centre, (box.w, box.d), box.yaw + plan.rotation_degrees, ITEM)
+outline(tote_axes, plan.place.center[:2], effector, plan.place.yaw, GRIPPER, "--")
 tote_axes.set(xlabel="x, mm", ylabel="y, mm", xlim=(-15, 315), ylim=(-15, 315))
 for axes in (bin_axes, tote_axes):
     axes.set_aspect("equal")
