@@ -100,7 +100,7 @@ def fault(scene: Scene, plan, accuracy: float = 0.002) -> str | None:
         return "the item is pressed into what is below it"
     if rest + h > scene.tote[2] + EPSILON:
         return "the item passes the rim"
-    if place[2] - h > rest + 5 * accuracy + 0.002:
+    if place[2] - h > rest + 6 * accuracy + 0.003:
         return "the item falls"
     if any(overlaps(box, effector.min(0), effector.max(0)) and box[4] > place[2] + EPSILON for box in scene.boxes):
         return "the effector hits an item"
