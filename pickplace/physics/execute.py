@@ -67,25 +67,15 @@ class Execute(Simulation):
     def place(self, gantry: "Gantry", placement: Placement, error: np.ndarray) -> Loss | None:
         height = placement.size[2]
         gantry.add((*(gantry.bin + placement.item), 0.0), bin_size(placement), placement.centre)
-        high = gantry.rim + height + HEADROOM  # of the plate's lower face, so that the item below it clears the rims
         low = placement.corner[2] + height + self.lip + self.release_height
         pick, place = gantry.bin + placement.pick, placement.place + error
         turn = ((placement.rotation + 90) % 360 - 90) / 180 * pi  # the short way round
-        loss = (
-            gantry.travel((*pick, high, 0.0))
-            or gantry.lower((*pick, height + self.lip, 0.0))
-            or gantry.grip()
-            or gantry.lift(high)
-            or gantry.travel((*place, high, turn))
-            or gantry.lower((*place, low, turn))
-        )
+        loss = gantry.bring((*pick, height + self.lip, 0.0), (*place, low, turn), height)
         expected = placement.centre + np.array((*error, self.release_height))
         if loss is None and np.linalg.norm(gantry.centre - expected) > self.tolerance:
             loss = Loss("wedged", len(gantry.boxes) - 1)
         if loss is None:
-            gantry.release()
-            loss = gantry.lift(high)
-            wait(gantry)
+            loss = gantry.leave(height)
         return loss
 
 
@@ -165,6 +155,34 @@ class Gantry(Scene):
             if loss := self._step():
                 return loss
         return None
+
+    def bring(self, pick, place, height: float) -> Loss | None:
+        """Carry the item that was added last from one place to another one, where it is held; return the first loss.
+
+        Args:
+            pick, place: goals of the plate, where it sucks and where it shall let go.
+            height: of the item, m.
+        """
+        (*over_pick, _, start), (*over_place, _, turn), high = pick, place, self._high(height)
+        return (
+            self.travel((*over_pick, high, start))
+            or self.lower(pick)
+            or self.grip()
+            or self.lift(high)
+            or self.travel((*over_place, high, turn))
+            or self.lower(place)
+        )
+
+    def leave(self, height: float) -> Loss | None:
+        """Let go of an item of a height, move up, and wait until all items are at rest."""
+        self.release()
+        loss = self.lift(self._high(height))
+        wait(self)
+        return loss
+
+    def _high(self, height: float) -> float:
+        """Return the height of the plate's lower face at which an item below it clears the rims."""
+        return self.rim + height + HEADROOM
 
     def lower(self, goal) -> Loss | None:
         """Move the plate down, the last centimetres slowly, and let it come to rest."""

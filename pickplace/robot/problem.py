@@ -119,7 +119,7 @@ class Problem:
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredProblem(Problem):
-    """The same for measured maps, in metres: heights are counted in millimetres."""
+    """A problem of measured maps, in metres; heights are counted in millimetres."""
 
     measured: MeasuredMaps
     tote: MeasuredTote
@@ -267,7 +267,7 @@ def read_metric(
     clear = torch.from_numpy(above_walls | _misses_walls(centres, cell, box.yaw, cell_size)).to(device)
     limited = replace(free, limits=_limits(cell, clear, centres / cell_size, ratio, 2 * slack))
     measured = measured_maps(limited, tote, item, sides)
-    # What a policy sees: heights as in training.
+    # A policy sees heights as in training.
     state, seen_rim = tote.state(limited, item), max(1, round(rim / ratio))
     heights = (state.heights / ratio).round().clamp(max=seen_rim).int()
     seen_item = item._replace(h=torch.tensor([max(1, round(h / ratio))], device=device))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pickplace.physics.execute import HEADROOM, Execute, Gantry
+from pickplace.physics.execute import Execute, Gantry
 from pickplace.physics.outcome import Loss
 from pickplace.physics.plans import EpisodePlan
 from pickplace.physics.scene import mujoco
@@ -69,7 +69,6 @@ class SimulatedCell:
             name: Camera.looking_down((sides[0] / 2, sides[1] / 2), CAMERA_HEIGHT, focal, IMAGE)
             for name, sides in (("bin", self.bin), ("tote", self.tote))
         }
-        self.plan: Plan | None = None
 
     def fill(self, items: Sequence[tuple]) -> Filled:
         """Fill the tote with the items that arrive one by one, until one finds no place.
@@ -97,37 +96,27 @@ class SimulatedCell:
         images = {name: self.depth_image(name) for name in self.cameras}
         items = self.cameras["bin"].items(images["bin"], cell, cell_size, accuracy=self.accuracy)
         tote = self.cameras["tote"].tote_map(images["tote"], cell, cell_size)
-        self.plan = self.planner.plan(
+        return self.planner.plan(
             items=items, tote=tote, cell_size=cell_size, accuracy=self.accuracy, clearance=self.clearance,
             tote_bearing=tote_bearing, alternatives=0,
         )  # fmt: skip
-        return self.plan
 
     def carry_out(self, plan: Plan, size: Sequence[float]) -> Loss | None:
         """Do what a plan says; return the loss if there is one."""
         assert plan.pick and plan.place and plan.rotation_degrees is not None and plan.drop_height is not None
-        gantry, high = self.gantry, self.gantry.rim + size[2] + HEADROOM
+        gantry = self.gantry
         start, turn = (math.radians(angle) for angle in (plan.pick.yaw, plan.rotation_degrees))
         turn = (turn + math.pi / 2) % (2 * math.pi) - math.pi / 2  # the short way round
         pick, place = np.array(plan.pick.center), np.array(plan.place.center)
         x, y = gantry.centre[:2] - gantry.bin - pick[:2]
         planned = place[:2] + (x * math.cos(turn) - y * math.sin(turn), x * math.sin(turn) + y * math.cos(turn))
         gantry.planned[-1] = (*planned, plan.drop_height + size[2] / 2)
-        over_bin = gantry.bin + pick[:2]
-        loss = (
-            gantry.travel((*over_bin, high, start))
-            or gantry.lower((*over_bin, pick[2], start))
-            or gantry.grip()
-            or gantry.lift(high)
-            or gantry.travel((*place[:2], high, start + turn))
-            or gantry.lower((*place, start + turn))
-        )
+        goals = (*(gantry.bin + pick[:2]), pick[2], start), (*place, start + turn)
+        loss = gantry.bring(*goals, size[2])
         if loss is None and np.linalg.norm(gantry.centre[:2] - planned) > self.simulation.tolerance:
             loss = Loss("wedged", len(gantry.boxes) - 1)
         if loss is None:
-            gantry.release()
-            loss = gantry.lift(high)
-            wait(gantry)
+            loss = gantry.leave(size[2])
         return loss or self.simulation.find_loss(gantry)
 
     def depth_image(self, name: str) -> np.ndarray:

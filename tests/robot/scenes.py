@@ -72,7 +72,7 @@ def rectangle(centre, sides, yaw) -> np.ndarray:
 
 
 def fault(scene: Scene, plan, accuracy: float = 0.002) -> str | None:
-    """What goes wrong when a robot does exactly what the plan says; None if nothing does.
+    """The first thing that goes wrong when a robot does exactly as the plan says; None if nothing does.
 
     What lies further below the highest thing under an item than heights may be wrong does not carry it.
     """
@@ -106,7 +106,7 @@ def fault(scene: Scene, plan, accuracy: float = 0.002) -> str | None:
         return "the effector hits an item"
     if place[2] < scene.tote[2] - EPSILON and not within(effector, scene.tote):
         return "the effector hits the tote's wall"
-    # What carries it.
+    # Support.
     level = rest - 4 * accuracy - 0.002
     if level > 0:  # else the floor does, too
         touching = [box for box in below if box[4] >= level]
