@@ -14,6 +14,7 @@ from pickplace.envs.checks import check_items, problem_bytes
 from pickplace.runs.machine import usable_device
 from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.task.checks import check_bytes, excerpt, one_of, whole_number
+from pickplace.task.corners import corner_mask
 from pickplace.task.feasibility import PlacingMaps, action_mask, footprint_mask, placing_maps
 from pickplace.task.items import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.task.observation import Term, check_terms, observe
@@ -33,6 +34,7 @@ class Mask(NamedTuple):
 MASKS = {
     "action": Mask(lambda cell: cell.num_actions, action_mask),
     "footprint": Mask(lambda cell: cell.num_footprints, lambda cell, maps: footprint_mask(cell, maps).flatten(1)),
+    "corner": Mask(lambda cell: cell.num_footprints, lambda cell, maps: corner_mask(cell, maps).flatten(1)),
 }
 
 

@@ -83,7 +83,7 @@ class Lookahead(MapPlanner):
             len(state.surface) * streams * 16 * self.cell.num_footprints,
             state.surface.device,
         )
-        logits = self.policy.footprint_logits(observation, footprint_mask(cell, maps).flatten(1))
+        logits = self.policy.footprint_logits(observation, self.policy.ranked(maps))
         # Of equals the first, as the policy itself plays.
         value, choice = torch.sort(logits, dim=1, descending=True, stable=True)
         value, choice = value[:, : self.candidates], choice[:, : self.candidates]
@@ -168,7 +168,7 @@ class Lookahead(MapPlanner):
         while len(row):
             item = self.items.sample("train", seed[row], stream[row], torch.full_like(row, step), cell.bin_size)
             maps = placing_maps(cell, State(surface, tote_height[row], item))
-            mask = footprint_mask(cell, maps).flatten(1)
+            mask = policy.ranked(maps)
             going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]
             if len(going) < len(row):
                 row, surface, mask, maps = row[going], surface[going], mask[going], maps.rows(going)

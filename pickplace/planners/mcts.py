@@ -98,7 +98,7 @@ class MCTS(MapPlanner):
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         item = Item(*(part.cpu() for part in maps.item))
-        seen, maps = _on_cpu(observation), PlacingMaps(maps.top.cpu(), maps.clearance.cpu(), item)
+        seen, maps = _on_cpu(observation), PlacingMaps(maps.top.cpu(), maps.clearance.cpu(), item, maps.rest.cpu())
         mask = footprint_mask(cell, maps).flatten(1) if self.mask else action_mask(cell, maps)
         roots = self._nodes(seen, mask)
         return self._search(seen, roots, cell, maps).to(observation["tote_depth"].device)
@@ -203,7 +203,7 @@ class MCTS(MapPlanner):
         action = torch.tensor([edge.action for _, edge in tried])
         if self.mask:
             tops = unchecked_top(cell, state)
-            after = put_down(cell, surface, PlacingMaps(tops, tops, item), action)
+            after = put_down(cell, surface, PlacingMaps(tops, tops, item, tops), action)
             failed = [False] * len(tried)
         else:
             step = apply(cell, state, action)

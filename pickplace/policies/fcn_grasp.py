@@ -15,6 +15,7 @@ from pickplace.task.feasibility import (
     footprint_mask,
 )
 from pickplace.task.grasps import class_index, footprint_index, is_outside, join_action, pick_classes, split_flat
+from pickplace.task.placing import clearance, unchecked_top
 from pickplace.task.state import Observation, State, item_from_depth
 from pickplace.task.transition import apply
 
@@ -49,7 +50,15 @@ class FootprintPolicy(Policy):
 
     def __init__(self, cell: CellSpec, **network):
         super().__init__(cell)
-        self.network = FootprintFcn(**network)
+        self.network = self.make_network(**network)
+
+    def make_network(self, **network):
+        """Return the network, which scores footprints by ``at``."""
+        return FootprintFcn(**network)
+
+    def ranked(self, maps: PlacingMaps) -> Tensor:
+        """Return the footprints among which it chooses, bool ``[N, Q * W_T * D_T]``; some, if any is feasible."""
+        return footprint_mask(self.cell, maps).flatten(1)
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
         """Return the scores of some footprints, float32 ``[M]``; a subclass may add what further terms tell.
@@ -68,14 +77,17 @@ class FootprintPolicy(Policy):
         return scores.new_full(mask.shape, MASKED).index_put((row, footprint), scores)
 
     def logits(self, observation: Observation) -> Tensor:
-        return self.footprint_logits(observation, observation["footprint_mask"])
+        return self.footprint_logits(observation, observation[f"{self.masks[0]}_mask"])
 
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
         row = torch.arange(len(choices), device=choices.device).repeat_interleave(choices.shape[1])
         return self.scores(observation, row, choices.flatten()).view(choices.shape)
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        return pick_one(actions_reaching(self.cell, self.maps_of(observation), choice))
+        state = State.from_observation(observation)
+        top = unchecked_top(self.cell, state)  # a choice is stable: the mask has looked
+        maps = PlacingMaps(top, clearance(self.cell, state), state.item, top)
+        return pick_one(actions_reaching(self.cell, maps, choice))
 
     def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
         state = State.from_observation(observation)
@@ -98,8 +110,7 @@ class FootprintPolicy(Policy):
 
     def best_feasible(self, observation: Observation, maps: PlacingMaps | None = None) -> Tensor:
         maps = self.maps_of(observation) if maps is None else maps
-        mask = footprint_mask(self.cell, maps).flatten(1)  # found without a look at the N_a actions one by one
-        choice = self.footprint_logits(observation, mask).argmax(1)
+        choice = self.footprint_logits(observation, self.ranked(maps)).argmax(1)
         return first_action_reaching(self.cell, maps, choice)
 
 

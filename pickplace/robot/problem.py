@@ -151,7 +151,7 @@ class MeasuredProblem(Problem):
         return box.w * box.d * box.h / (wide * deep * self.side**2 * self.tote.height * self.unit)
 
     def _top(self, action: Tensor) -> int:
-        return int(self.measured.rest.flatten()[self._footprint(action)] + self.state.item.h)
+        return int(self.measured.maps.rest.flatten()[self._footprint(action)] + self.state.item.h)
 
     def _footprint(self, action: Tensor) -> int:
         carried = carry(self.cell, self.state.item, action)

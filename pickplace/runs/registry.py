@@ -46,6 +46,7 @@ REGISTRY: dict[str, dict[str, str]] = {
     },
     "model.actor": {
         "fcn_grasp": "pickplace.policies.fcn_grasp.fcn_grasp",
+        "corners": "pickplace.policies.corners.corners",
         "fcn4d": "pickplace.policies.fcn4d.ActionPolicy",
         "typical": "pickplace.policies.fcn4d.TypicalPolicy",
         "individual_rl": "pickplace.policies.individual.IndividualRlPolicy",

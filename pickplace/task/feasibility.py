@@ -41,15 +41,17 @@ class PlacingMaps(NamedTuple):
     top: Tensor  # int32 [N, Q, W_T, D_T]: height of the item's top with its footprint's min corner there, or NEVER
     clearance: Tensor  # int32 [N, Q, W_T, D_T]: highest thing under the end effector with its reference cell there
     item: Item  # what is picked
+    rest: Tensor  # int32 [N, Q, W_T, D_T]: height on which the item would lie, stable or not; FAR outside the tote
 
     def rows(self, index: Tensor) -> "PlacingMaps":
         """Return the maps of some problems, by their numbers, which may come up more than once."""
-        return PlacingMaps(self.top[index], self.clearance[index], self.item.rows(index))
+        return PlacingMaps(self.top[index], self.clearance[index], self.item.rows(index), self.rest[index])
 
 
 def placing_maps(cell: CellSpec, state: State) -> PlacingMaps:
     """Return everything that decides which actions succeed: see :class:`PlacingMaps`."""
-    return PlacingMaps(resting_top(cell, state), clearance(cell, state), state.item)
+    top, rest = resting_top(cell, state)
+    return PlacingMaps(top, clearance(cell, state), state.item, rest)
 
 
 def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:

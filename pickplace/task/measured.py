@@ -57,7 +57,6 @@ class MeasuredMaps(NamedTuple):
     """The maps that decide which actions succeed, and why others fail; of one problem."""
 
     maps: PlacingMaps
-    rest: Tensor  # int32 [Q, W_T, D_T]: height on which an item comes to rest
     stable: Tensor  # bool [Q, W_T, D_T]
     highest_top: int  # greatest top that does not pass the rim
     rim: int  # least top at which the end effector passes the rim
@@ -88,7 +87,8 @@ def measured_maps(cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[f
     free = clearance(
         cell, tote.state(cell, item, slack)._replace(tote_height=torch.tensor([over_rim], device=z.device))
     )
-    return MeasuredMaps(PlacingMaps(torch.where(good, top, NEVER)[None], free, item), z, stable, highest, over_rim)
+    maps = PlacingMaps(torch.where(good, top, NEVER)[None], free, item, z[None])
+    return MeasuredMaps(maps, stable, highest, over_rim)
 
 
 class _Contact(NamedTuple):
@@ -181,7 +181,7 @@ def bearing_after(
     tote_w, tote_d, _ = cell.tote_size
     parity, x, y = footprint // (tote_w * tote_d), footprint // tote_d % tote_w, footprint % tote_d
     size, sides = _oriented(item, sides, parity)
-    z = maps.rest[parity, x : x + 1, y : y + 1]
+    z = maps.maps.rest[0, parity, x : x + 1, y : y + 1]
     count = tote.highest.shape[0] // tote_w
     shifted = tote._replace(lowest=tote.lowest[x * count :, y * count :], bears=tote.bears[x:, y:])
     contact = _contact(cell, shifted, size, sides, z)
@@ -211,7 +211,7 @@ def failures(cell: CellSpec, measured: MeasuredMaps, action: Tensor, bin_clear: 
         action: int64 ``[A]``.
         bin_clear: bool ``[P]``, whether the end effector hits no wall of the bin at each pick cell.
     """
-    (maps, z, stable, highest, rim), (tote_w, tote_d, _) = measured, cell.tote_size
+    (maps, stable, highest, rim), (tote_w, tote_d, _) = measured, cell.tote_size
     x_bin, y_bin, x_tote, y_tote, _ = split_action(cell, action)
     item = Item(*(part.expand(len(action)) for part in maps.item))
     picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action)
@@ -220,7 +220,7 @@ def failures(cell: CellSpec, measured: MeasuredMaps, action: Tensor, bin_clear: 
     effector_leaves = is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d)
     footprint = footprint_index(cell.tote_size, parity, x.clamp(0, tote_w - 1), y.clamp(0, tote_d - 1))
     place = footprint_index(cell.tote_size, parity, x_tote, y_tote)
-    top = z.flatten()[footprint] + item.h
+    top = maps.rest.flatten()[footprint] + item.h
     pick = x_bin * cell.bin_size[1] + y_bin
     checks = [  # from the last to the first, so that the first failure has the last word
         (Failure.UNSTABLE, ~stable.flatten()[footprint]),

@@ -95,6 +95,7 @@ RESERVED = (
     "action",
     "action_mask",
     "footprint_mask",
+    "corner_mask",
     "occupancy",
     "failure",
     "reward",

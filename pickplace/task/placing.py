@@ -42,18 +42,18 @@ def is_within_reach(lowest: Tensor, highest: Tensor, top: Tensor) -> Tensor:
 
 
 # ---------------------------------------------------------------------- maps
-def resting_top(cell: CellSpec, state: State) -> Tensor:
-    """Return the height of the item's top for every footprint, int32 ``[N, Q, W_T, D_T]``.
+def resting_top(cell: CellSpec, state: State) -> tuple[Tensor, Tensor]:
+    """Return the height of the item's top for every footprint, and what it rests on; int32 ``[N, Q, W_T, D_T]`` each.
 
-    It is ``NEVER`` where the item cannot rest: the footprint leaves the tote, the top passes the rim, or the support is
-    too small.
+    The top is ``NEVER`` where the item cannot rest: the footprint leaves the tote, the top passes the rim, or the
+    support is too small. The height below it is that of :func:`rest`, stable or not; ``FAR`` outside the tote.
     """
     item, (w, d) = state.item, footprint_sizes(cell, state.item)
     cells, under = footprint_cells(cell, state.surface, w, d)
     z = rest(cells, under)
     top = z + item.h.to(z.dtype)
     good = is_supported(cell, cells, under, z, w, d) & ~overflows(top, state.tote_height) & ~item.is_empty
-    return torch.where(good, top, NEVER).permute(3, 0, 1, 2)
+    return torch.where(good, top, NEVER).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
 
 def unchecked_top(cell: CellSpec, state: State) -> Tensor:

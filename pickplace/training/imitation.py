@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from pickplace.planners.base import BatchPlanner, decide, planner_parts
-from pickplace.policies.base import Policy
+from pickplace.policies.base import MASKED, Policy
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import trusted_config
 from pickplace.runs.registry import accepted_arguments, build, find
@@ -136,8 +136,10 @@ def _named_teacher():
 def imitation_loss(policy: Policy, data: TensorDictBase) -> tuple[Tensor, Tensor]:
     """Return the mean cross-entropy against the teacher's choices ``taught``, and the share of these that the policy
     finds most probable."""
-    taught = data["taught"]
-    logits = policy.logits(data)
+    taught, logits = data["taught"], policy.logits(data)
+    # A policy that leaves out some of what is feasible cannot learn to choose that.
+    reached = logits.gather(1, taught.clamp(min=0)[:, None])[:, 0] > MASKED / 2
+    taught = torch.where(reached, taught, -1)
     known = (taught >= 0).sum().clamp(min=1)
     agreed = (logits.argmax(-1) == taught).sum() / known
     return F.cross_entropy(logits, taught, ignore_index=-1, reduction="sum") / known, agreed

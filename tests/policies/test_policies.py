@@ -9,6 +9,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import as_actor, as_collection_policy, refuse_large_network
+from pickplace.policies.corners import CornerPolicy
 from pickplace.policies.fcn4d import ActionPolicy, TypicalPolicy
 from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy
 from pickplace.policies.individual import IndividualFootprintPolicy, IndividualGraspPolicy, IndividualRlPolicy
@@ -18,7 +19,7 @@ from pickplace.task.grasps import all_grasps, heuristic_pick, split_action
 GRASP, CONV4D = {"filters": 8, "hidden": 8, "head_std": 1.0}, {"filters": 4, "head_std": 1.0}
 POLICIES = {
     FootprintPolicy: GRASP, GraspPolicy: GRASP, IndividualGraspPolicy: GRASP, IndividualFootprintPolicy: GRASP,
-    ActionPolicy: CONV4D, TypicalPolicy: CONV4D, IndividualRlPolicy: CONV4D,
+    CornerPolicy: GRASP, ActionPolicy: CONV4D, TypicalPolicy: CONV4D, IndividualRlPolicy: CONV4D,
 }  # fmt: skip
 INDIVIDUAL = (IndividualFootprintPolicy, IndividualGraspPolicy, IndividualRlPolicy)
 CELLS = [
@@ -27,7 +28,7 @@ CELLS = [
     {"tote_size": (4, 4, 2), "bin_size": (3, 3, 1), "rotations": 1, "pick_rule": "overlap", "num_envs": 4},
 ]
 every_policy = pytest.mark.parametrize("kind", POLICIES)
-MASKS = {"masks": ("action", "footprint")}
+MASKS = {"masks": ("action", "footprint", "corner")}
 
 
 def small(kind, cell, **settings):
@@ -52,7 +53,7 @@ def test_the_distribution_over_flat_actions_is_one_and_its_best_is_played(kind, 
         log_probs = policy.action_log_probs(observation)
         assert log_probs.shape == (env.num_envs, env.cell.num_actions)
         torch.testing.assert_close(log_probs.exp().sum(1), torch.ones(env.num_envs), rtol=1e-4, atol=1e-4)
-        unmasked = observation.exclude("action_mask", "footprint_mask")
+        unmasked = observation.exclude("action_mask", "footprint_mask", "corner_mask")
         action = PolicyPlanner(env.cell, policy, "all").decide(unmasked)
         possible = at_pick(kind, env, mask).any(1)
         assert possible.all() or kind in INDIVIDUAL

@@ -12,6 +12,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from pickplace import PickPlaceEnv
 from pickplace.planners.heuristics import JointDBL
 from pickplace.policies.fcn4d import ActionPolicy
+from pickplace.policies.corners import corners
 from pickplace.policies.fcn_grasp import fcn_grasp
 from pickplace.policies.individual import IndividualRlPolicy, individual_grasp
 from pickplace.runs.provenance import imitated_planner
@@ -21,7 +22,7 @@ from pickplace.training.imitation import Phase, WarmStart, imitation_loss
 
 FCN = {"filters": 8, "hidden": 8}
 MODELS = {  # constructor, mask_infeasible, sizes
-    "footprint": (fcn_grasp, True, FCN), "grasp": (fcn_grasp, False, FCN),
+    "footprint": (fcn_grasp, True, FCN), "corners": (corners, True, FCN), "grasp": (fcn_grasp, False, FCN),
     "flat": (ActionPolicy, False, {"filters": 4}), "individual": (IndividualRlPolicy, False, {"filters": 4}),
     "individual_grasp": (individual_grasp, False, FCN), "individual_footprint": (individual_grasp, True, FCN),
 }  # fmt: skip

@@ -22,7 +22,9 @@ class PooledCritic(nn.Module):
         filters: width of the convolution.
         receptive_field: side of the square that is seen around a cell, odd; cells.
         hidden: width of the 1x1 layer before the output.
-        tote_clip, depth_range, item_range, compute_dtype: as in :class:`FootprintFcn`.
+        tote_clip, depth_range, item_range, compute_dtype: as in :class:`FootprintFcn`; depths in levels.
+        level: height units that one level of depth spans; depths and the item's height are rounded down to levels.
+        stride: of the convolution, in cells; on fine grids not every column need be looked at.
 
     Shapes:
         ``bin_depth [..., W_B, D_B]``, ``tote_depth`` and ``tote_bearing [..., W_T, D_T]`` -> ``[..., 1]``.
@@ -40,17 +42,20 @@ class PooledCritic(nn.Module):
         depth_range: int = 5,
         item_range: int = 3,
         compute_dtype: str = "auto",
+        level: int = 1,
+        stride: int = 1,
     ):
         super().__init__()
         odd_number("model.critic.receptive_field", receptive_field)
-        for key, value in {"filters": filters, "hidden": hidden}.items():
+        for key, value in {"filters": filters, "hidden": hidden, "level": level, "stride": stride}.items():
             whole_number(f"model.critic.{key}", value, most=MAX_WIDTH)
+        self.level, self.stride = level, stride
         for key, value in {"tote_clip": tote_clip, "depth_range": depth_range, "item_range": item_range}.items():
             whole_number(f"model.critic.{key}", value, most=MAX_LEVELS)
         check_inputs(f"model.critic.receptive_field={receptive_field}", depth_range * receptive_field**2)
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
         self.compute_dtype = one_of("model.critic.compute_dtype", compute_dtype, DTYPES)
-        self.around = nn.Conv2d(depth_range, filters, receptive_field, padding=receptive_field // 2)
+        self.around = nn.Conv2d(depth_range, filters, receptive_field, stride, padding=receptive_field // 2)
         self.weak = nn.Parameter(torch.zeros(filters, 1, receptive_field, receptive_field))  # see FootprintFcn
         self.item = nn.Linear(3 * item_range, filters, bias=False)
         self.room = nn.Parameter(torch.zeros(filters))
@@ -62,15 +67,16 @@ class PooledCritic(nn.Module):
     def forward(self, bin_depth: Tensor, tote_depth: Tensor, tote_bearing: Tensor) -> Tensor:
         batch = tote_depth.shape[:-2]
         bin_depth, tote_depth, bearing = (maps.flatten(0, -3) for maps in (bin_depth, tote_depth, tote_bearing))
+        tote_depth = tote_depth / self.level
         levels = depth_levels(tote_depth, self.tote_clip, self.depth_range)
         planes = one_hot(levels.flatten(1), self.depth_range).view(-1, self.depth_range, *levels.shape[1:])
-        room = tote_depth[..., None] / 5
+        room = tote_depth[:, :: self.stride, :: self.stride, None] / 5
         dtype = matrix_dtype(self.compute_dtype, tote_depth.device.type)
         with torch.autocast(tote_depth.device.type, dtype, enabled=dtype != torch.float32):
             x = self.around(planes.to(dtype, memory_format=torch.channels_last))
-            x = x + F.conv2d(1 - bearing[:, None].to(dtype), self.weak, padding="same")
+            x = x + F.conv2d(1 - bearing[:, None].to(dtype), self.weak, None, self.stride, len(self.weak[0, 0]) // 2)
             x = x.permute(0, 2, 3, 1)
-            x = x + self.item(item_code(bin_depth, self.item_range).to(dtype))[:, None, None]
+            x = x + self.item(item_code(bin_depth, self.item_range, self.level).to(dtype))[:, None, None]
             x = x + room.to(dtype) * self.room.to(dtype)
             x = F.relu(self.hidden(F.relu(x)))
         share, more = self.head(x.float()).unbind(-1)

@@ -47,9 +47,9 @@ def one_hot(levels: Tensor, count: int) -> Tensor:
     return (levels[:, None] == plane[:, None]).flatten(1)
 
 
-def item_code(bin_depth: Tensor, item_range: int) -> Tensor:
-    """Return the item's width, depth and height as one-hot codes, bool ``[N, 3 * item_range]``."""
+def item_code(bin_depth: Tensor, item_range: int, level: int = 1) -> Tensor:
+    """Return the item's width, depth, and height in levels, as one-hot codes, bool ``[N, 3 * item_range]``."""
     item = item_from_depth(bin_depth)
-    size = torch.stack([item.w, item.d, item.h], -1).clamp(1, item_range)
+    size = torch.stack([item.w, item.d, item.h // level], -1).clamp(1, item_range)
     step = torch.arange(1, item_range + 1, device=size.device)
     return (size[..., None] == step).flatten(1)

@@ -1,0 +1,38 @@
+"""The policy for fine grids: it chooses among the footprints that occupy a corner."""
+
+from torch import Tensor
+
+from pickplace.policies.fcn_grasp import FootprintPolicy
+from pickplace.policies.networks.corner_net import CornerNet
+from pickplace.task.cell import CellSpec
+from pickplace.task.corners import corner_mask
+from pickplace.task.feasibility import PlacingMaps
+
+
+class CornerPolicy(FootprintPolicy):
+    """``corners``: as ``fcn_grasp`` with a mask, but among some dozens of footprints, see :mod:`pickplace.task.corners`.
+
+    Args:
+        cell: the sizes.
+        network: arguments of :class:`~pickplace.policies.networks.corner_net.CornerNet`.
+    """
+
+    masks: tuple[str, ...] = ("corner",)
+    network: CornerNet
+
+    def make_network(self, **network) -> CornerNet:
+        return CornerNet(**network)
+
+    def ranked(self, maps: PlacingMaps) -> Tensor:
+        return corner_mask(self.cell, maps).flatten(1)
+
+
+def corners(cell: CellSpec, mask_infeasible: bool, **network) -> CornerPolicy:
+    """Return the policy for fine grids (config ``model=corners``).
+
+    Raises:
+        ValueError: without a mask, as its few choices come from what is feasible.
+    """
+    if not mask_infeasible:
+        raise ValueError("algo.mask_infeasible=False: with model=corners expected true; its choices are feasible ones.")
+    return CornerPolicy(cell, **network)

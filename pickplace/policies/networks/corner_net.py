@@ -1,0 +1,126 @@
+"""The network behind ``model=corners``: what surrounds a footprint, at points that lie relative to the item's size."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pickplace.task.checks import MAX_WIDTH, check_inputs, number, whole_number
+from pickplace.task.grasps import split_footprint
+from pickplace.task.state import item_from_depth
+
+PLANES = 6  # of each point, see `CornerNet`
+SIZES = 13  # numbers beside the points
+
+
+class CornerNet(nn.Module):
+    """Scores footprints by the heights at points on them and around them, in proportion to the item that would lie there.
+
+    A grid of points is laid over the footprint and turned with it, so that an item that is turned is seen as one that is
+    not. Along each side of the item, ``inside`` points are spread evenly; beyond each end follow the ``near`` next
+    cells, since the width of a gap counts in cells, and one point half an item further. At each point the network sees
+    how high the surface is above what the item would rest on, in heights of the item, and whether it is higher than the
+    item's top, level with the top, level with what the item rests on, too weak to bear weight, or outside the tote.
+    Beside the points come the item's sides and height, how high it rests and how much headroom is left, and how far the
+    tote's walls are. No weight depends on the size of the tote or of the item.
+
+    Args:
+        filters, hidden: widths of the two hidden layers.
+        inside: points along each side of the footprint.
+        near: cells beyond each end that are seen one by one.
+        item_scale: ``(side, height)`` of a large item, which the network sees as 1; cells and height units.
+        head_std: standard deviation of the last layer's initial weights.
+    """
+
+    def __init__(
+        self,
+        filters: int = 128,
+        hidden: int = 64,
+        inside: int = 4,
+        near: int = 4,
+        item_scale: tuple[float, float] = (10, 30),
+        head_std: float = 0.01,
+    ):
+        super().__init__()
+        for key, value in {"filters": filters, "hidden": hidden}.items():
+            whole_number(f"model.actor.{key}", value, most=MAX_WIDTH)
+        for key, value in {"inside": inside, "near": near}.items():
+            whole_number(f"model.actor.{key}", value, most=64)
+        self.item_scale = tuple(number("model.actor.item_scale", value, 1e-3, 1e6) for value in item_scale)
+        number("model.actor.head_std", head_std, most=1e3)
+        self.inside, self.near = inside, near
+        self.points = inside + 2 * (near + 1)
+        inputs = PLANES * self.points**2 + SIZES
+        check_inputs(f"model.actor.inside={inside}, near={near}", inputs)
+        self.body = nn.Sequential(nn.Linear(inputs, filters), nn.ReLU(), nn.Linear(filters, hidden), nn.ReLU())
+        self.head = nn.Linear(hidden, 1)
+        nn.init.normal_(self.head.weight, std=head_std)
+        nn.init.zeros_(self.head.bias)
+
+    def at(self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor) -> Tensor:
+        """Return the scores of some footprints, float32 ``[M, 1]``.
+
+        Args:
+            bin_depth, tote_depth: ``[N, W_B, D_B]``, ``[N, W_T, D_T]``.
+            bearing: 1 where a cell of the tote bears weight, else 0, ``[N, W_T, D_T]``.
+            row: int64 ``[M]``, which problem.
+            footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
+        """
+        return self.head(self.body(self.inputs(bin_depth, tote_depth, bearing, row, footprint)))
+
+    @torch.no_grad()
+    def inputs(self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor) -> Tensor:
+        """Return what the first layer sees, float32 ``[M, inputs]``; arguments as of :meth:`at`."""
+        _, wide, deep = tote_depth.shape
+        item = item_from_depth(bin_depth).rows(row)
+        parity, x, y = split_footprint((wide, deep), footprint)
+        turned = (parity == 1)[:, None]
+        w, d, h = (part[:, None] for part in (item.w, item.d, item.h.float()))
+
+        # The points along the item's width and depth, as cells of the tote: outside it, a cell of the margin.
+        along, across = self._points(w), self._points(d)  # [M, points]
+        corner_x, corner_y = x[:, None], y[:, None]
+        begin_w, begin_d = torch.where(turned, corner_y, corner_x), torch.where(turned, corner_x, corner_y)
+        size_w, size_d = torch.where(turned, deep, wide), torch.where(turned, wide, deep)
+        along = torch.minimum((begin_w + along).clamp(min=-1), size_w) + 1
+        across = torch.minimum((begin_d + across).clamp(min=-1), size_d) + 1
+        stride = deep + 2
+        step_w, step_d = torch.where(turned, 1, stride), torch.where(turned, stride, 1)
+        origin = (row * ((wide + 2) * stride))[:, None]
+        cells = (origin + along * step_w)[:, :, None] + (across * step_d)[:, None]  # [M, points, points]
+        outside = F.pad(torch.zeros_like(tote_depth), (1, 1, 1, 1), value=1.0).flatten()[cells]
+        depth = F.pad(tote_depth, (1, 1, 1, 1)).flatten()[cells]
+        weak = F.pad(1.0 - bearing, (1, 1, 1, 1)).flatten()[cells]
+
+        rest = self._rest(tote_depth, row, x, y, turned, w, d)  # depth of what the item rests on, [M, 1]
+        above = (rest[..., None] - depth) / h[..., None]  # of the surface, in heights of the item
+        inside = 1 - outside
+        planes = [above.clamp(-1.5, 1.5) * inside, (above > 1) * inside, (above == 1) * inside]
+        planes += [(above == 0) * (1 - weak) * inside, weak, outside]
+        side, height = self.item_scale
+        # The depth of the deepest place, and of the floor, tell how high the item lies.
+        deepest = tote_depth.amax((1, 2))[row][:, None]
+        walls = [begin_w / w, (size_w - begin_w - w) / w, begin_d / d, (size_d - begin_d - d) / d]
+        sizes = [w / side, d / side, h / height, (w * d) / side**2, (rest - h) / h, rest / height, (deepest - rest) / h]
+        flags = [(rest == h).float(), (deepest == rest).float()]
+        numbers = torch.cat([*sizes, *walls, *flags], 1).clamp(max=3)
+        return torch.cat([torch.stack(planes, 1).flatten(1), numbers], 1)
+
+    def _points(self, side: Tensor) -> Tensor:
+        """Return the points along sides of an item ``[M, 1]``, in cells from its beginning, int64 ``[M, points]``."""
+        near = torch.arange(1, self.near + 1, device=side.device).expand(len(side), -1)
+        beyond = torch.cat([near, self.near + (side + 1) // 2], 1)
+        within = (2 * torch.arange(self.inside, device=side.device) + 1) * side // (2 * self.inside)
+        return torch.cat([-beyond.flip(1), within, side - 1 + beyond], 1)
+
+    @staticmethod
+    def _rest(tote_depth: Tensor, row: Tensor, x: Tensor, y: Tensor, turned: Tensor, w: Tensor, d: Tensor) -> Tensor:
+        """Return the least depth under each footprint ``[M, 1]``."""
+        _, wide, deep = tote_depth.shape
+        longest = int(torch.maximum(w, d).amax()) if len(row) else 1
+        step = torch.arange(longest, device=row.device)
+        # The cells of a square; those beyond the footprint stand for its last row or column.
+        wx, wy = torch.where(turned, d, w), torch.where(turned, w, d)
+        column = (x[:, None] + torch.minimum(step, wx - 1)).clamp(max=wide - 1)
+        line = (y[:, None] + torch.minimum(step, wy - 1)).clamp(max=deep - 1)
+        cells = (row[:, None] * wide + column)[:, :, None] * deep + line[:, None]
+        return tote_depth.flatten()[cells].amin((1, 2))[:, None]
