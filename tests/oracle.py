@@ -7,6 +7,7 @@ and a flat action is `(((x_bin * D_B + y_bin) * W_T + x_tote) * D_T + y_tote) * 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from fractions import Fraction
 from itertools import chain, product
 from math import dist
 
@@ -28,6 +29,10 @@ class Rules:
     pick_rule: str = "contain"
     support: str | float = "half"
     support_margin: float = 0.0
+    body: str | Grid = "rectangle"  # rectangle, disc or `[W_E][D_E]` of 0 and 1
+    cup: str | Grid = "rectangle"
+    cup_size: Pair | None = None  # of a rectangle or disc in the middle; None: as large as the body
+    min_seal: float = 1.0
     pick_ok: list[bool] | None = None  # for each pick cell; None: no limits on the robot
     lowest_top: list[Grid] | None = None  # for each rotation and place cell
     highest_top: list[Grid] | None = None
@@ -59,6 +64,24 @@ def rotate(r: int, effector: Pair, offset: Pair, size: Pair) -> tuple[Pair, Pair
         ((effector_w, effector_d), (effector_w - ox - w, effector_d - oy - d), (w, d)),
         ((effector_d, effector_w), (oy, effector_w - ox - w), (d, w)),
     ][r]
+
+
+def shape_cells(shape: str | Grid, size: Pair, inner: Pair) -> list[Pair]:
+    """The cells of a mask, or of a rectangle or disc of `inner` cells in the middle of a rectangle of `size`."""
+    if not isinstance(shape, str):
+        return [(x, y) for x, y in cells((0, 0), size) if shape[x][y]]
+    x0, y0 = ((a - b) // 2 for a, b in zip(size, inner, strict=True))
+    return [(x, y) for x, y in cells((x0, y0), inner) if shape == "rectangle" or in_disc((x - x0, y - y0), inner)]
+
+
+def in_disc(cell: Pair, size: Pair) -> bool:
+    """Whether the inside of a cell meets the ellipse inscribed in a rectangle: its point nearest the centre does."""
+    total = Fraction(0)
+    for at, side in zip(cell, size, strict=True):
+        centre = Fraction(side, 2)
+        nearest = min(max(centre, Fraction(at)), Fraction(at + 1))
+        total += ((nearest - centre) / centre) ** 2
+    return total < 1
 
 
 def corner_for(reference_at: Pair, size: Pair) -> Pair:
@@ -147,10 +170,20 @@ class Oracle:
         w, d, h = self.item
         pick, place, r = rules.split(action)
 
-        effector_corner = corner_for(pick, rules.effector_size)
-        effector = cells(effector_corner, rules.effector_size)
-        gripped = [cell in effector for cell in cells(self.position, (w, d))]
-        if not (all(gripped) if rules.pick_rule == "contain" else any(gripped)):
+        size = rules.effector_size
+        body = shape_cells(rules.body, size, size)
+        effector_corner = corner_for(pick, size)
+        effector = [(effector_corner[0] + x, effector_corner[1] + y) for x, y in body]
+        cup = shape_cells(rules.cup, size, rules.cup_size or size)
+        cup = [(effector_corner[0] + x, effector_corner[1] + y) for x, y in cup]
+        item = cells(self.position, (w, d))
+        sealed = sum(cell in item for cell in cup)
+        gripped = {
+            "contain": all(cell in cup for cell in item),
+            "overlap": sealed > 0,
+            "seal": sealed / len(cup) >= rules.min_seal,
+        }
+        if not gripped[rules.pick_rule]:
             return PICK_MISS, None
 
         grid = self.bin_depth()
@@ -161,7 +194,8 @@ class Oracle:
         offset = self.position[0] - effector_corner[0], self.position[1] - effector_corner[1]
         effector_size, offset, size = rotate(r, rules.effector_size, offset, (w, d))
         effector_corner = corner_for(place, effector_size)
-        effector = cells(effector_corner, effector_size)
+        turned = [rotate(r, rules.effector_size, cell, (1, 1))[1] for cell in body]
+        effector = [(effector_corner[0] + x, effector_corner[1] + y) for x, y in turned]
         footprint = cells((effector_corner[0] + offset[0], effector_corner[1] + offset[1]), size)
         if not all(inside(cell, heights) for cell in footprint):
             return TOTE_COLLISION, None

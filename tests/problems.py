@@ -1,17 +1,19 @@
 """Random problems, as the package and as the plain-Python oracle see them; shared by the tests of several rooms."""
 
 from dataclasses import replace
+from itertools import product
+from random import Random
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from hypothesis import strategies as st
-from oracle import SUCCESS, Oracle, Rules, cells
+from oracle import SUCCESS, Oracle, Rules, cells, shape_cells
 from torchrl.envs.utils import step_mdp
 
 from pickplace import CellSpec, Item, PickPlaceEnv, State
 from pickplace.planners.heuristics import RandomFeasible
-from pickplace.task.cell import Limits
+from pickplace.task.cell import CELL_SETTINGS, Limits
 from pickplace.task.items import Uniform
 from pickplace.task.state import surface_from
 
@@ -53,8 +55,7 @@ def state_of(*cases: Case) -> State:
 def oracle_of(cell: CellSpec, case: Case) -> Oracle:
     """Return a case as the oracle sees it."""
     tables = {} if cell.limits is None else {key: value.tolist() for key, value in vars(cell.limits).items()}
-    names = ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "support", "support_margin")
-    rules = Rules(**{name: getattr(cell, name) for name in names}, **tables)
+    rules = Rules(**{name: getattr(cell, name) for name in CELL_SETTINGS if name != "height_unit"}, **tables)
     return Oracle(rules, case.rim, case.item[2:], case.item[:2], case.heights.tolist(), bearing=case.bearing.tolist())
 
 
@@ -67,16 +68,50 @@ def random_limits(cell: CellSpec, seed: int) -> Limits:
     return Limits(torch.from_numpy(random.random(cell.num_picks) < 0.7), *map(torch.from_numpy, (lowest, highest)))
 
 
+def random_effector(random: Random, size: tuple[int, int]) -> dict:
+    """Return a body, a cup in it and a least share, at random; often those that there are by default."""
+
+    def mask(share, within):
+        return [[int(within[x][y] and random.random() < share) for y in range(size[1])] for x in range(size[0])]
+
+    everything = [[1] * size[1]] * size[0]
+    body, cup, cup_size = (
+        random.choice(("rectangle", "disc", "mask")),
+        random.choice(("rectangle", "disc", "mask")),
+        None,
+    )
+    held = shape_cells("rectangle" if body == "mask" else body, size, size)
+    inside = [[int((x, y) in held) for y in range(size[1])] for x in range(size[0])]
+    if body == "mask":
+        inside = mask(random.choice((0.4, 0.8)), everything)
+        for x, y in ((0, -1), (-1, 0)) if random.random() < 0.5 else ((0, 0), (-1, -1)):  # on every edge there is one
+            inside[x][y] = 1
+        body = inside
+    if cup == "mask":
+        cup = mask(random.choice((0.3, 0.9)), inside)
+        x, y = random.choice([(x, y) for x, y in cells((0, 0), size) if inside[x][y]])
+        cup[x][y] = 1
+    else:
+        sides = [range(2 - side % 2, side + 1, 2) for side in size]
+        sizes = [pair for pair in product(*sides) if all(inside[x][y] for x, y in shape_cells(cup, size, pair))]
+        if not sizes:
+            cup = inside
+        elif tuple(size) not in sizes or random.random() < 0.6:
+            cup_size = random.choice(sizes)
+    return {"body": body, "cup": cup, "cup_size": cup_size, "min_seal": random.choice((1.0, 0.01, 1 / 3, 0.5, 0.7))}
+
+
 @st.composite
-def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=NEVER, count=1):
-    """Return a cell and ``count`` cases in it."""
+def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=NEVER, count=1, shaped=NEVER):
+    """Return a cell and ``count`` cases in it; ``shaped`` says whether body and cup are other than rectangles."""
     effector = draw(effector_sides), draw(effector_sides)
     bin_w, bin_d, tote_w, tote_d = (draw(st.integers(least, most)) for least, most in ((2, 5), (2, 4), (3, 5), (2, 4)))
-    rule = draw(st.sampled_from(["contain", "overlap"]))
+    shape = random_effector(Random(draw(st.integers(0, 99_999))), effector) if draw(shaped) else {}
+    rule = draw(st.sampled_from(["contain", "overlap", "seal"] if shape else ["contain", "overlap"]))
     support, margin = draw(st.sampled_from(SUPPORTS))
     cell = CellSpec(
         (bin_w, bin_d, draw(st.sampled_from([1, 2, 1, 3]))), (tote_w, tote_d, 6), effector,
-        draw(st.sampled_from(rotations)), rule, support, margin,
+        draw(st.sampled_from(rotations)), rule, support, margin, **shape,
     )  # fmt: skip
     if draw(limited):
         cell = replace(cell, limits=random_limits(cell, draw(st.integers(0, 999))))

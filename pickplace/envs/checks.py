@@ -35,9 +35,13 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
     height = cell.tote_size[2]
     # (x, y, w, d, h) -> the first kind like it: the rows of a long recording repeat themselves
     problems: dict[tuple[int, ...], int] = {}
+    widest: dict[str, tuple[int, ...]] = {"bin_size": (w_b, d_b)}
+    if cell.pick_rule == "contain":
+        cup = tuple(end - begin for begin, end in cell.cup_bounds)
+        widest["effector_size" if cup == cell.effector_size else "the cup"] = cup
     for kind, (w, d, h) in enumerate(items.sizes.tolist()):
-        for (grid_w, grid_d), what in (((w_b, d_b), "bin_size"), (cell.effector_size, "effector_size")):
-            if (w > grid_w or d > grid_d) and (what == "bin_size" or cell.pick_rule == "contain"):
+        for what, (grid_w, grid_d) in widest.items():
+            if w > grid_w or d > grid_d:
                 raise ValueError(f"{items.label(kind)} does not fit {what}: expected at most {grid_w}x{grid_d} cells.")
         if h > height:
             raise ValueError(f"{items.label(kind)} is higher than the tote: expected at most tote_size[2]={height}.")

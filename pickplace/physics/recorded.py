@@ -34,7 +34,7 @@ def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePl
     for move in recording.moves:
         if not move.failure:
             x, y, w, d = move.footprint
-            shape = cell.effectors[move.rotation % 2]
+            shape = cell.effector(move.rotation)
             placement = Placement(
                 metres(x, y, move.z), metres(w, d, move.item[4]), metres(*move.item[:2]),
                 middle(move.pick, cell.effector_size), middle(move.place, shape[:2]), 90 * move.rotation,

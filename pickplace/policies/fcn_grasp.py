@@ -145,7 +145,8 @@ class GraspPolicy(Policy):
         (tote_w, tote_d, _), offsets, low = self.cell.tote_size, self.cell.num_offsets, self.cell.min_offset
         step, x, y = torch.arange(offsets), torch.arange(tote_w), torch.arange(tote_d)
         found = []
-        for parity, shape in enumerate(self.cell.effectors):
+        for parity in range(self.cell.parities):
+            shape = self.cell.effector(parity)
             left = x[:, None] + (step[:, None, None, None] + low - shape.ref_x)  # [O, 1, W_T, 1]
             front = y + (step[:, None, None] + low - shape.ref_y)  # [O, 1, D_T]
             # The network sees a turned footprint along the item's own axes.

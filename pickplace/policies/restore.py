@@ -134,7 +134,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     cfg = trusted_config(facts["config"], trust)
     env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
     cell = cell_from_settings({**{key: env[key] for key in CELL_SETTINGS if key in env}, **sizes})
-    if cell.pick_rule == "overlap" and cell.longest_side is None:  # it determines the number of grasps
+    if not cell.has_known_offsets:  # it determines the number of grasps
         longest = int(build("items", cfg["items"]).sizes[:, :2].max())
         cell = replace(cell, longest_side=longest)
     policy = restore_policy(cfg, cell, state["policy"], env)

@@ -93,7 +93,7 @@ class Problem:
         """Return the poses at pick and place, the turn in degrees, and the item's top in height units."""
         cell = self.cell
         x_bin, y_bin, x_tote, y_tote, rotation = (int(part) for part in split_action(cell, action))
-        shape = cell.effectors[rotation % 2]
+        shape = cell.effector(rotation)
         x, y = effector_centres(cell, self.state.item, self.centre, self.yaw, self.side)[
             x_bin * cell.bin_size[1] + y_bin
         ]

@@ -2,14 +2,24 @@
 
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from pickplace.task.checks import excerpt, is_number, is_whole, number, one_of, short_text, whole_number
+from pickplace.task.effector import (
+    Box,
+    Mask,
+    boxes,
+    centred,
+    check_cup_size,
+    check_edges,
+    read_shape,
+    turned,
+)
 
-PICK_RULES = ("contain", "overlap")
+PICK_RULES = ("contain", "overlap", "seal")
 
 HULL_RULES = ("hull", "bearing")
 SUPPORT_RULES = ("half", "more_than_half", "hull", "bearing", "full")
@@ -26,12 +36,13 @@ def reference_cell(side):
 
 
 class EffectorShape(NamedTuple):
-    """The end effector as it is turned: its sides and its reference cell, in cells."""
+    """The end effector as it is turned: its sides, its reference cell and the rectangles of its body, in cells."""
 
     width: int
     depth: int
     ref_x: int
     ref_y: int
+    body: tuple[Box, ...]
 
 
 @dataclass(frozen=True)
@@ -76,9 +87,10 @@ class CellSpec:
     Args:
         bin_size: ``(W_B, D_B, H_B)``, grid of the bin and height of its walls.
         tote_size: ``(W_T, D_T, H_T)``; an episode's tote height may be lower than ``H_T``.
-        effector_size: ``(W_E, D_E)`` of the flat suction rectangle.
+        effector_size: ``(W_E, D_E)`` of the rectangle around the end effector.
         rotations: ``R``, the number of quarter turns to choose from, 1 to 4.
-        pick_rule: ``"contain"`` (the end effector covers the whole item) or ``"overlap"`` (one shared cell is enough).
+        pick_rule: on the cup's cells that lie on the item: ``"contain"`` (they cover the whole item), ``"overlap"``
+            (there is one) or ``"seal"`` (they are the share ``min_seal`` of the cup, or more).
         support: the stability rule, on the cells below the footprint that are as high as the highest of them:
             ``"half"`` (at least half of the footprint), ``"more_than_half"``, ``"full"``, ``"hull"`` (the item's
             centre lies inside their convex hull), ``"bearing"`` (the same, and a cell of another item counts only
@@ -88,8 +100,15 @@ class CellSpec:
             cells.
         height_unit: length of a height unit, in sides of a cell. The rules only count units; what converts heights to
             lengths (the robot's planner, the replay page) multiplies by it.
-        longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and under
-            ``overlap`` it also sets the number of offsets.
+        body: the cells of ``effector_size`` that must not hit anything: ``"rectangle"``, all; ``"disc"``, those that
+            the ellipse inscribed in it touches; or a mask, ``W_E`` lists of ``D_E`` times 0 or 1, with a 1 on each
+            edge.
+        cup: the cells that grip the item: ``"rectangle"`` or ``"disc"`` of ``cup_size``, or a mask as ``body``'s. They
+            must be cells of the body.
+        cup_size: ``(w, d)`` of the cup, in the middle of the body; None: ``effector_size``. None with a mask.
+        min_seal: with ``pick_rule="seal"``: least share of the cup's cells that must lie on the item, above 0.
+        longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and unless an
+            item must be contained it also sets the number of offsets.
         limits: of the robot, see :class:`Limits`; None: there are none.
 
     Raises:
@@ -104,6 +123,10 @@ class CellSpec:
     support: str | float = "bearing"
     support_margin: float = 0.25
     height_unit: float = 1.0
+    body: str | Mask = "rectangle"
+    cup: str | Mask = "rectangle"
+    cup_size: tuple[int, int] | None = None
+    min_seal: float = 1.0
     longest_side: int | None = field(default=None, metadata={"derived": True})
     limits: Limits | None = field(default=None, compare=False, metadata={"derived": True})
 
@@ -122,9 +145,30 @@ class CellSpec:
         object.__setattr__(self, "height_unit", float(number("height_unit", self.height_unit, 1e-3, 1e3)))
         if self.longest_side is not None:
             whole_number("longest_side", self.longest_side)
+        self._check_effector()
         self._check_products()
         if self.limits is not None:
             self.limits.check(self)
+
+    def _check_effector(self) -> None:
+        """Refuse a body or a cup that is impossible, or a cup that is not part of the body."""
+        for key in ("body", "cup"):
+            object.__setattr__(self, key, read_shape(key, getattr(self, key), self.effector_size))
+        check_edges("body", self.body_mask)
+        if self.cup_size is not None:
+            object.__setattr__(self, "cup_size", _sizes("cup_size", self.cup_size, 2, MAX_EFFECTOR))
+            if not isinstance(self.cup, str):
+                raise ValueError(f"cup_size={[*self.cup_size]}: expected null, as cup is a mask.")
+            check_cup_size(self.cup_size, self.effector_size)
+        for x, (body, cup) in enumerate(zip(self.body_mask, self.cup_mask, strict=True)):
+            for y in range(len(body)):
+                if cup[y] > body[y]:
+                    raise ValueError(
+                        f"cup={excerpt(self.cup)}, cup_size={excerpt(self.cup_size)}: cell ({x}, {y}) of the cup is "
+                        f"not in body={excerpt(self.body)}; expected a cup that is part of the body."
+                    )
+        if not is_number(self.min_seal) or not 0 < self.min_seal <= 1:
+            raise ValueError(f"min_seal={excerpt(self.min_seal)}: expected a number > 0 and <= 1.")
 
     def _check_products(self) -> None:
         """Refuse sizes each of which is possible, but whose products would fill the memory."""
@@ -134,7 +178,7 @@ class CellSpec:
             (f"{tote_size}: the tote has", self.num_places, "cells", MAX_CELLS),
             (f"{bin_size}, {tote_size}: the cell has", self.num_actions, "actions", MAX_ACTIONS),
         ]
-        if self.pick_rule == "contain" or self.longest_side is not None:  # else the items will say how many
+        if self.has_known_offsets:  # else the items will say how many
             table = self.rotations * self.num_offsets**2 * self.num_places
             key = f"effector_size={[*self.effector_size]}, {tote_size}: the table of offsets has"
             products.append((key, table, "entries", MAX_TABLE))
@@ -172,28 +216,89 @@ class CellSpec:
         return self.parities * self.num_places
 
     @cached_property
+    def body_mask(self) -> Mask:
+        """The cells of the body, before turning."""
+        return self._mask(self.body, self.effector_size)
+
+    @cached_property
+    def cup_mask(self) -> Mask:
+        """The cells of the cup, before turning."""
+        return self._mask(self.cup, self.cup_size or self.effector_size)
+
+    def _mask(self, shape: Any, size: tuple[int, int]) -> Mask:
+        return centred(shape, size, self.effector_size) if isinstance(shape, str) else shape
+
+    @cached_property
+    def cup_boxes(self) -> tuple[Box, ...]:
+        """Rectangles that do not overlap and make up the cup, before turning."""
+        return boxes(self.cup_mask)
+
+    @cached_property
+    def least_sealed(self) -> int:
+        """The least number of the cup's cells on an item, whatever its size, with which the cup may grip it."""
+        total = sum(map(sum, self.cup_mask))
+        return next(n for n in range(1, total + 1) if self.pick_rule != "seal" or n / total >= self.min_seal)
+
+    @property
+    def cup_bounds(self) -> tuple[tuple[int, int], ...]:
+        """Where the cup begins and ends along x and y, in cells of ``effector_size``."""
+        filled = [[at for at, line in enumerate(lines) if any(line)] for lines in self._cup_lines]
+        return tuple((line[0], line[-1] + 1) for line in filled)
+
+    @property
+    def _cup_lines(self) -> tuple[Mask, Mask]:
+        """The cup's lines across x, and across y."""
+        return self.cup_mask, tuple(zip(*self.cup_mask, strict=True))
+
+    @cached_property
     def max_side(self) -> int:
-        """``S``: the longest item side that fits the bin and, where it must be contained, the end effector."""
-        limits = self.effector_size if self.pick_rule == "contain" else self.bin_size[:2]
+        """``S``: the longest item side that fits the bin and, where it must be contained, the cup."""
+        limits = [end - begin for begin, end in self.cup_bounds] if self.pick_rule == "contain" else self.bin_size[:2]
         longest = max(min(a, b) for a, b in zip(limits, self.bin_size[:2], strict=True))
         return longest if self.longest_side is None else min(longest, self.longest_side)
 
-    @cached_property
-    def min_offset(self) -> int:
-        """The lowest offset of an item under the end effector along either axis."""
-        return 0 if self.pick_rule == "contain" else 1 - self.max_side
+    @property
+    def has_known_offsets(self) -> bool:
+        """Whether the number of offsets does not depend on an unknown longest item."""
+        return self.pick_rule == "contain" or self.longest_side is not None
 
     @cached_property
+    def _offsets(self) -> range:
+        """The offsets of an item under the end effector with which it may be gripped, along either axis, at any turn.
+
+        A contained item begins in a line of cells with a cell of the cup; any other covers lines with enough of them.
+        """
+        side = 1 if self.pick_rule == "contain" else self.max_side
+        found = []
+        for lines in self._cup_lines:
+            counts = [sum(line) for line in lines]
+            for part in (counts, counts[::-1]) if self.rotations > 1 else (counts,):
+                held = range(1 - side, len(part))
+                found += [at for at in held if sum(part[max(at, 0) : at + side]) >= self.least_sealed]
+        return range(min(found), max(found) + 1) if found else range(1)
+
+    @property
+    def min_offset(self) -> int:
+        """The lowest offset of an item under the end effector along either axis."""
+        return self._offsets[0]
+
+    @property
     def num_offsets(self) -> int:
         """``O``: how many offsets there are along one axis."""
-        return max(self.effector_size) - self.min_offset
+        return len(self._offsets)
 
     @cached_property
     def effectors(self) -> tuple[EffectorShape, ...]:
-        """The end effector's shape for each parity."""
-        w, d = self.effector_size
-        shapes = ((w, d), (d, w))[: self.parities]
-        return tuple(EffectorShape(a, b, reference_cell(a), reference_cell(b)) for a, b in shapes)
+        """The distinct shapes of the turned body: 1, 2 or ``R`` of them; see :meth:`effector`."""
+        masks = [self.body_mask]
+        for _ in range(self.rotations - 1):
+            masks.append(turned(masks[-1]))
+        count = next(n for n in (1, 2, len(masks)) if masks == [masks[r % n] for r in range(len(masks))])
+        return tuple(_effector_shape(mask) for mask in masks[:count])
+
+    def effector(self, rotation: int) -> EffectorShape:
+        """Return the shape of the end effector in a rotation."""
+        return self.effectors[rotation % len(self.effectors)]
 
     def describe(self) -> str:
         """Return the sizes in one short line, for messages."""
@@ -214,6 +319,12 @@ def cell_from_settings(settings: dict) -> CellSpec:
         value = excerpt(settings[unknown[0]])
         raise ValueError(f"{short_text(unknown[0])}={value}: expected one of {', '.join(CELL_SETTINGS)}.")
     return CellSpec(**settings)
+
+
+def _effector_shape(mask: Mask) -> EffectorShape:
+    """Return the shape of an end effector whose body is a mask."""
+    width, depth = len(mask), len(mask[0])
+    return EffectorShape(width, depth, reference_cell(width), reference_cell(depth), boxes(mask))
 
 
 def _sizes(name: str, value, count: int, most: int) -> tuple[int, ...]:

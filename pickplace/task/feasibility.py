@@ -1,11 +1,12 @@
 """Masks: which actions succeed, and which footprints some action reaches.
 
 Symbols used in shapes: ``N`` problems, ``P`` pick cells, ``R`` rotations, ``Q`` parities of a rotation, ``K`` offsets
-of the item under the end effector, ``T`` turns and ``T * K`` grasp classes (see :mod:`pickplace.task.grasps`).
+of the item under the end effector, ``T`` turns and ``T * K`` grasp classes (see :mod:`pickplace.task.grasps`), ``B``
+distinct shapes of the turned end effector (see :attr:`pickplace.task.cell.CellSpec.effectors`).
 
 Two ideas keep the joint feasibility of all ``N_a = P * W_T * D_T * R`` actions cheap. The bin matters only through the
 grasp class. And the end effector collides if and only if the highest thing under it, the rim counting as a wall around
-the tote, is higher than the item's top: one maximum over its rectangle decides.
+the tote, is higher than the item's top: one maximum over its cells decides.
 """
 
 from functools import reduce
@@ -39,13 +40,17 @@ class PlacingMaps(NamedTuple):
     """Everything that decides which actions succeed in a state."""
 
     top: Tensor  # int32 [N, Q, W_T, D_T]: height of the item's top with its footprint's min corner there, or NEVER
-    clearance: Tensor  # int32 [N, Q, W_T, D_T]: highest thing under the end effector with its reference cell there
+    clearance: Tensor  # int32 [N, B, W_T, D_T]: highest thing under the end effector with its reference cell there
     item: Item  # what is picked
     rest: Tensor  # int32 [N, Q, W_T, D_T]: height on which the item would lie, stable or not; FAR outside the tote
 
     def rows(self, index: Tensor) -> "PlacingMaps":
         """Return the maps of some problems, by their numbers, which may come up more than once."""
         return PlacingMaps(self.top[index], self.clearance[index], self.item.rows(index), self.rest[index])
+
+    def clearance_in(self, rotation: int) -> Tensor:
+        """Return the clearance in a rotation or turn, batch last, ``[W_T, D_T, N]``."""
+        return self.clearance[:, rotation % self.clearance.shape[1]].permute(1, 2, 0)
 
 
 def placing_maps(cell: CellSpec, state: State) -> PlacingMaps:
@@ -62,11 +67,11 @@ def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     mask = maps.top.new_empty(num_turns(cell), count, count, tote_w, tote_d, len(maps.top), dtype=torch.bool)
     for number in range(num_turns(cell)):
         parity = number % cell.parities
-        _, _, ref_x, ref_y = cell.effectors[parity]
+        _, _, ref_x, ref_y, _ = cell.effector(number)
         # With the reference cell at p and the item at offset o, the footprint begins at p - ref + o.
         pad = (ref_x - low, low + count - 1 - ref_x, ref_y - low, low + count - 1 - ref_y)
         top = windows(surround(maps.top[:, parity].permute(1, 2, 0), pad, NEVER), count)
-        is_clear(top, maps.clearance[:, parity].permute(1, 2, 0), out=mask[number])
+        is_clear(top, maps.clearance_in(number), out=mask[number])
         if limits is not None:
             lowest, highest = limits.lowest_top[number, ..., None], limits.highest_top[number, ..., None]
             mask[number] &= is_within_reach(lowest, highest, top)
@@ -147,12 +152,18 @@ def footprint_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     return reached.permute(3, 0, 1, 2).contiguous()
 
 
+def _reference_cells(cell: CellSpec, device) -> Tensor:
+    """Return the reference cell of the end effector in each rotation, int64 ``[R, 2]``."""
+    shapes = [cell.effector(rotation) for rotation in range(cell.rotations)]
+    return torch.tensor([(shape.ref_x, shape.ref_y) for shape in shapes], device=device)
+
+
 def _footprint_margins(cell: CellSpec, parity: int) -> tuple[int, int, int, int]:
     """Return margins after which window ``(i, j)`` of a map over place cells belongs to offset ``O - 1 - (i, j)``.
 
     The footprint at f is reached with offset o if the reference cell is at f + ref - o.
     """
-    _, _, ref_x, ref_y = cell.effectors[parity]
+    _, _, ref_x, ref_y, _ = cell.effector(parity)
     low, high = cell.min_offset, cell.min_offset + cell.num_offsets - 1
     return high - ref_x, ref_x - low, high - ref_y, ref_y - low
 
@@ -160,9 +171,11 @@ def _footprint_margins(cell: CellSpec, parity: int) -> tuple[int, int, int, int]
 def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Tensor) -> Tensor:
     """Return the least clearance with which any grasp reaches each footprint, ``[W_T, D_T, N]``; FAR if none does."""
     (tote_w, tote_d, _), count = cell.tote_size, cell.num_offsets
-    clear = surround(maps.clearance[:, parity].permute(1, 2, 0), _footprint_margins(cell, parity), FAR)
+    margins = _footprint_margins(cell, parity)
+    clear = {turn: surround(maps.clearance_in(turn), margins, FAR) for turn in range(parity, len(grasped), 2)}
     usable = (
-        torch.where(grasped[parity, count - 1 - i, count - 1 - j], clear[i : i + tote_w, j : j + tote_d], FAR)
+        torch.where(grasped[turn, count - 1 - i, count - 1 - j], clear[turn][i : i + tote_w, j : j + tote_d], FAR)
+        for turn in clear
         for i in range(count)
         for j in range(count)
     )
@@ -173,9 +186,9 @@ def _reached_within_limits(cell: CellSpec, limits: Limits, maps: PlacingMaps, pa
     """Return the footprints that some grasp of this parity reaches, bool ``[W_T, D_T, N]``, under the limits."""
     (tote_w, tote_d, _), count, margins = cell.tote_size, cell.num_offsets, _footprint_margins(cell, parity)
     top = maps.top[:, parity].permute(1, 2, 0)
-    clear = surround(maps.clearance[:, parity].permute(1, 2, 0), margins, FAR)
     reached = torch.zeros_like(top, dtype=torch.bool)
     for rotation in range(parity, cell.rotations, 2):
+        clear = surround(maps.clearance_in(rotation), margins, FAR)
         lowest = surround(limits.lowest_top[rotation, ..., None], margins, FAR)
         highest = surround(limits.highest_top[rotation, ..., None], margins, NEVER)
         for i in range(count):
@@ -200,12 +213,12 @@ def actions_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Te
     lifted, offset = all_grasps(cell, maps.item)
     rotation = torch.arange(cell.rotations, device=device)
     parity = rotation % 2
-    refs = torch.tensor([shape[2:] for shape in cell.effectors], device=device)[parity]  # [R, 2]
+    refs = _reference_cells(cell, device)
     turned, x, y = split_footprint(cell.tote_size, footprint)
     place_x, place_y = (torch.stack([x, y], -1)[:, None, None] + refs - offset).unbind(-1)  # [N, P, R]
     in_tote = ~is_outside(place_x, 1, tote_w) & ~is_outside(place_y, 1, tote_d)
     place_x, place_y = place_x.clamp(0, tote_w - 1), place_y.clamp(0, tote_d - 1)
-    index = footprint_index(cell.tote_size, parity, place_x, place_y)
+    index = footprint_index(cell.tote_size, rotation % len(cell.effectors), place_x, place_y)
     clear = maps.clearance.flatten(1).gather(1, index.flatten(1)).view_as(index)
     top = maps.top.flatten(1).gather(1, footprint[:, None])[..., None]
     same = (maps.item.w == maps.item.d)[:, None, None] | (parity == turned[:, None, None])
@@ -238,7 +251,7 @@ def action_footprints(cell: CellSpec, item: Item) -> Tensor:
     device = offset.device
     check_actions(cell, len(lifted), device)
     turned = torch.arange(cell.rotations, device=device) % 2  # [R]
-    refs = torch.tensor([shape[2:] for shape in cell.effectors], device=device)[turned]  # [R, 2]
+    refs = _reference_cells(cell, device)
     corner = (offset - refs)[:, :, None, None]  # [N, P, 1, 1, R, 2]
     x = corner[..., 0] + torch.arange(tote_w, device=device)[:, None, None]
     y = corner[..., 1] + torch.arange(tote_d, device=device)[:, None]

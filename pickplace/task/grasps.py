@@ -2,10 +2,12 @@
 
 The bin matters for the tote only through the *grasp class*: the turn and the item's offset under the end effector. Many
 pick cells and rotations share one, which keeps the masks over all actions cheap. ``O`` offsets are possible along one
-axis, ``K = O * O`` in all. Without limits on the robot a turn is a parity; with limits it is a rotation.
+axis, ``K = O * O`` in all. A turn is a parity, if neither the end effector nor limits on the robot tell rotations apart
+that differ by 180 degrees; else it is a rotation.
 """
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -17,16 +19,25 @@ from pickplace.task.state import Item
 
 
 # ---------------------------------------------------------------------- the checks of a pick, one function each
-def is_gripped(pick_rule: str, near: Tensor, back: Tensor, side: int) -> Tensor:
-    """Return whether the end effector grips the item, along one axis.
+def cup_cells_on(cell: CellSpec, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor) -> Tensor:
+    """Return how many cells of the cup lie on the item.
 
     Args:
-        pick_rule: ``"contain"`` or ``"overlap"``, see :class:`~pickplace.task.cell.CellSpec`.
-        near: from the end effector's minimum edge to the item's, in cells; negative if the item begins before it.
-        back: from the item's maximum edge to the end effector's.
-        side: of the end effector.
+        near_x, near_y: from the end effector's minimum corner to the item's, before turning, in cells; negative if the
+            item begins before it. They broadcast.
+        w, d: sides of the item.
     """
-    return torch.minimum(near, back) >= 0 if pick_rule == "contain" else torch.maximum(near, back) < side
+
+    def shared(near: Tensor, side: Tensor, begin: int, length: int) -> Tensor:
+        return ((near + side).clamp(max=begin + length) - near.clamp(min=begin)).clamp_(min=0)
+
+    counts = [shared(near_x, w, box.x, box.width) * shared(near_y, d, box.y, box.depth) for box in cell.cup_boxes]
+    return reduce(torch.add, counts)
+
+
+def is_gripped(cell: CellSpec, count: Tensor, w: Tensor, d: Tensor) -> Tensor:
+    """Return whether the end effector grips an item of sides ``(w, d)`` with ``count`` cells of the cup."""
+    return count >= (w * d if cell.pick_rule == "contain" else cell.least_sealed)
 
 
 def is_outside(corner: Tensor, side: Tensor | int, grid: int) -> Tensor:
@@ -90,7 +101,8 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor) -> Grasp:
     left, front = x - reference_cell(ee_w), y - reference_cell(ee_d)  # the end effector's minimum corner
     near_x, near_y = item.x - left, item.y - front
     back_x, back_y = ee_w - item.w - near_x, ee_d - item.d - near_y
-    gripped = is_gripped(cell.pick_rule, near_x, back_x, ee_w) & is_gripped(cell.pick_rule, near_y, back_y, ee_d)
+    gripped = is_gripped(cell, cup_cells_on(cell, near_x, near_y, item.w, item.d), item.w, item.d)
+    # Every edge of the rectangle has a cell of the body.
     leaves_bin = is_outside(left, ee_w, bin_w) | is_outside(front, ee_d, bin_d)
     # The only thing in a bin is its item, which is never higher than its own top: just the walls can be hit.
     collides = leaves_bin & ~is_clear(item.h, wall)
@@ -176,11 +188,11 @@ def all_grasps(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:
 
     The offset, int64 ``[N, P, R, 2]``, is the item's minimum corner in the frame of the turned end effector.
     """
-    number = torch.arange(cell.num_picks, device=item.x.device)[:, None]
-    found = grasp(cell, item, number // cell.bin_size[1], number % cell.bin_size[1])  # [P, N]
+    x, y = (torch.arange(side, device=item.x.device)[:, None] for side in cell.bin_size[:2])
+    found = grasp(cell, item, x[:, None], y)  # [W_B, D_B, N]
     pairs = turn(found.near_x, found.near_y, found.back_x, found.back_y)[: cell.rotations]
-    offset = torch.stack([torch.stack(pair, -1) for pair in pairs], 2)  # [P, N, R, 2]
-    return found.succeeds.t(), offset.transpose(0, 1)
+    offset = torch.stack([torch.stack(torch.broadcast_tensors(*pair), -1) for pair in pairs], 3)  # [..., N, R, 2]
+    return found.succeeds.flatten(0, 1).t(), offset.flatten(0, 1).transpose(0, 1)
 
 
 def heuristic_pick(cell: CellSpec, item: Item) -> Tensor:
@@ -201,8 +213,11 @@ def select_pick(cell: CellSpec, actions: Tensor, pick: Tensor) -> Tensor:
 
 # ---------------------------------------------------------------------- grasp classes
 def num_turns(cell: CellSpec) -> int:
-    """Return how many turns are told apart: parities, or rotations where limits may forbid one and not its like."""
-    return cell.parities if cell.limits is None else cell.rotations
+    """Return how many turns are told apart; a rotation's turn is its remainder.
+
+    They are parities; or rotations, where limits may forbid one and not its like, or a half turn changes the body.
+    """
+    return max(cell.parities, len(cell.effectors)) if cell.limits is None else cell.rotations
 
 
 def class_index(cell: CellSpec, turns: Tensor | int, step_x: Tensor, step_y: Tensor) -> Tensor:

@@ -14,7 +14,10 @@ NEVER = -1  # the "top" of a footprint on which the item cannot rest; no clearan
 
 
 def surround(maps: Tensor, margins: tuple[int, int, int, int], value) -> Tensor:
-    """Return maps ``[W, D, N]`` with margins (before and after along x, then y) of a value, or of one per problem."""
+    """Return maps ``[W, D, N]`` with margins (before and after along x, then y) of a value, or of one per problem.
+
+    A negative margin cuts the maps.
+    """
     x0, x1, y0, y1 = margins
     wide, deep, batch = maps.shape
     out = maps.new_empty(wide + x0 + x1, deep + y0 + y1, batch)
@@ -22,7 +25,9 @@ def surround(maps: Tensor, margins: tuple[int, int, int, int], value) -> Tensor:
         out.copy_(value.expand_as(out))
     else:
         out.fill_(value)
-    out[x0 : x0 + wide, y0 : y0 + deep] = maps
+    kept = maps[max(0, -x0) : max(0, wide + min(0, x1)), max(0, -y0) : max(0, deep + min(0, y1))]
+    x, y = max(0, x0), max(0, y0)
+    out[x : x + kept.shape[0], y : y + kept.shape[1]] = kept
     return out
 
 

@@ -219,7 +219,7 @@ def failures(cell: CellSpec, measured: MeasuredMaps, action: Tensor, bin_clear: 
     item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)
     effector_leaves = is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d)
     footprint = footprint_index(cell.tote_size, parity, x.clamp(0, tote_w - 1), y.clamp(0, tote_d - 1))
-    place = footprint_index(cell.tote_size, parity, x_tote, y_tote)
+    place = footprint_index(cell.tote_size, rotation % len(cell.effectors), x_tote, y_tote)
     top = maps.rest.flatten()[footprint] + item.h
     pick = x_bin * cell.bin_size[1] + y_bin
     checks = [  # from the last to the first, so that the first failure has the last word

@@ -87,18 +87,23 @@ def footprint_cells(
 
 
 def clearance(cell: CellSpec, state: State) -> Tensor:
-    """Return the least top at which the end effector hits nothing, per place cell, int32 ``[N, Q, W_T, D_T]``.
+    """Return the least top at which the end effector hits nothing, per shape and place cell.
 
-    That is the highest tote cell under the end effector; where it leaves the tote, the rim.
+    That is the highest tote cell under the end effector; where it leaves the tote, the rim. The result is int32
+    ``[N, B, W_T, D_T]``, for each of :attr:`~pickplace.task.cell.CellSpec.effectors`.
     """
     (tote_w, tote_d, _), surface = cell.tote_size, state.surface
-    maps = surface.new_empty(cell.parities, tote_w, tote_d, len(surface))
+    maps = surface.new_empty(len(cell.effectors), tote_w, tote_d, len(surface))
     rim = surface_from(state.tote_height)
-    for parity, shape in enumerate(cell.effectors):
+    for number, shape in enumerate(cell.effectors):
         after_x, after_y = shape.width - 1 - shape.ref_x, shape.depth - 1 - shape.ref_y
         walled = surround(surface.permute(1, 2, 0), (shape.ref_x, after_x, shape.ref_y, after_y), rim)
-        # The maximum over a rectangle is a maximum along one axis, then along the other.
-        for axis, size, grid in ((0, shape.width, tote_w), (1, shape.depth, tote_d)):
-            walled = reduce(torch.maximum, [walled.narrow(axis, i, grid) for i in range(size)])
-        maps[parity] = walled >> 1
+        highest = []
+        for box in shape.body:
+            under = walled
+            # The maximum over a rectangle is a maximum along one axis, then along the other.
+            for axis, begin, size, grid in ((0, box.x, box.width, tote_w), (1, box.y, box.depth, tote_d)):
+                under = reduce(torch.maximum, [under.narrow(axis, begin + i, grid) for i in range(size)])
+            highest.append(under)
+        maps[number] = reduce(torch.maximum, highest) >> 1
     return maps.permute(3, 0, 1, 2)

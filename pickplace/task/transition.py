@@ -1,11 +1,12 @@
 """One step: the effect of an action on a state, with the checks in the order of the rules."""
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from pickplace.task.cell import CellSpec
+from pickplace.task.cell import CellSpec, EffectorShape
 from pickplace.task.feasibility import PlacingMaps
 from pickplace.task.grasps import (
     carry,
@@ -49,7 +50,10 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     cells, under = squares(surface, x, y, side).unbind(0), is_under(w, d, side).unbind(0)
     z = rest(cells, under)
     top = z.long() + item.h
-    highest = torch.where(is_under(wide, deep, reach), squares(surface, left, front, reach), 0).amax(0) >> 1
+    covered = body_cells(cell.effectors, reach, action.device)  # [side * side, B]
+    if len(cell.effectors) > 1:
+        covered = covered[:, rotation % len(cell.effectors)]
+    highest = torch.where(covered, squares(surface, left, front, reach), 0).amax(0) >> 1
     item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)
     effector_leaves = is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d)
 
@@ -72,6 +76,16 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     footprint = torch.stack([x, y, w, d], -1)
     after = _add_item(cell, surface, footprint, z, torch.where(failure == 0, item.h, 0))
     return Step(after, failure, top, footprint)
+
+
+@lru_cache(maxsize=64)
+def body_cells(shapes: tuple[EffectorShape, ...], side: int, device: torch.device) -> Tensor:
+    """Return the cells of a square that the body covers, row by row, for each shape, bool ``[side * side, B]``."""
+    covered = torch.zeros(len(shapes), side, side, dtype=torch.bool)
+    for square, shape in zip(covered, shapes, strict=True):
+        for box in shape.body:
+            square[box.x : box.x + box.width, box.y : box.y + box.depth] = True
+    return covered.flatten(1).t().contiguous().to(device)
 
 
 def put_down(cell: CellSpec, surface: Tensor, maps: PlacingMaps, footprint: Tensor) -> Tensor:

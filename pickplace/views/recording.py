@@ -97,7 +97,7 @@ def record_moves(cell: CellSpec, planner, observation: TensorDictBase, state: St
     items = torch.stack(state.item, -1).tolist()
     moves = []
     for row in range(len(action)):
-        shape = cell.effectors[rotation[row] % 2]
+        shape = cell.effector(rotation[row])
         moves.append(
             Move(
                 item=tuple(items[row]),

@@ -7,7 +7,7 @@ from random import Random
 import pytest
 import torch
 from oracle import SUCCESS, Oracle, Rules, can_always_start
-from problems import SUPPORTS
+from problems import SUPPORTS, random_effector
 from tensordict import TensorDict
 
 from pickplace import PickPlaceEnv
@@ -17,10 +17,11 @@ from pickplace.task.items import Kinds
 NUM_ENVS, STEPS = (1, 6, 12, 24), 25  # per configuration: 25 to 600 transitions
 
 
-def draw_config(rng: Random):
-    """Return rules and item kinds: small, of every shape, and usually possible."""
+def draw_config(rng: Random, shaped=0.5):
+    """Return rules and item kinds: small, of every shape, and usually possible; a share of end effectors is shaped."""
     effector, bin_sides = (tuple(rng.randint(*sides) for _ in range(2)) for sides in ((1, 4), (2, 5)))
-    pick_rule = rng.choice(("contain", "contain", "overlap"))
+    shape = random_effector(rng, effector) if rng.random() < shaped else {}
+    pick_rule = rng.choice(("contain", "seal", "overlap") if shape else ("contain", "contain", "overlap"))
     limit = [min(3, side) for side in bin_sides]
     if pick_rule == "contain" and rng.random() < 0.95:
         limit = [min(pair) for pair in zip(limit, effector, strict=True)]
@@ -28,7 +29,7 @@ def draw_config(rng: Random):
     wide, deep, height = rng.randint(2, 6), rng.randint(2, 6), max(h for _, _, h in kinds) + rng.randint(0, 4)
     rules = Rules(
         (*bin_sides, rng.choice((1, 2, 3, 3))), (wide, deep, height), effector, rng.randint(1, 4), pick_rule,
-        **dict(zip(("support", "support_margin"), rng.choice(SUPPORTS), strict=True)),
+        **dict(zip(("support", "support_margin"), rng.choice(SUPPORTS), strict=True)), **shape,
     )  # fmt: skip
     if rng.random() < 0.4:  # limits that seldom leave an item nowhere to go
         lowest, highest = (

@@ -138,7 +138,8 @@ def test_without_a_mask_every_grasp_has_the_score_of_its_footprint(rotations, ef
     policy.outside.data.fill_(7.0)
     logits = policy.class_scores(state).flatten(1)
     scores = policy.network(*(state[key] for key in MAP_KEYS), env.cell.parities)
-    for parity, (_, _, ref_x, ref_y) in enumerate(env.cell.effectors):
+    for parity in range(env.cell.parities):
+        _, _, ref_x, ref_y, _ = env.cell.effector(parity)
         for ox, oy, x, y in itertools.product(range(count), range(count), range(4), range(5)):
             fx, fy = x - ref_x + ox, y - ref_y + oy
             got = logits[:, ((parity * count + ox) * count + oy) * 20 + x * 5 + y]

@@ -20,7 +20,7 @@ from pickplace.task.cell import CELL_SETTINGS, Limits, cell_from_settings, refer
         ({"effector_size": (3, -3)}, r"effector_size=\(3, -3\): expected 2"),
         ({"effector_size": (3, 3, 1)}, r"effector_size=\(3, 3, 1\)"),
         *(({"rotations": value}, f"rotations={value}: expected 1, 2, 3 or 4") for value in (5, 4.0)),
-        ({"pick_rule": "grab"}, "pick_rule='grab': expected 'contain' or 'overlap'"),
+        ({"pick_rule": "grab"}, "pick_rule='grab': expected 'contain' or 'overlap' or 'seal'"),
         *(
             ({"support": value}, f"support={value!r}: expected 'half' or .* 'full' or a number between 0 and 1")
             for value in (1.5, -0.1, "most", True)
@@ -39,7 +39,8 @@ def test_impossible_settings_are_refused(settings, message):
 def test_every_setting_reaches_the_cell_of_the_environment():
     given = {
         "bin_size": [4, 6, 2], "tote_size": [5, 7, 6], "effector_size": [2, 4], "rotations": 3, "pick_rule": "overlap",
-        "support": "hull", "support_margin": 0.25, "height_unit": 0.5,
+        "support": "hull", "support_margin": 0.25, "height_unit": 0.5, "body": "disc", "cup": "disc",
+        "cup_size": [2, 4], "min_seal": 0.5,
     }  # fmt: skip
     assert tuple(given) == CELL_SETTINGS
     cell = PickPlaceEnv(num_envs=1, **given).cell
@@ -56,7 +57,7 @@ def test_counts_of_offsets_and_footprints():
     assert (contain.max_side, contain.min_offset, contain.num_offsets) == (4, 0, 4)
     assert (overlap.max_side, overlap.min_offset, overlap.num_offsets) == (5, -4, 8)
     assert CellSpec(longest_side=2, pick_rule="overlap").num_offsets == 4
-    assert contain.effectors == ((2, 4, 0, 1), (4, 2, 1, 0))
+    assert contain.effectors == ((2, 4, 0, 1, ((0, 0, 2, 4),)), (4, 2, 1, 0, ((0, 0, 4, 2),)))
     assert [reference_cell(side) for side in (1, 2, 3, 4, 5)] == [0, 0, 1, 1, 2]
 
 
