@@ -18,8 +18,8 @@ from pickplace.policies.base import Policy, as_collection_policy, as_critic
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import trusted_config
 from pickplace.runs.machine import usable_device
-from pickplace.runs.registry import build
-from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
+from pickplace.runs.registry import build, build_cell
+from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import placing_maps
 from pickplace.task.observation import Term, check_terms
 from pickplace.task.state import Observation, State
@@ -56,7 +56,7 @@ def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: di
         sizes = {key: size for key, size in sizes.items() if size != getattr(cell, key)}
         if not sizes:
             raise
-        restored(replace(cell, limits=None, **sizes))  # if that fails too, the sizes are not the reason
+        restored(replace(cell, reach=None, limits=None, **sizes))  # if that fails too, the sizes are not the reason
         ours = ", ".join(f"env.{key}={[*getattr(cell, key)]}" for key in sizes)
         theirs = ", ".join(f"{[*size]}" for size in sizes.values())
         raise checkpoint.CheckpointError(
@@ -133,7 +133,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     state, facts = checkpoint.read(checkpoint.locate(path))
     cfg = trusted_config(facts["config"], trust)
     env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
-    cell = cell_from_settings({**{key: env[key] for key in CELL_SETTINGS if key in env}, **sizes})
+    cell = build_cell(env, **sizes)
     if cell.pick_rule == "overlap" and cell.longest_side is None:  # it determines the number of grasps
         longest = int(build("items", cfg["items"]).sizes[:, :2].max())
         cell = replace(cell, longest_side=longest)

@@ -17,6 +17,7 @@ from importlib import import_module
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.runs.errors import unknown_key
+from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.task.checks import short_text
 
 PLANNERS = {
@@ -39,6 +40,7 @@ REGISTRY: dict[str, dict[str, str]] = {
         "tote_bearing": "pickplace.task.observation.ToteBearing",
         "tote_height": "pickplace.task.observation.ToteHeight",
     },
+    "env.reach": {"annulus": "pickplace.task.reach.Annulus", "table": "pickplace.task.reach.ReachTable"},
     "items": {
         "kinds": "pickplace.task.items.Kinds",
         "uniform": "pickplace.task.items.Uniform",
@@ -100,6 +102,20 @@ def build(place: str, node: DictConfig | dict, **kwargs):
             raises.
     """
     return _make(place, OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node, kwargs)
+
+
+def build_cell(env: dict, **given) -> CellSpec:
+    """Return the cell of a config's group ``env``.
+
+    Args:
+        env: the settings, resolved; those of no cell are ignored.
+        **given: settings of the cell that replace them, made already.
+
+    Raises:
+        ValueError: as of :func:`build` and of the cell.
+    """
+    own = {key: env[key] for key in CELL_SETTINGS if key in env and key not in given}
+    return cell_from_settings({**_make("env", own, {}), **given})
 
 
 def _make(place: str, node, given: dict):

@@ -1,5 +1,6 @@
 """The robot cell: every size and option of bin, tote and end effector, stated once and checked once."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import NamedTuple
@@ -25,6 +26,14 @@ def reference_cell(side):
     return (side - 1) // 2
 
 
+def effector_centre(at, side):
+    """Return the end effector's centre along a side, with its reference cell at ``at``; in cells, numbers or tensors.
+
+    It comes from the rectangle: on even sides the reference cell is half a cell off.
+    """
+    return at - reference_cell(side) + side / 2
+
+
 class EffectorShape(NamedTuple):
     """The end effector as it is turned: its sides and its reference cell, in cells."""
 
@@ -42,28 +51,59 @@ class Limits:
         pick_ok: bool ``[P]``, whether the robot reaches each pick cell.
         lowest_top, highest_top: int ``[R, W_T, D_T]``, the range in which the item's top, where the suction face is,
             must be for each rotation and place cell; in height units. An empty range forbids the place cell.
+        lowest_pick, highest_pick: int ``[P]``, the same range for each pick cell; None: any height.
     """
 
     pick_ok: Tensor
     lowest_top: Tensor
     highest_top: Tensor
+    lowest_pick: Tensor | None = None
+    highest_pick: Tensor | None = None
 
     def check(self, cell: "CellSpec") -> None:
         """Refuse tables of another shape or type than the cell needs, with a ``ValueError`` that names the table."""
-        places = (cell.rotations, *cell.tote_size[:2])
-        shapes = {"pick_ok": (cell.num_picks,), "lowest_top": places, "highest_top": places}
+        picks, places = (cell.num_picks,), (cell.rotations, *cell.tote_size[:2])
+        shapes = {"pick_ok": picks, "lowest_top": places, "highest_top": places}
+        if self.lowest_pick is not None or self.highest_pick is not None:
+            shapes |= {"lowest_pick": picks, "highest_pick": picks}
         for name, shape in shapes.items():
-            found = tuple(getattr(self, name).shape)
-            if found != shape:
-                raise ValueError(f"limits.{name}: got shape {list(found)}, expected {list(shape)}.")
-            dtype = getattr(self, name).dtype
-            if (dtype == torch.bool) != (name == "pick_ok") or dtype.is_floating_point:
+            table = getattr(self, name)
+            if table is None:
+                raise ValueError(f"limits.{name}=None: expected a table, as the other one of the two.")
+            if tuple(table.shape) != shape:
+                raise ValueError(f"limits.{name}: got shape {list(table.shape)}, expected {list(shape)}.")
+            if (table.dtype == torch.bool) != (name == "pick_ok") or table.dtype.is_floating_point:
                 expected = "bool" if name == "pick_ok" else "integers"
-                raise ValueError(f"limits.{name}: got {dtype}, expected {expected}.")
+                raise ValueError(f"limits.{name}: got {table.dtype}, expected {expected}.")
 
     def on(self, device) -> "Limits":
         """Return the tables on a device."""
-        return Limits(*(getattr(self, item.name).to(device) for item in fields(self)))
+        tables = (getattr(self, item.name) for item in fields(self))
+        return Limits(*(table if table is None else table.to(device) for table in tables))
+
+
+class LimitsOfReach(Limits):
+    """Limits that a cell computed from its reach: a cell of other sizes computes them anew."""
+
+
+class Reach(ABC):
+    """The robot's reach, a setting of the cell; two of the same reach are equal."""
+
+    @abstractmethod
+    def limits(self, cell: "CellSpec") -> Limits:
+        """Return what a robot of this reach may do in a cell; the cell's own limits are not known yet."""
+
+    def picks(self, cell: "CellSpec", x: Tensor, y: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Return the range of heights of the suction face for centres of the end effector anywhere in the bin.
+
+        Args:
+            x, y: from the bin's corner, in cells; float64 of one shape.
+
+        Returns:
+            Lowest and highest, in height units, integers of that shape, an empty range where the robot cannot go;
+            None: only what lies between pick cells that are all reached is known to be reached.
+        """
+        return None
 
 
 @dataclass(frozen=True)
@@ -90,7 +130,8 @@ class CellSpec:
             lengths (the robot's planner, the replay page) multiplies by it.
         longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and under
             ``overlap`` it also sets the number of offsets.
-        limits: of the robot, see :class:`Limits`; None: there are none.
+        reach: of the robot, such as :class:`~pickplace.task.reach.Annulus`; None: it reaches everything.
+        limits: of the robot, see :class:`Limits`; None: those of ``reach``.
 
     Raises:
         ValueError: naming the argument, the value received and what was expected.
@@ -104,6 +145,7 @@ class CellSpec:
     support: str | float = "bearing"
     support_margin: float = 0.25
     height_unit: float = 1.0
+    reach: Reach | None = None
     longest_side: int | None = field(default=None, metadata={"derived": True})
     limits: Limits | None = field(default=None, compare=False, metadata={"derived": True})
 
@@ -123,6 +165,18 @@ class CellSpec:
         if self.longest_side is not None:
             whole_number("longest_side", self.longest_side)
         self._check_products()
+        self._find_limits()
+
+    def _find_limits(self) -> None:
+        """Compute the limits of the reach, or check those that were given."""
+        if isinstance(self.limits, LimitsOfReach):  # of the cell from which ``dataclasses.replace`` made this one
+            object.__setattr__(self, "limits", None)
+        if self.reach is not None:
+            if not isinstance(self.reach, Reach):
+                raise ValueError(f"reach={excerpt(self.reach)}: expected a Reach, such as an Annulus, or None.")
+            if self.limits is not None:
+                raise ValueError(f"limits, reach={excerpt(self.reach)}: got both, expected one of the two.")
+            object.__setattr__(self, "limits", LimitsOfReach(**vars(self.reach.limits(self))))
         if self.limits is not None:
             self.limits.check(self)
 
