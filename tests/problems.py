@@ -52,7 +52,7 @@ def state_of(*cases: Case) -> State:
 
 def oracle_of(cell: CellSpec, case: Case) -> Oracle:
     """Return a case as the oracle sees it."""
-    tables = {} if cell.limits is None else {key: value.tolist() for key, value in vars(cell.limits).items()}
+    tables = {} if cell.limits is None else {k: v.tolist() for k, v in vars(cell.limits).items() if v is not None}
     names = ("bin_size", "tote_size", "effector_size", "rotations", "pick_rule", "support", "support_margin")
     rules = Rules(**{name: getattr(cell, name) for name in names}, **tables)
     return Oracle(rules, case.rim, case.item[2:], case.item[:2], case.heights.tolist(), bearing=case.bearing.tolist())
@@ -64,7 +64,10 @@ def random_limits(cell: CellSpec, seed: int) -> Limits:
     places = (cell.rotations, *cell.tote_size[:2])
     lowest = random.integers(-1, 4, places)
     highest = lowest + random.integers(-1, 5, places)  # an empty range at times
-    return Limits(torch.from_numpy(random.random(cell.num_picks) < 0.7), *map(torch.from_numpy, (lowest, highest)))
+    pick_ok = random.random(cell.num_picks) < 0.7
+    picks = (random.choice(values, cell.num_picks, p=[0.9, 0.1]) for values in ((0, 2), (4, 1)))
+    tables = (pick_ok, lowest, highest, *picks)[: random.choice([3, 5])]  # heights of picks may not matter
+    return Limits(*map(torch.from_numpy, tables))
 
 
 @st.composite
