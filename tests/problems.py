@@ -65,7 +65,7 @@ def random_limits(cell: CellSpec, seed: int) -> Limits:
     lowest = random.integers(-1, 4, places)
     highest = lowest + random.integers(-1, 5, places)  # an empty range at times
     pick_ok = random.random(cell.num_picks) < 0.7
-    picks = (random.choice(values, cell.num_picks, p=[0.9, 0.1]) for values in ((0, 2), (4, 1)))
+    picks = (random.choice(values, cell.num_picks, p=[0.7, 0.3]) for values in ((0, 2), (4, 1)))
     tables = (pick_ok, lowest, highest, *picks)[: random.choice([3, 5])]  # heights of picks may not matter
     return Limits(*map(torch.from_numpy, tables))
 

@@ -25,9 +25,11 @@ def tenths(least, most):
 
 @st.composite
 def annuli(draw):
-    """An annulus about a base near bin and tote; all lengths are decimal fractions."""
-    radii, heights = (sorted([draw(tenths(*span)), draw(tenths(*span))]) for span in ((0, 90), (-5, 50)))
-    bin, tote = ([draw(tenths(-60, 30)), draw(tenths(-40, 20)), draw(tenths(-10, 10))] for _ in range(2))
+    """An annulus about a base near bin and tote, which reaches much of them; all lengths are decimal fractions."""
+    radii = draw(tenths(0, 20)), draw(tenths(20, 90))
+    lowest = draw(tenths(-10, 25))
+    heights = lowest, lowest + draw(tenths(0, 40))
+    bin, tote = ([draw(tenths(-50, 20)), draw(tenths(-30, 10)), draw(tenths(-15, 15))] for _ in range(2))
     return Annulus(radii, heights, bin, tote)
 
 
@@ -92,6 +94,20 @@ def test_the_tables_of_an_annulus(problem, reach, unit):
             sides = (d, w) if rotation % 2 else (w, d)
             for x, y in torch.cartesian_prod(*map(torch.arange, cell.tote_size[:2])).view(-1, 2).tolist():
                 assert places[rotation, x, y] == is_reached(reach, reach.tote, unit, (x, y), sides, face)
+
+
+def test_a_distance_that_is_exactly_a_radius_is_reached():
+    """Sides of Pythagorean triangles in decimal fractions, whose hypotenuse is a radius."""
+    for a, b, c in ((3, 4, 5), (5, 12, 13), (8, 15, 17), (7, 24, 25), (20, 21, 29)):
+        for scale in (0.1, 0.3, 0.7, 1.1):
+            for off, reached in ((0, True), (0.01, False)):
+                corner = [a * scale - 0.5, b * scale - 0.5, 0]
+                reach = [Annulus([least, most], [0, 9], corner, corner) for least, most in (
+                    (c * scale + off, 99), (0, c * scale - off), (c * scale + off, c * scale + off)
+                )]  # fmt: skip
+                for one in reach:
+                    limits = CellSpec((1, 1, 1), (1, 1, 5), (1, 1), 1, reach=one).limits
+                    assert bool(limits.pick_ok) == (int(limits.highest_top) >= 0) == reached
 
 
 @pytest.mark.parametrize(
