@@ -310,12 +310,12 @@ def _limits(cell: CellSpec, free: CellSpec, bin_clear: Tensor, centres: np.ndarr
         grip: height of the suction face when it grips the item, mm.
         release: height of the suction face above the item's planned top when it lets go, mm.
     """
-    device = bin_clear.device
-    if cell.limits is None:
+    device, limits, ratio = bin_clear.device, free.limits, 1.0
+    if cell.reach is None:
+        limits, ratio = cell.limits, cell.height_unit / free.height_unit
+    if limits is None:
         places = torch.zeros(cell.rotations, *cell.tote_size[:2], dtype=torch.int64, device=device)
         return Limits(bin_clear, places, places + FAR)
-    is_reach = cell.reach is not None and free.limits is not None
-    limits, ratio = (free.limits, 1.0) if is_reach else (cell.limits, cell.height_unit / free.height_unit)
     return Limits(
         bin_clear & _reached_picks(cell, free, limits, ratio, centres, grip).to(device),
         (limits.lowest_top * ratio - release).ceil().long().to(device),

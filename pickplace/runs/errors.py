@@ -138,7 +138,7 @@ def unknown_key(key: str, node: DictConfig | dict, prefix: str = "") -> str:
         if not isinstance(child, DictConfig):
             if parent in node:
                 place, value = short_text(prefix + parent), "null" if child is None else excerpt(child)
-                return f"{short_text(key)}: {place} is {value}, without keys; expected an option of a group that sets it."
+                return f"{short_text(key)}: {place} is {value}, without keys; expected an option that gives it some."
             leaf = parent
             break
         prefix, node = f"{prefix}{parent}.", child

@@ -1,7 +1,7 @@
 """The robot cell: every size and option of bin, tote and end effector, stated once and checked once."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -78,8 +78,7 @@ class Limits:
 
     def on(self, device) -> "Limits":
         """Return the tables on a device."""
-        tables = (getattr(self, item.name) for item in fields(self))
-        return Limits(*(table if table is None else table.to(device) for table in tables))
+        return replace(self, **{name: table.to(device) for name, table in vars(self).items() if table is not None})
 
 
 class LimitsOfReach(Limits):

@@ -109,5 +109,7 @@ def test_a_resumed_run_keeps_its_reach(trained):
 
     _, facts = checkpoint.read(checkpoint.locate(trained, prefer="last"))
     assert resumed_config("run", facts, ["total_frames=256"]).env.reach == composed(*TINY).env.reach
-    with pytest.raises(ValueError, match=r"env.reach=\{.*\}: the run began with .*, and a resumed run cannot change it"):
+    with pytest.raises(
+        ValueError, match=r"env.reach=\{.*\}: the run began with .*, and a resumed run cannot change it"
+    ):
         resumed_config("run", facts, ["env.reach.radii=[1,20]"])

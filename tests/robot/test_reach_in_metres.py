@@ -70,7 +70,9 @@ def test_the_annulus_decides_to_the_millimetre():
     assert status(heights=[-9, 1.24], tote=[0, -3, -5]) == "ok" and status(heights=[-9, 1.22], tote=[0, -3, -5]) != "ok"
     assert status(heights=[1.24, 99], tote=[0, -3, 5]) == "ok" and status(heights=[1.26, 99], tote=[0, -3, 5]) != "ok"
     # It lets go twice the accuracy above its top.
-    assert status(heights=[-9, 1.28], bin=[0, -2.5, -5]) == "ok" and status(heights=[-9, 1.26], bin=[0, -2.5, -5]) != "ok"
+    assert (
+        status(heights=[-9, 1.28], bin=[0, -2.5, -5]) == "ok" and status(heights=[-9, 1.26], bin=[0, -2.5, -5]) != "ok"
+    )
 
 
 def test_a_table_in_metres_needs_all_pick_cells_around(tmp_path):

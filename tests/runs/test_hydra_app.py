@@ -85,7 +85,7 @@ BAD = [
     ("train", "items=recorded", ["items.path", "no value"]),
     ("train", "reach=table", ["env.reach.path", "no value"]),
     ("train", "reach=table env.reach.path=nowhere.csv", ["reach.path='nowhere.csv'", "no such file"]),
-    ("train", "env.reach.radii=[1,2]", ["env.reach.radii: env.reach is null", "option of a group"]),
+    ("train", "env.reach.radii=[1,2]", ["env.reach.radii: env.reach is null", "an option that"]),
     ("train", "reach=annulus env.reach.radi=[1,2]", ["env.reach.radi", "'radii'"]),
     ("train", "reach=annulus env.reach.radii=[0,4]", ["item 1x1x1 at x=0, y=0", "reach=Annulus(radii=(0.0, 4.0)"]),
     ("train", "reach=annulus env.reach.radii=[4,0]", ["reach.radii=[4.0, 0.0]", "least <= greatest"]),

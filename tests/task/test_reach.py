@@ -28,7 +28,7 @@ def annuli(draw):
     """An annulus about a base near bin and tote, which reaches much of them; all lengths are decimal fractions."""
     radii = draw(tenths(0, 20)), draw(tenths(20, 90))
     lowest = draw(tenths(-10, 25))
-    heights = lowest, lowest + draw(tenths(0, 40))
+    heights = lowest, round(lowest + draw(tenths(0, 40)), 1)
     bin, tote = ([draw(tenths(-50, 20)), draw(tenths(-30, 10)), draw(tenths(-15, 15))] for _ in range(2))
     return Annulus(radii, heights, bin, tote)
 
@@ -45,10 +45,9 @@ def is_reached(reach, corner, unit, cell, sides, face):
         centre.append(exact(start) + Fraction(covered[0] + covered[-1] + 1, 2))
     distance = centre[0] ** 2 + centre[1] ** 2
     height = exact(corner[2]) + face * exact(unit)
-    return (
-        exact(reach.radii[0]) ** 2 <= distance <= exact(reach.radii[1]) ** 2
-        and exact(reach.heights[0]) <= height <= exact(reach.heights[1])
-    )
+    return exact(reach.radii[0]) ** 2 <= distance <= exact(reach.radii[1]) ** 2 and exact(
+        reach.heights[0]
+    ) <= height <= exact(reach.heights[1])
 
 
 @settings(max_examples=60)
