@@ -18,8 +18,8 @@ from pickplace.policies.base import Policy, as_collection_policy, as_critic
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import trusted_config
 from pickplace.runs.machine import usable_device
-from pickplace.runs.registry import build, build_cell
-from pickplace.task.cell import CellSpec
+from pickplace.runs.registry import build
+from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.task.feasibility import placing_maps
 from pickplace.task.observation import Term, check_terms
 from pickplace.task.state import Observation, State
@@ -112,6 +112,20 @@ class TrainedPolicy(TensorDictModuleBase):
         cell = {item.name: getattr(self.cell, item.name) for item in fields(CellSpec)}
         device = next(self.parameters()).device
         return PickPlaceEnv(num_envs=num_envs, observation=self.terms, device=device, **cell, **options)
+
+
+def build_cell(env: dict, **given) -> CellSpec:
+    """Return the cell of a config's group ``env``.
+
+    Args:
+        env: the settings, resolved; those of no cell are ignored.
+        **given: settings of the cell that replace them, made already.
+
+    Raises:
+        ValueError: as of :func:`~pickplace.runs.registry.build` and of the cell.
+    """
+    own = {key: env[key] for key in CELL_SETTINGS if key in env and key not in given}
+    return cell_from_settings({**build("env", own), **given})
 
 
 def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -> TrainedPolicy:

@@ -62,11 +62,7 @@ def parser() -> argparse.ArgumentParser:
     add("--tote-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
     add("--effector-size", type=int, nargs=2, metavar=("W", "D"), help="cells; default: as trained")
     add("--rotations", type=int, metavar="R", help="quarter turns to choose from; default: as trained")
-    add(
-        "--reach",
-        metavar="YAML",
-        help="reach of the robot: a file such as conf/reach/annulus.yaml; default: as trained",
-    )
+    add("--reach", metavar="YAML", help="file such as conf/reach/annulus.yaml, the robot's reach; default: as trained")
     add(
         "--trust", action="append", metavar="MODULE", default=[],
         help="your own module whose classes the checkpoint's config may name; may be repeated",

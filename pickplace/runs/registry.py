@@ -17,7 +17,6 @@ from importlib import import_module
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.runs.errors import unknown_key
-from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.task.checks import short_text
 
 PLANNERS = {
@@ -102,20 +101,6 @@ def build(place: str, node: DictConfig | dict, **kwargs):
             raises.
     """
     return _make(place, OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node, kwargs)
-
-
-def build_cell(env: dict, **given) -> CellSpec:
-    """Return the cell of a config's group ``env``.
-
-    Args:
-        env: the settings, resolved; those of no cell are ignored.
-        **given: settings of the cell that replace them, made already.
-
-    Raises:
-        ValueError: as of :func:`build` and of the cell.
-    """
-    own = {key: env[key] for key in CELL_SETTINGS if key in env and key not in given}
-    return cell_from_settings({**_make("env", own, {}), **given})
 
 
 def _make(place: str, node, given: dict):

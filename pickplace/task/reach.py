@@ -195,5 +195,5 @@ def _row(place: str, texts: list[str]) -> tuple[str, int, int, int, float, float
         if row[column] and not abs(heights[-1]) <= MAX_COORDINATE:
             raise refuse(column, "a height in sides of a cell, or nothing")
     if heights[0] > heights[1]:
-        raise refuse("highest", f"at least lowest={row['lowest']}")
+        raise refuse("highest", f"at least lowest={row['lowest'] or 0}")
     return row["where"], int(row["x"]), int(row["y"]), int(row["rotation"] or 0), heights[0], heights[1]

@@ -257,7 +257,7 @@ def test_full_error_shows_the_traceback(run, monkeypatch):
 @pytest.mark.parametrize("name", ["train", "evaluate"])
 def test_help_from_any_directory(name, tmp_path):
     """Without a wait for torch."""
-    code = f"import sys; from pickplace.cli import {name}; {name}(); assert 'torch' not in sys.modules"
+    code = f"import sys; from pickplace.cli import {name}\ntry: {name}()\nfinally: assert 'torch' not in sys.modules"
     path = str(Path(pickplace.__file__).parents[1])
     result = subprocess.run(
         [sys.executable, "-c", code, "--help"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
