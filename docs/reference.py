@@ -62,7 +62,8 @@ def read(path: Path) -> ConfigFile:
             bases.append(entry)
     top = [f"`{line}`." if line.startswith("pickplace-") else line for line in top]
     file = ConfigFile(group, path.stem, " ".join(top), bases, parts)
-    prefix = "" if group in ("", "experiment") else group.replace("/", ".") + "."
+    place = "env" if source.startswith("# @package env\n") else group
+    prefix = "" if place in ("", "experiment") else place.replace("/", ".") + "."
     _collect(yaml.compose(source), lines, prefix, file.settings)
     return file
 

@@ -36,6 +36,8 @@ class Rules:
     pick_ok: list[bool] | None = None  # for each pick cell; None: no limits on the robot
     lowest_top: list[Grid] | None = None  # for each rotation and place cell
     highest_top: list[Grid] | None = None
+    lowest_pick: list[int] | None = None  # for each pick cell, of the item's height; None: any height
+    highest_pick: list[int] | None = None
 
     @property
     def num_actions(self) -> int:
@@ -217,7 +219,10 @@ class Oracle:
 
         if rules.pick_ok is not None:
             lowest, highest = (table[r][place[0]][place[1]] for table in (rules.lowest_top, rules.highest_top))
-            if not rules.pick_ok[pick[0] * rules.bin_size[1] + pick[1]] or top < lowest or top > highest:
+            number = pick[0] * rules.bin_size[1] + pick[1]
+            if not rules.pick_ok[number] or top < lowest or top > highest:
+                return OUT_OF_REACH, None
+            if rules.lowest_pick is not None and not rules.lowest_pick[number] <= h <= rules.highest_pick[number]:
                 return OUT_OF_REACH, None
 
         after = [column[:] for column in heights]

@@ -54,8 +54,9 @@ def state_of(*cases: Case) -> State:
 
 def oracle_of(cell: CellSpec, case: Case) -> Oracle:
     """Return a case as the oracle sees it."""
-    tables = {} if cell.limits is None else {key: value.tolist() for key, value in vars(cell.limits).items()}
-    rules = Rules(**{name: getattr(cell, name) for name in CELL_SETTINGS if name != "height_unit"}, **tables)
+    tables = {} if cell.limits is None else {k: v.tolist() for k, v in vars(cell.limits).items() if v is not None}
+    names = (name for name in CELL_SETTINGS if name not in ("height_unit", "reach"))
+    rules = Rules(**{name: getattr(cell, name) for name in names}, **tables)
     return Oracle(rules, case.rim, case.item[2:], case.item[:2], case.heights.tolist(), bearing=case.bearing.tolist())
 
 
@@ -65,7 +66,10 @@ def random_limits(cell: CellSpec, seed: int) -> Limits:
     places = (cell.rotations, *cell.tote_size[:2])
     lowest = random.integers(-1, 4, places)
     highest = lowest + random.integers(-1, 5, places)  # an empty range at times
-    return Limits(torch.from_numpy(random.random(cell.num_picks) < 0.7), *map(torch.from_numpy, (lowest, highest)))
+    pick_ok = random.random(cell.num_picks) < 0.7
+    picks = (random.choice(values, cell.num_picks, p=[0.7, 0.3]) for values in ((0, 2), (4, 1)))
+    tables = (pick_ok, lowest, highest, *picks)[: random.choice([3, 5])]  # heights of picks may not matter
+    return Limits(*map(torch.from_numpy, tables))
 
 
 def random_effector(random: Random, size: tuple[int, int]) -> dict:

@@ -57,6 +57,8 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
     description = cell.describe()
     if cell.support in HULL_RULES:
         description += f", support={cell.support}, support_margin={cell.support_margin:g}"
+    if cell.reach is not None:
+        description += f", reach={cell.reach}"
     cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
     rows = torch.tensor([(*item, kind) for item, kind in problems.items()])
     if cell.limits is None:

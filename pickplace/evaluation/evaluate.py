@@ -16,7 +16,7 @@ from pickplace.physics.recorded import motion_for_replay, plan_of
 from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import own_modules, trusted_config
-from pickplace.runs.composition import task_overrides
+from pickplace.runs.composition import PARTS_OF_ENV, keys_set_in_env, task_overrides
 from pickplace.runs.errors import sentence
 from pickplace.runs.folder import EVALUATION, claim, refuse_occupied
 from pickplace.runs.hydra_app import apply_overrides, command
@@ -33,13 +33,13 @@ log = logging.getLogger(__name__)
 
 MAX_EVALUATION = 2**26  # greatest size of an evaluation.json that is read, in bytes
 
-#: Config groups that an evaluation takes from the checkpoint.
+#: Config groups that an evaluation takes from the checkpoint; :data:`PARTS_OF_ENV` are in the first.
 TRAINED = ("env", "items", "model", "algo")
 
 
 def main() -> None:
     """Entry point of ``pickplace-evaluate``."""
-    command("evaluate", run, from_checkpoint=("model", "items"))
+    command("evaluate", run, from_checkpoint=("model", "items", *(f"env.{part}" for part in PARTS_OF_ENV)))
 
 
 def run(cfg: DictConfig, run_dir: Path) -> float:
@@ -162,9 +162,15 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
     state, saved = checkpoint.read(folder)
     trained = trusted_config(saved["config"], cfg.trust)
     groups = {key: OmegaConf.create(resolved(cfg[key])) for key in ("env", "items")}
-    words = task_overrides(HydraConfig.get())
-    ours = [word for word in words if word.lstrip("+~").split("=")[0].split(".")[0] in TRAINED]
-    merged = apply_overrides(trained, ours, groups)
+    ours, changed = [], trained.copy()
+    for word in task_overrides(HydraConfig.get()):
+        key = word.lstrip("+~").split("=")[0]
+        if key in PARTS_OF_ENV:
+            for name in keys_set_in_env(word):
+                OmegaConf.update(changed, f"env.{name}", groups["env"][name], merge=False, force_add=True)
+        elif key.split(".")[0] in TRAINED:
+            ours.append(word)
+    merged = apply_overrides(changed, ours, groups)
     with open_dict(cfg):
         for group in TRAINED:  # resolved where they come from: here a reference could lead elsewhere
             cfg[group] = resolved(merged[group])
@@ -207,17 +213,29 @@ def evaluate(
 
 def episode_settings(cfg: DictConfig) -> dict:
     """Return the settings that determine which episodes an evaluation plays."""
-    items = resolved(cfg["items"])
-    path = items.get("path")
-    if isinstance(path, str) and Path(path).is_file():  # of a recorded stream the content counts, not its place
-        items["sha256"] = hashlib.sha256(read_file(path)).hexdigest()
     return {
-        "env": resolved(cfg.env),
-        "items": items,
+        "env": {key: with_hash(value) for key, value in resolved(cfg.env).items()},
+        "items": with_hash(resolved(cfg["items"])),
         "stream": cfg.evaluation.stream,
         "episodes": cfg.evaluation.episodes,
         "seed": cfg.evaluation.seed,
     }
+
+
+def with_hash(node: Any) -> Any:
+    """Return a part of a config with the hash of its file, if it has one: the content counts, not its place."""
+    path = node.get("path") if isinstance(node, dict) else None
+    if isinstance(path, str) and Path(path).is_file():
+        return {**node, "sha256": hashlib.sha256(read_file(path)).hexdigest()}
+    return node
+
+
+def is_same(ours: Any, theirs: Any) -> bool:
+    """Return whether two parts of configs agree, files by content if both know it, else by path."""
+    if isinstance(ours, dict) and isinstance(theirs, dict):
+        ignored = "path" if "sha256" in ours and "sha256" in theirs else "sha256"
+        ours, theirs = ({key: node[key] for key in node if key != ignored} for node in (ours, theirs))
+    return ours == theirs
 
 
 def read_comparison(path: Path, expected: dict) -> dict:
@@ -237,19 +255,15 @@ def read_comparison(path: Path, expected: dict) -> dict:
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{refused} ({error}).") from error
     for key in ("stream", "seed", "episodes", "items"):
-        ours, theirs = expected[key], other.get(key)
-        if key == "items" and isinstance(theirs, dict):  # a recorded stream: by content if both know it, else by path
-            ignored = "path" if "sha256" in ours and "sha256" in theirs else "sha256"
-            ours, theirs = ({k: v for k, v in items.items() if k != ignored} for items in (ours, theirs))
-        if ours != theirs:
+        if not is_same(expected[key], other.get(key)):
             found = excerpt(other.get(key))
             raise ValueError(f"compare={excerpt(str(path))}: its {key} is {found}, expected {excerpt(expected[key])}.")
     for key in CELL_SETTINGS:
         if key == "support_margin" and cell.get("support") not in HULL_RULES:
             continue
-        if expected["env"][key] != cell.get(key):
-            found = excerpt(cell.get(key))
-            raise ValueError(f"compare={excerpt(str(path))}: env.{key}={found}, expected {expected['env'][key]}.")
+        ours, theirs = expected["env"].get(key), cell.get(key)  # checkpoints of before have no reach
+        if not is_same(ours, theirs):
+            raise ValueError(f"compare={excerpt(str(path))}: env.{key}={excerpt(theirs)}, expected {ours}.")
     count = expected["episodes"]
     if not isinstance(values, list) or len(values) != count or not all(is_number(v) and 0 <= v <= 1 for v in values):
         raise ValueError(f"{refused} whose occupancy.per_episode is a list of {count} numbers between 0 and 1.")

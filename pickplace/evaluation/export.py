@@ -11,11 +11,11 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from pickplace.policies.restore import build_cell
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import trusted_config
 from pickplace.runs.errors import one_sentence
 from pickplace.runs.registry import build, find
-from pickplace.task.cell import CELL_SETTINGS, cell_from_settings
 from pickplace.task.files import read_text
 
 CARD = "card.json"
@@ -58,7 +58,7 @@ def critic_serves_any_tote(cfg: DictConfig) -> bool:
     Another one is tied to the tote of the training, and larger than the policy.
     """
     env: Any = OmegaConf.to_container(cfg.env, resolve=True)
-    cell = cell_from_settings({key: env[key] for key in CELL_SETTINGS if key in env})
+    cell = build_cell(env)
     find("model.critic", cfg.model.critic._target_)  # imports it, which the device "meta" does not allow
     with torch.device("meta"):
         return getattr(build("model.critic", cfg.model.critic, cell=cell), "any_size", False)

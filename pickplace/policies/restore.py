@@ -56,7 +56,7 @@ def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: di
         sizes = {key: size for key, size in sizes.items() if size != getattr(cell, key)}
         if not sizes:
             raise
-        restored(replace(cell, limits=None, **sizes))  # if that fails too, the sizes are not the reason
+        restored(replace(cell, reach=None, limits=None, **sizes))  # if that fails too, the sizes are not the reason
         ours = ", ".join(f"env.{key}={[*getattr(cell, key)]}" for key in sizes)
         theirs = ", ".join(f"{[*size]}" for size in sizes.values())
         raise checkpoint.CheckpointError(
@@ -114,6 +114,20 @@ class TrainedPolicy(TensorDictModuleBase):
         return PickPlaceEnv(num_envs=num_envs, observation=self.terms, device=device, **cell, **options)
 
 
+def build_cell(env: dict, **given) -> CellSpec:
+    """Return the cell of a config's group ``env``.
+
+    Args:
+        env: the settings, resolved; those of no cell are ignored.
+        **given: settings of the cell that replace them, made already.
+
+    Raises:
+        ValueError: as of :func:`~pickplace.runs.registry.build` and of the cell.
+    """
+    own = {key: env[key] for key in CELL_SETTINGS if key in env and key not in given}
+    return cell_from_settings({**build("env", own), **given})
+
+
 def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -> TrainedPolicy:
     """Return the policy of a checkpoint as a module; its ``make_env()`` makes an environment for it.
 
@@ -133,7 +147,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     state, facts = checkpoint.read(checkpoint.locate(path))
     cfg = trusted_config(facts["config"], trust)
     env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
-    cell = cell_from_settings({**{key: env[key] for key in CELL_SETTINGS if key in env}, **sizes})
+    cell = build_cell(env, **sizes)
     if not cell.has_known_offsets:  # it determines the number of grasps
         longest = int(build("items", cfg["items"]).sizes[:, :2].max())
         cell = replace(cell, longest_side=longest)

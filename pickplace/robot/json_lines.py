@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from pickplace.runs.errors import one_sentence, sentence, write_output
-from pickplace.task.files import read_file
+from pickplace.task.files import read_file, read_text
 
 if TYPE_CHECKING:
     from pickplace.robot.planner import Planner
@@ -62,6 +62,7 @@ def parser() -> argparse.ArgumentParser:
     add("--tote-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
     add("--effector-size", type=int, nargs=2, metavar=("W", "D"), help="cells; default: as trained")
     add("--rotations", type=int, metavar="R", help="quarter turns to choose from; default: as trained")
+    add("--reach", metavar="YAML", help="file such as conf/reach/annulus.yaml, the robot's reach; default: as trained")
     add(
         "--trust", action="append", metavar="MODULE", default=[],
         help="your own module whose classes the checkpoint's config may name; may be repeated",
@@ -92,6 +93,8 @@ def run(args: argparse.Namespace) -> None:
     use_threads("--threads", args.threads)
     sizes = {key: getattr(args, key) for key in ("bin_size", "tote_size", "effector_size", "rotations")}
     sizes = {key: value for key, value in sizes.items() if value is not None}
+    if args.reach is not None:
+        sizes["reach"] = read_reach(args.reach)
     candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates
     if args.checkpoint is not None:
         options = {"candidates": candidates, "device": args.device, "trust": args.trust, "planner": args.planner}
@@ -183,6 +186,26 @@ def finite_float(text: str) -> float:
 def refuse_constant(name: str):
     """Refuse NaN and Infinity, which Python's parser takes and JSON does not have."""
     raise ValueError(f"the line is not JSON: got {name[:20]}, expected a finite number.")
+
+
+def read_reach(path: str):
+    """Return the reach that a file such as those of ``conf/reach`` describes; None: the robot reaches everything.
+
+    Raises:
+        ValueError: naming the file, or the key in it.
+    """
+    from yaml import YAMLError, safe_load
+
+    from pickplace.runs.registry import build
+
+    expected = "expected a file with the key reach, such as conf/reach/annulus.yaml."
+    try:
+        content = safe_load(read_text(path, MAX_LINE))
+    except (OSError, ValueError, YAMLError) as error:
+        raise ValueError(f"--reach={path}: {str(error).splitlines()[0]}; {expected}") from error
+    if not isinstance(content, dict) or [*content] != ["reach"]:
+        raise ValueError(f"--reach={path}: {expected}")
+    return build("env", content)["reach"]
 
 
 def read_map(path: str) -> np.ndarray:

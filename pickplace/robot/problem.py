@@ -24,11 +24,12 @@ from pickplace.robot.measure import (
     whole_map,
     whole_units,
 )
-from pickplace.task.cell import MAX_SIDE, CellSpec, Limits, reference_cell
+from pickplace.task.cell import MAX_SIDE, CellSpec, Limits, effector_centre, reference_cell
 from pickplace.task.feasibility import PlacingMaps, footprint_mask, placing_maps
 from pickplace.task.grasps import carry, footprint_index, split_action
 from pickplace.task.maps import FAR
 from pickplace.task.measured import MeasuredMaps, MeasuredTote, bearing_after, failures, floor_height, measured_maps
+from pickplace.task.placing import is_within_reach
 from pickplace.task.state import EMPTY, Item, State, item_from_depth, surface_from
 from pickplace.task.transition import apply
 
@@ -98,12 +99,10 @@ class Problem:
             x_bin * cell.bin_size[1] + y_bin
         ]
         pick = Pose((x_bin, y_bin), (self._length(x), self._length(y), self._length(self.grip)), round(self.yaw, 6))
-        # The centre comes from the rectangle: the reference cell is half a cell off the centre on even sides.
-        left, front = x_tote - shape.ref_x, y_tote - shape.ref_y
         top = self._top(action)
         centre = (
-            self._length((left + shape.width / 2) * self.side),
-            self._length((front + shape.depth / 2) * self.side),
+            self._length(effector_centre(x_tote, shape.width) * self.side),
+            self._length(effector_centre(y_tote, shape.depth) * self.side),
             self._length(top * self.unit + self.release),
         )
         turn = round(90 * rotation - self.yaw, 6)
@@ -171,9 +170,7 @@ def effector_centres(cell: CellSpec, item: Item, centre: tuple[float, float], ya
     (ee_w, ee_d), (x, y, w, d, _) = cell.effector_size, (int(part) for part in item)
     number = np.arange(cell.num_picks)
     x_bin, y_bin = number // cell.bin_size[1], number % cell.bin_size[1]
-    along = np.stack([
-        x_bin - reference_cell(ee_w) + ee_w / 2 - (x + w / 2), y_bin - reference_cell(ee_d) + ee_d / 2 - (y + d / 2)
-    ], -1)  # fmt: skip
+    along = np.stack([effector_centre(x_bin, ee_w) - (x + w / 2), effector_centre(y_bin, ee_d) - (y + d / 2)], -1)
     turn = math.radians(yaw)
     axes = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
     return np.array(centre) + side * along @ axes
@@ -265,7 +262,8 @@ def read_metric(
     centres = effector_centres(free, item, (box.x, box.y), box.yaw, cell_size)
     above_walls = box.h - accuracy >= cell.bin_size[2] * unit - ROUNDING
     clear = torch.from_numpy(above_walls | _misses_walls(centres, cell, box.yaw, cell_size)).to(device)
-    limited = replace(free, limits=_limits(cell, clear, centres / cell_size, ratio, 2 * slack))
+    limits = _limits(cell, free, clear, centres / cell_size, h + slack, 2 * slack)
+    limited = replace(free, reach=None, limits=limits)
     measured = measured_maps(limited, tote, item, sides)
     # A policy sees heights as in training.
     state, seen_rim = tote.state(limited, item), max(1, round(rim / ratio))
@@ -301,32 +299,55 @@ def _misses_walls(centres: np.ndarray, cell: CellSpec, yaw: float, side: float) 
     return ((centres >= reach - ROUNDING) & (centres <= far - reach + ROUNDING)).all(1)
 
 
-def _limits(cell: CellSpec, bin_clear: Tensor, centres: np.ndarray, ratio: float, release: int) -> Limits:
+def _limits(cell: CellSpec, free: CellSpec, bin_clear: Tensor, centres: np.ndarray, grip: int, release: int) -> Limits:
     """Return the limits of the robot, with tops in millimetres, and the picks at which no wall is hit.
 
     Args:
+        cell: of the robot, with its limits, if any.
+        free: the same with heights in millimetres, for which those of a reach were computed anew.
         bin_clear: bool ``[P]``.
-        centres: of the end effector in the bin at each pick cell, in cells, ``[P, 2]``. They lie between the pick cells
-            of ``cell.limits``, all of which must be allowed.
-        ratio: millimetres of a height unit.
+        centres: of the end effector in the bin at each pick cell, in cells, ``[P, 2]``.
+        grip: height of the suction face when it grips the item, mm.
         release: height of the suction face above the item's planned top when it lets go, mm.
     """
-    device = bin_clear.device
-    if cell.limits is None:
+    device, limits, ratio = bin_clear.device, free.limits, 1.0
+    if cell.reach is None:
+        limits, ratio = cell.limits, cell.height_unit / free.height_unit
+    if limits is None:
         places = torch.zeros(cell.rotations, *cell.tote_size[:2], dtype=torch.int64, device=device)
         return Limits(bin_clear, places, places + FAR)
-    limits, (bin_w, bin_d, _) = cell.limits.on(device), cell.bin_size
-    allowed = F.pad(limits.pick_ok.view(bin_w, bin_d), (1, 1, 1, 1), value=False).cpu().numpy()
+    return Limits(
+        bin_clear & _reached_picks(cell, free, limits, ratio, centres, grip).to(device),
+        (limits.lowest_top * ratio - release).ceil().long().to(device),
+        (limits.highest_top.clamp(max=FAR) * ratio - release).floor().clamp(max=FAR).long().to(device),
+    )
+
+
+def _reached_picks(
+    cell: CellSpec, free: CellSpec, limits: Limits, ratio: float, centres: np.ndarray, grip: int
+) -> Tensor:
+    """Return at which of its centres ``[P, 2]`` in the bin the robot reaches the item, bool ``[P]``.
+
+    Args:
+        limits: of picks at whole cells; the centres lie between these, and all neighbours must be allowed.
+        ratio: millimetres of their height unit.
+        cell, free, grip: as of :func:`_limits`.
+    """
+    face = torch.tensor(grip)
+    if cell.reach is not None and (exact := cell.reach.picks(free, *torch.from_numpy(centres).unbind(1))):
+        return is_within_reach(*exact, face)
+    (bin_w, bin_d, _), reached = cell.bin_size, limits.pick_ok
+    if limits.lowest_pick is not None and limits.highest_pick is not None:
+        reached = reached & is_within_reach(limits.lowest_pick * ratio, limits.highest_pick * ratio, face)
+    allowed = F.pad(reached.view(bin_w, bin_d), (1, 1, 1, 1), value=False).cpu().numpy()
     at = [centres[:, axis] - side / 2 + reference_cell(side) for axis, side in enumerate(cell.effector_size)]
-    pick_ok = bin_clear.clone()
+    good = np.ones(len(centres), dtype=bool)
     for round_x in (np.floor, np.ceil):
         for round_y in (np.floor, np.ceil):
             x, y = (part.round(6) for part in at)
             x, y = round_x(x).clip(-1, bin_w).astype(int) + 1, round_y(y).clip(-1, bin_d).astype(int) + 1
-            pick_ok &= torch.from_numpy(allowed[x, y]).to(device)
-    lowest = (limits.lowest_top * ratio - release).ceil().long()
-    highest = (limits.highest_top.clamp(max=FAR) * ratio - release).floor().clamp(max=FAR).long()
-    return Limits(pick_ok, lowest, highest)
+            good &= allowed[x, y]
+    return torch.from_numpy(good)
 
 
 def _check_one_cuboid(bin_map: Tensor, unit_name: str) -> None:

@@ -16,6 +16,9 @@ from hydra.errors import ConfigCompositionException, HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+#: Config groups whose options set parts of the group ``env`` (``# @package env``).
+PARTS_OF_ENV = ("reach",)
+
 LONGEST_NAME = 150  # letters of the name of a run folder; file systems allow 255 bytes
 
 
@@ -85,7 +88,16 @@ def _is_choice(override: Override) -> bool:
 def _package(choice: Override | str) -> str:
     """Return the place in the config of the group that an override chooses, or of a ``group`` or ``group@package``."""
     group, _, package = choice.partition("@") if isinstance(choice, str) else (choice.key_or_group, "", choice.package)
-    return package or group.replace("/", ".")
+    return package or ("env." if group in PARTS_OF_ENV else "") + group.replace("/", ".")
+
+
+def keys_set_in_env(choice: str) -> list[str]:
+    """Return the keys of ``env`` that an option of :data:`PARTS_OF_ENV` sets, such as ``reach`` for ``reach=annulus``.
+
+    The search path is that of the running command.
+    """
+    search = [word for word in HydraConfig.get().overrides.hydra if word.startswith("hydra.searchpath")]
+    return [str(key) for key in hydra.compose(None, [*search, f"+{choice.lstrip('+')}"]).env]
 
 
 def _part_at(cfg: DictConfig, place: str) -> Any:

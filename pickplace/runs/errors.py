@@ -14,7 +14,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.task.checks import short_text
+from pickplace.task.checks import excerpt, short_text
 
 
 class JobFailed(Exception):
@@ -136,6 +136,9 @@ def unknown_key(key: str, node: DictConfig | dict, prefix: str = "") -> str:
     for parent in parents:
         child = node.get(parent) if parent in node else None
         if not isinstance(child, DictConfig):
+            if parent in node:
+                place, value = short_text(prefix + parent), "null" if child is None else excerpt(child)
+                return f"{short_text(key)}: {place} is {value}, without keys; expected an option that gives it some."
             leaf = parent
             break
         prefix, node = f"{prefix}{parent}.", child

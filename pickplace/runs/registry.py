@@ -39,6 +39,7 @@ REGISTRY: dict[str, dict[str, str]] = {
         "tote_bearing": "pickplace.task.observation.ToteBearing",
         "tote_height": "pickplace.task.observation.ToteHeight",
     },
+    "env.reach": {"annulus": "pickplace.task.reach.Annulus", "table": "pickplace.task.reach.ReachTable"},
     "items": {
         "kinds": "pickplace.task.items.Kinds",
         "uniform": "pickplace.task.items.Uniform",

@@ -1,6 +1,7 @@
 """The robot cell: every size and option of bin, tote and end effector, stated once and checked once."""
 
-from dataclasses import dataclass, field, fields
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -35,6 +36,14 @@ def reference_cell(side):
     return (side - 1) // 2
 
 
+def effector_centre(at, side):
+    """Return the end effector's centre along a side, with its reference cell at ``at``; in cells, numbers or tensors.
+
+    It comes from the rectangle: on even sides the reference cell is half a cell off.
+    """
+    return at - reference_cell(side) + side / 2
+
+
 class EffectorShape(NamedTuple):
     """The end effector as it is turned: its sides, its reference cell and the rectangles of its body, in cells."""
 
@@ -53,28 +62,58 @@ class Limits:
         pick_ok: bool ``[P]``, whether the robot reaches each pick cell.
         lowest_top, highest_top: int ``[R, W_T, D_T]``, the range in which the item's top, where the suction face is,
             must be for each rotation and place cell; in height units. An empty range forbids the place cell.
+        lowest_pick, highest_pick: int ``[P]``, the same range for each pick cell; None: any height.
     """
 
     pick_ok: Tensor
     lowest_top: Tensor
     highest_top: Tensor
+    lowest_pick: Tensor | None = None
+    highest_pick: Tensor | None = None
 
     def check(self, cell: "CellSpec") -> None:
         """Refuse tables of another shape or type than the cell needs, with a ``ValueError`` that names the table."""
-        places = (cell.rotations, *cell.tote_size[:2])
-        shapes = {"pick_ok": (cell.num_picks,), "lowest_top": places, "highest_top": places}
+        picks, places = (cell.num_picks,), (cell.rotations, *cell.tote_size[:2])
+        shapes = {"pick_ok": picks, "lowest_top": places, "highest_top": places}
+        if self.lowest_pick is not None or self.highest_pick is not None:
+            shapes |= {"lowest_pick": picks, "highest_pick": picks}
         for name, shape in shapes.items():
-            found = tuple(getattr(self, name).shape)
-            if found != shape:
-                raise ValueError(f"limits.{name}: got shape {list(found)}, expected {list(shape)}.")
-            dtype = getattr(self, name).dtype
-            if (dtype == torch.bool) != (name == "pick_ok") or dtype.is_floating_point:
+            table = getattr(self, name)
+            if table is None:
+                raise ValueError(f"limits.{name}=None: expected a table, as the other one of the two.")
+            if tuple(table.shape) != shape:
+                raise ValueError(f"limits.{name}: got shape {list(table.shape)}, expected {list(shape)}.")
+            if (table.dtype == torch.bool) != (name == "pick_ok") or table.dtype.is_floating_point:
                 expected = "bool" if name == "pick_ok" else "integers"
-                raise ValueError(f"limits.{name}: got {dtype}, expected {expected}.")
+                raise ValueError(f"limits.{name}: got {table.dtype}, expected {expected}.")
 
     def on(self, device) -> "Limits":
         """Return the tables on a device."""
-        return Limits(*(getattr(self, item.name).to(device) for item in fields(self)))
+        return replace(self, **{name: table.to(device) for name, table in vars(self).items() if table is not None})
+
+
+class LimitsOfReach(Limits):
+    """Limits that a cell computed from its reach: a cell of other sizes computes them anew."""
+
+
+class Reach(ABC):
+    """The robot's reach, a setting of the cell; two of the same reach are equal."""
+
+    @abstractmethod
+    def limits(self, cell: "CellSpec") -> Limits:
+        """Return what a robot of this reach may do in a cell; the cell's own limits are not known yet."""
+
+    def picks(self, cell: "CellSpec", x: Tensor, y: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Return the range of heights of the suction face for centres of the end effector anywhere in the bin.
+
+        Args:
+            x, y: from the bin's corner, in cells; float64 of one shape.
+
+        Returns:
+            Lowest and highest, in height units, integers of that shape, an empty range where the robot cannot go;
+            None: only what lies between pick cells that are all reached is known to be reached.
+        """
+        return None
 
 
 @dataclass(frozen=True)
@@ -107,9 +146,10 @@ class CellSpec:
             must be cells of the body.
         cup_size: ``(w, d)`` of the cup, in the middle of the body; None: ``effector_size``. None with a mask.
         min_seal: with ``pick_rule="seal"``: least share of the cup's cells that must lie on the item, above 0.
+        reach: of the robot, such as :class:`~pickplace.task.reach.Annulus`; None: it reaches everything.
         longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and unless an
             item must be contained it also sets the number of offsets.
-        limits: of the robot, see :class:`Limits`; None: there are none.
+        limits: of the robot, see :class:`Limits`; None: those of ``reach``.
 
     Raises:
         ValueError: naming the argument, the value received and what was expected.
@@ -127,6 +167,7 @@ class CellSpec:
     cup: str | Mask = "rectangle"
     cup_size: tuple[int, int] | None = None
     min_seal: float = 1.0
+    reach: Reach | None = None
     longest_side: int | None = field(default=None, metadata={"derived": True})
     limits: Limits | None = field(default=None, compare=False, metadata={"derived": True})
 
@@ -147,6 +188,18 @@ class CellSpec:
             whole_number("longest_side", self.longest_side)
         self._check_effector()
         self._check_products()
+        self._find_limits()
+
+    def _find_limits(self) -> None:
+        """Compute the limits of the reach, or check those that were given."""
+        if isinstance(self.limits, LimitsOfReach):  # of the cell from which ``dataclasses.replace`` made this one
+            object.__setattr__(self, "limits", None)
+        if self.reach is not None:
+            if not isinstance(self.reach, Reach):
+                raise ValueError(f"reach={excerpt(self.reach)}: expected a Reach, such as an Annulus, or None.")
+            if self.limits is not None:
+                raise ValueError(f"limits, reach={excerpt(self.reach)}: got both, expected one of the two.")
+            object.__setattr__(self, "limits", LimitsOfReach(**vars(self.reach.limits(self))))
         if self.limits is not None:
             self.limits.check(self)
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pickplace.task.cell import CellSpec, reference_cell
 from pickplace.task.maps import FAR
+from pickplace.task.placing import is_within_reach
 from pickplace.task.state import Item
 
 
@@ -109,7 +110,10 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor) -> Grasp:
     unreachable = None
     if cell.limits is not None:
         pick = (x.clamp(0, bin_w - 1) * bin_d + y.clamp(0, bin_d - 1)).expand_as(gripped)
-        unreachable = ~cell.limits.on(pick.device).pick_ok[pick]
+        limits = cell.limits.on(pick.device)
+        unreachable = ~limits.pick_ok[pick]
+        if limits.lowest_pick is not None and limits.highest_pick is not None:
+            unreachable |= ~is_within_reach(limits.lowest_pick[pick], limits.highest_pick[pick], item.h)
     return Grasp(gripped & ~item.is_empty, collides, unreachable, near_x, near_y, back_x, back_y)
 
 

@@ -1,7 +1,7 @@
 """The environment against the plain-Python oracle, on random sizes, effectors, items, options and limits."""
 
 from collections import Counter
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from random import Random
 
 import pytest
@@ -38,14 +38,18 @@ def draw_config(rng: Random, shaped=0.5):
         )
         pick_ok = [rng.random() < 0.95 for _ in range(bin_sides[0] * bin_sides[1])]
         rules = replace(rules, pick_ok=pick_ok, lowest_top=lowest, highest_top=highest)
+        if rng.random() < 0.5:
+            lowest, highest = (rng.choices(values, k=len(pick_ok)) for values in ((0, 0, 0, 2), (9, 9, 9, 1)))
+            rules = replace(rules, lowest_pick=lowest, highest_pick=highest)
     return rules, sorted(kinds)
 
 
 def make_env(rules, kinds, **settings):
     """Return the package's environment for the oracle's rules."""
     given = asdict(rules)
-    tables = [given.pop(key) for key in ("pick_ok", "lowest_top", "highest_top")]
-    limits = None if tables[0] is None else Limits(*map(torch.tensor, tables))
+    tables = {field.name: given.pop(field.name) for field in fields(Limits)}
+    tables = {name: torch.tensor(table) for name, table in tables.items() if table is not None}
+    limits = Limits(**tables) if tables else None
     return PickPlaceEnv(**given, limits=limits, items=Kinds(kinds), **settings)
 
 

@@ -45,7 +45,7 @@ def same(left, right):
         {"num_envs": 1, "rotations": 3, "masks": ()},
         {"pick_rule": "overlap", "support": "hull", "support_margin": 0.1, "masks": ("footprint", "action")},
         {"kinds": [(2, 3, 2), (1, 1, 1)], "bin_size": (4, 6, 2), "tote_size": (5, 7, 6), "effector_size": (2, 4)},
-        {"limits": random_limits(CellSpec(rotations=2), 0), "rotations": 2, "kinds": [(1, 1, 1)]},
+        {"limits": random_limits(CellSpec(rotations=2), 1), "rotations": 2, "kinds": [(1, 1, 1)]},
     ],
 )
 def test_specs_hold(kwargs):

@@ -109,6 +109,36 @@ def test_command_hands_every_option_on(command, tmp_path):
     assert searching["status"] == "ok" and searching["alternatives"] == [] and searching["place"]["cell"] == [0, 0]
 
 
+def test_the_reach_of_a_file(command, tmp_path):
+    """The nearest places are out of reach; without limits the plan is another one; a bad file is named."""
+    (tmp_path / "mine.yaml").write_text(
+        "# @package env\nreach: {_target_: annulus, radii: [6, 12], heights: [0, 9], bin: [-12, 0, 0], tote: [0, 0, 0]}"
+    )
+    (tmp_path / "all.yaml").write_text("reach: null\n")
+    request = json.dumps({"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist()}).encode()
+    near, far = (
+        [
+            json.loads(command(*given, "--alternatives", 0, "--reach", name, lines=request)[1])["place"]["center"]
+            for given in (["pretrained/r4"], ["--planner", "joint_dbl"])
+        ]
+        for name in ("all.yaml", "mine.yaml")
+    )
+    assert all(np.hypot(x, y) < 6 for x, y, _ in near) and all(6 <= np.hypot(x, y) <= 12 for x, y, _ in far)
+    for text, expected in (
+        ("reach: {", "--reach=bad.yaml: while parsing"),
+        ("radii: [1, 2]", "--reach=bad.yaml: expected a file with the key reach"),
+        (
+            "reach: {_target_: anulus}",
+            "env.reach._target_=anulus: there is no such class or function; did you mean 'annulus'",
+        ),
+        ("reach: far", "reach='far': expected a Reach"),
+    ):
+        (tmp_path / "bad.yaml").write_text(text)
+        code, out, err = command("--planner", "joint_dbl", "--reach", "bad.yaml", lines=request)
+        assert code == 2 and out == "" and err.startswith(f"error: {expected}") and err.count("\n") == 1, err
+    assert "nowhere.yaml" in command("--planner", "joint_dbl", "--reach", "nowhere.yaml")[2]
+
+
 def test_a_request_has_the_last_word(command):
     """Over what the command line says for all."""
     plain = {"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist()}

@@ -33,6 +33,15 @@ model: {actor: {filters: 7}}
 items: {width: [1, 1]}
 callbacks: {early_stopping: {patience: 5}}
 """
+FAR = """\
+# @package _global_
+defaults: [{override /reach: annulus}, _self_]
+env: {reach: {radii: [0, 50]}}
+"""
+OWN_CELL = """\
+defaults: [stable, _self_]
+reach: {_target_: annulus, radii: [0, 20], heights: [0, 9], bin: [-9, 0, 0], tote: [2, 0, 0]}
+"""
 SLOW = """\
 defaults: [{advance: frames}, {sample: current}, _self_]
 _target_: curriculum
@@ -74,6 +83,14 @@ BAD = [
     ("train", "items.kinds=[[1,1,9]]", ["item 1x1x9", "tote_size[2]=5"]),
     ("train", "items=recorded items.path=nowhere.csv", ["items.path='nowhere.csv'", "no such file"]),
     ("train", "items=recorded", ["items.path", "no value"]),
+    ("train", "reach=table", ["env.reach.path", "no value"]),
+    ("train", "reach=table env.reach.path=nowhere.csv", ["reach.path='nowhere.csv'", "no such file"]),
+    ("train", "env.reach.radii=[1,2]", ["env.reach.radii: env.reach is null", "an option that"]),
+    ("train", "reach=annulus env.reach.radi=[1,2]", ["env.reach.radi", "'radii'"]),
+    ("train", "reach=annulus env.reach.radii=[0,4]", ["item 1x1x1 at x=0, y=0", "reach=Annulus(radii=(0.0, 4.0)"]),
+    ("train", "reach=annulus env.reach.radii=[4,0]", ["reach.radii=[4.0, 0.0]", "least <= greatest"]),
+    ("train", "env.reach=far", ["reach='far'", "expected a Reach"]),
+    ("evaluate", "planner=joint_dbl env.reach.radii=[1,2]", ["reach={'radii': [1, 2]}", "expected a Reach"]),
     ("train", "model=fcn4d env.tote_size=[4,4,1]", ["tote_size=[4, 4, 1]", "eq. 3"]),
     ("train", "curriculum.start_height=9", ["start_height=9"]),
     (
@@ -141,6 +158,18 @@ OWN_VALUES = [
     ("experiment=mine algo=a2c", "algo.lr", 0.5),
     ("experiment=mine callbacks=early_stopping", "callbacks.early_stopping.patience", 3),
     ("experiment=mine callbacks=none", "callbacks", {}),
+    # groups that set a part of env
+    ("experiment=smoke", "env.reach", None),
+    ("experiment=far", "env.reach.radii", [0, 50]),
+    ("experiment=far reach=annulus", "env.reach.radii", [0, 50]),
+    ("experiment=far reach=annulus env.reach.radii=[1,2]", "env.reach.radii", [1, 2]),
+    ("experiment=far reach=everywhere", "env.reach", None),
+    ("experiment=far reach=table env.reach.path=a.csv", "env.reach", {"_target_": "table", "path": "a.csv"}),
+    ("env=own_cell", "env.reach.radii", [0, 20]),
+    ("env=own_cell env.reach.radii=[1,2]", "env.reach.radii", [1, 2]),
+    ("env=own_cell reach=everywhere", "env.reach", None),
+    ("env=own_cell reach=annulus", "env.reach.radii", [4.6, 9.6]),
+    ("reach=annulus env.reach.radii=[1,2] env.tote_size=[7,7,5]", "env.reach.radii", [1, 2]),
     ("experiment=mine ~curriculum.advance.window curriculum/advance=plateau", "curriculum.advance.window", None),
 ]
 
@@ -148,7 +177,8 @@ OWN_VALUES = [
 @pytest.mark.parametrize(("words", "key", "expected"), OWN_VALUES)
 def test_an_option_chosen_on_the_command_line_has_its_own_values(run, tmp_path, monkeypatch, words, key, expected):
     """In the config that the training gets, in Hydra's note on it, and in what ``--cfg job`` prints."""
-    for name, text in {"experiment/mine": MINE, "experiment/wide": WIDE, "curriculum/slow": SLOW}.items():
+    files = {"experiment/mine": MINE, "experiment/wide": WIDE, "experiment/far": FAR}
+    for name, text in {**files, "env/own_cell": OWN_CELL, "curriculum/slow": SLOW}.items():
         (tmp_path / "conf" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "conf" / f"{name}.yaml").write_text(text)
     search = f"hydra.searchpath=[file://{tmp_path}/conf,file://{CURRICULA}]"
@@ -227,7 +257,7 @@ def test_full_error_shows_the_traceback(run, monkeypatch):
 @pytest.mark.parametrize("name", ["train", "evaluate"])
 def test_help_from_any_directory(name, tmp_path):
     """Without a wait for torch."""
-    code = f"import sys; from pickplace.cli import {name}; {name}(); assert 'torch' not in sys.modules"
+    code = f"import sys; from pickplace.cli import {name}\ntry: {name}()\nfinally: assert 'torch' not in sys.modules"
     path = str(Path(pickplace.__file__).parents[1])
     result = subprocess.run(
         [sys.executable, "-c", code, "--help"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},

@@ -8,6 +8,7 @@ from commands import composed, options
 from omegaconf import OmegaConf
 
 from pickplace import PickPlaceEnv
+from pickplace.runs.composition import PARTS_OF_ENV
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.registry import REGISTRY, accepted_arguments, build, find, names_at
 from pickplace.task.items import ItemDistribution
@@ -37,7 +38,10 @@ def test_every_config_file_names_what_is_in_the_registry():
     for path in conf_dir().rglob("*.yaml"):
         content = OmegaConf.to_container(OmegaConf.load(path))
         if path.name not in ("train.yaml", "evaluate.yaml"):  # these two configure Hydra itself, see below
-            visit(".".join(path.parent.relative_to(conf_dir()).parts).removeprefix("experiment"), content, path)
+            group = ".".join(path.parent.relative_to(conf_dir()).parts)
+            in_env = path.read_text().startswith("# @package env\n")
+            assert in_env == (group in PARTS_OF_ENV)
+            visit("env" if in_env else group.removeprefix("experiment"), content, path)
     assert {(place, name) for place, names in REGISTRY.items() for name in names} == used
     text = "".join(path.read_text() for path in conf_dir().rglob("*.yaml"))
     assert len(re.findall("_target_: pickplace", text)) == 4  # Hydra's callbacks

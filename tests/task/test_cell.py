@@ -1,11 +1,14 @@
 """The robot cell: what it refuses (for more values see test_bad_settings), and the settings that configs may name."""
 
+from dataclasses import fields, replace
+
 import pytest
 import torch
 from problems import late_state
 
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.task.cell import CELL_SETTINGS, Limits, cell_from_settings, reference_cell
+from pickplace.task.reach import Annulus
 
 
 @pytest.mark.parametrize(
@@ -41,6 +44,7 @@ def test_every_setting_reaches_the_cell_of_the_environment():
         "bin_size": [4, 6, 2], "tote_size": [5, 7, 6], "effector_size": [2, 4], "rotations": 3, "pick_rule": "overlap",
         "support": "hull", "support_margin": 0.25, "height_unit": 0.5, "body": "disc", "cup": "disc",
         "cup_size": [2, 4], "min_seal": 0.5,
+        "reach": Annulus([0, 99], [0, 9], [-9, 0, 0], [2, 0, 0]),
     }  # fmt: skip
     assert tuple(given) == CELL_SETTINGS
     cell = PickPlaceEnv(num_envs=1, **given).cell
@@ -67,10 +71,11 @@ def test_the_height_unit_changes_no_rule():
     assert (plain == fine).all()
 
 
-@pytest.mark.parametrize("table", ["pick_ok", "lowest_top", "highest_top"])
+@pytest.mark.parametrize("table", [field.name for field in fields(Limits)])
 def test_a_table_of_another_shape_or_type_is_refused(table):
     places = torch.zeros(2, 6, 7, dtype=torch.int32)
     tables = {"pick_ok": torch.ones(20, dtype=torch.bool), "lowest_top": places, "highest_top": places + 5}
+    tables |= {"lowest_pick": torch.zeros(20).int(), "highest_pick": torch.ones(20).int()}
     sizes = {"bin_size": (4, 5, 1), "tote_size": (6, 7, 5), "rotations": 2}
     assert CellSpec(**sizes, limits=Limits(**tables)).limits.on("cpu").highest_top.equal(places + 5)
     kind = "bool" if table == "pick_ok" else "integers"
@@ -81,3 +86,16 @@ def test_a_table_of_another_shape_or_type_is_refused(table):
     ):
         with pytest.raises(ValueError, match=f"limits.{table}: {words}"):
             CellSpec(**sizes, limits=Limits(**{**tables, table: bad}))
+
+
+def test_limits_of_a_reach_are_those_of_the_cell_s_sizes():
+    reach = Annulus((0, 4.6), (0, 3), (-5, 0, 0), (0, 0, 0))
+    cell = CellSpec(reach=reach)
+    wider = replace(cell, tote_size=(8, 7, 5), effector_size=(2, 2), height_unit=0.5)
+    assert wider.limits.highest_top.shape == (4, 8, 7) and int(wider.limits.highest_top.max()) == 6
+    assert replace(cell, reach=None).limits is None and replace(cell, rotations=4).limits is not None
+    assert cell == CellSpec(reach=reach) != CellSpec() and hash(cell) == hash(CellSpec(reach=reach))
+    with pytest.raises(ValueError, match=r"limits, reach=Annulus\(.*\): got both, expected one of the two"):
+        CellSpec(reach=reach, limits=Limits(*list(vars(cell.limits).values())))
+    with pytest.raises(ValueError, match="reach='far': expected a Reach, such as an Annulus, or None"):
+        CellSpec(reach="far")

@@ -1,0 +1,115 @@
+"""A robot with a reach, end to end: training, checkpoint, evaluation with and without another reach, comparison."""
+
+import json
+from math import hypot
+
+import pytest
+from commands import composed
+
+from pickplace import Planner, load_policy
+from pickplace.runs import checkpoint
+from pickplace.task.reach import Annulus
+
+TINY = ["env.tote_size=[6,6,2]", "total_frames=128", "reach=annulus", "env.reach.radii=[4.6,9.7]"]
+EVALUATION = ["evaluation.episodes=2", "evaluation.latency_decisions=0", "evaluation.replay=1"]
+
+
+@pytest.fixture(scope="module")
+def trained(smoke, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reach") / "run"
+    smoke(folder, *TINY)
+    return folder
+
+
+@pytest.fixture
+def evaluation(run, tmp_path):
+    """Evaluate in this process; return ``evaluation.json`` with the folder, or the error."""
+
+    def call(*words):
+        folder = tmp_path / f"result{len(list(tmp_path.iterdir()))}"
+        code, _, err = run("evaluate", *EVALUATION, *words, f"hydra.run.dir={folder}")
+        return {**json.loads((folder / "evaluation.json").read_text()), "folder": folder} if code == 0 else err
+
+    return call
+
+
+def test_a_checkpoint_brings_its_reach(trained, evaluation):
+    """And ``load_policy`` and ``Planner.load`` know it too."""
+    _, facts = checkpoint.read(checkpoint.locate(trained))
+    assert facts["config"]["env"]["reach"]["radii"] == [4.6, 9.7]
+    policy = load_policy(trained)
+    reach = Annulus([4.6, 9.7], [0, 10], [-9, -2.5, 0], [4, -3, 0])
+    assert policy.cell.reach == policy.make_env().cell.reach == Planner.load(trained).cell.reach == reach
+    assert policy.cell.limits is not None and load_policy(trained, reach=None).cell.limits is None
+    other = Annulus([0, 99], [0, 9], [0, 0, 0], [0, 0, 0])
+    assert Planner.load(trained, reach=other, tote_size=(7, 5, 4)).cell.reach == other
+
+    plain = evaluation(f"checkpoint={trained}")
+    assert plain["env"]["reach"]["radii"] == [4.6, 9.7] and plain["failures"] == {"stuck": 2}
+    assert evaluation(f"checkpoint={trained}", "env.reach.heights=[0,1]")["occupancy"]["mean"] <= 0.5
+    swapped = evaluation(f"checkpoint={trained}", "env.reach.radii=[5,9.8]", "reach=annulus", "env.tote_size=[6,6,1]")
+    assert swapped["env"]["reach"]["radii"] == [5, 9.8] and swapped["env"]["tote_size"] == [6, 6, 1]
+    same = evaluation(f"checkpoint={trained}", f"compare={plain['folder']}/evaluation.json")
+    assert same["paired_difference"]["mean"] == 0
+    everywhere = evaluation(f"checkpoint={trained}", "reach=everywhere")
+    assert everywhere["env"]["reach"] is None
+    error = evaluation(f"checkpoint={trained}", "reach=everywhere", f"compare={plain['folder']}/evaluation.json")
+    assert "env.reach={" in error and "expected None" in error
+    assert "env.reach.radi:" in evaluation(f"checkpoint={trained}", "env.reach.radi=[1,2]")
+
+
+def test_weights_of_before_are_evaluated_with_a_reach(evaluation):
+    """Their config has no such key."""
+    assert "reach" not in checkpoint.read(checkpoint.locate("pretrained/r4"))[1]["config"]["env"]
+    words = ["checkpoint=pretrained/r4", "env.tote_size=[6,6,1]"]
+    plain = evaluation(*words)
+    assert "reach" not in plain["env"]
+    compare = f"compare={plain['folder']}/evaluation.json"
+    assert evaluation(*words, compare)["paired_difference"]["mean"] == 0
+    everywhere = evaluation(*words, "reach=everywhere", compare)
+    assert everywhere["paired_difference"]["mean"] == 0 and everywhere["env"]["reach"] is None
+    limited = evaluation(*words, "env.reach.radii=[4,7.6]", "reach=annulus")  # no item covers the last row of cells
+    assert limited["env"]["reach"]["radii"] == [4, 7.6]
+    assert max(limited["occupancy"]["per_episode"]) <= 30 / 36 < min(plain["occupancy"]["per_episode"])
+    assert "env.reach=None, expected {" in evaluation(*words, "reach=annulus", compare)
+    assert "env.reach.radii: there is no key" in evaluation(*words, "env.reach.radii=[4,9.6]")
+
+
+def test_tables_are_compared_by_content(evaluation, tmp_path):
+    rows = [f"bin,{x},{y},,," for x in range(5) for y in range(5)]
+    rows += [f"tote,{x},{y},{r},," for x in range(6) for y in range(6) for r in range(4) if x < 5]
+    for name, text in (("a", rows), ("b", rows), ("c", rows[:-1])):
+        (tmp_path / f"{name}.csv").write_text("\n".join(["where,x,y,rotation,lowest,highest", *text]))
+    words = ["planner=joint_dbl", "env.tote_size=[6,6,2]", "reach=table"]
+    first = evaluation(*words, f"env.reach.path={tmp_path}/a.csv")
+    compare = f"compare={first['folder']}/evaluation.json"
+    second = evaluation(*words, f"env.reach.path={tmp_path}/b.csv", compare)
+    assert second["paired_difference"]["mean"] == 0
+    assert "env.reach=" in evaluation(*words, f"env.reach.path={tmp_path}/c.csv", compare)
+
+
+def test_physics_carries_out_poses_in_reach(evaluation):
+    """Each pick and place, with the turned end effector's centre, from the rules to a gantry in metres."""
+    pytest.importorskip("mujoco")
+    words = ["planner=joint_dbl", "env.tote_size=[6,6,3]", "env.effector_size=[4,3]", "items=mixed", "reach=annulus"]
+    words += ["env.reach.heights=[0.5,2.5]", "env.reach.tote=[4,-3,0.5]", "env.reach.radii=[5.2,9.6]"]
+    result = evaluation(*words, "physics=execute", "evaluation.plans=true", "items.height=[1,2]")
+    assert set(result["physics"]["endings"]) == {"done"}
+    plans = [json.loads(line) for line in (result["folder"] / "plans.jsonl").read_text().splitlines()]
+    assert len(plans) > 10
+    for plan in plans:
+        picked, placed = plan["size"][2], plan["corner"][2] + plan["size"][2] + 0.025
+        for name, corner, face in (("pick", (-0.45, -0.125), picked), ("place", (0.2, -0.15), placed)):
+            x, y = (at + start for at, start in zip(plan[name], corner, strict=True))
+            assert 0.26 - 1e-6 <= hypot(x, y) <= 0.48 + 1e-6 and 0.025 - 1e-6 <= face <= 0.125 + 1e-6
+
+
+def test_a_resumed_run_keeps_its_reach(trained):
+    from pickplace.runs.resume import resumed_config
+
+    _, facts = checkpoint.read(checkpoint.locate(trained, prefer="last"))
+    assert resumed_config("run", facts, ["total_frames=256"]).env.reach == composed(*TINY).env.reach
+    with pytest.raises(
+        ValueError, match=r"env.reach=\{.*\}: the run began with .*, and a resumed run cannot change it"
+    ):
+        resumed_config("run", facts, ["env.reach.radii=[1,20]"])
