@@ -55,6 +55,8 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
                 "bin; expected a smaller bin, or fewer kinds."
             )
     description = cell.describe()
+    if cell.pick_rule != "contain":
+        description += f", pick_rule={cell.pick_rule}"
     if cell.support in HULL_RULES:
         description += f", support={cell.support}, support_margin={cell.support_margin:g}"
     if cell.reach is not None:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from pickplace.physics.outcome import Loss
-from pickplace.physics.plans import EpisodePlan, Placement
+from pickplace.physics.plans import EpisodePlan, Placement, Point
 from pickplace.physics.scene import STIFF, TIMESTEP, WALL, Scene, mujoco
 from pickplace.physics.simulation import Simulation, wait
 
@@ -61,7 +61,8 @@ class Execute(Simulation):
     def make_scene(self, plan: EpisodePlan) -> "Gantry":
         if not (plan.bin and plan.effector):
             raise ValueError(f"physics=execute: episode {plan.episode} has no bin; expected plans with all keys.")
-        self.check_width(f"episode {plan.episode}, end effector", plan.effector)
+        for _, _, *sides in plan_body(plan):
+            self.check_width(f"episode {plan.episode}, end effector", sides)
         return Gantry(self, plan)
 
     def place(self, gantry: "Gantry", placement: Placement, error: np.ndarray) -> Loss | None:
@@ -83,6 +84,11 @@ def bin_size(placement: Placement) -> tuple[float, ...]:
     """Return the sides of an item as it lies in the bin."""
     w, d, h = placement.size
     return (d, w, h) if placement.rotation % 180 else (w, d, h)
+
+
+def plan_body(plan: EpisodePlan) -> tuple[Point, ...]:
+    """Return the rectangles of a plan's end effector, x, y, w, d, from its near corner; m."""
+    return plan.body or ((0.0, 0.0, *plan.effector),)
 
 
 class Gantry(Scene):
@@ -108,16 +114,19 @@ class Gantry(Scene):
         self.rim = max(plan.tote[2], plan.bin[2])
         self.add_container(plan.tote)
         self.add_container(plan.bin, self.bin)
-        self._add_plate(plan.effector)
+        self._add_plate(plan)
         self.compile()
         self.goal = np.array((*(self.bin + np.divide(plan.bin[:2], 2)), self.rim + HEADROOM, 0.0))
         self.data.qpos[:4] = self.data.ctrl[:4] = self.goal
 
-    def _add_plate(self, size) -> None:
-        sides = (*np.subtract(size, self.gap), self.options.plate_thickness)
+    def _add_plate(self, plan: EpisodePlan) -> None:
+        """Add the end effector, a box for each rectangle of its body; each is narrower by the gap."""
         self.plate = self.spec.worldbody.add_body(name="plate", gravcomp=1.0)
-        geom = self.add_geom(self.plate, sides, (0, 0, sides[2] / 2))
-        geom.density = self.options.plate_mass / float(np.prod(sides))
+        thickness, boxes = self.options.plate_thickness, np.array(plan_body(plan))
+        sides, centres = boxes[:, 2:] - self.gap, boxes[:, :2] + boxes[:, 2:] / 2 - np.divide(plan.effector, 2)
+        for side, centre in zip(sides, centres, strict=True):
+            geom = self.add_geom(self.plate, (*side, thickness), (*centre, thickness / 2))
+            geom.density = self.options.plate_mass / float(sides.prod(1).sum() * thickness)
         for axis, name in enumerate(("x", "y", "z")):
             self.plate.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.eye(3)[axis])
         self.plate.add_joint(name="turn", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 0, 1), armature=0.01)
@@ -199,8 +208,9 @@ class Gantry(Scene):
 
     def grip(self) -> Loss | None:
         """Suck the item in the bin; return the loss if the lip does not reach it."""
-        plate, item, geoms = self.plate.id, self.boxes[-1].id, (self.plate.geoms[0].id, self.boxes[-1].geoms[0].id)
-        if mujoco.mj_geomDistance(self.model, self.data, *geoms, 0.1, None) > self.options.lip + REACH:
+        plate, item, box = self.plate.id, self.boxes[-1].id, self.boxes[-1].geoms[0].id
+        distances = [mujoco.mj_geomDistance(self.model, self.data, geom, box, 0.1, None) for geom in self._plate_geoms]
+        if min(distances) > self.options.lip + REACH:
             return Loss("dropped", len(self.boxes) - 1)
         offset = self.data.xmat[plate].reshape(3, 3).T @ (self.data.xpos[item] - self.data.xpos[plate])
         inverse, relative = np.zeros(4), np.zeros(4)
@@ -209,6 +219,10 @@ class Gantry(Scene):
         self.model.eq_data[self.weld.id, :11] = (0, 0, 0, *offset, *relative, 1.0)
         self.data.eq_active[self.weld.id] = self.holding = True
         return None
+
+    @property
+    def _plate_geoms(self) -> list[int]:
+        return [geom.id for geom in self.plate.geoms]
 
     def release(self) -> None:
         """Let go of the item."""
@@ -223,9 +237,8 @@ class Gantry(Scene):
         self.step(STEPS_PER_LOOK)
         if self.diverged:
             return Loss("diverged", number)
-        plate, item = self.plate.geoms[0].id, self.boxes[-1]
-        pairs, force, total = self.data.contact.geom, np.zeros(6), 0.0
-        for index in np.nonzero((pairs == plate).any(1))[0]:
+        item, pairs, force, total = self.boxes[-1], self.data.contact.geom, np.zeros(6), 0.0
+        for index in np.nonzero(np.isin(pairs, self._plate_geoms).any(1))[0]:
             if not self.holding or item.geoms[0].id not in pairs[index]:
                 mujoco.mj_contactForce(self.model, self.data, index, force)
                 total += abs(force[0])

@@ -10,7 +10,8 @@ A line has the keys
 which is all that ``settle`` needs, and for a robot (of these only their types are checked)
 
 * ``bin``: inner sides of the bin, ``[w, d, h]``; ``item``: near corner of the item in the bin, ``[x, y]``.
-* ``effector``: sides of the end effector as it hangs over the bin, ``[w, d]``.
+* ``effector``: sides of the end effector as it hangs over the bin, ``[w, d]``; ``body``, if it is not a rectangle:
+  rectangles that make it up, ``[[x, y, w, d], ...]``, from its near corner.
 * ``pick`` and ``place``: its centre when it sucks and when it releases, ``[x, y]``, in the frames of bin and tote.
 * ``rotation``: turn between the two, counter-clockwise seen from above; 0, 90, 180 or 270 degrees.
 """
@@ -33,6 +34,7 @@ MAX_FILE = 2**28  # greatest size of a file, bytes
 #: Keys of every line, and further ones for a robot, with the number of their values; 0: one number.
 KEYS = {"episode": 0, "tote": 3, "corner": 3, "size": 3}
 ROBOT_KEYS = {"bin": 3, "item": 2, "effector": 2, "pick": 2, "place": 2, "rotation": 0}
+MAX_BODY = 2_048  # rectangles of a body
 
 Point = tuple[float, ...]
 
@@ -68,6 +70,7 @@ class EpisodePlan:
     bin: Point = ()
     effector: Point = ()
     placements: list[Placement] = field(default_factory=list)
+    body: tuple[Point, ...] = ()  # rectangles of the end effector, x, y, w, d; none: it is one
 
 
 def to_lines(plans: Iterable[EpisodePlan]) -> str:
@@ -76,7 +79,7 @@ def to_lines(plans: Iterable[EpisodePlan]) -> str:
     for plan in plans:
         for placement in plan.placements:
             values = {**vars(plan), **vars(placement)}
-            keys = [*KEYS, *ROBOT_KEYS] if plan.bin else KEYS
+            keys = [*KEYS, *ROBOT_KEYS, *(["body"] if plan.body else [])] if plan.bin else KEYS
             lines.append(json.dumps({key: values[key] for key in keys}))
     return "".join(f"{line}\n" for line in lines)
 
@@ -93,7 +96,7 @@ def read_plans(path: str | Path) -> list[EpisodePlan]:
     for number, line in enumerate(read_text(path, MAX_FILE).splitlines(), 1):
         where = f"{path}, line {number}"
         values = _read_line(where, line)
-        sizes = {key: values.get(key, ()) for key in ("tote", "bin", "effector")}
+        sizes = {key: values.get(key, ()) for key in ("tote", "bin", "effector", "body")}
         if not plans or plans[-1].episode != values["episode"]:
             if any(plan.episode == values["episode"] for plan in plans):
                 raise ValueError(f"{where}: episode={values['episode']}: expected its lines to follow one another.")
@@ -117,12 +120,13 @@ def _read_line(where: str, line: str) -> dict:
     if not isinstance(values, dict):
         raise ValueError(f"{where}: got {type(values).__name__}, expected an object with {', '.join(KEYS)}.")
     known = {**KEYS, **ROBOT_KEYS}
-    if unknown := [key for key in values if key not in known]:
+    if unknown := [key for key in values if key not in known and key != "body"]:
         raise ValueError(f"{where}: {excerpt(unknown[0])}: there is no such key; expected {', '.join(known)}.")
-    needed = known if ROBOT_KEYS.keys() & values.keys() else KEYS
+    needed = known if (ROBOT_KEYS.keys() | {"body"}) & values.keys() else KEYS
     if missing := [key for key in needed if key not in values]:
         raise ValueError(f"{where}: {missing[0]}: missing; expected {', '.join(needed)}.")
-    for key, value in values.items():
+    for key in needed:
+        value = values[key]
         if not known[key]:
             if not is_whole(value) or value < 0 or (key == "rotation" and value not in (0, 90, 180, 270)):
                 expected = "0, 90, 180 or 270" if key == "rotation" else "a whole number >= 0"
@@ -134,7 +138,27 @@ def _read_line(where: str, line: str) -> dict:
             kind = "lengths above 0" if is_side else "coordinates"
             raise ValueError(f"{where}: {key}={excerpt(value)}: expected {known[key]} {kind}, in metres.")
         values[key] = tuple(map(float, value))
+    if "body" in values:
+        values["body"] = _read_body(where, values["body"], values["effector"])
     return values
+
+
+def _read_body(where: str, value, effector) -> tuple[Point, ...]:
+    """Return the rectangles of an end effector."""
+
+    def is_good(box) -> bool:
+        if not isinstance(box, list) or len(box) != 4 or not all(map(is_number, box)):
+            return False
+        (x, y, w, d), (wide, deep) = box, effector
+        inside = min(x, y) >= 0 and x + w <= wide + TOLERANCE and y + d <= deep + TOLERANCE
+        return inside and min(w, d) >= 1e-6
+
+    if not isinstance(value, list) or not 1 <= len(value) <= MAX_BODY or not all(map(is_good, value)):
+        raise ValueError(
+            f"{where}: body={excerpt(value)}: expected up to {MAX_BODY:,} rectangles x, y, w, d inside the effector, "
+            "in metres."
+        )
+    return tuple(tuple(map(float, box)) for box in value)
 
 
 def _fault(placement: Placement, plan: EpisodePlan) -> str:

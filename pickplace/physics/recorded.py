@@ -30,7 +30,8 @@ def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePl
         return metres(*(at + side / 2 for at, side in zip(corner, sides, strict=True)))
 
     tote = metres(*cell.tote_size[:2], recording.tote_height)
-    plan = EpisodePlan(recording.episode, tote, metres(*cell.bin_size), metres(*cell.effector_size))
+    sizes = tote, metres(*cell.bin_size), metres(*cell.effector_size)
+    plan = EpisodePlan(recording.episode, *sizes, body=body_of(cell, cell_size))
     for move in recording.moves:
         if not move.failure:
             x, y, w, d = move.footprint
@@ -41,6 +42,12 @@ def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePl
             )  # fmt: skip
             plan.placements.append(placement)
     return plan
+
+
+def body_of(cell: CellSpec, cell_size: float) -> tuple[Point, ...]:
+    """Return the rectangles of the end effector's body in metres; none if it is one rectangle."""
+    boxes = cell.effector(0).body
+    return tuple(tuple(round(part * cell_size, 9) for part in box) for box in boxes) if len(boxes) > 1 else ()
 
 
 def motion_for_replay(outcome: Outcome, cell_size: float) -> CarriedOut:

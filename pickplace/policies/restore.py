@@ -1,5 +1,6 @@
 """Policies and critics from checkpoints."""
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -24,7 +25,7 @@ from pickplace.task.feasibility import placing_maps
 from pickplace.task.observation import Term, check_terms
 from pickplace.task.state import Observation, State
 
-SIZES = ("effector_size", "bin_size", "tote_size")
+SIZES = ("effector_size", "bin_size", "tote_size", "body", "cup", "cup_size", "pick_rule", "min_seal")
 
 
 def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: dict) -> Policy:
@@ -52,15 +53,17 @@ def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: di
     try:
         return restored(cell)
     except checkpoint.CheckpointError as error:
-        sizes: dict[str, Any] = {key: tuple(trained_env[key]) for key in SIZES if key in trained_env}
-        sizes = {key: size for key, size in sizes.items() if size != getattr(cell, key)}
+        trained = build_cell(trained_env)
+        sizes: dict[str, Any] = {
+            key: getattr(trained, key) for key in SIZES if getattr(trained, key) != getattr(cell, key)
+        }
         if not sizes:
             raise
         restored(replace(cell, reach=None, limits=None, **sizes))  # if that fails too, the sizes are not the reason
-        ours = ", ".join(f"env.{key}={[*getattr(cell, key)]}" for key in sizes)
-        theirs = ", ".join(f"{[*size]}" for size in sizes.values())
+        ours = ", ".join(f"env.{key}={json.dumps(getattr(cell, key))}" for key in sizes)
+        theirs = ", ".join(map(json.dumps, sizes.values()))
         raise checkpoint.CheckpointError(
-            f"{ours}: the checkpoint was trained with {theirs}, and its policy does not serve every other size."
+            f"{ours}: the checkpoint was trained with {theirs}, and its policy does not serve every other cell."
         ) from error
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from pickplace.physics.execute import Execute, Gantry
 from pickplace.physics.outcome import Loss
 from pickplace.physics.plans import EpisodePlan
+from pickplace.physics.recorded import body_of
 from pickplace.physics.scene import mujoco
 from pickplace.physics.simulation import wait
 from pickplace.robot.camera import Camera
@@ -63,7 +64,8 @@ class SimulatedCell:
         scale = (cell_size, cell_size, cell_size * cell.height_unit)
         self.bin, self.tote = (tuple(np.multiply(size, scale)) for size in (cell.bin_size, cell.tote_size))
         effector = tuple(np.multiply(cell.effector_size, cell_size))
-        self.gantry: Gantry = self.simulation.make_scene(EpisodePlan(0, self.tote, self.bin, effector))
+        plan = EpisodePlan(0, self.tote, self.bin, effector, body=body_of(cell, cell_size))
+        self.gantry: Gantry = self.simulation.make_scene(plan)
         focal = 0.8 * IMAGE[0] * CAMERA_HEIGHT / (max(*self.bin[:2], *self.tote[:2]) + 0.1)
         self.cameras = {
             name: Camera.looking_down((sides[0] / 2, sides[1] / 2), CAMERA_HEIGHT, focal, IMAGE)

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 #: Config groups whose options set parts of the group ``env`` (``# @package env``).
-PARTS_OF_ENV = ("reach",)
+PARTS_OF_ENV = ("effector", "reach")
 
 LONGEST_NAME = 150  # letters of the name of a run folder; file systems allow 255 bytes
 

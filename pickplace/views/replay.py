@@ -38,6 +38,8 @@ def page(recordings: list[Recording], cell: CellSpec, title: str) -> str:
         "bin": [*cell.bin_size[:2], _cells(cell.bin_size[2], cell)],
         "tote": cell.tote_size[:2],
         "effector": cell.effector_size,
+        "body": cell.effector(0).body,
+        "cups": [[x, y] for x, column in enumerate(cell.cup_mask) for y, is_cup in enumerate(column) if is_cup],
         "colours": kinds,
         "episodes": [_episode(recording, cell) for recording in recordings],
     }

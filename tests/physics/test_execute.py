@@ -44,6 +44,23 @@ def test_cases_by_hand(placements, ending, during):
     assert outcome.placed == (len(placements) if during is None else during) and outcome.drift < 1e-3
 
 
+@pytest.mark.parametrize(("body", "rotation", "ending"), [
+    ((), 0, "effector_contact"),
+    (((0.05, 0.0, 0.1, 0.15),), 0, "done"),  # without the cells above the tall item
+    (((0.0, 0.0, 0.1, 0.15),), 0, "effector_contact"),
+    (((0.05, 0.0, 0.1, 0.15),), 180, "effector_contact"),
+    (((0.0, 0.0, 0.1, 0.15),), 180, "done"),
+    (((0.05, 0.0, 0.1, 0.15), (0.0, 0.0, 0.05, 0.05)), 0, "effector_contact"),  # an L
+])  # fmt: skip
+def test_only_the_body_hits_what_is_below_it(body, rotation, ending):
+    """The plate hangs 5 mm over the tall item."""
+    low = placed(*LOW, (0.02, 0))
+    if rotation == 180:  # picked on the other side, so that the plate is in the same place
+        low = replace(low, pick=(0.13, 0.15), rotation=180)
+    placements = [placed(*TALL, (0.03, 0)), low]
+    assert Execute().carry_out_one(EpisodePlan(0, (0.3, 0.3, 0.25), BIN, EFFECTOR, placements, body)).ending == ending
+
+
 @pytest.mark.parametrize(("suction", "ending"), [(2.0, "dropped"), (50.0, "done")])
 def test_a_heavy_item_needs_suction(suction, ending):
     """0.1 x 0.1 x 0.05 m of 2,000 kg/m^3 weigh 9.8 N."""
@@ -63,6 +80,10 @@ def test_plans_without_a_bin_are_refused():
 @pytest.mark.parametrize("settings", [
     {}, {"effector_size": (3, 2), "bin_size": (4, 5, 2)}, {"effector_size": (6, 5), "tote_size": (6, 6, 1)},
     {"pick_rule": "overlap", "bin_size": (5, 5, 3), "effector_size": (2, 2)},
+    {"pick_rule": "seal", "effector_size": (1, 1)},
+    {"pick_rule": "seal", "min_seal": 0.25, "cup": [[1, 0, 1], [0, 0, 0], [1, 0, 1]]},
+    {"pick_rule": "seal", "min_seal": 0.5, "body": [[1, 1, 1], [1, 0, 0]], "cup": [[1, 1, 0], [0, 0, 0]],
+     "effector_size": (2, 3)},
 ])  # fmt: skip
 def test_what_the_rules_call_feasible_is_carried_out(settings):
     """Random play with every rotation and grasp: each item comes to lie where the rules say."""

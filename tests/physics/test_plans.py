@@ -64,12 +64,27 @@ def test_a_recorded_episode_in_metres(tmp_path):
     ({"volume": 1}, "'volume': there is no such key; expected episode, tote, corner, size, bin"),
     ({"pick": [0, 0]}, "bin: missing; expected episode, tote, corner, size, bin"),
     ({**ROBOT, "rotation": 45}, "rotation=45: expected 0, 90, 180 or 270"),
+    *(
+        ({**ROBOT, "body": body}, "body=.*: expected up to 2,048 rectangles x, y, w, d inside the effector")
+        for body in ([], "L", [[0, 0, 0.1]], [[0, 0, 0.2, 0.1]], [[-0.1, 0, 0.1, 0.1]], [[0, 0, 0.1, 0]])
+    ),
+    ({"body": [[0, 0, 0.1, 0.1]]}, "bin: missing"),
 ])  # fmt: skip
 def test_a_bad_line_is_refused(change, words, tmp_path):
     path = written(tmp_path / "plans.jsonl", LINE, LINE | {"corner": [0.1, 0.1, 0]} | change)
     with pytest.raises(ValueError, match=f"plans.jsonl, line 2: {words}") as error:
         read_plans(path)
     assert str(error.value).count("\n") == 0
+
+
+def test_a_body_in_metres(tmp_path):
+    """An L of cells of 5 cm, written and read."""
+    cell = CellSpec(effector_size=(3, 2), body=[[1, 1], [1, 0], [1, 0]], cup=[[1, 0], [0, 0], [0, 0]])
+    move = Move((2, 1, 1, 1, 1), (2, 1), (0, 0), 0, (0, 0, 1, 1), 0, Failure.NONE)
+    plan = plan_of(Recording(0, 5, [move]), cell, 0.05)
+    assert plan.body == ((0.0, 0.0, 0.05, 0.1), (0.05, 0.0, 0.1, 0.05))
+    (tmp_path / "plans.jsonl").write_text(to_lines([plan]))
+    assert read_plans(tmp_path / "plans.jsonl") == [plan]
 
 
 @pytest.mark.parametrize(("text", "words"), [

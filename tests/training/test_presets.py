@@ -24,6 +24,19 @@ def test_every_preset_runs(name, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == files
 
 
+@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize("name", options("effector"))
+def test_every_effector_trains(name, masked, tmp_path):
+    kinds = ["items.kinds=[[5,4,1],[4,4,2]]", "env.bin_size=[9,9,1]", "env.tote_size=[11,10,2]"]
+    words = [f"effector={name}", f"algo.mask_infeasible={masked}", "curriculum=none", "logger=none", *TINY]
+    assert 0 <= train(composed(*words, *(kinds if name == "cup_round" else [])), tmp_path) <= 1
+
+
+@pytest.mark.parametrize("env", options("env"))
+def test_the_paper_s_effector_is_the_default(env):
+    assert composed(f"env={env}").env == composed(f"env={env}", "effector=paper").env
+
+
 @pytest.mark.parametrize(("masked", "samples"), [(True, "null"), (True, 2), (False, "null"), (False, 2)])
 @pytest.mark.parametrize("model", options("model"))
 def test_every_model_trains_with_and_without_a_mask(model, masked, samples, tmp_path):
