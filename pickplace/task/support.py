@@ -57,14 +57,19 @@ def is_share_enough(rule: str | float, share: Tensor) -> Tensor:
 def _is_in_hull(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor, margin: float) -> Tensor:
     """Return whether the item's centre lies inside the hull, further than ``margin`` from its edge."""
     side = round(len(cells) ** 0.5)
-    stable, sizes = torch.ones_like(supporting, dtype=torch.bool), (w.clamp(1, side) - 1, d.clamp(1, side) - 1)
-    for patterns, whole in hull_patterns(side, margin, supporting.device):
-        patterns, whole = patterns[:, *sizes], whole[sizes]
-        reached = torch.zeros_like(supporting, dtype=patterns.dtype)
-        for surface, pattern in zip(cells, patterns, strict=True):
-            reached |= (surface == supporting) * pattern
-        stable &= reached == whole
-    return stable
+    sizes = w.clamp(1, side) - 1, d.clamp(1, side) - 1
+    words = [(patterns[:, *sizes], whole[sizes]) for patterns, whole in hull_patterns(side, margin, supporting.device)]
+    reached = [torch.zeros_like(supporting, dtype=patterns.dtype) for patterns, _ in words]
+    for number, surface in enumerate(cells):
+        supports = surface == supporting
+        if len(words) == 1:
+            reached[0] |= supports * words[0][0][number]
+            continue
+        # With many words: all bits of a cell that supports, or none, are combined faster than numbers are multiplied.
+        supports = supports.int().neg_()
+        for bits, (patterns, _) in zip(reached, words, strict=True):
+            bits |= supports & patterns[number]
+    return torch.stack([bits == whole for bits, (_, whole) in zip(reached, words, strict=True)]).all(0)
 
 
 def bearing_cells(cells: Tensor, under: Tensor, z: Tensor) -> Tensor:
@@ -132,8 +137,8 @@ def hull_patterns(side: int, margin: float, device: torch.device) -> list[tuple[
     ends = torch.stack([2 * near[:, None] - size, 2 * near[:, None] + 2 - size])  # [2, cell, size]
     inside = near[:, None] < size
     inside = inside[:, None, :, None] & inside[None, :, None, :]  # [x, y, w, d]
-    words = []
-    for chunk in _normals(side).split(BITS):
+    words, normals = [], _normals(side)
+    for chunk in normals.split(BITS):
         furthest = _greater_products(chunk, ends)  # [normals, axis, cell, size]
         along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
         beyond = along > 2 * margin * chunk.double().norm(dim=1).view(-1, 1, 1, 1, 1)
@@ -143,6 +148,6 @@ def hull_patterns(side: int, margin: float, device: torch.device) -> list[tuple[
         flags = torch.tensor([1 << bit for bit in range(BITS)])[: len(chunk)]
         pattern = ((beyond & inside & fits[:, None, None]) * flags.view(-1, 1, 1, 1, 1)).sum(0)
         whole = (fits * flags.view(-1, 1, 1)).sum(0)
-        dtype = torch.uint8 if len(chunk) <= 8 else torch.int16 if len(chunk) <= 16 else torch.int32
+        dtype = torch.uint8 if len(normals) <= 8 else torch.int16 if len(normals) <= 16 else torch.int32
         words.append((pattern.flatten(0, 1).to(device, dtype), whole.to(device, dtype)))
     return words

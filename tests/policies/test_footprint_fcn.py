@@ -172,29 +172,34 @@ def test_the_fastest_type_of_matrix_products(able, expected, monkeypatch):
     assert matrix_dtype("float32", "cpu") == torch.float32
 
 
-@settings(max_examples=15)
+@settings(max_examples=25)
 @given(
-    seed=st.integers(0, 10**6), field=st.sampled_from([1, 3, 5]), tote=st.tuples(st.integers(1, 6), st.integers(1, 6))
+    seed=st.integers(0, 10**6),
+    field=st.sampled_from([1, 3, 5]),
+    tote=st.tuples(st.integers(1, 6), st.integers(1, 6)),
+    level=st.sampled_from([1, 1, 2]),
+    stride=st.sampled_from([1, 1, 2, 3]),
 )
-def test_the_critic_adds_up_what_each_column_will_hold(seed, field, tote):
+def test_the_critic_adds_up_what_each_column_will_hold(seed, field, tote, level, stride):
     generator = torch.Generator().manual_seed(seed)
-    critic = PooledCritic(4, field, 6, tote_clip=2, depth_range=4, item_range=3, compute_dtype="float32")
+    coarse = {"level": level, "stride": stride}
+    critic = PooledCritic(4, field, 6, tote_clip=2, depth_range=4, item_range=3, compute_dtype="float32", **coarse)
     for parameter in critic.parameters():
         parameter.requires_grad_(False).normal_(generator=generator)
     bins, totes, bearing = random_maps(seed, 2, (4, 6), tote)
     item, half = item_from_depth(bins), field // 2
     for n in range(2):
-        shift, total = max(int(totes[n].max()) - 2, 0), 0.0
+        shift, total = max(float(totes[n].max()) / level - 2, 0), 0.0
         code = torch.zeros(9)
-        for part, size in enumerate((item.w[n], item.d[n], item.h[n])):
+        for part, size in enumerate((item.w[n], item.d[n], max(item.h[n] // level, 1))):
             code[part * 3 + min(int(size), 3) - 1] = 1
-        for x, y in itertools.product(range(tote[0]), range(tote[1])):
-            room = float(totes[n, x, y]) / 5
+        for x, y in itertools.product(range(0, tote[0], stride), range(0, tote[1], stride)):
+            room = float(totes[n, x, y]) / level / 5
             out = critic.around.bias + critic.item(code) + room * critic.room
             for i, j in itertools.product(range(-half, half + 1), repeat=2):
                 if 0 <= x + i < tote[0] and 0 <= y + j < tote[1]:
-                    level = max(0, min(2 - (int(totes[n, x + i, y + j]) - shift), 3))
-                    out = out + critic.around.weight[:, level, i + half, j + half]
+                    plane = int(max(0, min(2 - (float(totes[n, x + i, y + j]) / level - shift), 3)))
+                    out = out + critic.around.weight[:, plane, i + half, j + half]
                     if not bearing[n, x + i, y + j]:
                         out = out + critic.weak[:, 0, i + half, j + half]
             share, more = critic.head(F.relu(critic.hidden(F.relu(out))))
