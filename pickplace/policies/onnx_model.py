@@ -44,7 +44,7 @@ class Scores(torch.nn.Module):
         return self.policy.unmasked_scores(dict(zip(self.keys, entries, strict=True)))
 
 
-def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tuple[int, int], float]:
+def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tuple[int, ...], float]:
     """Write the scoring network of a checkpoint as an ONNX model, if onnxruntime agrees with torch about it.
 
     Its inputs are entries of the observation, by their names; its output ``logits``, float32 ``[N, scores]``, has the
@@ -89,7 +89,7 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
         "cell": json.dumps(facts),
         "index": policy.score_index,
     })  # fmt: skip
-    differences = {}
+    differences: dict[tuple[int, ...], float] = {}
     with replaced_file(path) as new:
         model.save(new)
         session = onnxruntime.InferenceSession(new, providers=["CPUExecutionProvider"])
@@ -104,12 +104,13 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
                 expected = Scores(other.policy, keys)(*asked)
             found = session.run(None, {key: entry.numpy() for key, entry in zip(keys, asked, strict=True)})[0]
             difference = (torch.from_numpy(found) - expected).abs().max() / expected.abs().max().clamp(min=1)
-            tote = grown["tote_size"][:2]
+            tote = other.cell.tote_size[:2]
             differences[tote] = float(difference)
             if not differences[tote] <= TOLERANCE:  # nan, too
                 raise ValueError(
                     f"{path}: at a tote of {tote[0]}x{tote[1]} cells onnxruntime and torch differ by "
-                    f"{differences[tote]:.1e} of the greatest score; expected at most {TOLERANCE:g}. Nothing was written."
+                    f"{differences[tote]:.1e} of the greatest score; expected at most {TOLERANCE:g}. "
+                    "Nothing was written."
                 )
     return differences
 
@@ -119,7 +120,7 @@ def _load(checkpoint, trust: Sequence[str], **sizes) -> TrainedPolicy:
     trained = load_policy(checkpoint, trust=trust, **sizes)
     for module in trained.modules():
         if hasattr(module, "compute_dtype"):
-            module.compute_dtype = "float32"  # type: ignore[assignment]
+            module.compute_dtype = "float32"
     return trained
 
 

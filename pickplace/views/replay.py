@@ -42,15 +42,20 @@ def page(recordings: list[Recording], cell: CellSpec, title: str) -> str:
         "episodes": [_episode(recording, cell) for recording in recordings],
     }
     packed = base64.b64encode(zlib.compress(json.dumps(data, separators=(",", ":")).encode(), 9)).decode()
-    html = (ASSETS / "replay.html").read_text(encoding="utf-8")
-    parts = {"title": escape(title), "data": packed, "three": _three()}
-    return re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], html)
+    return filled("replay.html", title=escape(title), data=packed)
 
 
 @cache
-def _three() -> str:
-    """Return three.js, as it may stand inside of a script element."""
-    return (ASSETS / "three.min.js").read_text(encoding="utf-8").replace("</script", "<\\/script")
+def asset(name: str) -> str:
+    """Return a file that pages are made of."""
+    return (ASSETS / name).read_text(encoding="utf-8")
+
+
+def filled(template: str, **parts: str) -> str:
+    """Return a page: a template in which ``{{name}}`` stands for a part, or for what all pages share."""
+    shared = {"style": asset("page.css").rstrip(), "scene": asset("scene.js").rstrip()}
+    shared["three"] = asset("three.min.js").replace("</script", "<\\/script")  # it stands in a script element
+    return re.sub(r"\{\{(\w+)\}\}", lambda mark: {**shared, **parts}[mark[1]], asset(template))
 
 
 def _cells(height: int, cell: CellSpec) -> int | float:
