@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from browser import errors, wait_until
 
 from pickplace import Planner, __version__
 from pickplace.robot import serve
@@ -259,3 +260,59 @@ def test_a_missing_extra_is_one_sentence(monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
         serve.main()
     assert capsys.readouterr().err == "error: pickplace-serve: fastapi is missing; pip install 'pickplace[serve]'.\n"
+
+
+# ---------------------------------------------------------------------- in a browser
+EVIL = "<img src=x onerror='window.ran=1'><script>window.ran=1</script>"
+
+
+def test_the_page_shows_new_plans_and_runs_nothing_of_a_request(browser):
+    with served("pretrained/r4", "--history", 2) as client:
+        browser.get(f"http://127.0.0.1:{client.port}/")
+        browser.get_log("browser")  # empties it
+        wait_until(browser, "document.getElementById('state').textContent.startsWith('No plan')")
+        metres = {"items": [{"x": 0.1, "y": 0.125, "w": 0.08, "d": 0.04, "h": 0.05, "yaw": 20}], "cell_size": 0.05}
+        depth = [[0.25 - 0.05 * (x < 10 and y < 5) for y in range(30)] for x in range(30)]
+        _, _, plan = client.plan({"id": EVIL, **metres, "tote_depth": depth})
+        wait_until(browser, "live.state().shown === 1 && live.state().at === 1")
+        state = browser.execute_script("return live.state()")
+        # At rest: the item's centre, from the pose of the plan and the way it hung from the gripper; lengths in cells.
+        (px, py, _), (tx, ty, tz) = plan["pick"]["center"], plan["place"]["center"]
+        turn = complex(0, 1) ** (plan["rotation_degrees"] / 90)
+        middle = complex(tx, ty) + turn * (complex(0.1, 0.125) - complex(px, py))
+        expected = [20 * middle.real, 20 * middle.imag, 20 * (plan["drop_height"] + 0.025)]
+        for found in (state["item"][:3], state["target"]):
+            assert found == pytest.approx(expected, abs=1e-3)
+        assert state["gripper"] == pytest.approx([20 * tx, 20 * ty, 20 * tz], abs=1e-3)
+        assert browser.find_element("id", "which").text.startswith('Plan 1, id "<img src=x')
+        assert browser.find_element("id", "what").text.startswith("80 × 40 × 50 mm, turned")
+
+        client.plan({"id": EVIL, "tote_depth": [[5]]})
+        client.plan({**GRID, "tote_depth": [[0] * 6] * 6})
+        wait_until(browser, "live.state().shown === 3")
+        assert "The item fits nowhere any more" in browser.find_element("id", "ending").text
+        buttons = browser.find_elements("css selector", "#plans button")
+        assert [button.text.split()[-1] for button in buttons] == ["stuck", "refused"]  # the last two
+        buttons[1].click()
+        assert (
+            browser.find_element("id", "ending").text == "bin_depth: missing; expected a depth map as a list of rows."
+        )
+        assert browser.execute_script("return window.ran") is None and errors(browser) == []
+        hosts = browser.execute_script("return performance.getEntriesByType('resource').map(e => new URL(e.name).host)")
+        assert set(hosts) == {f"127.0.0.1:{client.port}"}
+        # Even what were written as HTML would not run.
+        browser.execute_script(
+            "const s = document.createElement('script'); s.text = 'window.ran = 1'; document.body.append(s)"
+        )
+        assert browser.execute_script("return window.ran") is None
+
+
+def test_the_page_asks_for_the_token(browser):
+    with served("pretrained/r4", token=TOKEN) as client:
+        client.plan(GRID, Authorization=f"Bearer {TOKEN}")
+        browser.get(f"http://127.0.0.1:{client.port}/")
+        wait_until(browser, "!document.getElementById('sign').hidden")
+        assert browser.execute_script("return live.state().plans") == 0
+        browser.find_element("id", "token").send_keys(TOKEN)
+        browser.find_element("css selector", "#sign button").click()
+        wait_until(browser, "live.state().plans === 1 && document.getElementById('sign').hidden")
