@@ -93,6 +93,11 @@ def test_a_plan_is_that_of_the_planner(client):
     assert status == 200 and reply["status"] == "ok" and reply["box"]["yaw"] == pytest.approx(20)
 
 
+def test_the_client_of_the_docs(client):
+    command = [sys.executable, ROOT / "docs/examples/plan_client.py", f"http://127.0.0.1:{client.port}"]
+    assert json.loads(subprocess.run(command, check=True, capture_output=True).stdout)["status"] == "ok"
+
+
 def test_health_says_what_is_served(client):
     status, _, health = client.ask("GET", "/health")
     assert status == 200 and (health["version"], health["checkpoint"]) == (__version__, "pretrained/r4")

@@ -1,4 +1,4 @@
-"""A ROS 2 node: depth images of the bin and the tote in, poses for a pick and a place out. Not tested; see README.md."""
+"""A ROS 2 node: depth images in, poses for a pick and a place out. Not tested; see README.md."""
 
 import math
 
@@ -37,10 +37,11 @@ class PickPlaceNode(Node):
         tote_size = number("tote_size", [6, 6, 5]).value  # cells
         self.planner = Planner.load(checkpoint, tote_size=tuple(tote_size))
         # [4, 4] row by row: the camera's optical frame in the frame of the bin, and of the tote. Here: 1.2 m above.
-        self.poses = {
-            place: number(f"{place}_camera_pose", [1.0, 0, 0, at, 0, -1.0, 0, at, 0, 0, -1.0, 1.2, 0, 0, 0, 1.0]).value
-            for place, at in (("bin", 0.125), ("tote", 0.15))
-        }
+        self.poses = {}
+        for place, middle in (("bin", 0.125), ("tote", 0.15)):
+            above = np.diag((1.0, -1.0, -1.0, 1.0))
+            above[:3, 3] = middle, middle, 1.2
+            self.poses[place] = number(f"{place}_camera_pose", above.ravel().tolist()).value
         self.images, self.infos = {}, {}
         for place in self.poses:
             for kind, topic, kept in ((Image, "depth", self.images), (CameraInfo, "camera_info", self.infos)):
