@@ -91,7 +91,10 @@ class Policy(TensorDictModuleBase, ABC):
         return self.logits(observation).gather(1, choices)
 
     def unmasked_scores(self, observation: Observation) -> Tensor:
-        """Return the network's score of everything that it scores, by ``map_keys`` alone, float32 ``[N, scores]``."""
+        """Return the score of everything that the policy scores, feasible or not, float32 ``[N, scores]``.
+
+        It reads the entries ``in_keys`` but for the masks, and takes bins and totes of any size.
+        """
         raise NotImplementedError(f"{type(self).__name__} has no scores for totes of any size.")
 
     @abstractmethod
