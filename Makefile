@@ -44,8 +44,9 @@ test: $(STAMP)  ## run the tests in one process a core, at most 4 (minutes; ARGS
 
 test-extras: export OMP_NUM_THREADS ?= 1
 test-extras: $(STAMP)  ## install every optional extra (a gigabyte), and run the tests that need them
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,wandb,mlflow,optuna,joblib,submitit,ray]'
-	$(BIN)/python -m pytest -q tests/runs/test_loggers.py tests/training/test_sweep.py tests/training/test_ray.py $(ARGS)
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,wandb,mlflow,optuna,joblib,submitit,ray,serve,onnx]'
+	$(BIN)/python -m pytest -q tests/runs/test_loggers.py tests/training/test_sweep.py tests/training/test_ray.py \
+	  tests/robot/test_serve.py tests/policies/test_export.py $(ARGS)
 
 test-slow: export OMP_NUM_THREADS ?= 2
 test-slow: $(STAMP)  ## run the tests marked slow (an hour)

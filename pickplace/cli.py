@@ -35,6 +35,16 @@ def physics() -> None:
     _run("pickplace.physics.command")
 
 
+def export() -> None:
+    """Entry point of ``pickplace-export``, see :mod:`pickplace.policies.export`."""
+    _run("pickplace.policies.export", "pickplace.policies.onnx_model")
+
+
+def serve() -> None:
+    """Entry point of ``pickplace-serve``, see :mod:`pickplace.robot.serve`."""
+    _run("pickplace.robot.serve", "pickplace.robot.planner")
+
+
 def _run(module: str, *needed: str, config_name: str | None = None) -> None:
     """Import a command and run it. While it is imported, and after it has ended, Ctrl-C ends the process quietly.
 

@@ -2,6 +2,7 @@
 
 import logging
 import multiprocessing
+import shutil
 import sys
 
 import pytest
@@ -59,3 +60,26 @@ def smoke_run(smoke, tmp_path_factory):
     smoke(run_dir, "evaluation_interval=512")
     assert sorted(path.name for path in (run_dir / "checkpoints").iterdir()) == ["best", "last", "previous"]
     return run_dir
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A window of a real browser, without any network but this machine."""
+    webdriver = pytest.importorskip("selenium.webdriver")
+    from selenium.webdriver.chrome.service import Service
+
+    driver, chrome = shutil.which("chromedriver"), shutil.which("chromium") or shutil.which("google-chrome")
+    if not driver or not chrome:
+        pytest.skip("needs chromium and chromedriver, such as Debian's packages chromium and chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chrome
+    for argument in (
+        "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1000,700",
+        "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+        "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+    ):  # fmt: skip
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    window = webdriver.Chrome(options=options, service=Service(driver))
+    yield window
+    window.quit()

@@ -16,7 +16,8 @@ from hydra import compose, initialize_config_dir
 import pickplace
 from pickplace import Planner
 from pickplace.physics import command as physics
-from pickplace.robot import json_lines
+from pickplace.policies import export
+from pickplace.robot import json_lines, serve
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.registry import build
 
@@ -24,6 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.glob("*.md"), *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"))])
 BLOCK = re.compile(r"^```(\w*)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+PARSERS = {"plan": json_lines.parser, "physics": physics.parser, "serve": serve.parser, "export": export.parser}
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 
@@ -85,8 +87,8 @@ def check_command(command, search, words, is_new):
 @each_page
 def test_commands_compose_and_reach_their_last_height(page, monkeypatch):
     for path, command, words in commands_of(page):
-        if command in ("plan", "physics"):
-            (json_lines if command == "plan" else physics).parser().parse_args(words)
+        if command in PARSERS:
+            PARSERS[command]().parse_args(words)
             continue
         monkeypatch.syspath_prepend(str(ROOT / path))
         search = ()

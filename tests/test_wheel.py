@@ -41,7 +41,8 @@ def test_commands_of_the_wheel_from_another_directory(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(site)
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     assert scripts == {
-        f"pickplace-{name}": f"pickplace.cli:{name}" for name in ("train", "evaluate", "plan", "physics")
+        f"pickplace-{name}": f"pickplace.cli:{name}"
+        for name in ("train", "evaluate", "plan", "physics", "serve", "export")
     }
     words = ["checkpoint=pretrained/r1", "evaluation.episodes=2", "evaluation.latency_decisions=0", "hydra.run.dir=run"]
     code = (

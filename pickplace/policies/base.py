@@ -56,6 +56,7 @@ class Policy(TensorDictModuleBase, ABC):
         excludes: what :meth:`action_log_probs` gives probability 0 by construction; None if nothing.
         ranks_footprints: whether it chooses among all footprints, by ``footprint_logits(observation, mask)``.
         needs_sizes: whether it cannot learn where :meth:`check_sizes` finds fault.
+        score_index: how an index of :meth:`unmasked_scores` is made; None if it has none for totes of any size.
     """
 
     choice_key: str
@@ -64,6 +65,7 @@ class Policy(TensorDictModuleBase, ABC):
     excludes: str | None = None
     ranks_footprints = False
     needs_sizes = False
+    score_index: str | None = None
     network: torch.nn.Module
 
     def __init__(self, cell: CellSpec, masks: tuple[str, ...] | None = None):
@@ -87,6 +89,13 @@ class Policy(TensorDictModuleBase, ABC):
             choices: int64 ``[N, M]``.
         """
         return self.logits(observation).gather(1, choices)
+
+    def unmasked_scores(self, observation: Observation) -> Tensor:
+        """Return the score of everything that the policy scores, feasible or not, float32 ``[N, scores]``.
+
+        It reads the entries ``in_keys`` but for the masks, and takes bins and totes of any size.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no scores for totes of any size.")
 
     @abstractmethod
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:

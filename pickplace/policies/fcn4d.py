@@ -26,6 +26,9 @@ class ActionPolicy(Policy):
 
     choice_key = "action"
     needs_sizes = True
+    score_index: str | None = (
+        "(((x_B * D_B + y_B) * W_T + x_T) * D_T + y_T) * R + r: pick cell, place cell, quarter turns"
+    )
     network: Conv4dPolicy
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
@@ -70,6 +73,9 @@ class ActionPolicy(Policy):
     def logits(self, observation: Observation) -> Tensor:
         return self.scores(observation, observation["action_mask"] if self.masks else None)
 
+    def unmasked_scores(self, observation: Observation) -> Tensor:
+        return self.scores(observation)
+
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
         return choice
 
@@ -94,6 +100,8 @@ class TypicalPolicy(ActionPolicy):
     Raises:
         ValueError: for a layer that memory does not hold.
     """
+
+    score_index = None  # its last layer serves one size
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
         super().__init__(cell, mask_infeasible, **network)

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from pickplace.policies.base import MASKED, Policy, pick_one
-from pickplace.policies.networks.footprint_fcn import MAP_KEYS, FootprintFcn
+from pickplace.policies.networks.footprint_fcn import MAP_KEYS, FootprintFcn, every_footprint
 from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import (
     PlacingMaps,
@@ -46,6 +46,7 @@ class FootprintPolicy(Policy):
     masks: tuple[str, ...] = ("footprint",)
     excludes: str | None = "failed picks and footprints outside the tote"
     ranks_footprints = True
+    score_index = "(parity * W_T + x) * D_T + y: minimum corner of the item in the tote; parity 1: turned by 90 degrees"
     network: FootprintFcn
 
     def __init__(self, cell: CellSpec, **network):
@@ -79,6 +80,10 @@ class FootprintPolicy(Policy):
     def logits(self, observation: Observation) -> Tensor:
         return self.footprint_logits(observation, observation[f"{self.masks[0]}_mask"])
 
+    def unmasked_scores(self, observation: Observation) -> Tensor:
+        totes = observation["tote_depth"]
+        return self.scores(observation, *every_footprint(totes, self.cell.parities)).view(totes.shape[0], -1)
+
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
         row = torch.arange(len(choices), device=choices.device).repeat_interleave(choices.shape[1])
         return self.scores(observation, row, choices.flatten()).view(choices.shape)
@@ -102,9 +107,7 @@ class FootprintPolicy(Policy):
         """
         footprint = action_footprints(self.cell, item_from_depth(observation["bin_depth"]))
         ways = count_ways(self.cell, footprint, footprint >= 0)
-        index = torch.arange(ways.numel(), device=ways.device)
-        logits = self.scores(observation, index // ways.shape[1], index % ways.shape[1]).view(ways.shape)
-        logits = torch.where(ways > 0, logits, MASKED)
+        logits = torch.where(ways > 0, self.unmasked_scores(observation), MASKED)
         share = logits.log_softmax(-1) - ways.clamp(min=1).log()
         return torch.where(footprint >= 0, share.gather(1, footprint.clamp(min=0)), MASKED)
 

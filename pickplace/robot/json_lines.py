@@ -41,11 +41,19 @@ def parser() -> argparse.ArgumentParser:
         epilog="Maps, frames of reference and errors: docs/robot.md",
     )
     add = options.add_argument
-    add("checkpoint", nargs="?", help="a run folder, a checkpoint, or pretrained/<name>")
-    add("--planner", metavar="NAME", help="what decides, such as joint_dbl or lookahead; default: the policy")
     add("--bin", metavar="NPY", help="depth map [W_B, D_B] or finer: height above the bin's floor")
     add("--tote", metavar="NPY", help="depth map [W_T, D_T] or finer: remaining height, from surface to rim")
     add("--tote-bearing", metavar="NPY", help="map [W_T, D_T]: tote_bearing of the plan before; default: all 1")
+    add("--time", action="store_true", help="print the latency of each plan on standard error")
+    add_planner_options(options)
+    return options
+
+
+def add_planner_options(options: argparse.ArgumentParser) -> None:
+    """Add what says how to plan, which :func:`load_planner` reads."""
+    add = options.add_argument
+    add("checkpoint", nargs="?", help="a run folder, a checkpoint, or pretrained/<name>")
+    add("--planner", metavar="NAME", help="what decides, such as joint_dbl or lookahead; default: the policy")
     add("--tote-height", type=float, metavar="H", help="height of the tote's rim; default: that of --tote-size")
     add("--cell-size", type=float, metavar="M", help="side of a cell in metres, if the maps are in metres")
     for key, default, what in (
@@ -69,27 +77,18 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add("--threads", type=int, metavar="N", help="CPU threads; default: as many as it may use")
     add("--device", default="cpu", help="cpu (the default) or cuda")
-    add("--time", action="store_true", help="print the latency of each plan on standard error")
-    return options
 
 
-def run(args: argparse.Namespace) -> None:
-    """Load the planner, then plan once, or once for each line of standard input.
+def load_planner(args: argparse.Namespace) -> tuple["Planner", dict]:
+    """Return the planner that a command line names, and the settings of its requests unless they say otherwise.
 
     Raises:
-        ValueError: for arguments, a checkpoint or maps that cannot be used.
+        ValueError: for arguments or a checkpoint that cannot be used.
     """
-    from pickplace.robot.planner import DepthMapError, Planner  # here, so that --help need not wait for torch
+    from pickplace.robot.planner import Planner  # here, so that --help need not wait for torch
     from pickplace.runs.machine import use_threads
     from pickplace.task.cell import CellSpec
 
-    if (args.bin is None) != (args.tote is None):
-        missing = "--bin" if args.bin is None else "--tote"
-        raise ValueError(f"{missing}: no file; expected both --bin and --tote, or neither to read JSON lines.")
-    if args.tote_bearing is not None and args.tote is None:
-        raise ValueError(f"--tote-bearing={args.tote_bearing}: expected --bin and --tote, too.")
-    if sys.stdout is None or (sys.stdin is None and args.bin is None):
-        raise ValueError("standard input or output is closed; expected requests and a place for the plans.")
     use_threads("--threads", args.threads)
     sizes = {key: getattr(args, key) for key in ("bin_size", "tote_size", "effector_size", "rotations")}
     sizes = {key: value for key, value in sizes.items() if value is not None}
@@ -107,6 +106,25 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError("checkpoint: missing; expected a checkpoint, or --planner joint_dbl or the like.")
     defaults = {key: getattr(args, key) for key in SETTINGS}
     planner.check_settings(**defaults)  # now, not in the answer to each request
+    return planner, defaults
+
+
+def run(args: argparse.Namespace) -> None:
+    """Load the planner, then plan once, or once for each line of standard input.
+
+    Raises:
+        ValueError: for arguments, a checkpoint or maps that cannot be used.
+    """
+    from pickplace.robot.measure import DepthMapError
+
+    if (args.bin is None) != (args.tote is None):
+        missing = "--bin" if args.bin is None else "--tote"
+        raise ValueError(f"{missing}: no file; expected both --bin and --tote, or neither to read JSON lines.")
+    if args.tote_bearing is not None and args.tote is None:
+        raise ValueError(f"--tote-bearing={args.tote_bearing}: expected --bin and --tote, too.")
+    if sys.stdout is None or (sys.stdin is None and args.bin is None):
+        raise ValueError("standard input or output is closed; expected requests and a place for the plans.")
+    planner, defaults = load_planner(args)
     if args.bin is not None:
         files = {"bin_depth": args.bin, "tote_depth": args.tote, "tote_bearing": args.tote_bearing}
         maps = {key: read_map(path) for key, path in files.items() if path is not None}
@@ -142,15 +160,34 @@ def plan_as_dict(planner: "Planner", print_latency: bool, **request) -> dict:
 
 def answer(planner: "Planner", line: bytes, defaults: dict, print_latency: bool = False) -> dict:
     """Return the reply to one line: a plan, or ``{"error": ...}`` in one sentence; with the request's ``id``."""
-    reply = {}
     try:
-        if len(line) > MAX_LINE:
-            raise ValueError(f"the line has more than {MAX_LINE:,} bytes; expected a shorter one.")
-        request = json.loads(line.decode(), parse_constant=refuse_constant, parse_float=finite_float)
-        if not isinstance(request, dict):
-            raise ValueError(f"got {type(request).__name__}, expected an object with bin_depth and tote_depth.")
-        if "id" in request:
-            reply["id"] = request.pop("id")
+        return answer_request(planner, parse_request(line), defaults, print_latency)
+    except ValueError as error:
+        return {"error": sentence(error)}
+
+
+def parse_request(text: bytes) -> dict:
+    """Return the object that a request's text holds, whatever its keys.
+
+    Raises:
+        ValueError: for a text that is too long, or is no object in JSON.
+    """
+    if len(text) > MAX_LINE:
+        raise ValueError(f"the request has more than {MAX_LINE:,} bytes; expected a shorter one.")
+    try:
+        request = json.loads(text.decode(), parse_constant=refuse_constant, parse_float=finite_float)
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"the request is not JSON: {error}.") from error
+    if not isinstance(request, dict):
+        raise ValueError(f"got {type(request).__name__}, expected an object with bin_depth and tote_depth.")
+    return request
+
+
+def answer_request(planner: "Planner", request: dict, defaults: dict, print_latency: bool = False) -> dict:
+    """Return the reply to a request that was parsed, as :func:`answer` does."""
+    reply = {key: request[key] for key in request if key == "id"}
+    request = {key: request[key] for key in request if key != "id"}
+    try:
         if unknown := sorted(set(request) - set(REQUEST_KEYS)):
             raise ValueError(f"{unknown[0][:40]}: there is no such key; expected any of {', '.join(REQUEST_KEYS)}.")
         for key in ("tote_depth",) if "items" in request else ("bin_depth", "tote_depth"):
@@ -159,8 +196,6 @@ def answer(planner: "Planner", line: bytes, defaults: dict, print_latency: bool 
         if "items" in request:
             request["items"] = read_boxes(request["items"])
         return {**reply, **plan_as_dict(planner, print_latency, **{**defaults, **request})}
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        return {**reply, "error": f"the line is not JSON: {error}."}
     except ValueError as error:
         return {**reply, "error": sentence(error)}
 
@@ -185,7 +220,7 @@ def finite_float(text: str) -> float:
 
 def refuse_constant(name: str):
     """Refuse NaN and Infinity, which Python's parser takes and JSON does not have."""
-    raise ValueError(f"the line is not JSON: got {name[:20]}, expected a finite number.")
+    raise ValueError(f"the request is not JSON: got {name[:20]}, expected a finite number.")
 
 
 def read_reach(path: str):

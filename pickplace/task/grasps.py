@@ -178,7 +178,9 @@ def footprint_index(tote_size: Sequence[int], parity: Tensor | int, x: Tensor, y
 def split_footprint(tote_size: Sequence[int], footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return parity, x and y of a footprint: the inverse of :func:`footprint_index`."""
     tote_w, tote_d = tote_size[:2]
-    return footprint // (tote_w * tote_d), footprint // tote_d % tote_w, footprint % tote_d
+    line = footprint // tote_d
+    parity = line // tote_w
+    return parity, line - parity * tote_w, footprint - line * tote_d  # ONNX has no % of a size that is not a constant
 
 
 def turned_size(item: Item, odd: Tensor) -> tuple[Tensor, Tensor]:

@@ -37,22 +37,31 @@ def page(recordings: list[Recording], cell: CellSpec, title: str) -> str:
         "binAt": _bin_corner(carried_out[0]) if carried_out else None,
         "bin": [*cell.bin_size[:2], _cells(cell.bin_size[2], cell)],
         "tote": cell.tote_size[:2],
-        "effector": cell.effector_size,
-        "body": cell.effector(0).body,
-        "cups": [[x, y] for x, column in enumerate(cell.cup_mask) for y, is_cup in enumerate(column) if is_cup],
+        **effector_parts(cell),
         "colours": kinds,
         "episodes": [_episode(recording, cell) for recording in recordings],
     }
     packed = base64.b64encode(zlib.compress(json.dumps(data, separators=(",", ":")).encode(), 9)).decode()
-    html = (ASSETS / "replay.html").read_text(encoding="utf-8")
-    parts = {"title": escape(title), "data": packed, "three": _three()}
-    return re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], html)
+    return filled("replay.html", title=escape(title), data=packed)
+
+
+def effector_parts(cell: CellSpec) -> dict:
+    """Return what the scene draws of the end effector: its sides, the rectangles of its body, the cells of its cup."""
+    cups = [[x, y] for x, column in enumerate(cell.cup_mask) for y, is_cup in enumerate(column) if is_cup]
+    return {"effector": cell.effector_size, "body": cell.effector(0).body, "cups": cups}
 
 
 @cache
-def _three() -> str:
-    """Return three.js, as it may stand inside of a script element."""
-    return (ASSETS / "three.min.js").read_text(encoding="utf-8").replace("</script", "<\\/script")
+def asset(name: str) -> str:
+    """Return a file that pages are made of."""
+    return (ASSETS / name).read_text(encoding="utf-8")
+
+
+def filled(template: str, **parts: str) -> str:
+    """Return a page: a template in which ``{{name}}`` stands for a part, or for what all pages share."""
+    shared = {"style": asset("page.css").rstrip(), "scene": asset("scene.js").rstrip()}
+    shared["three"] = asset("three.min.js").replace("</script", "<\\/script")  # it stands in a script element
+    return re.sub(r"\{\{(\w+)\}\}", lambda mark: {**shared, **parts}[mark[1]], asset(template))
 
 
 def _cells(height: int, cell: CellSpec) -> int | float:

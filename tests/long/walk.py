@@ -18,7 +18,10 @@ ROOT = Path(__file__).resolve().parents[2]
 BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PAGES = ("README.md", "docs/curriculum.md", "docs/robot.md", "docs/train_your_own.md", "docs/extending.md")
 RUN_PYTHON = "docs/robot.md"  # its Python writes the files that its commands read
-LEFT_OUT = ("#", "git clone", "cd ", "make install", "make reproduce", "pip install", ". ")
+LEFT_OUT = (
+    "#", "git clone", "cd ", "make install", "make reproduce", "pip install", ". ",
+    "pickplace-serve", "PICKPLACE_TOKEN=", "curl ", "pickplace-export",  # a server does not end; the rest needs extras
+)  # fmt: skip
 
 #: Settings that make a command small, by how it begins; the first one that fits.
 SMALL = {

@@ -3,14 +3,13 @@
 import base64
 import json
 import re
-import shutil
-import time
 import zlib
 from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
 import pytest
+from browser import errors, wait_until
 from untrained import untrained_planner
 
 from pickplace import CellSpec, Failure, PickPlaceEnv
@@ -117,38 +116,6 @@ def test_animation(tmp_path):
 
 
 # ---------------------------------------------------------------------- in a browser
-@pytest.fixture(scope="module")
-def browser():
-    webdriver = pytest.importorskip("selenium.webdriver")
-    from selenium.webdriver.chrome.service import Service
-
-    driver, chrome = shutil.which("chromedriver"), shutil.which("chromium") or shutil.which("google-chrome")
-    if not driver or not chrome:
-        pytest.skip("needs chromium and chromedriver, such as Debian's packages chromium and chromium-driver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = chrome
-    for argument in (
-        "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1000,700",
-        "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-        "--host-resolver-rules=MAP * ~NOTFOUND",
-    ):  # fmt: skip
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    window = webdriver.Chrome(options=options, service=Service(driver))
-    yield window
-    window.quit()
-
-
-def wait_until(browser, script, seconds=20):
-    """Wait until a script returns something true, and return it."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if value := browser.execute_script(f"return {script}"):
-            return value
-        time.sleep(0.05)
-    raise AssertionError(f"never true: {script}; console: {browser.get_log('browser')}")
-
-
 def open_page(browser, path, fragment=""):
     browser.get("about:blank")
     browser.get_log("browser")  # empties it
@@ -171,10 +138,6 @@ def written(tmp_path, recordings, cell):
     path = tmp_path / "replay.html"
     path.write_text(replay.page(recordings, cell, "title"), encoding="utf-8")
     return path
-
-
-def errors(browser):
-    return [entry for entry in browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
 
 
 def test_page_opens_steps_plays_and_changes_episodes(browser, tmp_path):

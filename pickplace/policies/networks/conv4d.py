@@ -180,12 +180,17 @@ class Conv4dPolicy(nn.Module):
         totes = self._prepare(tote_depth, self.tote_clip, TOTE_PADDING).flatten(0, -3)
         if pick is not None:
             bins = self._windows(bins, torch.arange(len(bins), device=bins.device), pick.flatten())
-        rows = bins.shape[1] - 4
-        states_at_once, rows_at_once = self._chunk_sizes(bins, totes)
-        parts = [
-            torch.cat([layers(b[:, row : row + rows_at_once + 4], t) for row in range(0, rows, rows_at_once)], dim=1)
-            for b, t in zip(bins.split(states_at_once), totes.split(states_at_once), strict=True)
-        ]
+        if torch.compiler.is_exporting():  # at once: the number of pieces depends on the sizes
+            parts = [layers(bins, totes)]
+        else:
+            rows = bins.shape[1] - 4
+            states_at_once, rows_at_once = self._chunk_sizes(bins, totes)
+            parts = [
+                torch.cat(
+                    [layers(b[:, row : row + rows_at_once + 4], t) for row in range(0, rows, rows_at_once)], dim=1
+                )
+                for b, t in zip(bins.split(states_at_once), totes.split(states_at_once), strict=True)
+            ]
         out = torch.cat(parts)
         return out.reshape(*batch, *out.shape[1:])
 
@@ -220,10 +225,10 @@ class Conv4dPolicy(nn.Module):
         from_bin = from_bin.permute(2, 0, 3, 1).contiguous()  # [W_B + 2, N, D_B + 2, filters]
         # One axis after the other: the gradient is then summed over one at a time, which is six times as fast as both.
         from_tote = from_tote[:, None].expand(-1, from_bin.shape[2], -1, -1, -1)
-        from_tote = from_tote[None].expand(len(from_bin), -1, -1, -1, -1, -1)
+        from_tote = from_tote[None].expand(from_bin.shape[0], -1, -1, -1, -1, -1)
         hidden = (from_bin[:, :, :, None, None] + from_tote).relu_()
 
-        rows, weight = len(hidden) - 2, self.second.weight.to(self._dtype)
+        rows, weight = hidden.shape[0] - 2, self.second.weight.to(self._dtype)
 
         def convolve(tap: int, bias: Tensor | None = None) -> Tensor:
             volume = hidden[tap : tap + rows].flatten(0, 1).permute(0, 4, 1, 2, 3)  # a channels-last view
@@ -231,7 +236,7 @@ class Conv4dPolicy(nn.Module):
             return F.conv3d(volume, kernel, bias)
 
         out = convolve(0, self.second.bias.to(self._dtype)).add_(convolve(1)).add_(convolve(2))
-        return out.relu_().permute(0, 2, 3, 4, 1).unflatten(0, (rows, len(bins)))
+        return out.relu_().permute(0, 2, 3, 4, 1).unflatten(0, (rows, bins.shape[0]))
 
     @property
     def _dtype(self) -> torch.dtype:

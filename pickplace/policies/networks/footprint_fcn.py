@@ -98,10 +98,9 @@ class FootprintFcn(nn.Module):
             bearing: 1 where a cell of the tote bears weight, else 0, ``[N, W_T, D_T]``.
             parities: 1, or 2 to turn the footprints too.
         """
-        count = parities * tote_depth[0].numel()
-        index = torch.arange(len(tote_depth) * count, device=tote_depth.device)
-        out = self.at(bin_depth, tote_depth, bearing, index // count, index % count)
-        return out.view(len(tote_depth), parities, *tote_depth.shape[1:], -1)
+        batch, wide, long = tote_depth.shape
+        out = self.at(bin_depth, tote_depth, bearing, *every_footprint(tote_depth, parities))
+        return out.view(batch, parities, wide, long, -1)
 
     def at(self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor) -> Tensor:
         """Return the scores of some footprints only, float32 ``[M, out_channels]``.
@@ -112,10 +111,10 @@ class FootprintFcn(nn.Module):
             footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
         """
         at_once = CHUNK_BYTES // (4 * self.patch.in_features)
-        if len(row) > at_once and not torch.is_grad_enabled():  # of large totes: a part at a time, to save memory
+        if not torch.is_grad_enabled() and len(row) > at_once:  # of large totes: a part at a time, to save memory
             parts = zip(row.split(at_once), footprint.split(at_once), strict=True)
             return torch.cat([self.at(bin_depth, tote_depth, bearing, *part) for part in parts])
-        dtype, count = matrix_dtype(self.compute_dtype, tote_depth.device.type), len(row)
+        dtype, count = matrix_dtype(self.compute_dtype, tote_depth.device.type), row.shape[0]
         lower = dtype != torch.float32
         if lower:
             padding = next((-count % step for beyond, step in PADDED_ROWS if count > beyond), 0)
@@ -144,7 +143,8 @@ class FootprintFcn(nn.Module):
         tap = torch.arange(side, device=row.device)
         steps = torch.stack([tap[:, None] * stride + tap, tap[:, None] + tap * stride]).flatten(1)
         # Depths as small whole numbers: comparing a row of them is what takes the time.
-        depth = clip_depth(tote_depth, 8_000, floor=-900).to(torch.int16)
+        small = torch.int32 if torch.compiler.is_exporting() else torch.int16  # onnxruntime lacks int16
+        depth = clip_depth(tote_depth, 8_000, floor=-900).to(small)
         deepest = depth.amax((1, 2)).clamp(min=self.tote_clip)[row]
         depth = F.pad(depth, (margin,) * 4, value=OUTSIDE)
         corner = (row * (wide + 2 * margin) + x) * stride + y
@@ -153,12 +153,12 @@ class FootprintFcn(nn.Module):
         weak = F.pad(1 - bearing, (margin,) * 4).flatten()[cells].to(dtype)
         under = self._under(bin_depth.shape[1:], row.device)[item.w[row], item.d[row]]
         rest = torch.where(under, seen, FAR_DOWN).amin(1)  # depth of what the item rests on
-        headroom = rest - item.h[row].to(torch.int16)  # above its top
+        headroom = rest - item.h[row].to(small)  # above its top
         around = (headroom[:, None] - seen).clamp_(-reach, reach).add_(reach)
         hole = (seen - rest[:, None]).clamp_(0, reach).add_(2 * reach + 1)
         level = torch.where(under, hole, around).masked_fill_(seen == OUTSIDE, self.planes)
 
-        sizes = [(size - 1).clamp(0, self.item_range - 1)[row].to(torch.int16) for size in (item.w, item.d, item.h)]
+        sizes = [(size - 1).clamp(0, self.item_range - 1)[row].to(small) for size in (item.w, item.d, item.h)]
         codes = [
             *sizes,
             (headroom + 1).clamp(0, self.headroom_bins - 1),
@@ -177,6 +177,13 @@ class FootprintFcn(nn.Module):
             begin = reference_cell(side) - reference_cell(size)
             maps.append((tap >= begin) & (tap < begin + size))
         return (maps[0][:, None, :, None] & maps[1][None, :, None]).flatten(2)
+
+
+def every_footprint(tote_depth: Tensor, parities: int) -> tuple[Tensor, Tensor]:
+    """Return row and index of every footprint of totes ``[N, W_T, D_T]``, int64 ``[N * parities * W_T * D_T]`` each."""
+    batch, wide, long = tote_depth.shape  # not len(), of which torch.export would make a constant
+    row, footprint = (torch.arange(size, device=tote_depth.device) for size in (batch, parities * wide * long))
+    return row[:, None].expand(batch, footprint.shape[0]).flatten(), footprint.expand(batch, -1).flatten()
 
 
 def matrix_dtype(name: str, device: str) -> torch.dtype:

@@ -1,0 +1,48 @@
+"""The ``pickplace-export`` command: the scoring network of a checkpoint as an ONNX file."""
+
+import argparse
+
+from pickplace.runs.errors import one_sentence, write_output
+
+
+def main() -> None:
+    """Entry point of ``pickplace-export``."""
+    with one_sentence():
+        run(parser().parse_args())
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    options = argparse.ArgumentParser(
+        prog="pickplace-export",
+        description="Export the scoring network of a checkpoint to ONNX, for batches, bins and totes of any size, and "
+        "check it with onnxruntime at three tote sizes that the export has not seen.",
+        epilog="Inputs, outputs and metadata of the file: docs/robot.md",
+    )
+    add = options.add_argument
+    add("checkpoint", help="a run folder, a checkpoint, or pretrained/<name>")
+    add("file", help="the ONNX file to write")
+    add("--rotations", type=int, metavar="R", help="quarter turns to choose from; default: as trained")
+    add(
+        "--trust", action="append", metavar="MODULE", default=[],
+        help="your own module whose classes the checkpoint's config may name; may be repeated",
+    )  # fmt: skip
+    return options
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Export as the command line says, and print what was checked."""
+    from pickplace.policies.onnx_model import export_onnx  # not before help is answered
+
+    sizes = {} if arguments.rotations is None else {"rotations": arguments.rotations}
+    differences = export_onnx(arguments.checkpoint, arguments.file, arguments.trust, **sizes)
+    totes = ", ".join(f"{wide}x{deep}" for wide, deep in differences)
+    greatest = max(differences.values())
+    write_output(
+        f"{arguments.file}: onnxruntime agrees with torch at totes of {totes} cells; greatest difference "
+        f"{greatest:.1e} of the greatest score.\n"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,157 @@
+"""Scoring networks as ONNX models: export, and the check by onnxruntime."""
+
+import json
+import logging
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.export import Dim
+
+import pickplace
+from pickplace.policies.base import Policy
+from pickplace.policies.restore import TrainedPolicy, load_policy
+from pickplace.task.cell import CELL_SETTINGS
+from pickplace.task.checks import short_text
+from pickplace.task.files import replaced_file
+
+TOLERANCE = 1e-5  # greatest difference between onnxruntime and torch, as a share of the greatest score
+#: Cells by which the totes, and the bins, of the check are larger than those of the training.
+CHECKS = (((1, 4), (0, 0)), ((3, 0), (0, 0)), ((7, 5), (1, 2)))
+ENVS, STEPS = 3, 8  # each check has ENVS * (STEPS + 1) problems at most
+
+#: Sizes that the model takes as they come; those of terms of your own follow from what is done with them.
+N, BIN, TOTE = Dim("N"), (Dim("W_B"), Dim("D_B")), (Dim("W_T"), Dim("D_T"))
+SHAPES = {"bin_depth": (N, *BIN), "tote_depth": (N, *TOTE), "tote_bearing": (N, *TOTE), "tote_height": (N, None)}
+
+
+class Scores(torch.nn.Module):
+    """:meth:`Policy.unmasked_scores` as a module: one argument for each entry of the observation.
+
+    Args:
+        policy: has a ``score_index``.
+        keys: the entries that it reads, in order.
+    """
+
+    def __init__(self, policy: Policy, keys: Sequence[str]):
+        super().__init__()
+        self.policy, self.keys = policy, keys
+
+    def forward(self, *entries: Tensor) -> Tensor:
+        """Return the scores, float32 ``[N, scores]``."""
+        return self.policy.unmasked_scores(dict(zip(self.keys, entries, strict=True)))
+
+
+def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tuple[int, ...], float]:
+    """Write the scoring network of a checkpoint as an ONNX model, if onnxruntime agrees with torch about it.
+
+    Its inputs are entries of the observation, by their names; its output ``logits``, float32 ``[N, scores]``, has the
+    unmasked score of every footprint, or of every flat action. The metadata says how an index is made. Matrix products
+    are those of float32.
+
+    Args:
+        checkpoint, trust, **sizes: see :func:`~pickplace.policies.restore.load_policy`, as for errors.
+        path: the file to write; an old one is replaced when the check has passed.
+
+    Returns:
+        For each tote ``(W_T, D_T)`` of the check the greatest difference, as a share of the greatest score.
+
+    Raises:
+        ValueError: for a policy that scores one size only, a missing extra, or a difference above :data:`TOLERANCE`.
+        OSError: if the file cannot be written.
+    """
+    try:
+        import onnx  # noqa: F401
+        import onnxruntime
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise ValueError(f"pickplace-export: {error.name} is missing; pip install 'pickplace[onnx]'.") from error
+    path = Path(path)
+    if path.is_dir() or not path.parent.is_dir():
+        raise ValueError(f"{path}: expected a file in a folder that exists.")
+    trained = _load(checkpoint, trust, **sizes)
+    policy, cell = trained.policy, trained.cell
+    if policy.score_index is None:
+        raise ValueError(
+            f"{short_text(checkpoint)}: {type(policy).__name__} has no scores for totes of any size; expected "
+            "model=fcn_grasp that was trained with a mask, or model=fcn4d."
+        )
+    keys = _inputs(policy)
+    seen = _observations(trained, keys, 1)
+    facts = {key: getattr(cell, key) for key in CELL_SETTINGS}
+    model = _convert(Scores(policy, keys).eval(), keys, seen)
+    model.model.metadata_props.update({
+        "pickplace": pickplace.__version__,
+        "checkpoint": str(checkpoint),
+        "policy": type(policy).__name__,
+        "cell": json.dumps(facts),
+        "index": policy.score_index,
+    })  # fmt: skip
+    differences: dict[tuple[int, ...], float] = {}
+    with replaced_file(path) as new:
+        model.save(new)
+        session = onnxruntime.InferenceSession(new, providers=["CPUExecutionProvider"])
+        for more_tote, more_bin in CHECKS:
+            grown = {
+                key: (*(side + more for side, more in zip(size, step, strict=False)), size[2])
+                for key, size, step in (("tote_size", cell.tote_size, more_tote), ("bin_size", cell.bin_size, more_bin))
+            }
+            other = _load(checkpoint, trust, **{**sizes, **grown})
+            asked = _observations(other, keys, STEPS)
+            with torch.no_grad():
+                expected = Scores(other.policy, keys)(*asked)
+            found = session.run(None, {key: entry.numpy() for key, entry in zip(keys, asked, strict=True)})[0]
+            difference = (torch.from_numpy(found) - expected).abs().max() / expected.abs().max().clamp(min=1)
+            tote = other.cell.tote_size[:2]
+            differences[tote] = float(difference)
+            if not differences[tote] <= TOLERANCE:  # nan, too
+                raise ValueError(
+                    f"{path}: at a tote of {tote[0]}x{tote[1]} cells onnxruntime and torch differ by "
+                    f"{differences[tote]:.1e} of the greatest score; expected at most {TOLERANCE:g}. "
+                    "Nothing was written."
+                )
+    return differences
+
+
+def _load(checkpoint, trust: Sequence[str], **sizes) -> TrainedPolicy:
+    """Return a policy that computes in float32."""
+    trained = load_policy(checkpoint, trust=trust, **sizes)
+    for module in trained.modules():
+        if hasattr(module, "compute_dtype"):
+            module.compute_dtype = "float32"
+    return trained
+
+
+def _inputs(policy: Policy) -> list[str]:
+    """Return the entries of the observation that the scores are made of."""
+    masks = {f"{mask}_mask" for mask in policy.masks}
+    return [key for key in policy.in_keys if key not in masks]
+
+
+def _observations(trained: TrainedPolicy, keys: Sequence[str], steps: int) -> list[Tensor]:
+    """Return entries of what the policy sees in its first steps in some episodes, ``[N, ...]`` each."""
+    env = trained.make_env(num_envs=ENVS, stream="validation")
+    seen = env.rollout(steps, trained, break_when_any_done=False).reshape(-1)
+    return [seen[key].contiguous() for key in keys]
+
+
+def _convert(scores: Scores, keys: Sequence[str], seen: list[Tensor]):
+    """Return the ``torch.onnx.ONNXProgram`` of scores."""
+    shapes = tuple(
+        dict(enumerate(SHAPES.get(key, (N, *[Dim.AUTO] * (entry.dim() - 1)))))
+        for key, entry in zip(keys, seen, strict=True)
+    )
+    logger = logging.getLogger("torch.onnx")
+    before = logger.level
+    try:
+        logger.setLevel(logging.ERROR)  # it tells of operators of packages that are not used
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return torch.onnx.export(
+                scores, tuple(seen), input_names=list(keys), output_names=["logits"],
+                dynamic_shapes=(shapes,), dynamo=True, verbose=False,
+            )  # fmt: skip
+    finally:
+        logger.setLevel(before)

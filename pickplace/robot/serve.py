@@ -1,0 +1,144 @@
+"""The ``pickplace-serve`` command: a planner behind HTTP, with a live page of the last plans."""
+
+import argparse
+import ipaddress
+import os
+import socket
+
+from pickplace.robot.json_lines import add_planner_options, load_planner
+from pickplace.runs.errors import one_sentence, write_output
+from pickplace.task.checks import excerpt, number, short_text, whole_number
+
+TOKEN = "PICKPLACE_TOKEN"  # the environment variable; a command line can be read by every user of the machine
+LEAST_TOKEN = 16  # letters
+CONNECTIONS = 32  # at a time; each may hold one request in memory
+
+
+def main() -> None:
+    """Entry point of ``pickplace-serve``."""
+    with one_sentence():
+        run(parser().parse_args())
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    options = argparse.ArgumentParser(
+        prog="pickplace-serve",
+        description="Answer requests over HTTP: POST /plan takes what pickplace-plan reads as a line, and / shows the "
+        "last plans in 3D. Without a token it serves this machine only.",
+        epilog=f"The environment variable {TOKEN} holds the token. Requests, errors and limits: docs/robot.md",
+    )
+    add_planner_options(options)
+    add = options.add_argument
+    add("--host", default="127.0.0.1", help="address to listen at (default %(default)s); others need a token")
+    add("--port", type=int, default=8000, help="port to listen at, or 0 for a free one (default %(default)s)")
+    add(
+        "--allow-host", action="append", metavar="NAME", default=[],
+        help="a further name by which clients call this machine; may be repeated",
+    )  # fmt: skip
+    add(
+        "--rate", type=float, metavar="N", default=600, help="most plans a minute, of all clients (default %(default)s)"
+    )
+    add("--history", type=int, metavar="N", default=20, help="plans that the page shows (default %(default)s)")
+    return options
+
+
+def run(args: argparse.Namespace) -> None:
+    """Load the planner and serve it until Ctrl-C.
+
+    Raises:
+        ValueError: for arguments, a token or a checkpoint that cannot be used, or a missing extra.
+    """
+    token = checked_token(args.host)
+    whole_number("--port", args.port, 0, 65_535)
+    number("--rate", args.rate, 1, 1e6)
+    whole_number("--history", args.history, 1, 1000)
+    try:
+        import uvicorn
+
+        from pickplace.robot.service import make_app
+    except ImportError as error:
+        if (error.name or "").startswith("pickplace"):
+            raise
+        raise ValueError(f"pickplace-serve: {error.name} is missing; pip install 'pickplace[serve]'.") from error
+
+    planner, defaults = load_planner(args)
+    name = args.planner or "policy"
+    app = make_app(
+        planner,
+        defaults,
+        name,
+        args.checkpoint,
+        token,
+        args.rate,
+        args.history,
+        allowed_hosts(args.host, args.allow_host),
+    )
+    listener = listen(args.host, args.port)
+    host = f"[{args.host}]" if ":" in args.host else args.host
+    write_output(f"Listening at http://{host}:{listener.getsockname()[1]}; Ctrl-C ends it.\n")
+    config = uvicorn.Config(
+        app, log_level="warning", access_log=False, server_header=False, limit_concurrency=CONNECTIONS,
+        timeout_graceful_shutdown=3,
+    )  # fmt: skip
+    uvicorn.Server(config).run(sockets=[listener])
+
+
+def is_local(host: str) -> bool:
+    """Return whether only this machine can reach an address."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def checked_token(host: str) -> str | None:
+    """Return the token that clients must send, None if this machine alone is served and there is none.
+
+    Raises:
+        ValueError: for another host without a token, or a token that is too short or no ASCII.
+    """
+    token = os.environ.get(TOKEN)
+    if token is None:
+        if not is_local(host):
+            raise ValueError(
+                f"--host={short_text(host)}: other machines can reach it; expected a token in the environment variable "
+                f"{TOKEN}, or --host 127.0.0.1."
+            )
+        return None
+    if len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
+        raise ValueError(
+            f"{TOKEN}: got {len(token)} letters; expected at least {LEAST_TOKEN}, of ASCII without spaces."
+        )
+    return token
+
+
+def allowed_hosts(host: str, more: list[str]) -> list[str]:
+    """Return the names by which clients may call the service.
+
+    A page of a stranger that has its name lead to this machine (DNS rebinding) calls it by another. Where the service
+    listens at all addresses and no name is given, any will do: the token, which the page lacks, is asked for anyway.
+    """
+    if host in ("0.0.0.0", "::") and not more:
+        return ["*"]
+    return ["localhost", "127.0.0.1", "[::1]", f"[{host}]" if ":" in host else host, *more]
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Return a socket that listens.
+
+    Raises:
+        ValueError: if the address is taken, or is none of this machine.
+    """
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        return socket.create_server((host, port), family=family)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ValueError(
+            f"--host={excerpt(host)} --port={port}: {reason}; expected an address of this machine and a free port."
+        ) from error
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,262 @@
+"""The HTTP service around a planner: ``/plan``, ``/health``, and a page that shows the last plans."""
+
+import asyncio
+import hmac
+import json
+import math
+import time
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
+
+from fastapi import Depends, FastAPI, Request
+from fastapi.exceptions import HTTPException, RequestValidationError
+from fastapi.responses import HTMLResponse, JSONResponse, Response
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+
+import pickplace
+from pickplace.robot.json_lines import MAX_LINE, answer_request, parse_request
+from pickplace.robot.measure import Box
+from pickplace.robot.planner import Plan, Planner
+from pickplace.runs.errors import sentence
+from pickplace.task.cell import CELL_SETTINGS
+from pickplace.views import live
+
+MAX_WAITING = 16  # plans that wait for their turn
+BODY_SECONDS = 30  # time that a client has to send its request
+
+Map = list[list[float]]
+EMPTY = [[5] * 6] * 6
+GRID = {"bin_depth": [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0] * 5, [0] * 5], "tote_depth": EMPTY}
+METRES = {
+    "items": [{"x": 0.1, "y": 0.12, "w": 0.09, "d": 0.04, "h": 0.05, "yaw": 20}],
+    "tote_depth": [[0.25] * 6] * 6,
+    "cell_size": 0.05,
+}
+
+
+class PlanRequest(BaseModel):
+    """One item and one tote, as a line of ``pickplace-plan``; without ``cell_size`` in whole cells, else in metres."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [GRID, METRES]})
+
+    id: object = Field(None, description="comes back as it is")
+    bin_depth: Map | None = Field(None, description="height above the bin's floor, [W_B, D_B] or a multiple of it")
+    items: list[Box] | None = Field(None, description="instead of bin_depth: one measured item, in metres")
+    tote_depth: Map = Field(description="height left up to the rim, [W_T, D_T] or a multiple of it")
+    tote_bearing: list[list[int]] | None = Field(None, description="tote_bearing of the plan before")
+    tote_height: float | None = Field(None, description="height of the rim above the tote's floor")
+    cell_size: float | None = Field(None, description="side of a cell in metres, if the maps are in metres")
+    accuracy: float = Field(0.003, description="greatest error of a measured height, in metres")
+    clearance: float = Field(0.005, description="least distance from what stands beside the item, in metres")
+    alternatives: int = Field(10, description="number of most probable choices reported")
+
+
+class Refusal(BaseModel):
+    """Why a request has no plan, in one sentence."""
+
+    error: str
+    id: object = None
+
+
+class Health(BaseModel):
+    """What is served."""
+
+    status: str
+    version: str
+    planner: str
+    checkpoint: str | None
+    cell: dict
+
+
+class Rate:
+    """A budget of plans, which fills up evenly.
+
+    Args:
+        per_minute: plans a minute, and as many at once.
+    """
+
+    def __init__(self, per_minute: float):
+        self.per_minute = self.left = per_minute
+        self.at = time.monotonic()
+
+    def take(self) -> float:
+        """Take one plan and return 0, or the seconds after which there is one."""
+        now = time.monotonic()
+        self.left = min(self.per_minute, self.left + (now - self.at) * self.per_minute / 60)
+        self.at = now
+        if self.left < 1:
+            return (1 - self.left) * 60 / self.per_minute
+        self.left -= 1
+        return 0.0
+
+
+class Service:
+    """The planner, one request at a time in a thread of its own, and the last answers.
+
+    Args:
+        planner, defaults: as :func:`pickplace.robot.json_lines.load_planner` returns them.
+        history: how many answers are kept.
+    """
+
+    def __init__(self, planner: Planner, defaults: dict, history: int):
+        self.planner, self.defaults = planner, defaults
+        self.worker = ThreadPoolExecutor(1, "planner")
+        self.waiting = self.count = 0
+        self.history: deque[dict] = deque(maxlen=history)
+
+    async def answer(self, body: bytes) -> tuple[int, str]:
+        """Return the status and the JSON text of the answer to a request."""
+        self.waiting += 1
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self.worker, self._answer, body)
+        finally:
+            self.waiting -= 1
+
+    def _answer(self, body: bytes) -> tuple[int, str]:
+        start, request = time.perf_counter(), {}
+        try:
+            request = parse_request(body)
+            reply = answer_request(self.planner, request, self.defaults)
+            status = 422 if "error" in reply else 200
+        except ValueError as error:
+            status, reply = 400, {"error": sentence(error)}
+        spent = time.perf_counter() - start
+        number = self.count + 1
+        self.history.append(live.entry(self.planner.cell, number, {**self.defaults, **request}, reply, spent))
+        self.count = number  # now: who knows of a number finds its answer
+        return status, json.dumps(reply)
+
+
+async def read_body(request: Request) -> bytes:
+    """Return the body of a request.
+
+    Raises:
+        HTTPException: 413 for more than :data:`MAX_LINE` bytes, 408 for a client that is too slow.
+    """
+    body = bytearray()
+    try:
+        async with asyncio.timeout(BODY_SECONDS):
+            async for chunk in request.stream():
+                body += chunk
+                if len(body) > MAX_LINE:
+                    raise HTTPException(413, f"the body has more than {MAX_LINE:,} bytes; expected a shorter one.")
+    except TimeoutError as error:
+        raise HTTPException(408, f"the body took more than {BODY_SECONDS} s; expected a faster one.") from error
+    return bytes(body)
+
+
+def make_app(
+    planner: Planner,
+    defaults: dict,
+    name: str = "policy",
+    checkpoint: str | None = None,
+    token: str | None = None,
+    rate: float = 600,
+    history: int = 20,
+    hosts: Sequence[str] = ("localhost", "127.0.0.1", "[::1]"),
+) -> FastAPI:
+    """Return the service as an ASGI application.
+
+    Args:
+        planner, defaults: as :func:`pickplace.robot.json_lines.load_planner` returns them.
+        name, checkpoint: what decides, for ``/health``.
+        token: what clients must send as ``Authorization: Bearer <token>``; None: nothing.
+        rate: most plans a minute.
+        history: answers that the page shows.
+        hosts: names by which clients may call it, ``"*"``: any.
+    """
+    service, budget = Service(planner, defaults, history), Rate(rate)
+    health = Health(
+        status="ok", version=pickplace.__version__, planner=name, checkpoint=checkpoint,
+        cell={key: getattr(planner.cell, key) for key in CELL_SETTINGS},
+    )  # fmt: skip
+    page = live.page(planner.cell)
+    page_headers = {
+        "Content-Security-Policy": live.content_policy(page), "X-Content-Type-Options": "nosniff",
+        "Referrer-Policy": "no-referrer", "Cache-Control": "no-store",
+    }  # fmt: skip
+
+    @asynccontextmanager
+    async def lifespan(_):
+        yield
+        service.worker.shutdown(wait=False, cancel_futures=True)
+
+    app = FastAPI(
+        title="pickplace", version=pickplace.__version__, lifespan=lifespan, docs_url=None, redoc_url=None,
+        description="Where a suction robot picks an item in a bin, and where and how it places it in a tote.",
+    )  # fmt: skip
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=list(hosts), www_redirect=False)
+
+    @app.exception_handler(StarletteHTTPException)
+    async def refuse(_, error):
+        return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+
+    @app.exception_handler(RequestValidationError)
+    async def refuse_parameters(_, error):
+        where = ".".join(map(str, error.errors()[0]["loc"]))
+        return JSONResponse({"error": f"{where}: {error.errors()[0]['msg']}."}, 422)
+
+    def authorize(sent: HTTPAuthorizationCredentials | None = Depends(HTTPBearer(auto_error=False))) -> None:  # noqa: B008
+        given = "" if sent is None else sent.credentials
+        if token is not None and not hmac.compare_digest(given.encode(), token.encode()):
+            headers = {"WWW-Authenticate": "Bearer"}
+            raise HTTPException(401, "the token is missing or wrong; expected Authorization: Bearer <token>.", headers)
+
+    def limit() -> None:
+        wait = 1.0 if service.waiting >= MAX_WAITING else budget.take()
+        if wait:
+            seconds = math.ceil(wait)
+            detail = f"too many plans are asked for; expected the next request after {seconds} s."
+            raise HTTPException(429, detail, {"Retry-After": str(seconds)})
+
+    reasons = {
+        400: "No JSON object, or a wrong Host", 401: "No token, or a wrong one", 408: "The body came too slowly",
+        413: "The body is too long", 415: "Not application/json", 422: "Maps or settings that cannot be used",
+        429: "Too many plans; Retry-After says when to come back",
+    }  # fmt: skip
+    answers: dict = {200: {"description": "A plan; status says whether there is one", "model": Plan}}
+    answers |= {code: {"description": text, "model": Refusal} for code, text in reasons.items()}
+
+    @app.post("/plan", responses=answers, dependencies=[Depends(authorize)], response_class=Response)
+    async def plan(request: Request):
+        """Plan one pick and one place. The body is a line of ``pickplace-plan``, and so is the answer."""
+        if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+            # A page of a stranger can send forms and plain text without asking, but no JSON.
+            raise HTTPException(415, "Content-Type: expected application/json.")
+        limit()
+        status, text = await service.answer(await read_body(request))
+        return Response(text, status, media_type="application/json")
+
+    @app.get("/health")
+    async def get_health() -> Health:
+        """Say what is served, also while a plan is computed; needs no token."""
+        return health
+
+    @app.get("/plans", dependencies=[Depends(authorize)])
+    async def plans(after: int = 0) -> dict:
+        """Return the last answers for the page, of those with a number above ``after``; lengths are in cells."""
+        news = [entry for entry in list(service.history) if entry["number"] > after]
+        return {"last": news[-1]["number"] if news else service.count, "most": history, "plans": news}
+
+    @app.get("/", response_class=HTMLResponse)
+    async def show():
+        """Return the page, which asks for ``/plans``; it holds no plans itself and needs no token."""
+        return HTMLResponse(page, headers=page_headers)
+
+    _describe_requests(app)
+    return app
+
+
+def _describe_requests(app: FastAPI) -> None:
+    """Add the schema of requests to the OpenAPI description: FastAPI does not see it, as it does not parse them."""
+    described = app.openapi()
+    schema = PlanRequest.model_json_schema(ref_template="#/components/schemas/{model}")
+    schemas = described["components"]["schemas"]
+    schemas |= schema.pop("$defs", {}) | {"PlanRequest": schema}
+    content = {"application/json": {"schema": {"$ref": "#/components/schemas/PlanRequest"}}}
+    described["paths"]["/plan"]["post"]["requestBody"] = {"required": True, "content": content}

@@ -1,0 +1,108 @@
+"""The live page of a service: the last plans in 3D, drawn as the replay page draws episodes."""
+
+import base64
+import hashlib
+import json
+import math
+import re
+import time
+
+import numpy as np
+
+from pickplace.task.cell import CellSpec
+from pickplace.task.checks import excerpt
+from pickplace.views.replay import effector_parts, filled
+
+MOST_COLUMNS = 60  # greatest number of columns along a side of the tote that the page draws
+
+
+def page(cell: CellSpec) -> str:
+    """Return the page of a service for a cell; it loads nothing but ``/plans`` of the service itself."""
+    unit = cell.height_unit
+    data = {
+        "bin": [*cell.bin_size[:2], cell.bin_size[2] * unit],
+        "tote": cell.tote_size[:2],
+        **effector_parts(cell),
+        "height": cell.tote_size[2] * unit,
+    }
+    return filled("live.html", data=json.dumps(data))
+
+
+def content_policy(html: str) -> str:
+    """Return the ``Content-Security-Policy`` of a page: its own scripts run, and nothing else does."""
+    scripts = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
+    digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts)
+    allowed = " ".join(f"'sha256-{digest}'" for digest in digests)
+    return (
+        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; connect-src 'self'; img-src data:; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+
+
+def entry(cell: CellSpec, number: int, request: dict, reply: dict, seconds: float) -> dict:
+    """Return what the page shows of an answer, as plain values; lengths are in cells.
+
+    Args:
+        cell: the sizes.
+        number: of the answer, from 1.
+        request: with its defaults, in the keys of a line of ``pickplace-plan``.
+        reply: a plan, or an error.
+        seconds: how long it took.
+    """
+    shown = {
+        "number": number,
+        "time": time.time(),
+        "milliseconds": round(1e3 * seconds, 1),
+        "id": excerpt(reply["id"]) if "id" in reply else None,
+        "status": reply.get("status", "refused"),
+        "error": reply.get("error"),
+        "scene": None,
+    }
+    return shown if "error" in reply else {**shown, "scene": _scene(cell, request, reply)}
+
+
+def _scene(cell: CellSpec, request: dict, plan: dict) -> dict:
+    """Return the bin, the tote and the move of a plan; lengths in cells, angles in degrees."""
+    side = request.get("cell_size")
+    along, up = (1.0, cell.height_unit) if side is None else (1 / side, 1 / side)  # cells in a length
+    rim = request.get("tote_height")
+    height = cell.tote_size[2] * cell.height_unit if rim is None else rim * up
+    box = plan["box"] or _box_of_item(plan["item"])
+
+    def pose(key: str) -> list[float] | None:
+        if plan[key] is None:
+            return None
+        x, y, z = plan[key]["center"]
+        return [x * along, y * along, z * up, plan[key]["yaw"]]
+
+    return {
+        "height": height,
+        "heights": surface(height - np.asarray(request["tote_depth"], float) * up, cell).round(3).tolist(),
+        "item": [*(box[key] * along for key in "xywd"), box["h"] * up, box["yaw"]],
+        "lengths": [box["w"], box["d"], box["h"]],
+        "unit": "cells" if side is None else "m",
+        "pick": pose("pick"),
+        "place": pose("place"),
+        "turn": plan["rotation_degrees"],
+        "rest": None if plan["drop_height"] is None else plan["drop_height"] * up,
+        "drop_height": plan["drop_height"],
+        "occupancy": [plan["occupancy_before"], plan["occupancy_after"]],
+        "reasons": plan["reasons"],
+        "warnings": plan["warnings"],
+    }
+
+
+def _box_of_item(item: dict) -> dict:
+    """Return an item of a grid as a box: its centre and sides."""
+    x, y = (item[at] + item[side] / 2 for at, side in ("xw", "yd"))
+    return {"x": x, "y": y, "w": item["w"], "d": item["d"], "h": item["h"], "yaw": 0.0}
+
+
+def surface(heights: np.ndarray, cell: CellSpec) -> np.ndarray:
+    """Return heights ``[k W_T, k D_T]`` with at most :data:`MOST_COLUMNS` values a side: the greatest of each patch."""
+    wide, deep = cell.tote_size[:2]
+    count = len(heights) // wide
+    most = max(1, MOST_COLUMNS // max(wide, deep))
+    kept = max(number for number in range(1, min(count, most) + 1) if count % number == 0)
+    patch = count // kept
+    return heights.reshape(wide * kept, patch, deep * kept, patch).max((1, 3)).clip(0, math.inf)

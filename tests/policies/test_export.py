@@ -1,0 +1,175 @@
+"""``pickplace-export``: onnxruntime against the network read cell by cell, and against the planner's choices."""
+
+import json
+import sys
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_footprint_fcn import by_hand, random_maps
+
+from pickplace import CellSpec, __version__, load_policy
+from pickplace.policies import export, onnx_model
+from pickplace.policies.base import MASKED
+from pickplace.policies.fcn4d import ActionPolicy
+from pickplace.policies.fcn_grasp import FootprintPolicy
+from pickplace.policies.onnx_model import SHAPES, Scores
+from pickplace.task.feasibility import footprint_mask
+from pickplace.task.state import item_from_depth
+
+MAKERS = {
+    "fcn_grasp": lambda **network: FootprintPolicy(CellSpec(), **network),
+    "fcn4d": lambda **network: ActionPolicy(CellSpec(rotations=3), filters=4, **network),
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_torch_export_takes_any_size(name):
+    """No size of the example is a constant of the program."""
+    torch.manual_seed(0)
+    policy = MAKERS[name](head_std=1.0, compute_dtype="float32")
+    scores = Scores(policy, policy.map_keys)
+    maps = [
+        part[: len(policy.map_keys)] for part in (random_maps(0, 2, (5, 6), (7, 9)), random_maps(1, 3, (6, 4), (5, 8)))
+    ]
+    shapes = tuple(dict(enumerate(SHAPES[key])) for key in policy.map_keys)
+    program = torch.export.export(scores, tuple(maps[0]), dynamic_shapes=(shapes,)).module()
+    for example in maps:
+        torch.testing.assert_close(program(*example), scores(*example), rtol=1e-5, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """``pretrained/mixed`` in onnxruntime; and what the export says of its check."""
+    runtime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    path = tmp_path_factory.mktemp("onnx") / "mixed.onnx"
+    differences = onnx_model.export_onnx("pretrained/mixed", path)
+    return runtime.InferenceSession(path, providers=["CPUExecutionProvider"]), differences
+
+
+def test_the_check_is_at_three_sizes_that_the_export_has_not_seen(exported):
+    session, differences = exported
+    assert len(differences) == 3 and (8, 8) not in differences and 0 < max(differences.values()) <= 1e-5
+    facts = session.get_modelmeta().custom_metadata_map
+    assert (facts["pickplace"], facts["checkpoint"], facts["policy"]) == (
+        __version__,
+        "pretrained/mixed",
+        "FootprintPolicy",
+    )
+    assert json.loads(facts["cell"])["tote_size"] == [8, 8, 8] and facts["index"].startswith(
+        "(parity * W_T + x) * D_T + y"
+    )
+    shapes = {entry.name: entry.shape for entry in session.get_inputs()}
+    assert shapes == {
+        "bin_depth": ["N", "W_B", "D_B"], "tote_depth": ["N", "W_T", "D_T"], "tote_bearing": ["N", "W_T", "D_T"]
+    }  # fmt: skip
+
+
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 10**6),
+    batch=st.integers(1, 3),
+    bin_size=st.tuples(st.integers(4, 6), st.integers(4, 6)),
+    tote=st.tuples(st.integers(3, 14), st.integers(3, 14)),
+)
+def test_any_size_is_what_a_person_would_read_off_the_maps(exported, seed, batch, bin_size, tote):
+    """Against plain Python; and the index of a score is that of its corner."""
+    maps = random_maps(seed, batch, bin_size, tote)
+    keys = ("bin_depth", "tote_depth", "tote_bearing")
+    (logits,) = exported[0].run(["logits"], {key: part.numpy() for key, part in zip(keys, maps, strict=True)})
+    assert logits.shape == (batch, 2 * tote[0] * tote[1])
+    network, item = load_policy("pretrained/mixed").policy.network, item_from_depth(maps[0])
+    row, parity = batch - 1, seed % 2
+    w, d, h = (int(part[row]) for part in item[2:])
+    wide, deep = (d, w) if parity else (w, d)
+    if wide <= tote[0] and deep <= tote[1]:
+        x, y = (tote[0] - wide) // 2, tote[1] - deep
+        expected = by_hand(network, (w, d, h), maps[1][row], maps[2][row], parity, x, y)
+        assert logits[row, (parity * tote[0] + x) * tote[1] + y] == pytest.approx(expected.item(), rel=1e-4, abs=1e-4)
+
+
+def test_its_best_feasible_footprint_is_the_planners(exported):
+    trained = load_policy("pretrained/mixed", tote_size=(7, 9, 6))
+    trained.policy.network.compute_dtype = "float32"
+    seen = trained.make_env(num_envs=8).rollout(10, trained, break_when_any_done=False).reshape(-1)
+    keys = [entry.name for entry in exported[0].get_inputs()]
+    logits = torch.from_numpy(exported[0].run(None, {key: seen[key].numpy() for key in keys})[0])
+    mask = footprint_mask(trained.cell, trained.policy.maps_of(seen)).flatten(1)
+    best = torch.where(mask, logits, MASKED).argmax(1)
+    assert torch.equal(best, trained.policy.to_choice(trained.policy.best_feasible(seen), seen))
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Run ``pickplace-export`` in this process, in an empty folder; returns exit code, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["pickplace-export", *arguments])
+        code = 0
+        try:
+            export.main()
+        except SystemExit as exit:
+            code = exit.code or 0
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+def test_the_command_replaces_a_file_when_the_check_has_passed(command, tmp_path, monkeypatch):
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    (tmp_path / "r1.onnx").write_text("old")
+    with monkeypatch.context() as patch:
+        patch.setattr(onnx_model, "TOLERANCE", -1.0)
+        code, out, err = command("pretrained/r1", "r1.onnx")
+    assert code == 2 and "at a tote of 7x10 cells onnxruntime and torch differ by" in err and err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["r1.onnx"] and (tmp_path / "r1.onnx").read_text() == "old"
+    code, out, err = command("pretrained/r1", "r1.onnx")
+    assert (code, err) == (0, "") and out.startswith(
+        "r1.onnx: onnxruntime agrees with torch at totes of 7x10, 9x6, 13x11"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["r1.onnx"] and (tmp_path / "r1.onnx").stat().st_size > 10**5
+
+
+def test_fcn4d_scores_every_flat_action(tmp_path):
+    runtime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    onnx_model.export_onnx("pretrained/fcn4d", tmp_path / "fcn4d.onnx", rotations=3)
+    trained = load_policy("pretrained/fcn4d", tote_size=(8, 7, 5), rotations=3)
+    trained.policy.network.compute_dtype = "float32"
+    seen = trained.make_env(num_envs=3).reset()
+    session = runtime.InferenceSession(tmp_path / "fcn4d.onnx", providers=["CPUExecutionProvider"])
+    (logits,) = session.run(None, {key: seen[key].numpy() for key in ("bin_depth", "tote_depth")})
+    expected = trained.policy.action_log_probs(seen)
+    torch.testing.assert_close(torch.from_numpy(logits).log_softmax(1), expected, rtol=1e-4, atol=1e-3)
+    assert logits.shape == (3, trained.cell.num_actions)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["pretrained/unmasked", "x.onnx"], "pretrained/unmasked: GraspPolicy has no scores for totes of any size"),
+        (["pretrained/r4", "nowhere/x.onnx"], "nowhere/x.onnx: expected a file in a folder that exists"),
+        (["pretrained/r4", "."], "expected a file in a folder that exists"),
+        (["pretrained/none", "x.onnx"], "expected pretrained/fcn4d"),
+        (["pretrained/r1", "x.onnx", "--rotations", "4"], "env.rotations=4: the checkpoint was trained with 1"),
+        (["pretrained/r4"], "required: file"),
+    ],
+)
+def test_the_command_refuses_in_one_sentence(command, tmp_path, arguments, message):
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    code, out, err = command(*arguments)
+    assert (code, out) == (2, "") and err.startswith("error: ") and err.count("\n") == 1 and message in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_extra_is_one_sentence(command, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    code, out, err = command("pretrained/r4", "x.onnx")
+    assert (code, out) == (2, "")
+    assert err == "error: pickplace-export: onnx is missing; pip install 'pickplace[onnx]'.\n"

@@ -1,0 +1,323 @@
+"""``pickplace-serve``: a real server in a process of its own, asked by a real client."""
+
+import http.client
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from browser import errors, wait_until
+
+from pickplace import Planner, __version__
+from pickplace.robot import serve
+
+pytest.importorskip("fastapi")
+pytest.importorskip("uvicorn")
+
+ROOT = Path(__file__).resolve().parents[2]
+TOKEN = "a-token-of-many-letters"
+GRID = {"bin_depth": [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0] * 5, [0] * 5], "tote_depth": [[5] * 6] * 6}
+
+
+class Client:
+    """One server, called through ``http.client``."""
+
+    def __init__(self, port, process):
+        self.port, self.process = port, process
+
+    def ask(self, method, path, body=None, **headers):
+        """Return status, headers and the answer: from JSON, or as text."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        if body is not None:
+            headers = {"Content-Type": "application/json", **headers}
+            body = body if isinstance(body, bytes) else json.dumps(body).encode()
+        headers = {key.replace("_", "-"): value for key, value in headers.items()}
+        connection.request(method, path, body, headers)
+        reply = connection.getresponse()
+        text = reply.read().decode()
+        connection.close()
+        is_json = reply.headers.get_content_type() == "application/json"
+        return reply.status, reply.headers, json.loads(text) if is_json else text
+
+    def plan(self, body, **headers):
+        return self.ask("POST", "/plan", body, **headers)
+
+
+@contextmanager
+def served(*arguments, token=None):
+    """Start ``pickplace-serve`` on a free port, and end it by Ctrl-C."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    environment.pop(serve.TOKEN, None)
+    if token:
+        environment[serve.TOKEN] = token
+    code = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from pickplace.cli import serve; sys.argv[0] = 'pickplace-serve'; serve()"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments), "--port", "0", "--threads", "1"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+    )  # fmt: skip
+    try:
+        line = process.stdout.readline()
+        assert line.startswith("Listening at http://"), line + process.stderr.read()
+        yield Client(int(line.partition("; ")[0].rpartition(":")[2]), process)
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            _, err = process.communicate(timeout=30)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
+    assert (process.returncode, err) == (130, "")
+
+
+@pytest.fixture(scope="module")
+def client():
+    with served("pretrained/r4", "--history", 3, "--rate", 1e6) as client:
+        yield client
+
+
+def test_a_plan_is_that_of_the_planner(client):
+    status, _, reply = client.plan({"id": "a", **GRID, "alternatives": 2})
+    expected = Planner.load("pretrained/r4").plan(**GRID, alternatives=2).as_dict()
+    assert status == 200 and reply == {"id": "a", **json.loads(json.dumps(expected))}
+    metres = {"items": [{"x": 0.1, "y": 0.12, "w": 0.09, "d": 0.04, "h": 0.05, "yaw": 20}], "cell_size": 0.05}
+    status, _, reply = client.plan({**metres, "tote_depth": [[0.25] * 6] * 6})
+    assert status == 200 and reply["status"] == "ok" and reply["box"]["yaw"] == pytest.approx(20)
+
+
+def test_the_client_of_the_docs(client):
+    command = [sys.executable, ROOT / "docs/examples/plan_client.py", f"http://127.0.0.1:{client.port}"]
+    assert json.loads(subprocess.run(command, check=True, capture_output=True).stdout)["status"] == "ok"
+
+
+def test_health_says_what_is_served(client):
+    status, _, health = client.ask("GET", "/health")
+    assert status == 200 and (health["version"], health["checkpoint"]) == (__version__, "pretrained/r4")
+    assert health["planner"] == "policy" and health["cell"]["tote_size"] == [6, 6, 5]
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "message"),
+    [
+        (b"{", 400, "the request is not JSON"),
+        (b"\xff", 400, "the request is not JSON"),
+        (b"[1]", 400, "got list, expected an object"),
+        (b'{"tote_depth": NaN}', 400, "NaN"),
+        ({"tote_depth": [[5]]}, 422, "bin_depth: missing"),
+        ({**GRID, "depth": 1}, 422, "depth: there is no such key"),
+        ({**GRID, "tote_depth": [[5] * 6] * 5}, 422, "tote_depth"),
+        ({**GRID, "alternatives": -1}, 422, "alternatives=-1: expected"),
+        (b" " * (2**24 + 1), 413, "16,777,216 bytes"),
+    ],
+)
+def test_bad_requests_have_one_sentence(client, body, status, message):
+    got, _, reply = client.plan(body)
+    assert got == status and set(reply) == {"error"} and message in reply["error"]
+
+
+def test_strangers_pages_are_refused(client):
+    """Forms of other sites, and names that lead to this machine (DNS rebinding)."""
+    for kind in ("text/plain", "application/x-www-form-urlencoded", ""):
+        assert client.plan(json.dumps(GRID).encode(), Content_Type=kind)[0] == 415
+    assert client.plan(GRID, Content_Type="application/json; charset=utf-8")[0] == 200
+    for path in ("/health", "/plans", "/"):
+        assert client.ask("GET", path, Host="evil.example")[0] == 400
+        status, headers, _ = client.ask("GET", path, Host="localhost", Origin="http://evil.example")
+        assert status == 200 and "Access-Control-Allow-Origin" not in headers
+    assert client.ask("GET", "/plan")[0] == 405 and client.ask("GET", "/docs")[0] == 404
+    assert set(client.ask("GET", "/none")[2]) == {"error"}
+
+
+def test_the_page_gets_the_last_answers_in_cells(client):
+    before = client.ask("GET", "/plans")[2]["last"]
+    metres = {"items": [{"x": 0.1, "y": 0.125, "w": 0.08, "d": 0.04, "h": 0.05}], "cell_size": 0.05}
+    depth = [[0.25 - 0.05 * (x < 10 and y < 5) for y in range(30)] for x in range(30)]
+    for body in (GRID, {**metres, "tote_depth": depth}, {"id": "<b>", "tote_depth": [[5]]}):
+        client.plan(body)
+    _, _, news = client.ask("GET", f"/plans?after={before}")
+    first, second, third = news["plans"]
+    assert news["last"] == third["number"] == before + 3 and news["most"] == 3
+    assert first["scene"]["item"] == [2, 2.5, 2, 1, 1, 0] and first["scene"]["heights"] == [[0] * 6] * 6
+    assert second["scene"]["item"] == pytest.approx([2, 2.5, 1.6, 0.8, 1, 0])
+    heights = second["scene"]["heights"]
+    assert len(heights) == 30 and sum(map(sum, heights)) == pytest.approx(50) and heights[9][4] == pytest.approx(1)
+    x, y, z, _ = second["scene"]["place"]
+    assert 0 < x < 6 and 0 < y < 6 and second["scene"]["height"] == pytest.approx(5) and z > second["scene"]["rest"]
+    assert (third["status"], third["scene"], third["id"]) == ("refused", None, "'<b>'")
+    assert client.ask("GET", "/plans")[2]["plans"][0]["number"] == before + 1  # of the last three
+    assert client.ask("GET", "/plans?after=x")[0] == 422
+
+
+def test_openapi_describes_requests_and_answers(client):
+    from dataclasses import fields
+
+    from pickplace.robot.json_lines import REQUEST_KEYS
+    from pickplace.robot.planner import Plan
+
+    status, _, described = client.ask("GET", "/openapi.json")
+    schemas = described["components"]["schemas"]
+    assert status == 200 and set(schemas["PlanRequest"]["properties"]) == set(REQUEST_KEYS)
+    assert set(schemas["Plan"]["properties"]) == {field.name for field in fields(Plan)}
+    references = set(json.dumps(described).split('"#/components/schemas/')[1:])
+    assert {reference.partition('"')[0] for reference in references} <= set(schemas)
+    for example in schemas["PlanRequest"]["examples"]:
+        assert client.plan(example)[2]["status"] == "ok"
+    defaults = {key: entry.get("default") for key, entry in schemas["PlanRequest"]["properties"].items()}
+    parsed = vars(serve.parser().parse_args([]))
+    assert all(defaults[key] == parsed[key] for key in ("accuracy", "clearance", "alternatives"))
+
+
+def test_a_token_is_asked_for():
+    with served("pretrained/r4", token=TOKEN) as client:
+        for wrong in ({}, {"Authorization": f"Bearer {TOKEN}x"}, {"Authorization": f"Basic {TOKEN}"}):
+            status, headers, reply = client.plan(GRID, **wrong)
+            assert status == 401 and headers["WWW-Authenticate"] == "Bearer" and "token" in reply["error"]
+            assert client.ask("GET", "/plans", **wrong)[0] == 401
+        right = {"Authorization": f"Bearer {TOKEN}"}
+        assert client.plan(GRID, **right)[0] == client.ask("GET", "/plans", **right)[0] == 200
+        assert client.ask("GET", "/health")[0] == client.ask("GET", "/")[0] == 200
+        assert TOKEN not in Path(f"/proc/{client.process.pid}/cmdline").read_text()
+
+
+def test_too_many_plans_are_put_off():
+    with served("--planner", "joint_dbl", "--rate", 3) as client:
+        replies = [client.plan(GRID) for _ in range(4)]
+        assert [status for status, *_ in replies] == [200, 200, 200, 429]
+        wait = int(replies[-1][1]["Retry-After"])
+        assert 10 <= wait <= 20 and f"after {wait} s" in replies[-1][2]["error"]
+        assert client.ask("GET", "/health")[0] == 200
+
+
+def test_the_rate_fills_up_evenly(monkeypatch):
+    from pickplace.robot.service import Rate
+
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    rate = Rate(60)
+    assert [rate.take() for _ in range(60)] == [0.0] * 60 and rate.take() == pytest.approx(1)
+    now[0] += 0.75
+    assert rate.take() == pytest.approx(0.25)
+    now[0] += 0.25
+    assert rate.take() == 0.0 and rate.take() > 0
+    now[0] += 3600
+    assert [rate.take() for _ in range(61)].count(0.0) == 60
+
+
+def test_health_answers_while_a_plan_is_computed():
+    """And plans are computed one after the other."""
+    with served("pretrained/r4", "--planner", "lookahead", "--tote-size", 12, 12, 8, "--bin-size", 8, 8, 1) as client:
+        slow = {"bin_depth": [[0] * 8, [0, 1, *[0] * 6], *[[0] * 8] * 6], "tote_depth": [[8] * 12] * 12}
+        ended = []
+
+        def ask():
+            ended.append((client.plan(slow)[0], time.monotonic()))
+
+        threads = [threading.Thread(target=ask) for _ in range(2)]
+        begin = time.monotonic()
+        for thread in threads:
+            thread.start()
+        time.sleep(0.05)
+        assert client.ask("GET", "/health")[0] == 200
+        healthy = time.monotonic()
+        for thread in threads:
+            thread.join()
+        (first_status, first), (second_status, second) = ended
+        assert first_status == second_status == 200 and begin < healthy < first < second
+
+
+@pytest.mark.parametrize(
+    ("arguments", "token", "message"),
+    [
+        (["--host", "0.0.0.0"], None, "--host=0.0.0.0: other machines can reach it; expected a token in the environ"),
+        (["--host", "example.org"], None, "--host=example.org: other machines"),
+        ([], "short", "PICKPLACE_TOKEN: got 5 letters; expected at least 16"),
+        ([], "", "PICKPLACE_TOKEN: got 0 letters"),
+        (["--port", "70000"], None, "--port=70000"),
+        (["--rate", "0"], None, "--rate=0"),
+        (["--history", "0"], None, "--history=0"),
+        (["--host", "192.0.2.1"], TOKEN, "expected an address of this machine and a free port"),
+    ],
+)
+def test_the_command_refuses_in_one_sentence(monkeypatch, capsys, arguments, token, message):
+    monkeypatch.setattr(sys, "argv", ["pickplace-serve", "--planner", "joint_dbl", *arguments])
+    monkeypatch.delenv(serve.TOKEN, raising=False)
+    if token is not None:
+        monkeypatch.setenv(serve.TOKEN, token)
+    with pytest.raises(SystemExit, match="2"):
+        serve.main()
+    err = capsys.readouterr().err
+    assert err.startswith("error: ") and err.count("\n") == 1 and message in err
+    assert not token or token not in err
+
+
+def test_a_missing_extra_is_one_sentence(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["pickplace-serve", "pretrained/r4"])
+    monkeypatch.delitem(sys.modules, "pickplace.robot.service", raising=False)
+    monkeypatch.setitem(sys.modules, "fastapi", None)
+    with pytest.raises(SystemExit, match="2"):
+        serve.main()
+    assert capsys.readouterr().err == "error: pickplace-serve: fastapi is missing; pip install 'pickplace[serve]'.\n"
+
+
+# ---------------------------------------------------------------------- in a browser
+EVIL = "<img src=x onerror='window.ran=1'><script>window.ran=1</script>"
+
+
+def test_the_page_shows_new_plans_and_runs_nothing_of_a_request(browser):
+    with served("pretrained/r4", "--history", 2) as client:
+        browser.get(f"http://127.0.0.1:{client.port}/")
+        browser.get_log("browser")  # empties it
+        wait_until(browser, "document.getElementById('state').textContent.startsWith('No plan')")
+        metres = {"items": [{"x": 0.1, "y": 0.125, "w": 0.08, "d": 0.04, "h": 0.05, "yaw": 20}], "cell_size": 0.05}
+        depth = [[0.25 - 0.05 * (x < 10 and y < 5) for y in range(30)] for x in range(30)]
+        _, _, plan = client.plan({"id": EVIL, **metres, "tote_depth": depth})
+        wait_until(browser, "live.state().shown === 1 && live.state().at === 1")
+        state = browser.execute_script("return live.state()")
+        # At rest: the item's centre, from the pose of the plan and the way it hung from the gripper; lengths in cells.
+        (px, py, _), (tx, ty, tz) = plan["pick"]["center"], plan["place"]["center"]
+        turn = complex(0, 1) ** (plan["rotation_degrees"] / 90)
+        middle = complex(tx, ty) + turn * (complex(0.1, 0.125) - complex(px, py))
+        expected = [20 * middle.real, 20 * middle.imag, 20 * (plan["drop_height"] + 0.025)]
+        for found in (state["item"][:3], state["target"]):
+            assert found == pytest.approx(expected, abs=1e-3)
+        assert state["gripper"] == pytest.approx([20 * tx, 20 * ty, 20 * tz], abs=1e-3)
+        assert browser.find_element("id", "which").text.startswith('Plan 1, id "<img src=x')
+        assert browser.find_element("id", "what").text.startswith("80 × 40 × 50 mm, turned")
+
+        client.plan({"id": EVIL, "tote_depth": [[5]]})
+        client.plan({**GRID, "tote_depth": [[0] * 6] * 6})
+        wait_until(browser, "live.state().shown === 3")
+        assert "The item fits nowhere any more" in browser.find_element("id", "ending").text
+        buttons = browser.find_elements("css selector", "#plans button")
+        assert [button.text.split()[-1] for button in buttons] == ["stuck", "refused"]  # the last two
+        buttons[1].click()
+        assert (
+            browser.find_element("id", "ending").text == "bin_depth: missing; expected a depth map as a list of rows."
+        )
+        assert browser.execute_script("return window.ran") is None and errors(browser) == []
+        hosts = browser.execute_script("return performance.getEntriesByType('resource').map(e => new URL(e.name).host)")
+        assert set(hosts) == {f"127.0.0.1:{client.port}"}
+        # Even what were written as HTML would not run.
+        browser.execute_script(
+            "const s = document.createElement('script'); s.text = 'window.ran = 1'; document.body.append(s)"
+        )
+        assert browser.execute_script("return window.ran") is None
+
+
+def test_the_page_asks_for_the_token(browser):
+    with served("pretrained/r4", token=TOKEN) as client:
+        client.plan(GRID, Authorization=f"Bearer {TOKEN}")
+        browser.get(f"http://127.0.0.1:{client.port}/")
+        wait_until(browser, "!document.getElementById('sign').hidden")
+        assert browser.execute_script("return live.state().plans") == 0
+        browser.find_element("id", "token").send_keys(TOKEN)
+        browser.find_element("css selector", "#sign button").click()
+        wait_until(browser, "live.state().plans === 1 && document.getElementById('sign').hidden")
