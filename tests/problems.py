@@ -72,18 +72,15 @@ def random_limits(cell: CellSpec, seed: int) -> Limits:
     return Limits(*map(torch.from_numpy, tables))
 
 
-def random_effector(random: Random, size: tuple[int, int]) -> dict:
-    """Return a body, a cup in it and a least share, at random; often those that there are by default."""
+def random_effector(random: Random, size: tuple[int, int], kind: str | None = None) -> dict:
+    """Return a body, of a kind or of any, a cup in it and a least share, at random."""
 
     def mask(share, within):
         return [[int(within[x][y] and random.random() < share) for y in range(size[1])] for x in range(size[0])]
 
     everything = [[1] * size[1]] * size[0]
-    body, cup, cup_size = (
-        random.choice(("rectangle", "disc", "mask")),
-        random.choice(("rectangle", "disc", "mask")),
-        None,
-    )
+    kinds = ("rectangle", "disc", "mask")
+    body, cup, cup_size = kind or random.choice(kinds), random.choice(kinds), None
     held = shape_cells("rectangle" if body == "mask" else body, size, size)
     inside = [[int((x, y) in held) for y in range(size[1])] for x in range(size[0])]
     if body == "mask":

@@ -199,7 +199,7 @@ def read_grid(cell: CellSpec, bin_depth, tote_depth, tote_height: int | None, to
     tote_map = whole_map("tote_depth", tote_depth, cell.tote_size[:2], height, unit_name)
     _check_one_cuboid(bin_map, unit_name)
     item = Item(*(part.to(device) for part in item_from_depth(bin_map[None].float())))
-    _check_longest(cell, item)
+    _check_longest(cell, item, "bin_depth")
     bearing = _read_bearing(cell, tote_bearing, tote_map == height)
     state = State(
         surface_from(height - tote_map, bearing)[None].to(device), torch.tensor([height], device=device), item
@@ -214,8 +214,6 @@ def read_metric(
     tote_bearing, device,
 ) -> MeasuredProblem:  # fmt: skip
     """Return the problem of maps and boxes in metres; arguments and errors as of :meth:`Planner.plan`."""
-    if cell.pick_rule != "contain":
-        raise DepthMapError(f"cell_size={cell_size:g}: with pick_rule={cell.pick_rule} expected None, whole cells.")
     grid, unit = cell.tote_size[:2], cell_size * cell.height_unit
     slack = math.ceil(accuracy / MILLIMETRE - ROUNDING)
     box, clearance = _read_box(cell, cell_size, accuracy, clearance, bin_depth, items)
@@ -254,10 +252,20 @@ def read_metric(
         for at, size, most_cells in zip((box.x, box.y), whole, cell.bin_size[:2], strict=True)
     ]
     item = Item(*(torch.tensor([part], device=device) for part in (*corner, *whole, h)))
+    _check_longest(cell, item, "items[0]")
+    # Cells at each edge that the item, narrower by its clearance, does not cover as a whole.
+    inset = [
+        math.ceil((size - side) / 2 + clearance / cell_size - ROUNDING) for size, side in zip(whole, sides, strict=True)
+    ]
 
     ratio = unit / MILLIMETRE
     free = replace(
-        cell, bin_size=(*cell.bin_size[:2], 1), tote_size=(*grid, rim), height_unit=MILLIMETRE / cell_size, limits=None
+        cell,
+        bin_size=(*cell.bin_size[:2], 1),
+        tote_size=(*grid, rim),
+        height_unit=MILLIMETRE / cell_size,
+        limits=None,
+        item_inset=(inset[0], inset[1]),
     )
     centres = effector_centres(free, item, (box.x, box.y), box.yaw, cell_size)
     above_walls = box.h - accuracy >= cell.bin_size[2] * unit - ROUNDING
@@ -292,7 +300,10 @@ def _read_box(cell: CellSpec, side: float, accuracy: float, clearance: float, bi
 
 
 def _misses_walls(centres: np.ndarray, cell: CellSpec, yaw: float, side: float) -> np.ndarray:
-    """Return at which of its centres ``[P, 2]`` the end effector misses the bin's walls, bool ``[P]``."""
+    """Return at which of its centres ``[P, 2]`` the end effector misses the bin's walls, bool ``[P]``.
+
+    The rectangle around it decides.
+    """
     turn, (wide, deep) = math.radians(yaw), (size * side / 2 for size in cell.effector_size)
     cos, sin = abs(math.cos(turn)), abs(math.sin(turn))
     reach, far = np.array([wide * cos + deep * sin, wide * sin + deep * cos]), np.array(cell.bin_size[:2]) * side
@@ -364,13 +375,12 @@ def _check_one_cuboid(bin_map: Tensor, unit_name: str) -> None:
         )
 
 
-def _check_longest(cell: CellSpec, item: Item) -> None:
+def _check_longest(cell: CellSpec, item: Item, key: str) -> None:
     """Refuse an item that is longer than the tables of grasps hold."""
     longest = max(int(item.w), int(item.d))
-    if cell.pick_rule == "overlap" and longest > cell.max_side:
+    if cell.pick_rule != "contain" and longest > cell.max_side:
         raise DepthMapError(
-            f"bin_depth: the item is {longest} cells long, longer than any in training; expected at most "
-            f"{cell.max_side}."
+            f"{key}: the item is {longest} cells long, longer than any in training; expected at most {cell.max_side}."
         )
 
 

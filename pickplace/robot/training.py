@@ -1,12 +1,16 @@
 """The items and sizes of a policy's training, and warnings about what lies outside of them."""
 
 from dataclasses import dataclass
+from typing import Any, cast
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from pickplace.task.cell import CellSpec
+from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.task.items import ItemDistribution
 from pickplace.task.state import Item
+
+#: Options of the cell that are no sizes; a policy should meet its own.
+RULES = ("support", "body", "cup", "cup_size", "pick_rule", "min_seal")
 
 
 @dataclass(frozen=True)
@@ -17,20 +21,22 @@ class Training:
         kinds: every size ``(w, d, h)`` of its items, in cells and height units.
         tote_size: greatest tote, ``(W_T, D_T, H_T)``.
         effector_size: ``(W_E, D_E)``.
-        support: its stability rule.
+        rules: its options that are no sizes, such as ``support``, by name.
     """
 
     kinds: frozenset[tuple[int, int, int]]
     tote_size: tuple[int, ...]
     effector_size: tuple[int, ...]
-    support: str | float
+    rules: dict[str, Any]
 
     @classmethod
     def of(cls, config: DictConfig, items: ItemDistribution) -> "Training":
         """Return what a checkpoint's config says."""
         kinds = frozenset((int(w), int(d), int(h)) for w, d, h in items.sizes.tolist())
-        env = config.env
-        return cls(kinds, tuple(env.tote_size), tuple(env.effector_size), env.get("support", "half"))
+        env = cast(dict, OmegaConf.to_container(config.env, resolve=True))
+        cell = cell_from_settings({"support": "half"} | {key: env[key] for key in CELL_SETTINGS if key in env})
+        rules = {key: getattr(cell, key) for key in RULES}
+        return cls(kinds, tuple(env["tote_size"]), tuple(env["effector_size"]), rules)
 
     def warnings(self, cell: CellSpec, item: Item) -> list[str]:
         """Return a sentence for each thing that the policy never met: the item, the tote, the effector, the rule."""
@@ -44,8 +50,9 @@ class Training:
         if sorted(self.effector_size) != sorted(cell.effector_size):
             sizes = _sides(cell.effector_size), _sides(self.effector_size)
             found.append(f"end effector of {sizes[0]} cells: the policy met {sizes[1]}.")
-        if self.support != cell.support:
-            found.append(f"support={cell.support}: the policy met support={self.support}.")
+        for key, value in self.rules.items():
+            if value != getattr(cell, key):
+                found.append(f"{key}={getattr(cell, key)}: the policy met {key}={value}.")
         return found
 
 

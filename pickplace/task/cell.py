@@ -150,6 +150,8 @@ class CellSpec:
         longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and unless an
             item must be contained it also sets the number of offsets.
         limits: of the robot, see :class:`Limits`; None: those of ``reach``.
+        item_inset: for ``"overlap"`` and ``"seal"``: cells at each edge of the item, along x and y, on which no cell of
+            the cup counts. A measured item may cover them in part only.
 
     Raises:
         ValueError: naming the argument, the value received and what was expected.
@@ -170,6 +172,7 @@ class CellSpec:
     reach: Reach | None = None
     longest_side: int | None = field(default=None, metadata={"derived": True})
     limits: Limits | None = field(default=None, compare=False, metadata={"derived": True})
+    item_inset: tuple[int, int] = field(default=(0, 0), metadata={"derived": True})
 
     def __post_init__(self):
         object.__setattr__(self, "bin_size", _sizes("bin_size", self.bin_size, 3, MAX_SIDE))

@@ -32,6 +32,9 @@ def cup_cells_on(cell: CellSpec, near_x: Tensor, near_y: Tensor, w: Tensor, d: T
     def shared(near: Tensor, side: Tensor, begin: int, length: int) -> Tensor:
         return ((near + side).clamp(max=begin + length) - near.clamp(min=begin)).clamp_(min=0)
 
+    if cell.pick_rule != "contain" and any(cell.item_inset):
+        x, y = cell.item_inset
+        near_x, near_y, w, d = near_x + x, near_y + y, w - 2 * x, d - 2 * y
     counts = [shared(near_x, w, box.x, box.width) * shared(near_y, d, box.y, box.depth) for box in cell.cup_boxes]
     return reduce(torch.add, counts)
 

@@ -19,6 +19,7 @@ class Scene:
     centre: tuple[float, float]
     yaw: float  # degrees
     boxes: list[tuple[float, ...]] = field(default_factory=list)  # x0, y0, x1, y1, top of what is in the tote
+    gripper: "Gripper | None" = None  # None: the effector's rectangle, which covers the item
 
     def drop(self, low, high, height: float) -> bool:
         """Let a box fall into the tote; one that would pass the rim stays out."""
@@ -45,15 +46,61 @@ class Scene:
         return self.tote[2] - (heights + noise)
 
 
-def random_scene(draw: np.random.Generator, tote: tuple[float, float, float]) -> Scene:
+@dataclass
+class Gripper:
+    """Convex parts of an end effector, ``[n, 2]`` each, from its centre, in metres: what may hit, and what seals."""
+
+    body: list[np.ndarray]
+    cups: list[np.ndarray]
+    least: float | None  # share of the cups that must lie on the item; None: the one cup covers the item
+
+    def grips(self, item: np.ndarray, pick: np.ndarray, yaw: float) -> bool:
+        """Whether it lifts an item with these corners."""
+        cups = [moved(cup, pick, yaw) for cup in self.cups]
+        if self.least is None:
+            return inside(item, cups[0])
+        return sum(inside(cup, item) for cup in cups) / len(cups) >= self.least - 1e-9
+
+
+def moved(corners: np.ndarray, centre, yaw: float) -> np.ndarray:
+    """Corners from a centre, turned about it."""
+    turn = radians(yaw)
+    return np.array(centre) + corners @ np.array([[cos(turn), sin(turn)], [-sin(turn), cos(turn)]])
+
+
+def disc(diameter: float) -> np.ndarray:
+    angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    return np.stack([np.cos(angle), np.sin(angle)], -1) * diameter / 2
+
+
+def squares(cells, size, side: float) -> list[np.ndarray]:
+    """The cells ``(x, y)`` of a rectangle of ``size`` cells, from its centre."""
+    return [rectangle((np.array(cell) + 0.5 - np.array(size) / 2) * side, (side, side), 0) for cell in cells]
+
+
+def meet(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two convex polygons, counter-clockwise, share more than an edge: no side of one parts them."""
+    for one, other in ((a, b), (b, a)):
+        edges = np.roll(one, -1, 0) - one
+        normals = np.stack([edges[:, 1], -edges[:, 0]], -1) / np.linalg.norm(edges, axis=1, keepdims=True)
+        away = (other @ normals.T).min(0) - (one * normals).sum(1)
+        if (away > -EPSILON).any():
+            return False
+    return True
+
+
+def random_scene(
+    draw: np.random.Generator, tote: tuple[float, float, float], most: tuple = (0.14, 0.14, 0.1), **fields
+) -> Scene:
     """A bin with one box, turned at random or not, and up to a dozen boxes dropped into the tote at random.
 
     Some totes are hardly higher than the item, or too low for it.
     """
-    item = tuple(draw.uniform((0.02, 0.02, 0.02), (0.14, 0.14, 0.1)).round(draw.choice((2, 6))))
+    item = tuple(draw.uniform((0.02, 0.02, 0.02), most).round(draw.choice((2, 6))))
     yaw = float(draw.choice((0, draw.uniform(-180, 180))))
     tote = (*tote[:2], float(draw.choice((tote[2], tote[2], item[2] + draw.uniform(-0.005, 0.01)))))
-    scene = Scene((0.25, 0.25, 0.05), tote, (0.15, 0.15), item, tuple(draw.uniform(0.07, 0.18, 2)), yaw)
+    sizes = {"bin": (0.25, 0.25, 0.05), "effector": (0.15, 0.15)} | fields
+    scene = Scene(tote=tote, item=item, centre=tuple(draw.uniform(0.07, 0.18, 2)), yaw=yaw, **sizes)
     for _ in range(draw.integers(0, 12)):
         size = draw.uniform((0.02, 0.02, 0.004), (0.15, 0.15, 0.08))
         corner = draw.uniform((0, 0), np.array(tote[:2]) - size[:2])
@@ -81,8 +128,11 @@ def fault(scene: Scene, plan, accuracy: float = 0.002) -> str | None:
     # Over the bin.
     effector = rectangle(pick[:2], scene.effector, plan.pick.yaw)
     item = rectangle(scene.centre, (w, d), scene.yaw)
-    if not inside(item, effector):
-        return "the effector does not cover the item"
+    gripper = scene.gripper or Gripper(
+        [rectangle((0, 0), scene.effector, 0)], [rectangle((0, 0), scene.effector, 0)], None
+    )
+    if not gripper.grips(item, pick[:2], plan.pick.yaw):
+        return "the effector does not grip the item"
     if pick[2] < h - EPSILON:
         return "the effector ends inside the item"
     if scene.bin[2] > h + EPSILON and not within(effector, scene.bin):
@@ -102,7 +152,10 @@ def fault(scene: Scene, plan, accuracy: float = 0.002) -> str | None:
         return "the item passes the rim"
     if place[2] - h > rest + 6 * accuracy + 0.003:
         return "the item falls"
-    if any(overlaps(box, effector.min(0), effector.max(0)) and box[4] > place[2] + EPSILON for box in scene.boxes):
+    parts = [moved(part, place[:2], plan.pick.yaw + plan.rotation_degrees) for part in gripper.body]
+    walls = [rectangle(((x0 + x1) / 2, (y0 + y1) / 2), (x1 - x0, y1 - y0), 0) for x0, y0, x1, y1, top in scene.boxes
+            if top > place[2] + EPSILON]  # fmt: skip
+    if any(meet(part, box) for part in parts for box in walls):
         return "the effector hits an item"
     if place[2] < scene.tote[2] - EPSILON and not within(effector, scene.tote):
         return "the effector hits the tote's wall"

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scenes import Scene, fault, random_scene
+from scenes import Gripper, Scene, disc, fault, random_scene, rectangle, squares
 
 from pickplace import CellSpec, DepthMapError, Planner
 from pickplace.robot.measure import box_of_map
@@ -48,7 +48,61 @@ def count_faults(name: str, scenes: int, seed: int, along: int = 5, accuracy: fl
 ])  # fmt: skip
 def test_no_plan_that_is_ok_goes_wrong(along, accuracy, options):
     found = count_faults("joint_dbl", 200, along, along, accuracy, **options)
-    assert set(found) <= {"ok", "stuck", "impossible"} and found["ok"] > 20, found
+    assert set(found) <= {"ok", "stuck", "impossible"} and found["ok"] > 15, found
+
+
+L_BODY, L_CUP = [[1, 1, 1], [1, 0, 0], [1, 1, 0]], [[0, 0, 1], [0, 0, 0], [1, 0, 0]]
+HALF_CUP = [[1, 1], [1, 0], [0, 0]]
+
+
+def ones(mask):
+    return [(x, y) for x, column in enumerate(mask) for y, cell in enumerate(column) if cell]
+
+
+#: End effectors: options of the cell, side of a cell, and what the gripper is in metres.
+EFFECTORS = {
+    "one cell": ({"effector_size": (1, 1), "pick_rule": "seal"}, 0.05,
+                 Gripper(squares([(0, 0)], (1, 1), 0.05), squares([(0, 0)], (1, 1), 0.05), 1.0)),
+    "disc": ({"effector_size": (7, 7), "body": "disc", "cup": "disc", "cup_size": (3, 3), "pick_rule": "seal"}, 0.02,
+             Gripper([disc(0.14)], [disc(0.06)], 1.0)),
+    "array": ({"cup": [[1, 0, 1], [0, 0, 0], [1, 0, 1]], "pick_rule": "seal", "min_seal": 0.25}, 0.05,
+              Gripper([rectangle((0, 0), (0.15, 0.15), 0)],
+                      squares([(0, 0), (0, 2), (2, 0), (2, 2)], (3, 3), 0.05), 0.25)),
+    "L": ({"body": L_BODY, "cup": L_CUP, "pick_rule": "overlap"}, 0.05,
+          Gripper(squares(ones(L_BODY), (3, 3), 0.05), squares(ones(L_CUP), (3, 3), 0.05), 0.5)),
+    "half": ({"effector_size": (3, 2), "cup": HALF_CUP, "pick_rule": "seal", "min_seal": 2 / 3}, 0.025,
+             Gripper([rectangle((0, 0), (0.075, 0.05), 0)], squares(ones(HALF_CUP), (3, 2), 0.025), 2 / 3)),
+    "contain": ({"effector_size": (7, 5), "body": "disc", "cup_size": (3, 3)}, 0.05 / 2,
+                Gripper([disc(1.0) * (0.175, 0.125)], [rectangle((0, 0), (0.075, 0.075), 0)], None)),
+}  # fmt: skip
+
+
+def scenes_of(name: str, scenes: int, seed: int, **options) -> Counter:
+    """Plans with an end effector, from boxes of which the centre is wrong by up to the clearance."""
+    (settings, side, gripper), draw, found = EFFECTORS[name], np.random.default_rng(seed), Counter()
+    most = (0.08, 0.08, 0.15) if gripper.least is None else (0.2, 0.2, 0.15)
+    bin_cells, cells = round(0.25 / side - 0.4), round(0.3 / side)
+    sizes = {"bin_size": (bin_cells, bin_cells, round(0.05 / side)), "tote_size": (cells, cells, round(0.25 / side))}
+    planner = Planner(CellSpec(**sizes, **settings, **options), planner="joint_dbl")
+    effector = tuple(np.multiply(planner.cell.effector_size, side))
+    for _ in range(scenes):
+        scene = random_scene(
+            draw, TOTE, most, bin=tuple(np.multiply(planner.cell.bin_size, side)), effector=effector, gripper=gripper
+        )
+        noise, error = draw.uniform(-NOISE, NOISE, (60, 60)), draw.uniform(-0.0035, 0.0035, 2)
+        box = Box(*(scene.centre + error), *scene.item[:2], scene.item[2] + draw.uniform(-NOISE, NOISE), scene.yaw)
+        plan = planner.plan(
+            items=[box], tote_depth=scene.tote_map(200, noise), tote_height=scene.tote[2], cell_size=side,
+            accuracy=NOISE, alternatives=0,
+        )  # fmt: skip
+        found[(fault(scene, plan, NOISE) or "ok") if plan.status == "ok" else plan.status] += 1
+    return found
+
+
+@pytest.mark.parametrize("name", EFFECTORS)
+def test_no_end_effector_makes_an_ok_plan_go_wrong(name):
+    found = scenes_of(name, 150, 7)
+    assert set(found) <= {"ok", "stuck", "impossible"} and found["ok"] > 15, found
 
 
 @pytest.mark.slow
@@ -212,9 +266,9 @@ def test_warnings_name_what_lies_outside_the_training():
     assert known.warnings == []
     with pytest.raises(ValueError, match="planner='uniform': it does not choose among|does not choose among feasible"):
         Planner(CellSpec(), planner="uniform")
-    with pytest.raises(DepthMapError, match="cell_size=0.05: with pick_rule=overlap expected None, whole cells"):
+    with pytest.raises(DepthMapError, match=r"items\[0\]: the item is 3 cells long, longer .*; expected at most 2"):
         overlap = Planner(CellSpec(pick_rule="overlap", longest_side=2), planner="joint_dbl")
-        overlap.plan(items=[Box(0.1, 0.1, 0.09, 0.04, 0.05)], tote_depth=np.full((6, 6), 0.25), **flat)
+        overlap.plan(items=[Box(0.1, 0.1, 0.1, 0.04, 0.05)], tote_depth=np.full((6, 6), 0.25), **flat)
     with pytest.raises(ValueError, match="policy=None: expected a policy"):
         Planner(CellSpec())
     with pytest.raises(ValueError, match="items=None: planner='mcts' needs it"):

@@ -3,6 +3,7 @@
 import itertools
 import math
 from dataclasses import replace
+from random import Random
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from oracle import SUCCESS, UNSTABLE
-from problems import oracle_of, problems, state_of
+from problems import Case, oracle_of, problems, random_effector, state_of
 from scipy.spatial import ConvexHull
 
 from pickplace import CellSpec, Failure, Item, State
@@ -66,6 +67,33 @@ def test_masks_equal_the_step_and_the_oracle(problem):
         assert torch.equal(first, torch.where(found >= 0, found, cell.num_actions).amin(1))
         after = put_down(cell, state.surface[same], maps.rows(same), each)
         assert torch.equal(after, step.surface[first])
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_bodies_among_towers(seed):
+    """Masks of body and cup in a wide tote with a few towers, where the cells of the body decide."""
+    random = Random(seed)
+    size = random.choice(((3, 3), (2, 3), (4, 2), (3, 4), (5, 5)))
+    body = random_effector(random, size, kind="mask")["body"]
+    shape = {"body": body, "cup": body, "min_seal": random.choice((0.1, 0.4))}
+    rotations, rule = random.choice((1, 2, 3, 4)), random.choice(("overlap", "seal", "seal"))
+    cell = CellSpec((5, 4, 1), (8, 7, 9), size, rotations, rule, 0.0, longest_side=3, **shape)
+    towers = np.array(random.choices((0, 0, 0, 0, 0, 3, 5), k=56)).reshape(8, 7)
+    w, d = random.randint(1, 3), random.randint(1, 3)
+    item = (random.randint(0, 5 - w), random.randint(0, 4 - d), w, d, random.randint(1, 3))
+    case = Case(9, towers, np.ones_like(towers), item)
+    state, plain = state_of(case), oracle_of(cell, case)
+    maps = placing_maps(cell, state)
+    mask, actions = action_mask(cell, maps)[0], torch.arange(cell.num_actions)
+    step, footprints = apply(cell, state.repeat(len(actions)), actions), action_footprints(cell, state.item)[0]
+    assert torch.equal(mask, step.failure == 0) and num_feasible(cell, maps).item() == mask.sum()
+    reached = footprint_mask(cell, maps)[0].flatten().nonzero()[:, 0]
+    assert torch.equal(reached, footprints[mask].unique())
+    found = actions_reaching(cell, maps.rows(torch.zeros_like(reached)), reached)
+    assert torch.equal(found[found >= 0].sort()[0], mask.nonzero()[:, 0])
+    lifted = (step.failure > Failure.BIN_COLLISION).logical_or(mask).nonzero()[:, 0].tolist()
+    tried = random.sample(lifted, min(400, len(lifted))) + random.sample(range(len(actions)), 100)
+    assert step.failure[tried].tolist() == [plain.try_action(action)[0] for action in tried]
 
 
 @settings(max_examples=60)
