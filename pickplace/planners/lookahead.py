@@ -8,7 +8,7 @@ from pickplace.policies.base import MASKED
 from pickplace.policies.fcn_grasp import FootprintPolicy
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import check_bytes, number, whole_number
-from pickplace.task.feasibility import PlacingMaps, first_action_reaching, footprint_mask, placing_maps
+from pickplace.task.feasibility import PlacingMaps, first_action_reaching, placing_maps
 from pickplace.task.items import ItemDistribution, check_seed, search_items
 from pickplace.task.observation import STANDARD_TERMS, observe
 from pickplace.task.placing import unchecked_top

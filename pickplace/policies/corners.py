@@ -10,7 +10,7 @@ from pickplace.task.feasibility import PlacingMaps
 
 
 class CornerPolicy(FootprintPolicy):
-    """``corners``: as ``fcn_grasp`` with a mask, but among some dozens of footprints, see :mod:`pickplace.task.corners`.
+    """``corners``: as ``fcn_grasp`` with a mask, but among some dozens of footprints (:mod:`pickplace.task.corners`).
 
     Args:
         cell: the sizes.
@@ -18,7 +18,7 @@ class CornerPolicy(FootprintPolicy):
     """
 
     masks: tuple[str, ...] = ("corner",)
-    network: CornerNet
+    network: CornerNet  # type: ignore[assignment]
 
     def make_network(self, **network) -> CornerNet:
         return CornerNet(**network)

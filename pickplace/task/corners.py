@@ -7,7 +7,6 @@ directions are those to the tote's first corner (Zhao, Bennell, Bektas and Dowsl
 container loading algorithms", have both terms).
 """
 
-import torch
 from torch import Tensor
 
 from pickplace.task.cell import CellSpec

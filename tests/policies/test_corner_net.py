@@ -1,4 +1,4 @@
-"""The network of ``model=corners``: its inputs against a plain computation, cell by cell, and what they do not depend on."""
+"""The network of ``model=corners``: its inputs against a plain computation, and what they do not depend on."""
 
 import pytest
 import torch
@@ -98,6 +98,7 @@ def test_a_turned_problem_is_the_same_problem(problem):
     [
         ({"filters": 0}, "model.actor.filters=0: expected a whole number >= 1"),
         ({"inside": 2.5}, "model.actor.inside=2.5: expected a whole number"),
+        ({"item_scale": (3,)}, r"model.actor.item_scale=\(3,\): expected \[side, height\]"),
         ({"item_scale": (0, 3)}, "model.actor.item_scale=0: expected a number"),
     ],
 )

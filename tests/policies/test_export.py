@@ -12,6 +12,7 @@ from test_footprint_fcn import by_hand, random_maps
 from pickplace import CellSpec, __version__, load_policy
 from pickplace.policies import export, onnx_model
 from pickplace.policies.base import MASKED
+from pickplace.policies.corners import CornerPolicy
 from pickplace.policies.fcn4d import ActionPolicy
 from pickplace.policies.fcn_grasp import FootprintPolicy
 from pickplace.policies.onnx_model import SHAPES, Scores
@@ -19,8 +20,9 @@ from pickplace.task.feasibility import footprint_mask
 from pickplace.task.state import item_from_depth
 
 MAKERS = {
-    "fcn_grasp": lambda **network: FootprintPolicy(CellSpec(), **network),
-    "fcn4d": lambda **network: ActionPolicy(CellSpec(rotations=3), filters=4, **network),
+    "fcn_grasp": lambda: FootprintPolicy(CellSpec(), head_std=1.0, compute_dtype="float32"),
+    "corners": lambda: CornerPolicy(CellSpec(), head_std=1.0),
+    "fcn4d": lambda: ActionPolicy(CellSpec(rotations=3), filters=4, head_std=1.0, compute_dtype="float32"),
 }
 
 
@@ -28,7 +30,7 @@ MAKERS = {
 def test_torch_export_takes_any_size(name):
     """No size of the example is a constant of the program."""
     torch.manual_seed(0)
-    policy = MAKERS[name](head_std=1.0, compute_dtype="float32")
+    policy = MAKERS[name]()
     scores = Scores(policy, policy.map_keys)
     maps = [
         part[: len(policy.map_keys)] for part in (random_maps(0, 2, (5, 6), (7, 9)), random_maps(1, 3, (6, 4), (5, 8)))

@@ -11,8 +11,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace import PickPlaceEnv
 from pickplace.planners.heuristics import JointDBL
-from pickplace.policies.fcn4d import ActionPolicy
 from pickplace.policies.corners import corners
+from pickplace.policies.fcn4d import ActionPolicy
 from pickplace.policies.fcn_grasp import fcn_grasp
 from pickplace.policies.individual import IndividualRlPolicy, individual_grasp
 from pickplace.runs.provenance import imitated_planner

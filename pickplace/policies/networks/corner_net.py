@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.task.checks import MAX_WIDTH, check_inputs, number, whole_number
+from pickplace.task.checks import MAX_WIDTH, check_inputs, excerpt, number, whole_number
 from pickplace.task.grasps import split_footprint
 from pickplace.task.state import item_from_depth
 
@@ -13,10 +13,10 @@ SIZES = 13  # numbers beside the points
 
 
 class CornerNet(nn.Module):
-    """Scores footprints by the heights at points on them and around them, in proportion to the item that would lie there.
+    """Scores footprints by the heights at points on and around them, in proportion to the item that would lie there.
 
-    A grid of points is laid over the footprint and turned with it, so that an item that is turned is seen as one that is
-    not. Along each side of the item, ``inside`` points are spread evenly; beyond each end follow the ``near`` next
+    A grid of points is laid over the footprint and turned with it, so that a turned item is seen as one that is not
+    turned. Along each side of the item, ``inside`` points are spread evenly; beyond each end follow the ``near`` next
     cells, since the width of a gap counts in cells, and one point half an item further. At each point the network sees
     how high the surface is above what the item would rest on, in heights of the item, and whether it is higher than the
     item's top, level with the top, level with what the item rests on, too weak to bear weight, or outside the tote.
@@ -45,6 +45,8 @@ class CornerNet(nn.Module):
             whole_number(f"model.actor.{key}", value, most=MAX_WIDTH)
         for key, value in {"inside": inside, "near": near}.items():
             whole_number(f"model.actor.{key}", value, most=64)
+        if not isinstance(item_scale, (list, tuple)) or len(item_scale) != 2:
+            raise ValueError(f"model.actor.item_scale={excerpt(item_scale)}: expected [side, height].")
         self.item_scale = tuple(number("model.actor.item_scale", value, 1e-3, 1e6) for value in item_scale)
         number("model.actor.head_std", head_std, most=1e3)
         self.inside, self.near = inside, near
@@ -91,7 +93,8 @@ class CornerNet(nn.Module):
         depth = F.pad(tote_depth, (1, 1, 1, 1)).flatten()[cells]
         weak = F.pad(1.0 - bearing, (1, 1, 1, 1)).flatten()[cells]
 
-        rest = self._rest(tote_depth, row, x, y, turned, w, d)  # depth of what the item rests on, [M, 1]
+        longest = torch.sym_max(*bin_depth.shape[1:])
+        rest = self._rest(tote_depth, longest, row, x, y, turned, w, d)  # depth of what the item rests on, [M, 1]
         above = (rest[..., None] - depth) / h[..., None]  # of the surface, in heights of the item
         inside = 1 - outside
         planes = [above.clamp(-1.5, 1.5) * inside, (above > 1) * inside, (above == 1) * inside]
@@ -107,16 +110,17 @@ class CornerNet(nn.Module):
 
     def _points(self, side: Tensor) -> Tensor:
         """Return the points along sides of an item ``[M, 1]``, in cells from its beginning, int64 ``[M, points]``."""
-        near = torch.arange(1, self.near + 1, device=side.device).expand(len(side), -1)
+        near = torch.arange(1, self.near + 1, device=side.device).expand(side.shape[0], -1)
         beyond = torch.cat([near, self.near + (side + 1) // 2], 1)
         within = (2 * torch.arange(self.inside, device=side.device) + 1) * side // (2 * self.inside)
         return torch.cat([-beyond.flip(1), within, side - 1 + beyond], 1)
 
     @staticmethod
-    def _rest(tote_depth: Tensor, row: Tensor, x: Tensor, y: Tensor, turned: Tensor, w: Tensor, d: Tensor) -> Tensor:
-        """Return the least depth under each footprint ``[M, 1]``."""
+    def _rest(
+        tote_depth: Tensor, longest: int, row: Tensor, x: Tensor, y: Tensor, turned: Tensor, w: Tensor, d: Tensor
+    ) -> Tensor:
+        """Return the least depth under each footprint ``[M, 1]``; no item is longer than ``longest``."""
         _, wide, deep = tote_depth.shape
-        longest = int(torch.maximum(w, d).amax()) if len(row) else 1
         step = torch.arange(longest, device=row.device)
         # The cells of a square; those beyond the footprint stand for its last row or column.
         wx, wy = torch.where(turned, d, w), torch.where(turned, w, d)
