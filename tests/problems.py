@@ -139,7 +139,9 @@ SETTINGS = [
     {"num_envs": 4, "tote_size": (5, 6, 3), "effector_size": (2, 3), "pick_rule": "overlap", "rotations": 2},
     {"num_envs": 4, "tote_size": (5, 5, 4), "items": Uniform((1, 2), (1, 3), (1, 2)), "support": "more_than_half"},
     {"num_envs": 4, "tote_size": (6, 6, 6), "items": Uniform((1, 3), (1, 3), (1, 2)), "support": "bearing"},
-]
+    {"num_envs": 4, "body": [[1, 1, 1], [1, 1, 0], [1, 1, 0]], "cup": [[0, 0, 0], [1, 1, 0], [0, 0, 0]],
+     "pick_rule": "seal", "min_seal": 0.5},
+]  # fmt: skip
 
 
 def random_states(steps=8, **settings):

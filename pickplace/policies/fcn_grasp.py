@@ -14,7 +14,15 @@ from pickplace.task.feasibility import (
     first_action_reaching,
     footprint_mask,
 )
-from pickplace.task.grasps import class_index, footprint_index, is_outside, join_action, pick_classes, split_flat
+from pickplace.task.grasps import (
+    class_index,
+    footprint_index,
+    is_outside,
+    join_action,
+    num_grasp_turns,
+    pick_classes,
+    split_flat,
+)
 from pickplace.task.placing import clearance, unchecked_top
 from pickplace.task.state import Observation, State, item_from_depth
 from pickplace.task.transition import apply
@@ -135,7 +143,7 @@ class GraspPolicy(Policy):
 
     def __init__(self, cell: CellSpec, **network):
         super().__init__(cell)
-        self.classes = cell.parities * cell.num_offsets**2
+        self.classes = num_grasp_turns(cell) * cell.num_offsets**2
         self.network = FootprintFcn(cell.num_offsets**2, **network)
         self.miss, self.outside = (nn.Parameter(torch.zeros(())) for _ in range(2))
         self.register_buffer("scored", self._scored(), persistent=False)
@@ -148,8 +156,8 @@ class GraspPolicy(Policy):
         (tote_w, tote_d, _), offsets, low = self.cell.tote_size, self.cell.num_offsets, self.cell.min_offset
         step, x, y = torch.arange(offsets), torch.arange(tote_w), torch.arange(tote_d)
         found = []
-        for parity in range(self.cell.parities):
-            shape = self.cell.effector(parity)
+        for turn in range(num_grasp_turns(self.cell)):  # those of one parity have the same scores
+            parity, shape = turn % 2, self.cell.effector(turn)
             left = x[:, None] + (step[:, None, None, None] + low - shape.ref_x)  # [O, 1, W_T, 1]
             front = y + (step[:, None, None] + low - shape.ref_y)  # [O, 1, D_T]
             # The network sees a turned footprint along the item's own axes.

@@ -226,7 +226,12 @@ def num_turns(cell: CellSpec) -> int:
 
     They are parities; or rotations, where limits may forbid one and not its like, or a half turn changes the body.
     """
-    return max(cell.parities, len(cell.effectors)) if cell.limits is None else cell.rotations
+    return num_grasp_turns(cell) if cell.limits is None else cell.rotations
+
+
+def num_grasp_turns(cell: CellSpec) -> int:
+    """Return how many turns are told apart without limits."""
+    return max(cell.parities, len(cell.effectors))
 
 
 def class_index(cell: CellSpec, turns: Tensor | int, step_x: Tensor, step_y: Tensor) -> Tensor:
@@ -235,10 +240,13 @@ def class_index(cell: CellSpec, turns: Tensor | int, step_x: Tensor, step_y: Ten
 
 
 def pick_classes(cell: CellSpec, item: Item) -> Tensor:
-    """Return the grasp class of every pick cell and rotation, int64 ``[N, P, R]``; -1 if the pick fails."""
+    """Return the grasp class of every pick cell and rotation, int64 ``[N, P, R]``; -1 if the pick fails.
+
+    The turns are those of :func:`num_grasp_turns`.
+    """
     succeeds, offset = all_grasps(cell, item)
     step = (offset - cell.min_offset).clamp(0, cell.num_offsets - 1)
-    turns = torch.arange(cell.rotations, device=offset.device) % cell.parities
+    turns = torch.arange(cell.rotations, device=offset.device) % num_grasp_turns(cell)
     return torch.where(succeeds[..., None], class_index(cell, turns, step[..., 0], step[..., 1]), -1)
 
 

@@ -26,6 +26,14 @@ CELLS = [
     {"tote_size": (4, 4, 2), "bin_size": (4, 4, 1), "num_envs": 4},
     {"tote_size": (4, 5, 3), "bin_size": (4, 3, 1), "effector_size": (3, 2), "rotations": 3, "num_envs": 4},
     {"tote_size": (4, 4, 2), "bin_size": (3, 3, 1), "rotations": 1, "pick_rule": "overlap", "num_envs": 4},
+    {
+        "tote_size": (4, 5, 2),
+        "effector_size": (2, 2),
+        "cup": [[1, 0], [1, 0]],
+        "pick_rule": "seal",
+        "min_seal": 0.5,
+        "num_envs": 4,
+    },
 ]
 every_policy = pytest.mark.parametrize("kind", POLICIES)
 MASKS = {"masks": ("action", "footprint", "corner")}
