@@ -10,6 +10,7 @@ from pickplace.physics.outcome import Loss
 from pickplace.physics.plans import EpisodePlan, Placement, Point
 from pickplace.physics.scene import STIFF, TIMESTEP, WALL, Scene, mujoco
 from pickplace.physics.simulation import Simulation, wait
+from pickplace.task.checks import number
 
 HEADROOM = 0.02  # distance between what is carried and the rims, m
 TURNING_SPEED = 4.0  # greatest speed of the hinge, rad/s
@@ -31,6 +32,8 @@ class Execute(Simulation):
 
     Args:
         plate_thickness: thickness of the end effector; m.
+        plate_diameter: of a round end effector in the middle of its cells, which it may cover in part; m. None: it
+            covers the cells of its body.
         plate_mass: mass of the end effector; kg.
         lip: length of the suction cup's lip, between plate and item; m.
         release_height: of an item above its planned pose when it is released; m.
@@ -42,6 +45,7 @@ class Execute(Simulation):
     """
 
     plate_thickness: float = 0.01
+    plate_diameter: float | None = None
     plate_mass: float = 2.0
     lip: float = 0.001
     release_height: float = 0.0005
@@ -58,9 +62,17 @@ class Execute(Simulation):
         "slow_speed": (0.01, 5),
     }  # fmt: skip
 
+    def __post_init__(self):
+        super().__post_init__()
+        if self.plate_diameter is not None:
+            number("physics.plate_diameter", self.plate_diameter, 1e-3, 10)
+
     def make_scene(self, plan: EpisodePlan) -> "Gantry":
         if not (plan.bin and plan.effector):
             raise ValueError(f"physics=execute: episode {plan.episode} has no bin; expected plans with all keys.")
+        if self.plate_diameter is not None and self.plate_diameter > min(plan.effector):
+            most = min(plan.effector)
+            raise ValueError(f"physics.plate_diameter={self.plate_diameter:g}: expected at most {most:g}, its cells.")
         for _, _, *sides in plan_body(plan):
             self.check_width(f"episode {plan.episode}, end effector", sides)
         return Gantry(self, plan)
@@ -120,13 +132,21 @@ class Gantry(Scene):
         self.data.qpos[:4] = self.data.ctrl[:4] = self.goal
 
     def _add_plate(self, plan: EpisodePlan) -> None:
-        """Add the end effector, a box for each rectangle of its body; each is narrower by the gap."""
+        """Add the end effector: a disc, or a box for each rectangle of its body; each is narrower by the gap."""
         self.plate = self.spec.worldbody.add_body(name="plate", gravcomp=1.0)
-        thickness, boxes = self.options.plate_thickness, np.array(plan_body(plan))
+        thickness, diameter, boxes = (
+            self.options.plate_thickness,
+            self.options.plate_diameter,
+            np.array(plan_body(plan)),
+        )
         sides, centres = boxes[:, 2:] - self.gap, boxes[:, :2] + boxes[:, 2:] / 2 - np.divide(plan.effector, 2)
+        if diameter is not None:
+            sides, centres = np.array([[diameter - self.gap] * 2]), np.zeros((1, 2))
         for side, centre in zip(sides, centres, strict=True):
             geom = self.add_geom(self.plate, (*side, thickness), (*centre, thickness / 2))
             geom.density = self.options.plate_mass / float(sides.prod(1).sum() * thickness)
+            if diameter is not None:
+                geom.type, geom.size = mujoco.mjtGeom.mjGEOM_CYLINDER, (side[0] / 2, thickness / 2, 0)
         for axis, name in enumerate(("x", "y", "z")):
             self.plate.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.eye(3)[axis])
         self.plate.add_joint(name="turn", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 0, 1), armature=0.01)

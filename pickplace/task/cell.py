@@ -333,12 +333,12 @@ class CellSpec:
                 found += [at for at in held if sum(part[max(at, 0) : at + side]) >= self.least_sealed]
         return range(min(found), max(found) + 1) if found else range(1)
 
-    @property
+    @cached_property
     def min_offset(self) -> int:
         """The lowest offset of an item under the end effector along either axis."""
         return self._offsets[0]
 
-    @property
+    @cached_property
     def num_offsets(self) -> int:
         """``O``: how many offsets there are along one axis."""
         return len(self._offsets)

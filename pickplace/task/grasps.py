@@ -20,28 +20,28 @@ from pickplace.task.state import Item
 
 
 # ---------------------------------------------------------------------- the checks of a pick, one function each
-def cup_cells_on(cell: CellSpec, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor) -> Tensor:
-    """Return how many cells of the cup lie on the item.
+def is_gripped(cell: CellSpec, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor) -> Tensor:
+    """Return whether the end effector grips the item: whether enough cells of the cup lie on it.
 
     Args:
         near_x, near_y: from the end effector's minimum corner to the item's, before turning, in cells; negative if the
             item begins before it. They broadcast.
         w, d: sides of the item.
     """
-
-    def shared(near: Tensor, side: Tensor, begin: int, length: int) -> Tensor:
-        return ((near + side).clamp(max=begin + length) - near.clamp(min=begin)).clamp_(min=0)
-
-    if cell.pick_rule != "contain" and any(cell.item_inset):
+    contain = cell.pick_rule == "contain"
+    if not contain and any(cell.item_inset):
         x, y = cell.item_inset
         near_x, near_y, w, d = near_x + x, near_y + y, w - 2 * x, d - 2 * y
-    counts = [shared(near_x, w, box.x, box.width) * shared(near_y, d, box.y, box.depth) for box in cell.cup_boxes]
-    return reduce(torch.add, counts)
+    shared = [(_shared(near_x, w, box.x, box.width), _shared(near_y, d, box.y, box.depth)) for box in cell.cup_boxes]
+    if contain and len(shared) == 1:  # the same along each axis, which is faster
+        return (shared[0][0] == w) & (shared[0][1] == d)
+    count = reduce(torch.add, [x.clamp(min=0) * y.clamp(min=0) for x, y in shared])
+    return count >= (w * d if contain else cell.least_sealed)
 
 
-def is_gripped(cell: CellSpec, count: Tensor, w: Tensor, d: Tensor) -> Tensor:
-    """Return whether the end effector grips an item of sides ``(w, d)`` with ``count`` cells of the cup."""
-    return count >= (w * d if cell.pick_rule == "contain" else cell.least_sealed)
+def _shared(near: Tensor, side: Tensor, begin: int, length: int) -> Tensor:
+    """Return how many cells an item and a part of the cup share along an axis; negative if there are cells between."""
+    return (near + side).clamp_(max=begin + length) - near.clamp(min=begin)
 
 
 def is_outside(corner: Tensor, side: Tensor | int, grid: int) -> Tensor:
@@ -105,7 +105,7 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor) -> Grasp:
     left, front = x - reference_cell(ee_w), y - reference_cell(ee_d)  # the end effector's minimum corner
     near_x, near_y = item.x - left, item.y - front
     back_x, back_y = ee_w - item.w - near_x, ee_d - item.d - near_y
-    gripped = is_gripped(cell, cup_cells_on(cell, near_x, near_y, item.w, item.d), item.w, item.d)
+    gripped = is_gripped(cell, near_x, near_y, item.w, item.d)
     # Every edge of the rectangle has a cell of the body.
     leaves_bin = is_outside(left, ee_w, bin_w) | is_outside(front, ee_d, bin_d)
     # The only thing in a bin is its item, which is never higher than its own top: just the walls can be hit.
@@ -266,8 +266,9 @@ def available_offsets(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:
     back_x, back_y = (
         (back - cell.min_offset).clamp(0, count - 1) for back in (found.back_x, found.back_y)
     )  # [O, 1, N], [O, N]
+    turns = num_turns(cell)
     turned = [
-        class_index(cell, rotation % num_turns(cell), step_x, step_y).expand(count, count, len(item.x))
+        class_index(cell, rotation % turns, step_x, step_y).expand(count, count, len(item.x))
         for rotation, (step_x, step_y) in enumerate(turn(here[:, None], here, back_x, back_y)[: cell.rotations])
     ]
     return (found.succeeds & in_bin).flatten(0, 1), torch.stack(turned).flatten(1, 2)

@@ -25,9 +25,10 @@ def surround(maps: Tensor, margins: tuple[int, int, int, int], value) -> Tensor:
         out.copy_(value.expand_as(out))
     else:
         out.fill_(value)
-    kept = maps[max(0, -x0) : max(0, wide + min(0, x1)), max(0, -y0) : max(0, deep + min(0, y1))]
-    x, y = max(0, x0), max(0, y0)
-    out[x : x + kept.shape[0], y : y + kept.shape[1]] = kept
+    if min(margins) < 0:
+        maps = maps[max(0, -x0) : max(0, wide + min(0, x1)), max(0, -y0) : max(0, deep + min(0, y1))]
+        (wide, deep, _), x0, y0 = maps.shape, max(0, x0), max(0, y0)
+    out[x0 : x0 + wide, y0 : y0 + deep] = maps
     return out
 
 

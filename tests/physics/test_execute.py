@@ -61,6 +61,24 @@ def test_only_the_body_hits_what_is_below_it(body, rotation, ending):
     assert Execute().carry_out_one(EpisodePlan(0, (0.3, 0.3, 0.25), BIN, EFFECTOR, placements, body)).ending == ending
 
 
+@pytest.mark.parametrize(("ahead", "diameter", "ending"), [
+    ((0.02, 0.0), None, "effector_contact"), ((0.02, 0.0), 0.15, "effector_contact"), ((0.02, 0.0), 0.13, "done"),
+    ((0.012, 0.02), None, "effector_contact"), ((0.012, 0.02), 0.15, "done"),  # only a corner is over the tall item
+])  # fmt: skip
+def test_a_round_plate_is_narrower_than_its_cells(ahead, diameter, ending):
+    low = ((0.1, 0.1, 0.0), (0.1, 0.1, 0.05)) if not ahead[1] else ((0.1, 0.12, 0.0), (0.1, 0.1, 0.05))
+    tall = TALL if not ahead[1] else ((0.0, 0.0, 0.0), (0.1, 0.12, 0.1))
+    outcome = carry(placed(*tall, (0.03, 0.06)), placed(*low, ahead), tote=(0.3, 0.4, 0.25), plate_diameter=diameter)
+    assert outcome.ending == ending
+
+
+def test_a_round_plate_must_fit_its_cells():
+    with pytest.raises(ValueError, match="physics.plate_diameter=0.2: expected at most 0.15, its cells"):
+        carry(placed(*LOW), plate_diameter=0.2)
+    with pytest.raises(ValueError, match="physics.plate_diameter='x': expected a number"):
+        Execute(plate_diameter="x")
+
+
 @pytest.mark.parametrize(("suction", "ending"), [(2.0, "dropped"), (50.0, "done")])
 def test_a_heavy_item_needs_suction(suction, ending):
     """0.1 x 0.1 x 0.05 m of 2,000 kg/m^3 weigh 9.8 N."""

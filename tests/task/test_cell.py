@@ -8,6 +8,7 @@ from problems import late_state
 
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.task.cell import CELL_SETTINGS, Limits, cell_from_settings, reference_cell
+from pickplace.task.effector import disc_mask
 from pickplace.task.reach import Annulus
 
 
@@ -28,6 +29,33 @@ from pickplace.task.reach import Annulus
             ({"support": value}, f"support={value!r}: expected 'half' or .* 'full' or a number between 0 and 1")
             for value in (1.5, -0.1, "most", True)
         ),
+        *(
+            (
+                {"body": value},
+                r"body=.*: expected 'rectangle', 'disc', or a mask of effector_size=\[3, 3\]: 3 lists of 3",
+            )
+            for value in ("oval", 3, [[1, 1], [1, 1]], [[1, 1, 2]] * 3, [[1, 1, True]] * 3, [["1"] * 3] * 3, None)
+        ),
+        *(
+            ({"body": value, "cup": value}, "body=.*: expected a 1 in its first and last list, and first and last in")
+            for value in ([[0, 0, 0], [1, 1, 1], [1, 1, 1]], [[0, 1, 1]] * 3, [[1, 1, 0]] * 3)
+        ),
+        ({"cup": [[0] * 3] * 3}, "cup=.*: expected a mask with a 1"),
+        ({"cup": [[1] * 3] * 3, "cup_size": [1, 1]}, r"cup_size=\[1, 1\]: expected null, as cup is a mask"),
+        *(
+            (
+                {"cup_size": value},
+                r"cup_size=.*: expected sides that differ from effector_size=\[3, 3\] by an even number",
+            )
+            for value in ([2, 3], [5, 5])
+        ),
+        ({"cup_size": 3}, "cup_size=3: expected 2 whole numbers"),
+        (
+            {"body": [[1, 1, 1], [1, 0, 0], [1, 0, 0]]},
+            r"cup='rectangle', cup_size=None: cell \(1, 1\) of the cup is not in",
+        ),
+        ({"effector_size": (7, 7), "body": "disc"}, r"cell \(0, 0\) of the cup is not in body='disc'"),
+        *(({"min_seal": value}, f"min_seal={value}: expected a number > 0 and <= 1") for value in (0, 1.1, True)),
         ({"support": "hull", "support_margin": -1}, "support_margin=-1: .* between 0 and 100"),
         *(({"height_unit": value}, f"height_unit={value}: .* between 0.001 and 1000") for value in (1e-4, 2000)),
         ({"longest_side": 0}, "longest_side=0: expected a whole number >= 1"),
@@ -63,6 +91,36 @@ def test_counts_of_offsets_and_footprints():
     assert CellSpec(longest_side=2, pick_rule="overlap").num_offsets == 4
     assert contain.effectors == ((2, 4, 0, 1, ((0, 0, 2, 4),)), (4, 2, 1, 0, ((0, 0, 4, 2),)))
     assert [reference_cell(side) for side in (1, 2, 3, 4, 5)] == [0, 0, 1, 1, 2]
+
+
+def test_a_disc_touches_these_cells():
+    """By hand: the corner cell of 7 is 2.5 * sqrt(2) cells from the centre, beyond 3.5; that of 6 is nearer than 3."""
+    assert [sum(map(sum, disc_mask(side, side))) for side in (1, 2, 3, 6, 7)] == [1, 4, 9, 36, 45]
+    assert disc_mask(7, 7)[0] == (0, 1, 1, 1, 1, 1, 0)
+    assert disc_mask(8, 4) == ((1, 1, 1, 1),) * 8  # (3 / 4)**2 + (1 / 2)**2 < 1
+    assert disc_mask(16, 6)[0] == (0, 1, 1, 1, 1, 0)  # (7 / 8)**2 + (2 / 3)**2 > 1 > (7 / 8)**2 + (1 / 3)**2
+
+
+def test_offsets_follow_from_the_cup():
+    """From the lowest to the highest offset at which an item of the longest side may be gripped."""
+
+    def offsets(**settings):
+        cell = CellSpec(**settings)
+        return cell.min_offset, cell.min_offset + cell.num_offsets - 1, cell.least_sealed
+
+    small = {"effector_size": (7, 7), "body": "disc", "cup": "disc", "cup_size": (3, 3), "longest_side": 4}
+    assert offsets(**small) == (2, 4, 1)  # the item begins under the cup, cells 2 to 4
+    assert offsets(**small, pick_rule="overlap") == (-1, 4, 1)
+    assert offsets(**small, pick_rule="seal") == (1, 2, 9)  # it covers cells 2 to 4
+    assert offsets(**small, pick_rule="seal", min_seal=2 / 3) == (0, 3, 6)  # two of three columns
+    assert offsets(**small, pick_rule="seal", min_seal=0.67) == (1, 2, 7)
+    corner = {"cup": [[1, 0, 0], [0, 0, 0], [0, 0, 0]], "longest_side": 1, "pick_rule": "seal"}
+    assert offsets(**corner) == (0, 2, 1) and offsets(**corner, rotations=1) == (0, 0, 1)
+    # The same after no, a quarter or half a turn: 1, 2, or R shapes.
+    bodies = [[1, 1, 1]] * 3, [[1, 1, 1], [0, 1, 0], [1, 1, 1]], [[1, 1, 1], [1, 0, 0], [1, 1, 1]]
+    for rotations, counts in ((1, (1, 1, 1)), (2, (1, 2, 2)), (3, (1, 2, 3)), (4, (1, 2, 4))):
+        cells = [CellSpec(body=body, cup=body, rotations=rotations) for body in bodies]
+        assert tuple(len(cell.effectors) for cell in cells) == counts
 
 
 def test_the_height_unit_changes_no_rule():
