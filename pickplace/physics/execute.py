@@ -117,7 +117,7 @@ class Gantry(Scene):
     """
 
     def __init__(self, options: Execute, plan: EpisodePlan):
-        super().__init__(options.friction, options.density, options.gap, options.sleep)
+        super().__init__(options.friction, options.density, options.gap, options.sleep, options.contact_damping)
         self.options, self.holding = options, False
         self.weld: mujoco.MjsEquality
         # So far apart that an end effector that hangs over a wall of one hits no wall of the other.

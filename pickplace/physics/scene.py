@@ -18,7 +18,7 @@ except ImportError:  # an extra; Simulation says so
     mujoco = None
 
 #: Contacts and welds are stiff: a tower of six boxes sinks by 0.02 mm.
-STIFF = {"solref": (0.005, 1.0), "solimp": (0.99, 0.999, 0.0001, 0.5, 2.0)}
+STIFF = {"solref": (0.005, 1.0), "solimp": (0.99, 0.999, 0.0001, 0.5, 2.0)}  # of contacts: time in s, damping ratio
 TIMESTEP = 0.002
 WALL = 0.01  # thickness of floor and walls
 
@@ -33,6 +33,7 @@ class Scene:
         density: of the boxes.
         gap: total narrowing of a box along x and along y.
         sleep: let bodies that do not move sleep.
+        contact_damping: damping ratio of contacts.
 
     Attributes:
         spec, model, data: MuJoCo's; the latter two are new ones after each :meth:`add`.
@@ -45,8 +46,9 @@ class Scene:
     plate: Any = None
     bin: Any = None
 
-    def __init__(self, friction: float, density: float, gap: float, sleep: bool = True):
+    def __init__(self, friction: float, density: float, gap: float, sleep: bool = True, contact_damping: float = 1.0):
         self.friction, self.density, self.gap = friction, density, gap
+        self._stiff = {**STIFF, "solref": (STIFF["solref"][0], contact_damping)}
         self.spec = mujoco.MjSpec()
         option = self.spec.option
         option.timestep, option.cone, option.impratio = TIMESTEP, mujoco.mjtCone.mjCONE_ELLIPTIC, 10
@@ -100,7 +102,7 @@ class Scene:
         """Add a box-shaped surface to a body."""
         friction = [self.friction, 0.005, 0.0001]
         box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": np.divide(size, 2), "pos": centre}
-        return body.add_geom(**box, friction=friction, density=self.density, **STIFF)
+        return body.add_geom(**box, friction=friction, density=self.density, **self._stiff)
 
     def run(self, seconds: float) -> None:
         """Let time pass."""

@@ -20,7 +20,7 @@ class Settle(Simulation):
     name: ClassVar[str] = "settle"
 
     def make_scene(self, plan: EpisodePlan) -> Scene:
-        scene = Scene(self.friction, self.density, self.gap, self.sleep)
+        scene = Scene(self.friction, self.density, self.gap, self.sleep, self.contact_damping)
         scene.add_container(plan.tote)
         return scene
 

@@ -85,6 +85,14 @@ def test_a_heavy_item_needs_suction(suction, ending):
     assert carry(placed(*LOW), density=2000.0, suction=suction).ending == ending
 
 
+def test_contacts_are_damped_as_asked():
+    plan = EpisodePlan(0, (0.3, 0.3, 0.25), BIN, EFFECTOR, [placed(*LOW)])
+    scene = Execute(contact_damping=2.0).make_scene(plan)
+    scene.add((0.1, 0.1, 0.0), (0.1, 0.1, 0.05), np.zeros(3))
+    assert len(scene.model.geom_solref) > 10 and (scene.model.geom_solref[:, 1] == 2.0).all()
+    assert Execute(contact_damping=2.0).carry_out_one(plan).ending == "done"
+
+
 def test_a_light_contact_does_not_count():
     heavy_handed = [placed(*TALL, (0.03, 0)), placed(*LOW, (0.02, 0))]  # 5 mm over the tall one
     assert carry(*heavy_handed, contact_force=1e5).ending != "effector_contact"
