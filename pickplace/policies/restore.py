@@ -151,7 +151,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     cfg = trusted_config(facts["config"], trust)
     env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
     cell = build_cell(env, **sizes)
-    if not cell.has_known_offsets:  # it determines the number of grasps
+    if not (cell.has_known_offsets or cfg.algo.mask_infeasible):  # the policy chooses among grasps: so many are there
         longest = int(build("items", cfg["items"]).sizes[:, :2].max())
         cell = replace(cell, longest_side=longest)
     policy = restore_policy(cfg, cell, state["policy"], env)

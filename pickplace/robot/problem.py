@@ -266,6 +266,7 @@ def read_metric(
         height_unit=MILLIMETRE / cell_size,
         limits=None,
         item_inset=(inset[0], inset[1]),
+        longest_side=cell.longest_side or (None if cell.has_known_offsets else max(whole)),
     )
     centres = effector_centres(free, item, (box.x, box.y), box.yaw, cell_size)
     above_walls = box.h - accuracy >= cell.bin_size[2] * unit - ROUNDING
