@@ -5,7 +5,8 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
+from pickplace.policies.restore import build_cell
+from pickplace.task.cell import CellSpec
 from pickplace.task.items import ItemDistribution
 from pickplace.task.state import Item
 
@@ -34,7 +35,7 @@ class Training:
         """Return what a checkpoint's config says."""
         kinds = frozenset((int(w), int(d), int(h)) for w, d, h in items.sizes.tolist())
         env = cast(dict, OmegaConf.to_container(config.env, resolve=True))
-        cell = cell_from_settings({"support": "half"} | {key: env[key] for key in CELL_SETTINGS if key in env})
+        cell = build_cell({"support": "half"} | env)
         rules = {key: getattr(cell, key) for key in RULES}
         return cls(kinds, tuple(env["tote_size"]), tuple(env["effector_size"]), rules)
 

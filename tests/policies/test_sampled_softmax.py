@@ -92,7 +92,7 @@ def test_forbidden_choices_are_no_candidates(samples):
 @pytest.mark.parametrize("options", CELLS)
 @every_policy
 def test_logits_of_some_choices_are_those_of_all(kind, options):
-    for env, observation in random_states(steps=3, masks=("action", "footprint"), **options):
+    for env, observation in random_states(steps=3, masks=("action", "footprint", "corner"), **options):
         policy = small(kind, env.cell)
         logits = policy.logits(observation)
         choices = torch.distributions.Categorical(logits=logits).sample((7,)).T
@@ -141,7 +141,7 @@ def test_logits_of_a_pair_are_the_same_in_any_batch():
 
 @every_policy
 def test_the_collector_s_candidates_are_drawn_from_the_policy(kind):
-    env, observation = next(iter(random_states(masks=("action", "footprint"), **CELLS[0])))
+    env, observation = next(iter(random_states(masks=("action", "footprint", "corner"), **CELLS[0])))
     policy = small(kind, env.cell)
     frame = as_sampling_policy(policy, 5, 2.0)(observation.clone())
     candidates, log_prob, log_weight = (frame[key] for key in CANDIDATE_KEYS)
