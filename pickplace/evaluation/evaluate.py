@@ -260,7 +260,7 @@ def read_comparison(path: Path, expected: dict) -> dict:
             raise ValueError(f"compare={excerpt(str(path))}: its {key} is {found}, expected {excerpt(expected[key])}.")
     unused = {"support_margin": cell.get("support") not in HULL_RULES, "min_seal": cell.get("pick_rule") != "seal"}
     for key in CELL_SETTINGS:
-        # A setting that is younger than the file, or than the checkpoint, has its default; the sizes are in all of them.
+        # A setting that is younger than the file, or the checkpoint, has its default; the sizes are in all of them.
         default = None if key.endswith("_size") else getattr(CellSpec, key)
         ours, theirs = (env.get(key, default) for env in (expected["env"], cell))
         if not is_same(ours, theirs) and not unused.get(key):

@@ -27,8 +27,8 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
     size = (*cell.tote_size[:2], recording.tote_height)
     figure = figure_of(12, 6)
     solid, plan = figure.subplots(1, 2, width_ratios=[1.2, 1])
-    draw_tote(solid, size)
-    draw_boxes(solid, boxes, colours, size)
+    draw_tote(solid, (*size[:2], size[2] * cell.height_unit))
+    (draw_boxes if cell.height_unit == 1 else draw_blocks)(solid, boxes, colours, size, cell.height_unit)
     if 0 < len(colours) <= 20:
         _draw_legend(figure, colours, cell)
     _draw_plan(plan, heights, recording.tote_height, cell)
@@ -101,7 +101,7 @@ def _to_paper(a, b) -> tuple[float, float]:
     return (a - b) * 3**0.5 / 2, -(a + b) / 2
 
 
-def draw_tote(axes, size: tuple[int, int, int]) -> None:
+def draw_tote(axes, size: tuple[float, float, float]) -> None:
     """Draw a tote in isometric projection, seen from above the corner with the greatest x and the least y."""
     from matplotlib.collections import LineCollection, PolyCollection
 
@@ -126,8 +126,44 @@ def draw_tote(axes, size: tuple[int, int, int]) -> None:
     axes.set_axis_off()
 
 
-def draw_boxes(axes, boxes: list[Box], colours: dict[Kind, str], size: tuple[int, int, int]) -> None:
-    """Draw the items in a tote of this size, in the projection of :func:`draw_tote`."""
+def far_to_near(low: np.ndarray, sides: np.ndarray) -> list[int]:
+    """Return the order in which boxes hide each other, seen from the direction (1, 1, 1): their numbers.
+
+    A box can hide another one only if it is nowhere wholly beyond it; so there is an order, unless three or more hide
+    each other in a circle, which one of them then ends.
+
+    Args:
+        low, sides: ``[n, 3]``, of boxes that do not overlap.
+    """
+    hides = ((low + sides)[:, None] > low + 1e-9).all(2) & ~np.eye(len(low), dtype=bool)  # [nearer, farther]
+    order, left = [], list(range(len(low)))
+    while left:
+        free = (number for number in left if not hides[number, left].any())
+        order.append(next(free, min(left, key=lambda index: low[index].sum())))
+        left.remove(order[-1])
+    return order
+
+
+def draw_blocks(axes, boxes: list[Box], colours: dict[Kind, str], size: tuple[int, int, int], unit: float) -> None:
+    """Draw the items one over the other, the farthest first: for heights in units that are no cells."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_rgb
+
+    wide, deep, _ = size
+    low = np.array([(x, deep - y - d, z * unit) for x, y, z, _, d, _ in boxes]).reshape(-1, 3)
+    sides = np.array([(w, d, h * unit) for *_, w, d, h in boxes]).reshape(-1, 3)
+    faces, fills = [], []
+    for number in far_to_near(low, sides):
+        for _, light, corners in FACES:
+            points = low[number] + np.array(corners) * sides[number]
+            faces.append([_to_paper(x - z, y - z) for x, y, z in points])
+            fills.append(np.array(to_rgb(colours[kind_of(boxes[number])])) * light)
+    width = float(np.clip(10 / (wide + deep), 0.35, 1.1))
+    axes.add_collection(PolyCollection(faces, facecolors=fills, edgecolors=INK, linewidths=width, zorder=2))
+
+
+def draw_boxes(axes, boxes: list[Box], colours: dict[Kind, str], size: tuple[int, int, int], unit: float = 1.0) -> None:
+    """Draw the items in a tote of this size, in the projection of :func:`draw_tote`; heights are in cells."""
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.colors import to_rgb
 

@@ -7,7 +7,7 @@ from pickplace import CellSpec, Failure
 from pickplace.views.figures import FAILURES, learning_curve
 from pickplace.views.recording import Move, Recording
 from pickplace.views.replay import picture
-from pickplace.views.scene import draw_scene, item_colours, visible_triangles
+from pickplace.views.scene import draw_scene, far_to_near, item_colours, visible_triangles
 from pickplace.views.tables import evaluation_table
 
 
@@ -146,3 +146,27 @@ def test_evaluation_table():
         "mask; candidates K": "in training yes, at decision no; 10",
         "checkpoint": "run/checkpoints/best (1,200,000 frames, seed 3)",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nearer_boxes_are_drawn_over_farther_ones(seed):
+    """On lines of sight through boxes of a random cut of a block, the box that is drawn last is the one that is seen."""
+    draw, boxes = np.random.default_rng(seed), [np.array([[0.0, 0, 0], [4, 3, 2]])]  # low and high corner
+    for _ in range(20):
+        low, high = boxes.pop(draw.integers(len(boxes)))
+        axis = draw.integers(3)
+        cut = draw.uniform(low[axis], high[axis])
+        halves = np.array([[low, high], [low, high]])
+        halves[0, 1, axis] = halves[1, 0, axis] = cut
+        boxes += [*halves]
+    low, high = np.array(boxes)[draw.random(len(boxes)) < 0.8].transpose(1, 0, 2)
+    order = far_to_near(low, high - low)
+    assert sorted(order) == list(range(len(low)))
+    met = 0
+    for origin in np.pad(draw.uniform(-2, 4, (2000, 2)), ((0, 0), (0, 1))):  # the line (a + t, b + t, t)
+        begin, end = (low - origin).max(1), (high - origin).min(1)
+        hit = np.nonzero(begin < end)[0]
+        if len(hit) > 1:
+            met += 1
+            assert max(hit, key=order.index) == max(hit, key=lambda number: end[number])
+    assert met > 100
