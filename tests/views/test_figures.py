@@ -150,7 +150,7 @@ def test_evaluation_table():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_nearer_boxes_are_drawn_over_farther_ones(seed):
-    """On lines of sight through boxes of a random cut of a block, the box that is drawn last is the one that is seen."""
+    """On lines of sight through the parts of a block that was cut at random, the last one drawn is the one seen."""
     draw, boxes = np.random.default_rng(seed), [np.array([[0.0, 0, 0], [4, 3, 2]])]  # low and high corner
     for _ in range(20):
         low, high = boxes.pop(draw.integers(len(boxes)))
