@@ -33,6 +33,9 @@ log = logging.getLogger(__name__)
 
 MAX_EVALUATION = 2**26  # greatest size of an evaluation.json that is read, in bytes
 
+#: Settings of the cell that older files lack; they were played with the default.
+YOUNG_SETTINGS = ("body", "cup", "cup_size", "min_seal", "reach")
+
 #: Config groups that an evaluation takes from the checkpoint; :data:`PARTS_OF_ENV` are in the first.
 TRAINED = ("env", "items", "model", "algo")
 
@@ -260,8 +263,8 @@ def read_comparison(path: Path, expected: dict) -> dict:
             raise ValueError(f"compare={excerpt(str(path))}: its {key} is {found}, expected {excerpt(expected[key])}.")
     unused = {"support_margin": cell.get("support") not in HULL_RULES, "min_seal": cell.get("pick_rule") != "seal"}
     for key in CELL_SETTINGS:
-        # A setting that is younger than the file, or the checkpoint, has its default; the sizes are in all of them.
-        default = None if key.endswith("_size") else getattr(CellSpec, key)
+        # A setting that is younger than the file, or the checkpoint, has its default.
+        default = getattr(CellSpec, key) if key in YOUNG_SETTINGS else None
         ours, theirs = (env.get(key, default) for env in (expected["env"], cell))
         if not is_same(ours, theirs) and not unused.get(key):
             raise ValueError(f"compare={excerpt(str(path))}: env.{key}={excerpt(theirs)}, expected {ours}.")

@@ -83,7 +83,7 @@ class Lookahead(MapPlanner):
             len(state.surface) * streams * 16 * self.cell.num_footprints,
             state.surface.device,
         )
-        logits = self.policy.footprint_logits(observation, self.policy.ranked(maps))
+        logits = self.policy.footprint_logits(observation, self.policy.with_cell(cell).ranked(maps))
         # Of equals the first, as the policy itself plays.
         value, choice = torch.sort(logits, dim=1, descending=True, stable=True)
         value, choice = value[:, : self.candidates], choice[:, : self.candidates]

@@ -80,7 +80,7 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
         )
     keys = _inputs(policy)
     seen = _observations(trained, keys, 1)
-    facts = {key: getattr(cell, key) for key in CELL_SETTINGS}
+    facts = {key: getattr(cell, key) for key in CELL_SETTINGS if key != "reach"}  # scores do not depend on it
     model = _convert(Scores(policy, keys).eval(), keys, seen)
     model.model.metadata_props.update({
         "pickplace": pickplace.__version__,
