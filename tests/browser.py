@@ -1,4 +1,4 @@
-"""What tests of pages do with the browser that ``conftest.py`` starts."""
+"""Helpers for tests of pages in the browser that ``conftest.py`` starts."""
 
 import time
 

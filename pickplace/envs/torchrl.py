@@ -55,7 +55,7 @@ class PickPlaceEnv(EnvBase):
         * further terms, see ``observation``.
         * ``action_mask``, bool ``[N, N_a]``: True where and only where the action would succeed.
         * ``footprint_mask``, bool ``[N, Q * W_T * D_T]``, only with ``masks`` naming it: the distinct footprints
-          ``(parity, x, y)`` that some action reaches.
+          ``(parity, x, y)`` that some action reaches; ``corner_mask``, the same of those that occupy a corner.
         * ``occupancy``, float32 ``[N, 1]``: volume placed / volume of the tote.
 
     Rewards:
@@ -75,7 +75,7 @@ class PickPlaceEnv(EnvBase):
         seed: seed of the item stream.
         device: where the tensors live.
         stream: family of item streams, ``"train"``, ``"validation"`` or ``"test"``; they never meet.
-        masks: which masks to emit, any of ``"action"`` and ``"footprint"``.
+        masks: which masks to emit, any of ``"action"``, ``"footprint"`` and ``"corner"``.
         observation: what the agent sees, :class:`~pickplace.task.observation.Term` by key; by default the four
             terms above, which are always among them.
         first_episode: number of the episode that slot 0 plays first; slot ``i`` plays ``first_episode + i``.

@@ -58,7 +58,7 @@ def critic_serves_any_tote(cfg: DictConfig) -> bool:
     Another one is tied to the tote of the training, and larger than the policy.
     """
     env: Any = OmegaConf.to_container(cfg.env, resolve=True)
-    cell = build_cell(env)
+    cell = build_cell(env, reach=None)  # a table of reach may be elsewhere
     find("model.critic", cfg.model.critic._target_)  # imports it, which the device "meta" does not allow
     with torch.device("meta"):
         return getattr(build("model.critic", cfg.model.critic, cell=cell), "any_size", False)

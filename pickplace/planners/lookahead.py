@@ -68,7 +68,9 @@ class Lookahead(MapPlanner):
             whole_number("planner.horizon", horizon)
         number("planner.confidence", confidence)
         if not getattr(policy, "ranks_footprints", False):
-            raise ValueError("planner=lookahead: expected a checkpoint of model=fcn_grasp, trained with a mask.")
+            raise ValueError(
+                "planner=lookahead: expected a checkpoint of model=fcn_grasp or corners, trained with a mask."
+            )
         self.cell, self.policy, self.critic, self.terms = cell, policy, critic, terms
         self.horizon = horizon if critic is not None else None
         self.items = search_items(items)

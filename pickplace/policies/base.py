@@ -52,7 +52,7 @@ class Policy(TensorDictModuleBase, ABC):
         choice_key: name of the choice in the TensorDict.
         in_keys: entries of the observation that :meth:`logits` reads.
         map_keys: entries of the observation that its network reads.
-        masks: masks that the environment must emit for training it, of ``"action"`` and ``"footprint"``.
+        masks: masks that the environment must emit for training it, of ``"action"``, ``"footprint"`` and ``"corner"``.
         excludes: what :meth:`action_log_probs` gives probability 0 by construction; None if nothing.
         ranks_footprints: whether it chooses among all footprints, by ``footprint_logits(observation, mask)``.
         needs_sizes: whether it cannot learn where :meth:`check_sizes` finds fault.

@@ -13,6 +13,7 @@ from pickplace.task.feasibility import (
     actions_reaching,
     first_action_reaching,
     footprint_mask,
+    unchecked_maps,
 )
 from pickplace.task.grasps import (
     class_index,
@@ -23,7 +24,6 @@ from pickplace.task.grasps import (
     pick_classes,
     split_flat,
 )
-from pickplace.task.placing import clearance, unchecked_top
 from pickplace.task.state import Observation, State, item_from_depth
 from pickplace.task.transition import apply
 
@@ -97,9 +97,7 @@ class FootprintPolicy(Policy):
         return self.scores(observation, row, choices.flatten()).view(choices.shape)
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        state = State.from_observation(observation)
-        top = unchecked_top(self.cell, state)  # a choice is stable: the mask has looked
-        maps = PlacingMaps(top, clearance(self.cell, state), state.item, top)
+        maps = unchecked_maps(self.cell, State.from_observation(observation))  # the mask has looked
         return pick_one(actions_reaching(self.cell, maps, choice))
 
     def to_choice(self, action: Tensor, observation: Observation) -> Tensor:

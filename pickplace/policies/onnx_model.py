@@ -76,7 +76,7 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
     if policy.score_index is None:
         raise ValueError(
             f"{short_text(checkpoint)}: {type(policy).__name__} has no scores for totes of any size; expected "
-            "model=fcn_grasp that was trained with a mask, or model=fcn4d."
+            "model=fcn_grasp or corners that was trained with a mask, or model=fcn4d."
         )
     keys = _inputs(policy)
     seen = _observations(trained, keys, 1)

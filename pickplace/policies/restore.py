@@ -53,7 +53,7 @@ def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: di
     try:
         return restored(cell)
     except checkpoint.CheckpointError as error:
-        trained = build_cell(trained_env)
+        trained = build_cell(trained_env, reach=None)  # a table of reach may be elsewhere
         sizes: dict[str, Any] = {
             key: getattr(trained, key) for key in SIZES if getattr(trained, key) != getattr(cell, key)
         }

@@ -64,7 +64,7 @@ class Refusal(BaseModel):
 
 
 class Health(BaseModel):
-    """What is served."""
+    """The version of the service, and the planner and the cell that it answers for."""
 
     status: str
     version: str

@@ -297,7 +297,7 @@ class CellSpec:
 
     @property
     def cup_bounds(self) -> tuple[tuple[int, int], ...]:
-        """Where the cup begins and ends along x and y, in cells of ``effector_size``."""
+        """The cup's bounding rectangle: its begin and end along x, and along y; in cells of ``effector_size``."""
         filled = [[at for at, line in enumerate(lines) if any(line)] for lines in self._cup_lines]
         return tuple((line[0], line[-1] + 1) for line in filled)
 

@@ -30,7 +30,7 @@ from pickplace.task.grasps import (
     turned_size,
 )
 from pickplace.task.maps import FAR, NEVER, surround, windows
-from pickplace.task.placing import clearance, is_within_reach, resting_top
+from pickplace.task.placing import clearance, is_within_reach, resting_top, unchecked_top
 from pickplace.task.state import Item, State
 
 CLASS_BYTES = 2**28  # of the masks of grasp classes that are held at a time
@@ -57,6 +57,12 @@ def placing_maps(cell: CellSpec, state: State) -> PlacingMaps:
     """Return everything that decides which actions succeed: see :class:`PlacingMaps`."""
     top, rest = resting_top(cell, state)
     return PlacingMaps(top, clearance(cell, state), state.item, rest)
+
+
+def unchecked_maps(cell: CellSpec, state: State) -> PlacingMaps:
+    """Return the maps of footprints that are known to be stable and below the rim, without a look at either."""
+    top = unchecked_top(cell, state)
+    return PlacingMaps(top, clearance(cell, state), state.item, top - state.item.h.to(top.dtype).view(-1, 1, 1, 1))
 
 
 def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:

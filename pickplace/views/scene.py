@@ -28,7 +28,10 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
     figure = figure_of(12, 6)
     solid, plan = figure.subplots(1, 2, width_ratios=[1.2, 1])
     draw_tote(solid, (*size[:2], size[2] * cell.height_unit))
-    (draw_boxes if cell.height_unit == 1 else draw_blocks)(solid, boxes, colours, size, cell.height_unit)
+    if cell.height_unit == 1:
+        draw_boxes(solid, boxes, colours, size)
+    else:
+        draw_blocks(solid, boxes, colours, size, cell.height_unit)
     if 0 < len(colours) <= 20:
         _draw_legend(figure, colours, cell)
     _draw_plan(plan, heights, recording.tote_height, cell)
@@ -162,7 +165,7 @@ def draw_blocks(axes, boxes: list[Box], colours: dict[Kind, str], size: tuple[in
     axes.add_collection(PolyCollection(faces, facecolors=fills, edgecolors=INK, linewidths=width, zorder=2))
 
 
-def draw_boxes(axes, boxes: list[Box], colours: dict[Kind, str], size: tuple[int, int, int], unit: float = 1.0) -> None:
+def draw_boxes(axes, boxes: list[Box], colours: dict[Kind, str], size: tuple[int, int, int]) -> None:
     """Draw the items in a tote of this size, in the projection of :func:`draw_tote`; heights are in cells."""
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.colors import to_rgb

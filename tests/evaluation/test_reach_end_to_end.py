@@ -5,10 +5,11 @@ from math import hypot
 
 import pytest
 from commands import composed
+from untrained import write_checkpoint
 
-from pickplace import Planner, load_policy
+from pickplace import CellSpec, Planner, load_policy
 from pickplace.runs import checkpoint
-from pickplace.task.reach import Annulus
+from pickplace.task.reach import Annulus, ReachTable
 
 TINY = ["env.tote_size=[6,6,2]", "total_frames=128", "reach=annulus", "env.reach.radii=[4.6,9.7]"]
 EVALUATION = ["evaluation.episodes=2", "evaluation.latency_decisions=0", "evaluation.replay=1"]
@@ -113,3 +114,17 @@ def test_a_resumed_run_keeps_its_reach(trained):
         ValueError, match=r"env.reach=\{.*\}: the run began with .*, and a resumed run cannot change it"
     ):
         resumed_config("run", facts, ["env.reach.radii=[1,20]"])
+
+
+def test_a_robot_does_without_the_table_of_the_training(tmp_path):
+    path = tmp_path / "reach.csv"
+    rows = [f"bin,{x},{y},,," for x in range(5) for y in range(5)]
+    rows += [f"tote,{x},{y},{r},," for x in range(6) for y in range(6) for r in range(4)]
+    path.write_text("\n".join(["where,x,y,rotation,lowest,highest", *rows]))
+    words = ["env.tote_size=[6,6,5]", "reach=table", f"env.reach.path={path}"]
+    folder = write_checkpoint(tmp_path / "run", CellSpec(), *words)
+    assert Planner.load(folder).cell.reach == ReachTable(str(path))
+    path.unlink()
+    with pytest.raises(ValueError, match="reach.csv': no such file"):
+        Planner.load(folder)
+    assert Planner.load(folder, reach=None).cell.reach is None

@@ -17,6 +17,7 @@ from pickplace.policies.fcn4d import ActionPolicy
 from pickplace.policies.fcn_grasp import FootprintPolicy
 from pickplace.policies.onnx_model import SHAPES, Scores
 from pickplace.task.feasibility import footprint_mask
+from pickplace.task.reach import Annulus
 from pickplace.task.state import item_from_depth
 
 MAKERS = {
@@ -67,6 +68,13 @@ def test_the_check_is_at_three_sizes_that_the_export_has_not_seen(exported):
     assert shapes == {
         "bin_depth": ["N", "W_B", "D_B"], "tote_depth": ["N", "W_T", "D_T"], "tote_bearing": ["N", "W_T", "D_T"]
     }  # fmt: skip
+
+
+def test_a_robot_with_a_reach_has_the_same_scores(tmp_path):
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    reach = Annulus((0, 99), (0, 9), (0, 0, 0), (0, 0, 0))
+    assert max(onnx_model.export_onnx("pretrained/r4", tmp_path / "r4.onnx", reach=reach).values()) <= 1e-5
 
 
 @settings(max_examples=25)

@@ -11,6 +11,7 @@ from pickplace import Box, CellSpec, Planner
 from pickplace.task.reach import Annulus, ReachTable
 
 CELL, TOTE, ACCURACY = 0.05, (0.3, 0.3, 0.25), 0.002  # metres
+ANNULUS_OF_ALL = Annulus((2, 20), (0, 10), (-9, -2.5, 0), (4, -3, 0))
 ANNULUS = Annulus([4.2, 7.3], [-0.3, 3.7], [-7.1, -2.3, -0.7], [1.7, -3.2, 0.4])
 
 
@@ -22,7 +23,7 @@ def plan_of(planner, scene, draw):
 
 
 def pose_fault(reach, plan):
-    """Which pose of a plan is out of the annulus, with lengths in millimetres."""
+    """Return the pose of a plan that is out of the annulus, with lengths in millimetres; None if none is."""
     for name, pose, corner in (("pick", plan.pick, reach.bin), ("place", plan.place, reach.tote)):
         x, y, z = (1000 * (at + CELL * start) for at, start in zip(pose.center, corner, strict=True))
         distance = hypot(x, y)
@@ -95,3 +96,16 @@ def test_a_table_in_metres_needs_all_pick_cells_around(tmp_path):
     assert plan(around, (0.14, 0.14), highest_pick="1.22") == "impossible"
     assert plan(around, (0.14, 0.14), highest_top="1.28") == "ok"
     assert plan(around, (0.14, 0.14), highest_top="1.26") == "impossible"
+
+
+def test_lookahead_ranks_what_the_robot_reaches():
+    """Not what the cell of the training, whose limits are in height units, lets it reach."""
+    depth = np.full((6, 6), 0.25)
+    depth[:3, :3] = 0  # footprint 0 is taken
+    planners = [Planner.load("pretrained/mixed", planner=name, tote_size=(6, 6, 5), reach=ANNULUS_OF_ALL)
+                for name in (None, "lookahead")]  # fmt: skip
+    for key, value in {"samples": 2, "rounds": 1, "candidates": 2, "horizon": 1}.items():
+        setattr(planners[1]._planner, key, value)
+    for place in ((0.07, 0.07), (0.18, 0.06), (0.06, 0.18)):
+        seen = {"items": [Box(*place, 0.1, 0.08, 0.06)], "tote_depth": depth, "cell_size": CELL, "alternatives": 0}
+        assert [planner.plan(**seen).status for planner in planners] == ["ok", "ok"]

@@ -116,7 +116,7 @@ def test_offsets_follow_from_the_cup():
     assert offsets(**small, pick_rule="seal", min_seal=0.67) == (1, 2, 7)
     corner = {"cup": [[1, 0, 0], [0, 0, 0], [0, 0, 0]], "longest_side": 1, "pick_rule": "seal"}
     assert offsets(**corner) == (0, 2, 1) and offsets(**corner, rotations=1) == (0, 0, 1)
-    # The same after no, a quarter or half a turn: 1, 2, or R shapes.
+    # A square looks the same in all rotations, an H after half a turn, a U in none: so many shapes are distinct.
     bodies = [[1, 1, 1]] * 3, [[1, 1, 1], [0, 1, 0], [1, 1, 1]], [[1, 1, 1], [1, 0, 0], [1, 1, 1]]
     for rotations, counts in ((1, (1, 1, 1)), (2, (1, 2, 2)), (3, (1, 2, 3)), (4, (1, 2, 4))):
         cells = [CellSpec(body=body, cup=body, rotations=rotations) for body in bodies]

@@ -141,7 +141,7 @@ def table(tmp_path):
 
 
 def test_a_table_says_which_poses_are_reached(table):
-    """What is not listed is out of reach; heights are in sides of a cell, here of two height units."""
+    """Poses that are not listed are out of reach. Heights are in sides of a cell, which is two height units here."""
     rows = "\ufeff" + HEADER + "bin,1,2,,,\nbin,0,0,,0.4,1.2\n\ntote,2,1,3,1,2.9\ntote, 0 ,0,0,,\ntote,0,0,1,,0\n"
     cell = CellSpec((2, 3, 1), (4, 3, 5), rotations=4, height_unit=0.5, reach=table(rows))
     limits, any_height = cell.limits, 2**20
