@@ -33,6 +33,8 @@ class Rules:
     cup: str | Grid = "rectangle"
     cup_size: Pair | None = None  # of a rectangle or disc in the middle; None: as large as the body
     min_seal: float = 1.0
+    bin_items: int = 1
+    refill: str = "each"
     pick_ok: list[bool] | None = None  # for each pick cell; None: no limits on the robot
     lowest_top: list[Grid] | None = None  # for each rotation and place cell
     highest_top: list[Grid] | None = None
@@ -134,8 +136,8 @@ def inside(cell: Pair, grid: Grid) -> bool:
 class Oracle:
     """One environment: an episode's tote and the item that waits in the bin.
 
-    `item` is `(w, d, h)` and `position` the bin cell of its corner; `heights` is `[W_T][D_T]`, and so is `bearing`,
-    1 where a cell bears weight.
+    `item` is `(w, d, h)` and `position` the bin cell of its corner; `others` are further items in the bin with theirs;
+    `heights` is `[W_T][D_T]`, and so is `bearing`, 1 where a cell bears weight.
     """
 
     rules: Rules
@@ -145,6 +147,7 @@ class Oracle:
     heights: Grid = field(default_factory=list)
     volume: int = 0
     bearing: Grid = field(default_factory=list)
+    others: list[tuple[Triple, Pair]] = field(default_factory=list)
 
     def __post_init__(self):
         wide, deep, _ = self.rules.tote_size
@@ -154,9 +157,34 @@ class Oracle:
     def bin_depth(self) -> Grid:
         """Height above the bin's floor, `[W_B][D_B]`."""
         grid = [[0] * self.rules.bin_size[1] for _ in range(self.rules.bin_size[0])]
-        for x, y in cells(self.position, self.item[:2]):
-            grid[x][y] = self.item[2]
+        for item, position in self.contents:
+            for x, y in cells(position, item[:2]):
+                grid[x][y] = item[2]
         return grid
+
+    @property
+    def contents(self) -> list[tuple[Triple, Pair]]:
+        """Every item in the bin, and its corner."""
+        return [(self.item, self.position), *self.others]
+
+    def taken(self, action: int) -> int | None:
+        """The number of the item that an action's pick takes: the highest that the cup grips; of equals the first."""
+        rules = self.rules
+        size = rules.effector_size
+        corner = corner_for(rules.split(action)[0], size)
+        cup = [(corner[0] + x, corner[1] + y) for x, y in shape_cells(rules.cup, size, rules.cup_size or size)]
+        best = None
+        for number, (item, position) in enumerate(self.contents):
+            under = cells(position, item[:2])
+            sealed = sum(cell in under for cell in cup)
+            gripped = {
+                "contain": all(cell in cup for cell in under),
+                "overlap": sealed > 0,
+                "seal": sealed / len(cup) >= rules.min_seal,
+            }
+            if gripped[rules.pick_rule] and (best is None or item[2] > self.contents[best][0][2]):
+                best = number
+        return best
 
     def tote_depth(self) -> Grid:
         """Remaining height, `[W_T][D_T]`."""
@@ -169,31 +197,25 @@ class Oracle:
     def try_action(self, action: int) -> tuple[int, Grid | None]:
         """The failure code of an action and, on success only, the heights it leaves."""
         rules, heights = self.rules, self.heights
-        w, d, h = self.item
         pick, place, r = rules.split(action)
+        number = self.taken(action)
+        if number is None:
+            return PICK_MISS, None
+        (w, d, h), position = self.contents[number]
 
         size = rules.effector_size
         body = shape_cells(rules.body, size, size)
         effector_corner = corner_for(pick, size)
         effector = [(effector_corner[0] + x, effector_corner[1] + y) for x, y in body]
-        cup = shape_cells(rules.cup, size, rules.cup_size or size)
-        cup = [(effector_corner[0] + x, effector_corner[1] + y) for x, y in cup]
-        item = cells(self.position, (w, d))
-        sealed = sum(cell in item for cell in cup)
-        gripped = {
-            "contain": all(cell in cup for cell in item),
-            "overlap": sealed > 0,
-            "seal": sealed / len(cup) >= rules.min_seal,
-        }
-        if not gripped[rules.pick_rule]:
-            return PICK_MISS, None
-
-        grid = self.bin_depth()
+        grid, item = self.bin_depth(), cells(position, (w, d))
         for x, y in effector:
-            if grid[x][y] > h if inside((x, y), grid) else rules.bin_size[2] > h:
+            if not inside((x, y), grid):
+                if rules.bin_size[2] > h:
+                    return BIN_COLLISION, None
+            elif (x, y) not in item and grid[x][y] >= h:  # another item that is as high
                 return BIN_COLLISION, None
 
-        offset = self.position[0] - effector_corner[0], self.position[1] - effector_corner[1]
+        offset = position[0] - effector_corner[0], position[1] - effector_corner[1]
         effector_size, offset, size = rotate(r, rules.effector_size, offset, (w, d))
         effector_corner = corner_for(place, effector_size)
         turned = [rotate(r, rules.effector_size, cell, (1, 1))[1] for cell in body]
@@ -238,7 +260,7 @@ class Oracle:
         heights = self.try_action(action)[1]
         grid = cells((0, 0), self.rules.tote_size[:2])
         footprint = [(x, y) for x, y in grid if heights[x][y] != self.heights[x][y]]
-        z = heights[footprint[0][0]][footprint[0][1]] - self.item[2]
+        z = heights[footprint[0][0]][footprint[0][1]] - self.contents[self.taken(action)][0][2]
         edges = hull_edges([(x, y) for x, y in footprint if self.heights[x][y] == z and self.bearing[x][y]])
         for x, y in footprint:
             corners = [(2 * (x + a), 2 * (y + b)) for a in (0, 1) for b in (0, 1)]
@@ -253,18 +275,22 @@ class Oracle:
         """Whether any action succeeds; `try_first` only saves time."""
         return any(self.try_action(action)[0] == SUCCESS for action in chain(try_first, range(self.rules.num_actions)))
 
-    def step(self, action: int, next_item: Triple, next_position: Pair, try_first=()) -> tuple[int, bool, int]:
+    def step(
+        self, action: int, next_item: Triple, next_position: Pair, try_first=(), others=()
+    ) -> tuple[int, bool, int]:
         """Takes an action; returns reward, terminated and failure code.
 
-        The next item arrives only after a success, and decides whether the episode is stuck.
+        The next item arrives only after a success, and decides whether the episode is stuck. `others` are what else
+        lies in the bin then.
         """
         failure, after = self.try_action(action)
         if failure != SUCCESS:
             return 0, True, failure
-        reward = self.item[0] * self.item[1] * self.item[2]
+        w, d, h = self.contents[self.taken(action)][0]
+        reward = w * d * h
         self.bearing = self.bearing_after(action)
         self.heights, self.volume = after, self.volume + reward
-        self.item, self.position = next_item, next_position
+        self.item, self.position, self.others = next_item, next_position, list(others)
         stuck = not self.has_feasible_action(try_first)
         return reward, stuck, STUCK if stuck else SUCCESS
 

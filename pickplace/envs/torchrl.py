@@ -12,10 +12,11 @@ from torchrl.envs import EnvBase
 
 from pickplace.envs.checks import check_items, problem_bytes
 from pickplace.runs.machine import usable_device
+from pickplace.task.bin import refill, remove_item
 from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.task.checks import check_bytes, excerpt, one_of, whole_number
 from pickplace.task.corners import corner_mask
-from pickplace.task.feasibility import PlacingMaps, action_mask, footprint_mask, placing_maps
+from pickplace.task.feasibility import PlacingMaps, action_mask, choice_mask, placing_maps
 from pickplace.task.items import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.task.observation import Term, check_terms, observe
 from pickplace.task.state import EMPTY, Failure, Item, State
@@ -33,8 +34,8 @@ class Mask(NamedTuple):
 
 MASKS = {
     "action": Mask(lambda cell: cell.num_actions, action_mask),
-    "footprint": Mask(lambda cell: cell.num_footprints, lambda cell, maps: footprint_mask(cell, maps).flatten(1)),
-    "corner": Mask(lambda cell: cell.num_footprints, lambda cell, maps: corner_mask(cell, maps).flatten(1)),
+    "footprint": Mask(lambda cell: cell.num_choices, choice_mask),
+    "corner": Mask(lambda cell: cell.num_choices, lambda cell, maps: maps.join(corner_mask(cell, maps))),
 }
 
 
@@ -49,13 +50,15 @@ class PickPlaceEnv(EnvBase):
 
     Observation space:
         * ``bin_depth``, float32 ``[N, W_B, D_B]``: height above the bin's floor, 0 where empty.
+        * with ``bin_items`` above 1: ``bin_labels``, float32 ``[N, W_B, D_B]``: number of the item on each cell, from 1
+          in the order of arrival, 0 where empty; and ``items``, int64 ``[N, M, 5]``: their x, y, w, d, h, or zeros.
         * ``tote_depth``, float32 ``[N, W_T, D_T]``: remaining height, ``H_T - height``.
         * ``tote_bearing``, float32 ``[N, W_T, D_T]``: 1 where the cell bears weight; all 1 unless ``support=bearing``.
         * ``tote_height``, int64 ``[N, 1]``: ``H_T`` of the running episode.
         * further terms, see ``observation``.
         * ``action_mask``, bool ``[N, N_a]``: True where and only where the action would succeed.
-        * ``footprint_mask``, bool ``[N, Q * W_T * D_T]``, only with ``masks`` naming it: the distinct footprints
-          ``(parity, x, y)`` that some action reaches; ``corner_mask``, the same of those that occupy a corner.
+        * ``footprint_mask``, bool ``[N, M * Q * W_T * D_T]``, only with ``masks`` naming it: the distinct
+          ``(item, parity, x, y)`` that some action reaches; ``corner_mask``, the same of those that occupy a corner.
         * ``occupancy``, float32 ``[N, 1]``: volume placed / volume of the tote.
 
     Rewards:
@@ -63,10 +66,11 @@ class PickPlaceEnv(EnvBase):
 
     Starting state:
         An empty tote of the height given as ``tote_height`` (int64 ``[N, 1]``) in the TensorDict handed to ``reset``,
-        by default ``tote_size[2]``, and a bin with the episode's first item.
+        by default ``tote_size[2]``, and a bin with the episode's first items: as many of ``bin_items`` as have room,
+        or the first alone if nothing is feasible then.
 
     Episode end:
-        ``terminated`` after a failed action, or when nothing can be done with the item that arrives (``stuck``);
+        ``terminated`` after a failed action, or when nothing can be done with any item in the bin (``stuck``);
         ``truncated`` when a recorded item stream has ended. ``failure``, int64 ``[N, 1]``, is a :class:`Failure`.
 
     Args:
@@ -118,7 +122,7 @@ class PickPlaceEnv(EnvBase):
                 f"items={excerpt(items)}: expected an ItemDistribution, such as pickplace.task.items.Kinds."
             )
         check_items(cell, items)
-        self.terms = check_terms(observation)
+        self.terms = check_terms(observation, cell.bin_items)
         self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
         device = usable_device(device)
         check_bytes(f"num_envs={num_envs}", num_envs * problem_bytes(self.cell, masks), device)
@@ -134,7 +138,10 @@ class PickPlaceEnv(EnvBase):
         # All run-time state, in buffers, so that state_dict() has it.
         self.register_buffer("surface", zeros(*cell.tote_size[:2], dtype=torch.int32) + EMPTY)
         self.register_buffer("tote_height", zeros() + cell.tote_size[2])
-        self.register_buffer("item", zeros(5))  # x, y, w, d, h
+        several = cell.bin_items > 1
+        self.register_buffer("item", zeros(cell.bin_items, 5) if several else zeros(5))  # x, y, w, d, h
+        if several:
+            self.register_buffer("arrived", zeros())  # items of the episode so far
         self.register_buffer("volume", zeros())
         self.register_buffer("steps", zeros())
         self.register_buffer("episode", zeros())
@@ -226,9 +233,17 @@ class PickPlaceEnv(EnvBase):
         self.volume.masked_fill_(rows, 0)
         self.steps.masked_fill_(rows, 0)
         self.episode.add_(rows * self.episode_stride)
-        item = torch.stack(self._arriving(), -1)
-        self.item.copy_(torch.where(rows[:, None], item, self.item))
-        self._update_masks(rows, empty=True)
+        if self.cell.bin_items == 1:
+            self.item.copy_(torch.where(rows[:, None], self._arriving().table, self.item))
+            self._update_masks(rows, empty=True)
+        else:
+            self.item[rows], self.arrived[rows] = 0, 0
+            self._refill(rows)
+            self._update_masks(rows)
+            if (jammed := rows & ~self.feasible).any():  # the first one alone always has a feasible action
+                self.item[:, 1:] *= ~jammed[:, None, None]
+                self.arrived.copy_(torch.where(jammed, 1, self.arrived))
+                self._update_masks(jammed)
         done = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         return self._observation().update({"done": done, "terminated": done.clone(), "truncated": done.clone()})
 
@@ -242,14 +257,17 @@ class PickPlaceEnv(EnvBase):
         state = self.state
         step = apply(self.cell, state, action)
         placed = step.failure == 0
-        gained = torch.where(placed, state.item.volume, 0)
+        gained = torch.where(placed, step.item.volume, 0)
         self.surface.copy_(step.surface)
         self.volume.add_(gained)
         self.steps.add_(placed)
-        arriving = self._arriving()
-        self.item.copy_(torch.where(placed[:, None], torch.stack(arriving, -1), self.item))
+        if step.taken is None:
+            self.item.copy_(torch.where(placed[:, None], self._arriving().table, self.item))
+        else:
+            self.item.copy_(remove_item(state.item, step.taken, placed).table)
+            self._refill(placed)
         self._update_masks(placed)
-        ended = placed & arriving.is_empty  # a recorded stream has no further item
+        ended = placed & self.state.items.is_empty.all(1)  # a recorded stream has no further item
         stuck = placed & ~self.feasible & ~ended
         failure = torch.where(stuck, int(Failure.STUCK), step.failure)
         result = {
@@ -270,8 +288,8 @@ class PickPlaceEnv(EnvBase):
 
     @property
     def current_item(self) -> Item:
-        """The item that lies in each bin."""
-        return Item(*self.item.unbind(-1))
+        """The item that lies in each bin, ``[N]``; of several ``[N, M]``."""
+        return Item.from_table(self.item)
 
     @property
     def state(self) -> State:
@@ -287,6 +305,14 @@ class PickPlaceEnv(EnvBase):
         """The item at each slot's (episode, step)."""
         seed = self.item_seed.expand_as(self.episode)
         return self.items.sample(self.stream, seed, self.episode, self.steps, self.cell.bin_size)
+
+    def _refill(self, rows: Tensor) -> None:
+        """Let items arrive in the bins in ``rows``, bool ``[N]``."""
+        index = rows.nonzero()[:, 0]
+        seed, episode, arrived = self.item_seed.expand_as(index), self.episode[index], self.arrived[index]
+        items = Item.from_table(self.item[index])
+        items, self.arrived[index] = refill(self.cell, self.items, self.stream, seed, episode, arrived, items)
+        self.item[index] = items.table
 
     def _update_masks(self, rows: Tensor, empty: bool = False):
         """Recompute the masks of the problems in ``rows``, bool ``[N]``; the others' states did not change.
@@ -306,7 +332,7 @@ class PickPlaceEnv(EnvBase):
 
     def _masks_of(self, surface: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
         """Return the masks that are emitted, or ``footprint``, bool ``[M, ...]``, of problems ``[M, ...]``."""
-        maps = placing_maps(self.cell, State(surface, tote_height, Item(*item.unbind(-1))))
+        maps = placing_maps(self.cell, State(surface, tote_height, Item.from_table(item)))
         return {name: MASKS[name].make(self.cell, maps) for name in self.masks or ("footprint",)}
 
     def _masks_of_empty_totes(self, surface: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:

@@ -12,6 +12,7 @@ from pickplace.policies.restore import restore_critic, restore_policy
 from pickplace.runs.errors import sentence
 from pickplace.runs.registry import find
 from pickplace.task.cell import CellSpec
+from pickplace.task.checks import one_of
 from pickplace.task.feasibility import PlacingMaps, placing_maps
 from pickplace.task.items import ItemDistribution
 from pickplace.task.observation import Term
@@ -68,6 +69,38 @@ class MapPlanner(ABC):
         """Return flat actions, int64 ``[N]``."""
         state = State.from_observation(observation)
         return self.choose(self.cell, state, placing_maps(self.cell, state), observation)
+
+
+#: Which of the items in the bin a planner considers.
+ITEM_RULES = ("any", "first", "nearest")
+
+
+def check_item_rule(rule: str) -> str:
+    """Return the setting ``planner.item`` if it is one of :data:`ITEM_RULES`."""
+    return one_of("planner.item", rule, ITEM_RULES)
+
+
+def restrict_items(rule: str, state: State, mask: Tensor) -> Tensor:
+    """Return a mask of choices in which one item of each bin is left, the first by a rule that has any choice.
+
+    Args:
+        rule: ``"first"``: in the order of arrival; ``"nearest"``: by the distance of the item's centre from the bin's
+            origin; ``"any"``: the mask stays as it is.
+        state: has the items.
+        mask: bool ``[N, M * C]``, those of an item side by side.
+    """
+    items = state.items
+    count = items.x.shape[1]
+    if rule == "any" or count == 1:
+        return mask
+    mask = mask.unflatten(1, (count, -1))
+    order = torch.arange(count, device=mask.device).expand_as(items.x)
+    if rule == "nearest":
+        distance = (2 * items.x + items.w) ** 2 + (2 * items.y + items.d) ** 2
+        order = distance * count + order
+    order = torch.where(mask.any(2), order, torch.iinfo(order.dtype).max)
+    chosen = order == order.amin(1, keepdim=True)
+    return (mask & chosen[:, :, None]).flatten(1)
 
 
 def decide(

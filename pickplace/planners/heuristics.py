@@ -3,15 +3,15 @@
 import torch
 from torch import Tensor
 
-from pickplace.planners.base import MapPlanner
+from pickplace.planners.base import MapPlanner, check_item_rule, restrict_items
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import number
 from pickplace.task.feasibility import (
     PlacingMaps,
     action_mask,
     actions_reaching,
+    choice_mask,
     first_action_reaching,
-    footprint_mask,
 )
 from pickplace.task.items import check_seed
 from pickplace.task.maps import FAR
@@ -84,28 +84,30 @@ class JointDBL(MapPlanner):
 
     Args:
         cell: the sizes.
+        item: which of several items in the bin are considered, see
+            :func:`~pickplace.planners.base.restrict_items`.
     """
 
     name = "joint_dbl"
 
-    def __init__(self, cell: CellSpec):
-        self.cell = cell
+    def __init__(self, cell: CellSpec, item: str = "any"):
+        self.cell, self.item = cell, check_item_rule(item)
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         tote_w, tote_d, _ = cell.tote_size
-        feasible = footprint_mask(cell, maps)  # [N, Q, W_T, D_T]
+        feasible = restrict_items(self.item, state, choice_mask(cell, maps))  # [N, M * Q * W_T * D_T]
         x = torch.arange(tote_w, device=feasible.device)[:, None]
         y = torch.arange(tote_d, device=feasible.device)
-        # The parities that share the least order are tied.
-        order = torch.where(feasible, dbl_order(cell, maps.top.long(), x, y), FAR**2).flatten(2)
-        best, corner = order.min(2)  # [N, Q]
+        # Items and parities that share the least order are tied.
+        order = torch.where(feasible, maps.join(dbl_order(cell, maps.top.long(), x, y)), FAR**2)
+        best, corner = order.unflatten(1, (-1, cell.num_places)).min(2)  # [N, M * Q]
         least = best.amin(1, keepdim=True)
         highest = cell.num_actions
         action = torch.full_like(least, highest)
-        for parity in range(cell.parities):
-            footprint = parity * cell.num_places + corner[:, parity]
-            reaching = actions_reaching(cell, maps, footprint)
-            reaching = torch.where((reaching >= 0) & (best[:, parity, None] == least), reaching, highest)
+        for number in range(best.shape[1]):
+            choice = number * cell.num_places + corner[:, number]
+            reaching = actions_reaching(cell, maps, choice)
+            reaching = torch.where((reaching >= 0) & (best[:, number, None] == least), reaching, highest)
             action = torch.minimum(action, reaching.amin(1, keepdim=True))
         return action[:, 0].clamp(max=highest - 1)
 
@@ -119,16 +121,19 @@ class Corner(MapPlanner):
     Args:
         cell: the sizes.
         height_weight: cost of one height unit, in cells of distance.
+        item: which of several items in the bin are considered, see
+            :func:`~pickplace.planners.base.restrict_items`.
     """
 
     name = "corner"
 
-    def __init__(self, cell: CellSpec, height_weight: float = 10):
+    def __init__(self, cell: CellSpec, height_weight: float = 10, item: str = "any"):
         self.cell, self.height_weight = cell, number("planner.height_weight", height_weight)
+        self.item = check_item_rule(item)
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        feasible = footprint_mask(cell, maps)
+        feasible = restrict_items(self.item, state, choice_mask(cell, maps))
         x, y = (torch.arange(side, device=feasible.device) for side in cell.tote_size[:2])
         cost = self.height_weight * maps.top + x[:, None] + y
-        footprint = torch.where(feasible, cost, torch.inf).flatten(1).argmin(1)
-        return first_action_reaching(cell, maps, footprint)
+        choice = torch.where(feasible, maps.join(cost), torch.inf).argmin(1)
+        return first_action_reaching(cell, maps, choice)

@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor
 
-from pickplace.planners.base import MapPlanner
+from pickplace.planners.base import MapPlanner, restrict_items
 from pickplace.planners.heuristics import dbl_order
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import one_of
 from pickplace.task.feasibility import PlacingMaps, action_footprints, action_mask
-from pickplace.task.grasps import heuristic_pick, join_pick, select_pick, split_footprint
+from pickplace.task.grasps import all_grasps, heuristic_pick, join_pick, select_pick, split_footprint
 from pickplace.task.maps import FAR
 from pickplace.task.state import Observation, State
 
@@ -23,19 +23,29 @@ class IndividualHeuristic(MapPlanner):
     succeeds in a forward simulation is played, ties by the lowest flat index. If none does, the first is played, and
     fails.
 
+    Of several items in the bin it takes the first that can be picked.
+
     Args:
         cell: the sizes.
         candidates: ``"corners"``, or ``"cells"`` for every footprint.
+        item: which item is the first: ``"first"``, the one that arrived first, or ``"nearest"``, the one nearest to the
+            bin's origin.
     """
 
     name = "individual_heuristic"
 
-    def __init__(self, cell: CellSpec, candidates: str = "corners"):
+    def __init__(self, cell: CellSpec, candidates: str = "corners", item: str = "first"):
         self.cell, self.candidates = cell, one_of("planner.candidates", candidates, CANDIDATES)
+        self.item = one_of("planner.item", item, ("first", "nearest"))
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        pick = heuristic_pick(cell, state.item)
-        footprint = select_pick(cell, action_footprints(cell, state.item), pick)
+        if maps.bin_items > 1:
+            lifted = all_grasps(cell, maps.item, maps.blocked)[0]  # [N * M, P]
+            lifted = restrict_items(self.item, state, lifted.reshape(len(state.surface), -1))
+            number = lifted.unflatten(1, (maps.bin_items, -1)).any(2).int().argmax(1)
+            maps = maps.of_choice(cell, number * cell.num_footprints)[0]._replace(bin_items=1)
+        pick = heuristic_pick(cell, maps.item, maps.blocked)
+        footprint = select_pick(cell, action_footprints(cell, maps.item, maps.blocked), pick)
         succeeds = select_pick(cell, action_mask(cell, maps), pick)
         allowed = footprint >= 0
         if self.candidates == "corners":

@@ -6,13 +6,14 @@ from torch import Tensor
 from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import MASKED
 from pickplace.policies.fcn_grasp import FootprintPolicy
+from pickplace.task.bin import refill, remove_item, select_item
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import check_bytes, number, whole_number
 from pickplace.task.feasibility import PlacingMaps, first_action_reaching, placing_maps
 from pickplace.task.items import ItemDistribution, check_seed, search_items
 from pickplace.task.observation import STANDARD_TERMS, observe
 from pickplace.task.placing import unchecked_top
-from pickplace.task.state import Observation, State
+from pickplace.task.state import Item, Observation, State
 from pickplace.task.transition import put_down
 
 
@@ -25,7 +26,7 @@ class Lookahead(MapPlanner):
     standard errors: a rollout algorithm (Tesauro & Galperin 1996) that the items' noise cannot make worse than its
     policy, to that confidence. A critic that errs could, where the policy fills nearly all: what wins by its judgement
     must gain without it too, both played out to the end. The imagined items come from the item distribution, never
-    from the stream that is played.
+    from the stream that is played. What lies in the bin already is known, and played out before them.
 
     Args:
         cell: the sizes.
@@ -82,7 +83,7 @@ class Lookahead(MapPlanner):
         streams = self.candidates * self.samples * 2 ** (self.rounds - 1)
         check_bytes(
             f"planner.candidates={self.candidates}, planner.samples={self.samples}, planner.rounds={self.rounds}",
-            len(state.surface) * streams * 16 * self.cell.num_footprints,
+            len(state.surface) * streams * 16 * self.cell.num_choices,
             state.surface.device,
         )
         logits = self.policy.footprint_logits(observation, self.policy.with_cell(cell).ranked(maps))
@@ -90,7 +91,8 @@ class Lookahead(MapPlanner):
         value, choice = torch.sort(logits, dim=1, descending=True, stable=True)
         value, choice = value[:, : self.candidates], choice[:, : self.candidates]
         seen = State.from_observation(observation)  # what is imagined goes on from there
-        tops = maps._replace(top=unchecked_top(self.cell, seen), item=seen.item)
+        each = seen.each_item()
+        tops = maps._replace(top=unchecked_top(self.cell, each), item=each.item)
         best = self._best(seen, tops, choice, value > MASKED / 2)
         return first_action_reaching(cell, maps, choice.gather(1, best[:, None])[:, 0])
 
@@ -114,8 +116,8 @@ class Lookahead(MapPlanner):
             row, column = open_.nonzero(as_tuple=True)
             if len(row) == 0:
                 break
-            after = put_down(self.cell, state.surface[row], maps.rows(row), choice[row, column])
-            volume = self._play_out(after, state.tote_height[row], row, streams, self.horizon)  # [rows, streams]
+            after = self._place(state.rows(row), maps.rows(row), choice[row, column])
+            volume = self._play_out(after, row, streams, self.horizon)  # [rows, streams]
             first = volume[(column == 0).nonzero()[:, 0]]  # one for each problem that is open
             problem = torch.unique_consecutive(row, return_inverse=True)[1]
             difference = volume - first[problem]
@@ -144,44 +146,65 @@ class Lookahead(MapPlanner):
             return best
         both = row.repeat_interleave(2)  # the policy's own choice and the candidate, on the same items
         column = torch.stack([torch.zeros_like(row), best[row]], 1).flatten()
-        after = put_down(self.cell, state.surface[both], maps.rows(both), choice[both, column])
-        volume = self._play_out(after, state.tote_height[both], both, self.samples, None).mean(1)
+        after = self._place(state.rows(both), maps.rows(both), choice[both, column])
+        volume = self._play_out(after, both, self.samples, None).mean(1)
         gain = volume[1::2] - volume[::2]
         return best.index_put((row,), torch.where(gain > 0, best[row], 0))
 
-    def _play_out(self, surface: Tensor, tote_height: Tensor, problem: Tensor, streams: int, horizon) -> Tensor:
+    def _place(self, state: State, maps: PlacingMaps, choice: Tensor) -> State:
+        """Return the state after the choices ``[N]``, before anything arrives: what is left in the bins.
+
+        Of one item nothing is left; the item stays in the state until the next one takes its place.
+        """
+        surface = put_down(self.cell, state.surface, maps, choice)
+        if state.item.x.dim() == 1:
+            return state._replace(surface=surface)
+        taken = choice // self.cell.num_footprints
+        return State(surface, state.tote_height, remove_item(state.item, taken, torch.ones_like(taken).bool()))
+
+    def _play_out(self, state: State, problem: Tensor, streams: int, horizon) -> Tensor:
         """Return the volume that the policy goes on to place, float64 ``[M, streams]``.
 
         Args:
-            surface: int32 ``[M, W_T, D_T]``.
+            state: as :meth:`_place` returns it, of ``M`` problems.
             problem: int64 ``[M]``; equal ones meet equal items.
             horizon: items after which the critic judges the state; None: played out to the end.
         """
         cell, policy = self.cell, self.policy
         keys = [*policy.in_keys, *getattr(self.critic, "in_keys", ())]
         self._decisions += 1
-        surface, tote_height, problem = (x.repeat_interleave(streams, 0) for x in (surface, tote_height, problem))
-        stream = torch.arange(len(surface), device=surface.device) % streams
+        state, problem = state.repeat(streams), problem.repeat_interleave(streams, 0)
+        stream = torch.arange(len(problem), device=problem.device) % streams
         # The address of an imagined item: the planner's seed, this call, the problem and the stream.
         seed = problem * 1_000_003 + self._decisions * 7_919 + self.seed
-        volume = torch.zeros(len(surface), dtype=torch.float64, device=surface.device)
-        row = torch.arange(len(surface), device=surface.device)
+        volume = torch.zeros(len(problem), dtype=torch.float64, device=problem.device)
+        arrived = torch.zeros_like(problem)
+        row = torch.arange(len(problem), device=problem.device)
         step = 0
         while len(row):
-            item = self.items.sample("train", seed[row], stream[row], torch.full_like(row, step), cell.bin_size)
-            maps = placing_maps(cell, State(surface, tote_height[row], item))
+            item, arrived = self._arrive(state.item, seed[row], stream[row], arrived)
+            state = state._replace(item=item)
+            maps = placing_maps(cell, state)
             mask = policy.ranked(maps)
             going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]
             if len(going) < len(row):
-                row, surface, mask, maps = row[going], surface[going], mask[going], maps.rows(going)
-                item = maps.item
+                row, state, mask, maps, arrived = (
+                    row[going], state.rows(going), mask[going], maps.rows(going), arrived[going],
+                )  # fmt: skip
             if len(row) == 0:
                 break
-            observation = observe(self.terms, cell, State(surface, tote_height[row], item), keys)
+            observation = observe(self.terms, cell, state, keys)
             if step == horizon:
                 volume[row] += self.critic(observation)[:, 0].double()
                 break
-            surface = put_down(cell, surface, maps, policy.footprint_logits(observation, mask).argmax(1))
-            volume[row] += item.volume.double()
+            choice = policy.footprint_logits(observation, mask).argmax(1)
+            volume[row] += select_item(state.items, choice // cell.num_footprints).volume.double()
+            state = self._place(state, maps, choice)
             step += 1
         return volume.view(-1, streams)
+
+    def _arrive(self, item: Item, seed: Tensor, stream: Tensor, arrived: Tensor) -> tuple[Item, Tensor]:
+        """Return what lies in the bins once imagined items have arrived, and how many have, int64 ``[N]``."""
+        if item.x.dim() == 2:
+            return refill(self.cell, self.items, "train", seed, stream, arrived, item)
+        return self.items.sample("train", seed, stream, arrived, self.cell.bin_size), arrived + 1

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pickplace.planners.base import MapPlanner
+from pickplace.planners.base import MapPlanner, check_item_rule, restrict_items
 from pickplace.policies.base import Policy
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import check_bytes, excerpt, is_whole
-from pickplace.task.feasibility import PlacingMaps, action_mask, placing_maps
+from pickplace.task.feasibility import PlacingMaps, action_mask, first_action_reaching, placing_maps
 from pickplace.task.state import Observation, State
 from pickplace.task.transition import apply
 
@@ -23,22 +23,28 @@ class PolicyPlanner(MapPlanner):
         policy: a policy made for this cell.
         candidates: ``K``, how many of the most probable flat actions, over all ``N_a`` and without a mask, are tried;
             if none succeeds the most probable one is played, and fails. ``"all"`` plays the best feasible one.
+        item: which of several items in the bin are considered, see
+            :func:`~pickplace.planners.base.restrict_items`.
     """
 
     name = "policy"
     needs = ("policy",)
 
-    def __init__(self, cell: CellSpec, policy: Policy, candidates: int | Literal["all"] = "all"):
+    def __init__(self, cell: CellSpec, policy: Policy, candidates: int | Literal["all"] = "all", item: str = "any"):
         if candidates != "all" and not (is_whole(candidates) and candidates >= 1):
             raise ValueError(f"planner.candidates={excerpt(candidates)}: expected 'all' or a whole number >= 1.")
-        self.cell, self.policy, self.candidates = cell, policy, candidates
+        self.cell, self.policy, self.candidates, self.item = cell, policy, candidates, check_item_rule(item)
+        if item != "any" and not (policy.ranks_footprints and candidates == "all"):
+            raise ValueError(
+                f"planner.item={item!r}: expected 'any', or a checkpoint of model=fcn_grasp or corners that was trained "
+                "with a mask, and planner.candidates=all."
+            )
 
     @torch.no_grad()
     def decide(self, observation: Observation) -> Tensor:
         """Return flat actions, int64 ``[N]``."""
         if self.candidates == "all":
-            with set_exploration_type(ExplorationType.DETERMINISTIC):
-                return self.policy.best_feasible(observation)
+            return super().decide(observation)
         count = min(self.candidates, self.cell.num_actions)
         score, tried = self.policy.action_log_probs(observation).topk(count, dim=1)  # [N, K]
         check_bytes(f"planner.candidates={count}", 32 * tried.numel() * self.cell.num_places, tried.device)
@@ -50,6 +56,9 @@ class PolicyPlanner(MapPlanner):
     @torch.no_grad()
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         policy = self.policy.with_cell(cell)
+        if self.item != "any":
+            mask = restrict_items(self.item, state, policy.ranked(maps))
+            return first_action_reaching(cell, maps, policy.footprint_logits(observation, mask).argmax(1))
         if self.candidates == "all":
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 return policy.best_feasible(observation, maps)

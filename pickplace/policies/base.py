@@ -27,7 +27,7 @@ from torchrl.modules import ValueOperator
 from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import PlacingMaps, action_mask, placing_maps
 from pickplace.task.maps import FAR
-from pickplace.task.observation import STANDARD_TERMS
+from pickplace.task.observation import standard_terms
 from pickplace.task.state import Observation, State
 
 #: The logit of what must not be chosen, far below what a network may score: its probability is exactly 0 in float32.
@@ -146,7 +146,7 @@ class Policy(TensorDictModuleBase, ABC):
     @property
     def act_keys(self) -> list[str]:
         """Entries of the observation that :meth:`to_action` may read."""
-        return list(dict.fromkeys([*STANDARD_TERMS, *self.in_keys]))
+        return list(dict.fromkeys([*standard_terms(self.cell.bin_items), *self.in_keys]))
 
     def learning_bytes(self, samples: int | None = None) -> int:
         """Return about how many bytes a frame takes in a gradient step; with ``fcn_grasp`` 90 kB at the paper's cell.
@@ -154,12 +154,12 @@ class Policy(TensorDictModuleBase, ABC):
         Args:
             samples: ``algo.vine_samples``.
         """
-        return 1_250 * self.cell.num_footprints
+        return 1_250 * self.cell.num_choices
 
     @property
     def acting_bytes(self) -> int:
         """About how many bytes a problem takes when a choice is drawn."""
-        return 40 * self.cell.num_footprints
+        return 40 * self.cell.num_choices
 
     def check_sizes(self) -> list[str]:
         """Check the paper's conditions on sizes in training: eq. 2 on the items, eq. 3 on the bin and the tote.
@@ -207,6 +207,15 @@ class Choice(Categorical):
         edges = self.probs.double().cumsum(-1)
         uniform = torch.rand(edges.shape[:-1], dtype=torch.float64, device=edges.device) * edges[..., -1]
         return torch.searchsorted(edges, uniform[..., None], right=True)[..., 0].clamp(max=edges.shape[-1] - 1)
+
+
+def refuse_several_items(cell: CellSpec, model: str) -> None:
+    """Refuse a bin with several items for a policy that does not choose among them, with a ``ValueError``."""
+    if cell.bin_items > 1:
+        raise ValueError(
+            f"env.bin_items={cell.bin_items}: expected 1 with {model}; model=fcn_grasp or corners with a mask, and "
+            "fcn4d, choose among several items."
+        )
 
 
 def pick_one(candidates: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ class CornerPolicy(FootprintPolicy):
         return CornerNet(**network)
 
     def ranked(self, maps: PlacingMaps) -> Tensor:
-        return corner_mask(self.cell, maps).flatten(1)
+        return maps.join(corner_mask(self.cell, maps))
 
 
 def corners(cell: CellSpec, mask_infeasible: bool, **network) -> CornerPolicy:

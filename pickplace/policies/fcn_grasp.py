@@ -4,15 +4,15 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from pickplace.policies.base import MASKED, Policy, pick_one
+from pickplace.policies.base import MASKED, Policy, pick_one, refuse_several_items
 from pickplace.policies.networks.footprint_fcn import MAP_KEYS, FootprintFcn, every_footprint
 from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import (
     PlacingMaps,
     action_footprints,
     actions_reaching,
+    choice_mask,
     first_action_reaching,
-    footprint_mask,
     unchecked_maps,
 )
 from pickplace.task.grasps import (
@@ -24,17 +24,18 @@ from pickplace.task.grasps import (
     pick_classes,
     split_flat,
 )
-from pickplace.task.state import Observation, State, item_from_depth
+from pickplace.task.state import Item, Observation, State, item_from_depth, items_from_observation
 from pickplace.task.transition import apply
 
 
-def count_ways(cell: CellSpec, footprint: Tensor, allowed: Tensor) -> Tensor:
-    """Return how many of the allowed actions, bool ``[N, M]``, leave each footprint, int64 ``[N, Q * W_T * D_T]``.
+def count_ways(choices: int, footprint: Tensor, allowed: Tensor) -> Tensor:
+    """Return how many of the allowed actions, bool ``[N, A]``, leave each footprint, int64 ``[N, choices]``.
 
     Args:
-        footprint: int64 ``[N, M]``, the footprint that each action leaves, or -1.
+        choices: the number of footprints, over all items in a bin.
+        footprint: int64 ``[N, A]``, the footprint that each action leaves, or -1.
     """
-    ways = footprint.new_zeros(len(footprint), cell.num_footprints + 1)
+    ways = footprint.new_zeros(len(footprint), choices + 1)
     return ways.scatter_add_(1, footprint + 1, allowed.long())[:, 1:]
 
 
@@ -42,7 +43,8 @@ class FootprintPolicy(Policy):
     """``fcn_grasp`` with a mask: chooses among the distinct footprints that some action reaches.
 
     A success leaves a tote that depends on the footprint alone; the grasp only decides whether it can be reached, and
-    the mask knows that.
+    the mask knows that. Where bins hold several items, a choice is a pair of an item and a footprint, with the index
+    ``item * num_footprints + footprint``.
 
     Args:
         cell: the sizes.
@@ -59,6 +61,8 @@ class FootprintPolicy(Policy):
 
     def __init__(self, cell: CellSpec, **network):
         super().__init__(cell)
+        if cell.bin_items > 1:
+            self.in_keys.append("items")
         self.network = self.make_network(**network)
 
     def make_network(self, **network):
@@ -66,21 +70,27 @@ class FootprintPolicy(Policy):
         return FootprintFcn(**network)
 
     def ranked(self, maps: PlacingMaps) -> Tensor:
-        """Return the footprints among which it chooses, bool ``[N, Q * W_T * D_T]``; some, if any is feasible."""
-        return footprint_mask(self.cell, maps).flatten(1)
+        """Return the footprints among which it chooses, bool ``[N, M * Q * W_T * D_T]``; some, if any is feasible."""
+        return choice_mask(self.cell, maps)
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
         """Return the scores of some footprints, float32 ``[M]``; a subclass may add what further terms tell.
 
         Args:
             row: int64 ``[M]``, index of the problem.
-            footprint: int64 ``[M]``, index ``(parity * W_T + x) * D_T + y``.
+            footprint: int64 ``[M]``, index ``(parity * W_T + x) * D_T + y``; of several items that of a choice.
         """
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
-        return self.network.at(bins, totes, bearing, row, footprint)[:, 0]
+        item = None
+        if "items" in observation.keys():  # noqa: SIM118 - a TensorDict does not iterate over its keys
+            number = footprint // self.cell.num_footprints
+            item = Item.from_table(observation["items"][row, number])
+            footprint = footprint - number * self.cell.num_footprints
+        return self.network.at(bins, totes, bearing, row, footprint, item)[:, 0]
 
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
-        """Return logits of the footprints that a mask ``[N, Q * W_T * D_T]`` allows; the others are not computed."""
+        """Return logits of the footprints that a mask ``[N, M * Q * W_T * D_T]`` allows; the others are not
+        computed."""
         row, footprint = mask.nonzero(as_tuple=True)
         scores = self.scores(observation, row, footprint)
         return scores.new_full(mask.shape, MASKED).index_put((row, footprint), scores)
@@ -89,8 +99,10 @@ class FootprintPolicy(Policy):
         return self.footprint_logits(observation, observation[f"{self.masks[0]}_mask"])
 
     def unmasked_scores(self, observation: Observation) -> Tensor:
-        totes = observation["tote_depth"]
-        return self.scores(observation, *every_footprint(totes, self.cell.parities)).view(totes.shape[0], -1)
+        totes, count = observation["tote_depth"], 1
+        if "items" in observation.keys():  # noqa: SIM118
+            count = observation["items"].shape[1]
+        return self.scores(observation, *every_footprint(totes, self.cell.parities * count)).view(totes.shape[0], -1)
 
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
         row = torch.arange(len(choices), device=choices.device).repeat_interleave(choices.shape[1])
@@ -101,19 +113,23 @@ class FootprintPolicy(Policy):
         return pick_one(actions_reaching(self.cell, maps, choice))
 
     def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
-        state = State.from_observation(observation)
-        x, y, w, _ = apply(self.cell, state, action).footprint.unbind(-1)
-        turned = (w != state.item.w).long()  # a square item is the same either way
-        return footprint_index(self.cell.tote_size, turned, x, y)
+        step = apply(self.cell, State.from_observation(observation), action)
+        x, y, w, _ = step.footprint.unbind(-1)
+        turned = (w != step.item.w).long()  # a square item is the same either way
+        footprint = footprint_index(self.cell.tote_size, turned, x, y)
+        return footprint if step.taken is None else footprint + step.taken * self.cell.num_footprints
 
     def action_log_probs(self, observation: Observation) -> Tensor:
         """Return the distribution over flat actions ``[N, N_a]``.
 
         An action whose pick misses, or whose item leaves the tote, has no footprint, so probability 0.
         """
-        footprint = action_footprints(self.cell, item_from_depth(observation["bin_depth"]))
-        ways = count_ways(self.cell, footprint, footprint >= 0)
-        logits = torch.where(ways > 0, self.unmasked_scores(observation), MASKED)
+        footprint, scores = (
+            action_footprints(self.cell, items_from_observation(observation)),
+            self.unmasked_scores(observation),
+        )
+        ways = count_ways(scores.shape[1], footprint, footprint >= 0)
+        logits = torch.where(ways > 0, scores, MASKED)
         share = logits.log_softmax(-1) - ways.clamp(min=1).log()
         return torch.where(footprint >= 0, share.gather(1, footprint.clamp(min=0)), MASKED)
 
@@ -141,6 +157,7 @@ class GraspPolicy(Policy):
 
     def __init__(self, cell: CellSpec, **network):
         super().__init__(cell)
+        refuse_several_items(cell, "model=fcn_grasp and algo.mask_infeasible=False")
         self.classes = num_grasp_turns(cell) * cell.num_offsets**2
         self.network = FootprintFcn(cell.num_offsets**2, **network)
         self.miss, self.outside = (nn.Parameter(torch.zeros(())) for _ in range(2))

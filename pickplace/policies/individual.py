@@ -5,7 +5,7 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from pickplace.policies.base import MASKED, Policy, pick_one
+from pickplace.policies.base import MASKED, Policy, pick_one, refuse_several_items
 from pickplace.policies.fcn4d import ActionPolicy
 from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy, count_ways
 from pickplace.task.cell import CellSpec
@@ -71,6 +71,10 @@ class IndividualRlPolicy(PlaceRotationPolicy, ActionPolicy):
     Args: as :class:`~pickplace.policies.fcn4d.ActionPolicy`.
     """
 
+    def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
+        refuse_several_items(cell, "model=individual_rl")
+        super().__init__(cell, mask_infeasible, **network)
+
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
         actions = join_pick(self.cell, self._pick(observation)[:, None], choices)
         return ActionPolicy.choice_logits(self, observation, actions)
@@ -104,6 +108,10 @@ class IndividualFootprintPolicy(FootprintPolicy):
     excludes = EXCLUDES
     ranks_footprints = False
 
+    def __init__(self, cell: CellSpec, **network):
+        refuse_several_items(cell, "model=individual_grasp")
+        super().__init__(cell, **network)
+
     def _reached(self, observation: Observation, mask: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Return the heuristic pick, the footprints that it leaves, and those to choose among.
 
@@ -121,7 +129,7 @@ class IndividualFootprintPolicy(FootprintPolicy):
 
     def _masked_logits(self, observation: Observation, mask: Tensor) -> Tensor:
         _, footprint, allowed = self._reached(observation, mask)
-        return self.footprint_logits(observation, count_ways(self.cell, footprint, allowed) > 0)
+        return self.footprint_logits(observation, count_ways(self.cell.num_footprints, footprint, allowed) > 0)
 
     def logits(self, observation: Observation) -> Tensor:
         return self._masked_logits(observation, observation["action_mask"])
@@ -142,7 +150,7 @@ class IndividualFootprintPolicy(FootprintPolicy):
     def action_log_probs(self, observation: Observation) -> Tensor:
         """Return the distribution over flat actions; minus infinity for other picks, and outside the tote."""
         pick, footprint, allowed = self._reached(observation)
-        ways = count_ways(self.cell, footprint, allowed)
+        ways = count_ways(self.cell.num_footprints, footprint, allowed)
         share = self.footprint_logits(observation, ways > 0).log_softmax(-1) - ways.clamp(min=1).log()
         score = torch.where(allowed, share.gather(1, footprint.clamp(min=0)), -torch.inf)
         return spread_over_actions(self.cell, score, pick)

@@ -22,6 +22,9 @@ from pickplace.task.effector import (
 
 PICK_RULES = ("contain", "overlap", "seal")
 
+REFILLS = ("each", "batch")
+MAX_BIN_ITEMS = 100
+
 HULL_RULES = ("hull", "bearing")
 SUPPORT_RULES = ("half", "more_than_half", "hull", "bearing", "full")
 
@@ -147,6 +150,8 @@ class CellSpec:
         cup_size: ``(w, d)`` of the cup, in the middle of the body; None: ``effector_size``. None with a mask.
         min_seal: with ``pick_rule="seal"``: least share of the cup's cells that must lie on the item, above 0.
         reach: of the robot, such as :class:`~pickplace.task.reach.Annulus`; None: it reaches everything.
+        bin_items: ``M``, how many items a bin holds at most.
+        refill: of several items: a new one arrives after ``"each"`` pick, or a ``"batch"`` when the bin is empty.
         longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and unless an
             item must be contained it also sets the number of offsets.
         limits: of the robot, see :class:`Limits`; None: those of ``reach``.
@@ -170,6 +175,8 @@ class CellSpec:
     cup_size: tuple[int, int] | None = None
     min_seal: float = 1.0
     reach: Reach | None = None
+    bin_items: int = 1
+    refill: str = "each"
     longest_side: int | None = field(default=None, metadata={"derived": True})
     limits: Limits | None = field(default=None, compare=False, metadata={"derived": True})
     item_inset: tuple[int, int] = field(default=(0, 0), metadata={"derived": True})
@@ -187,6 +194,8 @@ class CellSpec:
             one_of("support", self.support, SUPPORT_RULES, "a number between 0 and 1")
         number("support_margin", self.support_margin, 0, 100)
         object.__setattr__(self, "height_unit", float(number("height_unit", self.height_unit, 1e-3, 1e3)))
+        whole_number("bin_items", self.bin_items, most=MAX_BIN_ITEMS)
+        one_of("refill", self.refill, REFILLS)
         if self.longest_side is not None:
             whole_number("longest_side", self.longest_side)
         self._check_effector()
@@ -270,6 +279,11 @@ class CellSpec:
     def num_footprints(self) -> int:
         """The number of footprints ``(parity, x, y)``; what an action leaves in the tote is one of them."""
         return self.parities * self.num_places
+
+    @property
+    def num_choices(self) -> int:
+        """The number of pairs of an item in the bin and a footprint, ``item * num_footprints + footprint``."""
+        return self.bin_items * self.num_footprints
 
     @cached_property
     def body_mask(self) -> Mask:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from pickplace.task.cell import CellSpec, Limits
+from pickplace.task.bin import blocked_picks
 from pickplace.task.checks import check_bytes
 from pickplace.task.grasps import (
     all_grasps,
@@ -37,16 +38,49 @@ CLASS_BYTES = 2**28  # of the masks of grasp classes that are held at a time
 
 
 class PlacingMaps(NamedTuple):
-    """Everything that decides which actions succeed in a state."""
+    """Everything that decides which actions succeed in a state.
+
+    Where bins hold ``M`` items, there is a problem for each item, those of a bin one after the other: ``N`` is
+    ``N * M`` in the shapes of the fields.
+    """
 
     top: Tensor  # int32 [N, Q, W_T, D_T]: height of the item's top with its footprint's min corner there, or NEVER
     clearance: Tensor  # int32 [N, B, W_T, D_T]: highest thing under the end effector with its reference cell there
     item: Item  # what is picked
     rest: Tensor  # int32 [N, Q, W_T, D_T]: height on which the item would lie, stable or not; FAR outside the tote
+    blocked: Tensor | None = None  # bool [N, P]: see `blocked_picks`; None: the items lie alone
+    bin_items: int = 1  # M
 
     def rows(self, index: Tensor) -> "PlacingMaps":
-        """Return the maps of some problems, by their numbers, which may come up more than once."""
-        return PlacingMaps(self.top[index], self.clearance[index], self.item.rows(index), self.rest[index])
+        """Return the maps of some bins, by their numbers, which may come up more than once."""
+        if self.bin_items > 1:
+            index = self.rows_of_items(index)
+        return PlacingMaps(*self._parts(index), bin_items=self.bin_items)
+
+    def of_choice(self, cell: CellSpec, choice: Tensor) -> tuple["PlacingMaps", Tensor]:
+        """Return the maps of each choice's item, and its footprint.
+
+        Args:
+            cell: the sizes.
+            choice: int64 ``[N]``, ``item * num_footprints + footprint``.
+        """
+        if self.bin_items == 1:
+            return self, choice
+        item = choice // cell.num_footprints
+        row = torch.arange(len(choice), device=choice.device) * self.bin_items + item
+        return PlacingMaps(*self._parts(row)), choice - item * cell.num_footprints
+
+    def join(self, mask: Tensor) -> Tensor:
+        """Return a mask over footprints ``[N * M, Q, W_T, D_T]`` as one over choices, ``[N, M * Q * W_T * D_T]``."""
+        return mask.flatten(1).reshape(len(mask) // self.bin_items, -1)
+
+    def rows_of_items(self, index: Tensor) -> Tensor:
+        """Return the rows of the items of bins, int64 ``[len(index) * M]``."""
+        return (index[:, None] * self.bin_items + torch.arange(self.bin_items, device=index.device)).flatten()
+
+    def _parts(self, row: Tensor) -> tuple:
+        blocked = None if self.blocked is None else self.blocked[row]
+        return self.top[row], self.clearance[row], self.item.rows(row), self.rest[row], blocked
 
     def clearance_in(self, rotation: int) -> Tensor:
         """Return the clearance in a rotation or turn, batch last, ``[W_T, D_T, N]``."""
@@ -55,14 +89,21 @@ class PlacingMaps(NamedTuple):
 
 def placing_maps(cell: CellSpec, state: State) -> PlacingMaps:
     """Return everything that decides which actions succeed: see :class:`PlacingMaps`."""
-    top, rest = resting_top(cell, state)
-    return PlacingMaps(top, clearance(cell, state), state.item, rest)
+    each, clear, count = state.each_item(), clearance(cell, state), state.items.x.shape[1]
+    top, rest = resting_top(cell, each)
+    if count == 1:
+        return PlacingMaps(top, clear, each.item, rest)
+    return PlacingMaps(top, clear.repeat_interleave(count, 0), each.item, rest, blocked_picks(cell, state.item), count)
 
 
 def unchecked_maps(cell: CellSpec, state: State) -> PlacingMaps:
     """Return the maps of footprints that are known to be stable and below the rim, without a look at either."""
-    top = unchecked_top(cell, state)
-    return PlacingMaps(top, clearance(cell, state), state.item, top - state.item.h.to(top.dtype).view(-1, 1, 1, 1))
+    each, clear, count = state.each_item(), clearance(cell, state), state.items.x.shape[1]
+    top = unchecked_top(cell, each)
+    rest = top - each.item.h.to(top.dtype).view(-1, 1, 1, 1)
+    if count == 1:
+        return PlacingMaps(top, clear, each.item, rest)
+    return PlacingMaps(top, clear.repeat_interleave(count, 0), each.item, rest, blocked_picks(cell, state.item), count)
 
 
 def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
@@ -95,20 +136,22 @@ def check_actions(cell: CellSpec, batch: int, device) -> None:
 
 def num_feasible(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     """Return how many flat actions succeed, int64 ``[N]``, without listing them."""
-    at_once = max(1, CLASS_BYTES // (num_turns(cell) * cell.num_offsets**2 * cell.num_places))
-    if at_once < len(maps.top):
-        parts = torch.arange(len(maps.top), device=maps.top.device).split(at_once)
+    at_once = max(1, CLASS_BYTES // (num_turns(cell) * cell.num_offsets**2 * cell.num_places) // maps.bin_items)
+    bins = len(maps.top) // maps.bin_items
+    if at_once < bins:
+        parts = torch.arange(bins, device=maps.top.device).split(at_once)
         return torch.cat([num_feasible(cell, maps.rows(part)) for part in parts])
-    available, classes = available_offsets(cell, maps.item)
+    available, classes = available_offsets(cell, maps.item, maps.blocked)
     places = class_mask(cell, maps).sum(1)  # [T * K, N]
-    return reduce(torch.add, [(places.gather(0, turned) * available).sum(0) for turned in classes])
+    count = reduce(torch.add, [(places.gather(0, turned) * available).sum(0) for turned in classes])
+    return count if maps.bin_items == 1 else count.view(bins, -1).sum(1)
 
 
 def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     """Return exactly the flat actions that succeed, bool ``[N, N_a]``."""
     check_actions(cell, len(maps.top), maps.top.device)
     places, batch, rotations = cell.num_places, len(maps.top), cell.rotations
-    available, classes = available_offsets(cell, maps.item)
+    available, classes = available_offsets(cell, maps.item, maps.blocked)
     by_class = class_mask(cell, maps)
     num_classes = len(by_class)
     by_class = by_class.permute(2, 0, 1).reshape(-1, places).view(torch.uint8)  # [N * T * K, places]
@@ -128,17 +171,20 @@ def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     block = torch.where(usable.gather(1, block), block + first[:, None] * count, batch * count)
     mask = blocks.index_select(0, block.flatten()).view(torch.bool)
     mask = mask.view(batch, cell.num_picks, places, slots)
-    return mask[..., :rotations].reshape(batch, cell.num_actions)
+    mask = mask[..., :rotations].reshape(batch, cell.num_actions)
+    return mask if maps.bin_items == 1 else mask.unflatten(0, (-1, maps.bin_items)).any(1)
 
 
 def footprint_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     """Return the footprints that some action reaches, bool ``[N, Q, W_T, D_T]`` by parity and minimum corner.
 
+    Where bins hold several items, for each of them: ``[N * M, Q, W_T, D_T]``; see :func:`choice_mask`.
+
     A square footprint is the same in both parities; it is listed under parity 0 only, so that distinct entries leave
     distinct totes.
     """
     batch, count, turns = len(maps.top), cell.num_offsets, num_turns(cell)
-    available, classes = available_offsets(cell, maps.item)
+    available, classes = available_offsets(cell, maps.item, maps.blocked)
     # Each class that some pick has; the last row takes what is not available.
     grasped = available.new_zeros(turns * count**2 + 1, batch)
     grasped.scatter_(0, torch.where(available, classes, len(grasped) - 1).flatten(0, 1), True)
@@ -156,6 +202,11 @@ def footprint_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
         reached[0] |= square & reached[1]
         reached[1] &= ~square
     return reached.permute(3, 0, 1, 2).contiguous()
+
+
+def choice_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
+    """Return the footprints that some action reaches, with any item in the bin: bool ``[N, M * Q * W_T * D_T]``."""
+    return maps.join(footprint_mask(cell, maps))
 
 
 def _reference_cells(cell: CellSpec, device) -> Tensor:
@@ -209,14 +260,16 @@ def actions_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Te
     """Return all successful flat actions that leave the item in a given footprint.
 
     Args:
-        footprint: int64 ``[N]``, index ``(parity * W_T + x) * D_T + y``.
+        footprint: int64 ``[N]``, index ``(parity * W_T + x) * D_T + y``; of several items in a bin that of a choice,
+            ``item * num_footprints + footprint``.
 
     Returns:
         int64 ``[N, P * R]``: for each pick cell and rotation the flat action, or -1 if it does not succeed.
     """
     tote_w, tote_d, _ = cell.tote_size
     device = footprint.device
-    lifted, offset = all_grasps(cell, maps.item)
+    maps, footprint = maps.of_choice(cell, footprint)
+    lifted, offset = all_grasps(cell, maps.item, maps.blocked)
     rotation = torch.arange(cell.rotations, device=device)
     parity = rotation % 2
     refs = _reference_cells(cell, device)
@@ -246,14 +299,24 @@ def first_action_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) 
     return torch.where(actions >= 0, actions, cell.num_actions - 1).amin(1)
 
 
-def action_footprints(cell: CellSpec, item: Item) -> Tensor:
+def action_footprints(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> Tensor:
     """Return the footprint that each flat action would leave if nothing collided, int64 ``[N, N_a]``.
 
     It is an index as in :func:`actions_reaching`, with a square footprint under parity 0; -1 where the pick fails or
     the footprint leaves the tote.
+
+    Args:
+        cell: the sizes.
+        item: ``[N]``, or ``[N, M]`` in bins with several items.
+        blocked: as :func:`~pickplace.task.bin.blocked_picks` has it, which is asked for several items.
     """
     tote_w, tote_d, _ = cell.tote_size
-    lifted, offset = all_grasps(cell, item)
+    if item.x.dim() == 2:
+        blocked = blocked_picks(cell, item) if blocked is None else blocked
+        each = action_footprints(cell, Item(*(part.flatten() for part in item)), blocked).unflatten(0, item.x.shape)
+        number = torch.arange(item.x.shape[1], device=each.device)[:, None] * cell.num_footprints
+        return torch.where(each >= 0, each + number, -1).amax(1)  # a pick lifts one item at most
+    lifted, offset = all_grasps(cell, item, blocked)
     device = offset.device
     check_actions(cell, len(lifted), device)
     turned = torch.arange(cell.rotations, device=device) % 2  # [R]

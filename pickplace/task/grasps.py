@@ -94,12 +94,13 @@ class Grasp(NamedTuple):
         return good if self.unreachable is None else good & ~self.unreachable
 
 
-def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor) -> Grasp:
+def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | None = None) -> Grasp:
     """Return what picks at cells ``(x, y)`` do.
 
     Args:
         item: parts ``[N]``; the batch is the last axis.
         x, y: tensors that broadcast with ``[..., N]``.
+        blocked: bool ``[N, P]``, see :func:`~pickplace.task.bin.blocked_picks`; None: the item lies alone.
     """
     (bin_w, bin_d, wall), (ee_w, ee_d) = cell.bin_size, cell.effector_size
     left, front = x - reference_cell(ee_w), y - reference_cell(ee_d)  # the end effector's minimum corner
@@ -108,11 +109,14 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor) -> Grasp:
     gripped = is_gripped(cell, near_x, near_y, item.w, item.d)
     # Every edge of the rectangle has a cell of the body.
     leaves_bin = is_outside(left, ee_w, bin_w) | is_outside(front, ee_d, bin_d)
-    # The only thing in a bin is its item, which is never higher than its own top: just the walls can be hit.
+    # An item is never higher than its own top: just the walls and other items can be hit.
     collides = leaves_bin & ~is_clear(item.h, wall)
     unreachable = None
-    if cell.limits is not None:
+    if blocked is not None or cell.limits is not None:
         pick = (x.clamp(0, bin_w - 1) * bin_d + y.clamp(0, bin_d - 1)).expand_as(gripped)
+    if blocked is not None:
+        collides = collides | blocked.t().gather(0, pick.reshape(-1, pick.shape[-1])).view_as(pick)
+    if cell.limits is not None:
         limits = cell.limits.on(pick.device)
         unreachable = ~limits.pick_ok[pick]
         if limits.lowest_pick is not None and limits.highest_pick is not None:
@@ -135,11 +139,11 @@ class Carried(NamedTuple):
     d: Tensor
 
 
-def carry(cell: CellSpec, item: Item, action: Tensor) -> Carried:
-    """Return where flat actions ``[A]`` bring items, of which there are ``[A]``."""
+def carry(cell: CellSpec, item: Item, action: Tensor, blocked: Tensor | None = None) -> Carried:
+    """Return where flat actions ``[A]`` bring items, of which there are ``[A]``; ``blocked`` as of :func:`grasp`."""
     (ee_w, ee_d), (x_bin, y_bin, x_tote, y_tote, rotation) = cell.effector_size, split_action(cell, action)
     odd = rotation % 2 == 1
-    picked = grasp(cell, item, x_bin, y_bin)
+    picked = grasp(cell, item, x_bin, y_bin, blocked)
     turned = zip(*turn(picked.near_x, picked.near_y, picked.back_x, picked.back_y)[: cell.rotations], strict=True)
     offset_x, offset_y = (torch.stack(offsets).gather(0, rotation[None])[0] for offsets in turned)
     w, d = turned_size(item, odd)
@@ -192,25 +196,26 @@ def turned_size(item: Item, odd: Tensor) -> tuple[Tensor, Tensor]:
 
 
 # ---------------------------------------------------------------------- all picks at once
-def all_grasps(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:
+def all_grasps(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return what each pick cell does: whether it lifts the item, bool ``[N, P]``, and the item's offset.
 
     The offset, int64 ``[N, P, R, 2]``, is the item's minimum corner in the frame of the turned end effector.
+    ``blocked`` is as of :func:`grasp`.
     """
     x, y = (torch.arange(side, device=item.x.device)[:, None] for side in cell.bin_size[:2])
-    found = grasp(cell, item, x[:, None], y)  # [W_B, D_B, N]
+    found = grasp(cell, item, x[:, None], y, blocked)  # [W_B, D_B, N]
     pairs = turn(found.near_x, found.near_y, found.back_x, found.back_y)[: cell.rotations]
     offset = torch.stack([torch.stack(torch.broadcast_tensors(*pair), -1) for pair in pairs], 3)  # [..., N, R, 2]
     return found.succeeds.flatten(0, 1).t(), offset.flatten(0, 1).transpose(0, 1)
 
 
-def heuristic_pick(cell: CellSpec, item: Item) -> Tensor:
+def heuristic_pick(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> Tensor:
     """Return the pick cell of individual planning, which does not look at the tote, int64 ``[N]``.
 
     It has the least offset ``ox + oy``, then ``oy``, among the picks that succeed: the item lies in the end effector's
-    corner where possible.
+    corner where possible. ``blocked`` is as of :func:`grasp`.
     """
-    succeeds, offset = all_grasps(cell, item)
+    succeeds, offset = all_grasps(cell, item, blocked)
     ox, oy = offset[:, :, 0].unbind(-1)  # before turning, [N, P]
     return torch.where(succeeds, (ox + oy) * FAR + oy, FAR**2).argmin(1)
 
@@ -250,8 +255,10 @@ def pick_classes(cell: CellSpec, item: Item) -> Tensor:
     return torch.where(succeeds[..., None], class_index(cell, turns, step[..., 0], step[..., 1]), -1)
 
 
-def available_offsets(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:
+def available_offsets(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return which offsets a pick can have, and which grasp classes they become by turning.
+
+    ``blocked`` is as of :func:`grasp`.
 
     Returns:
         bool ``[K, N]``: some pick cell, the only one, lifts the item with this offset under the end effector before
@@ -261,7 +268,7 @@ def available_offsets(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:
     here = torch.arange(count, device=item.x.device)[:, None]
     step = here + cell.min_offset  # [O, 1]
     x, y = item.x - step + reference_cell(ee_w), item.y - step + reference_cell(ee_d)  # the pick cell, [O, N]
-    found = grasp(cell, item, x[:, None], y)
+    found = grasp(cell, item, x[:, None], y, blocked)
     in_bin = ~is_outside(x, 1, bin_w)[:, None] & ~is_outside(y, 1, bin_d)
     back_x, back_y = (
         (back - cell.min_offset).clamp(0, count - 1) for back in (found.back_x, found.back_y)

@@ -67,11 +67,13 @@ class ItemDistribution:
         sizes: int64 ``[K, 3]``, every size ``(w, d, h)`` that may arrive, in cells and height units.
         length: number of items in an episode, or None if they never end.
         varies: whether episodes differ at all.
+        has_corners: whether each item has one place in the bin, so that of several items one waits for its place.
     """
 
     sizes: Tensor
     length: int | None = None
     varies: bool = True
+    has_corners: bool = False
 
     def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size) -> Item:
         """Return the ``step``-th item (from 0) of each ``episode``, int64 ``[N]``; size 0 after the last one."""
@@ -182,7 +184,8 @@ class Recorded(ItemDistribution):
         numbers = torch.tensor(rows, dtype=torch.int64)
         self.sizes = numbers[:, :3]
         self._corner = numbers[:, 3:] if len(header) == 5 else None
-        self.varies = self._corner is None  # else not even where the items lie
+        self.has_corners = self._corner is not None
+        self.varies = not self.has_corners  # else not even where the items lie
         self._lines = [line for line, row in table[1:] if any(row)]
         self._loop = loop
         self.length = None if loop else len(rows)

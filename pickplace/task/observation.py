@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import excerpt, short_text
-from pickplace.task.state import State, bin_depth_from_item, depth_from_heights
+from pickplace.task.state import State, bin_depth_from_item, bin_labels_from_items, depth_from_heights
 
 
 class Bounds(NamedTuple):
@@ -50,6 +50,32 @@ class BinDepth(Term):
 
     def value(self, cell, state):
         return bin_depth_from_item(state.item, cell.bin_size)
+
+
+class BinLabels(Term):
+    """Number of the item on each cell of the bin, float32 ``[N, W_B, D_B]``: 1 to M, 0 where empty.
+
+    The numbers are those of :class:`Items`, so that 1 is the item that arrived first.
+    """
+
+    def bounds(self, cell, tallest):
+        return Bounds(0, cell.bin_items, cell.bin_size[:2])
+
+    def value(self, cell, state):
+        return bin_labels_from_items(state.items, cell.bin_size)
+
+
+class Items(Term):
+    """Items in the bin in the order in which they arrived, int64 ``[N, M, 5]``: x, y, w, d in cells, h in height units.
+
+    A row of zeros stands for no item.
+    """
+
+    def bounds(self, cell, tallest):
+        return Bounds(0, max(tallest, *cell.bin_size[:2]), (cell.bin_items, 5), torch.int64)
+
+    def value(self, cell, state):
+        return state.items.table
 
 
 class ToteDepth(Term):
@@ -90,6 +116,9 @@ STANDARD_TERMS: Mapping[str, Term] = {
     "tote_height": ToteHeight(),
 }
 
+#: What is there besides where a bin holds several items.
+SEVERAL_ITEMS: Mapping[str, Term] = {"bin_labels": BinLabels(), "items": Items()}
+
 #: Keys of the environment, the policies and the learner that no term may have.
 RESERVED = (
     "action",
@@ -119,15 +148,25 @@ RESERVED = (
 )
 
 
-def check_terms(terms: Mapping[str, Term] | None) -> dict[str, Term]:
+def standard_terms(bin_items: int) -> dict[str, Term]:
+    """Return the terms that an observation of a bin with that many items always has."""
+    return {**STANDARD_TERMS, **(SEVERAL_ITEMS if bin_items > 1 else {})}
+
+
+def check_terms(terms: Mapping[str, Term] | None, bin_items: int = 1) -> dict[str, Term]:
     """Return the terms of an observation, the standard ones first; None gives those alone.
+
+    Args:
+        terms: by key.
+        bin_items: number of items that a bin holds.
 
     Raises:
         ValueError: naming the key, for something else than a term, a key that is taken, or another term for a standard
             one.
     """
+    standard = standard_terms(bin_items)
     if terms is None:
-        return dict(STANDARD_TERMS)
+        return standard
     if not isinstance(terms, Mapping):
         raise ValueError(f"observation={excerpt(terms)}: expected terms by their keys.")
     for key, term in terms.items():
@@ -136,11 +175,11 @@ def check_terms(terms: Mapping[str, Term] | None) -> dict[str, Term]:
             raise ValueError(f"{place}={excerpt(term)}: expected a Term, such as pickplace.task.observation.ToteDepth.")
         if not isinstance(key, str) or key in RESERVED or not key.isidentifier():
             raise ValueError(f"{place}: expected another name; taken are {', '.join(RESERVED)}.")
-    for key, term in STANDARD_TERMS.items():
+    for key, term in standard.items():
         if type(found := terms.get(key, term)) is not type(term):
             expected = f"{type(term).__name__}, which is always there"
             raise ValueError(f"observation.{key}={excerpt(found)}: expected {expected}.")
-    return {**STANDARD_TERMS, **terms}
+    return {**standard, **terms}
 
 
 def observe(

@@ -1,4 +1,4 @@
-"""The state of a problem: the item in the bin, the surface in the tote, and why an episode ended."""
+"""The state of a problem: the items in the bin, the surface in the tote, and why an episode ended."""
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
@@ -56,7 +56,8 @@ _WORDS = {
 class Item(NamedTuple):
     """One item per problem, lying in its bin: minimum corner ``(x, y)`` and size ``(w, d, h)``, int64 ``[N]`` each.
 
-    ``h`` is in height units, the rest in cells. An empty bin has size ``(0, 0, 0)``.
+    ``h`` is in height units, the rest in cells. An empty bin has size ``(0, 0, 0)``. The items that lie in a bin
+    together have parts of shape ``[N, M]``, in the order in which they arrived; those of size 0 are not there.
     """
 
     x: Tensor
@@ -64,6 +65,16 @@ class Item(NamedTuple):
     w: Tensor
     d: Tensor
     h: Tensor
+
+    @classmethod
+    def from_table(cls, table: Tensor) -> "Item":
+        """Return the items of a table ``[..., 5]`` with columns x, y, w, d, h."""
+        return cls(*table.unbind(-1))
+
+    @property
+    def table(self) -> Tensor:
+        """The parts as columns, int64 ``[N, 5]`` or ``[N, M, 5]``."""
+        return torch.stack(self, -1)
 
     @property
     def volume(self) -> Tensor:
@@ -85,7 +96,7 @@ class State(NamedTuple):
 
     surface: Tensor  # int32 [N, W_T, D_T]: of what the tote holds, see `surface_from`
     tote_height: Tensor  # int64 [N]: height of the episode's tote, H_T
-    item: Item  # what lies in the bin
+    item: Item  # what lies in the bin, [N]; with several items [N, M]
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "State":
@@ -93,12 +104,17 @@ class State(NamedTuple):
         tote_height = observation["tote_height"].reshape(-1)
         heights = heights_from_depth(observation["tote_depth"], tote_height)
         surface = surface_from(heights, observation["tote_bearing"])
-        return cls(surface, tote_height, item_from_depth(observation["bin_depth"]))
+        return cls(surface, tote_height, items_from_observation(observation))
 
     @property
     def heights(self) -> Tensor:
         """The height of each cell of the tote, int32 ``[N, W_T, D_T]``."""
         return self.surface >> 1
+
+    @property
+    def items(self) -> Item:
+        """The items in each bin, ``[N, M]``, be it one."""
+        return self.item if self.item.x.dim() == 2 else self.item.rows((slice(None), None))
 
     @property
     def bearing(self) -> Tensor:
@@ -108,6 +124,12 @@ class State(NamedTuple):
     def rows(self, index) -> "State":
         """Return the state of some problems, by their numbers, which may come up more than once."""
         return State(self.surface[index], self.tote_height[index], self.item.rows(index))
+
+    def each_item(self) -> "State":
+        """Return a problem for each item of a bin, one after the other: ``[N * M]``; of one item this state."""
+        if self.item.x.dim() == 1:
+            return self
+        return State(*self.repeat(self.item.x.shape[1])[:2], Item(*(part.flatten() for part in self.item)))
 
     def repeat(self, count: int) -> "State":
         """Return each problem ``count`` times, one copy after the other."""
@@ -138,9 +160,30 @@ def heights_from_depth(tote_depth: Tensor, tote_height: Tensor) -> Tensor:
 
 
 def bin_depth_from_item(item: Item, bin_size: Sequence[int]) -> Tensor:
-    """Return the height above the bin's floor, float32 ``[N, W_B, D_B]``: the item's height under it, else 0."""
-    inside = rectangle(bin_size, item.x, item.y, item.w, item.d)
-    return (inside * item.h.float()).permute(2, 0, 1).contiguous()
+    """Return the height above the bin's floor, float32 ``[N, W_B, D_B]``: an item's height under it, else 0."""
+    return _bin_map(item, item.h, bin_size)
+
+
+def bin_labels_from_items(items: Item, bin_size: Sequence[int]) -> Tensor:
+    """Return which item of ``[N, M]`` lies on each cell of the bin, float32 ``[N, W_B, D_B]``, from 1; 0: none."""
+    return _bin_map(items, torch.arange(1, items.x.shape[1] + 1, device=items.x.device).expand_as(items.x), bin_size)
+
+
+def _bin_map(item: Item, value: Tensor, bin_size: Sequence[int]) -> Tensor:
+    """Return a map of a value of each item on its cells, 0 elsewhere, float32 ``[N, W_B, D_B]``."""
+    if item.x.dim() == 1:
+        inside = rectangle(bin_size, *item[:4])
+        return (inside * value.float()).permute(2, 0, 1).contiguous()
+    inside = rectangle(bin_size, *(part.flatten() for part in item[:4])).permute(2, 0, 1)  # [N * M, W_B, D_B]
+    return (inside * value.flatten()[:, None, None].float()).unflatten(0, item.x.shape).sum(1)
+
+
+def items_from_observation(observation: Observation) -> Item:
+    """Return what lies in the bins: the items listed by the term ``items``, ``[N, M]``, or the one that the bin's depth
+    map shows, ``[N]``."""
+    if "items" in observation.keys():  # noqa: SIM118 - a TensorDict does not iterate over its keys
+        return Item.from_table(observation["items"])
+    return item_from_depth(observation["bin_depth"])
 
 
 def item_from_depth(bin_depth: Tensor) -> Item:

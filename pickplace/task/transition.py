@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from pickplace.task.bin import blocked_picks, select_item, taken_item
 from pickplace.task.cell import CellSpec, EffectorShape
 from pickplace.task.feasibility import PlacingMaps
 from pickplace.task.grasps import (
@@ -19,7 +20,7 @@ from pickplace.task.grasps import (
 )
 from pickplace.task.maps import is_under, rectangle, square_cells, squares
 from pickplace.task.placing import is_within_reach, overflows, rest
-from pickplace.task.state import Failure, State, surface_from
+from pickplace.task.state import Failure, Item, State, surface_from
 from pickplace.task.support import bearing_cells, is_supported
 
 
@@ -30,6 +31,8 @@ class Step(NamedTuple):
     failure: Tensor  # int64 [N]
     top: Tensor  # int64 [N]: height of the item's top, meaningful without failure
     footprint: Tensor  # int64 [N, 4]: x, y, w, d of the footprint in the tote
+    item: Item  # the item that is taken, [N]
+    taken: Tensor | None = None  # int64 [N]: its number in the bin; None: it lies alone
 
     @property
     def heights(self) -> Tensor:
@@ -44,7 +47,12 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
         action: int64 ``[N]``, the flat index, in ``[0, N_a)``.
     """
     (surface, tote_height, item), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.effector_size
-    picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action)
+    taken = blocked = None
+    if item.x.dim() == 2:
+        taken = taken_item(cell, item, *split_action(cell, action)[:2])
+        blocked = blocked_picks(cell, item).unflatten(0, item.x.shape)[torch.arange(len(taken), device=taken.device), taken]
+        item = select_item(item, taken)
+    picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
     side, reach = cell.max_side, max(ee_w, ee_d)
     cells, under = squares(surface, x, y, side).unbind(0), is_under(w, d, side).unbind(0)
@@ -75,7 +83,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
         failure = torch.where(failed, int(kind), failure)
     footprint = torch.stack([x, y, w, d], -1)
     after = _add_item(cell, surface, footprint, z, torch.where(failure == 0, item.h, 0))
-    return Step(after, failure, top, footprint)
+    return Step(after, failure, top, footprint, item, taken)
 
 
 @lru_cache(maxsize=64)
@@ -93,8 +101,10 @@ def put_down(cell: CellSpec, surface: Tensor, maps: PlacingMaps, footprint: Tens
 
     Args:
         surface: int32 ``[N, W_T, D_T]``, of which ``maps`` were made.
-        footprint: int64 ``[N]``, index ``(parity * W_T + x) * D_T + y``, one that some action reaches.
+        footprint: int64 ``[N]``, index ``(parity * W_T + x) * D_T + y``, one that some action reaches; of several
+            items in a bin that of a choice.
     """
+    maps, footprint = maps.of_choice(cell, footprint)
     parity, x, y = split_footprint(cell.tote_size, footprint)
     w, d = turned_size(maps.item, parity == 1)
     z = maps.top.flatten(1).gather(1, footprint[:, None])[:, 0] - maps.item.h

@@ -2,11 +2,12 @@
 
 from collections import Counter
 from dataclasses import asdict, fields, replace
+from itertools import product
 from random import Random
 
 import pytest
 import torch
-from oracle import SUCCESS, Oracle, Rules, can_always_start
+from oracle import SUCCESS, Oracle, Rules, can_always_start, cells
 from problems import SUPPORTS, random_effector
 from tensordict import TensorDict
 
@@ -31,6 +32,10 @@ def draw_config(rng: Random, shaped=0.5):
         (*bin_sides, rng.choice((1, 2, 3, 3))), (wide, deep, height), effector, rng.randint(1, 4), pick_rule,
         **dict(zip(("support", "support_margin"), rng.choice(SUPPORTS), strict=True)), **shape,
     )  # fmt: skip
+    if rng.random() < 0.5:
+        bin_size = (*(side + rng.randint(0, 3) for side in bin_sides), rules.bin_size[2])
+        rules = replace(rules, bin_items=rng.randint(2, 5), refill=rng.choice(("each", "batch")), bin_size=bin_size)
+        bin_sides = bin_size[:2]
     if rng.random() < 0.4:  # limits that seldom leave an item nowhere to go
         lowest, highest = (
             [[rng.choices(values, k=deep) for _ in range(wide)] for _ in range(rules.rotations)]
@@ -53,6 +58,21 @@ def make_env(rules, kinds, **settings):
     return PickPlaceEnv(**given, limits=limits, items=Kinds(kinds), **settings)
 
 
+def read_items(observation, row):
+    """Return each item `(w, d, h)` in a bin and its corner `(x, y)`."""
+    if "items" not in observation.keys():  # noqa: SIM118
+        return [read_item(observation["bin_depth"][row].tolist())]
+    items = [tuple(item) for item in observation["items"][row].tolist()]
+    labels = [[0] * len(line) for line in observation["bin_labels"][row].tolist()]
+    for number, (x, y, w, d, h) in enumerate(items, 1):
+        assert (h > 0) == (number <= sum(item[4] > 0 for item in items))  # empty places come last
+        for column in labels[x : x + w]:
+            assert not any(column[y : y + d])  # items do not overlap
+            column[y : y + d] = [number] * d
+    assert labels == observation["bin_labels"][row].tolist()
+    return [((w, d, h), (x, y)) for x, y, w, d, h in items if h]
+
+
 def read_item(bin_depth):
     """Return the item `(w, d, h)` and its corner `(x, y)` that a `[W_B][D_B]` depth map shows."""
     filled = [(x, y) for x, column in enumerate(bin_depth) for y, height in enumerate(column) if height]
@@ -69,8 +89,9 @@ def compare_maps(oracle, observation, row):
 
 def fresh_oracle(rules, kinds, observation, row):
     """Return an oracle for an episode that has just begun in this row of an observation."""
-    oracle = Oracle(rules, int(observation["tote_height"][row]), *read_item(observation["bin_depth"][row].tolist()))
-    assert oracle.item in kinds
+    first, *others = read_items(observation, row)
+    oracle = Oracle(rules, int(observation["tote_height"][row]), *first, others=others)
+    assert all(item in kinds for item, _ in oracle.contents)
     compare_maps(oracle, observation, row)
     assert observation["action_mask"][row].any() and not observation["done"][row]
     return oracle
@@ -85,6 +106,26 @@ def compare_mask(oracle, mask, full, rng):
     count = min(12, len(yes))
     for action in rng.sample(yes, count) + rng.sample(no, min(24 - count, len(no))):
         assert (oracle.try_action(action)[0] == SUCCESS) == mask[action], action
+
+
+def compare_arrivals(rules, kinds, left, found):
+    """Return what lies in a bin, after checking what is new: `left` are the items that were there."""
+    if rules.refill == "batch" and left:
+        return left
+    assert len(found) <= rules.bin_items and found[: len(left)] == left
+    assert len(found) > len(left) or any(has_no_room(rules, kind, left) for kind in kinds)
+    if len(found) < rules.bin_items:  # the next one had no room
+        assert any(has_no_room(rules, kind, found) for kind in kinds)
+    assert all(item in kinds for item, _ in found)
+    return found
+
+
+def has_no_room(rules, kind, contents):
+    """Whether an item overlaps another one wherever it is put in the bin."""
+    wide, deep = rules.bin_size[:2]
+    full = {cell for item, position in contents for cell in cells(position, item[:2])}
+    corners = product(range(wide - kind[0] + 1), range(deep - kind[1] + 1))
+    return not any(full.isdisjoint(cells(corner, kind[:2])) for corner in corners)
 
 
 def choose_action(rules, mask, rng):
@@ -117,12 +158,16 @@ def compare_config(rules, kinds, seed, rng, full_share):
         td, following = env.step_and_maybe_reset(td.clone().set("action", torch.tensor(actions)))
         after = td["next"]
         for row, (oracle, action) in enumerate(zip(oracles, actions, strict=True)):
-            item, position = read_item(after["bin_depth"][row].tolist())
+            (item, position), *others = read_items(after, row)
             mask = after["action_mask"][row]
             feasible = mask.nonzero().flatten().tolist()[:1]
-            reward, terminated, failure = oracle.step(action, item, position, try_first=feasible)
+            left, taken = oracle.contents, oracle.taken(action)
+            reward, terminated, failure = oracle.step(action, item, position, try_first=feasible, others=others)
             found = [after[key][row].item() for key in ("failure", "reward", "terminated", "done", "truncated")]
-            assert found == [failure, reward, terminated, terminated, False] and item in kinds
+            assert found == [failure, reward, terminated, terminated, False]
+            if reward:
+                left = compare_arrivals(rules, kinds, [*left[:taken], *left[taken + 1 :]], [(item, position), *others])
+            assert left == [(item, position), *others]
             assert after["occupancy"][row].equal(torch.tensor([oracle.occupancy()], dtype=torch.float32))
             compare_maps(oracle, after, row)
             if terminated:  # stuck leaves nothing to do; another failure leaves all as it was

@@ -9,6 +9,7 @@ from pickplace.policies.networks.depth import depth_levels, item_code, one_hot
 from pickplace.policies.networks.footprint_fcn import DTYPES, MAP_KEYS, MAX_LEVELS, matrix_dtype
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import MAX_WIDTH, check_inputs, odd_number, one_of, whole_number
+from pickplace.task.state import Item, item_from_depth
 
 
 class PooledCritic(nn.Module):
@@ -27,11 +28,12 @@ class PooledCritic(nn.Module):
         stride: of the convolution, in cells; on fine grids not every column need be looked at.
 
     Shapes:
-        ``bin_depth [..., W_B, D_B]``, ``tote_depth`` and ``tote_bearing [..., W_T, D_T]`` -> ``[..., 1]``.
+        ``bin_depth [..., W_B, D_B]``, ``tote_depth`` and ``tote_bearing [..., W_T, D_T]``, and of several items in the
+        bin ``items [..., M, 5]``, of which it sees the mean -> ``[..., 1]``.
     """
 
     any_size = True
-    in_keys = MAP_KEYS
+    in_keys: tuple[str, ...] = MAP_KEYS
 
     def __init__(
         self,
@@ -64,7 +66,9 @@ class PooledCritic(nn.Module):
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, bin_depth: Tensor, tote_depth: Tensor, tote_bearing: Tensor) -> Tensor:
+    def forward(
+        self, bin_depth: Tensor, tote_depth: Tensor, tote_bearing: Tensor, items: Tensor | None = None
+    ) -> Tensor:
         batch = tote_depth.shape[:-2]
         bin_depth, tote_depth, bearing = (maps.flatten(0, -3) for maps in (bin_depth, tote_depth, tote_bearing))
         tote_depth = tote_depth / self.level
@@ -76,7 +80,8 @@ class PooledCritic(nn.Module):
             x = self.around(planes.to(dtype, memory_format=torch.channels_last))
             x = x + F.conv2d(1 - bearing[:, None].to(dtype), self.weak, None, self.stride, len(self.weak[0, 0]) // 2)
             x = x.permute(0, 2, 3, 1)
-            x = x + self.item(item_code(bin_depth, self.item_range, self.level).to(dtype))[:, None, None]
+            code = self._item_code(bin_depth, None if items is None else items.flatten(0, -3))
+            x = x + self.item(code.to(dtype))[:, None, None]
             x = x + room.to(dtype) * self.room.to(dtype)
             x = F.relu(self.hidden(F.relu(x)))
         share, more = self.head(x.float()).unbind(-1)
@@ -84,9 +89,21 @@ class PooledCritic(nn.Module):
         return value.view(*batch, 1)
 
 
+    def _item_code(self, bin_depth: Tensor, items: Tensor | None) -> Tensor:
+        """Return the code of what lies in the bin, ``[N, 3 * item_range]``; of several items the mean."""
+        if items is None:
+            return item_code(item_from_depth(bin_depth), self.item_range, self.level)
+        several = Item.from_table(items)
+        code = item_code(several, self.item_range, self.level) * ~several.is_empty[..., None]
+        return code.sum(1) / (~several.is_empty).sum(1, keepdim=True).clamp(min=1)
+
+
 def pooled_critic(cell: CellSpec, **network) -> PooledCritic:
     """Return the critic beside ``fcn_grasp``, for any sizes (config ``model=fcn_grasp``)."""
-    return PooledCritic(**network)
+    critic = PooledCritic(**network)
+    if cell.bin_items > 1:
+        critic.in_keys = (*MAP_KEYS, "items")
+    return critic
 
 
 def conv4d_critic(cell: CellSpec, **network) -> Conv4dCritic:

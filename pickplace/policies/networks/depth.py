@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pickplace.task.state import item_from_depth
+from pickplace.task.state import Item
 
 
 def clip_depth(depth: Tensor, limit: float | None, floor: float | None = None) -> Tensor:
@@ -47,9 +47,8 @@ def one_hot(levels: Tensor, count: int) -> Tensor:
     return (levels[:, None] == plane[:, None]).flatten(1)
 
 
-def item_code(bin_depth: Tensor, item_range: int, level: int = 1) -> Tensor:
-    """Return the item's width, depth, and height in levels, as one-hot codes, bool ``[N, 3 * item_range]``."""
-    item = item_from_depth(bin_depth)
+def item_code(item: Item, item_range: int, level: int = 1) -> Tensor:
+    """Return the item's width, depth, and height in levels, as one-hot codes, bool ``[..., 3 * item_range]``."""
     size = torch.stack([item.w, item.d, item.h // level], -1).clamp(1, item_range)
     step = torch.arange(1, item_range + 1, device=size.device)
-    return (size[..., None] == step).flatten(1)
+    return (size[..., None] == step).flatten(-2)

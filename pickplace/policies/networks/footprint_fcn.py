@@ -8,7 +8,7 @@ from pickplace.policies.networks.depth import clip_depth
 from pickplace.task.cell import reference_cell
 from pickplace.task.checks import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_number
 from pickplace.task.grasps import split_footprint
-from pickplace.task.state import item_from_depth
+from pickplace.task.state import Item, item_from_depth
 
 #: Entries of the observation that the networks of ``fcn_grasp`` read.
 MAP_KEYS = ("bin_depth", "tote_depth", "tote_bearing")
@@ -102,40 +102,52 @@ class FootprintFcn(nn.Module):
         out = self.at(bin_depth, tote_depth, bearing, *every_footprint(tote_depth, parities))
         return out.view(batch, parities, wide, long, -1)
 
-    def at(self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor) -> Tensor:
+    def at(
+        self,
+        bin_depth: Tensor,
+        tote_depth: Tensor,
+        bearing: Tensor,
+        row: Tensor,
+        footprint: Tensor,
+        item: Item | None = None,
+    ) -> Tensor:
         """Return the scores of some footprints only, float32 ``[M, out_channels]``.
 
         Args:
             bin_depth, tote_depth, bearing: as in :meth:`forward`.
             row: int64 ``[M]``, which problem.
             footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
+            item: ``[M]``, the item of each footprint; None: the only one in the bin.
         """
+        item = item_from_depth(bin_depth).rows(row) if item is None else item
         at_once = CHUNK_BYTES // (4 * self.patch.in_features)
         if not torch.is_grad_enabled() and len(row) > at_once:  # of large totes: a part at a time, to save memory
-            parts = zip(row.split(at_once), footprint.split(at_once), strict=True)
-            return torch.cat([self.at(bin_depth, tote_depth, bearing, *part) for part in parts])
+            parts = torch.arange(len(row), device=row.device).split(at_once)
+            return torch.cat(
+                [self.at(bin_depth, tote_depth, bearing, row[i], footprint[i], item.rows(i)) for i in parts]
+            )
         dtype, count = matrix_dtype(self.compute_dtype, tote_depth.device.type), row.shape[0]
         lower = dtype != torch.float32
         if lower:
             padding = next((-count % step for beyond, step in PADDED_ROWS if count > beyond), 0)
-            row, footprint = (F.pad(index, (0, padding)) for index in (row, footprint))
-        x, weak = self._inputs(bin_depth, tote_depth, bearing, row, footprint, dtype)
+            row, footprint, *parts = (F.pad(index, (0, padding)) for index in (row, footprint, *item))
+            item = Item(*parts)
+        x, weak = self._inputs(bin_depth, tote_depth, bearing, row, footprint, item, dtype)
         with torch.autocast(tote_depth.device.type, dtype, enabled=lower):
             x = F.relu(self.hidden(F.relu(self.patch(x) + F.linear(weak, self.weak))))
         return self.head(x.float())[:count]  # in full: scores that differ a little must not be rounded to a tie
 
     def _inputs(
-        self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor, dtype
+        self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor, item: Item, dtype
     ) -> tuple[Tensor, Tensor]:
         """Return the inputs of the first layer: ``[M, inputs]``, one-hot, cell by cell, then the five codes; and marks,
         ``[M, side * side]``."""
         side, reach = self.receptive_field, self.reach
         _, wide, long = tote_depth.shape
-        item = item_from_depth(bin_depth)
         parity, x, y = split_footprint((wide, long), footprint)
         turned = parity == 1
         # Patches begin some cells before their footprint along the item's own axes, to have it in their middle.
-        before_w, before_d = (reference_cell(side) - reference_cell(size) for size in (item.w[row], item.d[row]))
+        before_w, before_d = (reference_cell(side) - reference_cell(size) for size in (item.w, item.d))
         margin = side + max(bin_depth.shape[1:])
         stride = long + 2 * margin
         x = x + margin - torch.where(turned, before_d, before_w)
@@ -151,14 +163,14 @@ class FootprintFcn(nn.Module):
         cells = steps[turned.long()] + corner[:, None]  # [M, side * side]
         seen = depth.flatten()[cells]
         weak = F.pad(1 - bearing, (margin,) * 4).flatten()[cells].to(dtype)
-        under = self._under(bin_depth.shape[1:], row.device)[item.w[row], item.d[row]]
+        under = self._under(bin_depth.shape[1:], row.device)[item.w, item.d]
         rest = torch.where(under, seen, FAR_DOWN).amin(1)  # depth of what the item rests on
-        headroom = rest - item.h[row].to(small)  # above its top
+        headroom = rest - item.h.to(small)  # above its top
         around = (headroom[:, None] - seen).clamp_(-reach, reach).add_(reach)
         hole = (seen - rest[:, None]).clamp_(0, reach).add_(2 * reach + 1)
         level = torch.where(under, hole, around).masked_fill_(seen == OUTSIDE, self.planes)
 
-        sizes = [(size - 1).clamp(0, self.item_range - 1)[row].to(small) for size in (item.w, item.d, item.h)]
+        sizes = [(size - 1).clamp(0, self.item_range - 1).to(small) for size in (item.w, item.d, item.h)]
         codes = [
             *sizes,
             (headroom + 1).clamp(0, self.headroom_bins - 1),
