@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 MAX_EVALUATION = 2**26  # greatest size of an evaluation.json that is read, in bytes
 
 #: Settings of the cell that older files lack; they were played with the default.
-YOUNG_SETTINGS = ("body", "cup", "cup_size", "min_seal", "reach")
+YOUNG_SETTINGS = ("body", "cup", "cup_size", "min_seal", "reach", "bin_items", "refill")
 
 #: Config groups that an evaluation takes from the checkpoint; :data:`PARTS_OF_ENV` are in the first.
 TRAINED = ("env", "items", "model", "algo")
@@ -166,6 +166,9 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
     trained = trusted_config(saved["config"], cfg.trust)
     groups = {key: OmegaConf.create(resolved(cfg[key])) for key in ("env", "items")}
     ours, changed = [], trained.copy()
+    with open_dict(changed):
+        for key in YOUNG_SETTINGS:  # so that they can be overridden
+            changed.env.setdefault(key, getattr(CellSpec, key))
     for word in task_overrides(HydraConfig.get()):
         key = word.lstrip("+~").split("=")[0]
         if key in PARTS_OF_ENV:
@@ -261,7 +264,11 @@ def read_comparison(path: Path, expected: dict) -> dict:
         if not is_same(expected[key], other.get(key)):
             found = excerpt(other.get(key))
             raise ValueError(f"compare={excerpt(str(path))}: its {key} is {found}, expected {excerpt(expected[key])}.")
-    unused = {"support_margin": cell.get("support") not in HULL_RULES, "min_seal": cell.get("pick_rule") != "seal"}
+    unused = {
+        "support_margin": cell.get("support") not in HULL_RULES,
+        "min_seal": cell.get("pick_rule") != "seal",
+        "refill": cell.get("bin_items", 1) == 1,
+    }
     for key in CELL_SETTINGS:
         # A setting that is younger than the file, or the checkpoint, has its default.
         default = getattr(CellSpec, key) if key in YOUNG_SETTINGS else None

@@ -107,7 +107,7 @@ class _Batch:
             if ended[slot]:
                 recording.ending, recording.occupancy = Failure(int(self.failure[slot])), float(occupancy[slot])
                 if recording.ending == Failure.STUCK:
-                    recording.waiting = tuple(env.item[slot].tolist())
+                    recording.waiting = tuple(env.state.items.table[slot, 0].tolist())
 
 
 def check_episode_settings(evaluation: Mapping) -> None:

@@ -7,11 +7,12 @@ import torch
 from torch import Tensor
 
 from pickplace.planners.base import MapPlanner
+from pickplace.task.bin import refill, remove_item, select_item
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import flag, number, whole_number
-from pickplace.task.feasibility import PlacingMaps, action_mask, first_action_reaching, footprint_mask, placing_maps
+from pickplace.task.feasibility import PlacingMaps, action_mask, choice_mask, first_action_reaching, placing_maps
 from pickplace.task.items import ItemDistribution, check_seed, search_items
-from pickplace.task.observation import STANDARD_TERMS
+from pickplace.task.observation import standard_terms
 from pickplace.task.placing import unchecked_top
 from pickplace.task.state import Item, Observation, State
 from pickplace.task.transition import apply, put_down
@@ -21,10 +22,10 @@ MAX_NODES = 1_000_000  # of all trees of a decision
 
 @dataclass(eq=False)
 class _Node:
-    """A tote and the item that has arrived."""
+    """A tote, and what lies in the bin."""
 
     surface: Tensor  # int32 [W_T, D_T], of the tote
-    item: Tensor  # int64 [5]
+    item: Tensor  # int64 [5], or of several items [M, 5]
     untried: list[int] | None  # actions in random order, of which the last comes first; None: all N_a flat actions
     edges: dict[int, "_Edge"] = field(default_factory=dict)
 
@@ -39,6 +40,7 @@ class _Edge:
     total: float = 0.0  # of the returns
     volume: int = 0  # that the action places
     surface: Tensor | None = None  # what it leaves; None until it is simulated, and where it fails
+    item: Tensor | None = None  # what it leaves in a bin of several items, as in _Node
     failed: bool = False
     bins: list[_Node] = field(default_factory=list)
 
@@ -49,7 +51,7 @@ class MCTS(MapPlanner):
     Each simulation walks down by UCB1, tries one action that has not been tried, samples the bin that arrives, and
     plays uniformly at random to the end. An action's bins are sampled from the item distribution, ``visits **
     widening`` of them at most, so that the tree grows deeper than one step; the stream that is played is never looked
-    up. Simulations advance together on the environment's rules; those of one wave see each other's visits, but not yet
+    up. Of several items in the bin those that were not taken stay there. Simulations advance together on the environment's rules; those of one wave see each other's visits, but not yet
     their returns.
 
     Args:
@@ -97,9 +99,8 @@ class MCTS(MapPlanner):
         return self._search(state, self._nodes(state), self.cell, maps).to(observation["tote_depth"].device)
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        item = Item(*(part.cpu() for part in maps.item))
-        seen, maps = _on_cpu(observation), PlacingMaps(maps.top.cpu(), maps.clearance.cpu(), item, maps.rest.cpu())
-        mask = footprint_mask(cell, maps).flatten(1) if self.mask else action_mask(cell, maps)
+        seen, maps = _on_cpu(observation), maps.cpu()
+        mask = choice_mask(cell, maps) if self.mask else action_mask(cell, maps)
         roots = self._nodes(seen, mask)
         return self._search(seen, roots, cell, maps).to(observation["tote_depth"].device)
 
@@ -182,7 +183,10 @@ class MCTS(MapPlanner):
         if going:
             height = tote_height[[walks[number][0] for number in going]]
             surface = torch.stack(list(going.values()))
-            arrived = State(surface, height, self._arriving(len(going)))
+            left = None
+            if self.cell.bin_items > 1:
+                left = Item.from_table(torch.stack([walks[number][1][-1].item for number in going]))
+            arrived = State(surface, height, self._arriving(len(going), left))
             nodes = self._nodes(arrived)
             for number, node in zip(going, nodes, strict=True):
                 walks[number][1][-1].bins.append(node)
@@ -198,35 +202,43 @@ class MCTS(MapPlanner):
             return
         cell, height = self.cell, tote_height[[problem for problem, _ in tried]]
         surface = torch.stack([edge.node.surface for _, edge in tried])
-        item = Item(*torch.stack([edge.node.item for _, edge in tried]).unbind(1))
+        item = Item.from_table(torch.stack([edge.node.item for _, edge in tried]))
         state = State(surface, height, item)
         action = torch.tensor([edge.action for _, edge in tried])
         if self.mask:
-            tops = unchecked_top(cell, state)
-            after = put_down(cell, surface, PlacingMaps(tops, tops, item, tops), action)
-            failed = [False] * len(tried)
+            each = state.each_item()
+            tops = unchecked_top(cell, each)
+            maps = PlacingMaps(tops, tops, each.item, tops, bin_items=state.items.x.shape[1])
+            after, failed = put_down(cell, surface, maps, action), [False] * len(tried)
+            taken = action // cell.num_footprints
         else:
             step = apply(cell, state, action)
-            after, failed = step.surface, (step.failure > 0).tolist()
-        for (_, edge), left, bad, volume in zip(tried, after, failed, item.volume.tolist(), strict=True):
+            after, failed, taken = step.surface, (step.failure > 0).tolist(), step.taken
+        volumes = (item if item.x.dim() == 1 else select_item(item, taken)).volume.tolist()
+        for (_, edge), left, bad, volume in zip(tried, after, failed, volumes, strict=True):
             edge.failed = bad
             if not bad:
                 edge.surface, edge.volume = left, volume
+        if item.x.dim() == 2:
+            for (_, edge), table in zip(tried, _without(item, taken).table, strict=True):
+                edge.item = table
 
     def _nodes(self, state: State, mask: Tensor | None = None) -> list[_Node]:
         """Return new nodes, with the actions to try: those of a mask, or that the rules allow."""
         untried = [None] * len(state.surface)
         if self.mask and mask is None:
-            mask = footprint_mask(self.cell, placing_maps(self.cell, state)).flatten(1)
+            mask = choice_mask(self.cell, placing_maps(self.cell, state))
         if mask is not None:
             untried = [self._random.permutation(row.nonzero()[0]).tolist() for row in mask.numpy()]
-        return [_Node(*parts) for parts in zip(state.surface, torch.stack(state.item, 1), untried, strict=True)]
+        return [_Node(*parts) for parts in zip(state.surface, state.item.table, untried, strict=True)]
 
-    def _arriving(self, count: int) -> Item:
-        """Return bins from the item distribution, each drawn once."""
+    def _arriving(self, count: int, left: Item | None) -> Item:
+        """Return bins from the item distribution, each drawn once; ``left`` of several items is there already."""
         number = torch.arange(self._sampled, self._sampled + count)
         self._sampled += count
         seed = torch.full_like(number, self.seed)
+        if left is not None:
+            return refill(self.cell, self.items, "train", seed, number, torch.zeros_like(number), left)[0]
         return self.items.sample("train", seed, number, torch.zeros_like(number), self.cell.bin_size)
 
     def _play_out(self, state: State) -> Tensor:
@@ -237,21 +249,31 @@ class MCTS(MapPlanner):
             surface, tote_height, item = state
             if self.mask:
                 maps = placing_maps(cell, state)
-                mask = footprint_mask(cell, maps).flatten(1)
+                mask = choice_mask(cell, maps)
                 draw = torch.from_numpy(self._random.random(mask.shape, dtype=np.float32))
                 going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]
-                surface = put_down(cell, surface, maps, torch.where(mask, draw, -1.0).argmax(1))
+                choice = torch.where(mask, draw, -1.0).argmax(1)
+                surface, taken = put_down(cell, surface, maps, choice), choice // cell.num_footprints
+                placed = select_item(state.items, taken)
             else:
                 action = torch.from_numpy(self._random.integers(cell.num_actions, size=len(surface)))
                 step = apply(cell, state, action)
                 surface, going = step.surface, (step.failure == 0).nonzero()[:, 0]
+                placed, taken = step.item, step.taken
             row = row[going]
-            volume[row] += item.volume[going].double()
+            volume[row] += placed.volume[going].double()
             if len(row) == 0:
                 return volume
-            state = State(surface[going], tote_height[going], self._arriving(len(row)))
+            left = None if item.x.dim() == 1 else _without(item, taken).rows(going)
+            state = State(surface[going], tote_height[going], self._arriving(len(row), left))
+
+
+def _without(items: Item, taken: Tensor) -> Item:
+    """Return what is left in the bins ``[N, M]`` without the items of those numbers, int64 ``[N]``."""
+    return remove_item(items, taken, torch.ones_like(taken, dtype=torch.bool))
 
 
 def _on_cpu(observation: Observation) -> State:
     """Return the state that an observation shows, on the CPU."""
-    return State.from_observation({key: observation[key].cpu() for key in STANDARD_TERMS})
+    known = [key for key in standard_terms(2) if key in observation.keys()]  # noqa: SIM118
+    return State.from_observation({key: observation[key].cpu() for key in known})

@@ -15,6 +15,7 @@ from pickplace.task.grasps import is_gripped
 from pickplace.task.items import ItemDistribution, hashed_uniform
 from pickplace.task.state import Item
 
+
 def blocked_picks(cell: CellSpec, items: Item) -> Tensor:
     """Return at which pick cells the end effector would touch another item that is as high or higher.
 

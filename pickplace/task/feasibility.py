@@ -57,6 +57,12 @@ class PlacingMaps(NamedTuple):
             index = self.rows_of_items(index)
         return PlacingMaps(*self._parts(index), bin_items=self.bin_items)
 
+    def cpu(self) -> "PlacingMaps":
+        """Return the maps on the CPU."""
+        blocked = None if self.blocked is None else self.blocked.cpu()
+        item = Item(*(part.cpu() for part in self.item))
+        return PlacingMaps(self.top.cpu(), self.clearance.cpu(), item, self.rest.cpu(), blocked, self.bin_items)
+
     def of_choice(self, cell: CellSpec, choice: Tensor) -> tuple["PlacingMaps", Tensor]:
         """Return the maps of each choice's item, and its footprint.
 

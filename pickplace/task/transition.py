@@ -50,7 +50,9 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     taken = blocked = None
     if item.x.dim() == 2:
         taken = taken_item(cell, item, *split_action(cell, action)[:2])
-        blocked = blocked_picks(cell, item).unflatten(0, item.x.shape)[torch.arange(len(taken), device=taken.device), taken]
+        blocked = blocked_picks(cell, item).unflatten(0, item.x.shape)[
+            torch.arange(len(taken), device=taken.device), taken
+        ]
         item = select_item(item, taken)
     picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.

@@ -121,6 +121,8 @@ class WarmStart:
         action = self.policy.to_action(choice, data).clamp(min=0)
         reached = apply(self.cell, state, action)
         same = (reached.footprint == wanted.footprint).all(1) & (reached.failure == 0) & (wanted.failure == 0)
+        if reached.taken is not None:
+            same &= reached.taken == wanted.taken
         return torch.where(same, choice, -1)
 
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -45,6 +44,7 @@ class Move:
     z: int  # height of the item's underside once it rests
     failure: Failure
     heat: np.ndarray | None = None  # uint8 [W_T, D_T]: the policy's preference for each place cell, 255 the highest
+    others: list[tuple[int, int, int, int, int]] = field(default_factory=list)  # what else lies in the bin
 
 
 @dataclass
@@ -94,7 +94,8 @@ def record_moves(cell: CellSpec, planner, observation: TensorDictBase, state: St
     if heat is not None:
         heat = (255 * heat / heat.amax((1, 2), keepdim=True).clamp(min=1e-30)).round().byte().cpu().numpy()
     ref_x, ref_y = (reference_cell(side) for side in cell.effector_size)
-    items = torch.stack(state.item, -1).tolist()
+    items, contents = step.item.table.tolist(), state.items.table.tolist()
+    taken = [0] * len(action) if step.taken is None else step.taken.tolist()
     moves = []
     for row in range(len(action)):
         shape = cell.effector(rotation[row])
@@ -108,6 +109,9 @@ def record_moves(cell: CellSpec, planner, observation: TensorDictBase, state: St
                 z=int(step.top[row]) - items[row][4],
                 failure=Failure(int(step.failure[row])),
                 heat=None if heat is None else heat[row],
+                others=[
+                    tuple(item) for number, item in enumerate(contents[row]) if number != taken[row] and item[4] > 0
+                ],
             )
         )
     return moves

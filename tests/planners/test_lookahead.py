@@ -12,7 +12,7 @@ from pickplace.policies.fcn_grasp import FootprintPolicy
 from pickplace.policies.restore import restore_critic
 from pickplace.runs import checkpoint
 from pickplace.task.items import Kinds, Recorded
-from pickplace.task.state import EMPTY
+from pickplace.task.state import EMPTY, Item, State
 
 
 def untrained(cell):
@@ -32,7 +32,8 @@ def played_out(search, problem, streams, horizon=None):
     """Return what the search expects of empty totes, ``[problems, streams]``."""
     count = len(problem)
     empty, rims = torch.full((count, 4, 4), EMPTY, dtype=torch.int32), torch.ones(count, dtype=torch.int64)
-    return search._play_out(empty, rims, torch.tensor(problem), streams, horizon)
+    state = State(empty, rims, Item(*torch.zeros(5, count, dtype=torch.int64)))
+    return search._play_out(state, torch.tensor(problem), streams, horizon)
 
 
 def test_equal_candidates_meet_equal_items_and_each_call_others():

@@ -59,6 +59,8 @@ from pickplace.task.reach import Annulus
         ({"support": "hull", "support_margin": -1}, "support_margin=-1: .* between 0 and 100"),
         *(({"height_unit": value}, f"height_unit={value}: .* between 0.001 and 1000") for value in (1e-4, 2000)),
         ({"longest_side": 0}, "longest_side=0: expected a whole number >= 1"),
+        ({"bin_items": 0}, "bin_items=0: expected a whole number >= 1 and <= 100"),
+        ({"refill": "all"}, "refill='all': expected each, batch"),
         ({"tote_sizes": (6, 6, 5)}, r"tote_sizes=\(6, 6, 5\): expected one of bin_size, tote_size, .*, height_unit"),
     ],
 )
@@ -72,7 +74,7 @@ def test_every_setting_reaches_the_cell_of_the_environment():
         "bin_size": [4, 6, 2], "tote_size": [5, 7, 6], "effector_size": [2, 4], "rotations": 3, "pick_rule": "overlap",
         "support": "hull", "support_margin": 0.25, "height_unit": 0.5, "body": "disc", "cup": "disc",
         "cup_size": [2, 4], "min_seal": 0.5,
-        "reach": Annulus([0, 99], [0, 9], [-9, 0, 0], [2, 0, 0]),
+        "reach": Annulus([0, 99], [0, 9], [-9, 0, 0], [2, 0, 0]), "bin_items": 2, "refill": "batch",
     }  # fmt: skip
     assert tuple(given) == CELL_SETTINGS
     cell = PickPlaceEnv(num_envs=1, **given).cell

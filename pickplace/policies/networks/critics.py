@@ -88,7 +88,6 @@ class PooledCritic(nn.Module):
         value = (share * room[..., 0] + more / 5).sum((1, 2))
         return value.view(*batch, 1)
 
-
     def _item_code(self, bin_depth: Tensor, items: Tensor | None) -> Tensor:
         """Return the code of what lies in the bin, ``[N, 3 * item_range]``; of several items the mean."""
         if items is None:
