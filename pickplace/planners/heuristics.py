@@ -104,10 +104,10 @@ class JointDBL(MapPlanner):
         least = best.amin(1, keepdim=True)
         highest = cell.num_actions
         action = torch.full_like(least, highest)
-        for number in range(best.shape[1]):
-            choice = number * cell.num_places + corner[:, number]
+        for index in range(best.shape[1]):
+            choice = index * cell.num_places + corner[:, index]
             reaching = actions_reaching(cell, maps, choice)
-            reaching = torch.where((reaching >= 0) & (best[:, number, None] == least), reaching, highest)
+            reaching = torch.where((reaching >= 0) & (best[:, index, None] == least), reaching, highest)
             action = torch.minimum(action, reaching.amin(1, keepdim=True))
         return action[:, 0].clamp(max=highest - 1)
 

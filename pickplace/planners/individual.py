@@ -43,7 +43,7 @@ class IndividualHeuristic(MapPlanner):
             lifted = all_grasps(cell, maps.item, maps.blocked)[0]  # [N * M, P]
             lifted = restrict_items(self.item, state, lifted.reshape(len(state.surface), -1))
             number = lifted.unflatten(1, (maps.bin_items, -1)).any(2).int().argmax(1)
-            maps = maps.of_choice(cell, number * cell.num_footprints)[0]._replace(bin_items=1)
+            maps = maps.of_choice(cell, number * cell.num_footprints)[0]
         pick = heuristic_pick(cell, maps.item, maps.blocked)
         footprint = select_pick(cell, action_footprints(cell, maps.item, maps.blocked), pick)
         succeeds = select_pick(cell, action_mask(cell, maps), pick)

@@ -51,8 +51,8 @@ class MCTS(MapPlanner):
     Each simulation walks down by UCB1, tries one action that has not been tried, samples the bin that arrives, and
     plays uniformly at random to the end. An action's bins are sampled from the item distribution, ``visits **
     widening`` of them at most, so that the tree grows deeper than one step; the stream that is played is never looked
-    up. Of several items in the bin those that were not taken stay there. Simulations advance together on the environment's rules; those of one wave see each other's visits, but not yet
-    their returns.
+    up. Of several items in the bin, those that were not taken stay there. Simulations advance together on the
+    environment's rules; those of one wave see each other's visits, but not yet their returns.
 
     Args:
         cell: the sizes.
@@ -185,7 +185,8 @@ class MCTS(MapPlanner):
             surface = torch.stack(list(going.values()))
             left = None
             if self.cell.bin_items > 1:
-                left = Item.from_table(torch.stack([walks[number][1][-1].item for number in going]))
+                tables = [walks[number][1][-1].item for number in going]
+                left = Item.from_table(torch.stack([table for table in tables if table is not None]))
             arrived = State(surface, height, self._arriving(len(going), left))
             nodes = self._nodes(arrived)
             for number, node in zip(going, nodes, strict=True):
@@ -213,7 +214,8 @@ class MCTS(MapPlanner):
             taken = action // cell.num_footprints
         else:
             step = apply(cell, state, action)
-            after, failed, taken = step.surface, (step.failure > 0).tolist(), step.taken
+            after, failed = step.surface, (step.failure > 0).tolist()
+            taken = action if step.taken is None else step.taken
         volumes = (item if item.x.dim() == 1 else select_item(item, taken)).volume.tolist()
         for (_, edge), left, bad, volume in zip(tried, after, failed, volumes, strict=True):
             edge.failed = bad
@@ -259,7 +261,7 @@ class MCTS(MapPlanner):
                 action = torch.from_numpy(self._random.integers(cell.num_actions, size=len(surface)))
                 step = apply(cell, state, action)
                 surface, going = step.surface, (step.failure == 0).nonzero()[:, 0]
-                placed, taken = step.item, step.taken
+                placed, taken = step.item, action if step.taken is None else step.taken
             row = row[going]
             volume[row] += placed.volume[going].double()
             if len(row) == 0:

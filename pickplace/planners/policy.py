@@ -36,8 +36,8 @@ class PolicyPlanner(MapPlanner):
         self.cell, self.policy, self.candidates, self.item = cell, policy, candidates, check_item_rule(item)
         if item != "any" and not (policy.ranks_footprints and candidates == "all"):
             raise ValueError(
-                f"planner.item={item!r}: expected 'any', or a checkpoint of model=fcn_grasp or corners that was trained "
-                "with a mask, and planner.candidates=all."
+                f"planner.item={item!r}: expected 'any', or planner.candidates=all and a checkpoint of model=fcn_grasp "
+                "or corners that was trained with a mask."
             )
 
     @torch.no_grad()

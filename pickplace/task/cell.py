@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.checks import excerpt, is_number, is_whole, number, one_of, short_text, whole_number
+from pickplace.task.checks import excerpt, is_number, is_whole, number, one_of, short_text, size_tuple, whole_number
 from pickplace.task.effector import (
     Box,
     Mask,
@@ -182,9 +182,9 @@ class CellSpec:
     item_inset: tuple[int, int] = field(default=(0, 0), metadata={"derived": True})
 
     def __post_init__(self):
-        object.__setattr__(self, "bin_size", _sizes("bin_size", self.bin_size, 3, MAX_SIDE))
-        object.__setattr__(self, "tote_size", _sizes("tote_size", self.tote_size, 3, MAX_SIDE))
-        object.__setattr__(self, "effector_size", _sizes("effector_size", self.effector_size, 2, MAX_EFFECTOR))
+        object.__setattr__(self, "bin_size", size_tuple("bin_size", self.bin_size, 3, MAX_SIDE))
+        object.__setattr__(self, "tote_size", size_tuple("tote_size", self.tote_size, 3, MAX_SIDE))
+        object.__setattr__(self, "effector_size", size_tuple("effector_size", self.effector_size, 2, MAX_EFFECTOR))
         if not is_whole(self.rotations) or not 1 <= self.rotations <= 4:
             raise ValueError(
                 f"rotations={excerpt(self.rotations)}: expected 1, 2, 3 or 4 (quarter turns to choose from)."
@@ -221,7 +221,7 @@ class CellSpec:
             object.__setattr__(self, key, read_shape(key, getattr(self, key), self.effector_size))
         check_edges("body", self.body_mask)
         if self.cup_size is not None:
-            object.__setattr__(self, "cup_size", _sizes("cup_size", self.cup_size, 2, MAX_EFFECTOR))
+            object.__setattr__(self, "cup_size", size_tuple("cup_size", self.cup_size, 2, MAX_EFFECTOR))
             if not isinstance(self.cup, str):
                 raise ValueError(f"cup_size={[*self.cup_size]}: expected null, as cup is a mask.")
             check_cup_size(self.cup_size, self.effector_size)
@@ -395,15 +395,3 @@ def _effector_shape(mask: Mask) -> EffectorShape:
     """Return the shape of an end effector whose body is a mask."""
     width, depth = len(mask), len(mask[0])
     return EffectorShape(width, depth, reference_cell(width), reference_cell(depth), boxes(mask))
-
-
-def _sizes(name: str, value, count: int, most: int) -> tuple[int, ...]:
-    """Return ``value`` as a tuple of ``count`` positive ints, at most ``most``."""
-    try:
-        sizes = tuple(int(v) for v in value)
-        exact = all(int(v) == v and not isinstance(v, bool) for v in value)
-    except (TypeError, ValueError, OverflowError):
-        sizes, exact = (), False
-    if not exact or len(sizes) != count or min(sizes) < 1 or max(sizes) > most:
-        raise ValueError(f"{name}={excerpt(value)}: expected {count} whole numbers >= 1 and <= {most:,}.")
-    return sizes

@@ -92,6 +92,18 @@ def one_of(key: str, value, choices, alternative: str | None = None) -> str:
     return value
 
 
+def size_tuple(name: str, value, count: int, most: int) -> tuple[int, ...]:
+    """Return ``value`` as a tuple of ``count`` positive ints that are at most ``most``."""
+    try:
+        sizes = tuple(int(v) for v in value)
+        exact = all(int(v) == v and not isinstance(v, bool) for v in value)
+    except (TypeError, ValueError, OverflowError):
+        sizes, exact = (), False
+    if not exact or len(sizes) != count or min(sizes) < 1 or max(sizes) > most:
+        raise ValueError(f"{name}={excerpt(value)}: expected {count} whole numbers >= 1 and <= {most:,}.")
+    return sizes
+
+
 def odd_number(key: str, value, least: int = 1, most: int = 99) -> int:
     """Return ``value`` if it is an odd whole number in ``[least, most]``."""
     if not is_whole(value) or not least <= value <= most or value % 2 == 0:

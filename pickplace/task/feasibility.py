@@ -15,8 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.cell import CellSpec, Limits
 from pickplace.task.bin import blocked_picks
+from pickplace.task.cell import CellSpec, Limits
 from pickplace.task.checks import check_bytes
 from pickplace.task.grasps import (
     all_grasps,
@@ -55,7 +55,7 @@ class PlacingMaps(NamedTuple):
         """Return the maps of some bins, by their numbers, which may come up more than once."""
         if self.bin_items > 1:
             index = self.rows_of_items(index)
-        return PlacingMaps(*self._parts(index), bin_items=self.bin_items)
+        return self._of_rows(index)._replace(bin_items=self.bin_items)
 
     def cpu(self) -> "PlacingMaps":
         """Return the maps on the CPU."""
@@ -74,7 +74,7 @@ class PlacingMaps(NamedTuple):
             return self, choice
         item = choice // cell.num_footprints
         row = torch.arange(len(choice), device=choice.device) * self.bin_items + item
-        return PlacingMaps(*self._parts(row)), choice - item * cell.num_footprints
+        return self._of_rows(row), choice - item * cell.num_footprints
 
     def join(self, mask: Tensor) -> Tensor:
         """Return a mask over footprints ``[N * M, Q, W_T, D_T]`` as one over choices, ``[N, M * Q * W_T * D_T]``."""
@@ -84,9 +84,9 @@ class PlacingMaps(NamedTuple):
         """Return the rows of the items of bins, int64 ``[len(index) * M]``."""
         return (index[:, None] * self.bin_items + torch.arange(self.bin_items, device=index.device)).flatten()
 
-    def _parts(self, row: Tensor) -> tuple:
+    def _of_rows(self, row: Tensor) -> "PlacingMaps":
         blocked = None if self.blocked is None else self.blocked[row]
-        return self.top[row], self.clearance[row], self.item.rows(row), self.rest[row], blocked
+        return PlacingMaps(self.top[row], self.clearance[row], self.item.rows(row), self.rest[row], blocked)
 
     def clearance_in(self, rotation: int) -> Tensor:
         """Return the clearance in a rotation or turn, batch last, ``[W_T, D_T, N]``."""

@@ -84,8 +84,7 @@ def check_settings(cfg: DictConfig) -> None:
     several = cfg.env.get("bin_items", 1)
     if several != 1 and cfg.algo.vine_samples is not None and cfg.algo.advantages == "vine":
         raise ValueError(
-            f"algo.advantages=vine: expected gae with env.bin_items={excerpt(several)}; vine tries all choices with one "
-            "item that arrives."
+            f"algo.advantages=vine: expected gae with env.bin_items={excerpt(several)}; vine knows one item in the bin."
         )
     own_modules(cfg.trust)
     if cfg.algo.loss == "a2c" and cfg.algo.normalize_advantage and cfg.env.num_envs * cfg.algo.rollout_length == 1:

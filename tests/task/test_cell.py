@@ -60,7 +60,7 @@ from pickplace.task.reach import Annulus
         *(({"height_unit": value}, f"height_unit={value}: .* between 0.001 and 1000") for value in (1e-4, 2000)),
         ({"longest_side": 0}, "longest_side=0: expected a whole number >= 1"),
         ({"bin_items": 0}, "bin_items=0: expected a whole number >= 1 and <= 100"),
-        ({"refill": "all"}, "refill='all': expected each, batch"),
+        ({"refill": "all"}, "refill='all': expected 'each' or 'batch'"),
         ({"tote_sizes": (6, 6, 5)}, r"tote_sizes=\(6, 6, 5\): expected one of bin_size, tote_size, .*, height_unit"),
     ],
 )
