@@ -166,9 +166,6 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
     trained = trusted_config(saved["config"], cfg.trust)
     groups = {key: OmegaConf.create(resolved(cfg[key])) for key in ("env", "items")}
     ours, changed = [], trained.copy()
-    with open_dict(changed):
-        for key in YOUNG_SETTINGS:  # so that they can be overridden
-            changed.env.setdefault(key, getattr(CellSpec, key))
     for word in task_overrides(HydraConfig.get()):
         key = word.lstrip("+~").split("=")[0]
         if key in PARTS_OF_ENV:
@@ -176,6 +173,9 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
                 OmegaConf.update(changed, f"env.{name}", groups["env"][name], merge=False, force_add=True)
         elif key.split(".")[0] in TRAINED:
             ours.append(word)
+            name = key.removeprefix("env.")
+            if name in YOUNG_SETTINGS and name not in changed.env:  # older checkpoints lack what is to be overridden
+                OmegaConf.update(changed, key, getattr(CellSpec, name), force_add=True)
     merged = apply_overrides(changed, ours, groups)
     with open_dict(cfg):
         for group in TRAINED:  # resolved where they come from: here a reference could lead elsewhere
