@@ -34,13 +34,14 @@ SUPPORTS = [
 
 
 class Case(NamedTuple):
-    """The state of a problem: height of the tote, heights ``[W_T, D_T]`` in it, where they bear weight, and
-    ``(x, y, w, d, h)`` in the bin."""
+    """The state of a problem: height of the tote, heights ``[W_T, D_T]`` in it, where they bear weight, and one
+    ``(x, y, w, d, h)`` in the bin, or more."""
 
     rim: int
     heights: np.ndarray
     bearing: np.ndarray
     item: tuple[int, int, int, int, int]
+    others: tuple[tuple[int, int, int, int, int], ...] = ()
 
 
 def state_of(*cases: Case) -> State:
@@ -57,7 +58,9 @@ def oracle_of(cell: CellSpec, case: Case) -> Oracle:
     tables = {} if cell.limits is None else {k: v.tolist() for k, v in vars(cell.limits).items() if v is not None}
     names = (name for name in CELL_SETTINGS if name not in ("height_unit", "reach"))
     rules = Rules(**{name: getattr(cell, name) for name in names}, **tables)
-    return Oracle(rules, case.rim, case.item[2:], case.item[:2], case.heights.tolist(), bearing=case.bearing.tolist())
+    others = [(item[2:], item[:2]) for item in case.others]
+    heights, bearing = case.heights.tolist(), case.bearing.tolist()
+    return Oracle(rules, case.rim, case.item[2:], case.item[:2], heights, bearing=bearing, others=others)
 
 
 def random_limits(cell: CellSpec, seed: int) -> Limits:
@@ -141,6 +144,7 @@ SETTINGS = [
     {"num_envs": 4, "tote_size": (6, 6, 6), "items": Uniform((1, 3), (1, 3), (1, 2)), "support": "bearing"},
     {"num_envs": 4, "body": [[1, 1, 1], [1, 1, 0], [1, 1, 0]], "cup": [[0, 0, 0], [1, 1, 0], [0, 0, 0]],
      "pick_rule": "seal", "min_seal": 0.5},
+    {"num_envs": 4, "bin_items": 3, "bin_size": (6, 5, 1), "items": Uniform((1, 3), (1, 3), (1, 2)), "rotations": 2},
 ]  # fmt: skip
 
 
@@ -159,11 +163,12 @@ def late_state(steps=8, **settings):
     return list(random_states(steps, **settings))[-1]
 
 
-def results_by_hand(env, observation, row: int) -> dict[int, tuple[int, int, int, int, int]]:
-    """Return every feasible flat action of a problem, in plain Python: ``{action: (top, y, x, w, d)}``, of where the
-    item comes to lie."""
+def results_by_hand(env, observation, row: int) -> dict[int, tuple[int, int, int, int, int, int]]:
+    """Return every feasible flat action of a problem, in plain Python: ``{action: (top, y, x, w, d, number)}``, of
+    where the item comes to lie, and its number in the bin."""
+    first, *others = [tuple(item) for item in env.state.items.table[row].tolist() if item[4]]
     heights, bearing = env.state.heights[row].numpy(), env.state.bearing[row].int().numpy()
-    case = Case(int(env.tote_height[row]), heights, bearing, tuple(env.item[row].tolist()))
+    case = Case(int(env.tote_height[row]), heights, bearing, first, tuple(others))
     plain, found = oracle_of(env.cell, case), {}
     for action in observation["action_mask"][row].nonzero()[:, 0].tolist():
         failure, after = plain.try_action(action)
@@ -172,14 +177,19 @@ def results_by_hand(env, observation, row: int) -> dict[int, tuple[int, int, int
         grid = cells((0, 0), env.cell.tote_size[:2])
         changed = [(x, y) for x, y in grid if after[x][y] != plain.heights[x][y]]
         (x, y), (x1, y1) = min(changed), max(changed)
-        found[action] = (after[x][y], y, x, x1 - x + 1, y1 - y + 1)
+        found[action] = (after[x][y], y, x, x1 - x + 1, y1 - y + 1, plain.taken(action))
     return found
 
 
-def footprint_by_hand(cell: CellSpec, item, found) -> int:
-    """Return the footprint index of an entry of :func:`results_by_hand`; ``item`` is ``(x, y, w, d, h)``."""
-    _, y, x, w, d = found
-    return (((w, d) != tuple(item[2:4])) * cell.tote_size[0] + x) * cell.tote_size[1] + y
+def choice_by_hand(cell: CellSpec, items, found) -> int:
+    """Return the index of item and footprint of an entry of :func:`results_by_hand`.
+
+    Args:
+        items: ``(x, y, w, d, h)`` of each item in the bin.
+    """
+    _, y, x, w, d, number = found
+    turned = (w, d) != tuple(items[number][2:4])
+    return ((number * cell.parities + turned) * cell.tote_size[0] + x) * cell.tote_size[1] + y
 
 
 @torch.no_grad()

@@ -8,8 +8,8 @@ from torch import Tensor
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.runs.checkpoint import CheckpointError
 from pickplace.task.items import MAX_SEED
-from pickplace.task.observation import STANDARD_TERMS, observe
-from pickplace.task.state import Item, State
+from pickplace.task.observation import observe, standard_terms
+from pickplace.task.state import Item, State, bin_labels_from_items
 
 
 def check_saved_states(env: PickPlaceEnv, collector: Mapping) -> None:
@@ -45,7 +45,7 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     episode, seed = saved["episode"], saved["item_seed"]
     low, high = env.min_tote_height, cell.tote_size[2]
     check("tote_height", (tote_height >= low) & (tote_height <= high), f"{low} to {high}")
-    state = State(surface, tote_height, Item(*saved["item"].unbind(-1)))
+    state = State(surface, tote_height, Item.from_table(saved["item"]))
     heights = state.heights
     check("surface", (heights >= 0) & (heights <= tote_height[:, None, None]), "heights of 0 to tote_height")
     bearing = state.bearing | ((heights > 0) & (cell.support == "bearing"))
@@ -54,9 +54,19 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     check("steps", (steps >= 0) & (steps <= volume), "at most one for each unit of volume")
     check("episode", episode >= 0, "at least 0")
     check("item_seed", (seed >= 0) & (seed < MAX_SEED), "at least 0 and below 2**62")
-    item = env.items.sample(env.stream, seed.expand_as(episode), episode, steps, cell.bin_size)
-    check("item", saved["item"] == torch.stack(item, -1), "the item of this episode and step")
-    seen = observe(STANDARD_TERMS, cell, state)
+    if cell.bin_items == 1:
+        item = env.items.sample(env.stream, seed.expand_as(episode), episode, steps, cell.bin_size)
+        check("item", saved["item"] == item.table, "the item of this episode and step")
+    else:
+        items, limits = state.item, torch.tensor(cell.bin_size[:2])
+        corner, size = saved["item"][..., :2], saved["item"][..., 2:4]
+        check("item", (corner >= 0) & (size >= 0) & (corner + size <= limits), "items inside the bin")
+        sizes = torch.cat([env.items.sizes, torch.zeros(1, 3, dtype=torch.int64)])
+        check("item", (saved["item"][..., None, 2:] == sizes).all(-1).any(-1), "sizes of the distribution")
+        covered = (bin_labels_from_items(items, cell.bin_size) > 0).sum((1, 2))
+        check("item", covered == (items.w * items.d).sum(1), "items that do not overlap")
+        check("arrived", saved["arrived"] == steps + (items.h > 0).sum(1), "the items placed and those in the bin")
+    seen = observe(standard_terms(cell.bin_items), cell, state)
     seen["occupancy"] = (volume / cell.tote_volume(tote_height))[:, None]
     seen |= {key: torch.zeros(len(steps), 1) for key in ("failure", "done", "terminated", "truncated")}
     for key, value in seen.items():

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from problems import SETTINGS, footprint_by_hand, occupancies, random_states, results_by_hand
+from problems import SETTINGS, choice_by_hand, occupancies, random_states, results_by_hand
 from scipy.stats import chisquare
 
 from pickplace import PickPlaceEnv
@@ -71,7 +71,7 @@ def test_the_least_cost_over_all_feasible_actions_is_played(make, cost, options)
         assert torch.equal(make(env.cell).decide(observation.exclude("action_mask")), chosen)
         for n in range(env.num_envs):
             costs = {
-                action: cost(action, footprint_by_hand(env.cell, env.item[n].tolist(), found), found)
+                action: cost(action, choice_by_hand(env.cell, env.state.items.table[n].tolist(), found), found)
                 for action, found in results_by_hand(env, observation, n).items()
             }
             assert int(chosen[n]) == min(costs, key=costs.get)
