@@ -37,7 +37,9 @@ def assert_equal(a, b, keys=None):
         assert a[key].dtype == b[key].dtype and np.array_equal(a[key], b[key]), key
 
 
-@pytest.mark.parametrize("kwargs", [{}, {"bin_size": (4, 6, 2), "effector_size": (2, 3), "rotations": 3}])
+@pytest.mark.parametrize(
+    "kwargs", [{}, {"bin_size": (4, 6, 2), "effector_size": (2, 3), "rotations": 3}, {"bin_items": 3}]
+)
 def test_checkers_of_other_projects(kwargs):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -46,6 +46,8 @@ def same(left, right):
         {"pick_rule": "overlap", "support": "hull", "support_margin": 0.1, "masks": ("footprint", "action")},
         {"kinds": [(2, 3, 2), (1, 1, 1)], "bin_size": (4, 6, 2), "tote_size": (5, 7, 6), "effector_size": (2, 4)},
         {"limits": random_limits(CellSpec(rotations=2), 1), "rotations": 2, "kinds": [(1, 1, 1)]},
+        {"bin_items": 3, "masks": ("footprint", "action")},
+        {"bin_items": 4, "refill": "batch", "kinds": [(2, 3, 2), (1, 1, 1)], "bin_size": (4, 6, 1)},
     ],
 )
 def test_specs_hold(kwargs):

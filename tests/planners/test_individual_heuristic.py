@@ -6,13 +6,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from problems import late_state, occupancies
+from problems import late_state, occupancies, random_states
 
 from pickplace import CellSpec, Item, PickPlaceEnv, State
 from pickplace.planners.individual import IndividualHeuristic, corner_footprints
 from pickplace.task.feasibility import placing_maps
-from pickplace.task.grasps import heuristic_pick
-from pickplace.task.state import surface_from
+from pickplace.task.grasps import all_grasps, heuristic_pick
+from pickplace.task.items import Uniform
+from pickplace.task.state import Failure, surface_from
 from pickplace.task.transition import apply
 
 
@@ -85,6 +86,28 @@ def test_the_first_candidate_that_succeeds_is_played(candidates, rotations, tote
             assert chosen[row] == min(found)[-1]
             missed += min(found)[0]
     assert candidates == "cells" or missed > 0
+
+
+@pytest.mark.parametrize("rule", ["first", "nearest"])
+def test_of_several_items_it_takes_the_first_that_can_be_picked(rule):
+    """As if this item lay alone and its neighbours were part of what the end effector must not touch."""
+    kinds = Uniform((1, 3), (1, 3), (1, 1))  # all of one height
+    others = 0
+    for env, observation in random_states(bin_items=4, bin_size=(5, 5, 1), items=kinds, tote_size=(5, 5, 3)):
+        step = apply(env.cell, env.state, IndividualHeuristic(env.cell, item=rule).decide(observation))
+        assert not ((step.failure == Failure.PICK_MISS) | (step.failure == Failure.BIN_COLLISION)).any()
+        for n in range(env.num_envs):
+            items = env.state.rows([n])
+            table = items.item.table[0].tolist()
+            order = [k for k in range(4) if table[k][4]]
+            if rule == "nearest":
+                order.sort(key=lambda k: (table[k][0] + table[k][2] / 2) ** 2 + (table[k][1] + table[k][3] / 2) ** 2)
+            maps = placing_maps(env.cell, items)
+            lifted = all_grasps(env.cell, maps.item, maps.blocked)[0].any(1)
+            number = next(k for k in order if lifted[k])
+            assert step.taken[n] == number
+            others += number != order[0]
+    assert others > 0
 
 
 def test_bad_candidates_are_refused():

@@ -11,6 +11,7 @@ from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.fcn_grasp import FootprintPolicy
 from pickplace.policies.restore import restore_critic
 from pickplace.runs import checkpoint
+from pickplace.task.feasibility import choice_mask, placing_maps
 from pickplace.task.items import Kinds, Recorded
 from pickplace.task.state import EMPTY, Item, State
 
@@ -57,6 +58,22 @@ def test_the_horizon_adds_the_critics_value():
     assert (volume[volume >= 100] <= 100 + 2 * 4).all()
 
 
+def test_what_lies_in_the_bin_is_played_before_anything_is_imagined():
+    """A batch of three kinds of volumes 1, 2 and 4: after one of them is placed the other two follow, in any stream."""
+    kinds = [(1, 1, 1), (2, 1, 1), (2, 2, 1)]
+    sizes = {"items": Kinds(kinds), "bin_items": 3, "refill": "batch", "bin_size": (6, 6, 1)}
+    env = make_env(64, (6, 6, 5), **sizes)
+    env.reset()
+    search = search_of(env, lambda observation: torch.zeros(len(observation["tote_depth"]), 1), horizon=2)
+    state, maps = env.state, placing_maps(env.cell, env.state)
+    choice = choice_mask(env.cell, maps).int().argmax(1)
+    left = state.item.volume.sum(1) - state.item.volume.gather(1, choice[:, None] // env.cell.num_footprints)[:, 0]
+    volume = search._play_out(search._place(state, maps, choice), torch.arange(64), 4, 2)
+    assert torch.equal(volume, left.double()[:, None].expand(64, 4))
+    further = search._play_out(search._place(state, maps, choice), torch.arange(64), 4, 3)
+    assert further.std(1).max() > 0  # then comes an imagined batch
+
+
 def gain_bounds(gain):
     """Return mean -+ two standard errors."""
     error = 2 * gain.std() / len(gain) ** 0.5
@@ -76,6 +93,14 @@ def test_it_is_better_than_its_policy_and_a_critic_that_errs_does_not_make_it_wo
     assert gain_bounds(pack(search_of(env, worst, **settings)) - alone)[0] > 0
     monkeypatch.setattr(Lookahead, "_confirm", lambda self, best, *state: best)
     assert gain_bounds(pack(search_of(env, worst, **settings)) - alone)[1] < 0
+
+
+def test_it_is_better_than_its_policy_with_several_items():
+    sizes = {"tote_size": (4, 4, 2), "bin_items": 2}
+    env = make_env(1, **sizes)
+    search = search_of(env, candidates=8, samples=16, rounds=1)
+    alone = occupancies(PolicyPlanner(env.cell, untrained(env.cell)), make_env(32, **sizes))
+    assert gain_bounds(occupancies(search, make_env(32, **sizes)) - alone)[0] > 0.02
 
 
 def test_with_no_doubt_allowed_it_is_its_policy():

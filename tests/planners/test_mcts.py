@@ -31,9 +31,9 @@ def test_more_simulations_come_closer_to_the_optimum():
     assert OPTIMUM - 0.02 - 2 * noise < better.mean() < OPTIMUM + 3 * noise
 
 
-def searched(mask, simulations, rollouts=True):
+def searched(mask, simulations, rollouts=True, **settings):
     """Return the root of the tree of one decision."""
-    env, roots = make_env(tote_size=(4, 4, 2)), []
+    env, roots = make_env(tote_size=(4, 4, 2), **settings), []
     search = search_of(env, simulations, mask=mask, wave=7)
     make = search._nodes
     search._nodes = lambda *args: roots.append(make(*args)) or roots[-1]
@@ -51,9 +51,10 @@ def edges_of(root):
             stack += edge.bins
 
 
+@pytest.mark.parametrize("bin_items", [1, 3])
 @pytest.mark.parametrize("mask", [True, False])
-def test_visits_and_returns_add_up(mask):
-    root = searched(mask, 200)
+def test_visits_and_returns_add_up(mask, bin_items):
+    root = searched(mask, 200, bin_items=bin_items)
     assert sum(edge.visits for edge in root.edges.values()) == 200
     edges = list(edges_of(root))
     for edge in edges:
@@ -71,6 +72,18 @@ def test_a_return_is_what_the_walk_places_and_its_rollout(mask):
         below = sum(child.total for node in edge.bins for child in node.edges.values())
         assert edge.total == pytest.approx(edge.visits * edge.volume / 32 + below)
     assert any(edge.volume for edge in edges)
+
+
+@pytest.mark.parametrize("mask", [True, False])
+def test_what_is_not_taken_stays_in_the_bin(mask):
+    root = searched(mask, 3000, bin_items=3)
+    before, looked = root.item.tolist(), 0
+    for edge in root.edges.values():
+        for node in edge.bins:
+            after = node.item.tolist()
+            assert after[:2] in [before[:k] + before[k + 1 :] for k in range(3)]
+            looked += 1
+    assert looked > 3
 
 
 def test_without_a_mask_it_tries_what_fails():

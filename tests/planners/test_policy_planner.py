@@ -3,10 +3,13 @@
 import pytest
 import torch
 from problems import SETTINGS, random_states
+from untrained import untrained_policy
 
 from pickplace import PickPlaceEnv
+from pickplace.planners.heuristics import JointDBL
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy
+from pickplace.task.items import Uniform
 
 
 class Fixed(Policy):
@@ -46,6 +49,34 @@ def test_candidates_of_each_problem(options, candidates):
             shown = scores[n].exp() * mask if candidates == "all" else scores[n].exp()
             tote_w, tote_d, _ = env.cell.tote_size
             assert torch.equal(heat[n], shown.view(-1, tote_w, tote_d, env.cell.rotations).amax((0, 3)))
+
+
+@pytest.mark.parametrize("rule", ["first", "nearest"])
+def test_only_one_item_is_considered(rule):
+    """The first by the rule that has a feasible footprint; and of its footprints the best one."""
+    moved = 0
+    for env, observation in random_states(
+        bin_items=3, bin_size=(6, 6, 1), items=Uniform(), tote_size=(5, 5, 4), masks=("footprint", "action")
+    ):
+        policy = untrained_policy(env.cell)
+        planner = PolicyPlanner(env.cell, policy, item=rule)
+        chosen = policy.to_choice(planner.decide(observation), observation)
+        joint = JointDBL(env.cell, item=rule).decide(observation)
+        logits = policy.logits(observation)
+        for n in range(env.num_envs):
+            table, mask = env.item[n].tolist(), observation["footprint_mask"][n].unflatten(0, (3, -1))
+            order = [0, 1, 2]
+            if rule == "nearest":
+                order.sort(key=lambda k: (table[k][0] + table[k][2] / 2) ** 2 + (table[k][1] + table[k][3] / 2) ** 2)
+            number = next(k for k in order if mask[k].any())
+            assert chosen[n] == logits[n].unflatten(0, (3, -1))[number].argmax() + number * env.cell.num_footprints
+            assert policy.to_choice(joint[n : n + 1], observation[n : n + 1]) // env.cell.num_footprints == number
+            moved += number != order[0]
+    assert moved > 0
+    with pytest.raises(ValueError, match="planner.item='last': expected 'any' or 'first' or 'nearest'"):
+        JointDBL(env.cell, item="last")
+    with pytest.raises(ValueError, match="planner.item='first': expected 'any', or planner.candidates=all and a"):
+        PolicyPlanner(env.cell, policy, 3, "first")
 
 
 @pytest.mark.parametrize("candidates", [0, -1, 1.5, True, "some"])

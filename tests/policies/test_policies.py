@@ -62,7 +62,9 @@ def refuses(kind, options) -> bool:
     """Return whether a policy does not serve a cell; it says so."""
     if options.get("bin_items", 1) == 1 or kind in CHOOSERS:
         return False
-    with pytest.raises(ValueError, match=r"^env.bin_items=3: expected 1 with model=.*; model=fcn_grasp or corners with"):
+    with pytest.raises(
+        ValueError, match=r"^env.bin_items=3: expected 1 with model=.*; model=fcn_grasp or corners with"
+    ):
         small(kind, CellSpec(bin_items=3, longest_side=2))
     return True
 

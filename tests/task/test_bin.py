@@ -1,0 +1,131 @@
+"""Bins with several items: what is taken, what stands in the way, how items arrive; against plain Python."""
+
+from itertools import product
+from random import Random
+
+import pytest
+import torch
+from oracle import cells, shape_cells
+from problems import random_effector
+
+from pickplace import CellSpec, Item, PickPlaceEnv
+from pickplace.task.bin import blocked_picks, refill, remove_item, select_item, taken_item
+from pickplace.task.cell import reference_cell
+from pickplace.task.items import Kinds, Recorded, Uniform, hashed_uniform
+
+
+def random_contents(rng: Random, size, count, most=3):
+    """Return up to ``count`` items ``(x, y, w, d, h)`` that do not overlap."""
+    found, full = [], set()
+    for _ in range(count):
+        w, d, h = rng.randint(1, most), rng.randint(1, most), rng.randint(1, 3)
+        w, d = min(w, size[0]), min(d, size[1])
+        x, y = rng.randint(0, size[0] - w), rng.randint(0, size[1] - d)
+        if full.isdisjoint(cells((x, y), (w, d))):
+            full.update(cells((x, y), (w, d)))
+            found.append((x, y, w, d, h))
+    return found
+
+
+def as_items(contents, count):
+    """Return lists of items as a batch, ``[N, count]``."""
+    rows = [[*bin_, *[(0,) * 5] * (count - len(bin_))] for bin_ in contents]
+    return Item.from_table(torch.tensor(rows))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_a_pick_takes_and_what_stands_in_its_way(seed):
+    rng = Random(seed)
+    bin_size, effector = (rng.randint(3, 7), rng.randint(3, 7), 1), (rng.randint(1, 4), rng.randint(1, 4))
+    shape = random_effector(rng, effector) if seed % 2 else {}
+    rule = rng.choice(["contain", "overlap", "seal"]) if shape else "contain"
+    cell = CellSpec(bin_size=bin_size, effector_size=effector, pick_rule=rule, bin_items=4, **shape)
+    contents = [random_contents(rng, bin_size, 4) for _ in range(8)]
+    items = as_items(contents, 4)
+    blocked = blocked_picks(cell, items).view(8, 4, *bin_size[:2])
+    body = shape_cells(cell.body if isinstance(cell.body, str) else [*map(list, cell.body)], effector, effector)
+    cup = [(x, y) for x in range(effector[0]) for y in range(effector[1]) if cell.cup_mask[x][y]]
+    for n, x, y in product(range(8), range(bin_size[0]), range(bin_size[1])):
+        corner = x - reference_cell(effector[0]), y - reference_cell(effector[1])
+        below, held = ({(corner[0] + a, corner[1] + b) for a, b in part} for part in (body, cup))
+        gripped = []
+        for number, (i, j, w, d, h) in enumerate(contents[n]):
+            under = set(cells((i, j), (w, d)))
+            shared = len(under & held)
+            enough = {"contain": under <= held, "overlap": shared > 0, "seal": shared >= cell.least_sealed}[rule]
+            gripped += [(-h, number)] * enough
+            in_the_way = [
+                other for k, other in enumerate(contents[n])
+                if k != number and other[4] >= h and below & set(cells(other[:2], other[2:4]))
+            ]  # fmt: skip
+            assert blocked[n, number, x, y] == bool(in_the_way)
+        at = torch.full((8,), x), torch.full((8,), y)
+        assert taken_item(cell, items, *at)[n] == (min(gripped)[1] if gripped else 0)
+
+
+def test_items_are_taken_out_and_the_others_move_up():
+    items = as_items([[(0, 0, 1, 1, 1), (1, 0, 1, 1, 2), (2, 0, 1, 1, 3)]] * 4, 3)
+    left = remove_item(items, torch.tensor([0, 1, 2, 1]), torch.tensor([True, True, True, False]))
+    assert left.h.tolist() == [[2, 3, 0], [1, 3, 0], [1, 2, 0], [1, 2, 3]] and left.w[:3, 2].tolist() == [0, 0, 0]
+    assert select_item(items, torch.tensor([2, 0, 1, 1])).h.tolist() == [3, 1, 2, 2]
+
+
+def arrivals_by_hand(source, stream, address, contents, cell, arrived):
+    """Return what lies in one bin after the arrivals, and how many have arrived."""
+    found, (bin_w, bin_d, _) = list(contents), cell.bin_size
+    while len(found) < cell.bin_items and not (cell.refill == "batch" and contents):
+        where = *address, torch.tensor([arrived])
+        item = source.sample(stream, *where, cell.bin_size)
+        own_x, own_y, w, d, h = (int(part) for part in item)
+        uniform = float(hashed_uniform(stream, *where, 4)[3])
+        full = {part for other in found for part in cells(other[:2], other[2:4])}
+        places = [
+            (x, y) for x, y in product(range(bin_w - w + 1), range(bin_d - d + 1))
+            if full.isdisjoint(cells((x, y), (w, d)))
+        ]  # fmt: skip
+        if h == 0 or not places or (source.has_corners and (own_x, own_y) not in places):
+            break
+        x, y = (own_x, own_y) if source.has_corners else places[int(uniform * len(places))]
+        found.append((x, y, w, d, h))
+        arrived += 1
+    return found, arrived
+
+
+@pytest.mark.parametrize("rule", ["each", "batch"])
+@pytest.mark.parametrize("kind", ["uniform", "recorded", "placed"])
+def test_items_arrive_in_their_order_where_they_have_room(kind, rule, tmp_path):
+    rng, count = Random(kind), 5
+    path = tmp_path / "items.csv"
+    rows = [random_contents(rng, (5, 6), 1)[0] for _ in range(9)]
+    lines = [f"{w},{d},{h},{x},{y}" if kind == "placed" else f"{w},{d},{h}" for x, y, w, d, h in rows]
+    path.write_text("\n".join(["w,d,h,x,y" if kind == "placed" else "w,d,h", *lines]))
+    source = Uniform() if kind == "uniform" else Recorded(path)
+    cell = CellSpec(bin_size=(5, 6, 1), bin_items=count, refill=rule)
+    contents = [random_contents(rng, (5, 6), rng.choice((0, 0, 2, 4))) for _ in range(60)]
+    seed, episode = torch.full((60,), 3), torch.arange(60)
+    arrived = torch.tensor([rng.randint(0, 10) for _ in range(60)])
+    items, after = refill(cell, source, "train", seed, episode, arrived, as_items(contents, count))
+    for n in range(60):
+        address = seed[:1], episode[n : n + 1]
+        found, number = arrivals_by_hand(source, "train", address, contents[n], cell, int(arrived[n]))
+        assert [tuple(row) for row in items.table[n].tolist() if row[4]] == found and after[n] == number
+
+
+def test_places_are_drawn_evenly():
+    cell, count = CellSpec(bin_size=(3, 4, 1), bin_items=2), 30_000
+    first = as_items([[(0, 0, 1, 2, 1)]] * count, 2)
+    zeros = torch.zeros(count, dtype=torch.int64)
+    items, _ = refill(cell, Kinds([(1, 2, 1)]), "train", zeros, torch.arange(count), zeros, first)
+    places = torch.bincount(items.x[:, 1] * 4 + items.y[:, 1])
+    free = {(x, y) for x in range(3) for y in range(3)} - {(0, 0), (0, 1)}
+    assert set(places.nonzero()[:, 0].tolist()) == {x * 4 + y for x, y in free}
+    assert (places[places > 0] - count / len(free)).abs().max() < 5 * (count / len(free)) ** 0.5
+
+
+def test_a_bin_that_is_jammed_begins_with_one_item():
+    """Nine equal items between high walls: none can be gripped without a neighbour; so the first one comes alone."""
+    sizes = {"bin_size": (3, 3, 3), "effector_size": (2, 2), "tote_size": (4, 4, 3), "bin_items": 9}
+    env = PickPlaceEnv(Kinds([(1, 1, 1)]), num_envs=16, pick_rule="contain", **sizes)
+    observation = env.reset()
+    assert observation["action_mask"].any(1).all()
+    assert ((observation["items"][..., 4] > 0).sum(1) == 1).all() and (env.arrived == 1).all()
