@@ -5,6 +5,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from pickplace.policies.base import MASKED, Policy, pick_one, refuse_several_items
+from pickplace.policies.networks.depth import Contents
 from pickplace.policies.networks.footprint_fcn import MAP_KEYS, FootprintFcn, every_footprint
 from pickplace.task.cell import CellSpec
 from pickplace.task.feasibility import (
@@ -67,7 +68,7 @@ class FootprintPolicy(Policy):
 
     def make_network(self, **network):
         """Return the network, which scores footprints by ``at``."""
-        return FootprintFcn(**network)
+        return FootprintFcn(several_items=self.cell.bin_items > 1, **network)
 
     def ranked(self, maps: PlacingMaps) -> Tensor:
         """Return the footprints among which it chooses, bool ``[N, M * Q * W_T * D_T]``; some, if any is feasible."""
@@ -81,12 +82,12 @@ class FootprintPolicy(Policy):
             footprint: int64 ``[M]``, index ``(parity * W_T + x) * D_T + y``; of several items that of a choice.
         """
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
-        item = None
+        contents = None
         if "items" in observation.keys():  # noqa: SIM118 - a TensorDict does not iterate over its keys
             number = footprint // self.cell.num_footprints
-            item = Item.from_table(observation["items"][row, number])
+            contents = Contents(Item.from_table(observation["items"]), number)
             footprint = footprint - number * self.cell.num_footprints
-        return self.network.at(bins, totes, bearing, row, footprint, item)[:, 0]
+        return self.network.at(bins, totes, bearing, row, footprint, contents)[:, 0]
 
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
         """Return logits of the footprints that a mask ``[N, M * Q * W_T * D_T]`` allows; the others are not

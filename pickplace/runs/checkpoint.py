@@ -25,7 +25,8 @@ from pickplace.task.files import read_file
 SCHEMA = 1
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"  # weights that the package ships
 TENSORS, FACTS = "state.safetensors", "state.json"
-ZERO_SUFFIX = ".weak"  # of parameters that begin at zero, and that older weights lack
+SEVERAL_ITEMS_SUFFIX = ".rest_of_bin"  # of parameters that a bin with one item has no use for
+ZERO_SUFFIX = (".weak", SEVERAL_ITEMS_SUFFIX)  # of parameters that begin at zero, and that older weights lack
 PREVIOUS = "previous"  # the checkpoint before checkpoints/last, beside it
 MAX_BYTES = {FACTS: 2**25, TENSORS: 2**32}  # greatest size of each file
 
@@ -254,7 +255,8 @@ def restore(make: Callable[[], Module], state: dict, what: str) -> Module:
         own = make().state_dict()
     lacking = {key for key in own if key.endswith(ZERO_SUFFIX) and key not in state}
     weights = matching_state(state, {key: value for key, value in own.items() if key not in lacking}, what)
-    if unknown := sorted(map(str, set(state) - set(own))):
+    unused = {key for key in state if str(key).endswith(SEVERAL_ITEMS_SUFFIX)}
+    if unknown := sorted(map(str, set(state) - set(own) - unused)):
         raise CheckpointError(f"The checkpoint's {what} does not fit these settings: {unknown[0]} is not expected.")
     module = make()
     if nonzero := [key for key in sorted(lacking) if module.state_dict()[key].any()]:

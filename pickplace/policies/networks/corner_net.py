@@ -4,9 +4,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pickplace.policies.networks.depth import Contents
 from pickplace.task.checks import MAX_WIDTH, check_inputs, excerpt, number, whole_number
 from pickplace.task.grasps import split_footprint
-from pickplace.task.state import Item, item_from_depth
+from pickplace.task.state import item_from_depth
 
 PLANES = 6  # of each point, see `CornerNet`
 SIZES = 13  # numbers beside the points
@@ -65,7 +66,7 @@ class CornerNet(nn.Module):
         bearing: Tensor,
         row: Tensor,
         footprint: Tensor,
-        item: Item | None = None,
+        contents: Contents | None = None,
     ) -> Tensor:
         """Return the scores of some footprints, float32 ``[M, 1]``.
 
@@ -74,9 +75,9 @@ class CornerNet(nn.Module):
             bearing: 1 where a cell of the tote bears weight, else 0, ``[N, W_T, D_T]``.
             row: int64 ``[M]``, which problem.
             footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
-            item: ``[M]``, the item of each footprint; None: the only one in the bin.
+            contents: of bins with several items; None: there is one, which the depth map shows.
         """
-        return self.head(self.body(self.inputs(bin_depth, tote_depth, bearing, row, footprint, item)))
+        return self.head(self.body(self.inputs(bin_depth, tote_depth, bearing, row, footprint, contents)))
 
     @torch.no_grad()
     def inputs(
@@ -86,11 +87,11 @@ class CornerNet(nn.Module):
         bearing: Tensor,
         row: Tensor,
         footprint: Tensor,
-        item: Item | None = None,
+        contents: Contents | None = None,
     ) -> Tensor:
         """Return what the first layer sees, float32 ``[M, inputs]``; arguments as of :meth:`at`."""
         _, wide, deep = tote_depth.shape
-        item = item_from_depth(bin_depth).rows(row) if item is None else item
+        item = item_from_depth(bin_depth).rows(row) if contents is None else contents.scored(row)
         parity, x, y = split_footprint((wide, deep), footprint)
         turned = (parity == 1)[:, None]
         w, d, h = (part[:, None] for part in (item.w, item.d, item.h.float()))

@@ -1,10 +1,34 @@
 """Preparation of depth maps for the networks: clipping, then padding (fcn4d) or one-hot codes (fcn_grasp)."""
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from pickplace.task.state import Item
+
+
+class Contents(NamedTuple):
+    """What lies in bins with several items, and which of them is scored."""
+
+    items: Item  # [N, M]
+    number: Tensor  # int64, one for each footprint that is scored
+
+    def part(self, index: Tensor) -> "Contents":
+        """Return the same for some of the footprints."""
+        return Contents(self.items, self.number[index])
+
+    def scored(self, row: Tensor) -> Item:
+        """Return the item of each footprint; ``row`` is the bin of each."""
+        return self.items.rows((row, self.number))
+
+    def rest_code(self, row: Tensor, item_range: int) -> Tensor:
+        """Return the mean code of the other items in the bin, float32 ``[rows, 3 * item_range]``; 0 without any."""
+        there = ~self.items.is_empty
+        code = item_code(self.items, item_range) & there[..., None]
+        rest = code.sum(1)[row] - code[row, self.number].int()
+        return rest / (there.sum(1, keepdim=True) - 1).clamp(min=1)[row]
 
 
 def clip_depth(depth: Tensor, limit: float | None, floor: float | None = None) -> Tensor:

@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.policies.networks.depth import clip_depth
+from pickplace.policies.networks.depth import Contents, clip_depth
 from pickplace.task.cell import reference_cell
 from pickplace.task.checks import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_number
 from pickplace.task.grasps import split_footprint
@@ -33,8 +33,9 @@ class FootprintFcn(nn.Module):
     footprint, the height above the top that the item would have; under it, the depth of the hole that it would close;
     nothing outside the tote. After the patch come the item's width, depth and height, the headroom above its top (too
     little, none, or how much), and how far above the deepest place of the tote it rests (the clipped depth of
-    eq. 4), one-hot each. Cells that bear no weight are marked, too; what the marks do is learned from zero, so that
-    weights that were trained without them serve.
+    eq. 4), one-hot each. Cells that bear no weight are marked, too; and of several items in the bin the network sees
+    the mean of the others' codes. What these do is learned from zero, so that weights that were trained without them
+    serve.
 
     Args:
         out_channels: scores of each footprint.
@@ -50,6 +51,7 @@ class FootprintFcn(nn.Module):
         head_std: standard deviation of the last layer's initial weights.
         compute_dtype: ``"float32"``, ``"bfloat16"`` (autocast of the matrix products), or ``"auto"``: bfloat16 where
             the processor has units for it.
+        several_items: whether it looks at the other items in the bin.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class FootprintFcn(nn.Module):
         head_std: float = 0.01,
         compute_dtype: str = "auto",
         headroom_bins: int | None = None,
+        several_items: bool = False,
     ):
         super().__init__()
         odd_number("model.actor.receptive_field", receptive_field, least=3)
@@ -85,6 +88,7 @@ class FootprintFcn(nn.Module):
         check_inputs(f"model.actor.receptive_field={receptive_field}, {self.planes} planes", inputs)
         self.patch = nn.Linear(inputs, filters)
         self.weak = nn.Parameter(torch.zeros(filters, receptive_field**2))
+        self.rest_of_bin = nn.Parameter(torch.zeros(filters, 3 * item_range)) if several_items else None
         self.hidden = nn.Linear(filters, hidden)
         self.head = nn.Linear(hidden, out_channels)
         nn.init.normal_(self.head.weight, std=head_std)
@@ -109,7 +113,7 @@ class FootprintFcn(nn.Module):
         bearing: Tensor,
         row: Tensor,
         footprint: Tensor,
-        item: Item | None = None,
+        contents: Contents | None = None,
     ) -> Tensor:
         """Return the scores of some footprints only, float32 ``[M, out_channels]``.
 
@@ -117,24 +121,31 @@ class FootprintFcn(nn.Module):
             bin_depth, tote_depth, bearing: as in :meth:`forward`.
             row: int64 ``[M]``, which problem.
             footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
-            item: ``[M]``, the item of each footprint; None: the only one in the bin.
+            contents: of bins with several items; None: there is one, which the depth map shows.
         """
-        item = item_from_depth(bin_depth).rows(row) if item is None else item
         at_once = CHUNK_BYTES // (4 * self.patch.in_features)
         if not torch.is_grad_enabled() and len(row) > at_once:  # of large totes: a part at a time, to save memory
-            parts = torch.arange(len(row), device=row.device).split(at_once)
             return torch.cat(
-                [self.at(bin_depth, tote_depth, bearing, row[i], footprint[i], item.rows(i)) for i in parts]
+                [
+                    self.at(
+                        bin_depth, tote_depth, bearing, row[part], footprint[part], contents and contents.part(part)
+                    )
+                    for part in torch.arange(len(row), device=row.device).split(at_once)
+                ]
             )
         dtype, count = matrix_dtype(self.compute_dtype, tote_depth.device.type), row.shape[0]
         lower = dtype != torch.float32
         if lower:
             padding = next((-count % step for beyond, step in PADDED_ROWS if count > beyond), 0)
-            row, footprint, *parts = (F.pad(index, (0, padding)) for index in (row, footprint, *item))
-            item = Item(*parts)
+            row, footprint = (F.pad(index, (0, padding)) for index in (row, footprint))
+            contents = contents and contents._replace(number=F.pad(contents.number, (0, padding)))
+        item = item_from_depth(bin_depth).rows(row) if contents is None else contents.scored(row)
         x, weak = self._inputs(bin_depth, tote_depth, bearing, row, footprint, item, dtype)
         with torch.autocast(tote_depth.device.type, dtype, enabled=lower):
-            x = F.relu(self.hidden(F.relu(self.patch(x) + F.linear(weak, self.weak))))
+            x = self.patch(x) + F.linear(weak, self.weak)
+            if contents is not None and self.rest_of_bin is not None:
+                x = x + F.linear(contents.rest_code(row, self.item_range).to(dtype), self.rest_of_bin)
+            x = F.relu(self.hidden(F.relu(x)))
         return self.head(x.float())[:count]  # in full: scores that differ a little must not be rounded to a tie
 
     def _inputs(
