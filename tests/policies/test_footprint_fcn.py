@@ -1,6 +1,7 @@
 """The network of ``fcn_grasp`` and its critic, against plain convolutions and by hand."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from problems import late_state
 
-from pickplace import CellSpec
+from pickplace import CellSpec, Item
 from pickplace.policies.base import MASKED, as_collection_policy
 from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy
 from pickplace.policies.networks.critics import PooledCritic
+from pickplace.policies.networks.depth import Contents
 from pickplace.policies.networks.footprint_fcn import MAP_KEYS, FootprintFcn, matrix_dtype
 from pickplace.runs import checkpoint
 from pickplace.task.items import Kinds, Uniform
@@ -207,6 +209,50 @@ def test_the_critic_adds_up_what_each_column_will_hold(seed, field, tote, level,
         assert float(critic(bins, totes, bearing)[n]) == pytest.approx(total, rel=1e-4, abs=1e-4)
     several = critic(*(maps[:, None] for maps in (bins, totes, bearing)))  # any leading dimensions
     torch.testing.assert_close(several, critic(bins, totes, bearing).view(2, 1, 1), rtol=1e-4, atol=1e-4)
+
+
+def test_the_critic_sees_the_mean_of_several_items():
+    critic = PooledCritic(4, 3, 6, compute_dtype="float32").requires_grad_(False)
+    for parameter in critic.parameters():
+        parameter.normal_()
+    bins, totes, bearing = random_maps(3, 2, (4, 6), (5, 5))
+    one = item_from_depth(bins).table[:, None]
+    torch.testing.assert_close(critic(bins, totes, bearing, one), critic(bins, totes, bearing))
+    both = torch.cat([one, one.flip(0), torch.zeros_like(one)], 1)  # of an empty place it sees nothing
+    code = critic._item_code(bins, both)
+    each = [critic._item_code(bins, part[:, None]) for part in both.unbind(1)[:2]]
+    torch.testing.assert_close(code, (each[0] + each[1]) / 2)
+    several = critic(bins, totes, bearing, both)
+    assert not torch.allclose(several, critic(bins, totes, bearing))
+
+
+def test_the_policy_sees_the_mean_of_the_other_items():
+    """Its pairs are scored by item and footprint; what the others do is learned from zero, and needs several items."""
+    sizes = {"items": Uniform(), "tote_size": (6, 6, 6), "bin_size": (7, 7, 1), "masks": ("footprint", "action")}
+    env, state = late_state(bin_items=3, **sizes)
+    alone = FootprintPolicy(replace(env.cell, bin_items=1), **FLOAT)
+    policy = checkpoint.restore(lambda: FootprintPolicy(env.cell, **FLOAT), alone.state_dict(), "policy")
+    places = env.cell.num_footprints
+    for number in range(3):  # as if each item lay alone
+        one = state.exclude("items", "bin_labels")
+        one["bin_depth"] = torch.where(state["bin_labels"] == number + 1, state["bin_depth"], 0.0)
+        one["footprint_mask"] = state["footprint_mask"].unflatten(1, (3, -1))[:, number]
+        expected = policy.logits(state)[:, number * places : (number + 1) * places]
+        torch.testing.assert_close(alone.logits(one), expected)
+    policy.network.rest_of_bin.data.normal_()
+    changed = policy.logits(state)
+    swapped = state.clone().set("items", state["items"][:, [0, 2, 1]])  # the order of the others is nothing to it
+    swapped["footprint_mask"] = state["footprint_mask"].unflatten(1, (3, -1))[:, [0, 2, 1]].flatten(1)
+    torch.testing.assert_close(policy.logits(swapped)[:, :places], changed[:, :places])
+    code = Contents(Item.from_table(state["items"]), torch.zeros(1, dtype=torch.int64)).rest_code(torch.tensor([0]), 3)
+    by_hand = torch.zeros(9)
+    others = [item for item in state["items"][0, 1:].tolist() if item[4]]
+    for item in others:
+        for part, size in enumerate(item[2:]):
+            by_hand[part * 3 + min(size, 3) - 1] += 1 / len(others)
+    torch.testing.assert_close(code[0], by_hand)
+    again = checkpoint.restore(lambda: FootprintPolicy(alone.cell, **FLOAT), policy.state_dict(), "policy")
+    torch.testing.assert_close(again.logits(one), alone.logits(one))  # one item has no others
 
 
 def test_weights_that_are_older_than_the_marks_serve():

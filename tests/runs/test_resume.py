@@ -15,6 +15,8 @@ from loky import cpu_count
 from long import chaos
 from omegaconf import OmegaConf
 
+from pickplace import PickPlaceEnv
+from pickplace.envs.saved_state import check_saved_states
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import claim
 from pickplace.runs.loggers import read_csv
@@ -71,6 +73,17 @@ def test_a_run_that_is_killed_and_stopped_equals_an_undisturbed_one(collector, u
     assert [row["frames"] for row in rows] == [ITERATION * (i + 1) for i in range(10)]
     assert [i for i, row in enumerate(rows) if "eval/occupancy" in row] == [3, 7, 9]
     assert rows[0]["curriculum/level"] < rows[-1]["curriculum/level"]  # it really trains
+
+
+@pytest.mark.parametrize("refill", ["each", "batch"])
+def test_several_items_in_the_bin_are_resumed_exactly(refill, tmp_path):
+    several = ["env.bin_items=3", "env.bin_size=[5,5,1]", f"env.refill={refill}", "algo.advantages=gae"]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    whole.mkdir()
+    with after_batch(5, lambda _: shutil.copytree(whole, killed)):
+        train(composed(*SETTINGS, *several), whole)
+    resume_run([f"resume={killed}"])
+    assert_same(whole, killed)
 
 
 def test_a_run_killed_before_its_first_last_resumes_from_best(undisturbed, tmp_path):
@@ -262,6 +275,25 @@ def test_a_checkpoint_that_no_training_wrote_is_not_resumed(smoke_run, tmp_path,
         resume_run([f"resume={run_dir}", "total_frames=1280"])
     assert words in str(caught.value) and "\n" not in str(caught.value)
     assert content(run_dir) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda saved: saved["item"].select(2, 0).fill_(5), "item: expected items inside the bin"),
+        (lambda saved: saved["item"].select(2, 4).fill_(9), "item: expected sizes of the distribution"),
+        (lambda saved: saved["item"].copy_(saved["item"][:, :1].expand(-1, 2, -1)), "item: expected items that do not"),
+        (lambda saved: saved["arrived"].add_(1), "arrived: expected the items placed and those in the bin"),
+    ],
+)
+def test_a_bin_that_no_episode_leads_to_is_refused(change, words):
+    env = PickPlaceEnv(num_envs=4, bin_items=2)
+    carried = env.reset()
+    saved = {"environment": {key: value.clone() for key, value in env.state_dict().items()}, "carried": carried}
+    check_saved_states(env, saved)
+    change(saved["environment"])
+    with pytest.raises(checkpoint.CheckpointError, match=f"of no use: {words}"):
+        check_saved_states(env, saved)
 
 
 @pytest.mark.parametrize(

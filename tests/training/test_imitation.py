@@ -62,6 +62,20 @@ def test_the_policy_can_do_what_is_taught_as_the_teacher_does(name, states):
     assert torch.equal(theirs[known], ours[known])
 
 
+@pytest.mark.parametrize("name", ["footprint", "corners", "flat"])
+def test_of_several_items_the_taught_one_is_learnt(name):
+    env, td = late_state(5, num_envs=32, masks=("footprint", "corner", "action"), bin_items=3, bin_size=(7, 7, 1))
+    start, policy = warm_start(config(), name, env)
+    taught = start.ask(td, 0)
+    known = taught >= 0
+    assert known.all()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        own = policy.to_action(taught, td)
+    ours, theirs = (apply(env.cell, env.state, action) for action in (own, JointDBL(env.cell).decide(td)))
+    assert torch.equal(ours.taken, theirs.taken) and torch.equal(ours.footprint, theirs.footprint)
+    assert ours.taken.unique().numel() == 3
+
+
 def test_teachers_that_fail_draw_or_are_trained(states):
     env, td = states
     # Few of all actions are feasible, and only these are taught.
