@@ -12,6 +12,11 @@ def evaluation_table(result: dict) -> str:
     rows = [
         ("planner", result["planner"]),
         ("tote, rotations", f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}"),
+        *(
+            [("items in the bin", f"up to {count}, refill: {env['refill']}")]
+            if (count := env.get("bin_items", 1)) > 1
+            else []
+        ),
         ("episodes", f"{result['episodes']} of the {result['stream']} stream, seed {result['seed']}{same}"),
         ("occupancy", f"{occupancy['mean']:.4f} (95% interval {low:.4f} to {high:.4f}), least {occupancy['min']:.4f}"),
         ("items placed", f"{result['items_placed']:.1f} an episode"),

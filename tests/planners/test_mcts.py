@@ -8,6 +8,8 @@ from pickplace import PickPlaceEnv
 from pickplace.planners.mcts import MCTS, _Edge, _Node
 from pickplace.task.feasibility import actions_reaching, placing_maps
 from pickplace.task.items import Kinds, Recorded
+from pickplace.task.state import Item, State
+from pickplace.task.transition import apply
 
 OPTIMUM = 0.9456  # 4x4x1, R=4, by tests/dynamic_programming.py
 
@@ -76,14 +78,18 @@ def test_a_return_is_what_the_walk_places_and_its_rollout(mask):
 
 @pytest.mark.parametrize("mask", [True, False])
 def test_what_is_not_taken_stays_in_the_bin(mask):
-    root = searched(mask, 3000, bin_items=3)
-    before, looked = root.item.tolist(), 0
+    env = make_env(tote_size=(4, 4, 2), bin_items=3)
+    root, looked = searched(mask, 3000, bin_items=3), set()
+    before = root.item.tolist()
     for edge in root.edges.values():
+        taken = edge.action // env.cell.num_footprints
+        if not mask:
+            state = State(root.surface[None], torch.tensor([2]), Item.from_table(root.item[None]))
+            taken = int(apply(env.cell, state, torch.tensor([edge.action])).taken)
         for node in edge.bins:
-            after = node.item.tolist()
-            assert after[:2] in [before[:k] + before[k + 1 :] for k in range(3)]
-            looked += 1
-    assert looked > 3
+            assert node.item.tolist()[:2] == before[:taken] + before[taken + 1 :]
+            looked.add(taken)
+    assert looked == {0, 1, 2}
 
 
 def test_without_a_mask_it_tries_what_fails():
