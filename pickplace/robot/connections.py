@@ -9,7 +9,7 @@ CONNECTIONS = 32  # at a time; each may hold one request in memory
 CLIENT_SECONDS = 10  # time that a client has to send the headers of a request, or to read an answer
 
 CROWDED = JSONResponse(
-    {"error": f"{CONNECTIONS} connections are open, as many as may be; expected the next request after 1 s."},
+    {"error": f"more than {CONNECTIONS} connections are open; expected the next request after 1 s."},
     503,
     {"Retry-After": "1", "Connection": "close"},
 )

@@ -100,7 +100,9 @@ class KnownHosts:
 
 
 class Rate:
-    """A budget of plans, which fills up evenly. A request whose body is refused has spent its plan, so that none is free.
+    """A budget of plans, which fills up evenly.
+
+    A request whose body is refused has spent its plan: a client could send wrong ones without end otherwise.
 
     Args:
         per_minute: plans a minute, and as many at once.

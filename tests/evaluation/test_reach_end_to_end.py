@@ -60,7 +60,11 @@ def test_a_checkpoint_brings_its_reach(trained, evaluation):
     assert everywhere["env"]["reach"] is None
     error = evaluation(f"checkpoint={trained}", "reach=everywhere", f"compare={plain['folder']}/evaluation.json")
     assert "env.reach={" in error and "expected None" in error
-    for word, expected in (("~reach", "reach=everywhere"), ("~effector", "effector=paper"), ("~reach=null", "reach=everywhere")):
+    for word, expected in (
+        ("~reach", "reach=everywhere"),
+        ("~effector", "effector=paper"),
+        ("~reach=null", "reach=everywhere"),
+    ):
         error = evaluation(f"checkpoint={trained}", word)
         assert f"error: {word}: " in error and f"expected {expected}" in error and error.count("\n") == 1
     assert "env.reach.radi:" in evaluation(f"checkpoint={trained}", "env.reach.radi=[1,2]")

@@ -278,7 +278,9 @@ def test_a_client_may_wait_and_begin_anew():
     slow += "Planner.plan = lambda *given, **named: time.sleep(1.5) or plan(*given, **named)"
     with served("--planner", "joint_dbl", before=f"{IMPATIENT}; {slow}") as client:
         body = json.dumps(GRID).encode()
-        head = f"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: {len(body)}"
+        head = (
+            f"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: {len(body)}"
+        )
         (one,) = open_sockets(client, 1, head.encode() + b"\r\n\r\n")
         for _ in range(2):
             time.sleep(1.5)

@@ -37,7 +37,8 @@ class PickPlaceNode(Node):
         tote_size = tuple(number("tote_size", [0, 0, 0]).value)  # cells; zeros: as trained
         self.planner = Planner.load(checkpoint, **({"tote_size": tote_size} if any(tote_size) else {}))
         cell = self.planner.cell
-        # [4, 4] row by row: the camera's optical frame in the frame of the bin, and of the tote. Here: 1.2 m above the middle.
+        # [4, 4] row by row: the camera's optical frame in the frame of the bin, and of the tote.
+        # Here: 1.2 m above the middle.
         self.poses = {}
         for place, (wide, deep, _) in (("bin", cell.bin_size), ("tote", cell.tote_size)):
             above = np.diag((1.0, -1.0, -1.0, 1.0))
@@ -53,7 +54,7 @@ class PickPlaceNode(Node):
                 self.create_subscription(kind, f"{place}/{topic}", keep, qos_profile_sensor_data)
         self.publishers_of = {frame: self.create_publisher(PoseStamped, f"~/{name}", 1)
                               for frame, name in (("bin", "pick"), ("tote", "place"))}  # fmt: skip
-        self.bearing = self.open = None  # what the tote bears weight on, and the plan that the robot carries out
+        self.bearing = self.open = None  # where the tote bears weight, and the plan that the robot carries out
         for name in ("plan", "placed", "new_tote"):
             self.create_service(Trigger, f"~/{name}", getattr(self, name))
 
