@@ -17,7 +17,10 @@ def plan(request: dict, url: str = "http://127.0.0.1:8000") -> dict:
         with urllib.request.urlopen(call, timeout=30) as reply:
             return json.load(reply)
     except urllib.error.HTTPError as error:  # 4xx: the body says why in one sentence
-        return json.load(error)
+        try:
+            return json.load(error)
+        except ValueError:  # not of the service: of a proxy, or of another program at this address
+            return {"error": f"{url}: {error}, and no JSON; expected the address of pickplace-serve."}
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from pickplace.task.checks import excerpt, number, short_text, whole_number
 
 TOKEN = "PICKPLACE_TOKEN"  # the environment variable; a command line can be read by every user of the machine
 LEAST_TOKEN = 16  # letters
-CONNECTIONS = 32  # at a time; each may hold one request in memory
 
 
 def main() -> None:
@@ -56,6 +55,7 @@ def run(args: argparse.Namespace) -> None:
     try:
         import uvicorn
 
+        from pickplace.robot.connections import Connection
         from pickplace.robot.service import make_app
     except ImportError as error:
         if (error.name or "").startswith("pickplace"):
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> None:
     host = f"[{args.host}]" if ":" in args.host else args.host
     write_output(f"Listening at http://{host}:{listener.getsockname()[1]}; Ctrl-C ends it.\n")
     config = uvicorn.Config(
-        app, log_level="warning", access_log=False, server_header=False, limit_concurrency=CONNECTIONS,
+        app, http=Connection, ws="none", log_level="warning", access_log=False, server_header=False,
         timeout_graceful_shutdown=3,
     )  # fmt: skip
     uvicorn.Server(config).run(sockets=[listener])

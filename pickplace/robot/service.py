@@ -4,6 +4,7 @@ import asyncio
 import hmac
 import json
 import math
+import re
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -15,18 +16,22 @@ from fastapi.exceptions import HTTPException, RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import BaseModel, ConfigDict, Field
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException as StarletteHTTPException
-from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 import pickplace
 from pickplace.robot.json_lines import MAX_LINE, answer_request, parse_request
 from pickplace.robot.measure import Box
 from pickplace.robot.planner import Plan, Planner
 from pickplace.runs.errors import sentence
-from pickplace.task.cell import CELL_SETTINGS
+from pickplace.runs.registry import names_at
+from pickplace.task.cell import CELL_SETTINGS, Reach
+from pickplace.task.checks import excerpt
 from pickplace.views import live
 
-MAX_WAITING = 16  # plans that wait for their turn
+MAX_WAITING = 16  # requests whose body is read, or that wait for their turn
 BODY_SECONDS = 30  # time that a client has to send its request
 
 Map = list[list[float]]
@@ -73,8 +78,31 @@ class Health(BaseModel):
     cell: dict
 
 
+class KnownHosts:
+    """Middleware that refuses requests whose ``Host`` is none of the service's names.
+
+    Args:
+        app: what answers the others.
+        names: without a port; ``"*"``: any.
+    """
+
+    def __init__(self, app: ASGIApp, names: Sequence[str]):
+        self.app, self.names = app, [name.lower() for name in names]
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        app = self.app
+        if scope["type"] == "http" and "*" not in self.names:
+            host = Headers(scope=scope).get("host", "")
+            if re.sub(r":\d*$", "", host).lower() not in self.names:
+                expected = "expected a name of this service, see --allow-host"
+                app = JSONResponse({"error": f"Host: got {excerpt(host)}; {expected}."}, 400)
+        await app(scope, receive, send)
+
+
 class Rate:
     """A budget of plans, which fills up evenly.
+
+    A request whose body is refused has spent its plan: a client could send wrong ones without end otherwise.
 
     Args:
         per_minute: plans a minute, and as many at once.
@@ -111,11 +139,7 @@ class Service:
 
     async def answer(self, body: bytes) -> tuple[int, str]:
         """Return the status and the JSON text of the answer to a request."""
-        self.waiting += 1
-        try:
-            return await asyncio.get_running_loop().run_in_executor(self.worker, self._answer, body)
-        finally:
-            self.waiting -= 1
+        return await asyncio.get_running_loop().run_in_executor(self.worker, self._answer, body)
 
     def _answer(self, body: bytes) -> tuple[int, str]:
         start, request = time.perf_counter(), {}
@@ -136,7 +160,8 @@ async def read_body(request: Request) -> bytes:
     """Return the body of a request.
 
     Raises:
-        HTTPException: 413 for more than :data:`MAX_LINE` bytes, 408 for a client that is too slow.
+        HTTPException: 413 for more than :data:`MAX_LINE` bytes, 408 for a client that is too slow, 400 for one that
+            leaves.
     """
     body = bytearray()
     try:
@@ -147,6 +172,8 @@ async def read_body(request: Request) -> bytes:
                     raise HTTPException(413, f"the body has more than {MAX_LINE:,} bytes; expected a shorter one.")
     except TimeoutError as error:
         raise HTTPException(408, f"the body took more than {BODY_SECONDS} s; expected a faster one.") from error
+    except ClientDisconnect as error:  # nobody reads the answer, but it is no fault of the service
+        raise HTTPException(400, "the connection ended within the body; expected a whole one.") from error
     return bytes(body)
 
 
@@ -173,7 +200,7 @@ def make_app(
     service, budget = Service(planner, defaults, history), Rate(rate)
     health = Health(
         status="ok", version=pickplace.__version__, planner=name, checkpoint=checkpoint,
-        cell={key: getattr(planner.cell, key) for key in CELL_SETTINGS},
+        cell={key: getattr(planner.cell, key) for key in CELL_SETTINGS} | {"reach": kind_of_reach(planner.cell.reach)},
     )  # fmt: skip
     page = live.page(planner.cell)
     page_headers = {
@@ -190,7 +217,11 @@ def make_app(
         title="pickplace", version=pickplace.__version__, lifespan=lifespan, docs_url=None, redoc_url=None,
         description="Where a suction robot picks an item in a bin, and where and how it places it in a tote.",
     )  # fmt: skip
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=list(hosts), www_redirect=False)
+    app.add_middleware(KnownHosts, names=hosts)
+
+    @app.exception_handler(Exception)
+    async def report_fault(_, error):
+        return JSONResponse({"error": "the service failed; its log says more."}, 500)
 
     @app.exception_handler(StarletteHTTPException)
     async def refuse(_, error):
@@ -217,7 +248,8 @@ def make_app(
     reasons = {
         400: "No JSON object, or a wrong Host", 401: "No token, or a wrong one", 408: "The body came too slowly",
         413: "The body is too long", 415: "Not application/json", 422: "Maps or settings that cannot be used",
-        429: "Too many plans; Retry-After says when to come back",
+        429: "Too many plans; Retry-After says when to come back", 500: "The service failed; its log says more",
+        503: "Too many connections; Retry-After says when to come back",
     }  # fmt: skip
     answers: dict = {200: {"description": "A plan; status says whether there is one", "model": Plan}}
     answers |= {code: {"description": text, "model": Refusal} for code, text in reasons.items()}
@@ -229,7 +261,11 @@ def make_app(
             # A page of a stranger can send forms and plain text without asking, but no JSON.
             raise HTTPException(415, "Content-Type: expected application/json.")
         limit()
-        status, text = await service.answer(await read_body(request))
+        service.waiting += 1  # from now on: reading a slow body takes up a place, too
+        try:
+            status, text = await service.answer(await read_body(request))
+        finally:
+            service.waiting -= 1
         return Response(text, status, media_type="application/json")
 
     @app.get("/health")
@@ -250,6 +286,13 @@ def make_app(
 
     _describe_requests(app)
     return app
+
+
+def kind_of_reach(reach: Reach | None) -> str:
+    """Return the name of a reach: the option of the config group, or the class if it is of the user's own."""
+    path = f"{type(reach).__module__}.{type(reach).__qualname__}"
+    options = {path: name for name, path in names_at("env.reach").items()}
+    return "everywhere" if reach is None else options.get(path, path)
 
 
 def _describe_requests(app: FastAPI) -> None:

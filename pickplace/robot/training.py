@@ -35,7 +35,7 @@ class Training:
         """Return what a checkpoint's config says."""
         kinds = frozenset((int(w), int(d), int(h)) for w, d, h in items.sizes.tolist())
         env = cast(dict, OmegaConf.to_container(config.env, resolve=True))
-        cell = build_cell({"support": "half"} | env, reach=None)  # a table of reach may be elsewhere
+        cell = build_cell(env, reach=None)  # a table of reach may be elsewhere
         rules = {key: getattr(cell, key) for key in RULES}
         return cls(kinds, tuple(env["tote_size"]), tuple(env["effector_size"]), rules)
 

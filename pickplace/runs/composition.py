@@ -16,8 +16,8 @@ from hydra.errors import ConfigCompositionException, HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-#: Config groups whose options set parts of the group ``env`` (``# @package env``).
-PARTS_OF_ENV = ("effector", "reach")
+#: Config groups whose options set parts of the group ``env`` (``# @package env``), and their plainest options.
+PARTS_OF_ENV = {"effector": "paper", "reach": "everywhere"}
 
 LONGEST_NAME = 150  # letters of the name of a run folder; file systems allow 255 bytes
 
@@ -95,7 +95,16 @@ def keys_set_in_env(choice: str) -> list[str]:
     """Return the keys of ``env`` that an option of :data:`PARTS_OF_ENV` sets, such as ``reach`` for ``reach=annulus``.
 
     The search path is that of the running command.
+
+    Raises:
+        ValueError: for one that is removed (``~reach``): nothing says what would be there instead.
     """
+    if choice.startswith("~"):
+        group = choice[1:].partition("=")[0]
+        raise ValueError(
+            f"{choice}: the checkpoint's {group} can be exchanged, not removed; expected {group}={PARTS_OF_ENV[group]} "
+            "or another option."
+        )
     search = [word for word in HydraConfig.get().overrides.hydra if word.startswith("hydra.searchpath")]
     return [str(key) for key in hydra.compose(None, [*search, f"+{choice.lstrip('+')}"]).env]
 

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from pickplace.runs import checkpoint
 from pickplace.runs.allowlist import modules_to_trust, own_modules, trusted_config
-from pickplace.runs.composition import compose_plain
+from pickplace.runs.composition import PARTS_OF_ENV, compose_plain
 from pickplace.runs.errors import WorkerDied, sentence
 from pickplace.runs.folder import occupied, refuse_occupied
 from pickplace.runs.hydra_app import apply_overrides, refuse_unknown_keys
@@ -97,6 +97,11 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     if "threads" not in repeated and is_whole(saved.get("threads")) and saved.threads > cpu_count():
         log.warning("threads=%s of the checkpoint: going on with %d, all of this machine", saved.threads, cpu_count())
         saved["threads"] = cpu_count()
+    for word in given:
+        if word.key_or_group in PARTS_OF_ENV:
+            raise ValueError(
+                f"{word.input_line}: a resumed run keeps the {word.key_or_group} that it began with; start a new one."
+            )
     cfg = apply_overrides(saved, [str(word.input_line) for word in given if word.key_or_group != "trust"])
     for key in FIXED_KEYS:
         before, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)

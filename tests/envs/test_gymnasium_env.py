@@ -6,12 +6,17 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from commands import composed
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from pickplace import Failure, PickPlaceEnv
+from pickplace.runs.registry import build
+from pickplace.task.cell import CELL_SETTINGS
 from pickplace.task.items import Kinds, Recorded
+from pickplace.task.reach import Annulus
 
 ID = "pickplace/PickPlace-v0"
 SMALL = {"tote_size": (4, 5, 2), "items": [(1, 1, 1), (2, 1, 1), (2, 2, 1)]}
@@ -76,6 +81,34 @@ def test_a_single_environment_against_the_batched_one(seed, height):
             state = below.step(TensorDict({"action": torch.tensor([action])}, [1]))["next"]
             observation, reward, ended, truncated, info = env.step(action)
             assert (reward, ended, truncated) == (state["reward"].item(), state["terminated"].item(), False)
+
+
+def test_a_cup_and_a_reach_against_the_batched_environment_of_the_config():
+    """And against distances computed here: centres of cells, as the end effector's sides are odd."""
+    words = ["effector=cup_round", "reach=annulus", "env.bin_size=[9,8,2]", "env.tote_size=[14,12,8]"]
+    words += ["env.reach.radii=[8.5,15.5]", "env.reach.bin=[-16,-4,0]", "env.reach.tote=[4,-5,0]"]
+    cfg, items = OmegaConf.to_container(composed(*words).env), Kinds([(5, 4, 2), (4, 4, 3), (6, 5, 2)])
+    below = build("env", {**cfg, "num_envs": 1}, items=items, seed=6)
+    settings = {key: cfg[key] for key in CELL_SETTINGS if key != "reach"}
+    reach = Annulus((8.5, 15.5), (0, 10), (-16, -4, 0), (4, -5, 0))
+    env, free = (gymnasium.make(ID, items=items, **settings, reach=given) for given in (reach, None))
+    generator, forbidden, steps = np.random.default_rng(0), 0, 0
+    for episode in range(10):
+        seed = 6 if episode == 0 else None
+        state, (_, info), (_, unlimited) = below.reset(), env.reset(seed=seed), free.reset(seed=seed)
+        ended = False
+        while not ended:
+            mask = info["action_mask"]
+            assert np.array_equal(mask, state["action_mask"][0].numpy())
+            x_b, y_b, x_t, y_t, _ = np.unravel_index(np.arange(mask.size), (9, 8, 14, 12, 4))
+            picks, places = np.hypot(x_b - 15.5, y_b - 3.5), np.hypot(x_t + 4.5, y_t - 4.5)
+            within = np.logical_and.reduce([(part >= 8.5) & (part <= 15.5) for part in (picks, places)])
+            assert np.array_equal(mask, unlimited["action_mask"] & within)
+            forbidden, steps = forbidden + (unlimited["action_mask"] & ~within).sum(), steps + 1
+            action = feasible([mask], generator)[0]
+            state = below.step(TensorDict({"action": torch.tensor([action])}, [1]))["next"]
+            (_, _, ended, _, info), (*_, unlimited) = env.step(action), free.step(action)
+    assert forbidden > 0 and steps > 20
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))

@@ -9,9 +9,13 @@ from untrained import write_checkpoint
 
 from pickplace import CellSpec, Planner, load_policy
 from pickplace.runs import checkpoint
+from pickplace.runs.resume import resumed_config
 from pickplace.task.reach import Annulus, ReachTable
+from pickplace.training.train import resume_run
 
 TINY = ["env.tote_size=[6,6,2]", "total_frames=128", "reach=annulus", "env.reach.radii=[4.6,9.7]"]
+WIDE_REACH = ([3, 30], [0, 9], [-12, -4, 0], [4, -4, 0])
+WIDE = [f"env.reach.{key}={value}" for key, value in zip(("radii", "heights", "bin", "tote"), WIDE_REACH, strict=True)]
 EVALUATION = ["evaluation.episodes=2", "evaluation.latency_decisions=0", "evaluation.replay=1"]
 
 
@@ -56,6 +60,13 @@ def test_a_checkpoint_brings_its_reach(trained, evaluation):
     assert everywhere["env"]["reach"] is None
     error = evaluation(f"checkpoint={trained}", "reach=everywhere", f"compare={plain['folder']}/evaluation.json")
     assert "env.reach={" in error and "expected None" in error
+    for word, expected in (
+        ("~reach", "reach=everywhere"),
+        ("~effector", "effector=paper"),
+        ("~reach=null", "reach=everywhere"),
+    ):
+        error = evaluation(f"checkpoint={trained}", word)
+        assert f"error: {word}: " in error and f"expected {expected}" in error and error.count("\n") == 1
     assert "env.reach.radi:" in evaluation(f"checkpoint={trained}", "env.reach.radi=[1,2]")
 
 
@@ -105,8 +116,19 @@ def test_physics_carries_out_poses_in_reach(evaluation):
             assert 0.26 - 1e-6 <= hypot(x, y) <= 0.48 + 1e-6 and 0.025 - 1e-6 <= face <= 0.125 + 1e-6
 
 
-def test_a_resumed_run_keeps_its_reach(trained):
-    from pickplace.runs.resume import resumed_config
+def test_a_resumed_run_keeps_its_cell(trained, smoke, tmp_path):
+    """Options of ``reach`` and ``effector`` are refused, as other settings of the cell are."""
+    run_dir = tmp_path / "run"
+    smoke(run_dir, *TINY, "effector=cup_round", "env.effector_size=[3,3]", "items.kinds=[[3,3,1],[4,3,1]]", *WIDE)
+    begun = load_policy(run_dir).cell
+    assert begun.body == begun.cup == "disc" and begun.pick_rule == "seal" and begun.reach == Annulus(*WIDE_REACH)
+    before = checkpoint.read(checkpoint.locate(run_dir, prefer="last"))[1]
+    resume_run([f"resume={run_dir}", "total_frames=256"])
+    after = checkpoint.read(checkpoint.locate(run_dir, prefer="last"))[1]
+    assert (before["frames"], after["frames"]) == (128, 256) and after["config"]["env"] == before["config"]["env"]
+    for word in ("reach=everywhere", "reach=annulus", "effector=paper", "~reach"):
+        with pytest.raises(ValueError, match=f"^{word}: a resumed run keeps the (reach|effector) that it began with"):
+            resume_run([f"resume={run_dir}", word, "total_frames=384"])
 
     _, facts = checkpoint.read(checkpoint.locate(trained, prefer="last"))
     assert resumed_config("run", facts, ["total_frames=256"]).env.reach == composed(*TINY).env.reach

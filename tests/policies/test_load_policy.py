@@ -6,7 +6,7 @@ from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from untrained import write_checkpoint
 
-from pickplace import CellSpec, load_policy
+from pickplace import CellSpec, Planner, load_policy
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import as_collection_policy
 from pickplace.task.observation import STANDARD_TERMS
@@ -51,6 +51,17 @@ def test_other_sizes_and_shipped_weights():
     policy = load_policy("pretrained/r4", tote_size=(7, 8, 3), rotations=3)
     data = policy.make_env(num_envs=4, items=None, stream="test").rollout(60, policy)
     assert policy.cell == CellSpec(tote_size=(7, 8, 3), rotations=3) and data["next", "occupancy"].max() > 0.7
+
+
+def test_weights_from_before_the_setting_support_were_trained_under_half(tmp_path):
+    """Also where a robot's planner compares its cell with that of the training."""
+    old = write_checkpoint(tmp_path / "run", CellSpec(support="half"), "~env.support", "env.tote_size=[6,6,5]")
+    assert load_policy(old).cell.support == load_policy(old).make_env().cell.support == "half"
+    item = {"bin_depth": torch.eye(5) * (torch.arange(5) == 2), "tote_depth": torch.full((6, 6), 5)}
+    assert Planner.load(old).plan(**item).warnings == []
+    other = Planner.load(old, support="bearing")
+    assert other.cell.support == "bearing"
+    assert other.plan(**item).warnings == ["support=bearing: the policy met support=half."]
 
 
 @pytest.mark.parametrize(

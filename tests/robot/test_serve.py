@@ -4,11 +4,13 @@ import http.client
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
@@ -50,14 +52,14 @@ class Client:
 
 
 @contextmanager
-def served(*arguments, token=None):
-    """Start ``pickplace-serve`` on a free port, and end it by Ctrl-C."""
+def served(*arguments, token=None, before="pass"):
+    """Start ``pickplace-serve`` on a free port, after some code, and end it by Ctrl-C."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     environment.pop(serve.TOKEN, None)
     if token:
         environment[serve.TOKEN] = token
     code = (
-        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        f"import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); {before}; "
         "from pickplace.cli import serve; sys.argv[0] = 'pickplace-serve'; serve()"
     )
     process = subprocess.Popen(
@@ -96,12 +98,43 @@ def test_a_plan_is_that_of_the_planner(client):
 def test_the_client_of_the_docs(client):
     command = [sys.executable, ROOT / "docs/examples/plan_client.py", f"http://127.0.0.1:{client.port}"]
     assert json.loads(subprocess.run(command, check=True, capture_output=True).stdout)["status"] == "ok"
+    command[-1] += "/elsewhere"
+    assert json.loads(subprocess.run(command, check=True, capture_output=True).stdout) == {"error": "Not Found"}
+
+
+def test_the_client_of_the_docs_meets_another_program():
+    class Busy(BaseHTTPRequestHandler):
+        def do_POST(self):  # noqa: N802
+            self.send_error(503, "Full")
+
+        def log_message(self, *_):
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Busy) as server:
+        threading.Thread(target=server.handle_request, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}"
+        command = [sys.executable, ROOT / "docs/examples/plan_client.py", url]
+        answer = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+    wanted = "HTTP Error 503: Full, and no JSON; expected the address of pickplace-serve."
+    assert answer == {"error": f"{url}: {wanted}"}
 
 
 def test_health_says_what_is_served(client):
     status, _, health = client.ask("GET", "/health")
     assert status == 200 and (health["version"], health["checkpoint"]) == (__version__, "pretrained/r4")
     assert health["planner"] == "policy" and health["cell"]["tote_size"] == [6, 6, 5]
+    assert health["cell"]["reach"] == "everywhere"
+
+
+def test_health_says_no_more_of_a_reach_than_its_kind(tmp_path):
+    """It needs no token."""
+    rows = [f"bin,{x},{y},,," for x in range(5) for y in range(5)]
+    rows += [f"tote,{x},{y},{r},," for x in range(6) for y in range(6) for r in range(4)]
+    (tmp_path / "poses.csv").write_text("\n".join(["where,x,y,rotation,lowest,highest", *rows]))
+    (tmp_path / "table.yaml").write_text(f"reach: {{_target_: table, path: {tmp_path}/poses.csv}}")
+    for file, kind in ((tmp_path / "table.yaml", "table"), (ROOT / "conf/reach/annulus.yaml", "annulus")):
+        with served("--planner", "joint_dbl", "--reach", file, token=TOKEN) as client:
+            assert client.ask("GET", "/health")[2]["cell"]["reach"] == kind
 
 
 @pytest.mark.parametrize(
@@ -129,7 +162,9 @@ def test_strangers_pages_are_refused(client):
         assert client.plan(json.dumps(GRID).encode(), Content_Type=kind)[0] == 415
     assert client.plan(GRID, Content_Type="application/json; charset=utf-8")[0] == 200
     for path in ("/health", "/plans", "/"):
-        assert client.ask("GET", path, Host="evil.example")[0] == 400
+        for host in ("evil.example", "localhost.evil.example:80", "127.0.0.1:80:80", "", "\xe9"):
+            status, headers, reply = client.ask("GET", path, Host=host)
+            assert status == 400 and set(reply) == {"error"} and "Host: got" in reply["error"]
         status, headers, _ = client.ask("GET", path, Host="localhost", Origin="http://evil.example")
         assert status == 200 and "Access-Control-Allow-Origin" not in headers
     assert client.ask("GET", "/plan")[0] == 405 and client.ask("GET", "/docs")[0] == 404
@@ -173,6 +208,115 @@ def test_openapi_describes_requests_and_answers(client):
     defaults = {key: entry.get("default") for key, entry in schemas["PlanRequest"]["properties"].items()}
     parsed = vars(serve.parser().parse_args([]))
     assert all(defaults[key] == parsed[key] for key in ("accuracy", "clearance", "alternatives"))
+
+
+def open_sockets(client, count, text):
+    """Return connections over which each a text was sent; their buffers are small."""
+    sockets = []
+    for _ in range(count):
+        one = socket.socket()
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
+        one.settimeout(20)
+        one.connect(("127.0.0.1", client.port))
+        one.sendall(text)
+        sockets.append(one)
+    return sockets
+
+
+def wait_for(condition):
+    """Wait until a condition holds."""
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def is_ended(one):
+    """Return whether the server ends a connection, after what it had written."""
+    try:
+        while one.recv(2**16):
+            pass
+    except ConnectionError:
+        pass
+    except TimeoutError:
+        return False
+    return True
+
+
+IMPATIENT = "from pickplace.robot import connections; connections.CLIENT_SECONDS = 1"
+LINE = b"GET /health HTTP/1.1\r\n"
+FIRST = LINE + b"Host: localhost\r\n\r\n"
+LONG = b"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: text/plain\r\nContent-Length: 9999\r\n\r\n"
+PAGES = FIRST.replace(b"/health", b"/") * 1000  # answers of many megabytes, for a client that reads none of them
+
+
+@pytest.mark.parametrize("text", [b"", LINE, FIRST + LINE, LONG, PAGES], ids=["", "line", "second", "body", "answer"])
+def test_clients_that_stop_are_cut_off(text):
+    """In the headers of the first request or of a later one, in a body that was refused, or while they are answered.
+
+    A byte now and then does not help; nor do they keep others out for good.
+    """
+    with served("--planner", "joint_dbl", before=IMPATIENT) as client:
+        begin = time.monotonic()
+        sockets = open_sockets(client, 32, text)
+        status, headers, reply = client.ask("GET", "/health")
+        assert status == 503 and set(reply) == {"error"} and headers["Retry-After"] == "1"
+        try:
+            while time.monotonic() < begin + 5:
+                for one in sockets if text != PAGES else ():
+                    one.sendall(b"x")
+                time.sleep(0.2)
+        except ConnectionError:
+            pass
+        assert client.ask("GET", "/health")[0] == 200
+        assert all(map(is_ended, sockets))
+
+
+def test_a_client_may_wait_and_begin_anew():
+    """For a plan longer than it may take for its headers, and with a body that comes late, on one connection."""
+    slow = "import time; from pickplace import Planner; plan = Planner.plan; "
+    slow += "Planner.plan = lambda *given, **named: time.sleep(4) or plan(*given, **named)"
+    with served("--planner", "joint_dbl", before=f"{IMPATIENT.replace('= 1', '= 3')}; {slow}") as client:
+        body = json.dumps(GRID).encode()
+        head = (
+            f"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: {len(body)}"
+        )
+        (one,) = open_sockets(client, 1, head.encode() + b"\r\n\r\n")
+        for _ in range(2):
+            time.sleep(4)
+            one.sendall(body)
+            reply = http.client.HTTPResponse(one)
+            reply.begin()
+            assert reply.status == 200 and json.loads(reply.read())["status"] == "ok"
+            one.sendall(head.encode())
+            time.sleep(0.2)
+            one.sendall(b"\r\n\r\n")
+        one.close()
+
+
+def test_slow_bodies_take_up_places():
+    head = b"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 99\r\n\r\n{"
+    with served("--planner", "joint_dbl", "--rate", 1e6) as client:
+        sockets = open_sockets(client, 20, head)
+        wait_for(lambda: client.plan(GRID)[0] == 429)
+        status, headers, reply = client.plan(GRID)
+        assert status == 429 and headers["Retry-After"] == "1" and "too many plans" in reply["error"]
+        for one in sockets:
+            one.close()
+        wait_for(lambda: client.plan(GRID)[0] == 200)
+
+
+def test_a_refused_body_has_spent_its_plan():
+    with served("--planner", "joint_dbl", "--rate", 3) as client:
+        assert [client.plan(body)[0] for body in (b"{", b" " * (2**24 + 1), GRID, GRID)] == [400, 413, 200, 429]
+
+
+def test_a_fault_is_answered_in_json():
+    fault = "import logging; logging.disable(); from pickplace import Planner; Planner.plan = None"
+    with served("--planner", "joint_dbl", before=fault) as client:
+        status, _, reply = client.plan(GRID)
+        assert (status, reply) == (500, {"error": "the service failed; its log says more."})
+        assert client.ask("GET", "/health")[0] == 200
 
 
 def test_a_token_is_asked_for():

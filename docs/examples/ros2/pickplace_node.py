@@ -1,4 +1,4 @@
-"""A ROS 2 node: depth images in, poses for a pick and a place out. Not tested; see README.md."""
+"""A ROS 2 node: depth images in, poses for a pick and a place out. Not tested with ROS; see README.md."""
 
 import math
 
@@ -34,13 +34,15 @@ class PickPlaceNode(Node):
         self.accuracy = number("accuracy", 0.003).value  # greatest error of a height, m
         self.clearance = number("clearance", 0.005).value  # m
         self.longest_age = number("longest_age", 1.0).value  # of an image that is planned from, s
-        tote_size = number("tote_size", [6, 6, 5]).value  # cells
-        self.planner = Planner.load(checkpoint, tote_size=tuple(tote_size))
-        # [4, 4] row by row: the camera's optical frame in the frame of the bin, and of the tote. Here: 1.2 m above.
+        tote_size = tuple(number("tote_size", [0, 0, 0]).value)  # cells; zeros: as trained
+        self.planner = Planner.load(checkpoint, **({"tote_size": tote_size} if any(tote_size) else {}))
+        cell = self.planner.cell
+        # [4, 4] row by row: the camera's optical frame in the frame of the bin, and of the tote.
+        # Here: 1.2 m above the middle.
         self.poses = {}
-        for place, middle in (("bin", 0.125), ("tote", 0.15)):
+        for place, (wide, deep, _) in (("bin", cell.bin_size), ("tote", cell.tote_size)):
             above = np.diag((1.0, -1.0, -1.0, 1.0))
-            above[:3, 3] = middle, middle, 1.2
+            above[:3, 3] = wide * self.cell_size / 2, deep * self.cell_size / 2, 1.2
             self.poses[place] = number(f"{place}_camera_pose", above.ravel().tolist()).value
         self.images, self.infos = {}, {}
         for place in self.poses:
@@ -52,13 +54,13 @@ class PickPlaceNode(Node):
                 self.create_subscription(kind, f"{place}/{topic}", keep, qos_profile_sensor_data)
         self.publishers_of = {frame: self.create_publisher(PoseStamped, f"~/{name}", 1)
                               for frame, name in (("bin", "pick"), ("tote", "place"))}  # fmt: skip
-        self.bearing = self.next_bearing = None
+        self.bearing = self.open = None  # where the tote bears weight, and the plan that the robot carries out
         for name in ("plan", "placed", "new_tote"):
             self.create_service(Trigger, f"~/{name}", getattr(self, name))
 
     def plan(self, _, response):
         """Plan, publish both poses, and answer with the status; without a plan nothing is published."""
-        self.next_bearing = None
+        self.open = None
         try:
             depth = {place: self.depth_of(place) for place in self.poses}
             cameras = {place: self.camera_of(place) for place in self.poses}
@@ -73,22 +75,22 @@ class PickPlaceNode(Node):
             return response
         response.success, response.message = plan.status == "ok", plan.status
         if plan.status == "ok":
-            self.next_bearing = plan.tote_bearing
+            self.open = plan
             self.publish("bin", plan.pick)
             self.publish("tote", plan.place)
         return response
 
     def placed(self, _, response):
         """Note that the tote holds what the last plan put there."""
-        response.success = self.next_bearing is not None
+        response.success = self.open is not None
         response.message = "" if response.success else "no plan is open"
         if response.success:
-            self.bearing, self.next_bearing = self.next_bearing, None
+            self.bearing, self.open = self.open.tote_bearing, None
         return response
 
     def new_tote(self, _, response):
         """Forget the tote."""
-        self.bearing = self.next_bearing = None
+        self.bearing = self.open = None
         response.success = True
         return response
 
