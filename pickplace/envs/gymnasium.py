@@ -76,6 +76,13 @@ class PickPlaceGymEnv(gymnasium.Env):
     | `tote_bearing` | `(W_T, D_T)` float32 | 1 where the cell bears weight, else 0; all 1 unless `support=bearing` |
     | `tote_height` | `(1,)` int64 | height of the episode's tote; height units |
 
+    With `bin_items=M` above 1 also
+
+    | key | shape, type | meaning |
+    |---|---|---|
+    | `bin_labels` | `(W_B, D_B)` float32 | number of the item on each cell of the bin, from 1; 0 where empty |
+    | `items` | `(M, 5)` int64 | x, y, w, d, h of each item in the bin; zeros: none |
+
     and what `observation=` adds (see `PickPlaceEnv`).
 
     ## Rewards
@@ -87,7 +94,7 @@ class PickPlaceGymEnv(gymnasium.Env):
     without a seed go on to its next episode. `options={"tote_height": h}` sets the height of this episode's tote.
 
     ## Episode End
-    Termination: the action fails, or nothing can be done with the item that arrives. Truncation: a recorded item stream
+    Termination: the action fails, or nothing can be done with any item in the bin. Truncation: a recorded item stream
     has ended; nothing more comes then, so a learner that continues truncated episodes by a value had better take 0.
 
     ## Information
