@@ -64,12 +64,12 @@ def test_recordings_are_what_happened(cell, planner):
             assert space.max() == move.z
             space[:] = move.z + h
         failed = recording.moves[len(recording.boxes) :]
-        assert [move.failure for move in failed] == [recording.ending] * (recording.waiting is None)
+        assert [move.failure for move in failed] == [recording.ending] * (not recording.waiting)
         assert (heights == result.final_heights[number].numpy()).all()
         volume = sum(w * d * h for *_, w, d, h in recording.boxes)
         assert volume / heights.size / recording.tote_height == pytest.approx(recording.occupancy)
         assert recording.occupancy == float(result.occupancy[number])
-        assert (recording.waiting is not None) == (recording.ending == Failure.STUCK)
+        assert (len(recording.waiting) == 1) == (recording.ending == Failure.STUCK)
         assert len(recording.boxes) == int(result.items_placed[number])
 
 
@@ -95,11 +95,11 @@ def test_page_is_one_file_that_holds_the_episodes():
 
 def test_heights_on_the_page_are_in_cells():
     moves = [Move((0, 0, 2, 1, h), (0, 0), (0, 0), 0, (0, 0, 2, 1), z, Failure.NONE) for z, h in ((0, 3), (3, 2))]
-    recording = Recording(0, 6, moves, Failure.STUCK, (1, 1, 1, 1, 7), 0.5)
+    recording = Recording(0, 6, moves, Failure.STUCK, [(1, 1, 1, 1, 7)], 0.5)
     cell = CellSpec(bin_size=(5, 5, 3), height_unit=0.1)
     data = unpack(replay.page([recording], cell, ""))
     episode = data["episodes"][0]
-    assert (data["bin"], episode["height"], episode["waiting"]) == ([5, 5, 0.3], 0.6, [1, 1, 1, 1, 0.7])
+    assert (data["bin"], episode["height"], episode["waiting"]) == ([5, 5, 0.3], 0.6, [[1, 1, 1, 1, 0.7]])
     assert [(move[4], move[14]) for move in episode["moves"]] == [(0.3, 0), (0.2, 0.3)]
     assert set(data["colours"]) == {"1,2,0.3", "1,2,0.2", "1,1,0.7"}
     double = unpack(replay.page([recording], CellSpec(height_unit=2), ""))
@@ -176,7 +176,7 @@ def test_page_opens_steps_plays_and_changes_episodes(browser, tmp_path):
 def test_page_of_very_many_moves(browser, tmp_path):
     """More than a function takes arguments."""
     moves = [Move((1, 1, 1, 1, 1 + n % 2), (0, 0), (0, 0), 0, (0, 0, 1, 1), 0, Failure.NONE) for n in range(1500)]
-    recordings = [Recording(n, 5, moves, Failure.STUCK, (0, 0, 1, 1, 4), 1.0) for n in range(100)]
+    recordings = [Recording(n, 5, moves, Failure.STUCK, [(0, 0, 1, 1, 4)], 1.0) for n in range(100)]
     state = open_page(browser, written(tmp_path, recordings, CellSpec()))
     assert state()["moves"] == 1500 and errors(browser) == []
 
@@ -203,7 +203,7 @@ def test_page_shows_what_physics_did(browser, tmp_path):
     plate = [(0, -0.3, 0.05, 0.3, 1, 0, 0, 0), (8, -0.3, 0.05, 0.3, *turned)]
     motion = Motion((-0.5, 0.1), 10, plate, [first, second], [5, 10])
     carried_out = CarriedOut("Item 2 left its place.", "item 2 left its place", 1, 1, 0.25, 0.05, motion)
-    recording = Recording(0, 5, moves, Failure.STUCK, None, 0.5, carried_out)
+    recording = Recording(0, 5, moves, Failure.STUCK, [], 0.5, carried_out)
     path = written(tmp_path, [recording], CellSpec())
     assert unpack(path.read_text())["binAt"] == [-10, 2]
     state = open_page(browser, path)
@@ -239,7 +239,7 @@ def test_page_shows_what_physics_did(browser, tmp_path):
     kept = CarriedOut(
         "Carried out.", "carried out", None, 1, 2 / 180, 0.05, Motion((-0.5, 0.1), 5, plate, [first], [5])
     )
-    recording = Recording(0, 5, [moves[0], failing], Failure.TOTE_COLLISION, None, 2 / 180, kept)
+    recording = Recording(0, 5, [moves[0], failing], Failure.TOTE_COLLISION, [], 2 / 180, kept)
     state = open_page(browser, written(tmp_path, [recording], CellSpec()), "#step=9")
     assert state()["ending"] == f"Carried out. {Failure.TOTE_COLLISION.sentence}"
     assert browser.find_element("id", "ending").get_attribute("class") == "bad" and state()["moves"] == 1
