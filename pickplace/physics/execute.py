@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import pi
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -126,7 +126,7 @@ class Gantry(Scene):
     def __init__(self, options: Execute, plan: EpisodePlan):
         super().__init__(options.friction, options.density, options.gap, options.sleep, options.contact_damping)
         self.options, self.holding = options, False
-        self.weld: mujoco.MjsEquality | None = None  # between the plate and the last one of the boxes
+        self.weld: Any = None  # MuJoCo's, between the plate and the last one of the boxes
         # So far apart that an end effector that hangs over a wall of one hits no wall of the other.
         distance = 2 * WALL + 2 * max(plan.effector) + 0.1
         self.bin = np.array((-plan.bin[0] - distance, (plan.tote[1] - plan.bin[1]) / 2))
@@ -286,7 +286,7 @@ class Gantry(Scene):
         return None
 
     def _is_reached(self, body, below: bool = False) -> bool:
-        """Return whether the lip reaches an item; with ``below``, only if the item is below the plate, not beside it."""
+        """Return whether the lip reaches an item; with ``below`` only one below the plate, not beside it."""
         for geom in self._plate_geoms:
             ends = np.zeros(6)  # of the shortest line between the two
             distance = mujoco.mj_geomDistance(self.model, self.data, geom, body.geoms[0].id, 0.1, ends)
@@ -308,7 +308,8 @@ class Gantry(Scene):
     def _step(self) -> Loss | None:
         """Let a little time pass; return what was lost in it."""
         number, start = len(self.boxes) - 1, self.model.body_dofadr[self.boxes[-1].id]
-        before = self.data.qvel[start : start + 3].copy()
+        velocity = self.data.qvel[start : start + 3]
+        before = velocity.copy()
         self.step(STEPS_PER_LOOK)
         if self.diverged:
             return Loss("diverged", number)
@@ -321,7 +322,9 @@ class Gantry(Scene):
             return Loss("effector_contact", number)
         if self.holding:
             # From the motion: with drives that are integrated implicitly, the weld's force is not what it transmits.
-            acceleration = (self.data.qvel[start : start + 3] - before) / (STEPS_PER_LOOK * TIMESTEP) - self.model.opt.gravity
+            acceleration = (self.data.qvel[start : start + 3] - before) / (
+                STEPS_PER_LOOK * TIMESTEP
+            ) - self.model.opt.gravity
             if self.model.body_mass[item.id] * np.linalg.norm(acceleration) > self.options.suction:
                 return Loss("dropped", number)
         return Loss("disturbed", number) if self.waiting and self.is_disturbed else None

@@ -14,8 +14,8 @@ which is all that ``settle`` needs, and for a robot (of these only their types a
   rectangles that make it up, ``[[x, y, w, d], ...]``, from its near corner.
 * ``pick`` and ``place``: its centre when it sucks and when it releases, ``[x, y]``, in the frames of bin and tote.
 * ``rotation``: turn between the two, counter-clockwise seen from above; 0, 90, 180 or 270 degrees.
-* ``neighbours``, if the item does not lie alone: what else lies in the bin, ``[[x, y, w, d, h], ...]``, near corners and
-  sides. An item that keeps its place from one line to the next is the same one, and stays there until it is taken.
+* ``neighbours``, if the item does not lie alone: what else lies in the bin, ``[[x, y, w, d, h], ...]``, near corners
+  and sides. An item lies there from the first line that names it until it is taken.
 """
 
 import json

@@ -136,10 +136,10 @@ def test_what_the_rules_call_feasible_is_carried_out(settings):
 
 def beside(x, height, depth=0.1):
     """Return the first item of these tests beside another item in the bin, 5 cm wide, that begins at ``x``."""
-    return replace(placed(*LOW, (0.026, 0)), neighbours=((x, 0.1, 0.05, depth, height),))
+    return replace(placed(*LOW, (0.025, 0)), neighbours=((x, 0.1, 0.05, depth, height),))
 
 
-@pytest.mark.parametrize(("placement", "ending"), [  # the item lies at 0.1 to 0.2 m, and the plate hangs at 0.101 to 0.251
+@pytest.mark.parametrize(("placement", "ending"), [  # the item lies at 0.1 to 0.2 m, and the plate hangs at 0.1 to 0.25
     (beside(0.2, 0.05), "effector_contact"),  # level with the item: the lip would suck it, too
     (beside(0.2, 0.1), "effector_contact"),  # higher
     (beside(0.2, 0.04), "done"),  # lower
@@ -172,7 +172,9 @@ def test_an_item_waits_in_the_bin_until_it_is_taken():
     scene.motion = Motion(tuple(start))
     assert execute.place(scene, first, np.zeros(2)) is None
     (waiting,) = scene.waiting.values()
-    assert len(scene.bodies) == 2 and np.allclose(scene.data.xpos[waiting.id], (*(start + (0.15, 0.05)), 0.02), atol=1e-4)
+    assert len(scene.bodies) == 2 and np.allclose(
+        scene.data.xpos[waiting.id], (*(start + (0.15, 0.05)), 0.02), atol=1e-4
+    )
     assert execute.place(scene, second, np.zeros(2)) is None
     assert len(scene.bodies) == 3 and scene.boxes[1].name == waiting.name
     assert np.allclose(scene.data.xpos[waiting.id], (0.15, 0.25, 0.02), atol=1e-3) and list(scene.waiting) == [C]
@@ -183,7 +185,9 @@ def test_an_item_waits_in_the_bin_until_it_is_taken():
     for poses, box in zip(motion.boxes, (A, B, C), strict=True):
         assert np.allclose(poses[0][1:4], (*(start + box[:2] + np.divide(box[2:4], 2)), box[4] / 2), atol=1e-4)
     assert a[0][0] <= 1 and b[0][0] <= 1 and motion.ends[0] <= c[0][0] <= motion.ends[0] + 1 and len(c) == 1
-    assert b[1][0] > motion.ends[0] and np.allclose(b[-1][1:4], (0.15, 0.25, 0.02), atol=1e-3)  # not before its own turn
+    assert b[1][0] > motion.ends[0] and np.allclose(
+        b[-1][1:4], (0.15, 0.25, 0.02), atol=1e-3
+    )  # not before its own turn
 
 
 def test_a_neighbour_hardly_wider_than_the_gap_is_refused():

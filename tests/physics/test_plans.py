@@ -70,13 +70,14 @@ def test_a_recorded_episode_in_metres(tmp_path):
     ),
     ({"body": [[0, 0, 0.1, 0.1]]}, "bin: missing"),
     *(
-        ({**ROBOT, "neighbours": value}, "neighbours=.*: expected up to 100 boxes x, y, w, d, h with sides above 0, in met")
+        ({**ROBOT, "neighbours": value}, "neighbours=.*: expected up to 100 boxes x, y, w, d, h with sides above 0")
         for value in (
             "one", {}, None, [0.1], [[0.1, 0.1, 0.1, 0.1]], [[0.1, 0.1, 0.1, 0.1, 0]], [[1e3, 0, 0.1, 0.1, 0.1]],
             [[0.1, 0.1, 0.1, 0.1, None]], [[n, 1, 0.5, 0.5, 0.5] for n in range(101)],
         )
     ),
-    ({**ROBOT, "size": [0.1, 0.05, 0.05], "neighbours": [[0.04, 0, 0.1, 0.1, 0.1]]}, r"neighbours: \[0.04, 0, .*\] overlaps \[0.0, 0.0, 0.05, 0.1"),
+    ({**ROBOT, "size": [0.1, 0.05, 0.05], "neighbours": [[0.04, 0, 0.1, 0.1, 0.1]]},
+     r"neighbours: \[0.04, 0, .*\] overlaps \[0.0, 0.0, 0.05, 0.1"),
     ({**ROBOT, "neighbours": [[0.1, 0.1, 0.1, 0.1, 0.1]] * 2}, "neighbours: .* overlaps .* in the bin"),
     ({"neighbours": [[0.1, 0.1, 0.1, 0.1, 0.1]]}, "bin: missing"),
 ])  # fmt: skip
