@@ -322,9 +322,7 @@ class Gantry(Scene):
             return Loss("effector_contact", number)
         if self.holding:
             # From the motion: with drives that are integrated implicitly, the weld's force is not what it transmits.
-            acceleration = (self.data.qvel[start : start + 3] - before) / (
-                STEPS_PER_LOOK * TIMESTEP
-            ) - self.model.opt.gravity
+            acceleration = (velocity - before) / (STEPS_PER_LOOK * TIMESTEP) - self.model.opt.gravity
             if self.model.body_mass[item.id] * np.linalg.norm(acceleration) > self.options.suction:
                 return Loss("dropped", number)
         return Loss("disturbed", number) if self.waiting and self.is_disturbed else None
