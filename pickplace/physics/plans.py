@@ -7,7 +7,8 @@ A line has the keys
 * ``corner``: near corner of the item at rest in the tote, ``[x, y, z]``, from the tote's near corner on its floor.
 * ``size``: sides of the item as it lies in the tote, ``[w, d, h]``.
 
-which is all that ``settle`` needs, and for a robot (of these only their types are checked, and that items in the bin do not overlap)
+which is all that ``settle`` needs, and for a robot (of these only their types are checked, and that nothing overlaps in
+the bin)
 
 * ``bin``: inner sides of the bin, ``[w, d, h]``; ``item``: near corner of the item in the bin, ``[x, y]``.
 * ``effector``: sides of the end effector as it hangs over the bin, ``[w, d]``; ``body``, if it is not a rectangle:
