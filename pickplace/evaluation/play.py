@@ -17,7 +17,7 @@ from pickplace.task.checks import check_bytes, one_of, whole_number
 from pickplace.task.feasibility import num_feasible, placing_maps
 from pickplace.task.items import check_seed
 from pickplace.task.state import Failure
-from pickplace.views.recording import Recording, record_moves
+from pickplace.views.recording import Recording, items_in_bin, record_moves
 
 #: ``make_env(first_episode, num_envs)`` makes the environment for a share of the episodes.
 MakeEnv = Callable[[int, int], PickPlaceEnv]
@@ -107,7 +107,7 @@ class _Batch:
             if ended[slot]:
                 recording.ending, recording.occupancy = Failure(int(self.failure[slot])), float(occupancy[slot])
                 if recording.ending == Failure.STUCK:
-                    recording.waiting = tuple(env.state.items.table[slot, 0].tolist())
+                    recording.waiting = items_in_bin(env.state.items, slot)
 
 
 def check_episode_settings(evaluation: Mapping) -> None:

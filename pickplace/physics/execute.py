@@ -1,13 +1,14 @@
 """``execute``: a gantry with a suction plate carries each item from the bin to the tote."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import pi
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from pickplace.physics.outcome import Loss
-from pickplace.physics.plans import EpisodePlan, Placement, Point
+from pickplace.physics.plans import TOLERANCE, EpisodePlan, Placement, Point
 from pickplace.physics.scene import STIFF, TIMESTEP, WALL, Scene, mujoco
 from pickplace.physics.simulation import Simulation, wait
 from pickplace.task.checks import number
@@ -25,10 +26,12 @@ STEPS_PER_LOOK = 2  # steps of the simulation between two looks at contacts and 
 @dataclass(frozen=True)
 class Execute(Simulation):
     """A gantry carries each item (config ``physics=execute``): over the bin, down, suction, up, over the rim while it
-    turns, down, release, up.
+    turns, down, release, up. An item that lies in the bin beside others stays there until it is taken.
 
     Losses besides ``collapsed``: ``dropped``, the plate reached no item or lost it; ``effector_contact``, the plate
-    touched a wall or another item; ``wedged``, the item is not where it was planned to be at its release.
+    touched a wall or another item, or its lip reached an item in the bin that it shall not take; ``disturbed``, an item
+    that waits in the bin moved, by whatever pushed it; ``wedged``, the item is not where it was planned to be at its
+    release.
 
     Args:
         plate_thickness: thickness of the end effector; m.
@@ -39,7 +42,7 @@ class Execute(Simulation):
         release_height: of an item above its planned pose when it is released; m.
         suction: force along any direction that the suction bears; N.
         contact_force: force on the plate from which on a contact counts; N.
-        tolerance: greatest error of an item's position at release; m.
+        tolerance: greatest error of an item's position at release, and in the bin while it waits; m.
         speed: greatest speed of the plate; m/s.
         slow_speed: the same on its last centimetres down and its first ones up; m/s.
     """
@@ -75,11 +78,15 @@ class Execute(Simulation):
             raise ValueError(f"physics.plate_diameter={self.plate_diameter:g}: expected at most {most:g}, its cells.")
         for _, _, *sides in plan_body(plan):
             self.check_width(f"episode {plan.episode}, end effector", sides)
+        for index, placement in enumerate(plan.placements, 1):
+            for box in placement.neighbours:
+                self.check_width(f"episode {plan.episode}, a neighbour of item {index}", box[2:])
         return Gantry(self, plan)
 
     def place(self, gantry: "Gantry", placement: Placement, error: np.ndarray) -> Loss | None:
         height = placement.size[2]
-        gantry.add((*(gantry.bin + placement.item), 0.0), bin_size(placement), placement.centre)
+        gantry.fill(placement.neighbours)
+        gantry.take((*placement.item, *bin_size(placement)), placement.centre)
         low = placement.corner[2] + height + self.lip + self.release_height
         pick, place = gantry.bin + placement.pick, placement.place + error
         turn = ((placement.rotation + 90) % 360 - 90) / 180 * pi  # the short way round
@@ -111,25 +118,26 @@ class Gantry(Scene):
         plan: has the sizes.
 
     Attributes:
-        rim: height of the higher one of tote and bin.
+        rim: height of the highest of tote, bin and what waits in it.
         goal: commanded centre of the plate's lower face and its turn, m and rad, ``[4]``.
-        holding: whether the plate holds the item that was added last.
+        holding: whether the plate holds the last one of :attr:`boxes`.
     """
 
     def __init__(self, options: Execute, plan: EpisodePlan):
         super().__init__(options.friction, options.density, options.gap, options.sleep, options.contact_damping)
         self.options, self.holding = options, False
-        self.weld: mujoco.MjsEquality
+        self.weld: Any = None  # MuJoCo's, between the plate and the last one of the boxes
         # So far apart that an end effector that hangs over a wall of one hits no wall of the other.
         distance = 2 * WALL + 2 * max(plan.effector) + 0.1
         self.bin = np.array((-plan.bin[0] - distance, (plan.tote[1] - plan.bin[1]) / 2))
-        self.rim = max(plan.tote[2], plan.bin[2])
+        neighbours = [box[4] for placement in plan.placements for box in placement.neighbours]
+        self.rim = max(plan.tote[2], plan.bin[2], *neighbours)
         self.add_container(plan.tote)
         self.add_container(plan.bin, self.bin)
         self._add_plate(plan)
-        self.compile()
         self.goal = np.array((*(self.bin + np.divide(plan.bin[:2], 2)), self.rim + HEADROOM, 0.0))
-        self.data.qpos[:4] = self.data.ctrl[:4] = self.goal
+        self.compile()
+        self.data.qpos[:4] = self.goal
 
     def _add_plate(self, plan: EpisodePlan) -> None:
         """Add the end effector: a disc, or a box for each rectangle of its body; each is narrower by the gap."""
@@ -154,19 +162,55 @@ class Gantry(Scene):
             drive = self.spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             drive.set_to_position(kp=STIFFNESS[joint.name == "turn"], dampratio=1.0)
 
-    def add(self, corner, size, planned, yaw=0.0) -> None:
+    def compile(self) -> None:
         if self.boxes:
-            self.weld.name2 = f"item{len(self.boxes)}"
-        else:
-            kinds = {"type": mujoco.mjtEq.mjEQ_WELD, "objtype": mujoco.mjtObj.mjOBJ_BODY}
-            self.weld = self.spec.add_equality(**kinds, name1="plate", name2="item0", active=False, **STIFF)
-        super().add(corner, size, planned, yaw)
+            if self.weld is None:
+                kinds = {"type": mujoco.mjtEq.mjEQ_WELD, "objtype": mujoco.mjtObj.mjOBJ_BODY}
+                self.weld = self.spec.add_equality(**kinds, name1="plate", active=False, **STIFF)
+            self.weld.name2 = self.boxes[-1].name
+        super().compile()
         self.data.ctrl[:] = self.goal
+
+    def fill(self, boxes: Iterable[Point]) -> None:
+        """Put items into the bin, but those that wait there already.
+
+        Args:
+            boxes: near corner in the bin and sides, x, y, w, d, h.
+        """
+        count = len(self.bodies)
+        for box in boxes:
+            if self._find(box) is None:
+                self.waiting[box] = self._add_body((*(self.bin + box[:2]), 0.0), box[2:])
+        if len(self.bodies) > count:
+            self.compile()
+            if self.motion:
+                self.record()
+
+    def take(self, box: Point, planned: Point) -> None:
+        """Choose the item that is carried next, ``box`` as of :meth:`fill`; ``planned`` is its centre in the tote."""
+        known = self._find(box)
+        if known is None:
+            self.add((*(self.bin + box[:2]), 0.0), box[2:], planned)
+        else:
+            self.boxes.append(self.waiting.pop(known))
+            self.planned = np.vstack([self.planned, planned])
+            self.compile()
+
+    def _find(self, box: Point) -> Point | None:
+        """Return the waiting item that lies where ``box`` does and has its size, as it is named in :attr:`waiting`."""
+        return next((one for one in self.waiting if np.abs(np.subtract(one, box)).max() <= TOLERANCE), None)
 
     @property
     def centre(self) -> np.ndarray:
-        """The centre of the item that was added last, m, ``[3]``."""
+        """The centre of the item that is carried, the last one of :attr:`boxes`, m, ``[3]``."""
         return self.data.xpos[self.boxes[-1].id]
+
+    @property
+    def is_disturbed(self) -> bool:
+        """Whether an item that waits in the bin has left its place."""
+        places = [(*(self.bin + box[:2]), 0.0) + np.divide(box[2:], 2) for box in self.waiting]
+        shifts = self.data.xpos[[body.id for body in self.waiting.values()]] - np.reshape(places, (-1, 3))
+        return bool((np.linalg.norm(shifts, axis=1) > self.options.tolerance).any())
 
     def travel(self, goal, speed: float | None = None) -> Loss | None:
         """Move the plate along a line, from rest to rest; return the first loss on the way.
@@ -186,7 +230,7 @@ class Gantry(Scene):
         return None
 
     def bring(self, pick, place, height: float) -> Loss | None:
-        """Carry the item that was added last from one place to another one, where it is held; return the first loss.
+        """Carry the last one of :attr:`boxes` from one place to another one, where it is held; return the first loss.
 
         Args:
             pick, place: goals of the plate, where it sucks and where it shall let go.
@@ -227,11 +271,12 @@ class Gantry(Scene):
         return self.travel((x, y, low + SLOW_WAY, turn), self.options.slow_speed) or self.travel((x, y, z, turn))
 
     def grip(self) -> Loss | None:
-        """Suck the item in the bin; return the loss if the lip does not reach it."""
-        plate, item, box = self.plate.id, self.boxes[-1].id, self.boxes[-1].geoms[0].id
-        distances = [mujoco.mj_geomDistance(self.model, self.data, geom, box, 0.1, None) for geom in self._plate_geoms]
-        if min(distances) > self.options.lip + REACH:
+        """Suck the item in the bin; return the loss if the lip does not reach it, or another one as well."""
+        plate, item = self.plate.id, self.boxes[-1].id
+        if not self._is_reached(self.boxes[-1]):
             return Loss("dropped", len(self.boxes) - 1)
+        if any(self._is_reached(body, below=True) for body in self.waiting.values()):
+            return Loss("effector_contact", len(self.boxes) - 1)
         offset = self.data.xmat[plate].reshape(3, 3).T @ (self.data.xpos[item] - self.data.xpos[plate])
         inverse, relative = np.zeros(4), np.zeros(4)
         mujoco.mju_negQuat(inverse, self.data.xquat[plate])
@@ -239,6 +284,15 @@ class Gantry(Scene):
         self.model.eq_data[self.weld.id, :11] = (0, 0, 0, *offset, *relative, 1.0)
         self.data.eq_active[self.weld.id] = self.holding = True
         return None
+
+    def _is_reached(self, body, below: bool = False) -> bool:
+        """Return whether the lip reaches an item; with ``below`` only one below the plate, not beside it."""
+        for geom in self._plate_geoms:
+            ends = np.zeros(6)  # of the shortest line between the two
+            distance = mujoco.mj_geomDistance(self.model, self.data, geom, body.geoms[0].id, 0.1, ends)
+            if distance <= self.options.lip + REACH and not (below and np.hypot(*(ends[3:5] - ends[:2])) > TOLERANCE):
+                return True
+        return False
 
     @property
     def _plate_geoms(self) -> list[int]:
@@ -253,7 +307,9 @@ class Gantry(Scene):
 
     def _step(self) -> Loss | None:
         """Let a little time pass; return what was lost in it."""
-        number, before = len(self.boxes) - 1, self.speeds[-1, :3].copy()
+        number, start = len(self.boxes) - 1, self.model.body_dofadr[self.boxes[-1].id]
+        velocity = self.data.qvel[start : start + 3]
+        before = velocity.copy()
         self.step(STEPS_PER_LOOK)
         if self.diverged:
             return Loss("diverged", number)
@@ -266,7 +322,7 @@ class Gantry(Scene):
             return Loss("effector_contact", number)
         if self.holding:
             # From the motion: with drives that are integrated implicitly, the weld's force is not what it transmits.
-            acceleration = (self.speeds[-1, :3] - before) / (STEPS_PER_LOOK * TIMESTEP) - self.model.opt.gravity
+            acceleration = (velocity - before) / (STEPS_PER_LOOK * TIMESTEP) - self.model.opt.gravity
             if self.model.body_mass[item.id] * np.linalg.norm(acceleration) > self.options.suction:
                 return Loss("dropped", number)
-        return None
+        return Loss("disturbed", number) if self.waiting and self.is_disturbed else None

@@ -7,21 +7,26 @@ A line has the keys
 * ``corner``: near corner of the item at rest in the tote, ``[x, y, z]``, from the tote's near corner on its floor.
 * ``size``: sides of the item as it lies in the tote, ``[w, d, h]``.
 
-which is all that ``settle`` needs, and for a robot (of these only their types are checked)
+which is all that ``settle`` needs, and for a robot (of these only their types are checked, and that nothing overlaps in
+the bin)
 
 * ``bin``: inner sides of the bin, ``[w, d, h]``; ``item``: near corner of the item in the bin, ``[x, y]``.
 * ``effector``: sides of the end effector as it hangs over the bin, ``[w, d]``; ``body``, if it is not a rectangle:
   rectangles that make it up, ``[[x, y, w, d], ...]``, from its near corner.
 * ``pick`` and ``place``: its centre when it sucks and when it releases, ``[x, y]``, in the frames of bin and tote.
 * ``rotation``: turn between the two, counter-clockwise seen from above; 0, 90, 180 or 270 degrees.
+* ``neighbours``, if the item does not lie alone: what else lies in the bin, ``[[x, y, w, d, h], ...]``, near corners
+  and sides. An item lies there from the first line that names it until it is taken.
 """
 
 import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 
+from pickplace.task.cell import MAX_BIN_ITEMS
 from pickplace.task.checks import excerpt, is_number, is_whole
 from pickplace.task.files import read_text
 
@@ -34,6 +39,7 @@ MAX_FILE = 2**28  # greatest size of a file, bytes
 #: Keys of every line, and further ones for a robot, with the number of their values; 0: one number.
 KEYS = {"episode": 0, "tote": 3, "corner": 3, "size": 3}
 ROBOT_KEYS = {"bin": 3, "item": 2, "effector": 2, "pick": 2, "place": 2, "rotation": 0}
+OPTIONAL_KEYS = ("body", "neighbours")  # which a robot may do without
 MAX_BODY = 2_048  # rectangles of a body
 
 Point = tuple[float, ...]
@@ -49,6 +55,7 @@ class Placement:
     pick: Point = ()
     place: Point = ()
     rotation: int = 0
+    neighbours: tuple[Point, ...] = ()  # what else lies in the bin, x, y, w, d, h
 
     @property
     def centre(self) -> Point:
@@ -79,7 +86,7 @@ def to_lines(plans: Iterable[EpisodePlan]) -> str:
     for plan in plans:
         for placement in plan.placements:
             values = {**vars(plan), **vars(placement)}
-            keys = [*KEYS, *ROBOT_KEYS, *(["body"] if plan.body else [])] if plan.bin else KEYS
+            keys = [*KEYS, *ROBOT_KEYS, *(key for key in OPTIONAL_KEYS if values[key])] if plan.bin else KEYS
             lines.append(json.dumps({key: values[key] for key in keys}))
     return "".join(f"{line}\n" for line in lines)
 
@@ -120,9 +127,9 @@ def _read_line(where: str, line: str) -> dict:
     if not isinstance(values, dict):
         raise ValueError(f"{where}: got {type(values).__name__}, expected an object with {', '.join(KEYS)}.")
     known = {**KEYS, **ROBOT_KEYS}
-    if unknown := [key for key in values if key not in known and key != "body"]:
+    if unknown := [key for key in values if key not in known and key not in OPTIONAL_KEYS]:
         raise ValueError(f"{where}: {excerpt(unknown[0])}: there is no such key; expected {', '.join(known)}.")
-    needed = known if (ROBOT_KEYS.keys() | {"body"}) & values.keys() else KEYS
+    needed = known if (ROBOT_KEYS.keys() | {*OPTIONAL_KEYS}) & values.keys() else KEYS
     if missing := [key for key in needed if key not in values]:
         raise ValueError(f"{where}: {missing[0]}: missing; expected {', '.join(needed)}.")
     for key in needed:
@@ -140,6 +147,8 @@ def _read_line(where: str, line: str) -> dict:
         values[key] = tuple(map(float, value))
     if "body" in values:
         values["body"] = _read_body(where, values["body"], values["effector"])
+    if "neighbours" in values:
+        values["neighbours"] = _read_neighbours(where, values)
     return values
 
 
@@ -158,6 +167,28 @@ def _read_body(where: str, value, effector) -> tuple[Point, ...]:
             f"{where}: body={excerpt(value)}: expected up to {MAX_BODY:,} rectangles x, y, w, d inside the effector, "
             "in metres."
         )
+    return tuple(tuple(map(float, box)) for box in value)
+
+
+def _read_neighbours(where: str, values: dict) -> tuple[Point, ...]:
+    """Return what else lies in the bin of a line whose other values have been read."""
+    value, (w, d, _) = values["neighbours"], values["size"]
+
+    def is_good(box) -> bool:
+        if not isinstance(box, list) or len(box) != 5 or not all(map(is_number, box)):
+            return False
+        return min(box[2:]) >= 1e-6 and max(map(abs, box)) <= MAX_LENGTH
+
+    if not isinstance(value, list) or len(value) > MAX_BIN_ITEMS or not all(map(is_good, value)):
+        raise ValueError(
+            f"{where}: neighbours={excerpt(value)}: expected up to {MAX_BIN_ITEMS} boxes x, y, w, d, h with sides "
+            "above 0, in metres."
+        )
+    item = *values["item"], *((d, w) if values["rotation"] % 180 else (w, d))
+    for one, other in combinations([item, *value], 2):
+        shared = [min(one[i] + one[i + 2], other[i] + other[i + 2]) - max(one[i], other[i]) for i in (0, 1)]
+        if min(shared) > TOLERANCE:
+            raise ValueError(f"{where}: neighbours: {excerpt([*other])} overlaps {excerpt([*one])} in the bin.")
     return tuple(tuple(map(float, box)) for box in value)
 
 

@@ -12,6 +12,7 @@ ENDINGS = {
     "collapsed": ("Item {} left its place.", "item {} left its place"),
     "effector_contact": ("The gripper hit something while it moved item {}.", "gripper hit something"),
     "wedged": ("Item {} was not in its place when it was released.", "item {} wedged"),
+    "disturbed": ("Another item in the bin moved when item {} was taken.", "moved another item"),
     "dropped": ("The suction did not hold item {}.", "item {} not held"),
     "diverged": ("The simulation became impossible.", "simulation diverged"),
 }
@@ -39,6 +40,7 @@ def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePl
             placement = Placement(
                 metres(x, y, move.z), metres(w, d, move.item[4]), metres(*move.item[:2]),
                 middle(move.pick, cell.effector_size), middle(move.place, shape[:2]), 90 * move.rotation,
+                tuple((*metres(*other[:2]), *metres(*other[2:])) for other in move.others),
             )  # fmt: skip
             plan.placements.append(placement)
     return plan

@@ -37,7 +37,10 @@ class Scene:
 
     Attributes:
         spec, model, data: MuJoCo's; the latter two are new ones after each :meth:`add`.
-        boxes, plate: MuJoCo's body of each box, and of the end effector if there is one.
+        bodies: MuJoCo's body of each box, in the order in which they were added.
+        boxes: those of them that are in the tote or on the way to it, in the order of the placements.
+        waiting: the other ones, by near corner in the bin and sides where they shall lie, x, y, w, d, h.
+        plate: MuJoCo's body of the end effector, if there is one.
         bin: near corner of the bin, if there is one.
         planned: centre of each box where it is planned to rest, ``[n, 3]``.
         motion: records the poses, if there is one.
@@ -57,7 +60,9 @@ class Scene:
             option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
             # In m/s. With MuJoCo's own, 1e-3, items fall asleep while they begin to tilt; with 2e-4 `execute` is slow.
             option.sleep_tolerance = 5e-4
+        self.bodies: list = []
         self.boxes: list = []
+        self.waiting: dict[tuple[float, ...], Any] = {}
         self.planned = np.zeros((0, 3))
         self.motion: Motion | None = None
         self._next_picture = 0.0  # s
@@ -88,15 +93,20 @@ class Scene:
             yaw: its turn, rad.
         """
         self.planned = np.vstack([self.planned, planned])
-        turn = np.array((np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)))
-        centre = np.add(corner, np.divide(size, 2))
-        body = self.spec.worldbody.add_body(name=f"item{len(self.boxes)}", pos=centre, quat=turn)
-        body.add_freejoint()
-        self.add_geom(body, np.subtract(size, (self.gap, self.gap, 0)))
-        self.boxes.append(body)
+        self.boxes.append(self._add_body(corner, size, yaw))
         self.compile()
         if self.motion:
             self.record()
+
+    def _add_body(self, corner: Vector, size: Vector, yaw: float = 0.0):
+        """Add the body of a box, see :meth:`add`."""
+        turn = np.array((np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)))
+        centre = np.add(corner, np.divide(size, 2))
+        body = self.spec.worldbody.add_body(name=f"item{len(self.bodies)}", pos=centre, quat=turn)
+        body.add_freejoint()
+        self.add_geom(body, np.subtract(size, (self.gap, self.gap, 0)))
+        self.bodies.append(body)
+        return body
 
     def add_geom(self, body, size: Vector, centre: Vector = (0.0, 0.0, 0.0)):
         """Add a box-shaped surface to a body."""
@@ -123,8 +133,17 @@ class Scene:
         assert self.motion is not None
         mujoco.mj_kinematics(self.model, self.data)  # of what was added since the last step, too
         poses = np.hstack([self.data.xpos, self.data.xquat])
-        self.motion.add(poses[self._ids], None if self.plate is None else poses[self.plate.id])
+        ids = [body.id for body in self.bodies]
+        self.motion.add(poses[ids], None if self.plate is None else poses[self.plate.id])
         self._next_picture = self.data.time + INTERVAL
+
+    def finish_motion(self) -> None:
+        """Add the last picture to the motion, and sort its boxes: first those of the placements."""
+        assert self.motion is not None
+        self.record()
+        poses = {body.name: poses for body, poses in zip(self.bodies, self.motion.boxes, strict=True)}
+        self.motion.boxes = [poses[body.name] for body in [*self.boxes, *self.waiting.values()]]
+        self.motion.left = [box[2:] for box in self.waiting]
 
     @property
     def diverged(self) -> bool:
@@ -133,8 +152,8 @@ class Scene:
 
     @property
     def speeds(self) -> np.ndarray:
-        """The velocity of each box, linear and angular, ``[n, 6]``; m/s and rad/s."""
-        return self.data.qvel[-6 * len(self.boxes) :].reshape(-1, 6)
+        """The velocity of each body, linear and angular, ``[n, 6]``; m/s and rad/s."""
+        return self.data.qvel[-6 * len(self.bodies) :].reshape(-1, 6)
 
     @property
     def shifts(self) -> np.ndarray:

@@ -135,7 +135,7 @@ class Simulation(ABC):
         if scene.motion:
             if loss and loss.reason == "collapsed":
                 scene.run(AFTERMATH)
-            scene.record()
+            scene.finish_motion()
             scene.motion.ends = [*scene.motion.ends[: count - 1], scene.motion.pictures]
         return outcome
 

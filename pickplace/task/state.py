@@ -43,7 +43,7 @@ class Failure(IntEnum):
 _WORDS = {
     Failure.NONE: ("The item stream is over.", "stream over"),
     Failure.PICK_MISS: ("The gripper does not cover the item.", "missed the item"),
-    Failure.BIN_COLLISION: ("The gripper would hit the bin's wall.", "hit the bin"),
+    Failure.BIN_COLLISION: ("The gripper would hit the bin's wall, or another item in it.", "hit the bin"),
     Failure.TOTE_COLLISION: ("The gripper or the item would hit the tote's wall.", "hit the tote"),
     Failure.OVERFLOW: ("The item would stick out of the tote.", "too high"),
     Failure.ITEM_COLLISION: ("The gripper would hit an item in the tote.", "hit an item"),

@@ -11,7 +11,8 @@ from tensordict import TensorDict
 
 from pickplace.envs.gymnasium import PickPlaceGymEnv
 from pickplace.task.state import Failure, bin_depth_from_item
-from pickplace.views.recording import Box, Recording, record_moves
+from pickplace.views.figures import INK
+from pickplace.views.recording import Box, Recording, items_in_bin, record_moves
 from pickplace.views.scene import draw_scene, item_colours
 
 
@@ -52,6 +53,8 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         _, _, terminated, truncated, info = result
         if self._recording is not None and (terminated or truncated):
             self._recording.ending = Failure[info["failure"].upper()]
+            if self._recording.ending == Failure.STUCK:
+                self._recording.waiting = items_in_bin(self._env.state.items, 0)
         self._update_window()
         return result
 
@@ -62,6 +65,8 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
 
     def _picture(self) -> np.ndarray:
         """Return a picture of the tote in 3D, its height map and the bin, uint8 ``[600, 1200, 3]``."""
+        from matplotlib.patches import Rectangle
+
         if self._recording is None:
             raise gymnasium.error.ResetNeeded("render() before reset().")
         cell, item = self._env.cell, self._env.current_item
@@ -69,6 +74,9 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         inset = scene.add_axes((0.01, 0.04, 0.09, 0.18))
         bin_depth = bin_depth_from_item(item, cell.bin_size)
         inset.imshow(bin_depth[0].cpu().numpy().T, origin="lower", cmap="YlOrBr", vmin=0)
+        if cell.bin_items > 1:  # so that items side by side are told apart
+            for x, y, w, d, _ in items_in_bin(self._env.state.items, 0):
+                inset.add_patch(Rectangle((x - 0.5, y - 0.5), w, d, fill=False, edgecolor=INK, linewidth=1))
         inset.set_title("bin", fontsize="medium")
         inset.set_xticks([])
         inset.set_yticks([])

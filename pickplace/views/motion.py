@@ -19,7 +19,8 @@ class Motion:
         bin: near corner of the bin, ``[2]``, m; None without a gantry.
         pictures: number of pictures, at most :data:`INTERVAL` apart.
         plate: poses of the end effector: of the middle of its lower face.
-        boxes: poses of each box: of its middle.
+        boxes: poses of each box: of its middle. First the boxes that were carried, in that order.
+        left: sides of the other ones, which stayed in the bin, m.
         ends: number of pictures when each placement had ended.
     """
 
@@ -28,6 +29,7 @@ class Motion:
     plate: list[tuple[float, ...]] = field(default_factory=list)
     boxes: list[list[tuple[float, ...]]] = field(default_factory=list)
     ends: list[int] = field(default_factory=list)
+    left: list[tuple[float, ...]] = field(default_factory=list)
 
     def add(self, boxes: np.ndarray, plate: np.ndarray | None) -> None:
         """Add a picture.

@@ -9,11 +9,15 @@ from torch import Tensor
 
 from pickplace.task.cell import CellSpec, reference_cell
 from pickplace.task.grasps import split_action
-from pickplace.task.state import Failure, State
+from pickplace.task.state import Failure, Item, State
 from pickplace.task.transition import apply
 from pickplace.views.motion import CarriedOut
 
 FULL = "The tote is full."
+NONE_FITS = "None of these items fits anywhere any more."
+
+#: An item in the bin: its minimum corner and its size, x, y, w, d, h; in cells and height units.
+InBin = tuple[int, int, int, int, int]
 
 
 class Box(NamedTuple):
@@ -36,7 +40,7 @@ class Box(NamedTuple):
 class Move:
     """One decision and its effect; in cells and height units."""
 
-    item: tuple[int, int, int, int, int]  # x, y, w, d, h in the bin
+    item: InBin  # the one that is taken
     pick: tuple[int, int]  # min corner of the end effector in the bin
     place: tuple[int, int]  # min corner of the turned end effector in the tote
     rotation: int  # quarter turns, counter-clockwise seen from above
@@ -44,7 +48,7 @@ class Move:
     z: int  # height of the item's underside once it rests
     failure: Failure
     heat: np.ndarray | None = None  # uint8 [W_T, D_T]: the policy's preference for each place cell, 255 the highest
-    others: list[tuple[int, int, int, int, int]] = field(default_factory=list)  # what else lies in the bin
+    others: list[InBin] = field(default_factory=list)  # what else lies in the bin
 
 
 @dataclass
@@ -55,7 +59,7 @@ class Recording:
     tote_height: int
     moves: list[Move] = field(default_factory=list)
     ending: Failure | None = None  # None while it goes on; Failure.NONE where the item stream ended
-    waiting: tuple[int, int, int, int, int] | None = None  # the item that arrived last and fits nowhere
+    waiting: list[InBin] = field(default_factory=list)  # what lies in the bin at the end, of a stuck episode
     occupancy: float = 0.0
     carried_out: CarriedOut | None = None  # by a physics engine
 
@@ -74,8 +78,17 @@ class Recording:
         if self.ending is None:
             return ""
         volume = sum(box.volume for box in self.boxes)
-        full = self.ending == Failure.STUCK and volume == num_places * self.tote_height
-        return FULL if full else self.ending.sentence
+        if self.ending == Failure.STUCK:
+            if volume == num_places * self.tote_height:
+                return FULL
+            if len(self.waiting) > 1:
+                return NONE_FITS
+        return self.ending.sentence
+
+
+def items_in_bin(items: Item, row: int) -> list[InBin]:
+    """Return the items in one of the bins ``[N, M]``, in the order of arrival."""
+    return [tuple(item) for item in items.rows(row).table.tolist() if item[4] > 0]
 
 
 def record_moves(cell: CellSpec, planner, observation: TensorDictBase, state: State, action: Tensor) -> list[Move]:

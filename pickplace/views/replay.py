@@ -14,7 +14,7 @@ import numpy as np
 from pickplace.task.cell import CellSpec
 from pickplace.task.state import Failure
 from pickplace.views.motion import CarriedOut
-from pickplace.views.recording import FULL, Box, Recording
+from pickplace.views.recording import FULL, Box, InBin, Recording
 from pickplace.views.scene import draw_scene, item_colours
 
 ASSETS = Path(__file__).resolve().parent / "assets"
@@ -72,9 +72,8 @@ def _cells(height: int, cell: CellSpec) -> int | float:
 
 def _items_not_placed(recording: Recording) -> list[Box]:
     """Return the items that are seen but not placed, as boxes at the origin."""
-    items = [move.item for move in recording.moves if move.failure]
-    items += [recording.waiting] if recording.waiting else []
-    return [Box(0, 0, 0, w, d, h) for _, _, w, d, h in items]
+    items = [item for move in recording.moves for item in ([move.item] if move.failure else []) + move.others]
+    return [Box(0, 0, 0, w, d, h) for _, _, w, d, h in items + recording.waiting]
 
 
 def _label(recording: Recording, ending: str) -> str:
@@ -103,8 +102,9 @@ def _episode(recording: Recording, cell: CellSpec) -> dict:
         "label": _label(recording, ending),
         "failed": recording.ending not in (None, Failure.NONE, Failure.STUCK),
         "stuck": recording.ending == Failure.STUCK and ending != FULL,
-        "waiting": _item(recording.waiting, cell) if recording.waiting else None,
+        "waiting": [_item(item, cell) for item in recording.waiting],
         "moves": moves,
+        "others": [[_item(item, cell) for item in move.others] for move in recording.moves],
         "heat": base64.b64encode(np.stack(heat).tobytes()).decode() if heat else None,
     }
     return facts if carried_out is None else facts | _physics(carried_out, facts)
@@ -125,6 +125,7 @@ def _physics(carried_out: CarriedOut, facts: dict) -> dict:
             "ends": motion.ends,
             "plate": _poses(motion.plate, carried_out.cell_size),
             "boxes": [_poses(poses, carried_out.cell_size) for poses in motion.boxes],
+            "left": [[round(side / carried_out.cell_size, 6) for side in sides] for sides in motion.left],
         },
     }
 
@@ -141,7 +142,7 @@ def _bin_corner(carried_out: CarriedOut) -> list[float] | None:
     return None if corner is None else [round(at / carried_out.cell_size, 6) for at in corner]
 
 
-def _item(item: tuple[int, int, int, int, int], cell: CellSpec) -> list[int | float]:
+def _item(item: InBin, cell: CellSpec) -> list[int | float]:
     """Return an item ``(x, y, w, d, h)`` with its height in cells."""
     return [*item[:4], _cells(item[4], cell)]
 

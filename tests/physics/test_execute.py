@@ -10,7 +10,10 @@ from pickplace.evaluation.play import play
 from pickplace.physics.execute import Execute
 from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.physics.recorded import plan_of
+from pickplace.physics.settle import Settle
 from pickplace.planners.heuristics import RandomFeasible
+from pickplace.task.items import Uniform
+from pickplace.views.motion import Motion
 
 pytest.importorskip("mujoco")
 BIN, EFFECTOR = (0.25, 0.25, 0.05), (0.15, 0.15)
@@ -110,6 +113,7 @@ def test_plans_without_a_bin_are_refused():
     {"pick_rule": "seal", "min_seal": 0.25, "cup": [[1, 0, 1], [0, 0, 0], [1, 0, 1]]},
     {"pick_rule": "seal", "min_seal": 0.5, "body": [[1, 1, 1], [1, 0, 0]], "cup": [[1, 1, 0], [0, 0, 0]],
      "effector_size": (2, 3)},
+    {"bin_items": 3, "bin_size": (6, 5, 1), "items": Uniform((1, 2), (1, 3), (1, 2))},
 ])  # fmt: skip
 def test_what_the_rules_call_feasible_is_carried_out(settings):
     """Random play with every rotation and grasp: each item comes to lie where the rules say."""
@@ -128,6 +132,68 @@ def test_what_the_rules_call_feasible_is_carried_out(settings):
     ):
         assert (outcome.ending, outcome.placed) == ("done", len(plan.placements)), outcome
         assert outcome.occupancy == pytest.approx(float(occupancy)) and outcome.drift < 1e-3
+
+
+def beside(x, height, depth=0.1):
+    """Return the first item of these tests beside another item in the bin, 5 cm wide, that begins at ``x``."""
+    return replace(placed(*LOW, (0.025, 0)), neighbours=((x, 0.1, 0.05, depth, height),))
+
+
+@pytest.mark.parametrize(("placement", "ending"), [  # the item lies at 0.1 to 0.2 m, and the plate hangs at 0.1 to 0.25
+    (beside(0.2, 0.05), "effector_contact"),  # level with the item: the lip would suck it, too
+    (beside(0.2, 0.1), "effector_contact"),  # higher
+    (beside(0.2, 0.04), "done"),  # lower
+    (beside(0.2, 0.048), "done"),
+    (beside(0.05, 0.05), "done"),  # level and side by side, but not below the plate
+    (beside(0.05, 0.1), "done"),
+    (beside(0.186, 0.04), "disturbed"),  # in the item by 14 mm: they push each other out of the way
+])  # fmt: skip
+def test_neighbours_in_the_bin(placement, ending):
+    outcome = Execute().carry_out_one(EpisodePlan(0, (0.3, 0.3, 0.25), (0.3, 0.3, 0.05), EFFECTOR, [placement]))
+    assert (outcome.ending, outcome.placed) == (ending, int(ending == "done"))
+    alone = replace(placement, neighbours=())
+    plans = [EpisodePlan(0, (0.3, 0.3, 0.25), placements=[one]) for one in (placement, alone)]
+    settled = [replace(Settle().carry_out_one(plan), cpu_seconds=0) for plan in plans]
+    assert settled[0] == settled[1] and settled[0].ending == "done"
+
+
+A, B, C = (0.0, 0.0, 0.1, 0.05, 0.05), (0.1, 0.0, 0.1, 0.1, 0.04), (0.0, 0.1, 0.05, 0.1, 0.03)
+
+
+def test_an_item_waits_in_the_bin_until_it_is_taken():
+    """B lies there from the first pick on and is taken second; C comes with the second pick and stays."""
+    first = Placement((0.1, 0.1, 0.0), A[2:], A[:2], (0.075, 0.075), (0.175, 0.175), 0, (B,))
+    near = (0.1 + 1e-9, *B[1:2])  # written by another program
+    second = Placement((0.1, 0.2, 0.0), B[2:], near, (0.15, 0.05), (0.15, 0.25), 0, (C,))
+    plan = EpisodePlan(0, (0.4, 0.4, 0.25), (0.25, 0.25, 0.02), EFFECTOR, [first, second])
+    execute = Execute()
+    scene = execute.make_scene(plan)
+    start = scene.bin
+    scene.motion = Motion(tuple(start))
+    assert execute.place(scene, first, np.zeros(2)) is None
+    (waiting,) = scene.waiting.values()
+    assert len(scene.bodies) == 2 and np.allclose(
+        scene.data.xpos[waiting.id], (*(start + (0.15, 0.05)), 0.02), atol=1e-4
+    )
+    assert execute.place(scene, second, np.zeros(2)) is None
+    assert len(scene.bodies) == 3 and scene.boxes[1].name == waiting.name
+    assert np.allclose(scene.data.xpos[waiting.id], (0.15, 0.25, 0.02), atol=1e-3) and list(scene.waiting) == [C]
+
+    motion = execute.carry_out_one(plan, record=True).motion
+    a, b, c = motion.boxes
+    assert motion.left == [C[2:]] and len(motion.ends) == 2
+    for poses, box in zip(motion.boxes, (A, B, C), strict=True):
+        assert np.allclose(poses[0][1:4], (*(start + box[:2] + np.divide(box[2:4], 2)), box[4] / 2), atol=1e-4)
+    assert a[0][0] <= 1 and b[0][0] <= 1 and motion.ends[0] <= c[0][0] <= motion.ends[0] + 1 and len(c) == 1
+    assert b[1][0] > motion.ends[0] and np.allclose(
+        b[-1][1:4], (0.15, 0.25, 0.02), atol=1e-3
+    )  # not before its own turn
+
+
+def test_a_neighbour_hardly_wider_than_the_gap_is_refused():
+    plan = EpisodePlan(4, (0.3, 0.3, 0.25), (0.3, 0.3, 0.05), EFFECTOR, [beside(0.2, 0.05, 0.0015)])
+    with pytest.raises(ValueError, match="episode 4, a neighbour of item 1: 0.0015 m wide; expected sides of at least"):
+        Execute().carry_out_one(plan)
 
 
 def test_errors_of_placement_reach_the_tote():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pickplace import CellSpec
 from pickplace.physics import command
-from pickplace.physics.plans import KEYS, ROBOT_KEYS, EpisodePlan, Placement, read_plans, to_lines
+from pickplace.physics.plans import KEYS, OPTIONAL_KEYS, ROBOT_KEYS, EpisodePlan, Placement, read_plans, to_lines
 from pickplace.physics.recorded import plan_of
 from pickplace.task.state import Failure
 from pickplace.views.recording import Move, Recording
@@ -69,6 +69,17 @@ def test_a_recorded_episode_in_metres(tmp_path):
         for body in ([], "L", [[0, 0, 0.1]], [[0, 0, 0.2, 0.1]], [[-0.1, 0, 0.1, 0.1]], [[0, 0, 0.1, 0]])
     ),
     ({"body": [[0, 0, 0.1, 0.1]]}, "bin: missing"),
+    *(
+        ({**ROBOT, "neighbours": value}, "neighbours=.*: expected up to 100 boxes x, y, w, d, h with sides above 0")
+        for value in (
+            "one", {}, None, [0.1], [[0.1, 0.1, 0.1, 0.1]], [[0.1, 0.1, 0.1, 0.1, 0]], [[1e3, 0, 0.1, 0.1, 0.1]],
+            [[0.1, 0.1, 0.1, 0.1, None]], [[n, 1, 0.5, 0.5, 0.5] for n in range(101)],
+        )
+    ),
+    ({**ROBOT, "size": [0.1, 0.05, 0.05], "neighbours": [[0.04, 0, 0.1, 0.1, 0.1]]},
+     r"neighbours: \[0.04, 0, .*\] overlaps \[0.0, 0.0, 0.05, 0.1"),
+    ({**ROBOT, "neighbours": [[0.1, 0.1, 0.1, 0.1, 0.1]] * 2}, "neighbours: .* overlaps .* in the bin"),
+    ({"neighbours": [[0.1, 0.1, 0.1, 0.1, 0.1]]}, "bin: missing"),
 ])  # fmt: skip
 def test_a_bad_line_is_refused(change, words, tmp_path):
     path = written(tmp_path / "plans.jsonl", LINE, LINE | {"corner": [0.1, 0.1, 0]} | change)
@@ -84,6 +95,21 @@ def test_a_body_in_metres(tmp_path):
     plan = plan_of(Recording(0, 5, [move]), cell, 0.05)
     assert plan.body == ((0.0, 0.0, 0.05, 0.1), (0.05, 0.0, 0.1, 0.05))
     (tmp_path / "plans.jsonl").write_text(to_lines([plan]))
+    assert read_plans(tmp_path / "plans.jsonl") == [plan]
+
+
+def test_neighbours_in_metres(tmp_path):
+    """Cells of 4 cm, heights of 1 cm; by hand. Only the move that has neighbours names them."""
+    cell = CellSpec((5, 5, 3), (6, 6, 20), (3, 2), height_unit=0.25, bin_items=2)
+    moves = [
+        Move((2, 1, 2, 1, 5), (1, 0), (0, 1), 0, (0, 1, 2, 1), 0, Failure.NONE, others=[(0, 3, 1, 2, 6)]),
+        Move((0, 3, 1, 2, 6), (0, 2), (3, 3), 0, (3, 3, 1, 2), 0, Failure.NONE),
+    ]
+    plan = plan_of(Recording(0, 20, moves), cell, 0.04)
+    assert [one.neighbours for one in plan.placements] == [((0.0, 0.12, 0.04, 0.08, 0.06),), ()]
+    (tmp_path / "plans.jsonl").write_text(to_lines([plan]))
+    lines = [json.loads(line) for line in (tmp_path / "plans.jsonl").read_text().splitlines()]
+    assert [line.get("neighbours") for line in lines] == [[[0.0, 0.12, 0.04, 0.08, 0.06]], None]
     assert read_plans(tmp_path / "plans.jsonl") == [plan]
 
 
@@ -112,9 +138,9 @@ def test_the_lines_of_an_episode_follow_one_another(tmp_path):
 VALUES = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.lists(st.floats(), max_size=4)
 
 
-@given(st.dictionaries(st.sampled_from([*KEYS, *ROBOT_KEYS, "x"]), VALUES))
-def test_any_line_is_read_or_refused_in_a_sentence(tmp_path_factory, values):
-    path = written(tmp_path_factory.mktemp("plans") / "plans.jsonl", LINE | values)
+@given(st.dictionaries(st.sampled_from([*KEYS, *ROBOT_KEYS, *OPTIONAL_KEYS, "x"]), VALUES), st.booleans())
+def test_any_line_is_read_or_refused_in_a_sentence(tmp_path_factory, values, for_robot):
+    path = written(tmp_path_factory.mktemp("plans") / "plans.jsonl", LINE | (ROBOT if for_robot else {}) | values)
     try:
         read_plans(path)
     except ValueError as error:

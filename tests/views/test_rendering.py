@@ -62,6 +62,22 @@ def test_the_bin_lies_as_the_height_map(scenes):
     assert np.array_equal(image.get_array(), observation["bin_depth"].T) and image.origin == "lower"
 
 
+def test_several_items_in_the_bin_are_outlined(scenes):
+    env, place = make(bin_size=(5, 6, 1), bin_items=3, items=[(2, 2, 1), (1, 1, 2)])
+    _, info = env.reset(seed=0)
+    while info["action_mask"].any():
+        env.render()
+        lying = [tuple(item) for item in env.unwrapped._env.item[0].tolist() if item[4]]
+        inset = scenes[-1][-1].axes[-1]
+        found = [(p.get_x() + 0.5, p.get_y() + 0.5, p.get_width(), p.get_height()) for p in inset.patches]
+        assert len(lying) > 1 and found == [item[:4] for item in lying]
+        for x, y, w, d, h in lying:
+            assert (inset.images[0].get_array()[y : y + d, x : x + w] == h).all()
+        info = place(info)
+    env.render()
+    assert scenes[-1][-1].get_suptitle().endswith("None of these items fits anywhere any more.")
+
+
 def test_human_mode_without_a_display_warns(monkeypatch):
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)

@@ -25,6 +25,7 @@ CELLS = {
     "paper": {},
     "odd": {**ODD, "items": Kinds([(1, 2, 2)])},
     "mixed": {"tote_size": (6, 5, 4), "effector_size": (4, 3), "items": Uniform((1, 3), (1, 3), (1, 2))},
+    "several": {"bin_size": (6, 5, 1), "bin_items": 3, "items": Uniform((1, 2), (1, 3), (1, 2))},
 }
 PLANNERS = {
     "joint_dbl": JointDBL, "uniform": UniformRandom, "policy": untrained_planner,
@@ -64,13 +65,34 @@ def test_recordings_are_what_happened(cell, planner):
             assert space.max() == move.z
             space[:] = move.z + h
         failed = recording.moves[len(recording.boxes) :]
-        assert [move.failure for move in failed] == [recording.ending] * (recording.waiting is None)
+        assert [move.failure for move in failed] == [recording.ending] * (not recording.waiting)
         assert (heights == result.final_heights[number].numpy()).all()
         volume = sum(w * d * h for *_, w, d, h in recording.boxes)
         assert volume / heights.size / recording.tote_height == pytest.approx(recording.occupancy)
         assert recording.occupancy == float(result.occupancy[number])
-        assert (recording.waiting is not None) == (recording.ending == Failure.STUCK)
+        assert (len(recording.waiting) == 1) == (recording.ending == Failure.STUCK)
         assert len(recording.boxes) == int(result.items_placed[number])
+
+
+def test_several_items_lie_in_the_bin_until_they_are_taken():
+    cell, result = record("several", "joint_dbl")
+    for recording in result.recordings:
+        contents = [[move.item, *move.others] for move in recording.moves] + [recording.waiting]
+        for move, lying, after in zip(recording.moves, contents, contents[1:], strict=False):
+            cells = [(x + i, y + j) for x, y, w, d, _ in lying for i in range(w) for j in range(d)]
+            assert len(cells) == len({*cells}) and 2 <= len(lying) <= 3
+            assert [item for item in after if item in move.others] and {*move.others} <= {*after}
+        assert recording.ending == Failure.STUCK and len(recording.waiting) > 1
+        assert recording.describe_ending(cell.num_places) == "None of these items fits anywhere any more."
+    episode, recording = unpack(replay.page(result.recordings, cell, ""))["episodes"][0], result.recordings[0]
+    assert [[tuple(item) for item in others] for others in episode["others"]] == [m.others for m in recording.moves]
+    assert [tuple(item) for item in episode["waiting"]] == recording.waiting
+
+
+def test_items_that_are_never_taken_have_a_colour():
+    move = Move((0, 0, 2, 1, 3), (0, 0), (0, 0), 0, (0, 0, 2, 1), 0, Failure.NONE, others=[(3, 0, 1, 1, 2)])
+    recordings = [Recording(0, 6, [move]), Recording(1, 6, [move], Failure.STUCK, [(0, 2, 1, 3, 1)])]
+    assert set(unpack(replay.page(recordings, CellSpec(bin_items=2), ""))["colours"]) == {"1,2,3", "1,1,2", "1,3,1"}
 
 
 def unpack(html):
@@ -95,11 +117,11 @@ def test_page_is_one_file_that_holds_the_episodes():
 
 def test_heights_on_the_page_are_in_cells():
     moves = [Move((0, 0, 2, 1, h), (0, 0), (0, 0), 0, (0, 0, 2, 1), z, Failure.NONE) for z, h in ((0, 3), (3, 2))]
-    recording = Recording(0, 6, moves, Failure.STUCK, (1, 1, 1, 1, 7), 0.5)
+    recording = Recording(0, 6, moves, Failure.STUCK, [(1, 1, 1, 1, 7)], 0.5)
     cell = CellSpec(bin_size=(5, 5, 3), height_unit=0.1)
     data = unpack(replay.page([recording], cell, ""))
     episode = data["episodes"][0]
-    assert (data["bin"], episode["height"], episode["waiting"]) == ([5, 5, 0.3], 0.6, [1, 1, 1, 1, 0.7])
+    assert (data["bin"], episode["height"], episode["waiting"]) == ([5, 5, 0.3], 0.6, [[1, 1, 1, 1, 0.7]])
     assert [(move[4], move[14]) for move in episode["moves"]] == [(0.3, 0), (0.2, 0.3)]
     assert set(data["colours"]) == {"1,2,0.3", "1,2,0.2", "1,1,0.7"}
     double = unpack(replay.page([recording], CellSpec(height_unit=2), ""))
@@ -176,7 +198,7 @@ def test_page_opens_steps_plays_and_changes_episodes(browser, tmp_path):
 def test_page_of_very_many_moves(browser, tmp_path):
     """More than a function takes arguments."""
     moves = [Move((1, 1, 1, 1, 1 + n % 2), (0, 0), (0, 0), 0, (0, 0, 1, 1), 0, Failure.NONE) for n in range(1500)]
-    recordings = [Recording(n, 5, moves, Failure.STUCK, (0, 0, 1, 1, 4), 1.0) for n in range(100)]
+    recordings = [Recording(n, 5, moves, Failure.STUCK, [(0, 0, 1, 1, 4)], 1.0) for n in range(100)]
     state = open_page(browser, written(tmp_path, recordings, CellSpec()))
     assert state()["moves"] == 1500 and errors(browser) == []
 
@@ -203,7 +225,7 @@ def test_page_shows_what_physics_did(browser, tmp_path):
     plate = [(0, -0.3, 0.05, 0.3, 1, 0, 0, 0), (8, -0.3, 0.05, 0.3, *turned)]
     motion = Motion((-0.5, 0.1), 10, plate, [first, second], [5, 10])
     carried_out = CarriedOut("Item 2 left its place.", "item 2 left its place", 1, 1, 0.25, 0.05, motion)
-    recording = Recording(0, 5, moves, Failure.STUCK, None, 0.5, carried_out)
+    recording = Recording(0, 5, moves, Failure.STUCK, [], 0.5, carried_out)
     path = written(tmp_path, [recording], CellSpec())
     assert unpack(path.read_text())["binAt"] == [-10, 2]
     state = open_page(browser, path)
@@ -239,10 +261,67 @@ def test_page_shows_what_physics_did(browser, tmp_path):
     kept = CarriedOut(
         "Carried out.", "carried out", None, 1, 2 / 180, 0.05, Motion((-0.5, 0.1), 5, plate, [first], [5])
     )
-    recording = Recording(0, 5, [moves[0], failing], Failure.TOTE_COLLISION, None, 2 / 180, kept)
+    recording = Recording(0, 5, [moves[0], failing], Failure.TOTE_COLLISION, [], 2 / 180, kept)
     state = open_page(browser, written(tmp_path, [recording], CellSpec()), "#step=9")
     assert state()["ending"] == f"Carried out. {Failure.TOTE_COLLISION.sentence}"
     assert browser.find_element("id", "ending").get_attribute("class") == "bad" and state()["moves"] == 1
+    assert errors(browser) == []
+
+
+def test_page_shows_all_that_lies_in_the_bin(browser, tmp_path):
+    """Before, during and after each move, and at the end; by hand. The bin's corner is at (-7, 0.5)."""
+    a, b, c, d = (0, 0, 2, 1, 1), (3, 1, 1, 1, 2), (0, 3, 1, 2, 3), (3, 3, 1, 1, 1)
+    moves = [
+        Move(b, (2, 0), (0, 0), 0, (0, 0, 1, 1), 0, Failure.NONE, others=[a, c]),
+        Move(a, (0, 0), (3, 3), 0, (3, 3, 2, 1), 0, Failure.NONE, others=[c, d]),
+    ]
+    cell = CellSpec(bin_items=3)
+    recording = Recording(0, 5, moves, Failure.STUCK, [c, d, b], 0.1)
+    state = open_page(browser, written(tmp_path, [recording], cell))
+    browser.execute_script(WATCH + "document.getElementById('seek').step = 'any'")
+
+    def lying(moment):
+        """The items on the floor of the bin that are visible: x, y, w, d, h."""
+        browser.execute_script(
+            "window.scene = null; const s = document.getElementById('seek'); s.value = arguments[0]; s.oninput()",
+            moment,
+        )
+        wait_until(browser, "!!window.scene")
+        boxes = browser.execute_script(
+            "const is = o => o.children.length === 2 && o.children[0].isMesh && o.children[1].isLineSegments;"
+            "const items = o => !o.isGroup || !o.visible ? [] : is(o) ? [o] : o.children.flatMap(items);"
+            "return scene.children.flatMap(items).map(o => "
+            "[...o.position.toArray(), ...o.children[0].scale.clone().multiply(o.scale).toArray()])"
+        )
+        found = [(x - w / 2 + 7, y - d / 2 - 0.5, w, d, h) for x, y, z, w, d, h in boxes if abs(z - h / 2) < 0.05]
+        found = [tuple(round(part, 1) for part in box) for box in found if box[0] < 5]
+        assert len(found) == len({*found})
+        return {*found}
+
+    assert lying(0) == lying(0.1) == {a, b, c}
+    assert lying(0.25) == lying(0.6) == {a, c}  # b is lifted, and over the tote
+    assert lying(0.9) == lying(1) == {a, c, d}
+    assert lying(1.6) == {c, d}
+    assert lying(1.9) == lying(2) == {b, c, d}
+    assert state()["ending"] == "None of these items fits anywhere any more."
+    assert browser.find_element("id", "legend").text.count("×") == 2 * 4
+    assert errors(browser) == []
+
+    # Carried out: c and d stayed in the bin, and b came after that; each is there once.
+    def pose(at, item):
+        x, y, w, d, h = item
+        return (at, *(0.05 * np.array((x + w / 2 - 7, y + d / 2 + 0.5, h / 2))).tolist(), 1, 0, 0, 0)
+
+    boxes = [[pose(0, b), (6, 0.025, 0.025, 0.05, 1, 0, 0, 0)], [pose(0, a), (15, 0.2, 0.175, 0.025, 1, 0, 0, 0)],
+             [pose(0, c)], [pose(10, d)]]  # fmt: skip
+    motion = Motion(
+        (-0.35, 0.025), 20, [(0, -0.3, 0.05, 0.5, 1, 0, 0, 0)], boxes, [10, 20], [(0.05, 0.1, 0.15), (0.05,) * 3]
+    )
+    kept = CarriedOut("Carried out.", "carried out", None, 2, 0.1, 0.05, motion)
+    state = open_page(browser, written(tmp_path, [replace(recording, carried_out=kept)], cell))
+    browser.execute_script(WATCH + "document.getElementById('seek').step = 'any'")
+    assert state()["moves"] == 2 and lying(0.1) == {a, b, c} and lying(0.8) == {a, c}
+    assert lying(1.2) == {a, c, d} and lying(1.9) == {c, d} and lying(2) == {b, c, d}
     assert errors(browser) == []
 
 

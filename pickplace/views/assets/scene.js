@@ -22,6 +22,7 @@ let dirty = true, turned = false;  // turned: the viewer has chosen a view, whic
 controls.addEventListener("change", () => { dirty = true; });
 controls.addEventListener("start", () => { turned = true; });
 
+const BEHIND_EDGES = { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
 const material = (color, more = {}) => new THREE.MeshLambertMaterial({ color, ...more });
 function addBox(parent, x, y, z, w, d, h, mat) {
   const mesh = new THREE.Mesh(new THREE.BoxGeometry(w, d, h), mat);
@@ -98,7 +99,7 @@ arm.rotation.x = Math.PI / 2;
 gripper.add(arm);
 scene.add(gripper);
 
-const carried = new THREE.Mesh(new THREE.BoxGeometry(1, 1, 1), material(0xffffff, { transparent: true }));
+const carried = new THREE.Mesh(new THREE.BoxGeometry(1, 1, 1), material(0xffffff, { transparent: true, ...BEHIND_EDGES }));
 const carriedEdges = new THREE.LineSegments(new THREE.EdgesGeometry(carried.geometry), new THREE.LineBasicMaterial({ color: INK }));
 const item = new THREE.Group();
 item.add(carried, carriedEdges);
