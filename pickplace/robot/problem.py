@@ -185,7 +185,7 @@ def _read_cuboid(bin_map: Tensor, segment: Tensor, unit_name: str, name: str, hi
     """Return the item of a segment of the bin, bool ``[W_B, D_B]``; refuse all but a box filled at one height."""
     x, y, w, d, _ = (int(value) for value in item_from_depth(segment[None].float()))
     box = bin_map[x : x + w, y : y + d]
-    h = int(box.max())
+    h = int(bin_map.max())
     if (box != h).any():
         i, j = (box != h).nonzero()[0].tolist()
         raise DepthMapError(
