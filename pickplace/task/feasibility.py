@@ -15,8 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.bin import blocked_picks
 from pickplace.task.cell import CellSpec, Limits
+from pickplace.task.bin import blocked_picks
 from pickplace.task.checks import check_bytes
 from pickplace.task.grasps import (
     all_grasps,
