@@ -44,6 +44,11 @@ class Box:
         return replace(self, w=w, d=d, yaw=self.yaw - 90 * quarters)
 
 
+@dataclass(frozen=True)
+class HiddenBox(Box):
+    """A box behind a higher one, of which a camera may not see all: it is in the way, and is not picked."""
+
+
 def checked_number(name: str, value, wanted: str, accepts: Callable[[float], bool]) -> float:
     """Return a value as a finite number that ``accepts`` accepts; ``wanted`` describes such numbers."""
     try:

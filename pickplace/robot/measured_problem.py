@@ -16,6 +16,7 @@ from pickplace.robot.measure import (
     ROUNDING,
     Box,
     DepthMapError,
+    HiddenBox,
     as_array,
     box_of_map,
     boxes_of_map,
@@ -192,6 +193,8 @@ def read_metric(
         centres = effector_centres(free, item, box, cell_size)
         above_walls = box.h - accuracy >= cell.bin_size[2] * unit - ROUNDING
         clear = above_walls | _misses_walls(centres, cell, box.yaw, cell_size)
+        if isinstance(box, HiddenBox):
+            clear = np.zeros_like(clear)
         if len(boxes) > 1:  # one that lies alone may be picked anywhere
             clear &= ~_hits_others(centres, cell, number, boxes, cell_size, accuracy, clearance)
         bin_clear = torch.from_numpy(clear).to(device)
