@@ -13,7 +13,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy import ndimage
 
-from pickplace.robot.measure import MAX_PATCHES, SNAPPED, Box, DepthMapError, is_inside, smallest_rectangle
+from pickplace.robot.measure import MAX_PATCHES, SNAPPED, Box, DepthMapError, HiddenBox, is_inside, smallest_rectangle
 from pickplace.task.cell import CellSpec
 
 #: Greatest share of a tote that the camera may not see.
@@ -22,6 +22,8 @@ MOST_MISSING = 0.01  # greatest share of the inside of its rectangle that an ite
 BORDER = 2.5  # width of the part of the rectangle that is not its inside, pixels
 #: Fewest pixels along a cell.
 LEAST_PIXELS = 2
+HIDDEN_PIXELS = 1.5  # distance from a box at which its edge should be seen, pixels
+EDGE_POINTS = 32  # along each side of a box, and along each ray
 MIN_ITEM_PIXELS = 9  # pixels of the smallest thing in a bin that counts
 
 
@@ -164,7 +166,10 @@ class Camera:
     def items(
         self, depth, cell: CellSpec, cell_size: float, labels=None, accuracy: float = 0.003, sizes=None
     ) -> list[Box]:
-        """Return the items in the bin.
+        """Return the items in the bin, for ``planner.plan(items=...)``.
+
+        What a higher item hides in part is a :class:`~pickplace.robot.measure.HiddenBox`, as large as it may be: the
+        planner takes others first. An item that is wholly hidden is not known of.
 
         Args:
             depth: an image.
@@ -206,9 +211,14 @@ class Camera:
             segment = segments == number
             if segment.sum() >= MIN_ITEM_PIXELS:
                 boxes.append(self._box(points, segment, narrowed=labels is None))
-        for box in boxes:
-            _check_reading(box, sizes, 2 * self.pixel() + 2 * accuracy)
-        return boxes
+        hidden = [self._hidden_length(box, boxes) for box in boxes]
+        for box, length in zip(boxes, hidden, strict=True):
+            if not length:
+                _check_reading(box, sizes, 2 * self.pixel() + 2 * accuracy)
+        return [
+            HiddenBox(box.x, box.y, box.w + 2 * length, box.d + 2 * length, box.h, box.yaw) if length else box
+            for box, length in zip(boxes, hidden, strict=True)
+        ]
 
     def _inside(self, depth, sides: Sequence[float], rim: float, name: str) -> np.ndarray:
         """Return the points between the walls, median-filtered, NaN elsewhere, ``[rows, columns, 3]``."""
@@ -253,6 +263,25 @@ class Camera:
                 "or pass labels."
             )
         return Box(x, y, float(w + grown), float(d + grown), height, yaw).upright()
+
+    def _hidden_length(self, box: Box, boxes: Sequence[Box]) -> float:
+        """Return how far a box may go on where higher ones hide what is beside it, m; 0 if its whole edge is seen."""
+        side = np.linspace(-1, 1, EDGE_POINTS)
+        one = np.ones_like(side)
+        edge = np.concatenate([[side, one], [side, -one], [one, side], [-one, side]], 1).T
+        turn, grown = math.radians(box.yaw), HIDDEN_PIXELS * self.pixel(box.h)
+        axes = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+        edge = (box.x, box.y) + edge * (box.w / 2 + grown, box.d / 2 + grown) @ axes  # [points, 2]
+        to_camera, longest = self.pose[:2, 3] - edge, 0.0
+        for other in boxes:
+            share = (other.h - box.h) / (self.pose[2, 3] - box.h)  # of the ray that runs below the other's top
+            if share <= 0:
+                continue
+            ray = edge + np.linspace(0, share, EDGE_POINTS)[:, None, None] * to_camera
+            inside = is_inside(ray, (other.x, other.y), (other.w, other.d), other.yaw)
+            hides = inside.any(0) & ~inside[0]  # what lies in the other is no part of the box
+            longest = max(longest, float((share * np.linalg.norm(to_camera[hides], axis=1)).max(initial=0.0)))
+        return longest if longest > self.pixel(box.h) / 2 else 0.0
 
     def _at_height(self, shape: tuple[int, ...], height: float) -> np.ndarray:
         """Return where the ray of every pixel passes a height, ``[rows, columns, 2]``."""

@@ -21,7 +21,7 @@ MAX_MAP = 2**26  # greatest size of a .npy file, in bytes
 
 #: Keys of a request; ``id`` comes back as it is.
 SETTINGS = ("tote_height", "cell_size", "accuracy", "clearance", "alternatives")
-REQUEST_KEYS = ("id", "bin_depth", "items", "tote_depth", "tote_bearing", *SETTINGS)
+REQUEST_KEYS = ("id", "bin_depth", "bin_labels", "items", "tote_depth", "tote_bearing", *SETTINGS)
 
 
 def main() -> None:
@@ -36,12 +36,13 @@ def parser() -> argparse.ArgumentParser:
         prog="pickplace-plan",
         description="Plan one pick and one place. With --bin and --tote: one plan, as JSON. Without them: read one "
         'request a line from standard input, {"bin_depth": [[...]], "tote_depth": [[...]]}, and answer each with a '
-        'plan in one line; "items": [{"x": .., "y": .., "w": .., "d": .., "h": .., "yaw": ..}] may stand for '
-        "bin_depth. A bad request is answered with an error, and the process goes on.",
+        'plan in one line; "items": [{"x": .., "y": .., "w": .., "d": .., "h": .., "yaw": ..}, ...] may stand '
+        "for bin_depth. A bad request is answered with an error, and the process goes on.",
         epilog="Maps, frames of reference and errors: docs/robot.md",
     )
     add = options.add_argument
     add("--bin", metavar="NPY", help="depth map [W_B, D_B] or finer: height above the bin's floor")
+    add("--bin-labels", metavar="NPY", help="map in the shape of --bin: a number for each of several items, else 0")
     add("--tote", metavar="NPY", help="depth map [W_T, D_T] or finer: remaining height, from surface to rim")
     add("--tote-bearing", metavar="NPY", help="map [W_T, D_T]: tote_bearing of the plan before; default: all 1")
     add("--time", action="store_true", help="print the latency of each plan on standard error")
@@ -120,13 +121,15 @@ def run(args: argparse.Namespace) -> None:
     if (args.bin is None) != (args.tote is None):
         missing = "--bin" if args.bin is None else "--tote"
         raise ValueError(f"{missing}: no file; expected both --bin and --tote, or neither to read JSON lines.")
-    if args.tote_bearing is not None and args.tote is None:
-        raise ValueError(f"--tote-bearing={args.tote_bearing}: expected --bin and --tote, too.")
+    for option, path in (("--bin-labels", args.bin_labels), ("--tote-bearing", args.tote_bearing)):
+        if path is not None and args.tote is None:
+            raise ValueError(f"{option}={path}: expected --bin and --tote, too.")
     if sys.stdout is None or (sys.stdin is None and args.bin is None):
         raise ValueError("standard input or output is closed; expected requests and a place for the plans.")
     planner, defaults = load_planner(args)
     if args.bin is not None:
-        files = {"bin_depth": args.bin, "tote_depth": args.tote, "tote_bearing": args.tote_bearing}
+        files = {"bin_depth": args.bin, "bin_labels": args.bin_labels, "tote_depth": args.tote}
+        files["tote_bearing"] = args.tote_bearing
         maps = {key: read_map(path) for key, path in files.items() if path is not None}
         try:
             result = plan_as_dict(planner, args.time, **maps, **defaults)
@@ -201,15 +204,23 @@ def answer_request(planner: "Planner", request: dict, defaults: dict, print_late
 
 
 def read_boxes(items) -> list:
-    """Return the boxes of a request's ``items``."""
+    """Return the boxes of a request's ``items``.
+
+    Raises:
+        ValueError: naming the first one with other keys.
+    """
     from pickplace.robot.measure import Box
 
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
         raise ValueError("items: expected a list of objects with x, y, w, d, h and, if it is turned, yaw.")
-    try:
-        return [Box(**item) for item in items]
-    except TypeError as error:
-        raise ValueError("items[0]: expected the keys x, y, w, d, h and, if it is turned, yaw.") from error
+    boxes = []
+    for number, item in enumerate(items):
+        try:
+            boxes.append(Box(**item))
+        except TypeError as error:
+            expected = "expected the keys x, y, w, d, h and, if it is turned, yaw."
+            raise ValueError(f"items[{number}]: {expected}") from error
+    return boxes
 
 
 def finite_float(text: str) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pickplace.task.cell import MAX_BIN_ITEMS
 from pickplace.task.checks import excerpt, is_number
 
 #: A length is taken for the whole number of units that it is so close to: three cells of 0.05 m are not exactly 0.15 m
@@ -16,6 +17,7 @@ ROUNDING = 1e-6
 MILLIMETRE = 1e-3  # height unit of measured maps, m
 MAX_PATCHES = 8  # greatest number of patches along a cell; finer maps are reduced to it
 MAX_VALUE = 1e3  # greatest coordinate of a box, m, and greatest yaw, degrees
+MAX_LABEL = 2**31 - 1
 #: Width of the border of an item that is taken to be parallel to the walls, as a share of its side: sine of a degree.
 SNAPPED = 0.02
 
@@ -42,6 +44,11 @@ class Box:
         return replace(self, w=w, d=d, yaw=self.yaw - 90 * quarters)
 
 
+@dataclass(frozen=True)
+class HiddenBox(Box):
+    """A box behind a higher one, of which a camera may not see all: it is in the way, and is not picked."""
+
+
 def checked_number(name: str, value, wanted: str, accepts: Callable[[float], bool]) -> float:
     """Return a value as a finite number that ``accepts`` accepts; ``wanted`` describes such numbers."""
     try:
@@ -53,27 +60,28 @@ def checked_number(name: str, value, wanted: str, accepts: Callable[[float], boo
     return number
 
 
-def checked_box(items, bin_sides: Sequence[float]) -> Box:
-    """Return the one measured item, which stands in the bin.
+def checked_boxes(items, bin_sides: Sequence[float]) -> list[Box]:
+    """Return the measured items, which stand in the bin.
 
     Raises:
         DepthMapError: for anything else.
     """
     if not isinstance(items, (list, tuple)) or not all(isinstance(item, Box) for item in items):
-        raise DepthMapError(f"items={excerpt(items)}: expected a list of one Box.")
-    if len(items) != 1:
-        raise DepthMapError(
-            f"items: got {len(items)} boxes, expected one: {'an empty bin' if not items else 'too many'}."
-        )
-    (box,) = items
-    for key, value in vars(box).items():
-        if not is_number(value) or abs(value) > MAX_VALUE or (key in "wdh" and value < MILLIMETRE):
-            expected = "a length of at least 0.001 m" if key in "wdh" else "a finite number"
-            raise DepthMapError(f"items[0].{key}={excerpt(value)}: expected {expected}.")
-    for key, side in zip("xy", bin_sides, strict=True):
-        if not 0 <= getattr(box, key) <= side:
-            raise DepthMapError(f"items[0].{key}={getattr(box, key):g}: expected 0 to {side:g} m, in the bin.")
-    return box.upright()
+        raise DepthMapError(f"items={excerpt(items)}: expected a list of Box.")
+    if not 1 <= len(items) <= MAX_BIN_ITEMS:
+        found = "an empty bin" if not items else "too many"
+        raise DepthMapError(f"items: got {len(items)} boxes, expected 1 to {MAX_BIN_ITEMS}: {found}.")
+    for number, box in enumerate(items):
+        for key, value in vars(box).items():
+            if not is_number(value) or abs(value) > MAX_VALUE or (key in "wdh" and value < MILLIMETRE):
+                expected = "a length of at least 0.001 m" if key in "wdh" else "a finite number"
+                raise DepthMapError(f"items[{number}].{key}={excerpt(value)}: expected {expected}.")
+        for key, side in zip("xy", bin_sides, strict=True):
+            if not 0 <= getattr(box, key) <= side:
+                raise DepthMapError(
+                    f"items[{number}].{key}={getattr(box, key):g}: expected 0 to {side:g} m, in the bin."
+                )
+    return [box.upright() for box in items]
 
 
 def as_array(name: str, values, grid: Sequence[int], kinds: str = "iuf") -> np.ndarray:
@@ -179,6 +187,42 @@ def flags_of_map(name: str, values, grid: Sequence[int]) -> Tensor:
     return torch.from_numpy(array.astype(np.int64))
 
 
+def labels_of_map(values, heights: np.ndarray, least: float) -> dict[int, np.ndarray]:
+    """Return where each label of ``bin_labels`` stands, bool in the shape of ``heights``; by ascending labels.
+
+    Args:
+        values: whole numbers, 0 where the bin is empty.
+        heights: ``bin_depth``.
+        least: a height above it is an item's, so it must have a label, and each label must have one.
+
+    Raises:
+        DepthMapError: naming the first value that is no such number, or does not fit the heights.
+    """
+    array = as_array("bin_labels", values, heights.shape)
+    if array.shape != heights.shape:
+        raise DepthMapError(
+            f"bin_labels: got shape {list(array.shape)}, expected {list(heights.shape)}, that of bin_depth."
+        )
+
+    def refuse(bad: np.ndarray, expected: str) -> None:
+        if bad.any():
+            x, y = np.argwhere(bad)[0].tolist()
+            raise DepthMapError(
+                f"bin_labels[{x}, {y}]: got {array[x, y]:g} where bin_depth is {heights[x, y]:g}, expected {expected}."
+            )
+
+    refuse(~((array >= 0) & (array <= MAX_LABEL) & (array == np.floor(array))), f"a whole number, 0 to {MAX_LABEL:,}")
+    refuse((heights > least) & (array == 0), "a label for each item")
+    labels = [int(label) for label in np.unique(array) if label]
+    if not 1 <= len(labels) <= MAX_BIN_ITEMS:
+        raise DepthMapError(f"bin_labels: got {len(labels)} labels, expected 1 to {MAX_BIN_ITEMS}, one for each item.")
+    segments = {label: array == label for label in labels}
+    for segment in segments.values():
+        if not (heights[segment] > least).any():
+            refuse(segment, "0, as no item is seen")
+    return segments
+
+
 def is_inside(points: np.ndarray, centre: Sequence[float], sides: Sequence[float], yaw: float) -> np.ndarray:
     """Return which of the points ``[..., 2]`` lie in a rectangle with a yaw in degrees, bool ``[...]``."""
     turn, away = math.radians(yaw), points - centre
@@ -186,7 +230,45 @@ def is_inside(points: np.ndarray, centre: Sequence[float], sides: Sequence[float
     return (np.abs(along[0]) < sides[0] / 2) & (np.abs(along[1]) < sides[1] / 2)
 
 
-def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: bool = False) -> Box:
+def touches(centres: np.ndarray, sides: Sequence[float], yaw: float, box: Box) -> np.ndarray:
+    """Return at which centres ``[P, 2]`` a rectangle overlaps a box in plan view, bool ``[P]``; an edge is no overlap.
+
+    Two rectangles are apart if they are along one of their four axes.
+
+    Args:
+        sides, yaw: of the rectangle; m, degrees.
+    """
+    away = centres - (box.x, box.y)
+    halves = []  # the vectors from a centre to the middles of two sides, of each rectangle
+    for (w, d), degrees in ((sides, yaw), ((box.w, box.d), box.yaw)):
+        cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        halves += [(w / 2 * cos, w / 2 * sin), (-d / 2 * sin, d / 2 * cos)]
+    axes = np.array(halves) / np.linalg.norm(halves, axis=1, keepdims=True)
+    reach = np.abs(axes @ np.array(halves).T).sum(1)
+    return (np.abs(away @ axes.T) < reach - ROUNDING).all(1)
+
+
+def boxes_of_map(heights: np.ndarray, labels, side: float, accuracy: float, is_cell_map: bool = False) -> list[Box]:
+    """Return the cuboid of each label in a bin's map, by ascending labels.
+
+    Args:
+        labels: ``bin_labels``, see :func:`labels_of_map`; the others as of :func:`box_of_map`.
+
+    Raises:
+        DepthMapError: for labels that do not fit the map, or a label of something else than one cuboid.
+    """
+    boxes = []
+    for label, segment in labels_of_map(labels, heights, least_height(accuracy)).items():
+        boxes.append(box_of_map(np.where(segment, heights, 0.0), side, accuracy, is_cell_map, f" with label {label}"))
+    return boxes
+
+
+def least_height(accuracy: float) -> float:
+    """Return the height up to which a bin's map shows its floor, m."""
+    return max(2 * accuracy, MILLIMETRE / 2)
+
+
+def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: bool = False, name: str = "") -> Box:
     """Return the one cuboid that a bin's map shows.
 
     Args:
@@ -194,11 +276,12 @@ def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: b
         side: of a value's square, m.
         accuracy: greatest error of a height, m.
         is_cell_map: whether the map has one value a cell: then the item is all cells in which it lies.
+        name: of the item, for messages; none if it should lie alone.
 
     Raises:
         DepthMapError: for an empty bin, or something else than one cuboid.
     """
-    filled = heights > max(2 * accuracy, MILLIMETRE / 2)
+    filled = heights > least_height(accuracy)
     if not filled.any():
         raise DepthMapError("bin_depth: got no cell above 0, expected one item.")
     where = np.argwhere(filled)
@@ -212,8 +295,8 @@ def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: b
     if (bad := inside & (heights < box.h - 2 * accuracy - ROUNDING)).any():
         i, j = np.argwhere(bad)[0].tolist()
         raise DepthMapError(
-            f"bin_depth[{i}, {j}]: got {heights[i, j]:g} m, expected {box.h:g} m: one cuboid, {w:g} x {d:g} m with its "
-            f"centre at [{x:g}, {y:g}]."
+            f"bin_depth[{i}, {j}]: got {heights[i, j]:g} m{name}, expected {box.h:g} m: one cuboid, {w:g} x {d:g} m "
+            f"with its centre at [{x:g}, {y:g}]{'' if name else '; of several items give bin_labels, too'}."
         )
     return box.upright()
 

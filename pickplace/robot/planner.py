@@ -1,13 +1,15 @@
 """The planner for a robot cell: from depth maps or measured boxes to one pick and one place, with reasons if none.
 
+Several items may lie in the bin; the planner chooses one of them.
+
 Frames of reference (see ``docs/robot.md``): the bin and the tote have a frame each. The origin is the outer corner of
 cell ``(0, 0)`` on the inner floor; x runs along the first axis of the depth map, y along the second, z upwards. Cell
 ``(i, j)`` covers ``[i, i + 1) x [j, j + 1)`` cells. A rotation turns the end effector, with the item, counter-clockwise
 seen from above.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 import torch
@@ -17,40 +19,25 @@ from pickplace.planners.base import MapPlanner, decide
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy
 from pickplace.policies.restore import load_critic, load_policy
+from pickplace.robot.alternatives import MAX_ALTERNATIVES, Alternative, list_alternatives
 from pickplace.robot.camera import ToteMap
 from pickplace.robot.measure import Box, DepthMapError, checked_number
-from pickplace.robot.problem import Pose, Problem, check_tote_height, read_grid, read_metric
+from pickplace.robot.measured_problem import read_metric
+from pickplace.robot.problem import Pose, Problem, check_tote_height, read_grid
 from pickplace.robot.training import Training
 from pickplace.runs.registry import build, find
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import excerpt, is_whole
-from pickplace.task.feasibility import action_footprints, action_mask
-from pickplace.task.grasps import split_action
 from pickplace.task.items import ItemDistribution
 from pickplace.task.observation import Term, check_terms, observe
 from pickplace.task.state import Failure, Observation
 
 __all__ = ["Alternative", "Box", "DepthMapError", "Plan", "Planner", "Pose"]
 
-MAX_ALTERNATIVES = 100_000  # greatest number of choices that a plan may report
-
-
-@dataclass(frozen=True)
-class Alternative:
-    """One of the most probable choices, and whether it succeeds in a forward simulation."""
-
-    action: int  #: flat index
-    pick_cell: tuple[int, int]
-    place_cell: tuple[int, int]
-    rotation_degrees: int  #: turn of the end effector's pose in the tote, in quarter turns
-    probability: float  #: of the action, or of the footprint if the policy chooses footprints; without a mask
-    rejected: str | None  #: the reason why it would fail; None if it would succeed
-    chosen: bool
-
 
 @dataclass(frozen=True)
 class Plan:
-    """One pick and one place for the item in the bin; made by :meth:`Planner.plan`.
+    """One pick and one place for an item in the bin; made by :meth:`Planner.plan`.
 
     The lengths ``center`` and ``drop_height`` are in metres if ``cell_size`` was given, else in cells along x and y and
     in height units along z.
@@ -59,8 +46,10 @@ class Plan:
     #: "ok"; "stuck": no action is feasible; "impossible": no action would be feasible in an empty tote either;
     #: "rejected": some action is feasible, but not the one that the planner chooses
     status: str
-    item: dict[str, int]  #: the item as the policy sees it: x, y, w, d in cells, h in height units
-    box: Box | None  #: the item as it was measured, in metres; None without cell_size
+    #: the item that is taken, as the policy sees it: x, y, w, d in cells, h in height units; None if several items lie
+    #: in the bin and none is taken
+    item: dict[str, int] | None
+    box: Box | None  #: the same item as it was measured, in metres; None without cell_size
     pick: Pose | None  #: in the bin's frame
     place: Pose | None  #: in the tote's frame; the end effector lets go there
     #: turn between pick and place, counter-clockwise seen from above, -45 to 315; the shorter way round is as good
@@ -74,6 +63,8 @@ class Plan:
     #: with ``support="bearing"``: 1 where the tote bears weight once the item rests, for the next call; else None
     tote_bearing: list[list[int]] | None
     warnings: list[str]  #: what lies outside the policy's training
+    #: of the item that is taken, from 0: in ``items``, or among the ascending labels; None if none is taken
+    item_number: int | None = None
 
     def as_dict(self) -> dict:
         """Return the plan as plain values, ready for JSON."""
@@ -91,6 +82,9 @@ class Planner:
         planner: what decides: None: the policy; the short name of a planner (``"joint_dbl"``), or one that was made.
         items: the item distribution, for a search to imagine.
         training: what the policy was trained with, for :attr:`Plan.warnings`; None: it is not known.
+
+    Any number of items may lie in the bin, whatever ``cell.bin_items`` is. A planner that was made must have been made
+    for several.
     """
 
     def __init__(
@@ -104,26 +98,18 @@ class Planner:
         training: Training | None = None,
         critic=None,
     ):
-        self.cell, self.terms, self.policy, self.training = cell, check_terms(terms), policy, training
-        if planner is None or planner == "policy":
-            if policy is None:
-                raise ValueError("policy=None: expected a policy, or planner='joint_dbl' or another that needs none.")
-            planner = PolicyPlanner(cell, policy, candidates)
-        elif isinstance(planner, str):
-            given = {"items": items, "terms": self.terms, "policy": policy, "critic": critic}
-            maker = find("planner", planner)
-            needs = getattr(maker, "needs", ())
-            for key in ("policy", "items"):
-                if key in needs and given[key] is None:
-                    raise ValueError(
-                        f"{key}=None: planner={planner!r} needs it; Planner.load has it from a checkpoint."
-                    )
-            planner = maker(cell=cell, **{key: given[key] for key in given if key in needs})
+        self.cell, self.policy, self.training = cell, policy, training
+        self.terms = check_terms(terms, cell.bin_items)
+        self._make = None  # a function of cell, policy and terms; None: the planner was made
+        if planner is None or isinstance(planner, str):
+            self._make = _maker(planner or "policy", candidates, policy=policy, items=items, critic=critic)
+            planner = self._make(cell, policy, self.terms)
         if not isinstance(planner, MapPlanner):
             raise ValueError(
                 f"planner={excerpt(planner)}: it does not choose among feasible actions; expected another."
             )
         self._planner: MapPlanner = planner
+        self._others: dict[int, MapPlanner] = {}  # for another number of items in the bin
 
     @classmethod
     def load(
@@ -156,8 +142,9 @@ class Planner:
         tote_bearing=None,
         items: Sequence[Box] | None = None,
         tote: ToteMap | None = None,
+        bin_labels=None,
     ) -> Plan:
-        """Return where to pick the one item in the bin, where to place it and how to turn it.
+        """Return which item in the bin to pick and where, where to place it and how to turn it.
 
         Args:
             bin_depth: ``[W_B, D_B]``, or a whole multiple of it: height above the bin's floor, 0 where empty; numpy,
@@ -174,12 +161,15 @@ class Planner:
             tote_bearing: with ``support="bearing"``, ``[W_T, D_T]``, 1 where a cell bears weight, else 0: what the
                 plan before this one returned; None: every cell bears weight. In metres, of a map with one value a
                 cell, only the floor does then: nothing tells whether a cell is level.
-            items: instead of ``bin_depth``: a list of one :class:`Box`, in metres.
+            items: instead of ``bin_depth``: a list of :class:`Box`, in metres: everything that lies in the bin.
             tote: instead of ``tote_depth``: what a :class:`~pickplace.robot.camera.Camera` sees.
+            bin_labels: where several items lie in the bin, whole numbers in the shape of ``bin_depth``: 0 where it is
+                empty, another number for each item. None: one item lies there.
 
         Raises:
             DepthMapError: for a map of another shape or type, a value that is not finite or out of range, an empty
-                bin, or anything but one cuboid in it; it names the cell.
+                bin, or anything but one cuboid in it, or for each label; it names the cell. Also for several items
+                among which the planner cannot choose.
         """
         self.check_settings(tote_height, cell_size, accuracy, clearance, alternatives)
         device = torch.device("cpu") if self.policy is None else next(self.policy.parameters()).device
@@ -194,32 +184,57 @@ class Planner:
                     )
             if bin_depth is None:
                 raise DepthMapError("bin_depth: missing; expected a depth map.")
-            problem = read_grid(self.cell, bin_depth, tote_depth, tote_height, tote_bearing, device)
+            problem = read_grid(self.cell, bin_depth, bin_labels, tote_depth, tote_height, tote_bearing, device)
         else:
             problem = read_metric(
-                self.cell, cell_size, accuracy, clearance, bin_depth, items, tote if tote_depth is None else tote_depth,
-                tote_height, tote_bearing, device,
+                self.cell, cell_size, accuracy, clearance, bin_depth, bin_labels, items,
+                tote if tote_depth is None else tote_depth, tote_height, tote_bearing, device,
             )  # fmt: skip
-        observation = observe(self.terms, self.cell, problem.seen)
-        status, action = self._decide(problem, observation)
-        pick, place, turn, top = (None,) * 4 if action is None else problem.poses(action)
-        before, bearing = problem.filled(), problem.bearing_after(action)
+        planner, terms = self._planner_of(problem.bin_items, cell_size is not None)
+        observation = observe(terms, problem.cell, problem.seen)
+        status, action = _decide(planner, problem, observation)
+        number = None if action is None else int(problem.taken_items(action))
+        item = problem if number is None else problem.of_item(number)
+        is_known = number is not None or problem.bin_items == 1
+        pick, place, turn, top = (None,) * 4 if action is None else item.poses(action)
+        before, bearing = problem.filled(), item.bearing_after(action)
         return Plan(
             status=status,
-            item={key: int(value) for key, value in problem.seen.item._asdict().items()},
-            box=problem.box,
+            item={key: int(value) for key, value in item.seen.item._asdict().items()} if is_known else None,
+            box=item.box if is_known else None,
             pick=pick,
             place=place,
             rotation_degrees=turn,
-            drop_height=None if top is None else problem.drop_height(top),
+            drop_height=None if top is None else item.drop_height(top),
             action=None if action is None else int(action),
             occupancy_before=before,
-            occupancy_after=before if action is None else before + problem.item_share(),
-            alternatives=self._alternatives(problem, observation, action, alternatives),
-            reasons=self._reasons(problem) if status in ("stuck", "impossible") else None,
+            occupancy_after=before if action is None else before + item.item_share(),
+            alternatives=list_alternatives(planner, problem, observation, action, alternatives),
+            reasons=_reasons(problem) if status in ("stuck", "impossible") else None,
             tote_bearing=bearing.int().tolist() if self.cell.support == "bearing" else None,
-            warnings=[] if self.training is None else self.training.warnings(self.cell, problem.seen.item),
+            warnings=[] if self.training is None else self.training.warnings(self.cell, problem.seen.items),
+            item_number=number,
         )
+
+    def _planner_of(self, count: int, is_metric: bool) -> tuple[MapPlanner, Mapping[str, Term]]:
+        """Return what decides among so many items in the bin, and the terms of the observation.
+
+        Raises:
+            DepthMapError: for a planner that cannot.
+        """
+        planner, terms = self._planner, self.terms
+        if count != self.cell.bin_items:
+            planner = self._others.get(count, planner)
+            terms = check_terms(terms, max(count, self.cell.bin_items))
+            if self._make is not None and count not in self._others:
+                cell, policy = replace(self.cell, bin_items=count), self.policy
+                if policy is not None:
+                    policy = policy.with_cell(cell)
+                    policy.in_keys = [*dict.fromkeys([*policy.in_keys, "items"])]
+                planner = self._others[count] = self._make(cell, policy, terms)
+        if count > 1:
+            _check_choice(planner, count, is_metric)
+        return planner, terms
 
     def check_settings(self, tote_height, cell_size, accuracy, clearance, alternatives) -> None:
         """Check the arguments of :meth:`plan` beside the maps.
@@ -237,77 +252,65 @@ class Planner:
             expected = f"expected a whole number >= 0 and <= {MAX_ALTERNATIVES:,}."
             raise DepthMapError(f"alternatives={excerpt(alternatives)}: {expected}")
 
-    def _decide(self, problem: Problem, observation: Observation) -> tuple[str, Tensor | None]:
-        """Return the status, and the action if one was found that succeeds."""
-        if not problem.is_feasible():
-            return "stuck" if problem.is_feasible_in_an_empty_tote() else "impossible", None
 
-        def choose(observation):
-            return self._planner.choose(problem.cell, problem.state, problem.maps, observation)
+def _maker(name: str, candidates: int | Literal["all"], **given) -> Callable[..., MapPlanner]:
+    """Return a function of a cell, a policy for it and the terms of the observation: it makes the planner of a name.
 
-        action = decide(self._planner, problem.cell, observation, choose)
-        return ("ok", action) if int(problem.failures(action)) == 0 else ("rejected", None)
+    Args:
+        given: policy, items and critic, or None.
+    """
+    if name == "policy":
+        if given["policy"] is None:
+            raise ValueError("policy=None: expected a policy, or planner='joint_dbl' or another that needs none.")
+        return lambda cell, policy, terms: PolicyPlanner(cell, policy, candidates)
+    maker = find("planner", name)
+    needs = getattr(maker, "needs", ())
+    for key in ("policy", "items"):
+        if key in needs and given[key] is None:
+            raise ValueError(f"{key}=None: planner={name!r} needs it; Planner.load has it from a checkpoint.")
 
-    def _alternatives(
-        self, problem: Problem, observation: Observation, chosen: Tensor | None, count: int
-    ) -> list[Alternative]:
-        """Return the most probable choices, in the order in which the planner prefers them."""
-        if count == 0 or not isinstance(self._planner, PolicyPlanner):
-            return []
-        cell, policy, candidates = problem.cell, self._planner.policy, self._planner.candidates
-        log_probs = policy.with_cell(cell).action_log_probs(observation)[0]
-        if candidates == "all" and policy.ranks_footprints:
-            actions, probability = self._probable_footprints(log_probs, problem, chosen, count)
-        else:
-            tried = cell.num_actions if candidates == "all" else min(candidates, cell.num_actions)
-            actions = log_probs.topk(tried).indices[:count]  # the same call as the planner's, so that ties agree
-            if chosen is not None and not (actions == chosen).any():
-                actions = torch.cat([actions, chosen])
-            probability = log_probs[actions].exp()
-        failure = problem.failures(actions)
-        columns = [column.tolist() for column in split_action(cell, actions)]
-        return [
-            Alternative(
-                action=action,
-                pick_cell=(x_bin, y_bin),
-                place_cell=(x_tote, y_tote),
-                rotation_degrees=90 * rotation,
-                probability=share,
-                rejected=Failure(code).name.lower() if code else None,
-                chosen=chosen is not None and action == int(chosen),
-            )
-            for action, x_bin, y_bin, x_tote, y_tote, rotation, share, code in zip(
-                actions.tolist(), *columns, probability.tolist(), failure.tolist(), strict=True
-            )
-        ]
+    def make(cell, policy, terms):
+        parts = {**given, "policy": policy, "terms": terms}
+        return maker(cell=cell, **{key: parts[key] for key in parts if key in needs})
 
-    @staticmethod
-    def _probable_footprints(
-        log_probs: Tensor, problem: Problem, chosen: Tensor | None, count: int
-    ) -> tuple[Tensor, Tensor]:
-        """Return an action for each of the most probable footprints, and the footprint's probability.
+    return make
 
-        Many actions leave the same footprint, and the policy does not tell them apart. The action returned is the
-        chosen one, else the first feasible one, else the first one.
-        """
-        cell = problem.cell
-        footprint = action_footprints(cell, problem.state.item)[0]  # [N_a]
-        lands = footprint >= 0
-        total = log_probs.new_zeros(cell.num_footprints)
-        total.scatter_add_(0, footprint[lands], log_probs[lands].exp())
-        reachable = torch.zeros_like(total, dtype=torch.bool).index_fill_(0, footprint[lands], True)
-        ranked = torch.where(reachable, total, -1).argsort(descending=True, stable=True)[: int(reachable.sum())][:count]
-        if chosen is not None and not (ranked == footprint[chosen]).any():
-            ranked = torch.cat([ranked, footprint[chosen]])
-        preference = action_mask(cell, problem.maps)[0].int()
-        if chosen is not None:
-            preference[chosen] = 2
-        shown = [torch.where(footprint == wanted, preference, -1).argmax() for wanted in ranked]
-        return torch.stack(shown) if shown else ranked, total[ranked]
 
-    @staticmethod
-    def _reasons(problem: Problem) -> dict[str, int]:
-        """Return how many of all flat actions fail for each reason."""
-        codes = problem.failures(torch.arange(problem.cell.num_actions, device=problem.state.surface.device))
-        counts = codes.bincount(minlength=len(Failure)).tolist()
-        return {failure.name.lower(): counts[failure] for failure in Failure if counts[failure]}
+def _check_choice(planner: MapPlanner, count: int, is_metric: bool) -> None:
+    """Refuse several items in the bin for a planner that cannot choose among them."""
+    policy = getattr(planner, "policy", None)
+    if planner.cell.bin_items == 1:
+        raise DepthMapError(
+            f"bin: got {count} items, expected one: the planner was made for a cell with bin_items=1; expected one "
+            f"made with bin_items={count}, or its name."
+        )
+    if policy is None or policy.ranks_footprints:
+        return
+    name = type(policy).__name__
+    others = "expected one item, or a checkpoint of model=fcn_grasp or corners that was trained with a mask"
+    if policy.choice_key != "action":
+        raise DepthMapError(f"bin: got {count} items, among which {name} does not choose; {others}.")
+    if is_metric:
+        raise DepthMapError(
+            f"bin: got {count} items in metres, each on a grid of its own, while {name} sees the bin as one grid; "
+            f"{others}."
+        )
+
+
+def _decide(planner: MapPlanner, problem: Problem, observation: Observation) -> tuple[str, Tensor | None]:
+    """Return the status, and the action if one was found that succeeds."""
+    if not problem.is_feasible():
+        return "stuck" if problem.is_feasible_in_an_empty_tote() else "impossible", None
+
+    def choose(observation):
+        return planner.choose(problem.cell, problem.state, problem.maps, observation)
+
+    action = decide(planner, problem.cell, observation, choose)
+    return ("ok", action) if int(problem.failures(action)) == 0 else ("rejected", None)
+
+
+def _reasons(problem: Problem) -> dict[str, int]:
+    """Return how many of all flat actions fail for each reason, each with the item that its pick takes."""
+    codes = problem.failures(torch.arange(problem.cell.num_actions, device=problem.state.surface.device))
+    counts = codes.bincount(minlength=len(Failure)).tolist()
+    return {failure.name.lower(): counts[failure] for failure in Failure if counts[failure]}

@@ -45,13 +45,14 @@ METRES = {
 
 
 class PlanRequest(BaseModel):
-    """One item and one tote, as a line of ``pickplace-plan``; without ``cell_size`` in whole cells, else in metres."""
+    """A bin and a tote, as a line of ``pickplace-plan``; without ``cell_size`` in whole cells, else in metres."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [GRID, METRES]})
 
     id: object = Field(None, description="comes back as it is")
     bin_depth: Map | None = Field(None, description="height above the bin's floor, [W_B, D_B] or a multiple of it")
-    items: list[Box] | None = Field(None, description="instead of bin_depth: one measured item, in metres")
+    bin_labels: list[list[int]] | None = Field(None, description="a number for each of several items, 0 elsewhere")
+    items: list[Box] | None = Field(None, description="instead of bin_depth: the measured items, in metres")
     tote_depth: Map = Field(description="height left up to the rim, [W_T, D_T] or a multiple of it")
     tote_bearing: list[list[int]] | None = Field(None, description="tote_bearing of the plan before")
     tote_height: float | None = Field(None, description="height of the rim above the tote's floor")

@@ -22,12 +22,14 @@ class Training:
         kinds: every size ``(w, d, h)`` of its items, in cells and height units.
         tote_size: greatest tote, ``(W_T, D_T, H_T)``.
         effector_size: ``(W_E, D_E)``.
+        bin_items: number of items that the bin holds.
         rules: its options that are no sizes, such as ``support``, by name.
     """
 
     kinds: frozenset[tuple[int, int, int]]
     tote_size: tuple[int, ...]
     effector_size: tuple[int, ...]
+    bin_items: int
     rules: dict[str, Any]
 
     @classmethod
@@ -37,15 +39,24 @@ class Training:
         env = cast(dict, OmegaConf.to_container(config.env, resolve=True))
         cell = build_cell(env, reach=None)  # a table of reach may be elsewhere
         rules = {key: getattr(cell, key) for key in RULES}
-        return cls(kinds, tuple(env["tote_size"]), tuple(env["effector_size"]), rules)
+        return cls(kinds, tuple(env["tote_size"]), tuple(env["effector_size"]), cell.bin_items, rules)
 
-    def warnings(self, cell: CellSpec, item: Item) -> list[str]:
-        """Return a sentence for each thing that the policy never met: the item, the tote, the effector, the rule."""
-        found = []
-        w, d, h = (int(part) for part in item[2:])
-        if not {(w, d, h), (d, w, h)} & self.kinds:
-            longest = [max(kind[axis] for kind in self.kinds) for axis in range(3)]
-            found.append(f"item of {w}x{d}x{h} cells: the policy met other sizes, up to {_sides(longest)}.")
+    def warnings(self, cell: CellSpec, items: Item) -> list[str]:
+        """Return a sentence for each thing that the policy never met: an item, the tote, the effector, the rule.
+
+        Args:
+            cell: the sizes.
+            items: all in the bin, ``[1, M]``, as the policy sees them.
+        """
+        longest = [max(kind[axis] for kind in self.kinds) for axis in range(3)]
+        new = {
+            f"item of {w}x{d}x{h} cells: the policy met other sizes, up to {_sides(longest)}."
+            for w, d, h in items.table[0, :, 2:].tolist()
+            if not {(w, d, h), (d, w, h)} & self.kinds
+        }
+        found = sorted(new)
+        if (count := items.x.shape[1]) > self.bin_items:
+            found.append(f"{count} items in the bin: the policy met at most {self.bin_items}.")
         if self.tote_size[:2] != cell.tote_size[:2] or cell.tote_size[2] > self.tote_size[2]:
             found.append(f"tote of {_sides(cell.tote_size)} cells: the policy met {_sides(self.tote_size)}.")
         if sorted(self.effector_size) != sorted(cell.effector_size):

@@ -67,7 +67,7 @@ def _scene(cell: CellSpec, request: dict, plan: dict) -> dict:
     along, up = (1.0, cell.height_unit) if side is None else (1 / side, 1 / side)  # cells in a length
     rim = request.get("tote_height")
     height = cell.tote_size[2] * cell.height_unit if rim is None else rim * up
-    box = plan["box"] or _box_of_item(plan["item"])
+    box = plan["box"] or (plan["item"] and _box_of_item(plan["item"]))  # None: of several items none is taken
 
     def pose(key: str) -> list[float] | None:
         if plan[key] is None:
@@ -78,8 +78,8 @@ def _scene(cell: CellSpec, request: dict, plan: dict) -> dict:
     return {
         "height": height,
         "heights": surface(height - np.asarray(request["tote_depth"], float) * up, cell).round(3).tolist(),
-        "item": [*(box[key] * along for key in "xywd"), box["h"] * up, box["yaw"]],
-        "lengths": [box["w"], box["d"], box["h"]],
+        "item": box and [*(box[key] * along for key in "xywd"), box["h"] * up, box["yaw"]],
+        "lengths": box and [box["w"], box["d"], box["h"]],
         "unit": "cells" if side is None else "m",
         "pick": pose("pick"),
         "place": pose("place"),

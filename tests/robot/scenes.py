@@ -1,6 +1,6 @@
 """Random scenes of boxes, and a check of a plan in plane geometry with floats, which knows no grid and no rules."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import cos, radians, sin
 
 import numpy as np
@@ -10,7 +10,7 @@ EPSILON = 1e-6  # m
 
 @dataclass
 class Scene:
-    """A bin with one box and a tote with boxes, in metres."""
+    """A bin with one box, or with several of which a plan takes one, and a tote with boxes, in metres."""
 
     bin: tuple[float, float, float]
     tote: tuple[float, float, float]
@@ -20,6 +20,32 @@ class Scene:
     yaw: float  # degrees
     boxes: list[tuple[float, ...]] = field(default_factory=list)  # x0, y0, x1, y1, top of what is in the tote
     gripper: "Gripper | None" = None  # None: the effector's rectangle, which covers the item
+    others: list[tuple] = field(default_factory=list)  # size, centre and yaw of what else is in the bin
+
+    def in_bin(self) -> list[tuple]:
+        """Size, centre and yaw of everything in the bin."""
+        return [(self.item, self.centre, self.yaw), *self.others]
+
+    def taking(self, number: int) -> "Scene":
+        """The same scene, in which another box is the item."""
+        (item, centre, yaw), *others = (self.in_bin()[at] for at in (number, *range(number), *range(number + 1, 9))
+                                        if at <= len(self.others))  # fmt: skip
+        return replace(self, item=item, centre=centre, yaw=yaw, others=others)
+
+    def add_others(self, draw: np.random.Generator, count: int, most: tuple) -> None:
+        """Put more boxes into the bin, where they overlap none; many are as high as another, or nearly."""
+        for _ in range(100 * count):
+            if len(self.others) == count:
+                return
+            size = draw.uniform((0.02, 0.02, 0.02), most)
+            known = self.in_bin()[draw.integers(0, 1 + len(self.others))][0][2]
+            size[2] = draw.choice((size[2], known, max(0.012, known + draw.uniform(-0.01, 0.01))))
+            yaw = float(draw.choice((0, draw.uniform(-180, 180))))
+            corners = rectangle((0, 0), size[:2], yaw)
+            centre = draw.uniform(corners.max(0), np.array(self.bin[:2]) - corners.max(0))
+            shapes = [rectangle(at, sides[:2], turn) for sides, at, turn in self.in_bin()]
+            if not any(meet(corners + centre, shape) for shape in shapes):
+                self.others.append((tuple(size), tuple(centre), yaw))
 
     def drop(self, low, high, height: float) -> bool:
         """Let a box fall into the tote; one that would pass the rim stays out."""
@@ -137,6 +163,14 @@ def fault(scene: Scene, plan, accuracy: float = 0.002) -> str | None:
         return "the effector ends inside the item"
     if scene.bin[2] > h + EPSILON and not within(effector, scene.bin):
         return "the effector hits the bin's wall"
+    for (*sides, top), centre, yaw in scene.others:
+        box = rectangle(centre, sides, yaw)
+        if top < h:  # in nobody's way
+            continue
+        if gripper.grips(box, pick[:2], plan.pick.yaw):
+            return "the effector lifts two items"
+        if any(meet(moved(part, pick[:2], plan.pick.yaw), box) for part in gripper.body):
+            return "the effector hits another item in the bin"
     # Over the tote.
     item, effector = over_the_tote(scene, plan)
     if abs(np.ptp(item, 0).prod() - w * d) > 1e-6:
