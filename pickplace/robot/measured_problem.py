@@ -109,7 +109,7 @@ class MeasuredBin(Problem):
             getattr(parts[0], key)._replace(item=join_items([getattr(part, key).item for part in parts]))
             for key in ("state", "seen")
         )
-        maps = PlacingMaps(top, clearance, item, rest, blocked, len(parts))
+        maps = PlacingMaps(top, clearance, item, rest, blocked, len(parts), parts[0].maps.level_step)
         return cls(cell=cell, state=state, seen=seen, maps=maps, parts=parts)
 
     def of_item(self, number: int) -> Problem:

@@ -26,17 +26,18 @@ def corner_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     """
     feasible = footprint_mask(cell, maps)
     top = maps.rest + maps.item.h.to(maps.rest.dtype).view(-1, 1, 1, 1)
-    mask = feasible & _in_corner(maps.rest, footprint_mask(cell, maps._replace(top=top)))
+    mask = feasible & _in_corner(maps, footprint_mask(cell, maps._replace(top=top)))
     bare = feasible.flatten(1).any(1) & ~mask.flatten(1).any(1)
     if bare.any():
-        mask[bare] = feasible[bare] & _in_corner(maps.rest[bare], feasible[bare])
+        mask[bare] = feasible[bare] & _in_corner(maps, feasible)[bare]
     return mask
 
 
-def _in_corner(rest: Tensor, free: Tensor) -> Tensor:
+def _in_corner(maps: PlacingMaps, free: Tensor) -> Tensor:
     """Return where a step along x and one along y would raise the item, or end on a footprint that is not free."""
+    rest, level = maps.rest, maps.rest + maps.level_step
     before_x, after_x, before_y, after_y = (
-        (_neighbours(rest, axis, step, FAR) > rest) | ~_neighbours(free, axis, step, False)
+        (_neighbours(rest, axis, step, FAR) > level) | ~_neighbours(free, axis, step, False)
         for axis in (2, 3)
         for step in (-1, 1)
     )

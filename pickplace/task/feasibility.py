@@ -50,18 +50,20 @@ class PlacingMaps(NamedTuple):
     rest: Tensor  # int32 [N, Q, W_T, D_T]: height on which the item would lie, stable or not; FAR outside the tote
     blocked: Tensor | None = None  # bool [N, P]: see `blocked_picks`; None: the items lie alone
     bin_items: int = 1  # M
+    level_step: int = 0  # by how much the heights of a level surface may differ, where they are measured
 
     def rows(self, index: Tensor) -> "PlacingMaps":
         """Return the maps of some bins, by their numbers, which may come up more than once."""
         if self.bin_items > 1:
             index = self.rows_of_items(index)
-        return self._of_rows(index)._replace(bin_items=self.bin_items)
+        return self._of_rows(index)._replace(bin_items=self.bin_items, level_step=self.level_step)
 
     def cpu(self) -> "PlacingMaps":
         """Return the maps on the CPU."""
         blocked = None if self.blocked is None else self.blocked.cpu()
         item = Item(*(part.cpu() for part in self.item))
-        return PlacingMaps(self.top.cpu(), self.clearance.cpu(), item, self.rest.cpu(), blocked, self.bin_items)
+        parts = self.top.cpu(), self.clearance.cpu(), item, self.rest.cpu(), blocked
+        return PlacingMaps(*parts, self.bin_items, self.level_step)
 
     def of_choice(self, cell: CellSpec, choice: Tensor) -> tuple["PlacingMaps", Tensor]:
         """Return the maps of each choice's item, and its footprint.

@@ -87,7 +87,7 @@ def measured_maps(cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[f
     free = clearance(
         cell, tote.state(cell, item, slack)._replace(tote_height=torch.tensor([over_rim], device=z.device))
     )
-    maps = PlacingMaps(torch.where(good, top, NEVER)[None], free, item, z[None])
+    maps = PlacingMaps(torch.where(good, top, NEVER)[None], free, item, z[None], level_step=level_step(slack))
     return MeasuredMaps(maps, stable, highest, over_rim)
 
 

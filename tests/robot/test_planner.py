@@ -32,7 +32,7 @@ def planner():
 @given(problems(), st.sampled_from(["all", 1, 7]), st.booleans(), st.integers(0, 5))
 def test_plans_agree_with_the_oracle_and_with_plane_geometry(problem, candidates, mask, seed):
     cell, (case,) = problem
-    rim, heights, bearing, item = case
+    rim, heights, bearing, item = case[:4]
     x, y, w, d, h = item
     bin_depth = np.zeros(cell.bin_size[:2])
     bin_depth[x : x + w, y : y + d] = h

@@ -14,7 +14,7 @@ from pickplace.task.feasibility import footprint_mask, placing_maps
 from pickplace.task.state import surface_from
 
 
-def plain_corners(heights, sizes, feasible, free):
+def plain_corners(heights, sizes, feasible, free, level_step):
     """Return the feasible (parity, x, y) that are blocked along both axes, cell by cell; the fallback if there is none.
 
     Args:
@@ -22,6 +22,7 @@ def plain_corners(heights, sizes, feasible, free):
         sizes: the footprint's sides for each parity.
         feasible: a set of (parity, x, y).
         free: the same of those at which nothing is hit, stable or not.
+        level_step: by how much the heights of a level surface may differ.
     """
     wide, deep = len(heights), len(heights[0])
 
@@ -34,7 +35,7 @@ def plain_corners(heights, sizes, feasible, free):
     def blocked(place, step, free):
         parity, x, y = place
         there = parity, x + step[0], y + step[1]
-        return rest(*there) > rest(*place) or there not in free
+        return rest(*there) > rest(*place) + level_step or there not in free
 
     def corners(free):
         return {
@@ -48,11 +49,11 @@ def plain_corners(heights, sizes, feasible, free):
 
 
 @settings(max_examples=200)
-@given(problems(limited=st.booleans(), count=3))
-def test_the_mask_equals_a_plain_search(problem):
+@given(problems(limited=st.booleans(), count=3), st.sampled_from([0, 0, 1, 2]))
+def test_the_mask_equals_a_plain_search(problem, level_step):
     cell, cases = problem
     state = state_of(*cases)
-    maps = placing_maps(cell, state)
+    maps = placing_maps(cell, state)._replace(level_step=level_step)
     loose = replace(cell, support=0.0)
     never_unstable = footprint_mask(loose, placing_maps(loose, state))
     feasible, mask = footprint_mask(cell, maps), corner_mask(cell, maps)
@@ -60,7 +61,7 @@ def test_the_mask_equals_a_plain_search(problem):
         w, d = case.item[2:4]
         found = {tuple(place) for place in mask[row].nonzero().tolist()}
         among, free = ({tuple(place) for place in of[row].nonzero().tolist()} for of in (feasible, never_unstable))
-        assert found == plain_corners(case.heights.tolist(), [(w, d), (d, w)], among, free)
+        assert found == plain_corners(case.heights.tolist(), [(w, d), (d, w)], among, free, level_step)
         assert bool(found) == bool(among)
 
 
