@@ -13,7 +13,7 @@ def evaluation_table(result: dict) -> str:
         ("planner", result["planner"]),
         ("tote, rotations", f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}"),
         *(
-            [("items in the bin", f"up to {count}, refill: {env['refill']}")]
+            [("items in the bin", f"up to {count}, refill: {env.get('refill', 'each')}")]
             if (count := env.get("bin_items", 1)) > 1
             else []
         ),

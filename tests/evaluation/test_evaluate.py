@@ -35,6 +35,20 @@ def evaluation(run, tmp_path):
     return call
 
 
+def test_weights_of_before_play_with_several_items(evaluation):
+    """Their config lacks the keys; one is given, the other has its default."""
+    few = [*SMALL[1:], "env.tote_size=[5,5,4]", "evaluation.episodes=3", "threads=1"]
+    one = evaluation("checkpoint=pretrained/mixed", *few)
+    several = evaluation("checkpoint=pretrained/mixed", "env.bin_items=2", "env.bin_size=[6,6,1]", *few)
+    assert "| items in the bin " in several["out"] and "up to 2, refill: each" in several["out"]
+    assert "items in the bin" not in one["out"] and "bin_items" not in one["env"]
+    path = one["path"]
+    evaluation(
+        "checkpoint=pretrained/mixed", "env.bin_items=2", *few, f"compare={path}",
+        refused="env.bin_items=1, expected 2",
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize(("group", "stream", "seed"), [("default", "test", 7), ("validation", "validation", 3)])
 def test_evaluation_json(evaluation, group, stream, seed):
     settings = [f"evaluation={group}", f"evaluation.seed={seed}", "evaluation.episodes=5"]
