@@ -97,21 +97,22 @@ class PlacingMaps(NamedTuple):
 
 def placing_maps(cell: CellSpec, state: State) -> PlacingMaps:
     """Return everything that decides which actions succeed: see :class:`PlacingMaps`."""
-    each, clear, count = state.each_item(), clearance(cell, state), state.items.x.shape[1]
-    top, rest = resting_top(cell, each)
-    if count == 1:
-        return PlacingMaps(top, clear, each.item, rest)
-    return PlacingMaps(top, clear.repeat_interleave(count, 0), each.item, rest, blocked_picks(cell, state.item), count)
+    return _complete(cell, state, *resting_top(cell, state.each_item()))
 
 
 def unchecked_maps(cell: CellSpec, state: State) -> PlacingMaps:
     """Return the maps of footprints that are known to be stable and below the rim, without a look at either."""
-    each, clear, count = state.each_item(), clearance(cell, state), state.items.x.shape[1]
+    each = state.each_item()
     top = unchecked_top(cell, each)
-    rest = top - each.item.h.to(top.dtype).view(-1, 1, 1, 1)
+    return _complete(cell, state, top, top - each.item.h.to(top.dtype).view(-1, 1, 1, 1))
+
+
+def _complete(cell: CellSpec, state: State, top: Tensor, rest: Tensor) -> PlacingMaps:
+    """Return the maps with what the end effector must clear, in the tote and in the bin."""
+    clear, item, count = clearance(cell, state), state.each_item().item, state.items.x.shape[1]
     if count == 1:
-        return PlacingMaps(top, clear, each.item, rest)
-    return PlacingMaps(top, clear.repeat_interleave(count, 0), each.item, rest, blocked_picks(cell, state.item), count)
+        return PlacingMaps(top, clear, item, rest)
+    return PlacingMaps(top, clear.repeat_interleave(count, 0), item, rest, blocked_picks(cell, state.item), count)
 
 
 def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
