@@ -57,7 +57,10 @@ class FootprintPolicy(Policy):
     masks: tuple[str, ...] = ("footprint",)
     excludes: str | None = "failed picks and footprints outside the tote"
     ranks_footprints = True
-    score_index = "(parity * W_T + x) * D_T + y: minimum corner of the item in the tote; parity 1: turned by 90 degrees"
+    score_index = (
+        "(parity * W_T + x) * D_T + y: minimum corner of the item in the tote; parity 1: turned by 90 degrees; of "
+        "several items one after the other"
+    )
     network: FootprintFcn
 
     def __init__(self, cell: CellSpec, **network):
@@ -84,9 +87,10 @@ class FootprintPolicy(Policy):
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
         contents = None
         if "items" in observation.keys():  # noqa: SIM118 - a TensorDict does not iterate over its keys
-            number = footprint // self.cell.num_footprints
+            places = self.cell.parities * totes.shape[1] * totes.shape[2]
+            number = footprint // places
             contents = Contents(Item.from_table(observation["items"]), number)
-            footprint = footprint - number * self.cell.num_footprints
+            footprint = footprint - number * places
         return self.network.at(bins, totes, bearing, row, footprint, contents)[:, 0]
 
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:

@@ -24,7 +24,10 @@ ENVS, STEPS = 3, 8  # each check has ENVS * (STEPS + 1) problems at most
 
 #: Sizes that the model takes as they come; those of terms of your own follow from what is done with them.
 N, BIN, TOTE = Dim("N"), (Dim("W_B"), Dim("D_B")), (Dim("W_T"), Dim("D_T"))
-SHAPES = {"bin_depth": (N, *BIN), "tote_depth": (N, *TOTE), "tote_bearing": (N, *TOTE), "tote_height": (N, None)}
+SHAPES = {
+    "bin_depth": (N, *BIN), "tote_depth": (N, *TOTE), "tote_bearing": (N, *TOTE), "tote_height": (N, Dim.STATIC),
+    "items": (N, Dim("M"), Dim.STATIC),
+}  # fmt: skip
 
 
 class Scores(torch.nn.Module):

@@ -70,6 +70,25 @@ def test_the_check_is_at_three_sizes_that_the_export_has_not_seen(exported):
     }  # fmt: skip
 
 
+def test_several_items_are_an_input(tmp_path):
+    """Each item's part of the scores; with more or fewer items than in training, too."""
+    runtime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    path = tmp_path / "several.onnx"
+    onnx_model.export_onnx("pretrained/mixed_bin3", path)
+    session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    assert {entry.name: entry.shape for entry in session.get_inputs()}["items"] == ["N", "M", 5]
+    for count in (2, 4):
+        trained = onnx_model._load("pretrained/mixed_bin3", (), bin_items=count, tote_size=(7, 9, 5))
+        seen = trained.make_env(num_envs=3).rollout(4, trained, break_when_any_done=False).reshape(-1)
+        keys = [entry.name for entry in session.get_inputs()]
+        (found,) = session.run(None, {key: seen[key].numpy() for key in keys})
+        with torch.no_grad():
+            expected = trained.policy.unmasked_scores(seen)
+        assert found.shape == (len(seen), trained.cell.num_choices)
+        torch.testing.assert_close(torch.from_numpy(found), expected, rtol=1e-4, atol=1e-3)
+
+
 def test_a_robot_with_a_reach_has_the_same_scores(tmp_path):
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
