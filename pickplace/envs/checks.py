@@ -19,7 +19,7 @@ def problem_bytes(cell: CellSpec, masks: Collection[str]) -> int:
     """Return about how many bytes the masks of one problem, and what they are found with, take."""
     offsets = cell.num_offsets**2
     count = 64 * cell.num_footprints + 32 * cell.rotations * (offsets + cell.num_picks)
-    return count + ("action" in masks) * (4 * cell.num_actions + 8 * offsets * cell.num_places)
+    return cell.bin_items * (count + ("action" in masks) * (4 * cell.num_actions + 8 * offsets * cell.num_places))
 
 
 def check_items(cell: CellSpec, items: ItemDistribution) -> None:

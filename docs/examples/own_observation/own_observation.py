@@ -41,4 +41,4 @@ class PitPolicy(FootprintPolicy):
     def scores(self, observation, row, footprint):
         """Return the scores of footprints, float32 ``[M]``; ``row`` is the problem of each."""
         pits = self.pits(observation["pit_depth"][:, None]).flatten(1)  # [N, Q * W_T * D_T]
-        return super().scores(observation, row, footprint) + pits[row, footprint]
+        return super().scores(observation, row, footprint) + pits[row, footprint % pits.shape[1]]
