@@ -184,6 +184,11 @@ def _read_neighbours(where: str, values: dict) -> tuple[Point, ...]:
             f"{where}: neighbours={excerpt(value)}: expected up to {MAX_BIN_ITEMS} boxes x, y, w, d, h with sides "
             "above 0, in metres."
         )
+    wide, deep, _ = values["bin"]
+    for box in value:
+        x, y, far_x, far_y = box[0], box[1], box[0] + box[2], box[1] + box[3]
+        if min(x, y) < -TOLERANCE or far_x > wide + TOLERANCE or far_y > deep + TOLERANCE:
+            raise ValueError(f"{where}: neighbours: {excerpt(box)} leaves the bin of {wide:g} x {deep:g} m.")
     item = *values["item"], *((d, w) if values["rotation"] % 180 else (w, d))
     for one, other in combinations([item, *value], 2):
         shared = [min(one[i] + one[i + 2], other[i] + other[i + 2]) - max(one[i], other[i]) for i in (0, 1)]

@@ -1,6 +1,7 @@
 """Monte-Carlo tree search, with which the paper compares."""
 
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 import torch
@@ -185,8 +186,7 @@ class MCTS(MapPlanner):
             surface = torch.stack(list(going.values()))
             left = None
             if self.cell.bin_items > 1:
-                tables = [walks[number][1][-1].item for number in going]
-                left = Item.from_table(torch.stack([table for table in tables if table is not None]))
+                left = Item.from_table(torch.stack([cast(Tensor, walks[number][1][-1].item) for number in going]))
             arrived = State(surface, height, self._arriving(len(going), left))
             nodes = self._nodes(arrived)
             for number, node in zip(going, nodes, strict=True):

@@ -178,6 +178,11 @@ class RestoredCritic:
     in_keys: list[str]
     reward_scale: float
 
+    def with_bin_items(self, bin_items: int) -> "RestoredCritic":
+        """Return this critic for bins with another number of items."""
+        keys_for = getattr(self.network, "keys_for", None)  # others see depth maps only
+        return self if keys_for is None else replace(self, in_keys=[*keys_for(bin_items)])
+
     def __call__(self, observation: Observation) -> Tensor:
         return self.network(*(observation[key] for key in self.in_keys)) / self.reward_scale
 

@@ -28,7 +28,7 @@ class Alternative:
     probability: float
     rejected: str | None  #: the reason why it would fail; None if it would succeed
     chosen: bool
-    item_number: int = 0  #: of the item in the bin that it takes, see :attr:`Plan.item_number`
+    item_number: int = 0  #: of the item that it takes, see :attr:`Plan.item_number`; 0 if it grips none
 
 
 def list_alternatives(

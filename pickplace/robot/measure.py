@@ -248,6 +248,29 @@ def touches(centres: np.ndarray, sides: Sequence[float], yaw: float, box: Box) -
     return (np.abs(away @ axes.T) < reach - ROUNDING).all(1)
 
 
+def refuse_stacked(boxes: list[Box], tolerance: float) -> None:
+    """Refuse boxes of which one stands on another, as the lower one would be lifted with it.
+
+    Those that a camera sees in part only may seem to reach below others.
+
+    Args:
+        boxes: the items.
+        tolerance: by which each side may be measured too long, m.
+    """
+    seen = [
+        (number, replace(box, **{key: max(getattr(box, key) - 2 * tolerance, MILLIMETRE) for key in "wd"}))
+        for number, box in enumerate(boxes)
+        if not isinstance(box, HiddenBox)
+    ]
+    for index, (number, box) in enumerate(seen):
+        for other_number, other in seen[:index]:
+            if touches(np.array([[box.x, box.y]]), (box.w, box.d), box.yaw, other).any():
+                raise DepthMapError(
+                    f"items[{number}] overlaps items[{other_number}] in plan view; expected items that stand side by "
+                    "side on the bin's floor, none on another."
+                )
+
+
 def boxes_of_map(heights: np.ndarray, labels, side: float, accuracy: float, is_cell_map: bool = False) -> list[Box]:
     """Return the cuboid of each label in a bin's map, by ascending labels.
 

@@ -23,6 +23,7 @@ from pickplace.robot.measure import (
     checked_boxes,
     metric_map,
     patches,
+    refuse_stacked,
     touches,
     whole_units,
 )
@@ -151,7 +152,7 @@ def effector_centres(cell: CellSpec, item: Item, box: Box, side: float) -> np.nd
     return np.array((box.x, box.y)) + side * along @ axes
 
 
-class _Placed(NamedTuple):
+class _PlacedItem(NamedTuple):
     """An item as it was measured, and at whole cells of a grid that lies along it."""
 
     box: Box
@@ -187,7 +188,7 @@ def read_metric(
     state, seen_rim = tote.state(free, placed[0].item), max(1, round(tote.height / ratio))
     heights = (state.heights / ratio).round().clamp(max=seen_rim).int()
     seen = State(surface_from(heights, tote.bears[None]), torch.tensor([seen_rim], device=device), state.item)
-    parts, takers = [], _takers(free, placed)
+    parts, taken = [], _item_of_each_pick(free, placed)
     for number, (box, item, sides, _) in enumerate(placed):
         h = int(item.h)
         centres = effector_centres(free, item, box, cell_size)
@@ -200,7 +201,7 @@ def read_metric(
         bin_clear = torch.from_numpy(clear).to(device)
         limits = _limits(cell, free, bin_clear, centres / cell_size, h + tote.accuracy, 2 * tote.accuracy)
         if len(boxes) > 1:
-            limits = replace(limits, pick_ok=limits.pick_ok & (takers == number))
+            limits = replace(limits, pick_ok=limits.pick_ok & (taken == number))
         limited = replace(free, reach=None, limits=limits)
         measured = measured_maps(limited, tote, item, sides)
         seen_item = item._replace(h=torch.tensor([max(1, round(h / ratio))], device=device))
@@ -225,6 +226,7 @@ def _read_boxes(
         if bin_labels is not None:
             raise DepthMapError("bin_labels, items: got both, expected bin_labels with bin_depth only.")
         boxes = checked_boxes(items, bin_sides)
+        refuse_stacked(boxes, max(clearance, accuracy))
     else:
         least = -max(4 * accuracy, 0.01)
         heights = metric_map("bin_depth", bin_depth, cell.bin_size[:2], least, MAX_SIDE * MILLIMETRE)
@@ -261,7 +263,7 @@ def _read_tote(cell: CellSpec, accuracy: float, tote_depth, height: float, tote_
     return MeasuredTote(high.to(device), low.to(device), bears.to(device), rim, over_rim, slack)
 
 
-def _place(cell: CellSpec, box: Box, cell_size: float, clearance: float, name: str, device) -> _Placed:
+def _place(cell: CellSpec, box: Box, cell_size: float, clearance: float, name: str, device) -> _PlacedItem:
     """Return an item at whole cells of a grid that lies along it; refuse one that is too large."""
     sides = box.w / cell_size, box.d / cell_size
     whole = [max(1, math.ceil((side + 2 * clearance) / cell_size - ROUNDING)) for side in (box.w, box.d)]
@@ -281,10 +283,10 @@ def _place(cell: CellSpec, box: Box, cell_size: float, clearance: float, name: s
     inset = [
         math.ceil((size - side) / 2 + clearance / cell_size - ROUNDING) for size, side in zip(whole, sides, strict=True)
     ]
-    return _Placed(box, item, sides, (inset[0], inset[1]))
+    return _PlacedItem(box, item, sides, (inset[0], inset[1]))
 
 
-def _takers(cell: CellSpec, placed: Sequence[_Placed]) -> Tensor:
+def _item_of_each_pick(cell: CellSpec, placed: Sequence[_PlacedItem]) -> Tensor:
     """Return the number of the item that each pick cell takes, int64 ``[P]``, so that an action means one pose.
 
     Each item has a grid of its own. A pick cell that grips several of them stands for the highest, as on the grid.

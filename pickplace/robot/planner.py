@@ -270,7 +270,8 @@ def _maker(name: str, candidates: int | Literal["all"], **given) -> Callable[...
             raise ValueError(f"{key}=None: planner={name!r} needs it; Planner.load has it from a checkpoint.")
 
     def make(cell, policy, terms):
-        parts = {**given, "policy": policy, "terms": terms}
+        critic = given["critic"] and given["critic"].with_bin_items(cell.bin_items)
+        parts = {**given, "policy": policy, "terms": terms, "critic": critic}
         return maker(cell=cell, **{key: parts[key] for key in parts if key in needs})
 
     return make

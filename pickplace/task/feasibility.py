@@ -56,7 +56,7 @@ class PlacingMaps(NamedTuple):
         """Return the maps of some bins, by their numbers, which may come up more than once."""
         if self.bin_items > 1:
             index = self.rows_of_items(index)
-        return self._of_rows(index)._replace(bin_items=self.bin_items, level_step=self.level_step)
+        return self._of_rows(index)._replace(bin_items=self.bin_items)
 
     def cpu(self) -> "PlacingMaps":
         """Return the maps on the CPU."""
@@ -88,7 +88,8 @@ class PlacingMaps(NamedTuple):
 
     def _of_rows(self, row: Tensor) -> "PlacingMaps":
         blocked = None if self.blocked is None else self.blocked[row]
-        return PlacingMaps(self.top[row], self.clearance[row], self.item.rows(row), self.rest[row], blocked)
+        parts = self.top[row], self.clearance[row], self.item.rows(row), self.rest[row], blocked
+        return PlacingMaps(*parts, level_step=self.level_step)
 
     def clearance_in(self, rotation: int) -> Tensor:
         """Return the clearance in a rotation or turn, batch last, ``[W_T, D_T, N]``."""

@@ -80,6 +80,7 @@ def test_a_recorded_episode_in_metres(tmp_path):
      r"neighbours: \[0.04, 0, .*\] overlaps \[0.0, 0.0, 0.05, 0.1"),
     ({**ROBOT, "neighbours": [[0.1, 0.1, 0.1, 0.1, 0.1]] * 2}, "neighbours: .* overlaps .* in the bin"),
     ({"neighbours": [[0.1, 0.1, 0.1, 0.1, 0.1]]}, "bin: missing"),
+    ({**ROBOT, "neighbours": [[0.9, 0, 0.05, 0.05, 0.05]]}, r"neighbours: \[0.9, .*\] leaves the bin of 0.25 x 0.25"),
 ])  # fmt: skip
 def test_a_bad_line_is_refused(change, words, tmp_path):
     path = written(tmp_path / "plans.jsonl", LINE, LINE | {"corner": [0.1, 0.1, 0]} | change)

@@ -3,6 +3,7 @@
 import json
 from collections import Counter
 from dataclasses import replace
+from itertools import combinations
 from math import cos, radians, sin
 
 import numpy as np
@@ -18,7 +19,7 @@ from pickplace import CellSpec, DepthMapError, Failure, Planner
 from pickplace.planners.heuristics import JointDBL
 from pickplace.policies.fcn4d import ActionPolicy
 from pickplace.robot.json_lines import answer
-from pickplace.robot.measure import Box, touches
+from pickplace.robot.measure import Box, HiddenBox, touches
 from pickplace.robot.measured_problem import read_metric
 from pickplace.task.grasps import all_grasps
 from pickplace.task.reach import Annulus
@@ -236,6 +237,8 @@ def test_an_action_means_one_item():
     cell, draw, several = CellSpec(bin_size=(5, 5, 1)), np.random.default_rng(0), 0
     for _ in range(100):
         boxes = [Box(*draw.uniform(0.02, 0.23, 2), 0.02, 0.02, h, draw.uniform(-45, 45)) for h in (0.05, 0.1, 0.07)]
+        if any(touches(np.array([[a.x, a.y]]), (a.w, a.d), a.yaw, b).any() for a, b in combinations(boxes, 2)):
+            continue
         problem = read_metric(
             cell, CELL, NOISE, 0.005, None, None, boxes, FLAT["tote_depth"], None, None, torch.device("cpu")
         )
@@ -297,7 +300,7 @@ def test_those_that_cannot_choose_refuse_in_one_sentence():
         (Planner.load("pretrained/unmasked"), grid, "bin: got 2 items, among which GraspPolicy does not choose"),
         (Planner.load("pretrained/fcn4d"), boxes, "bin: got 2 items in metres, each on a grid of its own, while Act"),
         (Planner(CellSpec(), planner=JointDBL(CellSpec())), grid, "was made for a cell with bin_items=1; expected one"),
-        (Planner(CellSpec(rotations=1), planner="joint_dbl"), {**boxes, "items": [BOXES[1], BOXES[1]]},
+        (Planner(CellSpec(rotations=1), planner="joint_dbl"), {**boxes, "items": [BOXES[1], BOXES[0]]},
          "items[0].yaw=30: expected 0 with rotations=1"),
     ):  # fmt: skip
         with pytest.raises(DepthMapError) as caught:
@@ -316,6 +319,45 @@ def test_warnings_count_the_items():
         "item of 2x2x4 cells: the policy met other sizes, up to 3x3x3.",
         "3 items in the bin: the policy met at most 1.",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("upper", "refused"),
+    [
+        (Box(0.3, 0.2, 0.03, 0.05, 0.12), True),  # it stands on the end of the lower one
+        (Box(0.2, 0.2, 0.24, 0.15, 0.09), True),
+        (Box(0.35, 0.2, 0.06, 0.05, 0.12, yaw=45), False),  # its corner overlaps by millimetres: an error of measuring
+        (HiddenBox(0.3, 0.2, 0.03, 0.05, 0.03), False),
+    ],
+)
+def test_an_item_that_stands_on_another_is_refused(upper, refused):
+    """The lower one would be lifted with what stands on it."""
+    cell = CellSpec(bin_size=(8, 8, 1), tote_size=(6, 6, 5), effector_size=(2, 2), pick_rule="seal", support="half")
+    given = {
+        "items": [Box(0.2, 0.2, 0.24, 0.15, 0.06), upper],
+        "tote_depth": np.full((30, 30), 0.25),
+        "cell_size": 0.05,
+    }
+    planner = Planner(cell, planner="joint_dbl")
+    if refused:
+        with pytest.raises(
+            DepthMapError, match=r"^items\[1\] overlaps items\[0\] in plan view; expected items that stand"
+        ):
+            planner.plan(**given)
+    else:
+        assert planner.plan(**given).status == "ok"
+
+
+def test_the_critic_of_a_search_sees_each_item():
+    planner = Planner.load("pretrained/mixed", planner="lookahead", tote_size=(6, 6, 5))
+    depth, labels = np.zeros((5, 5)), np.zeros((5, 5), dtype=int)
+    for label, (corner, height) in enumerate(((slice(0, 1), 1), (slice(3, 5), 2)), 1):
+        depth[corner, corner], labels[corner, corner] = height, label
+    critics = [planner._planner.critic]
+    assert planner.plan(depth, np.full((6, 6), 5), bin_labels=labels).status == "ok"
+    critics.append(planner._others[2].critic)
+    assert [critic.in_keys[3:] for critic in critics] == [[], ["items"]]
+    assert critics[0].network is critics[1].network
 
 
 def test_items_of_a_fine_map_and_of_a_line():

@@ -91,7 +91,7 @@ class CornerNet(nn.Module):
     ) -> Tensor:
         """Return what the first layer sees, float32 ``[M, inputs]``; arguments as of :meth:`at`."""
         _, wide, deep = tote_depth.shape
-        item = item_from_depth(bin_depth).rows(row) if contents is None else contents.scored(row)
+        item = item_from_depth(bin_depth).rows(row) if contents is None else contents.scored_items(row)
         parity, x, y = split_footprint((wide, deep), footprint)
         turned = (parity == 1)[:, None]
         w, d, h = (part[:, None] for part in (item.w, item.d, item.h.float()))

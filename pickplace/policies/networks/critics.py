@@ -88,6 +88,11 @@ class PooledCritic(nn.Module):
         value = (share * room[..., 0] + more / 5).sum((1, 2))
         return value.view(*batch, 1)
 
+    @staticmethod
+    def keys_for(bin_items: int) -> tuple[str, ...]:
+        """Return the entries of the observation to read where a bin holds so many items."""
+        return (*MAP_KEYS, "items") if bin_items > 1 else MAP_KEYS
+
     def _item_code(self, bin_depth: Tensor, items: Tensor | None) -> Tensor:
         """Return the code of what lies in the bin, ``[N, 3 * item_range]``; of several items the mean."""
         if items is None:
@@ -100,8 +105,7 @@ class PooledCritic(nn.Module):
 def pooled_critic(cell: CellSpec, **network) -> PooledCritic:
     """Return the critic beside ``fcn_grasp``, for any sizes (config ``model=fcn_grasp``)."""
     critic = PooledCritic(**network)
-    if cell.bin_items > 1:
-        critic.in_keys = (*MAP_KEYS, "items")
+    critic.in_keys = critic.keys_for(cell.bin_items)
     return critic
 
 

@@ -19,7 +19,7 @@ class Contents(NamedTuple):
         """Return the same for some of the footprints."""
         return Contents(self.items, self.number[index])
 
-    def scored(self, row: Tensor) -> Item:
+    def scored_items(self, row: Tensor) -> Item:
         """Return the item of each footprint; ``row`` is the bin of each."""
         return self.items.rows((row, self.number))
 

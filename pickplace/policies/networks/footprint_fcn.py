@@ -128,7 +128,12 @@ class FootprintFcn(nn.Module):
             return torch.cat(
                 [
                     self.at(
-                        bin_depth, tote_depth, bearing, row[part], footprint[part], contents and contents.part(part)
+                        bin_depth,
+                        tote_depth,
+                        bearing,
+                        row[part],
+                        footprint[part],
+                        None if contents is None else contents.part(part),
                     )
                     for part in torch.arange(len(row), device=row.device).split(at_once)
                 ]
@@ -139,7 +144,7 @@ class FootprintFcn(nn.Module):
             padding = next((-count % step for beyond, step in PADDED_ROWS if count > beyond), 0)
             row, footprint = (F.pad(index, (0, padding)) for index in (row, footprint))
             contents = contents and contents._replace(number=F.pad(contents.number, (0, padding)))
-        item = item_from_depth(bin_depth).rows(row) if contents is None else contents.scored(row)
+        item = item_from_depth(bin_depth).rows(row) if contents is None else contents.scored_items(row)
         x, weak = self._inputs(bin_depth, tote_depth, bearing, row, footprint, item, dtype)
         with torch.autocast(tote_depth.device.type, dtype, enabled=lower):
             x = self.patch(x) + F.linear(weak, self.weak)
