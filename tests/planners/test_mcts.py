@@ -79,7 +79,7 @@ def test_a_return_is_what_the_walk_places_and_its_rollout(mask):
 @pytest.mark.parametrize("mask", [True, False])
 def test_what_is_not_taken_stays_in_the_bin(mask):
     env = make_env(tote_size=(4, 4, 2), bin_items=3)
-    root, looked = searched(mask, 3000, bin_items=3), set()
+    root, looked = searched(mask, 1500, bin_items=3), set()
     before = root.item.tolist()
     for edge in root.edges.values():
         taken = edge.action // env.cell.num_footprints
