@@ -160,7 +160,7 @@ class Lookahead(MapPlanner):
         if state.item.x.dim() == 1:
             return state._replace(surface=surface)
         taken = choice // self.cell.num_footprints
-        return State(surface, state.tote_height, remove_item(state.item, taken, torch.ones_like(taken).bool()))
+        return State(surface, state.tote_height, remove_item(state.item, taken))
 
     def _play_out(self, state: State, problem: Tensor, streams: int, horizon) -> Tensor:
         """Return the volume that the policy goes on to place, float64 ``[M, streams]``.

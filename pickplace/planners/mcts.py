@@ -94,13 +94,13 @@ class MCTS(MapPlanner):
 
     def decide(self, observation: Observation) -> Tensor:
         """Return flat actions, int64 ``[N]``."""
-        state, maps = _on_cpu(observation), None
+        state, maps = _on_cpu(observation, self.cell.bin_items), None
         if self.mask:
             maps = placing_maps(self.cell, state)
         return self._search(state, self._nodes(state), self.cell, maps).to(observation["tote_depth"].device)
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        seen, maps = _on_cpu(observation), maps.cpu()
+        seen, maps = _on_cpu(observation, self.cell.bin_items), maps.cpu()
         mask = choice_mask(cell, maps) if self.mask else action_mask(cell, maps)
         roots = self._nodes(seen, mask)
         return self._search(seen, roots, cell, maps).to(observation["tote_depth"].device)
@@ -222,7 +222,7 @@ class MCTS(MapPlanner):
             if not bad:
                 edge.surface, edge.volume = left, volume
         if item.x.dim() == 2:
-            for (_, edge), table in zip(tried, _without(item, taken).table, strict=True):
+            for (_, edge), table in zip(tried, remove_item(item, taken).table, strict=True):
                 edge.item = table
 
     def _nodes(self, state: State, mask: Tensor | None = None) -> list[_Node]:
@@ -266,16 +266,10 @@ class MCTS(MapPlanner):
             volume[row] += placed.volume[going].double()
             if len(row) == 0:
                 return volume
-            left = None if item.x.dim() == 1 else _without(item, taken).rows(going)
+            left = None if item.x.dim() == 1 else remove_item(item, taken).rows(going)
             state = State(surface[going], tote_height[going], self._arriving(len(row), left))
 
 
-def _without(items: Item, taken: Tensor) -> Item:
-    """Return what is left in the bins ``[N, M]`` without the items of those numbers, int64 ``[N]``."""
-    return remove_item(items, taken, torch.ones_like(taken, dtype=torch.bool))
-
-
-def _on_cpu(observation: Observation) -> State:
+def _on_cpu(observation: Observation, bin_items: int) -> State:
     """Return the state that an observation shows, on the CPU."""
-    known = [key for key in standard_terms(2) if key in observation.keys()]  # noqa: SIM118
-    return State.from_observation({key: observation[key].cpu() for key in known})
+    return State.from_observation({key: observation[key].cpu() for key in standard_terms(bin_items)})

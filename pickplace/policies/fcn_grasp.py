@@ -25,7 +25,7 @@ from pickplace.task.grasps import (
     pick_classes,
     split_flat,
 )
-from pickplace.task.state import Item, Observation, State, item_from_depth, items_from_observation
+from pickplace.task.state import Observation, State, item_from_depth, items_from_observation, listed_items
 from pickplace.task.transition import apply
 
 
@@ -86,10 +86,10 @@ class FootprintPolicy(Policy):
         """
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
         contents = None
-        if "items" in observation.keys():  # noqa: SIM118 - a TensorDict does not iterate over its keys
+        if (items := listed_items(observation)) is not None:
             places = self.cell.parities * totes.shape[1] * totes.shape[2]
             number = footprint // places
-            contents = Contents(Item.from_table(observation["items"]), number)
+            contents = Contents(items, number)
             footprint = footprint - number * places
         return self.network.at(bins, totes, bearing, row, footprint, contents)[:, 0]
 
@@ -104,10 +104,9 @@ class FootprintPolicy(Policy):
         return self.footprint_logits(observation, observation[f"{self.masks[0]}_mask"])
 
     def unmasked_scores(self, observation: Observation) -> Tensor:
-        totes, count = observation["tote_depth"], 1
-        if "items" in observation.keys():  # noqa: SIM118
-            count = observation["items"].shape[1]
-        return self.scores(observation, *every_footprint(totes, self.cell.parities * count)).view(totes.shape[0], -1)
+        totes, items = observation["tote_depth"], listed_items(observation)
+        parities = self.cell.parities * (1 if items is None else items.x.shape[1])  # of each item
+        return self.scores(observation, *every_footprint(totes, parities)).view(totes.shape[0], -1)
 
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
         row = torch.arange(len(choices), device=choices.device).repeat_interleave(choices.shape[1])
@@ -129,10 +128,8 @@ class FootprintPolicy(Policy):
 
         An action whose pick misses, or whose item leaves the tote, has no footprint, so probability 0.
         """
-        footprint, scores = (
-            action_footprints(self.cell, items_from_observation(observation)),
-            self.unmasked_scores(observation),
-        )
+        footprint = action_footprints(self.cell, items_from_observation(observation))
+        scores = self.unmasked_scores(observation)
         ways = count_ways(scores.shape[1], footprint, footprint >= 0)
         logits = torch.where(ways > 0, scores, MASKED)
         share = logits.log_softmax(-1) - ways.clamp(min=1).log()

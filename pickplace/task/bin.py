@@ -63,15 +63,16 @@ def select_item(items: Item, number: Tensor) -> Item:
     return Item(*(part.gather(1, number[:, None])[:, 0] for part in items))
 
 
-def remove_item(items: Item, number: Tensor, removed: Tensor) -> Item:
+def remove_item(items: Item, number: Tensor, removed: Tensor | None = None) -> Item:
     """Return what is left in the bins ``[N, M]``; later items move up, so that the first is the oldest.
 
     Args:
         number: int64 ``[N]``.
-        removed: bool ``[N]``, whether that item is removed at all.
+        removed: bool ``[N]``, whether that item is removed at all; None: it is.
     """
     place = torch.arange(items.x.shape[1], device=items.x.device)
-    after = place + ((place >= number[:, None]) & removed[:, None])
+    later = place >= number[:, None]
+    after = place + (later if removed is None else later & removed[:, None])
     return Item(*(torch.cat([part, torch.zeros_like(part[:, :1])], 1).gather(1, after) for part in items))
 
 

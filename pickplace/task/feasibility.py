@@ -55,7 +55,7 @@ class PlacingMaps(NamedTuple):
     def rows(self, index: Tensor) -> "PlacingMaps":
         """Return the maps of some bins, by their numbers, which may come up more than once."""
         if self.bin_items > 1:
-            index = self.rows_of_items(index)
+            index = (index[:, None] * self.bin_items + torch.arange(self.bin_items, device=index.device)).flatten()
         return self._of_rows(index)._replace(bin_items=self.bin_items)
 
     def cpu(self) -> "PlacingMaps":
@@ -81,10 +81,6 @@ class PlacingMaps(NamedTuple):
     def join(self, mask: Tensor) -> Tensor:
         """Return a mask over footprints ``[N * M, Q, W_T, D_T]`` as one over choices, ``[N, M * Q * W_T * D_T]``."""
         return mask.flatten(1).reshape(len(mask) // self.bin_items, -1)
-
-    def rows_of_items(self, index: Tensor) -> Tensor:
-        """Return the rows of the items of bins, int64 ``[len(index) * M]``."""
-        return (index[:, None] * self.bin_items + torch.arange(self.bin_items, device=index.device)).flatten()
 
     def _of_rows(self, row: Tensor) -> "PlacingMaps":
         blocked = None if self.blocked is None else self.blocked[row]

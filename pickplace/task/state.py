@@ -178,12 +178,17 @@ def _bin_map(item: Item, value: Tensor, bin_size: Sequence[int]) -> Tensor:
     return (inside * value.flatten()[:, None, None].float()).unflatten(0, item.x.shape).sum(1)
 
 
-def items_from_observation(observation: Observation) -> Item:
-    """Return what lies in the bins: the items listed by the term ``items``, ``[N, M]``, or the one that the bin's depth
-    map shows, ``[N]``."""
+def listed_items(observation: Observation) -> Item | None:
+    """Return the items that an observation of bins with several items lists, ``[N, M]``; None if it has no list."""
     if "items" in observation.keys():  # noqa: SIM118 - a TensorDict does not iterate over its keys
         return Item.from_table(observation["items"])
-    return item_from_depth(observation["bin_depth"])
+    return None
+
+
+def items_from_observation(observation: Observation) -> Item:
+    """Return what lies in the bins: the listed items, ``[N, M]``, or the one that the depth map shows, ``[N]``."""
+    items = listed_items(observation)
+    return item_from_depth(observation["bin_depth"]) if items is None else items
 
 
 def item_from_depth(bin_depth: Tensor) -> Item:

@@ -90,7 +90,7 @@ def test_the_first_candidate_that_succeeds_is_played(candidates, rotations, tote
 
 @pytest.mark.parametrize("rule", ["first", "nearest"])
 def test_of_several_items_it_takes_the_first_that_can_be_picked(rule):
-    """As if this item lay alone and its neighbours were part of what the end effector must not touch."""
+    """In the order of the rule; an item that its neighbours block is passed over."""
     kinds = Uniform((1, 3), (1, 3), (1, 1))  # all of one height
     others = 0
     for env, observation in random_states(bin_items=4, bin_size=(5, 5, 1), items=kinds, tote_size=(5, 5, 3)):

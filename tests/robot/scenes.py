@@ -27,7 +27,7 @@ class Scene:
         return [(self.item, self.centre, self.yaw), *self.others]
 
     def taking(self, number: int) -> "Scene":
-        """The same scene, in which another box is the item."""
+        """Return the scene with another box as the item."""
         (item, centre, yaw), *others = (self.in_bin()[at] for at in (number, *range(number), *range(number + 1, 9))
                                         if at <= len(self.others))  # fmt: skip
         return replace(self, item=item, centre=centre, yaw=yaw, others=others)

@@ -60,14 +60,9 @@ class CornerNet(nn.Module):
         nn.init.zeros_(self.head.bias)
 
     def at(
-        self,
-        bin_depth: Tensor,
-        tote_depth: Tensor,
-        bearing: Tensor,
-        row: Tensor,
-        footprint: Tensor,
+        self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor,
         contents: Contents | None = None,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """Return the scores of some footprints, float32 ``[M, 1]``.
 
         Args:
@@ -81,14 +76,9 @@ class CornerNet(nn.Module):
 
     @torch.no_grad()
     def inputs(
-        self,
-        bin_depth: Tensor,
-        tote_depth: Tensor,
-        bearing: Tensor,
-        row: Tensor,
-        footprint: Tensor,
+        self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor,
         contents: Contents | None = None,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """Return what the first layer sees, float32 ``[M, inputs]``; arguments as of :meth:`at`."""
         _, wide, deep = tote_depth.shape
         item = item_from_depth(bin_depth).rows(row) if contents is None else contents.scored_items(row)

@@ -10,7 +10,7 @@ from pickplace.task.state import Item
 
 
 class Contents(NamedTuple):
-    """What lies in bins with several items, and which of them is scored."""
+    """The items in bins with several of them, and the number of the one that is scored."""
 
     items: Item  # [N, M]
     number: Tensor  # int64, one for each footprint that is scored

@@ -107,14 +107,9 @@ class FootprintFcn(nn.Module):
         return out.view(batch, parities, wide, long, -1)
 
     def at(
-        self,
-        bin_depth: Tensor,
-        tote_depth: Tensor,
-        bearing: Tensor,
-        row: Tensor,
-        footprint: Tensor,
+        self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor,
         contents: Contents | None = None,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """Return the scores of some footprints only, float32 ``[M, out_channels]``.
 
         Args:
