@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from fractions import Fraction
-from itertools import chain, product
+from itertools import chain, combinations_with_replacement, product
 from math import dist
 
 SUCCESS, PICK_MISS, BIN_COLLISION, TOTE_COLLISION, OVERFLOW, ITEM_COLLISION, UNSTABLE, STUCK, OUT_OF_REACH = range(9)
@@ -106,7 +106,25 @@ def is_stable(rules: Rules, supporting: list[Pair], size: Pair) -> bool:
     if rules.support in ("hull", "bearing"):
         edges = hull_edges(supporting)
         return bool(edges) and all(cross(a, b, size) > 2 * rules.support_margin * dist(a, b) for a, b in edges)
+    if rules.support == "half_or_hull":
+        return share > 0.5 or in_hull_of_middles(supporting, size)
+    if rules.support == "corners":
+        w, d = size
+        held = sum(corner in supporting for corner in [(0, 0), (w - 1, 0), (0, d - 1), (w - 1, d - 1)])
+        exact = Fraction(len(supporting), w * d)
+        return exact >= Fraction(60 if held == 4 else 80 if held == 3 else 95, 100)
     return {"half": share >= 0.5, "more_than_half": share > 0.5, "full": share == 1}[rules.support]
+
+
+def in_hull_of_middles(supporting: list[Pair], size: Pair) -> bool:
+    """Whether the middle of a rectangle is one of the middles of cells, or on a line or in a triangle of some."""
+    centre, points = size, [(2 * x + 1, 2 * y + 1) for x, y in supporting]
+    for a, b, c in combinations_with_replacement(points, 3):
+        turns = [cross(p, q, centre) for p, q in ((a, b), (b, c), (c, a))]
+        within = all(min(p) <= q <= max(p) for p, q in zip(zip(a, b, c, strict=True), centre, strict=True))
+        if within and (min(turns) >= 0 or max(turns) <= 0):
+            return True
+    return False
 
 
 def hull_edges(supporting: list[Pair]) -> list[tuple[Pair, Pair]]:

@@ -28,6 +28,8 @@ SUPPORTS = [
     ("hull", 0.3),
     ("bearing", 0.0),
     ("bearing", 0.2),
+    ("half_or_hull", 0.0),
+    ("corners", 0.0),
     (0.0, 0.0),
     (2 / 3, 0.0),
 ]

@@ -15,6 +15,7 @@ from pickplace.task.feasibility import (
 )
 from pickplace.task.items import check_seed
 from pickplace.task.maps import FAR
+from pickplace.task.placing import footprint_cells, footprint_sizes
 from pickplace.task.state import Observation, State
 
 
@@ -137,3 +138,44 @@ class Corner(MapPlanner):
         cost = self.height_weight * maps.top + x[:, None] + y
         choice = torch.where(feasible, maps.join(cost), torch.inf).argmin(1)
         return first_action_reaching(cell, maps, choice)
+
+
+class HeightmapMinimisation(MapPlanner):
+    """Raises the tote's height map least: the heuristic of Wang and Hauser, 2019, "Stable bin packing of non-convex 3D
+    objects with a robot manipulator".
+
+    Minimises ``distance_weight * (x + y)`` of the footprint plus the sum of all heights in the tote after the
+    placement, over everything that is feasible; ties go to the lowest footprint index, then to the lowest flat index.
+
+    Args:
+        cell: the sizes.
+        distance_weight: cost of one cell of distance from the tote's first corner, in cells times height units.
+        item: which of several items in the bin are considered, see
+            :func:`~pickplace.planners.base.restrict_items`.
+    """
+
+    name = "heightmap_minimisation"
+
+    def __init__(self, cell: CellSpec, distance_weight: float = 0.01, item: str = "any"):
+        self.cell, self.distance_weight = cell, number("planner.distance_weight", distance_weight)
+        self.item = check_item_rule(item)
+
+    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
+        feasible = restrict_items(self.item, state, choice_mask(cell, maps))
+        x, y = (torch.arange(side, device=feasible.device) for side in cell.tote_size[:2])
+        cost = added_volume(cell, state, maps) + self.distance_weight * (x[:, None] + y).double()
+        choice = torch.where(feasible, maps.join(cost), torch.inf).argmin(1)
+        return first_action_reaching(cell, maps, choice)
+
+
+def added_volume(cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:
+    """Return by how much an item on each feasible footprint raises the sum of all heights, int64 ``[N, Q, W_T, D_T]``.
+
+    That is the item's volume and the empty space that it encloses below itself.
+    """
+    each = state.each_item()
+    w, d = footprint_sizes(cell, each.item)
+    cells, under = footprint_cells(cell, each.surface, w, d)
+    before = sum((surface >> 1).long() * used for surface, used in zip(cells, under, strict=True))  # [Q, W_T, D_T, N]
+    area = each.item.w * each.item.d
+    return area.view(-1, 1, 1, 1) * maps.top - before.permute(3, 0, 1, 2)

@@ -24,6 +24,7 @@ PLANNERS = {
     "lookahead": "pickplace.planners.lookahead.Lookahead",
     "joint_dbl": "pickplace.planners.heuristics.JointDBL",
     "corner": "pickplace.planners.heuristics.Corner",
+    "heightmap_minimisation": "pickplace.planners.heuristics.HeightmapMinimisation",
     "individual_heuristic": "pickplace.planners.individual.IndividualHeuristic",
     "mcts": "pickplace.planners.mcts.MCTS",
     "random": "pickplace.planners.heuristics.RandomFeasible",

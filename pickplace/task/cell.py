@@ -26,7 +26,7 @@ REFILLS = ("each", "batch")
 MAX_BIN_ITEMS = 100
 
 HULL_RULES = ("hull", "bearing")
-SUPPORT_RULES = ("half", "more_than_half", "hull", "bearing", "full")
+SUPPORT_RULES = ("half", "more_than_half", "hull", "bearing", "full", "half_or_hull", "corners")
 
 #: Greatest side of a grid or height, in cells or height units, and greatest side of an end effector.
 MAX_SIDE, MAX_EFFECTOR = 2_000, 64
@@ -136,8 +136,10 @@ class CellSpec:
         support: the stability rule, on the cells below the footprint that are as high as the highest of them:
             ``"half"`` (at least half of the footprint), ``"more_than_half"``, ``"full"``, ``"hull"`` (the item's
             centre lies inside their convex hull), ``"bearing"`` (the same, and a cell of another item counts only
-            where it lies inside the hull of that item's own supporting cells), or a number, the least share of the
-            footprint.
+            where it lies inside the hull of that item's own supporting cells), ``"half_or_hull"`` (more than half of
+            the footprint, or the item's centre lies inside the convex hull of the middles of these cells, or on its
+            edge), ``"corners"`` (60% of the footprint and its four corners, 80% and three of them, or 95%), or a
+            number, the least share of the footprint.
         support_margin: of ``"hull"`` and ``"bearing"``: distance from the hull's edge that the centre must exceed, in
             cells.
         height_unit: length of a height unit, in sides of a cell. The rules only count units; what converts heights to

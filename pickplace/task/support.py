@@ -1,8 +1,8 @@
 """Support: whether what an item rests on keeps it stable, and where it may bear weight itself.
 
 The *supporting cells* are the cells under the footprint that are as high as the highest of them, and bear weight. A
-rule decides by their number, or by their convex hull: an item tilts unless the vertical line through its centre passes
-the hull. With ``bearing`` the top of an item bears weight only above the hull of its own supporting cells. Then
+rule decides by their number, by the corners of the footprint among them, or by their convex hull: an item tilts unless
+the vertical line through its centre passes the hull. With ``bearing`` the top of an item bears weight only above the hull of its own supporting cells. Then
 whatever is put on it presses inside that hull, down to the floor, and no item tips the pile below it. With every other
 rule all cells bear weight.
 
@@ -24,7 +24,9 @@ from pickplace.task.cell import HULL_RULES, CellSpec
 from pickplace.task.state import surface_from
 
 BITS = 32  # normals in a word of a pattern
-LEAST_SUPPORT: dict = {"half": 0.5, "full": 1.0}  # share of the footprint, of rules that have a name
+LEAST_SUPPORT: dict = {"half": 0.5, "full": 1.0, "corners": 0.95}  # share of the footprint that suffices alone
+#: Of ``corners``: the least number of supported corners, and the share that suffices with them.
+CORNER_SUPPORT = ((4, 0.6), (3, 0.8))
 MAX_HULL_SIDE = 16  # longest side of an item with the rules of the hull, in cells: the tables grow with its sixth power
 
 
@@ -46,16 +48,35 @@ def is_supported(
     count = torch.zeros_like(z)
     for surface, used in zip(cells, under, strict=True):
         count += (surface == supporting) & used
-    return is_share_enough(cell.support, count.double() / (w * d))
+    share = count.double() / (w * d)
+    stable = is_share_enough(cell.support, share)
+    if cell.support == "half_or_hull":
+        stable |= _is_in_hull(cells, supporting, w, d, None)
+    if cell.support == "corners":
+        corners = _supported_corners(cells, supporting, w, d)
+        for least, enough in CORNER_SUPPORT:
+            stable |= (corners >= least) & (share >= enough)
+    return stable
 
 
 def is_share_enough(rule: str | float, share: Tensor) -> Tensor:
-    """Return whether a supported share of the footprint, float64, keeps an item stable by a rule without a hull."""
-    return share > 0.5 if rule == "more_than_half" else share >= LEAST_SUPPORT.get(rule, rule)
+    """Return whether a supported share of the footprint, float64, keeps an item stable whatever else a rule allows."""
+    return share > 0.5 if rule in ("more_than_half", "half_or_hull") else share >= LEAST_SUPPORT.get(rule, rule)
 
 
-def _is_in_hull(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor, margin: float) -> Tensor:
-    """Return whether the item's centre lies inside the hull, further than ``margin`` from its edge."""
+def _supported_corners(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor) -> Tensor:
+    """Return how many of the footprint's four corners lie on supporting cells; one cell may have several of them."""
+    side = round(len(cells) ** 0.5)
+    corners = torch.zeros_like(supporting)
+    for number, surface in enumerate(cells):
+        x, y = divmod(number, side)
+        at_corner = ((w == x + 1).int() + (x == 0)) * ((d == y + 1).int() + (y == 0))
+        corners += (surface == supporting) * at_corner
+    return corners
+
+
+def _is_in_hull(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor, margin: float | None) -> Tensor:
+    """Return whether the item's centre lies inside the hull; ``margin`` as of :func:`hull_patterns`."""
     side = round(len(cells) ** 0.5)
     sizes = w.clamp(1, side) - 1, d.clamp(1, side) - 1
     words = [(patterns[:, *sizes], whole[sizes]) for patterns, whole in hull_patterns(side, margin, supporting.device)]
@@ -108,17 +129,18 @@ def _normals(side: int) -> Tensor:
 
 
 def _greater_products(normals: Tensor, ends: Tensor) -> Tensor:
-    """Return the greater product of each normal's parts ``[normals, axis]`` with the two ends ``[2, ...]``."""
+    """Return the greatest product of each normal's parts ``[normals, axis]`` with the ends ``[1 or 2, ...]``."""
     return (normals[:, :, None, None, None] * ends).amax(2)
 
 
 @lru_cache(maxsize=64)
-def hull_patterns(side: int, margin: float, device: torch.device) -> list[tuple[Tensor, Tensor]]:
+def hull_patterns(side: int, margin: float | None, device: torch.device) -> list[tuple[Tensor, Tensor]]:
     """Return the patterns of the cells of every footprint up to ``side x side``, in words of :data:`BITS` normals.
 
     Args:
         side: longest side of a footprint, in cells.
-        margin: distance from the centre that a cell has to pass along a normal, in cells.
+        margin: distance from the centre that a cell has to pass along a normal, in cells; None: its middle has to
+            reach the centre.
         device: place of the tables.
 
     Returns:
@@ -130,18 +152,21 @@ def hull_patterns(side: int, margin: float, device: torch.device) -> list[tuple[
     """
     if side > MAX_HULL_SIDE:
         raise ValueError(
-            f"items may be {side} cells long; with support=hull and bearing expected at most {MAX_HULL_SIDE}."
+            f"items may be {side} cells long; with support=hull, bearing and half_or_hull expected at most {MAX_HULL_SIDE}."
         )
     size, near = torch.arange(1, side + 1), torch.arange(side)
     # Twice the distance from the centre to the near and the far edge of each cell, by cell and size of the footprint.
     ends = torch.stack([2 * near[:, None] - size, 2 * near[:, None] + 2 - size])  # [2, cell, size]
+    if margin is None:
+        ends = ends[:1] + 1
     inside = near[:, None] < size
     inside = inside[:, None, :, None] & inside[None, :, None, :]  # [x, y, w, d]
     words, normals = [], _normals(side)
     for chunk in normals.split(BITS):
         furthest = _greater_products(chunk, ends)  # [normals, axis, cell, size]
         along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
-        beyond = along > 2 * margin * chunk.double().norm(dim=1).view(-1, 1, 1, 1, 1)
+        distance = 2 * (margin or 0) * chunk.double().norm(dim=1).view(-1, 1, 1, 1, 1)
+        beyond = along >= distance if margin is None else along > distance
         # No edge has the direction from one cell to another that is not in the footprint.
         x, y = chunk.abs()[:, :, None, None].unbind(1)
         fits = ((y < size[:, None]) & (x < size)) | (x + y == 1)
