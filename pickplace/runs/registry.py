@@ -24,6 +24,8 @@ PLANNERS = {
     "lookahead": "pickplace.planners.lookahead.Lookahead",
     "joint_dbl": "pickplace.planners.heuristics.JointDBL",
     "corner": "pickplace.planners.heuristics.Corner",
+    "best_fit": "pickplace.planners.spaces.BestFit",
+    "online_bph": "pickplace.planners.spaces.OnlineBPH",
     "heightmap_minimisation": "pickplace.planners.heuristics.HeightmapMinimisation",
     "individual_heuristic": "pickplace.planners.individual.IndividualHeuristic",
     "mcts": "pickplace.planners.mcts.MCTS",

@@ -1,0 +1,157 @@
+"""Planners that set items down in corners of maximal empty spaces, as the packing heuristics of the literature do.
+
+A *maximal empty space* is a box above the items, open to the top, that cannot grow: a rectangle of cells no higher than
+its floor, one of which is as high, with something higher, or a wall, along each side.
+"""
+
+from abc import abstractmethod
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pickplace.planners.base import MapPlanner, check_item_rule, restrict_items
+from pickplace.planners.heuristics import dbl_order
+from pickplace.task.cell import MAX_SIDE, CellSpec
+from pickplace.task.checks import check_bytes
+from pickplace.task.feasibility import PlacingMaps, choice_mask, first_action_reaching
+from pickplace.task.maps import FAR
+from pickplace.task.state import Observation, State
+
+LAST = FAR**2  # order of a footprint in no corner
+AT_ONCE = 2**23  # rectangles that are looked at together, over all problems
+
+
+class Rectangles(NamedTuple):
+    """All rectangles of a grid, int64 ``[S]`` each: from ``x0`` to before ``x1``, and the same along y."""
+
+    x0: Tensor
+    y0: Tensor
+    x1: Tensor
+    y1: Tensor
+
+    @classmethod
+    def of_grid(cls, wide: int, deep: int, device) -> "Rectangles":
+        """Return those of a grid; raises ``ValueError`` if the memory does not hold them."""
+        count = wide * (wide + 1) // 2 * (deep * (deep + 1) // 2)
+        check_bytes(f"tote_size: {count:,} rectangles of cells", 100 * count, device)
+        along_x, along_y = (torch.combinations(torch.arange(side + 1, device=device)) for side in (wide, deep))
+        x = along_x.repeat_interleave(len(along_y), 0)
+        y = along_y.repeat(len(along_x), 1)
+        return cls(x[:, 0], y[:, 0], x[:, 1], y[:, 1])
+
+    def grow(self, left: int, front: int, right: int, back: int) -> "Rectangles":
+        """Return them with further cells on each side."""
+        return Rectangles(self.x0 - left, self.y0 - front, self.x1 + right, self.y1 + back)
+
+
+def empty_spaces(heights: Tensor, rectangles: Rectangles, level_step: int = 0) -> Iterator[tuple[int, Tensor]]:
+    """Yield each height in the totes, and which rectangles are maximal empty spaces with their floor there.
+
+    Args:
+        heights: int32 ``[N, W_T, D_T]``.
+        rectangles: of the grid.
+        level_step: by how much the heights of a level surface may differ.
+
+    Yields:
+        the height, and bool ``[N, S]``
+    """
+    area = (rectangles.x1 - rectangles.x0) * (rectangles.y1 - rectangles.y0)
+    sides = [rectangles.grow(*(int(side == n) for n in range(4))) for side in range(4)]
+    for level in heights.unique().tolist():
+        higher = _counter(heights > level + level_step)
+        lower = _counter(heights < level, outside=0)
+        space = (higher(rectangles) == 0) & (lower(rectangles) < area)
+        for grown in sides:
+            space &= higher(grown) > 0
+        yield level, space
+
+
+def _counter(cells: Tensor, outside: int = 1):
+    """Return a function that counts the marked cells ``[N, W, D]`` in rectangles; beyond the walls all, or none, are."""
+    padded = torch.nn.functional.pad(cells.int(), (1, 1, 1, 1), value=outside)
+    wide, deep = padded.shape[1:]
+    table = torch.nn.functional.pad(padded.cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32), (1, 0, 1, 0))
+    table = table.flatten(1)
+
+    def at(x: Tensor, y: Tensor) -> Tensor:
+        return table[:, (x + 1) * (deep + 1) + y + 1]
+
+    return lambda box: at(box.x1, box.y1) - at(box.x0, box.y1) - at(box.x1, box.y0) + at(box.x0, box.y0)
+
+
+class SpacePlanner(MapPlanner):
+    """Sets the item down in the first corner of the empty space that comes first in an order of the planner's own.
+
+    Minimises (:meth:`space_order`, footprint y, footprint x, parity) over all feasible footprints that lie in a maximal
+    empty space and in its first corner; then the lowest flat index. An item that only fits elsewhere goes where
+    deepest-bottom-left sets it down.
+
+    Args:
+        cell: the sizes.
+        item: which of several items in the bin are considered, see
+            :func:`~pickplace.planners.base.restrict_items`.
+    """
+
+    def __init__(self, cell: CellSpec, item: str = "any"):
+        self.cell, self.item = cell, check_item_rule(item)
+
+    @abstractmethod
+    def space_order(self, floor: int, left_x: Tensor, left_y: Tensor) -> Tensor | int:
+        """Return a number >= 0 by which the planner orders spaces, least first, int64 of the shape of ``left_x``.
+
+        Args:
+            floor: height of the spaces' floor.
+            left_x, left_y: cells along x and y that the item leaves free in each space.
+        """
+
+    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
+        feasible = restrict_items(self.item, state, choice_mask(cell, maps))
+        x, y = (torch.arange(side, device=feasible.device) for side in cell.tote_size[:2])
+        parity = torch.arange(cell.parities, device=feasible.device)[:, None, None]
+        orders, last = [], LAST * cell.num_footprints
+        for order in (self._corner_order(cell, state, maps), maps.top.long()):
+            order = dbl_order(cell, order, x[:, None], y) * cell.parities + parity
+            orders.append(torch.where(feasible, maps.join(order), last))
+        in_corner, elsewhere = orders
+        has_corner = (in_corner < last).any(1, keepdim=True)
+        return first_action_reaching(cell, maps, torch.where(has_corner, in_corner, elsewhere).argmin(1))
+
+    def _corner_order(self, cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:
+        """Return the least order of a space in whose first corner a footprint lies, int64 ``[N * M, Q, W_T, D_T]``."""
+        each, count = state.each_item(), state.items.x.shape[1]
+        rectangles = Rectangles.of_grid(*cell.tote_size[:2], each.surface.device)
+        wide, deep = rectangles.x1 - rectangles.x0, rectangles.y1 - rectangles.y0
+        corner = rectangles.x0 * cell.tote_size[1] + rectangles.y0
+        order = torch.full((len(each.surface), cell.parities, cell.num_places), LAST, device=corner.device)
+        for rows in torch.arange(len(each.surface), device=corner.device).split(max(1, AT_ONCE // len(corner))):
+            part = each.rows(rows)
+            for floor, space in empty_spaces(part.heights, rectangles, maps.level_step):
+                for parity in range(cell.parities):
+                    w, d = (part.item.d, part.item.w) if parity else (part.item.w, part.item.d)
+                    left_x, left_y = wide - w[:, None], deep - d[:, None]
+                    fits = space & (left_x >= 0) & (left_y >= 0) & (floor + part.item.h <= part.tote_height)[:, None]
+                    found = torch.where(fits, self.space_order(floor, left_x, left_y), LAST)
+                    least = order[rows, parity].scatter_reduce(1, corner.expand_as(found), found, "amin")
+                    order[rows, parity] = least
+        return order.view(-1, cell.parities, *cell.tote_size[:2])
+
+
+class BestFit(SpacePlanner):
+    """Fills the lowest maximal empty space that the item fits best: it leaves the fewest cells along the shorter rest."""
+
+    name = "best_fit"
+
+    def space_order(self, floor: int, left_x: Tensor, left_y: Tensor) -> Tensor:
+        return floor * MAX_SIDE + torch.minimum(left_x, left_y)
+
+
+class OnlineBPH(SpacePlanner):
+    """Fills the deepest-bottom-left maximal empty space that has room: the heuristic of Ha et al., 2017, "An online
+    packing heuristic for the three-dimensional container loading problem"."""
+
+    name = "online_bph"
+
+    def space_order(self, floor: int, left_x: Tensor, left_y: Tensor) -> int:
+        return floor
