@@ -7,6 +7,7 @@ import yaml
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 PAGE = Path(__file__).with_suffix(".md")
+PRESETS = ("benchmark", "experiment")  # groups whose options set keys of others
 COMMANDS = {"train": "pickplace-train", "evaluate": "pickplace-evaluate"}
 
 INTRODUCTION = """\
@@ -63,7 +64,7 @@ def read(path: Path) -> ConfigFile:
     top = [f"`{line}`." if line.startswith("pickplace-") else line for line in top]
     file = ConfigFile(group, path.stem, " ".join(top), bases, parts)
     place = "env" if source.startswith("# @package env\n") else group
-    prefix = "" if place in ("", "experiment") else place.replace("/", ".") + "."
+    prefix = "" if place in ("", *PRESETS) else place.replace("/", ".") + "."
     _collect(yaml.compose(source), lines, prefix, file.settings)
     return file
 
@@ -125,7 +126,7 @@ def meaning(key: str, file: ConfigFile, files: dict) -> str:
     for base in file.bases:
         if comment := meaning(key, files[file.group, base], files):
             return comment
-    if file.group != "experiment":
+    if file.group not in PRESETS:
         return ""
     found = (other.settings[key].comment for other in files.values() if key in other.settings)
     return next((comment for comment in found if comment), "")
@@ -152,8 +153,8 @@ def page() -> str:
         for group, option in file.parts.items():
             out.append(f"| `{group}` | `{option}` | {', '.join(f'`{other}`' for other in options(group))} |")
         out += [*table(file, files), ""]
-    groups = list(dict.fromkeys(group for group, _ in files if group not in ("", "experiment")))
-    for group in [*groups, "experiment"]:
+    groups = list(dict.fromkeys(group for group, _ in files if group not in ("", *PRESETS)))
+    for group in [*groups, *PRESETS]:
         out += [f"## `{group}`", ""]
         for file in (file for file in files.values() if file.group == group):
             out += [f"### `{group}={file.name}`", "", file.text]

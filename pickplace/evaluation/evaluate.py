@@ -167,8 +167,10 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
     groups = {key: OmegaConf.create(resolved(cfg[key])) for key in ("env", "items")}
     ours, changed = [], trained.copy()
     for word in task_overrides(HydraConfig.get()):
-        key = word.lstrip("+~").split("=")[0]
-        if key in PARTS_OF_ENV:
+        key, _, option = word.lstrip("+~").partition("=")
+        if key == "benchmark":
+            ours += ["env=benchmark", "items=benchmark"] if option not in ("", "null") else []
+        elif key in PARTS_OF_ENV:
             for name in keys_set_in_env(word):
                 OmegaConf.update(changed, f"env.{name}", groups["env"][name], merge=False, force_add=True)
         elif key.split(".")[0] in TRAINED:

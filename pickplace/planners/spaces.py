@@ -14,8 +14,8 @@ from torch import Tensor
 from pickplace.planners.base import MapPlanner, check_item_rule, restrict_items
 from pickplace.planners.heuristics import dbl_order
 from pickplace.task.cell import MAX_SIDE, CellSpec
-from pickplace.task.checks import check_bytes
-from pickplace.task.feasibility import PlacingMaps, choice_mask, first_action_reaching
+from pickplace.task.checks import check_bytes, flag
+from pickplace.task.feasibility import PlacingMaps, action_mask, choice_mask, first_action_reaching
 from pickplace.task.maps import FAR
 from pickplace.task.state import Observation, State
 
@@ -69,7 +69,7 @@ def empty_spaces(heights: Tensor, rectangles: Rectangles, level_step: int = 0) -
 
 
 def _counter(cells: Tensor, outside: int = 1):
-    """Return a function that counts the marked cells ``[N, W, D]`` in rectangles; beyond the walls all, or none, are."""
+    """Return a function that counts marked cells ``[N, W, D]`` in rectangles, and of ``outside`` beyond the walls."""
     padded = torch.nn.functional.pad(cells.int(), (1, 1, 1, 1), value=outside)
     wide, deep = padded.shape[1:]
     table = torch.nn.functional.pad(padded.cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32), (1, 0, 1, 0))
@@ -84,18 +84,24 @@ def _counter(cells: Tensor, outside: int = 1):
 class SpacePlanner(MapPlanner):
     """Sets the item down in the first corner of the empty space that comes first in an order of the planner's own.
 
-    Minimises (:meth:`space_order`, footprint y, footprint x, parity) over all feasible footprints that lie in a maximal
-    empty space and in its first corner; then the lowest flat index. An item that only fits elsewhere goes where
-    deepest-bottom-left sets it down.
+    Minimises (:meth:`space_order`, footprint y, footprint x, parity) over all feasible footprints that begin in the
+    first corner of a maximal empty space; then the lowest flat index.
 
     Args:
         cell: the sizes.
         item: which of several items in the bin are considered, see
             :func:`~pickplace.planners.base.restrict_items`.
+        elsewhere: where no item fits a corner of a space: whether deepest-bottom-left decides over all feasible
+            footprints. Else an action is played that fails, and ends the episode, as in the literature.
+
+    Raises:
+        ValueError: for settings of other types.
     """
 
-    def __init__(self, cell: CellSpec, item: str = "any"):
-        self.cell, self.item = cell, check_item_rule(item)
+    needs_room = True  # whether a space must hold the item; else it may begin there and stick out
+
+    def __init__(self, cell: CellSpec, item: str = "any", elsewhere: bool = True):
+        self.cell, self.item, self.elsewhere = cell, check_item_rule(item), flag("planner.elsewhere", elsewhere)
 
     @abstractmethod
     def space_order(self, floor: int, left_x: Tensor, left_y: Tensor) -> Tensor | int:
@@ -116,11 +122,14 @@ class SpacePlanner(MapPlanner):
             orders.append(torch.where(feasible, maps.join(order), last))
         in_corner, elsewhere = orders
         has_corner = (in_corner < last).any(1, keepdim=True)
-        return first_action_reaching(cell, maps, torch.where(has_corner, in_corner, elsewhere).argmin(1))
+        action = first_action_reaching(cell, maps, torch.where(has_corner, in_corner, elsewhere).argmin(1))
+        if self.elsewhere or has_corner.all():
+            return action
+        return torch.where(has_corner[:, 0], action, action_mask(cell, maps).int().argmin(1))
 
     def _corner_order(self, cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:
         """Return the least order of a space in whose first corner a footprint lies, int64 ``[N * M, Q, W_T, D_T]``."""
-        each, count = state.each_item(), state.items.x.shape[1]
+        each = state.each_item()
         rectangles = Rectangles.of_grid(*cell.tote_size[:2], each.surface.device)
         wide, deep = rectangles.x1 - rectangles.x0, rectangles.y1 - rectangles.y0
         corner = rectangles.x0 * cell.tote_size[1] + rectangles.y0
@@ -131,15 +140,18 @@ class SpacePlanner(MapPlanner):
                 for parity in range(cell.parities):
                     w, d = (part.item.d, part.item.w) if parity else (part.item.w, part.item.d)
                     left_x, left_y = wide - w[:, None], deep - d[:, None]
-                    fits = space & (left_x >= 0) & (left_y >= 0) & (floor + part.item.h <= part.tote_height)[:, None]
-                    found = torch.where(fits, self.space_order(floor, left_x, left_y), LAST)
+                    fits = (left_x >= 0) & (left_y >= 0) & (floor + part.item.h <= part.tote_height)[:, None]
+                    found = torch.where(
+                        space & fits if self.needs_room else space, self.space_order(floor, left_x, left_y), LAST
+                    )
                     least = order[rows, parity].scatter_reduce(1, corner.expand_as(found), found, "amin")
                     order[rows, parity] = least
         return order.view(-1, cell.parities, *cell.tote_size[:2])
 
 
 class BestFit(SpacePlanner):
-    """Fills the lowest maximal empty space that the item fits best: it leaves the fewest cells along the shorter rest."""
+    """Fills the lowest maximal empty space that the item fits best: with the least rest along x or y, whichever is
+    less."""
 
     name = "best_fit"
 
@@ -148,10 +160,10 @@ class BestFit(SpacePlanner):
 
 
 class OnlineBPH(SpacePlanner):
-    """Fills the deepest-bottom-left maximal empty space that has room: the heuristic of Ha et al., 2017, "An online
+    """Tries the maximal empty spaces from the deepest-bottom-left one: the heuristic of Ha et al., 2017, "An online
     packing heuristic for the three-dimensional container loading problem"."""
 
-    name = "online_bph"
+    name, needs_room = "online_bph", False
 
     def space_order(self, floor: int, left_x: Tensor, left_y: Tensor) -> int:
         return floor

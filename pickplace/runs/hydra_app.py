@@ -163,9 +163,9 @@ def _clearer_errors(config_name: str, overrides: list[str]):
     except (ValueError, TypeError) as error:  # Hydra's own, which names no key
         if isinstance(error.__cause__, OSError):  # such as a log file that cannot be opened
             raise error.__cause__ from None
-        for word in overrides:  # a group without an option, allowed for experiment only
+        for word in overrides:  # a group without an option, allowed for presets only
             group, _, option = word.lstrip("+").partition("=")
-            is_empty = option in ("null", "") and group != "experiment"
+            is_empty = option in ("null", "") and group not in ("benchmark", "experiment")
             if is_empty and (names := list_options(group, config_name, overrides)):
                 raise ValueError(f"{word}: expected {group}=<one of {', '.join(names)}>.") from error
         raise ValueError(f"{' '.join(overrides)}: {error}.") from error

@@ -165,6 +165,7 @@ def _is_stable(
     reached = flags.double() @ (contact.along > margin).double().t()  # [W, D, directions]
     enough = (reached > 0).all(-1)
     if cell.support not in HULL_RULES:
+        # Of ``half_or_hull`` and ``corners``, too, the share that suffices alone: stricter than the rule.
         enough &= is_share_enough(cell.support, flags.sum(-1).double() / contact.touched)
     stable[inside] = on_floor | full | enough
     return stable

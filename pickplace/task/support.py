@@ -2,9 +2,9 @@
 
 The *supporting cells* are the cells under the footprint that are as high as the highest of them, and bear weight. A
 rule decides by their number, by the corners of the footprint among them, or by their convex hull: an item tilts unless
-the vertical line through its centre passes the hull. With ``bearing`` the top of an item bears weight only above the hull of its own supporting cells. Then
-whatever is put on it presses inside that hull, down to the floor, and no item tips the pile below it. With every other
-rule all cells bear weight.
+the vertical line through its centre passes the hull. With ``bearing`` the top of an item bears weight only above the
+hull of its own supporting cells. Then whatever is put on it presses inside that hull, down to the floor, and no item
+tips the pile below it. With every other rule all cells bear weight.
 
 The hull is never computed. A point lies in a convex polygon if the polygon reaches as far along the normal of each of
 its edges. Those of a hull of cells are parallel to the axes, or to a line from one cell to another: a few directions.
@@ -152,7 +152,8 @@ def hull_patterns(side: int, margin: float | None, device: torch.device) -> list
     """
     if side > MAX_HULL_SIDE:
         raise ValueError(
-            f"items may be {side} cells long; with support=hull, bearing and half_or_hull expected at most {MAX_HULL_SIDE}."
+            f"items may be {side} cells long; with support=hull, bearing and half_or_hull expected at most "
+            f"{MAX_HULL_SIDE}."
         )
     size, near = torch.arange(1, side + 1), torch.arange(side)
     # Twice the distance from the centre to the near and the far edge of each cell, by cell and size of the footprint.

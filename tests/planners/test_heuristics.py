@@ -6,7 +6,7 @@ from problems import SETTINGS, choice_by_hand, occupancies, random_states, resul
 from scipy.stats import chisquare
 
 from pickplace import PickPlaceEnv
-from pickplace.planners.heuristics import Corner, JointDBL, RandomFeasible, UniformRandom
+from pickplace.planners.heuristics import Corner, HeightmapMinimisation, JointDBL, RandomFeasible, UniformRandom
 from pickplace.task.items import Uniform
 
 # Planner and items; tote, R, occupancy and its standard error, from an independent prototype of the rules. Where no
@@ -54,6 +54,30 @@ def test_reference_figures(planner, items, tote, rotations, mean, error, episode
 def corner_cost(height_weight):
     """Return what ``Corner`` minimises, of an action, its footprint and ``(top, y, x, w, d)``."""
     return lambda action, footprint, found: (height_weight * found[0] + found[1] + found[2], footprint, action)
+
+
+def raised_by(env, n, found):
+    """Return the sum of all heights after an entry of :func:`results_by_hand`, less the sum before."""
+    top, y, x, w, d, _ = found
+    heights = env.state.heights[n].tolist()
+    return sum(top - heights[a][b] for a in range(x, x + w) for b in range(y, y + d))
+
+
+@pytest.mark.parametrize("options", SETTINGS)
+@pytest.mark.parametrize("weight", [0.01, 0, 3])
+def test_heightmap_minimisation_raises_the_heights_least(weight, options):
+    for env, observation in random_states(**options):
+        chosen = HeightmapMinimisation(env.cell, weight).decide(observation)
+        for n in range(env.num_envs):
+            items = env.state.items.table[n].tolist()
+            costs = {
+                action: (
+                    raised_by(env, n, found) + weight * (found[1] + found[2]),
+                    choice_by_hand(env.cell, items, found), action,
+                )
+                for action, found in results_by_hand(env, observation, n).items()
+            }  # fmt: skip
+            assert int(chosen[n]) == min(costs, key=costs.get)
 
 
 @pytest.mark.parametrize(

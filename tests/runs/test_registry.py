@@ -41,7 +41,7 @@ def test_every_config_file_names_what_is_in_the_registry():
             group = ".".join(path.parent.relative_to(conf_dir()).parts)
             in_env = path.read_text().startswith("# @package env\n")
             assert in_env == (group in PARTS_OF_ENV)
-            visit("env" if in_env else group.removeprefix("experiment"), content, path)
+            visit("env" if in_env else "" if group in ("benchmark", "experiment") else group, content, path)
     assert {(place, name) for place, names in REGISTRY.items() for name in names} == used
     text = "".join(path.read_text() for path in conf_dir().rglob("*.yaml"))
     assert len(re.findall("_target_: pickplace", text)) == 4  # Hydra's callbacks

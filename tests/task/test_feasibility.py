@@ -12,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from oracle import SUCCESS, UNSTABLE
 from problems import Case, oracle_of, problems, random_effector, state_of
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from pickplace import CellSpec, Failure, Item, State
 from pickplace.task.cell import Limits, reference_cell
@@ -169,6 +169,42 @@ def test_shares_are_compared_exactly_in_float64(width, held):
     expected |= {"more_than_half": SUCCESS if 2 * held > width else UNSTABLE}
     for support, failure in expected.items():
         assert rest_on(heights, (width, 1, 1), support) == failure, support
+
+
+@pytest.mark.parametrize(("free", "size", "stable"), [
+    ([], (4, 5), True),
+    ([(1, 1)], (4, 5), True),  # all four corners
+    ([(0, 0)], (4, 5), True),  # three, and exactly 95%
+    ([(0, 0), (1, 1)], (4, 5), True),  # three, and 90%
+    ([(0, 0), (3, 4)], (4, 5), False),  # two, and 90%
+    ([(0, 0), (1, 1), (2, 1), (1, 2)], (4, 5), True),  # three, and exactly 80%
+    ([(0, 0), (1, 1), (2, 1), (1, 2), (2, 2)], (4, 5), False),  # three, and 75%
+    ([(1, y) for y in range(5)] + [(2, y) for y in range(3)], (4, 5), True),  # four, and exactly 60%
+    ([(1, y) for y in range(5)] + [(2, y) for y in range(4)], (4, 5), False),  # four, and 55%
+    ([(1, 0)], (3, 1), True),  # each end has two corners
+    ([(0, 0)], (2, 1), False),
+])  # fmt: skip
+def test_corners_by_hand(free, size, stable):
+    heights = torch.ones(size)
+    for x, y in free:
+        heights[x, y] = 0
+    assert rest_on(heights, (*size, 1), "corners") == (SUCCESS if stable else UNSTABLE)
+
+
+@settings(max_examples=200)
+@given(st.data())
+def test_half_or_hull_equals_scipys_hull(data):
+    w, d = data.draw(st.integers(2, 7)), data.draw(st.integers(2, 7))
+    held = data.draw(st.lists(st.tuples(st.integers(0, w - 1), st.integers(0, d - 1)), min_size=3, unique=True))
+    heights = torch.zeros(w, d)
+    for x, y in held:
+        heights[x, y] = 3
+    try:
+        hull = ConvexHull([(x + 0.5, y + 0.5) for x, y in held]).equations
+    except QhullError:  # all on a line
+        assume(False)
+    inside = (hull @ [w / 2, d / 2, 1]).max() < 1e-9
+    assert rest_on(heights, (w, d, 1), "half_or_hull") == (SUCCESS if 2 * len(held) > w * d or inside else UNSTABLE)
 
 
 @pytest.mark.parametrize(("cells", "size", "distance"), [
