@@ -1,5 +1,7 @@
 """Planners that need no training."""
 
+from functools import reduce
+
 import torch
 from torch import Tensor
 
@@ -176,6 +178,6 @@ def added_volume(cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:
     each = state.each_item()
     w, d = footprint_sizes(cell, each.item)
     cells, under = footprint_cells(cell, each.surface, w, d)
-    before = sum((surface >> 1).long() * used for surface, used in zip(cells, under, strict=True))  # [Q, W_T, D_T, N]
+    before = reduce(torch.add, [(surface >> 1).long() * used for surface, used in zip(cells, under, strict=True)])
     area = each.item.w * each.item.d
     return area.view(-1, 1, 1, 1) * maps.top - before.permute(3, 0, 1, 2)

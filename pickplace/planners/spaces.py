@@ -55,9 +55,9 @@ def empty_spaces(heights: Tensor, rectangles: Rectangles, level_step: int = 0) -
         level_step: by how much the heights of a level surface may differ.
 
     Yields:
-        the height, and bool ``[N, S]``
+        the height, and bool ``[S, N]``, batch last
     """
-    area = (rectangles.x1 - rectangles.x0) * (rectangles.y1 - rectangles.y0)
+    area = ((rectangles.x1 - rectangles.x0) * (rectangles.y1 - rectangles.y0))[:, None]
     sides = [rectangles.grow(*(int(side == n) for n in range(4))) for side in range(4)]
     for level in heights.unique().tolist():
         higher = _counter(heights > level + level_step)
@@ -69,14 +69,13 @@ def empty_spaces(heights: Tensor, rectangles: Rectangles, level_step: int = 0) -
 
 
 def _counter(cells: Tensor, outside: int = 1):
-    """Return a function that counts marked cells ``[N, W, D]`` in rectangles, and of ``outside`` beyond the walls."""
+    """Return a function that counts marked cells ``[N, W, D]`` in rectangles, ``[S, N]``, and of ``outside`` beyond the walls."""
     padded = torch.nn.functional.pad(cells.int(), (1, 1, 1, 1), value=outside)
-    wide, deep = padded.shape[1:]
     table = torch.nn.functional.pad(padded.cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32), (1, 0, 1, 0))
-    table = table.flatten(1)
+    deep, table = table.shape[2], table.flatten(1).t().contiguous()
 
     def at(x: Tensor, y: Tensor) -> Tensor:
-        return table[:, (x + 1) * (deep + 1) + y + 1]
+        return table.index_select(0, (x + 1) * deep + y + 1)
 
     return lambda box: at(box.x1, box.y1) - at(box.x0, box.y1) - at(box.x1, box.y0) + at(box.x0, box.y0)
 
@@ -131,22 +130,22 @@ class SpacePlanner(MapPlanner):
         """Return the least order of a space in whose first corner a footprint lies, int64 ``[N * M, Q, W_T, D_T]``."""
         each = state.each_item()
         rectangles = Rectangles.of_grid(*cell.tote_size[:2], each.surface.device)
-        wide, deep = rectangles.x1 - rectangles.x0, rectangles.y1 - rectangles.y0
-        corner = rectangles.x0 * cell.tote_size[1] + rectangles.y0
-        order = torch.full((len(each.surface), cell.parities, cell.num_places), LAST, device=corner.device)
+        wide, deep = (rectangles.x1 - rectangles.x0)[:, None], (rectangles.y1 - rectangles.y0)[:, None]
+        corner = (rectangles.x0 * cell.tote_size[1] + rectangles.y0)[:, None]
+        order = torch.full((cell.parities, cell.num_places, len(each.surface)), LAST, device=corner.device)
         for rows in torch.arange(len(each.surface), device=corner.device).split(max(1, AT_ONCE // len(corner))):
             part = each.rows(rows)
             for floor, space in empty_spaces(part.heights, rectangles, maps.level_step):
                 for parity in range(cell.parities):
                     w, d = (part.item.d, part.item.w) if parity else (part.item.w, part.item.d)
-                    left_x, left_y = wide - w[:, None], deep - d[:, None]
-                    fits = (left_x >= 0) & (left_y >= 0) & (floor + part.item.h <= part.tote_height)[:, None]
+                    left_x, left_y = wide - w, deep - d
+                    fits = (left_x >= 0) & (left_y >= 0) & (floor + part.item.h <= part.tote_height)
                     found = torch.where(
                         space & fits if self.needs_room else space, self.space_order(floor, left_x, left_y), LAST
                     )
-                    least = order[rows, parity].scatter_reduce(1, corner.expand_as(found), found, "amin")
-                    order[rows, parity] = least
-        return order.view(-1, cell.parities, *cell.tote_size[:2])
+                    least = order[parity][:, rows].scatter_reduce(0, corner.expand_as(found), found, "amin")
+                    order[parity, :, rows] = least
+        return order.permute(2, 0, 1).unflatten(2, cell.tote_size[:2])
 
 
 class BestFit(SpacePlanner):

@@ -17,6 +17,13 @@ from pickplace.planners.heuristics import JointDBL
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.views.tables import evaluation_table
 
+
+def compose_evaluation(*words):
+    """Return the config of an evaluation."""
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return compose("evaluate", list(words))
+
+
 SMALL = ["env.tote_size=[4,4,2]", "evaluation.latency_decisions=0", "evaluation.replay=0"]
 JOINT = ["planner=joint_dbl", *SMALL]
 
@@ -47,6 +54,21 @@ def test_weights_of_before_play_with_several_items(evaluation):
         "checkpoint=pretrained/mixed", "env.bin_items=2", *few, f"compare={path}",
         refused="env.bin_items=1, expected 2",
     )  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "least", "rotations", "support", "episodes"),
+    [("gopt_rs", 1, 2, "half_or_hull", 1000), ("cdrl_rs", 2, 1, "corners", 2000)],
+)
+def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, support, episodes):
+    cfg = compose_evaluation(f"benchmark={name}")
+    sides = [[least, 5]] * 3
+    assert [cfg.items.width, cfg.items.depth, cfg.items.height] == sides and cfg.evaluation.episodes == episodes
+    assert (cfg.env.tote_size, cfg.env.rotations, cfg.env.support) == ([10, 10, 10], rotations, support)
+    short = [f"benchmark={name}", "evaluation.episodes=2", *SMALL[1:]]
+    first = evaluation("planner=joint_dbl", *short)
+    assert first["failures"] == {"stuck": 2} and first["env"]["support"] == support
+    second = evaluation("checkpoint=pretrained/mixed", *short, "env.tote_size=[10,10,6]")
+    assert second["items"] == first["items"]
+    assert second["env"] == {**first["env"], "tote_size": [10, 10, 6]}
 
 
 @pytest.mark.parametrize(("group", "stream", "seed"), [("default", "test", 7), ("validation", "validation", 3)])

@@ -45,6 +45,7 @@ def count_faults(name: str, scenes: int, seed: int, along: int = 5, accuracy: fl
     (1, 0.002, {}), (2, 0.002, {}), (5, 0.002, {}), (8, 0.005, {}), (11, 0.0, {}),
     (5, 0.002, {"support": "half"}), (4, 0.003, {"support": "full", "rotations": 2}),
     (5, 0.002, {"support": "hull", "support_margin": 0.0, "rotations": 3}),
+    (5, 0.002, {"support": "half_or_hull"}), (5, 0.002, {"support": "corners"}),
 ])  # fmt: skip
 def test_no_plan_that_is_ok_goes_wrong(along, accuracy, options):
     found = count_faults("joint_dbl", 200, along, along, accuracy, **options)

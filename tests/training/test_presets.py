@@ -26,6 +26,12 @@ def test_every_preset_runs(name, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == files
 
 
+@pytest.mark.parametrize("name", options("benchmark"))
+def test_a_benchmark_is_trained_on(name, tmp_path):
+    words = [f"benchmark={name}", *TINY, "env.tote_size=[6,6,5]"]
+    assert 0 <= train(composed(*words), tmp_path) <= 1
+
+
 @pytest.mark.parametrize("masked", [True, False])
 @pytest.mark.parametrize("name", options("effector"))
 def test_every_effector_trains(name, masked, tmp_path):
