@@ -69,7 +69,7 @@ def empty_spaces(heights: Tensor, rectangles: Rectangles, level_step: int = 0) -
 
 
 def _counter(cells: Tensor, outside: int = 1):
-    """Return a function that counts marked cells ``[N, W, D]`` in rectangles, ``[S, N]``, and of ``outside`` beyond the walls."""
+    """Return a function that counts marked cells ``[N, W, D]`` in rectangles, ``[S, N]``; ``outside`` beyond walls."""
     padded = torch.nn.functional.pad(cells.int(), (1, 1, 1, 1), value=outside)
     table = torch.nn.functional.pad(padded.cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32), (1, 0, 1, 0))
     deep, table = table.shape[2], table.flatten(1).t().contiguous()

@@ -61,7 +61,7 @@ def test_weights_of_before_play_with_several_items(evaluation):
 def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, support, episodes):
     cfg = compose_evaluation(f"benchmark={name}")
     sides = [[least, 5]] * 3
-    assert [cfg.items.width, cfg.items.depth, cfg.items.height] == sides and cfg.evaluation.episodes == episodes
+    assert [cfg["items"][key] for key in ("width", "depth", "height")] == sides and cfg.evaluation.episodes == episodes
     assert (cfg.env.tote_size, cfg.env.rotations, cfg.env.support) == ([10, 10, 10], rotations, support)
     short = [f"benchmark={name}", "evaluation.episodes=2", *SMALL[1:]]
     first = evaluation("planner=joint_dbl", *short)
