@@ -26,7 +26,7 @@ REFILLS = ("each", "batch")
 MAX_BIN_ITEMS = 100
 
 HULL_RULES = ("hull", "bearing")
-SUPPORT_RULES = ("half", "more_than_half", "hull", "bearing", "full", "half_or_hull", "corners")
+SUPPORT_RULES = ("half", "more_than_half", "hull", "bearing", "half_or_hull", "corners", "full")
 
 #: Greatest side of a grid or height, in cells or height units, and greatest side of an end effector.
 MAX_SIDE, MAX_EFFECTOR = 2_000, 64
