@@ -55,6 +55,7 @@ class Policy(TensorDictModuleBase, ABC):
         masks: masks that the environment must emit for training it, of ``"action"``, ``"footprint"`` and ``"corner"``.
         excludes: what :meth:`action_log_probs` gives probability 0 by construction; None if nothing.
         ranks_footprints: whether it chooses among all footprints, by ``footprint_logits(observation, mask)``.
+        learns_values: whether its network is the critic, and ``algo.loss=td`` trains it.
         needs_sizes: whether it cannot learn where :meth:`check_sizes` finds fault.
         score_index: how an index of :meth:`unmasked_scores` is made; None if it has none for totes of any size.
     """
@@ -64,6 +65,7 @@ class Policy(TensorDictModuleBase, ABC):
     masks: tuple[str, ...] = ()
     excludes: str | None = None
     ranks_footprints = False
+    learns_values = False
     needs_sizes = False
     score_index: str | None = None
     network: torch.nn.Module

@@ -51,6 +51,7 @@ REGISTRY: dict[str, dict[str, str]] = {
     "model.actor": {
         "fcn_grasp": "pickplace.policies.fcn_grasp.fcn_grasp",
         "corners": "pickplace.policies.corners.corners",
+        "afterstate": "pickplace.policies.afterstate.afterstate",
         "fcn4d": "pickplace.policies.fcn4d.ActionPolicy",
         "typical": "pickplace.policies.fcn4d.TypicalPolicy",
         "individual_rl": "pickplace.policies.individual.IndividualRlPolicy",
@@ -59,6 +60,7 @@ REGISTRY: dict[str, dict[str, str]] = {
     "model.critic": {
         "pooled": "pickplace.policies.networks.critics.pooled_critic",
         "conv4d": "pickplace.policies.networks.critics.conv4d_critic",
+        "tote_value": "pickplace.policies.afterstate.tote_value",
     },
     "curriculum": {"curriculum": "pickplace.training.curriculum.Curriculum"},
     "curriculum.advance": {

@@ -1,4 +1,4 @@
-"""PPO and A2C: advantages, loss, learning rate and the epochs over one batch."""
+"""PPO, A2C and TD(lambda): advantages, loss, learning rate and the epochs over one batch."""
 
 import torch
 import torch.nn.functional as F
@@ -27,12 +27,12 @@ DIAGNOSTICS = {
 
 
 def make_losses(algo: DictConfig, policy: Policy, critic: ValueOperator) -> tuple[GAE, A2CLoss | ClipPPOLoss]:
-    """Make the advantage estimator and the loss that ``algo.loss`` names."""
+    """Make the advantage estimator and the loss that ``algo.loss`` names; of ``td`` that whose critic part is used."""
     # TorchRL leaves out a part whose coefficient is 0 at first; with 1 it is computed, so that it can be logged.
     common = {"entropy_coeff": 1.0, "critic_coeff": 1.0, "loss_critic_type": "l2"}
     exact = algo.vine_samples is None
     actor = as_actor(policy) if exact else as_sampled_actor(policy)
-    if algo.loss == "ppo":
+    if algo.loss != "a2c":
         clip = {"clip_epsilon": algo.clip_epsilon, "normalize_advantage": exact and algo.normalize_advantage}
         loss = ClipPPOLoss(actor, critic, **clip, **common)
     else:
@@ -68,6 +68,23 @@ def add_advantages(batch: TensorDictBase, advantage: GAE, reward_scale: float) -
     batch["next", "reward"] = batch["next", "reward"] * reward_scale
     batch["next", "terminated"] |= is_bin_empty(batch["next"])
     advantage(batch)
+
+
+def afterstates(batch: TensorDictBase, critic: ValueOperator, gamma: float) -> TensorDictBase:
+    """Return each tote that a step left ``[N * T]``, with the value of what followed as ``value_target``.
+
+    TD(lambda) on afterstates. The critic looks at the tote alone, so that GAE's ``value_target`` of a state is the reward
+    of its item and what follows. The value of the tote that is left must count the items that have no place there: it
+    is 0 where the episode ended, and such totes are among those returned.
+
+    Args:
+        batch: ``[N, T]``, with ``value_target``.
+        critic: reads terms that do not tell what lies in the bin.
+        gamma: discount, above 0.
+    """
+    data = batch["next"].select(*critic.in_keys)
+    data["value_target"] = (batch["value_target"] - batch["next", "reward"]) / gamma
+    return data.reshape(-1)
 
 
 def of_taken_choice(advantage: Tensor, candidates: int, normalize: bool) -> Tensor:
@@ -113,9 +130,9 @@ def update(loss, optimizer, data: TensorDictBase, algo: DictConfig, policy, phas
     for _ in range(algo.epochs):
         for index in torch.randperm(len(data), device=data.device).split(algo.minibatch_size):
             part = data[index]
-            losses = loss(part)
+            losses = loss(part) if algo.loss != "td" else critic_part(loss, part)
             total = losses["loss_critic"]
-            if phase == Phase.REWARD:
+            if phase == Phase.REWARD and algo.loss != "td":
                 total = losses["loss_objective"] + total + losses["loss_entropy"]
             elif phase == Phase.IMITATION:
                 losses["loss_imitation"], losses["agreement"] = imitation_loss(policy, part)
@@ -133,6 +150,12 @@ def update(loss, optimizer, data: TensorDictBase, algo: DictConfig, policy, phas
             for name, value in {**diagnostics, "grad_norm": norm}.items():
                 totals[name] = totals.get(name, 0.0) + value
     return {f"train/{name}": float(value) / steps for name, value in totals.items()}
+
+
+def critic_part(loss: ClipPPOLoss, data: TensorDictBase) -> dict[str, Tensor]:
+    """Return the critic's part of TorchRL's loss, as the whole loss has it; the policy is not asked."""
+    error, _, explained = loss.loss_critic(data)
+    return {"loss_critic": error.mean(), "explained_variance": explained.mean()}
 
 
 def value_ranges(values) -> str:

@@ -60,7 +60,7 @@ CHECKS = {
     "algo.vine_samples": _or_null(partial(whole_number, most=10_000)),
     "algo.vine_temperature": partial(number, least=0.01, most=100.0),
     "algo.advantages": partial(one_of, choices=("vine", "gae")),
-    "algo.loss": partial(one_of, choices=("ppo", "a2c")),
+    "algo.loss": partial(one_of, choices=("ppo", "a2c", "td")),
     **dict.fromkeys(("algo.mask_infeasible", "algo.normalize_advantage"), flag),
     "planner._target_": _only("policy", "since training validates its own policy"),
     "evaluation.stream": _only("validation", "on which training selects its best policy"),
@@ -92,6 +92,23 @@ def check_settings(cfg: DictConfig) -> None:
             "algo.normalize_advantage=True: a batch of one frame (env.num_envs x algo.rollout_length) has no variance; "
             "expected more frames, or false."
         )
+
+
+def check_learner(algo: DictConfig, warm_start: DictConfig, policy: Policy) -> None:
+    """Check that the policy learns by the loss, and that nothing is asked for which that has no use.
+
+    Raises:
+        ValueError: naming the key, its value, and what was expected.
+    """
+    if policy.learns_values != (algo.loss == "td"):
+        expected = "'td' with model=afterstate" if policy.learns_values else "'ppo' or 'a2c'; 'td' is for model=afterstate"
+        raise ValueError(f"algo.loss={excerpt(algo.loss)}: expected {expected}.")
+    if algo.loss == "td" and warm_start.frames:
+        raise ValueError(f"warm_start.frames={excerpt(warm_start.frames)}: expected 0 with algo.loss=td.")
+    if algo.loss == "td" and algo.gamma == 0:
+        raise ValueError("algo.gamma=0: expected more than 0 with algo.loss=td.")
+    if algo.loss == "td" and algo.vine_samples is not None:
+        raise ValueError(f"algo.vine_samples={excerpt(algo.vine_samples)}: expected null with algo.loss=td.")
 
 
 def check_memory(cfg: DictConfig, env: PickPlaceEnv, policy: Policy) -> None:

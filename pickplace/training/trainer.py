@@ -38,9 +38,9 @@ from pickplace.training.collectors import refuse_other_workers, rng_state, set_r
 from pickplace.training.curriculum import Curriculum, push_level
 from pickplace.training.imitation import Phase, WarmStart
 from pickplace.training.metrics import has_passed, progress_line, validation_metrics
-from pickplace.training.ppo import add_advantages, learning_rate, make_losses, of_taken_choice, update
+from pickplace.training.ppo import add_advantages, afterstates, learning_rate, make_losses, of_taken_choice, update
 from pickplace.training.report import REPORT, write_report
-from pickplace.training.settings import check_memory, check_settings
+from pickplace.training.settings import check_learner, check_memory, check_settings
 from pickplace.training.vine import vine_advantages
 from pickplace.views.figures import learning_curve
 
@@ -105,12 +105,15 @@ class Trainer:
         )
         weights = self.state if self.resumed else self._first_weights()
         self.policy: Policy = self._restored("policy", make_actor, weights)
+        check_learner(self.algo, cfg.warm_start, self.policy)
         for warning in self.policy.check_sizes():
             log.warning(warning)
         self.planner = build("planner", cfg.planner, cell=self.cell, policy=self.policy)
         self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, self.items, self.terms, cfg.seed, cfg.trust)
         make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
         self.critic = self._restored("critic", lambda: as_critic(make_critic()), weights)
+        if self.policy.learns_values:
+            self.policy.network = self.critic.module
         check_memory(cfg, probe, self.policy)
 
     def _first_weights(self) -> dict:
@@ -269,6 +272,10 @@ class Trainer:
         rate = learning_rate(self.algo, self.frames, self.cfg.total_frames)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
+        if self.algo.loss == "td":
+            data = afterstates(batch, self.critic, self.algo.gamma)
+            metrics = update(self.loss, self.optimizer, data, self.algo, self.policy, phase)
+            return {**metrics, "train/lr": rate}
         seen = {*self.policy.in_keys, *self.critic.in_keys}
         drawn = ("log_prob",) if self.algo.vine_samples is None else CANDIDATE_KEYS
         data = batch.select(*seen, self.policy.choice_key, *drawn, "advantage", "value_target").reshape(-1)

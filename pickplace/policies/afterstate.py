@@ -1,0 +1,76 @@
+"""The policy that judges a placement by the tote that it leaves."""
+
+import torch
+from torch import Tensor
+
+from pickplace.policies.base import refuse_several_items
+from pickplace.policies.corners import CornerPolicy
+from pickplace.policies.networks.tote_value import ToteValue
+from pickplace.task.cell import CellSpec
+from pickplace.task.checks import number
+from pickplace.task.grasps import split_footprint, turned_size
+from pickplace.task.maps import FAR, rectangle
+from pickplace.task.state import Observation, item_from_depth
+
+
+class AfterstatePolicy(CornerPolicy):
+    """``afterstate``: chooses, among the footprints that occupy a corner, the one whose tote is worth most.
+
+    The reward of an item is its volume wherever it lies, so that placements differ only in the tote that they leave,
+    the *afterstate* (Sutton & Barto 2018, section 6.8). Its value is what ``algo=td`` learns; the logit of a footprint
+    is the value of its afterstate, divided by a temperature.
+
+    Args:
+        cell: the sizes.
+        temperature: of the exploration in training; reward times ``algo.reward_scale``.
+        **network: arguments of :class:`~pickplace.policies.networks.tote_value.ToteValue`.
+    """
+
+    map_keys = ("bin_depth", "tote_depth", "tote_height")
+    learns_values = True
+    network: ToteValue  # type: ignore[assignment]
+
+    def __init__(self, cell: CellSpec, temperature: float = 0.01, **network):
+        refuse_several_items(cell, "model=afterstate")
+        self.temperature = number("model.actor.temperature", temperature, 1e-6)
+        super().__init__(cell, **network)
+
+    def make_network(self, **network) -> ToteValue:  # type: ignore[override]
+        return ToteValue(place="model.actor", **network)
+
+    def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
+        after = depth_after(observation["bin_depth"], observation["tote_depth"], row, footprint)
+        return self.network(after, observation["tote_height"][row])[:, 0] / self.temperature
+
+
+def depth_after(bin_depth: Tensor, tote_depth: Tensor, row: Tensor, footprint: Tensor) -> Tensor:
+    """Return the remaining height of totes after the item came to rest on a footprint, ``[M, W_T, D_T]``.
+
+    Args:
+        bin_depth, tote_depth: ``[N, W_B, D_B]``, ``[N, W_T, D_T]``.
+        row: int64 ``[M]``, which problem.
+        footprint: int64 ``[M]``, index ``(parity * W_T + x) * D_T + y``; what leaves the tote is cut off.
+    """
+    item, depth = item_from_depth(bin_depth).rows(row), tote_depth[row]
+    parity, x, y = split_footprint(depth.shape[1:], footprint)
+    inside = rectangle(depth.shape[1:], x, y, *turned_size(item, parity == 1)).permute(2, 0, 1)
+    rest = torch.where(inside, depth, FAR).amin((1, 2))
+    return torch.where(inside, (rest - item.h)[:, None, None], depth)
+
+
+def afterstate(cell: CellSpec, mask_infeasible: bool, **settings) -> AfterstatePolicy:
+    """Return the policy over afterstates (config ``model=afterstate``).
+
+    Raises:
+        ValueError: without a mask, as its choices come from what is feasible.
+    """
+    if not mask_infeasible:
+        raise ValueError(
+            "algo.mask_infeasible=False: with model=afterstate expected true; its choices are feasible ones."
+        )
+    return AfterstatePolicy(cell, **settings)
+
+
+def tote_value(cell: CellSpec, **network) -> ToteValue:
+    """Return the value network that ``afterstate`` shares (config ``model=afterstate``)."""
+    return ToteValue(**network)
