@@ -101,7 +101,9 @@ def check_learner(algo: DictConfig, warm_start: DictConfig, policy: Policy) -> N
         ValueError: naming the key, its value, and what was expected.
     """
     if policy.learns_values != (algo.loss == "td"):
-        expected = "'td' with model=afterstate" if policy.learns_values else "'ppo' or 'a2c'; 'td' is for model=afterstate"
+        expected = (
+            "'td' with model=afterstate" if policy.learns_values else "'ppo' or 'a2c'; 'td' is for model=afterstate"
+        )
         raise ValueError(f"algo.loss={excerpt(algo.loss)}: expected {expected}.")
     if algo.loss == "td" and warm_start.frames:
         raise ValueError(f"warm_start.frames={excerpt(warm_start.frames)}: expected 0 with algo.loss=td.")

@@ -54,6 +54,8 @@ def test_weights_of_before_play_with_several_items(evaluation):
         "checkpoint=pretrained/mixed", "env.bin_items=2", *few, f"compare={path}",
         refused="env.bin_items=1, expected 2",
     )  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("name", "least", "rotations", "support", "episodes"),
     [("gopt_rs", 1, 2, "half_or_hull", 1000), ("cdrl_rs", 2, 1, "corners", 2000)],

@@ -51,8 +51,8 @@ def test_every_model_trains_with_and_without_a_mask(model, masked, samples, tmp_
     algo = ["algo=a2c"] if model == "fcn_grasp" and masked else []  # presets train it with PPO
     algo += [f"algo.mask_infeasible={masked}", f"algo.vine_samples={samples}"]
     overrides = [f"model={model}", "curriculum=none", "logger=none", *algo, *TINY]
-    if model == "corners" and not masked:
-        with pytest.raises(ValueError, match="^algo.mask_infeasible=False: with model=corners expected true"):
+    if model in ("corners", "afterstate") and not masked:
+        with pytest.raises(ValueError, match=f"^algo.mask_infeasible=False: with model={model} expected true"):
             train(composed(*overrides), tmp_path)
         return
     assert 0 <= train(composed(*overrides, "env.rotations=2"), tmp_path) <= 1

@@ -1,0 +1,162 @@
+"""``model=afterstate``: the totes that it judges, its network, and TD(lambda) against sums by hand."""
+
+from functools import partial
+from statistics import mean
+
+import pytest
+import torch
+from commands import composed
+from dynamic_programming import optimal_occupancy
+from problems import SETTINGS, random_states, results_by_hand
+from tensordict import TensorDict
+
+from pickplace import PickPlaceEnv
+from pickplace.evaluation.play import play
+from pickplace.planners.policy import PolicyPlanner
+from pickplace.policies.afterstate import AfterstatePolicy, depth_after
+from pickplace.policies.base import as_critic
+from pickplace.policies.networks.tote_value import ToteValue
+from pickplace.runs import checkpoint
+from pickplace.runs.registry import build
+from pickplace.task.cell import CellSpec
+from pickplace.task.grasps import footprint_index
+from pickplace.training.ppo import afterstates
+from pickplace.training.train import train
+
+
+@pytest.mark.parametrize("options", [case for case in SETTINGS if "bin_items" not in case])
+def test_totes_after_a_placement_are_those_of_the_oracle(options):
+    compared = 0
+    for env, observation in random_states(4, **options):
+        for n in range(0, env.num_envs, 4):
+            for top, y, x, w, d, _ in results_by_hand(env, observation, n).values():
+                item, before = env.state.item.rows(n), observation["tote_depth"][n]
+                turned = int((w, d) != (int(item.w), int(item.d)))
+                footprint = footprint_index(env.cell.tote_size, turned, x, y)
+                expected = before.clone()
+                expected[x : x + w, y : y + d] = int(env.tote_height[n]) - top
+                maps = observation["bin_depth"], observation["tote_depth"]
+                found = depth_after(*maps, torch.tensor([n]), torch.tensor([footprint]))
+                assert torch.equal(found[0], expected)
+                compared += 1
+    assert compared > 100
+
+
+def network(**settings):
+    torch.manual_seed(0)
+    net = ToteValue(**{"grid": (6, 5, 4), "filters": 4, "hidden": 8, "compute_dtype": "float32", **settings})
+    torch.nn.init.normal_(net.head.weight, std=3)
+    return net
+
+
+def random_totes(count, wide, deep, high):
+    depth = torch.randint(0, high + 1, (count, wide, deep), generator=torch.Generator().manual_seed(1)).float()
+    return depth, torch.full((count, 1), high)
+
+
+@pytest.mark.parametrize("scale", [1, 3, 10])
+def test_a_finer_grid_shows_the_same_tote(scale):
+    net, (depth, height) = network(), random_totes(20, 6, 5, 4)
+    finer = scale * depth.repeat_interleave(scale, 1).repeat_interleave(scale, 2)
+    with torch.no_grad():
+        value = net(depth, height)
+        torch.testing.assert_close(net(finer, scale * height), scale**3 * value)
+        assert value.std() > 1 and (value >= 0).all() and (value[:, 0] <= depth.sum((1, 2))).all()
+
+
+def test_heights_are_told_apart_at_whole_steps_of_the_tote():
+    """By plain comparisons of fractions: step k of 4 is passed where height / tote height > k / 4."""
+    net, (depth, height) = network(), random_totes(3, 6, 5, 7)
+    picture = net._picture(depth, height[:, 0])
+    for n, x, y, k in torch.cartesian_prod(*map(torch.arange, (3, 6, 5, 4))).tolist():
+        assert picture[n, k, x, y] == (4 * (7 - int(depth[n, x, y])) > 7 * k)
+    assert picture[:, 4].all()
+
+
+@pytest.mark.parametrize(("grid", "views"), [((5, 5, 4), 8), ((6, 5, 4), 4)])
+def test_a_tote_is_learnt_from_every_side(grid, views):
+    net, (depth, height) = network(grid=grid), random_totes(1, *grid)
+    expected = {tuple(view.flatten().tolist()) for turned in (depth[0], depth[0].t())[: views // 4]
+                for view in (turned, turned.flip(0), turned.flip(1), turned.flip(0, 1))}  # fmt: skip
+    assert {tuple(net._mirror(depth).flatten().tolist()) for _ in range(200)} == expected
+    values = {round(float(net(depth, height).detach()), 4) for _ in range(100)}
+    assert len(values) > 1
+    with torch.no_grad():
+        assert len({round(float(net(depth, height)), 4) for _ in range(20)}) == 1
+    plain = network(grid=grid, mirrored=False)
+    assert len({round(float(plain(depth, height).detach()), 4) for _ in range(20)}) == 1
+
+
+def test_targets_are_what_followed():
+    """Two episodes of three steps, of which the first ends after two; lambda and gamma by hand."""
+    reward = torch.tensor([[1.0, 2, 4], [8, 16, 32]])
+    done = torch.tensor([[False, True, False], [False, False, False]])
+    target = torch.tensor([[3.0, 2, 9], [20, 40, 33]])
+    depth = torch.arange(12.0).view(2, 3, 1, 2)
+    batch = TensorDict(
+        {
+            "tote_depth": depth, "value_target": target[..., None],
+            "next": {
+                "tote_depth": depth + 1, "tote_height": torch.ones(2, 3, 1), "reward": reward[..., None],
+                "done": done[..., None],
+            },
+        },
+        batch_size=[2, 3],
+    )  # fmt: skip
+    data = afterstates(batch, as_critic(network()), 0.5)
+    assert data["value_target"][:, 0].tolist() == [4, 0, 10, 24, 48, 2]
+    assert torch.equal(data["tote_depth"], (depth + 1).flatten(0, 1))
+
+
+def test_it_comes_within_1_percent_of_the_optimum(tmp_path):
+    words = ["experiment=afterstate", "env.tote_size=[3,3,1]", "env.rotations=2", "model.actor.grid=[3,3,1]"]
+    words += ["model.actor.filters=16", "model.actor.hidden=32", "items=kinds", "env.num_envs=32", "logger=none"]
+    words += [
+        "total_frames=32_768",
+        "algo.minibatch_size=128",
+        "algo.lr=3e-3",
+        "algo.reward_scale=0.5",
+        "evaluation.episodes=1",
+    ]
+    cfg = composed(*words)
+    train(cfg, tmp_path)
+    state, _ = checkpoint.read(tmp_path / "checkpoints" / "last")
+    assert all(torch.equal(state["policy"][f"network.{key}"], value) for key, value in shared(state).items())
+
+    def make_env(first, count):
+        sizes = {"tote_size": (3, 3, 1), "rotations": 2, "num_envs": count}
+        return PickPlaceEnv(stream="test", first_episode=first, masks=(), **sizes)
+
+    cell = make_env(0, 1).cell
+    policy = checkpoint.restore(
+        partial(build, "model.actor", cfg.model.actor, cell=cell, mask_infeasible=True), state["policy"], "policy"
+    )
+    occupancy = play(make_env, PolicyPlanner(cell, policy), 2000, 1000).occupancy
+    assert mean(occupancy.tolist()) > 0.99 * optimal_occupancy(3, 3, 2)
+
+
+def shared(state):
+    return {key.removeprefix("module."): value for key, value in state["critic"].items()}
+
+
+@pytest.mark.parametrize(("words", "refusal"), [
+    (["model=afterstate"], "algo.loss='ppo': expected 'td' with model=afterstate"),
+    (["algo=td"], "algo.loss='td': expected 'ppo' or 'a2c'"),
+    (["model=afterstate", "algo=td", "warm_start=imitate"], "warm_start.frames=200000: expected 0"),
+    (["model=afterstate", "algo=td", "algo.vine_samples=2"], "algo.vine_samples=2: expected null"),
+    (["model=afterstate", "algo=td", "algo.gamma=0"], "algo.gamma=0: expected more than 0"),
+    (["model=afterstate", "algo=td", "algo.mask_infeasible=false"], "algo.mask_infeasible=False: with model=aft"),
+    (["model=afterstate", "algo=td", "env.bin_items=2"], "env.bin_items=2: expected 1 with model=afterstate"),
+    (["model=afterstate", "algo=td", "model.actor.grid=[10,10]"], r"model.actor.grid=\[10, 10\]: expected 3"),
+    (["model=afterstate", "algo=td", "model.actor.temperature=0"], "model.actor.temperature=0: expected a number"),
+])  # fmt: skip
+def test_settings_that_do_not_fit_are_refused(words, refusal, tmp_path):
+    with pytest.raises(ValueError, match=f"^{refusal}"):
+        train(composed(*words), tmp_path)
+
+
+def test_it_serves_other_totes():
+    policy = AfterstatePolicy(CellSpec(tote_size=(9, 7, 6)), grid=(6, 5, 4), filters=4, hidden=8)
+    env = PickPlaceEnv(num_envs=3, tote_size=(9, 7, 6), masks=())
+    seen = env.reset()
+    assert (env.step(seen.set("action", policy.best_feasible(seen)))["next", "failure"] == 0).all()
