@@ -171,7 +171,10 @@ class Lookahead(MapPlanner):
             horizon: items after which the critic judges the state; None: played out to the end.
         """
         cell, policy = self.cell, self.policy
-        keys = [*policy.in_keys, *getattr(self.critic, "in_keys", ())]
+        critic_keys = getattr(self.critic, "in_keys", ())
+        keys = [*policy.in_keys, *critic_keys]
+        # A critic that sees the tote alone judges it before the next item arrives.
+        sees_items = not critic_keys or not {"bin_depth", "items"}.isdisjoint(critic_keys)
         self._decisions += 1
         state, problem = state.repeat(streams), problem.repeat_interleave(streams, 0)
         stream = torch.arange(len(problem), device=problem.device) % streams
@@ -182,6 +185,9 @@ class Lookahead(MapPlanner):
         row = torch.arange(len(problem), device=problem.device)
         step = 0
         while len(row):
+            if step == horizon and not sees_items:
+                volume[row] += self.critic(observe(self.terms, cell, state, critic_keys))[:, 0].double()
+                break
             item, arrived = self._arrive(state.item, seed[row], stream[row], arrived)
             state = state._replace(item=item)
             maps = placing_maps(cell, state)

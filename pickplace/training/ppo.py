@@ -73,9 +73,9 @@ def add_advantages(batch: TensorDictBase, advantage: GAE, reward_scale: float) -
 def afterstates(batch: TensorDictBase, critic: ValueOperator, gamma: float) -> TensorDictBase:
     """Return each tote that a step left ``[N * T]``, with the value of what followed as ``value_target``.
 
-    TD(lambda) on afterstates. The critic looks at the tote alone, so that GAE's ``value_target`` of a state is the reward
-    of its item and what follows. The value of the tote that is left must count the items that have no place there: it
-    is 0 where the episode ended, and such totes are among those returned.
+    TD(lambda) on afterstates. The critic looks at the tote alone, so that GAE's ``value_target`` of a state is the
+    reward of its item and what follows. The value of the tote that is left must count the items that have no place
+    there: it is 0 where the episode ended, and such totes are among those returned.
 
     Args:
         batch: ``[N, T]``, with ``value_target``.
