@@ -48,7 +48,9 @@ def test_the_paper_s_effector_is_the_default(env):
 @pytest.mark.parametrize(("masked", "samples"), [(True, "null"), (True, 2), (False, "null"), (False, 2)])
 @pytest.mark.parametrize("model", options("model"))
 def test_every_model_trains_with_and_without_a_mask(model, masked, samples, tmp_path):
-    algo = ["algo=a2c"] if model == "fcn_grasp" and masked else []  # presets train it with PPO
+    if model == "afterstate" and samples != "null":
+        pytest.skip("algo=td draws no choices")
+    algo = ["algo=td"] if model == "afterstate" else ["algo=a2c"] if model == "fcn_grasp" and masked else []
     algo += [f"algo.mask_infeasible={masked}", f"algo.vine_samples={samples}"]
     overrides = [f"model={model}", "curriculum=none", "logger=none", *algo, *TINY]
     if model in ("corners", "afterstate") and not masked:
