@@ -31,7 +31,7 @@ SUPPORT_RULES = ("half", "more_than_half", "hull", "bearing", "half_or_hull", "c
 #: Greatest side of a grid or height, in cells or height units, and greatest side of an end effector.
 MAX_SIDE, MAX_EFFECTOR = 2_000, 64
 #: Greatest number of cells of a grid, of flat actions, and of entries in a table over offsets and place cells.
-MAX_CELLS, MAX_ACTIONS, MAX_TABLE = 2**16, 2**27, 2**25
+MAX_CELLS, MAX_ACTIONS, MAX_TABLE = 2**16, 2**27, 2**26
 
 
 def reference_cell(side):

@@ -138,10 +138,11 @@ class Uniform(Kinds):
     """Cuboids whose sides and heights are drawn uniformly and independently from closed ranges.
 
     Args:
-        width, depth, height: ``(least, greatest)``, in cells and height units.
+        width, depth, height: ``(least, greatest)``, in units.
+        unit: number of cells, and of height units, in a unit.
     """
 
-    def __init__(self, width=(1, 3), depth=(1, 3), height=(1, 3)):
+    def __init__(self, width=(1, 3), depth=(1, 3), height=(1, 3), unit=1):
         ranges = {"width": width, "depth": depth, "height": height}
         for name, limits in ranges.items():
             pair = isinstance(limits, (list, tuple)) and len(limits) == 2 and all(map(_is_length, limits))
@@ -150,7 +151,10 @@ class Uniform(Kinds):
                 raise ValueError(f"items.{name}={excerpt(limits)}: expected {expected}.")
         words = ", ".join(f"items.{name}={[*limits]}" for name, limits in ranges.items())
         _check_count(f"{words}: the ranges have", math.prod(high - low + 1 for low, high in ranges.values()))
-        super().__init__(list(product(*(range(low, high + 1) for low, high in ranges.values()))))
+        if not _is_length(unit):
+            raise ValueError(f"items.unit={excerpt(unit)}: expected a whole number >= 1.")
+        sides = ([unit * length for length in range(low, high + 1)] for low, high in ranges.values())
+        super().__init__(list(product(*sides)))
 
 
 class Recorded(ItemDistribution):

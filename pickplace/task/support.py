@@ -51,7 +51,7 @@ def is_supported(
     share = count.double() / (w * d)
     stable = is_share_enough(cell.support, share)
     if cell.support == "half_or_hull":
-        stable |= _is_in_hull(cells, supporting, w, d, None)
+        stable |= _is_in_hull_of_middles(cells, under, supporting, w, d)
     if cell.support == "corners":
         corners = _supported_corners(cells, supporting, w, d)
         for least, enough in CORNER_SUPPORT:
@@ -75,8 +75,38 @@ def _supported_corners(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d
     return corners
 
 
-def _is_in_hull(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor, margin: float | None) -> Tensor:
-    """Return whether the item's centre lies inside the hull; ``margin`` as of :func:`hull_patterns`."""
+def _is_in_hull_of_middles(
+    cells: Sequence[Tensor], under: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor
+) -> Tensor:
+    """Return whether the item's centre lies in the hull of the middles of the supporting cells, or on its edge.
+
+    It does if some line between two of these middles passes the centre on its far side along y, and some on its near
+    side. Such a line goes from one at ``(-a, b)`` to one at ``(a', b')``, as seen from the centre, and passes at a
+    height of the sign of ``b / a + b' / a'``: so the steepest on each side decide, and no pairs are compared.
+    """
+    side = round(len(cells) ** 0.5)
+    exact = torch.float32 if side <= 64 else torch.float64  # ratios of whole numbers up to the side are told apart
+    w, d = w.short(), d.short()
+    none = torch.full(supporting.shape, -torch.inf, dtype=exact, device=supporting.device)
+    steepest = [[none, none], [none, none]]  # to the far side, left and right of the centre; to the near side
+    for x in range(side):
+        first = last = torch.zeros_like(supporting, dtype=torch.int16)  # counted from the ends of the square; 0: none
+        for y in range(side):
+            here = ((cells[x * side + y] == supporting) & under[x * side + y]).short()
+            first, last = torch.maximum(first, here * (side - y)), torch.maximum(last, here * (y + 1))
+        offset = (2 * x + 1 - w).to(exact)
+        gap = torch.where(last > 0, 0.0, torch.inf).to(exact)
+        for parts, beyond in zip(steepest, (2 * last - 1 - d, d - 2 * (side - first) - 1), strict=True):
+            slope = (beyond.to(exact) - gap) / offset.abs()  # on the line through the centre +-inf, and nan for 0 / 0
+            slope = torch.where(slope.isnan(), torch.inf, slope)
+            parts[0] = torch.maximum(parts[0], torch.where(offset <= 0, slope, -torch.inf))
+            parts[1] = torch.maximum(parts[1], torch.where(offset >= 0, slope, -torch.inf))
+    (left, right), (near_left, near_right) = steepest
+    return (left + right >= 0) & (near_left + near_right >= 0)
+
+
+def _is_in_hull(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor, margin: float) -> Tensor:
+    """Return whether the item's centre lies inside the hull, further than ``margin`` from its edge."""
     side = round(len(cells) ** 0.5)
     sizes = w.clamp(1, side) - 1, d.clamp(1, side) - 1
     words = [(patterns[:, *sizes], whole[sizes]) for patterns, whole in hull_patterns(side, margin, supporting.device)]
@@ -134,13 +164,12 @@ def _greater_products(normals: Tensor, ends: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-def hull_patterns(side: int, margin: float | None, device: torch.device) -> list[tuple[Tensor, Tensor]]:
+def hull_patterns(side: int, margin: float, device: torch.device) -> list[tuple[Tensor, Tensor]]:
     """Return the patterns of the cells of every footprint up to ``side x side``, in words of :data:`BITS` normals.
 
     Args:
         side: longest side of a footprint, in cells.
-        margin: distance from the centre that a cell has to pass along a normal, in cells; None: its middle has to
-            reach the centre.
+        margin: distance from the centre that a cell has to pass along a normal, in cells.
         device: place of the tables.
 
     Returns:
@@ -152,22 +181,19 @@ def hull_patterns(side: int, margin: float | None, device: torch.device) -> list
     """
     if side > MAX_HULL_SIDE:
         raise ValueError(
-            f"items may be {side} cells long; with support=hull, bearing and half_or_hull expected at most "
-            f"{MAX_HULL_SIDE}."
+            f"items may be {side} cells long; with support=hull and bearing expected at most {MAX_HULL_SIDE}."
         )
     size, near = torch.arange(1, side + 1), torch.arange(side)
     # Twice the distance from the centre to the near and the far edge of each cell, by cell and size of the footprint.
     ends = torch.stack([2 * near[:, None] - size, 2 * near[:, None] + 2 - size])  # [2, cell, size]
-    if margin is None:
-        ends = ends[:1] + 1
     inside = near[:, None] < size
     inside = inside[:, None, :, None] & inside[None, :, None, :]  # [x, y, w, d]
     words, normals = [], _normals(side)
     for chunk in normals.split(BITS):
         furthest = _greater_products(chunk, ends)  # [normals, axis, cell, size]
         along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
-        distance = 2 * (margin or 0) * chunk.double().norm(dim=1).view(-1, 1, 1, 1, 1)
-        beyond = along >= distance if margin is None else along > distance
+        distance = 2 * margin * chunk.double().norm(dim=1).view(-1, 1, 1, 1, 1)
+        beyond = along > distance
         # No edge has the direction from one cell to another that is not in the footprint.
         x, y = chunk.abs()[:, :, None, None].unbind(1)
         fits = ((y < size[:, None]) & (x < size)) | (x + y == 1)
