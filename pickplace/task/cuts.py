@@ -5,7 +5,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from pickplace.task.checks import excerpt, one_of, size_tuple
+from pickplace.task.checks import one_of, size_tuple
 from pickplace.task.items import ItemDistribution, check_range, hashed_uniform, place_at_random
 from pickplace.task.state import Item
 
@@ -64,7 +64,9 @@ class Cut(ItemDistribution):
         if count > MAX_ITEMS:
             raise ValueError(f"{key}: an episode has up to {count:,} items; expected at most {MAX_ITEMS:,}.")
         cuts = [
-            [at for at in range(least, length - least + 1) if fits[at] and fits[length - at]] if length > greatest else []
+            [at for at in range(least, length - least + 1) if fits[at] and fits[length - at]]
+            if length > greatest
+            else []
             for length in range(longest + 1)
         ]
         arising: list[set[int]] = []  # the sides that come of each length
@@ -84,7 +86,9 @@ class Cut(ItemDistribution):
         if unseen := list(dict.fromkeys(key for key in keys if key not in self._kept)):
             self._keep(stream, unseen)
         sequences = map(self._kept.__getitem__, keys)
-        size = [each[number] if number < len(each) else [0, 0, 0] for each, number in zip(sequences, rows[2], strict=True)]
+        size = [
+            each[number] if number < len(each) else [0, 0, 0] for each, number in zip(sequences, rows[2], strict=True)
+        ]
         item = place_at_random(torch.tensor(size, device=step.device), across, along, bin_size)
         if len(self._kept) > max(KEPT_EPISODES, 2 * len(keys)):
             self._kept = {key: self._kept[key] for key in keys}
@@ -109,7 +113,7 @@ class Cut(ItemDistribution):
             For each episode int64 ``[n, 6]``, the ``x, y, z, w, d, h`` of its items in their order of arrival.
         """
         row, low, high, uniform = self._cut(stream, seed, episode)
-        # Row by row; within a row the lower come first, so that a stable sort by time keeps an item after its supporters.
+        # Row by row; within a row the lower come first, so that a stable sort keeps an item after its supporters.
         index = torch.argsort(row * self.container[2] + low[:, 2], stable=True)
         row, low, high, uniform = row[index], low[index], high[index], uniform[index]
         counts = torch.bincount(row, minlength=len(episode))

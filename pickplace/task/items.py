@@ -51,7 +51,7 @@ def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, cou
 
 
 def place_at_random(size: Tensor, across: Tensor, along: Tensor, bin_size) -> Item:
-    """Return items of given sizes, int64 ``[N, 3]``, in the bin; the place follows from two uniform numbers, ``[N]``."""
+    """Return items of given sizes, int64 ``[N, 3]``, in the bin, at places that two uniform numbers decide, ``[N]``."""
     w, d, h = size.unbind(-1)
     x = (across * (bin_size[0] - w + 1)).long()
     y = (along * (bin_size[1] - d + 1)).long()
