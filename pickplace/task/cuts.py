@@ -1,12 +1,13 @@
 """Sequences of items that are cut from a full container, so that a perfect packing of each is known to exist."""
 
+import math
 from itertools import product
 
 import torch
 from torch import Tensor
 
 from pickplace.task.checks import one_of, size_tuple
-from pickplace.task.items import ItemDistribution, check_range, hashed_uniform, place_at_random
+from pickplace.task.items import ItemDistribution, check_count, check_range, hashed_uniform, place_at_random
 from pickplace.task.state import Item
 
 #: Orders of arrival: CUT-1 and CUT-2.
@@ -60,19 +61,19 @@ class Cut(ItemDistribution):
         fits = [-(-length // greatest) * least <= length for length in range(longest + 1)]
         if bad := [side for side in self.container if not fits[side]]:
             raise ValueError(f"{key}: sides of {least} to {greatest} do not add up to {bad[0]}; expected some that do.")
-        count = (self.container[0] // least) * (self.container[1] // least) * (self.container[2] // least)
+        count = math.prod(side // least for side in self.container)
         if count > MAX_ITEMS:
             raise ValueError(f"{key}: an episode has up to {count:,} items; expected at most {MAX_ITEMS:,}.")
         cuts = [
-            [at for at in range(least, length - least + 1) if fits[at] and fits[length - at]]
-            if length > greatest
-            else []
+            [at for at in range(least, length - least + 1) if length > greatest and fits[at] and fits[length - at]]
             for length in range(longest + 1)
         ]
         arising: list[set[int]] = []  # the sides that come of each length
         for length, places in enumerate(cuts):
             arising.append({length} if length <= greatest else set().union(*(arising[at] for at in places)))
-        self.sizes = torch.tensor(list(product(*(sorted(arising[side]) for side in self.container))))
+        sides_of_items = [sorted(arising[side]) for side in self.container]
+        check_count(f"{key}: the container gives", math.prod(map(len, sides_of_items)))
+        self.sizes = torch.tensor(list(product(*sides_of_items)))
         self._num_cuts = torch.tensor([len(places) for places in cuts])
         self._cuts = torch.tensor([places + [0] * (longest - len(places)) for places in cuts])
         self._layers = self.container[2] // least
@@ -89,7 +90,9 @@ class Cut(ItemDistribution):
         size = [
             each[number] if number < len(each) else [0, 0, 0] for each, number in zip(sequences, rows[2], strict=True)
         ]
-        item = place_at_random(torch.tensor(size, device=step.device), across, along, bin_size)
+        item = place_at_random(
+            torch.tensor(size, dtype=torch.int64, device=step.device).view(-1, 3), across, along, bin_size
+        )
         if len(self._kept) > max(KEPT_EPISODES, 2 * len(keys)):
             self._kept = {key: self._kept[key] for key in keys}
         return Item(*(torch.where(item.is_empty, 0, part) for part in item))
@@ -137,7 +140,7 @@ class Cut(ItemDistribution):
         the order of the cuts does not matter.
         """
         _, depth, height = self.container
-        volume = self.container[0] * depth * height
+        volume = math.prod(self.container)
         row, low = torch.arange(len(episode)), torch.zeros(len(episode), 3, dtype=torch.int64)
         high = low + torch.tensor(self.container)
         done = []

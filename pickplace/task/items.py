@@ -72,7 +72,8 @@ def check_range(key: str, limits) -> tuple[int, int]:
     return int(limits[0]), int(limits[1])
 
 
-def _check_count(words: str, count: int) -> None:
+def check_count(words: str, count: int) -> None:
+    """Refuse more than :data:`MAX_KINDS` kinds; the message begins with ``words``."""
     if count > MAX_KINDS:
         raise ValueError(f"{words} {count:,} kinds of items; expected at most {MAX_KINDS:,}.")
 
@@ -127,7 +128,7 @@ class Kinds(ItemDistribution):
     def __init__(self, kinds, weights=None):
         if not isinstance(kinds, (list, tuple)) or not kinds:
             raise ValueError(f"items.kinds={excerpt(kinds)}: expected a list of at least one (w, d, h).")
-        _check_count("items.kinds: the list has", len(kinds))
+        check_count("items.kinds: the list has", len(kinds))
         for kind in kinds:
             if not isinstance(kind, (list, tuple)) or len(kind) != 3 or not all(map(_is_length, kind)):
                 raise ValueError(f"items.kinds: got {excerpt(kind)}, expected (w, d, h) in positive whole cells.")
@@ -162,7 +163,7 @@ class Uniform(Kinds):
         for name, limits in ranges.items():
             check_range(f"items.{name}", limits)
         words = ", ".join(f"items.{name}={[*limits]}" for name, limits in ranges.items())
-        _check_count(f"{words}: the ranges have", math.prod(high - low + 1 for low, high in ranges.values()))
+        check_count(f"{words}: the ranges have", math.prod(high - low + 1 for low, high in ranges.values()))
         super().__init__(list(product(*(range(low, high + 1) for low, high in ranges.values()))))
 
 

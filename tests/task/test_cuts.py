@@ -85,6 +85,8 @@ def test_the_stream_is_the_sizes_of_the_boxes_and_then_nothing(given, episode):
     item = cut.sample("train", torch.tensor(0), torch.full_like(step, episode), step, bin_size)
     assert (item.x >= 0).all() and (item.x + item.w <= 9).all() and (item.y >= 0).all() and (item.y + item.d <= 8).all()
     assert torch.stack(item)[:, -2:].eq(0).all()
+    nothing = torch.zeros(0, dtype=torch.int64)
+    assert cut.sample("train", nothing, nothing, nothing, bin_size).w.tolist() == []
 
 
 def test_the_paper_s_kinds():
@@ -263,7 +265,11 @@ def test_a_perfect_packing_is_feasible_in_the_benchmark_s_environment(order):
         ({"container": [8, 8, 3], "sides": [4, 6]}, "do not add up to 3; expected some that do"),
         ({"sides": [11, 12]}, "do not add up to 10"),
         ({"container": [30, 30, 30]}, "an episode has up to 3,375 items; expected at most 1,000"),
-        ({"container": [200, 200, 200], "sides": [20, 100]}, None),
+        (
+            {"container": [200, 200, 200], "sides": [20, 100]},
+            "the container gives 531,441 kinds of items; expected at most",
+        ),
+        ({"container": [200, 20, 20], "sides": [20, 100]}, None),
     ],
 )
 def test_bad_settings_are_refused(given, message):
