@@ -94,8 +94,8 @@ class PickPlaceGymEnv(gymnasium.Env):
     without a seed go on to its next episode. `options={"tote_height": h}` sets the height of this episode's tote.
 
     ## Episode End
-    Termination: the action fails, or nothing can be done with any item in the bin. Truncation: a recorded item stream
-    has ended; nothing more comes then, so a learner that continues truncated episodes by a value had better take 0.
+    Termination: the action fails, or nothing can be done with any item in the bin. Truncation: the item stream has
+    ended; nothing more comes then, so a learner that continues truncated episodes by a value had better take 0.
 
     ## Information
     `occupancy`: share of the tote's volume that is filled; `failure`: why the action or the episode failed (`"none"`,

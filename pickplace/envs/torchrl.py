@@ -71,7 +71,7 @@ class PickPlaceEnv(EnvBase):
 
     Episode end:
         ``terminated`` after a failed action, or when nothing can be done with any item in the bin (``stuck``);
-        ``truncated`` when a recorded item stream has ended. ``failure``, int64 ``[N, 1]``, is a :class:`Failure`.
+        ``truncated`` when the item stream has ended. ``failure``, int64 ``[N, 1]``, is a :class:`Failure`.
 
     Args:
         items: an :class:`~pickplace.task.items.ItemDistribution`; by default the paper's four kinds.
@@ -267,7 +267,7 @@ class PickPlaceEnv(EnvBase):
             self.item.copy_(remove_item(state.item, step.taken, placed).table)
             self._refill(placed)
         self._update_masks(placed)
-        ended = placed & self.state.items.is_empty.all(1)  # a recorded stream has no further item
+        ended = placed & self.state.items.is_empty.all(1)  # the stream has no further item
         stuck = placed & ~self.feasible & ~ended
         failure = torch.where(stuck, int(Failure.STUCK), step.failure)
         result = {

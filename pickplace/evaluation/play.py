@@ -35,7 +35,7 @@ class Episodes:
 
     occupancy: Tensor  # float64 [E]
     items_placed: Tensor  # int64 [E]
-    failure: Tensor  # int64 [E], a Failure; NONE where a recorded stream ended
+    failure: Tensor  # int64 [E], a Failure; NONE where the item stream ended
     final_heights: Tensor  # int32 [E, W_T, D_T]: the tote when the episode ended
     tote_height: Tensor  # int64 [E]
     feasible_share: float  # mean share of the N_a actions that were feasible, over all decisions

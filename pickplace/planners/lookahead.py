@@ -31,7 +31,7 @@ class Lookahead(MapPlanner):
     Args:
         cell: the sizes.
         policy: an ``fcn_grasp`` policy that was trained with a mask.
-        items: the item distribution; of a recorded stream, its sizes, equally likely.
+        items: the item distribution; of a sequence, recorded or cut, its sizes, equally likely.
         candidates: how many of the policy's most probable choices are played out.
         critic: the value of a state, a function from observations to ``[N, 1]``, in volume; None: there is none.
         terms: of the observation, by key.

@@ -57,7 +57,7 @@ class MCTS(MapPlanner):
 
     Args:
         cell: the sizes.
-        items: the item distribution; of a recorded stream, its sizes, equally likely.
+        items: the item distribution; of a sequence, recorded or cut, its sizes, equally likely.
         simulations: for each decision.
         mask: search among the distinct footprints that some action reaches; False: among all ``N_a`` flat actions,
             as in the paper, in the tree and in the rollouts.

@@ -47,6 +47,7 @@ REGISTRY: dict[str, dict[str, str]] = {
         "kinds": "pickplace.task.items.Kinds",
         "uniform": "pickplace.task.items.Uniform",
         "recorded": "pickplace.task.items.Recorded",
+        "cut": "pickplace.task.cuts.Cut",
     },
     "model.actor": {
         "fcn_grasp": "pickplace.policies.fcn_grasp.fcn_grasp",

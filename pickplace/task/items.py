@@ -50,12 +50,30 @@ def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, cou
     return ((key >> 11) & ((1 << 53) - 1)).double() / float(1 << 53)
 
 
+def place_at_random(size: Tensor, across: Tensor, along: Tensor, bin_size) -> Item:
+    """Return items of given sizes, int64 ``[N, 3]``, in the bin, at places that two uniform numbers decide, ``[N]``."""
+    w, d, h = size.unbind(-1)
+    x = (across * (bin_size[0] - w + 1)).long()
+    y = (along * (bin_size[1] - d + 1)).long()
+    return Item(x, y, w, d, h)
+
+
 def _is_length(value) -> bool:
     """Return whether a value is a positive whole number that fits the tensors."""
     return is_whole(value) and 1 <= int(value) < 2**31
 
 
-def _check_count(words: str, count: int) -> None:
+def check_range(key: str, limits) -> tuple[int, int]:
+    """Return ``(least, greatest)``, or raise a ``ValueError`` that names the ``key``."""
+    pair = isinstance(limits, (list, tuple)) and len(limits) == 2 and all(map(_is_length, limits))
+    if not pair or limits[0] > limits[1]:
+        expected = "[least, greatest], whole cells with 1 <= least <= greatest"
+        raise ValueError(f"{key}={excerpt(limits)}: expected {expected}.")
+    return int(limits[0]), int(limits[1])
+
+
+def check_count(words: str, count: int) -> None:
+    """Refuse more than :data:`MAX_KINDS` kinds; the message begins with ``words``."""
     if count > MAX_KINDS:
         raise ValueError(f"{words} {count:,} kinds of items; expected at most {MAX_KINDS:,}.")
 
@@ -65,23 +83,22 @@ class ItemDistribution:
 
     Attributes:
         sizes: int64 ``[K, 3]``, every size ``(w, d, h)`` that may arrive, in cells and height units.
-        length: number of items in an episode, or None if they never end.
+        length: number of items in each episode, or None if they never end, or if it differs between episodes.
         varies: whether episodes differ at all.
+        sequential: whether an episode is a sequence whose order a search must not know: it samples from ``sizes``.
         has_corners: whether each item has one place in the bin, so that of several items one waits for its place.
     """
 
     sizes: Tensor
     length: int | None = None
     varies: bool = True
+    sequential: bool = False
     has_corners: bool = False
 
     def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size) -> Item:
         """Return the ``step``-th item (from 0) of each ``episode``, int64 ``[N]``; size 0 after the last one."""
         kind, across, along = hashed_uniform(stream, seed, episode, step, 3)
-        w, d, h = self.sizes.to(step.device)[self._index(kind, step)].unbind(-1)
-        x = (across * (bin_size[0] - w + 1)).long()
-        y = (along * (bin_size[1] - d + 1)).long()
-        return Item(x, y, w, d, h)
+        return place_at_random(self.sizes.to(step.device)[self._index(kind, step)], across, along, bin_size)
 
     def _index(self, uniform: Tensor, step: Tensor) -> Tensor:
         """Return which row of ``sizes`` arrives, int64 ``[N]``."""
@@ -111,7 +128,7 @@ class Kinds(ItemDistribution):
     def __init__(self, kinds, weights=None):
         if not isinstance(kinds, (list, tuple)) or not kinds:
             raise ValueError(f"items.kinds={excerpt(kinds)}: expected a list of at least one (w, d, h).")
-        _check_count("items.kinds: the list has", len(kinds))
+        check_count("items.kinds: the list has", len(kinds))
         for kind in kinds:
             if not isinstance(kind, (list, tuple)) or len(kind) != 3 or not all(map(_is_length, kind)):
                 raise ValueError(f"items.kinds: got {excerpt(kind)}, expected (w, d, h) in positive whole cells.")
@@ -145,12 +162,9 @@ class Uniform(Kinds):
     def __init__(self, width=(1, 3), depth=(1, 3), height=(1, 3), unit=1):
         ranges = {"width": width, "depth": depth, "height": height}
         for name, limits in ranges.items():
-            pair = isinstance(limits, (list, tuple)) and len(limits) == 2 and all(map(_is_length, limits))
-            if not pair or limits[0] > limits[1]:
-                expected = "[least, greatest], whole cells with 1 <= least <= greatest"
-                raise ValueError(f"items.{name}={excerpt(limits)}: expected {expected}.")
+            check_range(f"items.{name}", limits)
         words = ", ".join(f"items.{name}={[*limits]}" for name, limits in ranges.items())
-        _check_count(f"{words}: the ranges have", math.prod(high - low + 1 for low, high in ranges.values()))
+        check_count(f"{words}: the ranges have", math.prod(high - low + 1 for low, high in ranges.values()))
         if not _is_length(unit):
             raise ValueError(f"items.unit={excerpt(unit)}: expected a whole number >= 1.")
         sides = ([unit * length for length in range(low, high + 1)] for low, high in ranges.values())
@@ -168,6 +182,8 @@ class Recorded(ItemDistribution):
     Raises:
         ValueError: a missing file or column, or a value that is not a whole number, naming the line.
     """
+
+    sequential = True
 
     def __init__(self, path, loop=False):
         flag("items.loop", loop)
@@ -227,5 +243,5 @@ class Recorded(ItemDistribution):
 
 
 def search_items(items: ItemDistribution) -> ItemDistribution:
-    """Return the distribution that a search samples from: of a recorded stream only its sizes, equally likely."""
-    return Kinds(items.sizes.tolist()) if isinstance(items, Recorded) else items
+    """Return the distribution that a search samples from: of a sequence only its sizes, equally likely."""
+    return Kinds(items.sizes.tolist()) if items.sequential else items

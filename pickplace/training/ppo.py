@@ -103,7 +103,7 @@ def of_taken_choice(advantage: Tensor, candidates: int, normalize: bool) -> Tens
 
 
 def is_bin_empty(state: TensorDictBase) -> Tensor:
-    """Whether no item has arrived because a recorded stream has ended, bool ``[..., 1]``.
+    """Whether no item has arrived because the item stream has ended, bool ``[..., 1]``.
 
     The environment reports that as a truncation. But no reward can follow and no action is taken in that state, so the
     critic would never learn the value with which GAE continues a truncated episode.

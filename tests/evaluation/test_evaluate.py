@@ -1,6 +1,7 @@
 """``pickplace-evaluate``: what it writes, what it compares, and planners of the user's own."""
 
 import json
+from itertools import product
 
 import numpy
 import pytest
@@ -15,6 +16,7 @@ from pickplace.physics.plans import read_plans
 from pickplace.physics.settle import Settle
 from pickplace.planners.heuristics import JointDBL
 from pickplace.runs.hydra_app import conf_dir
+from pickplace.runs.registry import build
 from pickplace.views.tables import evaluation_table
 
 
@@ -56,14 +58,31 @@ def test_weights_of_before_play_with_several_items(evaluation):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("side", [30, 50, 100])
+def test_larger_benchmarks_are_gopt_rs_on_a_finer_grid(side):
+    small, cfg = compose_evaluation("benchmark=gopt_rs"), compose_evaluation(f"benchmark=gopt_{side}")
+    scale = side // 10
+    sizes = [build("items", each["items"]).sizes for each in (small, cfg)]
+    assert torch.equal(sizes[1], scale * sizes[0])
+    assert cfg.env.tote_size == [side] * 3 and cfg.env.bin_size == [5 * scale, 5 * scale, 1]
+    assert {**cfg.env, "tote_size": 0, "bin_size": 0} == {**small.env, "tote_size": 0, "bin_size": 0}
+    assert cfg.evaluation.episodes == small.evaluation.episodes == 1000
+
+
 @pytest.mark.parametrize(
     ("name", "least", "rotations", "support", "episodes"),
-    [("gopt_rs", 1, 2, "half_or_hull", 1000), ("cdrl_rs", 2, 1, "corners", 2000)],
+    [
+        ("gopt_rs", 1, 2, "half_or_hull", 1000),
+        *((name, 2, 1, "corners", 2000) for name in ("cdrl_rs", "cut1", "cut2")),
+    ],
 )
 def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, support, episodes):
     cfg = compose_evaluation(f"benchmark={name}")
-    sides = [[least, 5]] * 3
-    assert [cfg["items"][key] for key in ("width", "depth", "height")] == sides and cfg.evaluation.episodes == episodes
+    sizes = build("items", cfg["items"]).sizes.tolist()
+    assert sorted(sizes) == [list(size) for size in product(range(least, 6), repeat=3)]
+    assert cfg["items"].get("order") == {"cut1": "z", "cut2": "stacking"}.get(name)
+    assert cfg["items"].get("container", cfg.env.tote_size) == cfg.env.tote_size
+    assert cfg.evaluation.episodes == episodes
     assert (cfg.env.tote_size, cfg.env.rotations, cfg.env.support) == ([10, 10, 10], rotations, support)
     short = [f"benchmark={name}", "evaluation.episodes=2", *SMALL[1:]]
     first = evaluation("planner=joint_dbl", *short)

@@ -85,6 +85,7 @@ def test_weights_and_ranges():
     assert kinds.sizes.tolist() == [[1, 1, 1], [1, 2, 1]]  # what may arrive: a weight of 0 is not checked for a fit
     items = Uniform((1, 2), (3, 3), (2, 4))
     assert sorted(items.sizes.tolist()) == [[w, 3, h] for w in (1, 2) for h in (2, 3, 4)]
+    assert torch.equal(Uniform((1, 2), (3, 3), (2, 4), unit=5).sizes, 5 * items.sizes)
     item = drawn(items, 30_000)
     assert is_even((item.w - 1) * 3 + item.h - 2, 6)
     two = torch.ones(1).int().numpy()[0] + 1  # an integer of numpy's
@@ -115,6 +116,10 @@ def test_weights_and_ranges():
             for limits in ((1, "2"), (1.0, 2.5), (1, 2, 3), (2, 1), (0, 1))
         ),
         (lambda: Uniform((1, 100), (1, 100), (1, 100)), "items.width=.* the ranges have 1,000,000 kinds"),
+        *(
+            (lambda unit=unit: Uniform(unit=unit), "items.unit=.*: expected a whole number >= 1")
+            for unit in (0, 1.5, "a", True)
+        ),
         (lambda: Recorded("missing.csv"), "items.path='missing.csv': no such file"),
         (lambda: Recorded(5), "items.path='5': no such file"),
         (lambda: Recorded("missing.csv", loop="maybe"), "items.loop='maybe': expected true or false"),

@@ -28,7 +28,9 @@ def test_every_preset_runs(name, tmp_path):
 
 @pytest.mark.parametrize("name", options("benchmark"))
 def test_a_benchmark_is_trained_on(name, tmp_path):
-    words = [f"benchmark={name}", *TINY, "env.tote_size=[6,6,5]"]
+    unit = composed(f"benchmark={name}")["items"].get("unit", 1)
+    words = [f"benchmark={name}", *TINY, f"env.tote_size=[{6 * unit},{6 * unit},{5 * unit}]"]
+    words += ["model=afterstate", "algo=td"] * (unit > 1)
     assert 0 <= train(composed(*words), tmp_path) <= 1
 
 

@@ -1,0 +1,179 @@
+"""Sequences of items that are cut from a full container, so that a perfect packing of each is known to exist."""
+
+import math
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from pickplace.task.checks import one_of, size_tuple
+from pickplace.task.items import ItemDistribution, check_count, check_range, hashed_uniform, place_at_random
+from pickplace.task.state import Item
+
+#: Orders of arrival: CUT-1 and CUT-2.
+ORDERS = ("z", "stacking")
+
+#: Greatest side of a container, and greatest number of items of an episode: more would fill the memory.
+MAX_SIDE, MAX_ITEMS = 200, 1000
+
+#: Number of episodes whose items are kept, so that they are not cut again at each step.
+KEPT_EPISODES = 1024
+
+
+class Cut(ItemDistribution):
+    """Items cut from a full container: an episode's items tile it, so that an occupancy of 1 is possible.
+
+    CUT-1 and CUT-2 of Zhao et al., "Online 3D Bin Packing with Constrained Deep Reinforcement Learning", AAAI 2021,
+    arXiv 2006.14978, section 4 and Algorithm 3 of its supplement. The container is cut in two again and again: a piece
+    with a side above the greatest is cut across such a side, drawn at random; the others are the items. They arrive
+
+    * CUT-1, ``order="z"``: by the height of their lower faces in the container, lowest first, equal ones at random;
+    * CUT-2, ``order="stacking"``: each time, one of those that lie on the floor or on items that have arrived.
+
+    The paper leaves open, and we chose:
+
+    * How the place of a cut is drawn. Ours is uniform over the places that leave two parts which can be cut into
+      allowed sides. Any place, as Algorithm 3 reads, also gives parts below the least side, which it never finishes.
+    * What "random" means for the side to cut, for ties in CUT-1 and for the next item in CUT-2: ours is uniform.
+    * What comes after the last item. The paper asks for a total volume of at least the container's; ours is equal to
+      it, and the episode ends.
+    * The generator and its seeds, so that the paper's test sequences cannot be repeated, only their distribution.
+
+    Args:
+        container: ``(W, D, H)`` that is cut, in cells and height units; the tote's size.
+        sides: ``(least, greatest)`` side of an item, of widths, depths and heights alike.
+        order: ``"z"`` or ``"stacking"``.
+
+    Raises:
+        ValueError: a bad value, or sides into which the container cannot be cut.
+    """
+
+    sequential = True
+
+    def __init__(self, container=(10, 10, 10), sides=(2, 5), order="z"):
+        self.order = one_of("items.order", order, ORDERS)
+        self.container = size_tuple("items.container", container, 3, MAX_SIDE)
+        self._greatest = check_range("items.sides", sides)[1]
+        least, greatest = sides
+        key = f"items.container={[*self.container]}, items.sides={[least, greatest]}"
+        longest = max(self.container)
+        # A length can be cut into allowed sides if some number of them may be as short and as long in all.
+        fits = [-(-length // greatest) * least <= length for length in range(longest + 1)]
+        if bad := [side for side in self.container if not fits[side]]:
+            raise ValueError(f"{key}: sides of {least} to {greatest} do not add up to {bad[0]}; expected some that do.")
+        count = math.prod(side // least for side in self.container)
+        if count > MAX_ITEMS:
+            raise ValueError(f"{key}: an episode has up to {count:,} items; expected at most {MAX_ITEMS:,}.")
+        cuts = [
+            [at for at in range(least, length - least + 1) if length > greatest and fits[at] and fits[length - at]]
+            for length in range(longest + 1)
+        ]
+        arising: list[set[int]] = []  # the sides that come of each length
+        for length, places in enumerate(cuts):
+            arising.append({length} if length <= greatest else set().union(*(arising[at] for at in places)))
+        sides_of_items = [sorted(arising[side]) for side in self.container]
+        check_count(f"{key}: the container gives", math.prod(map(len, sides_of_items)))
+        self.sizes = torch.tensor(list(product(*sides_of_items)))
+        self._num_cuts = torch.tensor([len(places) for places in cuts])
+        self._cuts = torch.tensor([places + [0] * (longest - len(places)) for places in cuts])
+        self._layers = self.container[2] // least
+        self._at_once = max(1, 2**22 // count**2)  # episodes, for the memory of `_arrival`
+        self._kept: dict[tuple[str, int, int], list[list[int]]] = {}
+
+    def sample(self, stream, seed, episode, step, bin_size):
+        _, across, along = hashed_uniform(stream, seed, episode, step, 3)
+        rows = [part.tolist() for part in torch.broadcast_tensors(seed, episode, step)]
+        keys = [(stream, *key) for key in zip(*rows[:2], strict=True)]
+        if unseen := list(dict.fromkeys(key for key in keys if key not in self._kept)):
+            self._keep(stream, unseen)
+        sequences = map(self._kept.__getitem__, keys)
+        size = [
+            each[number] if number < len(each) else [0, 0, 0] for each, number in zip(sequences, rows[2], strict=True)
+        ]
+        item = place_at_random(
+            torch.tensor(size, dtype=torch.int64, device=step.device).view(-1, 3), across, along, bin_size
+        )
+        if len(self._kept) > max(KEPT_EPISODES, 2 * len(keys)):
+            self._kept = {key: self._kept[key] for key in keys}
+        return Item(*(torch.where(item.is_empty, 0, part) for part in item))
+
+    def _keep(self, stream: str, keys: list[tuple[str, int, int]]) -> None:
+        """Cut the episodes of these keys, ``(stream, seed, episode)``, and keep the sizes of their items."""
+        for start in range(0, len(keys), self._at_once):
+            some = keys[start : start + self._at_once]
+            _, seed, episode = zip(*some, strict=True)
+            boxes = self.boxes(stream, torch.tensor(seed), torch.tensor(episode))
+            self._kept.update(zip(some, (each[:, 3:].tolist() for each in boxes), strict=True))
+
+    def boxes(self, stream: str, seed: Tensor, episode: Tensor) -> list[Tensor]:
+        """Return the items of whole episodes where they were cut: they tile the container.
+
+        Args:
+            stream: family of item streams.
+            seed, episode: int64 ``[E]``, on the CPU.
+
+        Returns:
+            For each episode int64 ``[n, 6]``, the ``x, y, z, w, d, h`` of its items in their order of arrival.
+        """
+        row, low, high, uniform = self._cut(stream, seed, episode)
+        # Row by row; within a row the lower come first, so that a stable sort keeps an item after its supporters.
+        index = torch.argsort(row * self.container[2] + low[:, 2], stable=True)
+        row, low, high, uniform = row[index], low[index], high[index], uniform[index]
+        counts = torch.bincount(row, minlength=len(episode))
+        place = torch.arange(len(row)) - (counts.cumsum(0) - counts)[row]
+        shape = len(episode), int(counts.max())
+
+        def padded(part: Tensor) -> Tensor:
+            return part.new_zeros(*shape, *part.shape[1:]).index_put((row, place), part)
+
+        low, high, uniform = padded(low), padded(high), padded(uniform)
+        time = low[..., 2] + uniform if self.order == "z" else self._arrival(low, high, uniform)
+        time = time.masked_fill(torch.arange(shape[1]) >= counts[:, None], torch.inf)
+        order = time.argsort(stable=True)[..., None].expand_as(low)
+        boxes = torch.cat([low.gather(1, order), (high - low).gather(1, order)], -1)
+        return [each[:count] for each, count in zip(boxes, counts.tolist(), strict=True)]
+
+    def _cut(self, stream: str, seed: Tensor, episode: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the items of episodes, ``[B]`` in all: the episode's row, two corners ``[B, 3]``, a uniform number.
+
+        All pieces are cut at once, round by round. A piece has the numbers of its own place in the container, so that
+        the order of the cuts does not matter.
+        """
+        _, depth, height = self.container
+        volume = math.prod(self.container)
+        row, low = torch.arange(len(episode)), torch.zeros(len(episode), 3, dtype=torch.int64)
+        high = low + torch.tensor(self.container)
+        done = []
+        while len(row):
+            first, last = ((cell[:, 0] * depth + cell[:, 1]) * height + cell[:, 2] for cell in (low, high - 1))
+            address = -1 - (first * volume + last)  # below 0: at the steps lie where the items are in the bin
+            side_number, place_number, order_number = hashed_uniform(stream, seed[row], episode[row], address, 3)
+            rank = (high - low > self._greatest).cumsum(1)  # [B, 3]
+            long = rank[:, -1] > 0
+            done.append((row[~long], low[~long], high[~long], order_number[~long]))
+            row, low, high, rank = row[long], low[long], high[long], rank[long]
+            wanted = (side_number[long] * rank[:, -1]).long() + 1
+            side = torch.searchsorted(rank, wanted[:, None])  # [B, 1]
+            length = (high - low).gather(1, side)
+            cut = self._cuts[length, (place_number[long, None] * self._num_cuts[length]).long()] + low.gather(1, side)
+            row = torch.cat([row, row])
+            low, high = torch.cat([low, low.scatter(1, side, cut)]), torch.cat([high.scatter(1, side, cut), high])
+        return tuple(map(torch.cat, zip(*done, strict=True)))  # type: ignore[return-value]
+
+    def _arrival(self, low: Tensor, high: Tensor, uniform: Tensor) -> Tensor:
+        """Return times whose order is that of CUT-2, float64 ``[E, K]``.
+
+        Each item arrives an exponentially distributed time after the last of those that it lies on. Because such a
+        time has no memory, the next to arrive is any of the items that may, with the same probability.
+
+        Args:
+            low, high: int64 ``[E, K, 3]``, two corners of each item.
+            uniform: float64 ``[E, K]``.
+        """
+        overlap = (low[:, :, None, :2] < high[:, None, :, :2]) & (low[:, None, :, :2] < high[:, :, None, :2])
+        below = overlap.all(-1) & (high[:, :, None, 2] == low[:, None, :, 2])  # [E, below, above]
+        wait = -torch.log1p(-uniform)
+        time = wait
+        for _ in range(self._layers - 1):
+            time = wait + torch.where(below, time[:, :, None], 0).amax(1)
+        return time
