@@ -9,6 +9,7 @@ grasp class. And the end effector collides if and only if the highest thing unde
 the tote, is higher than the item's top: one maximum over its cells decides.
 """
 
+import itertools
 from functools import reduce
 from typing import NamedTuple
 
@@ -235,14 +236,19 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Te
     """Return the least clearance with which any grasp reaches each footprint, ``[W_T, D_T, N]``; FAR if none does."""
     (tote_w, tote_d, _), count = cell.tote_size, cell.num_offsets
     margins = _footprint_margins(cell, parity)
-    clear = {turn: surround(maps.clearance_in(turn), margins, FAR) for turn in range(parity, len(grasped), 2)}
-    usable = (
-        torch.where(grasped[turn, count - 1 - i, count - 1 - j], clear[turn][i : i + tote_w, j : j + tote_d], FAR)
-        for turn in clear
-        for i in range(count)
-        for j in range(count)
-    )
-    return reduce(torch.minimum, usable)
+    least = []
+    for turn in range(parity, len(grasped), 2):
+        clear, kinds = surround(maps.clearance_in(turn), margins, FAR), grasped[turn].flip(0, 1)  # as the windows are
+        in_x, in_y = kinds.any(1), kinds.any(0)  # [count, 1, 1, N]
+        if count > 3 and torch.equal(kinds, in_x[:, None] & in_y):
+            # Mostly so. The least in a rectangle is the least along x, then along y.
+            along = reduce(torch.minimum, (torch.where(in_x[i], clear[i : i + tote_w], FAR) for i in range(count)))
+            usable = (torch.where(in_y[j], along[:, j : j + tote_d], FAR) for j in range(count))
+        else:
+            each = itertools.product(range(count), repeat=2)
+            usable = (torch.where(kinds[i, j], clear[i : i + tote_w, j : j + tote_d], FAR) for i, j in each)
+        least.append(reduce(torch.minimum, usable))
+    return reduce(torch.minimum, least)
 
 
 def _reached_within_limits(cell: CellSpec, limits: Limits, maps: PlacingMaps, parity: int, grasped: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from pickplace.task import large
 from pickplace.task.cell import CellSpec
 from pickplace.task.maps import FAR, NEVER, is_under, surround, windows
 from pickplace.task.state import Item, State, surface_from
@@ -49,10 +50,14 @@ def resting_top(cell: CellSpec, state: State) -> tuple[Tensor, Tensor]:
     support is too small. The height below it is that of :func:`rest`, stable or not; ``FAR`` outside the tote.
     """
     item, (w, d) = state.item, footprint_sizes(cell, state.item)
-    cells, under = footprint_cells(cell, state.surface, w, d)
-    z = rest(cells, under)
+    if large.serves(cell):
+        z, stable = large.resting(cell, state.surface.permute(1, 2, 0), w, d)
+    else:
+        cells, under = footprint_cells(cell, state.surface, w, d)
+        z = rest(cells, under)
+        stable = is_supported(cell, cells, under, z, w, d)
     top = z + item.h.to(z.dtype)
-    good = is_supported(cell, cells, under, z, w, d) & ~overflows(top, state.tote_height) & ~item.is_empty
+    good = stable & ~overflows(top, state.tote_height) & ~item.is_empty
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
 

@@ -13,7 +13,7 @@ stable if the patterns of its supporting cells cover all of them. That is exact,
 up to 3 cells.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from math import gcd
 
@@ -48,12 +48,31 @@ def is_supported(
     count = torch.zeros_like(z)
     for surface, used in zip(cells, under, strict=True):
         count += (surface == supporting) & used
+    return is_stable(cell, count, _rows(cells, under, supporting), w, d)
+
+
+#: Of each row of a square along y, the first and the last supporting cell under the item: int16, of the shape of ``z``,
+#: counted from the square's corner; beyond the square and -1 where there is none.
+Rows = Iterable[tuple[Tensor, Tensor]]
+
+
+def is_stable(cell: CellSpec, count: Tensor, rows: Rows, w: Tensor, d: Tensor) -> Tensor:
+    """Return whether an item is stable by a rule other than those of the whole cells' hull, of the shape of ``count``.
+
+    Args:
+        cell: has the rule, ``cell.support``.
+        count: of the supporting cells, int32.
+        rows: of the supporting cells.
+        w, d: the footprint's sides, broadcastable.
+    """
     share = count.double() / (w * d)
     stable = is_share_enough(cell.support, share)
     if cell.support == "half_or_hull":
-        stable |= _is_in_hull_of_middles(cells, under, supporting, w, d)
+        stable |= _is_in_hull_of_middles(rows, w, d, torch.full_like(share, -torch.inf, dtype=_exact(cell.max_side)))
     if cell.support == "corners":
-        corners = _supported_corners(cells, supporting, w, d)
+        corners = torch.zeros_like(count)
+        for x, (first, last) in enumerate(rows):  # one cell may have several corners
+            corners += ((first == 0).int() + (last == d - 1)) * ((w == x + 1).int() + (x == 0))
         for least, enough in CORNER_SUPPORT:
             stable |= (corners >= least) & (share >= enough)
     return stable
@@ -64,40 +83,36 @@ def is_share_enough(rule: str | float, share: Tensor) -> Tensor:
     return share > 0.5 if rule in ("more_than_half", "half_or_hull") else share >= LEAST_SUPPORT.get(rule, rule)
 
 
-def _supported_corners(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor) -> Tensor:
-    """Return how many of the footprint's four corners lie on supporting cells; one cell may have several of them."""
+def _rows(cells: Sequence[Tensor], under: Sequence[Tensor], supporting: Tensor) -> Rows:
+    """Yield the rows of the supporting cells of squares."""
     side = round(len(cells) ** 0.5)
-    corners = torch.zeros_like(supporting)
-    for number, surface in enumerate(cells):
-        x, y = divmod(number, side)
-        at_corner = ((w == x + 1).int() + (x == 0)) * ((d == y + 1).int() + (y == 0))
-        corners += (surface == supporting) * at_corner
-    return corners
+    for x in range(side):
+        first = last = torch.zeros_like(supporting, dtype=torch.int16)  # counted from the ends of the square; 0: none
+        for y in range(side):
+            here = ((cells[x * side + y] == supporting) & under[x * side + y]).short()
+            first, last = torch.maximum(first, here * (side - y)), torch.maximum(last, here * (y + 1))
+        yield side - first, last - 1
 
 
-def _is_in_hull_of_middles(
-    cells: Sequence[Tensor], under: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor
-) -> Tensor:
+def _exact(side: int) -> torch.dtype:
+    """Return a type that tells apart all ratios of whole numbers up to the side."""
+    return torch.float32 if side <= 64 else torch.float64
+
+
+def _is_in_hull_of_middles(rows: Rows, w: Tensor, d: Tensor, lowest: Tensor) -> Tensor:
     """Return whether the item's centre lies in the hull of the middles of the supporting cells, or on its edge.
 
     It does if some line between two of these middles passes the centre on its far side along y, and some on its near
     side. Such a line goes from one at ``(-a, b)`` to one at ``(a', b')``, as seen from the centre, and passes at a
     height of the sign of ``b / a + b' / a'``: so the steepest on each side decide, and no pairs are compared.
     """
-    side = round(len(cells) ** 0.5)
-    exact = torch.float32 if side <= 64 else torch.float64  # ratios of whole numbers up to the side are told apart
     w, d = w.short(), d.short()
-    none = torch.full(supporting.shape, -torch.inf, dtype=exact, device=supporting.device)
-    steepest = [[none, none], [none, none]]  # to the far side, left and right of the centre; to the near side
-    for x in range(side):
-        first = last = torch.zeros_like(supporting, dtype=torch.int16)  # counted from the ends of the square; 0: none
-        for y in range(side):
-            here = ((cells[x * side + y] == supporting) & under[x * side + y]).short()
-            first, last = torch.maximum(first, here * (side - y)), torch.maximum(last, here * (y + 1))
-        offset = (2 * x + 1 - w).to(exact)
-        gap = torch.where(last > 0, 0.0, torch.inf).to(exact)
-        for parts, beyond in zip(steepest, (2 * last - 1 - d, d - 2 * (side - first) - 1), strict=True):
-            slope = (beyond.to(exact) - gap) / offset.abs()  # on the line through the centre +-inf, and nan for 0 / 0
+    steepest = [[lowest, lowest], [lowest, lowest]]  # to the far side, left and right of the centre; to the near side
+    for x, (first, last) in enumerate(rows):
+        offset = (2 * x + 1 - w).to(lowest.dtype)
+        gap = torch.where(last >= 0, 0.0, torch.inf).to(lowest.dtype)
+        for parts, beyond in zip(steepest, (2 * last + 1 - d, d - 2 * first - 1), strict=True):
+            slope = (beyond - gap) / offset.abs()  # on the line through the centre +-inf, and nan for 0 / 0
             slope = torch.where(slope.isnan(), torch.inf, slope)
             parts[0] = torch.maximum(parts[0], torch.where(offset <= 0, slope, -torch.inf))
             parts[1] = torch.maximum(parts[1], torch.where(offset >= 0, slope, -torch.inf))

@@ -4,6 +4,7 @@ import itertools
 import math
 from dataclasses import replace
 from random import Random
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -14,7 +15,10 @@ from oracle import SUCCESS, UNSTABLE
 from problems import Case, oracle_of, problems, random_effector, state_of
 from scipy.spatial import ConvexHull, QhullError
 
-from pickplace import CellSpec, Failure, Item, State
+from pickplace import CellSpec, Failure, Item, PickPlaceEnv, State
+from pickplace.planners.base import decide
+from pickplace.planners.heuristics import JointDBL
+from pickplace.task import large
 from pickplace.task.cell import Limits, reference_cell
 from pickplace.task.feasibility import (
     action_footprints,
@@ -26,17 +30,20 @@ from pickplace.task.feasibility import (
     placing_maps,
 )
 from pickplace.task.grasps import all_grasps, heuristic_pick
+from pickplace.task.items import Uniform
+from pickplace.task.placing import resting_top
 from pickplace.task.state import EMPTY, surface_from
 from pickplace.task.support import bearing_cells
 from pickplace.task.transition import apply, put_down
 
 
 @settings(max_examples=150)
-@given(problems(limited=st.booleans(), count=2, shaped=st.booleans()))
-def test_masks_equal_the_step_and_the_oracle(problem):
+@given(problems(limited=st.booleans(), count=2, shaped=st.booleans()), st.sampled_from([1, large.LEAST_SIDE]))
+def test_masks_equal_the_step_and_the_oracle(problem, least_side):
     cell, cases = problem
     state, actions = state_of(*cases), torch.arange(cell.num_actions)
-    maps = placing_maps(cell, state)
+    with patch.object(large, "LEAST_SIDE", least_side):
+        maps = placing_maps(cell, state)
     masks, reached = action_mask(cell, maps), footprint_mask(cell, maps)
     footprints = action_footprints(cell, state.item)
     assert torch.equal(num_feasible(cell, maps), masks.sum(1))
@@ -205,6 +212,27 @@ def test_half_or_hull_equals_scipys_hull(data):
         assume(False)
     inside = (hull @ [w / 2, d / 2, 1]).max() < 1e-9
     assert rest_on(heights, (w, d, 1), "half_or_hull") == (SUCCESS if 2 * len(held) > w * d or inside else UNSTABLE)
+
+
+@pytest.mark.parametrize("at_once", [1, large.AT_ONCE])
+@pytest.mark.parametrize(("support", "unit"), [("half_or_hull", 3), ("half_or_hull", 10), ("corners", 4), (0.7, 5)])
+def test_large_items_rest_as_small_ones_do(support, unit, at_once, monkeypatch):
+    sizes = {"bin_size": (5 * unit, 5 * unit, 1), "tote_size": (7 * unit, 6 * unit, 8 * unit), "support": support}
+    items, effector = Uniform((1, 5), (1, 5), (1, 5), unit=unit), {"effector_size": (1, 1), "pick_rule": "overlap"}
+    env = PickPlaceEnv(items, num_envs=2, masks=(), rotations=2, **sizes, **effector)
+    planner, seen, stable = JointDBL(env.cell), env.reset(), 0
+    monkeypatch.setattr(large, "AT_ONCE", at_once)
+    for _ in range(2 if unit > 5 else 12):
+        each = []
+        for least_side in (1, 999):
+            monkeypatch.setattr(large, "LEAST_SIDE", least_side)
+            each.append(resting_top(env.cell, env.state.each_item()))
+        (top, rest), (expected_top, expected_rest) = each
+        assert torch.equal(top, expected_top) and torch.equal(rest, expected_rest)
+        stable += int((top >= 0).sum())
+        seen["action"] = decide(planner, env.cell, seen)
+        seen = env.step_and_maybe_reset(seen)[1]
+    assert stable > 0
 
 
 @pytest.mark.parametrize(("cells", "size", "distance"), [

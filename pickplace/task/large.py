@@ -1,0 +1,95 @@
+"""The placements of large items on fine grids: what an item rests on, and which cells hold it.
+
+:mod:`~pickplace.task.placing` looks at each cell of the square under an item, for all footprints at once. That is
+fastest for items of a few cells. Here the work grows with the side of the square instead of its area: the greatest
+height under a rectangle is a maximum along one axis, then along the other; and for each height in a tote tables are
+made of the cells that have it, in which a row of any footprint is looked up.
+"""
+
+from functools import reduce
+
+import torch
+from torch import Tensor
+
+from pickplace.task.cell import HULL_RULES, CellSpec
+from pickplace.task.maps import FAR, NEVER, surround
+from pickplace.task.state import surface_from
+from pickplace.task.support import Rows, is_stable
+
+LEAST_SIDE = 8  # of the square, from which on this way is faster
+AT_ONCE = 2**22  # entries of a table
+
+
+def serves(cell: CellSpec) -> bool:
+    """Return whether :func:`resting` serves a cell and is faster than a look at each cell of the square."""
+    return cell.max_side >= LEAST_SIDE and cell.support not in HULL_RULES
+
+
+def resting(cell: CellSpec, surface: Tensor, w: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the height on which an item comes to rest on each footprint, and whether it is stable there.
+
+    Both are ``[Q, W_T, D_T, N]``, int32 and bool. Footprints that leave the tote rest higher than any rim.
+
+    Args:
+        surface: int32 ``[W_T, D_T, N]``, all cells bear weight.
+        w, d: footprint sizes, int64 ``[Q, 1, 1, N]``.
+    """
+    count = surface.shape[-1]
+    at_once = max(1, AT_ONCE // (len(surface.unique()) * cell.tote_size[0] * cell.tote_size[1]))
+    parts = [slice(start, start + at_once) for start in range(0, count, at_once)]
+    z, stable = zip(*(_resting(cell, surface[..., part], w[..., part], d[..., part]) for part in parts), strict=True)
+    return torch.cat(z, -1), torch.cat(stable, -1)
+
+
+def _resting(cell: CellSpec, surface: Tensor, w: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    (wide, deep, _), side = cell.tote_size, cell.max_side
+    highest = surround(surface, (0, side - 1, 0, side - 1), 2 * FAR)[None]
+    for axis, size, grid in ((1, w, wide), (2, d, deep)):
+        parts = (torch.where(step < size, highest.narrow(axis, step, grid), NEVER) for step in range(side))
+        highest = reduce(torch.maximum, parts)
+    z = highest >> 1
+    tables = _Tables(surface, surface_from(z))
+    return z, is_stable(cell, tables.count(w, d), tables.rows(side, w, d), w, d)
+
+
+class _Tables:
+    """Where the cells of each height are, for the height on which an item rests on each footprint.
+
+    Args:
+        surface: int32 ``[W_T, D_T, N]``.
+        supporting: the surface of supporting cells for each footprint, ``[Q, W_T, D_T, N]``.
+    """
+
+    def __init__(self, surface: Tensor, supporting: Tensor):
+        levels, (wide, deep, count) = surface.unique(), surface.shape
+        self._shape, self._at = (wide, deep, count), surface == levels.view(-1, 1, 1, 1)  # [levels, W_T, D_T, N]
+        self._level = torch.searchsorted(levels, supporting).clamp_(max=len(levels) - 1)
+        self._x, self._y, self._n = (
+            torch.arange(size, device=surface.device).view(shape)
+            for size, shape in zip(self._shape, [(-1, 1, 1), (-1, 1), (-1,)], strict=True)
+        )
+
+    def count(self, w: Tensor, d: Tensor) -> Tensor:
+        """Return the number of supporting cells under each footprint, int32."""
+        (wide, deep, count), number = self._shape, self._at.cumsum(1).cumsum(2).int()
+        sums = number.new_zeros(len(number), wide + 1, deep + 1, count)  # of the cells before x and y
+        sums[:, 1:, 1:] = number
+        begin, end = (self._x, self._y), ((self._x + w).clamp_(max=wide), (self._y + d).clamp_(max=deep))
+
+        def before(x: Tensor, y: Tensor) -> Tensor:
+            return sums.take(((self._level * (wide + 1) + x) * (deep + 1) + y) * count + self._n)
+
+        return before(*end) - before(begin[0], end[1]) - before(end[0], begin[1]) + before(*begin)
+
+    def rows(self, side: int, w: Tensor, d: Tensor) -> Rows:
+        """Yield the rows of the supporting cells under each footprint."""
+        (wide, deep, count), y = self._shape, self._y.short()
+        after = torch.where(self._at, y, deep).flip(2).cummin(2).values.flip(2)  # first of the level from y on
+        before = torch.where(self._at, y, -1).cummax(2).values
+        start = ((self._level * wide + self._x) * deep + self._y) * count + self._n
+        end = start + (d - 1) * count
+        for x in range(side):
+            row, most = x * deep * count, after.numel() - 1
+            first, last = after.take((start + row).clamp_(max=most)) - y, before.take((end + row).clamp_(max=most)) - y
+            held = (x < w) & (first < d)
+            yield torch.where(held, first, side), torch.where(held, last, -1)
