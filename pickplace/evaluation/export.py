@@ -55,13 +55,16 @@ def export(source, folder: Path, evaluations: list[Path]) -> None:
 def critic_serves_any_tote(cfg: DictConfig) -> bool:
     """Return whether the critic of a checkpoint's config is of use for other totes, such as to ``planner=lookahead``.
 
-    Another one is tied to the tote of the training, and larger than the policy.
+    Another one is tied to the tote of the training, and larger than the policy; or it is the policy's own network.
     """
     env: Any = OmegaConf.to_container(cfg.env, resolve=True)
     cell = build_cell(env, reach=None)  # a table of reach may be elsewhere
-    find("model.critic", cfg.model.critic._target_)  # imports it, which the device "meta" does not allow
+    for key in ("actor", "critic"):
+        find(f"model.{key}", cfg.model[key]._target_)  # imports it, which the device "meta" does not allow
     with torch.device("meta"):
-        return getattr(build("model.critic", cfg.model.critic, cell=cell), "any_size", False)
+        policy = build("model.actor", cfg.model.actor, cell=cell, mask_infeasible=cfg.algo.mask_infeasible)
+        critic = build("model.critic", cfg.model.critic, cell=cell)
+    return getattr(critic, "any_size", False) and not policy.learns_values
 
 
 def main() -> None:

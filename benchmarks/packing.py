@@ -1,0 +1,108 @@
+"""Play the public packing benchmarks, without a gripper and with one: python benchmarks/packing.py
+
+Writes docs/results/packing.csv, and prints what is in it. What was played before is not played again; `--match` names
+some rows, such as `^cut1`.
+"""
+
+import argparse
+import csv
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from common import console_command
+
+ROOT = Path(__file__).parents[1]
+TABLE, RUNS = ROOT / "docs" / "results" / "packing.csv", ROOT / "outputs" / "packing"
+PLATES = ("plate_3x3", "plate_5x5")
+SCALED = {"gopt_30": 1000, "gopt_50": 1000, "gopt_100": 100}  # episodes: a decision on a fine grid takes longer
+#: Benchmark and end effector -> weights. docs/benchmarks.md has the commands that train those in outputs/.
+WEIGHTS = {(name, "point"): "pretrained/gopt_rs" for name in ("gopt_rs", *SCALED, "pct1")}
+WEIGHTS |= {("cdrl_rs", "point"): "pretrained/cdrl_rs"}
+WEIGHTS |= {(name, "point"): f"outputs/{name}" for name in ("cut1", "cut2")}
+WEIGHTS |= {("gopt_rs", plate): f"outputs/{plate}" for plate in PLATES}
+COLUMNS = ("benchmark", "effector", "rotations", "planner", "episodes", "mean", "low", "high")
+COLUMNS += ("kept", "kept_low", "kept_high", "ms")
+
+
+class Row(NamedTuple):
+    """What is played: a benchmark, an end effector, a number of rotations, and by whom."""
+
+    benchmark: str
+    effector: str
+    rotations: int
+    planner: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.benchmark}-{self.effector}-R{self.rotations}-{self.planner}"
+
+    def words(self) -> list[str]:
+        """Return overrides of pickplace-evaluate."""
+        learned = f"checkpoint={WEIGHTS.get(self[:2])}"
+        planner = learned if self.planner == "learned" else f"planner={self.planner}"
+        words = [f"benchmark={self.benchmark}", f"effector={self.effector}", f"env.rotations={self.rotations}", planner]
+        if self.benchmark in SCALED:
+            words += [f"evaluation.episodes={SCALED[self.benchmark]}"]
+        elif self.planner != "learned":
+            words += ["evaluation.episodes=300"]
+        return [*words, "physics=settle", "evaluation.replay=0", "threads=1"]
+
+
+def rows() -> list[Row]:
+    """Return what is played: the benchmarks as they are, then with grippers that may turn an item."""
+    rotations = {name: 1 if name in ("cdrl_rs", "cut1", "cut2") else 2 for name, _ in WEIGHTS}
+    played = [Row(name, "point", rotations[name], "learned") for name in rotations]
+    for name in ("gopt_rs", "cdrl_rs", "cut1", "cut2"):
+        for effector in ("point", *PLATES):
+            planners = ["joint_dbl", "individual_heuristic"]
+            if effector != "point" and (name, effector) in WEIGHTS:
+                planners.insert(0, "learned")
+            turns = (rotations[name],) if effector == "point" else (2, 4) if name == "gopt_rs" else (2,)
+            played += [Row(name, effector, turn, planner) for turn in turns for planner in planners]
+    return played
+
+
+def play(row: Row) -> None:
+    """Play a row, if it has not been played."""
+    folder = RUNS / row.name
+    if not (folder / "evaluation.json").is_file():
+        words = [console_command("pickplace-evaluate"), *row.words(), f"hydra.run.dir={folder}"]
+        subprocess.run(words, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
+
+
+def result_of(row: Row) -> dict | None:
+    """Return a line of the table; None of what was not played."""
+    path = RUNS / row.name / "evaluation.json"
+    if not path.is_file():
+        return None
+    result = json.loads(path.read_text())
+    occupancy, kept = result["occupancy"], result["physics"]["carried_out"]
+    line = {**row._asdict(), "episodes": result["episodes"], "ms": result["latency_ms"]["p50"]}
+    line |= {"mean": occupancy["mean"], "low": occupancy["ci95"][0], "high": occupancy["ci95"][1]}
+    return line | {"kept": kept["mean"], "kept_low": kept["ci95"][0], "kept_high": kept["ci95"][1]}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--match", default="", help="regular expression; plays the rows in whose name it is found")
+    match = parser.parse_args().match
+    for row in rows():
+        if re.search(match, row.name):
+            play(row)
+    lines = [line for row in rows() if (line := result_of(row))]
+    with TABLE.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({key: round(v, 4) if isinstance(v, float) else v for key, v in line.items()} for line in lines)
+    for line in lines:
+        share = " ".join(f"{100 * line[key]:.1f}" for key in ("mean", "low", "high", "kept", "kept_low", "kept_high"))
+        words = [line["benchmark"], line["effector"], f"R={line['rotations']}", line["planner"], line["episodes"]]
+        sys.stdout.write(" | ".join(map(str, [*words, share, f"{line['ms']:.1f} ms"])) + "\n")
+
+
+if __name__ == "__main__":
+    main()
