@@ -9,7 +9,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from pickplace.task import large
+from pickplace.task import large_items
 from pickplace.task.cell import CellSpec
 from pickplace.task.maps import FAR, NEVER, is_under, surround, windows
 from pickplace.task.state import Item, State, surface_from
@@ -50,8 +50,8 @@ def resting_top(cell: CellSpec, state: State) -> tuple[Tensor, Tensor]:
     support is too small. The height below it is that of :func:`rest`, stable or not; ``FAR`` outside the tote.
     """
     item, (w, d) = state.item, footprint_sizes(cell, state.item)
-    if large.serves(cell):
-        z, stable = large.resting(cell, state.surface.permute(1, 2, 0), w, d)
+    if large_items.are_large(cell):
+        z, stable = large_items.resting(cell, state.surface.permute(1, 2, 0), w, d)
     else:
         cells, under = footprint_cells(cell, state.surface, w, d)
         z = rest(cells, under)

@@ -16,11 +16,11 @@ from pickplace.task.maps import FAR, NEVER, surround
 from pickplace.task.state import surface_from
 from pickplace.task.support import Rows, is_stable
 
-LEAST_SIDE = 8  # of the square, from which on this way is faster
-AT_ONCE = 2**22  # entries of a table
+LEAST_SIDE = 8  # of the square; from there on this way is faster
+MAX_ENTRIES = 2**22  # of a table; more problems are looked at in turn
 
 
-def serves(cell: CellSpec) -> bool:
+def are_large(cell: CellSpec) -> bool:
     """Return whether :func:`resting` serves a cell and is faster than a look at each cell of the square."""
     return cell.max_side >= LEAST_SIDE and cell.support not in HULL_RULES
 
@@ -35,7 +35,7 @@ def resting(cell: CellSpec, surface: Tensor, w: Tensor, d: Tensor) -> tuple[Tens
         w, d: footprint sizes, int64 ``[Q, 1, 1, N]``.
     """
     count = surface.shape[-1]
-    at_once = max(1, AT_ONCE // (len(surface.unique()) * cell.tote_size[0] * cell.tote_size[1]))
+    at_once = max(1, MAX_ENTRIES // (len(surface.unique()) * cell.tote_size[0] * cell.tote_size[1]))
     parts = [slice(start, start + at_once) for start in range(0, count, at_once)]
     z, stable = zip(*(_resting(cell, surface[..., part], w[..., part], d[..., part]) for part in parts), strict=True)
     return torch.cat(z, -1), torch.cat(stable, -1)
@@ -71,7 +71,7 @@ class _Tables:
 
     def count(self, w: Tensor, d: Tensor) -> Tensor:
         """Return the number of supporting cells under each footprint, int32."""
-        (wide, deep, count), number = self._shape, self._at.cumsum(1).cumsum(2).int()
+        (wide, deep, count), number = self._shape, self._at.cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32)
         sums = number.new_zeros(len(number), wide + 1, deep + 1, count)  # of the cells before x and y
         sums[:, 1:, 1:] = number
         begin, end = (self._x, self._y), ((self._x + w).clamp_(max=wide), (self._y + d).clamp_(max=deep))
