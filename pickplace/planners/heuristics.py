@@ -1,5 +1,6 @@
 """Planners that need no training."""
 
+from abc import abstractmethod
 from functools import reduce
 
 import torch
@@ -115,7 +116,28 @@ class JointDBL(MapPlanner):
         return action[:, 0].clamp(max=highest - 1)
 
 
-class Corner(MapPlanner):
+class _Cheapest(MapPlanner):
+    """Chooses the footprint of least cost over everything that is feasible; ties go to the lowest index."""
+
+    item: str
+
+    @abstractmethod
+    def cost(self, cell: CellSpec, state: State, maps: PlacingMaps, distance: Tensor) -> Tensor:
+        """Return the cost of each footprint, ``[N, Q, W_T, D_T]``.
+
+        Args:
+            distance: from the tote's first corner, ``x + y``, int64 ``[W_T, D_T]``.
+        """
+
+    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
+        feasible = restrict_items(self.item, state, choice_mask(cell, maps))
+        x, y = (torch.arange(side, device=feasible.device) for side in cell.tote_size[:2])
+        cost = self.cost(cell, state, maps, x[:, None] + y)
+        choice = torch.where(feasible, maps.join(cost), torch.inf).argmin(1)
+        return first_action_reaching(cell, maps, choice)
+
+
+class Corner(_Cheapest):
     """Keeps the item's top low and its footprint near the tote's first corner; not in the paper.
 
     Minimises ``height_weight * top + x + y`` of the footprint over everything that is feasible; ties go to the lowest
@@ -134,15 +156,11 @@ class Corner(MapPlanner):
         self.cell, self.height_weight = cell, number("planner.height_weight", height_weight)
         self.item = check_item_rule(item)
 
-    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        feasible = restrict_items(self.item, state, choice_mask(cell, maps))
-        x, y = (torch.arange(side, device=feasible.device) for side in cell.tote_size[:2])
-        cost = self.height_weight * maps.top + x[:, None] + y
-        choice = torch.where(feasible, maps.join(cost), torch.inf).argmin(1)
-        return first_action_reaching(cell, maps, choice)
+    def cost(self, cell: CellSpec, state: State, maps: PlacingMaps, distance: Tensor) -> Tensor:
+        return self.height_weight * maps.top + distance
 
 
-class HeightmapMinimisation(MapPlanner):
+class HeightmapMinimisation(_Cheapest):
     """Raises the tote's height map least: the heuristic of Wang and Hauser, 2019, "Stable bin packing of non-convex 3D
     objects with a robot manipulator".
 
@@ -162,12 +180,8 @@ class HeightmapMinimisation(MapPlanner):
         self.cell, self.distance_weight = cell, number("planner.distance_weight", distance_weight)
         self.item = check_item_rule(item)
 
-    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        feasible = restrict_items(self.item, state, choice_mask(cell, maps))
-        x, y = (torch.arange(side, device=feasible.device) for side in cell.tote_size[:2])
-        cost = added_volume(cell, state, maps) + self.distance_weight * (x[:, None] + y).double()
-        choice = torch.where(feasible, maps.join(cost), torch.inf).argmin(1)
-        return first_action_reaching(cell, maps, choice)
+    def cost(self, cell: CellSpec, state: State, maps: PlacingMaps, distance: Tensor) -> Tensor:
+        return added_volume(cell, state, maps) + self.distance_weight * distance.double()
 
 
 def added_volume(cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:

@@ -166,8 +166,8 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
 def load_critic(path, trained: TrainedPolicy) -> "RestoredCritic | None":
     """Return the critic of the checkpoint of a policy that :func:`load_policy` returned; None if it does not serve."""
     if trained.policy.learns_values:
-        network = trained.policy.network
-        return RestoredCritic(network, [*network.in_keys], trained.config.algo.reward_scale)
+        critic = as_critic(trained.policy.network)
+        return RestoredCritic(critic.module, list(critic.in_keys), trained.config.algo.reward_scale)
     state, _ = checkpoint.read(checkpoint.locate(path))
     env = cast(dict, OmegaConf.to_container(trained.config.env, resolve=True))
     return restore_critic(trained.config, trained.cell, state, env)
