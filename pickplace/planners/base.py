@@ -161,5 +161,5 @@ def planner_parts(
         cfg, state, env = trained
         parts["policy"] = restore_policy(cfg, cell, state["policy"], env).to(cfg.device)
         if "critic" in needs:
-            parts["critic"] = restore_critic(cfg, cell, state, env)
+            parts["critic"] = restore_critic(cfg, parts["policy"], state, env)
     return parts

@@ -30,7 +30,7 @@ class Lookahead(MapPlanner):
 
     Args:
         cell: the sizes.
-        policy: an ``fcn_grasp`` policy that was trained with a mask.
+        policy: ``fcn_grasp``, ``corners`` or ``afterstate``, trained with a mask.
         items: the item distribution; of a sequence, recorded or cut, its sizes, equally likely.
         candidates: how many of the policy's most probable choices are played out.
         critic: the value of a state, a function from observations to ``[N, 1]``, in volume; None: there is none.
@@ -70,7 +70,7 @@ class Lookahead(MapPlanner):
         number("planner.confidence", confidence)
         if not getattr(policy, "ranks_footprints", False):
             raise ValueError(
-                "planner=lookahead: expected a checkpoint of model=fcn_grasp or corners, trained with a mask."
+                "planner=lookahead: expected a checkpoint of model=fcn_grasp, corners or afterstate, with a mask."
             )
         self.cell, self.policy, self.critic, self.terms = cell, policy, critic, terms
         self.horizon = horizon if critic is not None else None

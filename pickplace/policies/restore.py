@@ -165,12 +165,9 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
 
 def load_critic(path, trained: TrainedPolicy) -> "RestoredCritic | None":
     """Return the critic of the checkpoint of a policy that :func:`load_policy` returned; None if it does not serve."""
-    if trained.policy.learns_values:
-        critic = as_critic(trained.policy.network)
-        return RestoredCritic(critic.module, list(critic.in_keys), trained.config.algo.reward_scale)
     state, _ = checkpoint.read(checkpoint.locate(path))
     env = cast(dict, OmegaConf.to_container(trained.config.env, resolve=True))
-    return restore_critic(trained.config, trained.cell, state, env)
+    return restore_critic(trained.config, trained.policy, state, env)
 
 
 @dataclass(frozen=True)
@@ -190,20 +187,24 @@ class RestoredCritic:
         return self.network(*(observation[key] for key in self.in_keys)) / self.reward_scale
 
 
-def restore_critic(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: dict) -> RestoredCritic | None:
+def restore_critic(cfg: DictConfig, policy: Policy, state: dict, trained_env: dict) -> RestoredCritic | None:
     """Return the critic of a checkpoint.
 
     Args:
         cfg: the checkpoint's config.
-        cell: the sizes.
+        policy: of the checkpoint; has the sizes.
         state: as :func:`pickplace.runs.checkpoint.read` returns it, with or without ``state["critic"]``.
         trained_env: the group ``env`` in training.
 
     Returns:
         None where there is no critic, or it does not serve this tote.
     """
+    if policy.learns_values:
+        critic = as_critic(policy.network)
+        return RestoredCritic(critic.module, list(critic.in_keys), cfg.algo.reward_scale)
     if "critic" not in state:
         return None
+    cell = policy.cell
 
     def make():
         return as_critic(build("model.critic", cfg.model.critic, cell=cell))

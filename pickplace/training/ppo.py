@@ -70,21 +70,25 @@ def add_advantages(batch: TensorDictBase, advantage: GAE, reward_scale: float) -
     advantage(batch)
 
 
-def afterstates(batch: TensorDictBase, critic: ValueOperator, gamma: float) -> TensorDictBase:
-    """Return each tote that a step left ``[N * T]``, with the value of what followed as ``value_target``.
+@torch.no_grad()
+def afterstates(batch: TensorDictBase, advantage: GAE, reward_scale: float) -> TensorDictBase:
+    """Return the totes that the steps of a batch left, ``[N * (T - 1)]``, with TD(lambda) targets as ``value_target``.
 
-    TD(lambda) on afterstates. The critic looks at the tote alone, so that GAE's ``value_target`` of a state is the
-    reward of its item and what follows. The value of the tote that is left must count the items that have no place
-    there: it is 0 where the episode ended, and such totes are among those returned.
+    A step from one afterstate to the next is the arrival of an item and its placement. Its reward is that of the
+    *next* action of the batch. Where the item that arrived has no place, the environment has ended the episode already,
+    together with the action before: the step to that end has reward 0.
 
     Args:
-        batch: ``[N, T]``, with ``value_target``.
-        critic: reads terms that do not tell what lies in the bin.
-        gamma: discount, above 0.
+        batch: ``[N, T]``, at least two steps; its rewards are not scaled.
+        advantage: GAE with a critic that reads terms of the tote alone.
     """
-    data = batch["next"].select(*critic.in_keys)
-    data["value_target"] = (batch["value_target"] - batch["next", "reward"]) / gamma
-    return data.reshape(-1)
+    after, keys = batch["next"], advantage.value_network.in_keys
+    ended = after["done"][:, :-1]
+    reward = torch.where(ended, 0.0, reward_scale * after["reward"][:, 1:])
+    steps = after[:, :-1].select(*keys)
+    steps["next"] = after[:, 1:].select(*keys).update({"reward": reward, "done": ended, "terminated": ended.clone()})
+    advantage(steps)
+    return steps.exclude("next").reshape(-1)
 
 
 def of_taken_choice(advantage: Tensor, candidates: int, normalize: bool) -> Tensor:

@@ -105,11 +105,14 @@ def check_learner(algo: DictConfig, warm_start: DictConfig, policy: Policy) -> N
             "'td' with model=afterstate" if policy.learns_values else "'ppo' or 'a2c'; 'td' is for model=afterstate"
         )
         raise ValueError(f"algo.loss={excerpt(algo.loss)}: expected {expected}.")
-    if algo.loss == "td" and warm_start.frames:
-        raise ValueError(f"warm_start.frames={excerpt(warm_start.frames)}: expected 0 with algo.loss=td.")
-    if algo.loss == "td" and algo.gamma == 0:
-        raise ValueError("algo.gamma=0: expected more than 0 with algo.loss=td.")
-    if algo.loss == "td" and algo.vine_samples is not None:
+    if algo.loss != "td":
+        return
+    for key in ("frames", "critic_frames"):
+        if warm_start[key]:
+            raise ValueError(f"warm_start.{key}={excerpt(warm_start[key])}: expected 0 with algo.loss=td.")
+    if algo.rollout_length < 2:
+        raise ValueError(f"algo.rollout_length={excerpt(algo.rollout_length)}: expected at least 2 with algo.loss=td.")
+    if algo.vine_samples is not None:
         raise ValueError(f"algo.vine_samples={excerpt(algo.vine_samples)}: expected null with algo.loss=td.")
 
 

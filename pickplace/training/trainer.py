@@ -110,10 +110,11 @@ class Trainer:
             log.warning(warning)
         self.planner = build("planner", cfg.planner, cell=self.cell, policy=self.policy)
         self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, self.items, self.terms, cfg.seed, cfg.trust)
-        make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
-        self.critic = self._restored("critic", lambda: as_critic(make_critic()), weights)
         if self.policy.learns_values:
-            self.policy.network = self.critic.module
+            self.critic = as_critic(self.policy.network)
+        else:
+            make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
+            self.critic = self._restored("critic", lambda: as_critic(make_critic()), weights)
         check_memory(cfg, probe, self.policy)
 
     def _first_weights(self) -> dict:
@@ -268,14 +269,14 @@ class Trainer:
 
     def learn(self, batch: TensorDictBase, phase: Phase) -> dict:
         """Train on a batch ``[N, T]``: advantages and the teacher's choices once, then epochs of minibatches."""
-        add_advantages(batch, self.advantage, self.algo.reward_scale)
         rate = learning_rate(self.algo, self.frames, self.cfg.total_frames)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         if self.algo.loss == "td":
-            data = afterstates(batch, self.critic, self.algo.gamma)
+            data = afterstates(batch, self.advantage, self.algo.reward_scale)
             metrics = update(self.loss, self.optimizer, data, self.algo, self.policy, phase)
             return {**metrics, "train/lr": rate}
+        add_advantages(batch, self.advantage, self.algo.reward_scale)
         seen = {*self.policy.in_keys, *self.critic.in_keys}
         drawn = ("log_prob",) if self.algo.vine_samples is None else CANDIDATE_KEYS
         data = batch.select(*seen, self.policy.choice_key, *drawn, "advantage", "value_target").reshape(-1)

@@ -9,7 +9,7 @@ from pickplace import CellSpec, PickPlaceEnv
 from pickplace.planners.lookahead import Lookahead
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.fcn_grasp import FootprintPolicy
-from pickplace.policies.restore import restore_critic
+from pickplace.policies.restore import restore_critic, restore_policy
 from pickplace.runs import checkpoint
 from pickplace.task.feasibility import choice_mask, placing_maps
 from pickplace.task.items import Kinds, Recorded
@@ -148,7 +148,8 @@ def test_the_critic_of_a_checkpoint_judges_in_cells():
     """Nearly all of an empty tote's 180 cells, a little less for the discount; near nothing in a full one."""
     state, facts = checkpoint.read(checkpoint.locate("pretrained/r4"))
     cfg = OmegaConf.create({**facts["config"], "device": "cpu"})
-    critic = restore_critic(cfg, CellSpec(), state, facts["config"]["env"])
+    policy = restore_policy(cfg, CellSpec(), state["policy"], facts["config"]["env"])
+    critic = restore_critic(cfg, policy, state, facts["config"]["env"])
     bins = torch.zeros(1, 5, 5)
     bins[0, 1:3, 2] = 1.0
     tote = torch.ones(1, 6, 6)

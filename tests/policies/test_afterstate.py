@@ -9,6 +9,7 @@ from commands import composed
 from dynamic_programming import optimal_occupancy
 from problems import SETTINGS, random_states, results_by_hand
 from tensordict import TensorDict
+from torchrl.objectives.value import GAE
 
 from pickplace import PickPlaceEnv
 from pickplace.evaluation.play import play
@@ -88,25 +89,47 @@ def test_a_tote_is_learnt_from_every_side(grid, views):
     assert len({round(float(plain(depth, height).detach()), 4) for _ in range(20)}) == 1
 
 
-def test_targets_are_what_followed():
-    """Two episodes of three steps, of which the first ends after two; lambda and gamma by hand."""
+class Empty(torch.nn.Module):
+    """A critic whose value is the empty volume, to compute targets by hand."""
+
+    in_keys = ("tote_depth", "tote_height")
+
+    def forward(self, tote_depth, tote_height):
+        return tote_depth.sum((-2, -1))[..., None]
+
+
+def gae(lmbda, gamma=1.0):
+    return GAE(gamma=gamma, lmbda=lmbda, value_network=as_critic(Empty()), deactivate_vmap=True)
+
+
+def steps_of(values, reward, done):
+    """Return a batch ``[N, T]`` whose steps left totes of these values."""
+    depth = values[..., None, None].expand(*values.shape, 1, 1)
+    after = {"tote_depth": depth, "tote_height": torch.ones_like(values)[..., None]}
+    after |= {"reward": reward[..., None], "done": done[..., None]}
+    return TensorDict({"tote_depth": torch.full_like(depth, 99.0), "next": after}, batch_size=values.shape)
+
+
+def test_targets_by_hand():
+    """Three totes in a row; after the second of the other row the item that arrives has no place."""
+    values = torch.tensor([[5.0, 7, 11], [13, 17, 19]])
     reward = torch.tensor([[1.0, 2, 4], [8, 16, 32]])
-    done = torch.tensor([[False, True, False], [False, False, False]])
-    target = torch.tensor([[3.0, 2, 9], [20, 40, 33]])
-    depth = torch.arange(12.0).view(2, 3, 1, 2)
-    batch = TensorDict(
-        {
-            "tote_depth": depth, "value_target": target[..., None],
-            "next": {
-                "tote_depth": depth + 1, "tote_height": torch.ones(2, 3, 1), "reward": reward[..., None],
-                "done": done[..., None],
-            },
-        },
-        batch_size=[2, 3],
-    )  # fmt: skip
-    data = afterstates(batch, as_critic(network()), 0.5)
-    assert data["value_target"][:, 0].tolist() == [4, 0, 10, 24, 48, 2]
-    assert torch.equal(data["tote_depth"], (depth + 1).flatten(0, 1))
+    done = torch.tensor([[False, False, False], [False, True, False]])
+    data = afterstates(steps_of(values, reward, done), gae(lmbda=0.25, gamma=0.5), reward_scale=0.1)
+    second = 0.4 + 0.5 * 11
+    first = 0.2 + 0.5 * (0.75 * 7 + 0.25 * second)
+    other = 1.6 + 0.5 * (0.75 * 17 + 0.25 * 0)
+    assert data["value_target"][:, 0].tolist() == pytest.approx([first, second, other, 0])
+    assert data["tote_depth"][:, 0, 0].tolist() == [5, 7, 13, 17]
+
+
+@pytest.mark.parametrize("length", [2, 16])
+@pytest.mark.parametrize("lmbda", [0.0, 0.8, 1.0])
+def test_the_true_value_is_where_targets_agree_with_it(lmbda, length):
+    """Each item has a place with probability 3/4 and a reward of 1: 3 items follow on average."""
+    done = torch.rand(20_000, length, generator=torch.Generator().manual_seed(0)) < 0.25
+    data = afterstates(steps_of(torch.full(done.shape, 3.0), torch.ones(done.shape), done), gae(lmbda), 1.0)
+    assert data["value_target"].mean().item() == pytest.approx(3.0, abs=0.06)
 
 
 def test_it_comes_within_1_percent_of_the_optimum(tmp_path):
@@ -145,7 +168,8 @@ def shared(state):
     (["algo=td"], "algo.loss='td': expected 'ppo' or 'a2c'"),
     (["model=afterstate", "algo=td", "warm_start=imitate"], "warm_start.frames=200000: expected 0"),
     (["model=afterstate", "algo=td", "algo.vine_samples=2"], "algo.vine_samples=2: expected null"),
-    (["model=afterstate", "algo=td", "algo.gamma=0"], "algo.gamma=0: expected more than 0"),
+    (["model=afterstate", "algo=td", "algo.rollout_length=1"], "algo.rollout_length=1: expected at least 2"),
+    (["model=afterstate", "algo=td", "warm_start.critic_frames=64"], "warm_start.critic_frames=64: expected 0"),
     (["model=afterstate", "algo=td", "algo.mask_infeasible=false"], "algo.mask_infeasible=False: with model=aft"),
     (["model=afterstate", "algo=td", "env.bin_items=2"], "env.bin_items=2: expected 1 with model=afterstate"),
     (["model=afterstate", "algo=td", "model.actor.grid=[10,10]"], r"model.actor.grid=\[10, 10\]: expected 3"),

@@ -76,7 +76,7 @@ class ToteValue(nn.Module):
         """
         batch = tote_depth.shape[:-2]
         depth, height = tote_depth.flatten(0, -3), tote_height.reshape(-1)
-        if torch.is_grad_enabled():
+        if self.training and torch.is_grad_enabled():
             depth = self._mirror(depth) if self.mirrored else depth
             return self._values(depth, height).view(*batch, 1)
         at_once = AT_ONCE.get(depth.device.type, AT_ONCE["cpu"])
