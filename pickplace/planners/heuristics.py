@@ -1,7 +1,6 @@
 """Planners that need no training."""
 
 from abc import abstractmethod
-from functools import reduce
 
 import torch
 from torch import Tensor
@@ -17,8 +16,8 @@ from pickplace.task.feasibility import (
     first_action_reaching,
 )
 from pickplace.task.items import check_seed
-from pickplace.task.maps import FAR
-from pickplace.task.placing import footprint_cells, footprint_sizes
+from pickplace.task.maps import FAR, rectangle_sums
+from pickplace.task.placing import footprint_sizes
 from pickplace.task.state import Observation, State
 
 
@@ -191,7 +190,6 @@ def added_volume(cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:
     """
     each = state.each_item()
     w, d = footprint_sizes(cell, each.item)
-    cells, under = footprint_cells(cell, each.surface, w, d)
-    before = reduce(torch.add, [(surface >> 1).long() * used for surface, used in zip(cells, under, strict=True)])
+    before = rectangle_sums((each.surface >> 1).permute(1, 2, 0)[None], w, d)
     area = each.item.w * each.item.d
     return area.view(-1, 1, 1, 1) * maps.top - before.permute(3, 0, 1, 2)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pickplace.task.cell import HULL_RULES, CellSpec
-from pickplace.task.maps import FAR, NEVER, surround
+from pickplace.task.maps import FAR, NEVER, rectangle_sums, surround
 from pickplace.task.state import surface_from
 from pickplace.task.support import Rows, is_stable
 
@@ -53,7 +53,7 @@ def _resting(cell: CellSpec, surface: Tensor, w: Tensor, d: Tensor) -> tuple[Ten
 
 
 class _Tables:
-    """Where the cells of each height are, for the height on which an item rests on each footprint.
+    """Tables of the cells of each height, in which the supporting cells of footprints are looked up.
 
     Args:
         surface: int32 ``[W_T, D_T, N]``.
@@ -61,32 +61,22 @@ class _Tables:
     """
 
     def __init__(self, surface: Tensor, supporting: Tensor):
-        levels, (wide, deep, count) = surface.unique(), surface.shape
-        self._shape, self._at = (wide, deep, count), surface == levels.view(-1, 1, 1, 1)  # [levels, W_T, D_T, N]
+        levels = surface.unique()
+        self._has_level = surface == levels.view(-1, 1, 1, 1)  # [levels, W_T, D_T, N]
         self._level = torch.searchsorted(levels, supporting).clamp_(max=len(levels) - 1)
-        self._x, self._y, self._n = (
-            torch.arange(size, device=surface.device).view(shape)
-            for size, shape in zip(self._shape, [(-1, 1, 1), (-1, 1), (-1,)], strict=True)
-        )
 
     def count(self, w: Tensor, d: Tensor) -> Tensor:
-        """Return the number of supporting cells under each footprint, int32."""
-        (wide, deep, count), number = self._shape, self._at.cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32)
-        sums = number.new_zeros(len(number), wide + 1, deep + 1, count)  # of the cells before x and y
-        sums[:, 1:, 1:] = number
-        begin, end = (self._x, self._y), ((self._x + w).clamp_(max=wide), (self._y + d).clamp_(max=deep))
-
-        def before(x: Tensor, y: Tensor) -> Tensor:
-            return sums.take(((self._level * (wide + 1) + x) * (deep + 1) + y) * count + self._n)
-
-        return before(*end) - before(begin[0], end[1]) - before(end[0], begin[1]) + before(*begin)
+        """Return the number of supporting cells under each footprint, int64."""
+        return rectangle_sums(self._has_level, w, d, self._level)
 
     def rows(self, side: int, w: Tensor, d: Tensor) -> Rows:
         """Yield the rows of the supporting cells under each footprint."""
-        (wide, deep, count), y = self._shape, self._y.short()
-        after = torch.where(self._at, y, deep).flip(2).cummin(2).values.flip(2)  # first of the level from y on
-        before = torch.where(self._at, y, -1).cummax(2).values
-        start = ((self._level * wide + self._x) * deep + self._y) * count + self._n
+        _, wide, deep, count = self._has_level.shape
+        x_at, y_at, number = (torch.arange(size, device=self._level.device) for size in (wide, deep, count))
+        start = ((self._level * wide + x_at.view(-1, 1, 1)) * deep + y_at.view(-1, 1)) * count + number
+        y = y_at.view(-1, 1).short()
+        after = torch.where(self._has_level, y, deep).flip(2).cummin(2).values.flip(2)  # first of the level from y on
+        before = torch.where(self._has_level, y, -1).cummax(2).values
         end = start + (d - 1) * count
         for x in range(side):
             row, most = x * deep * count, after.numel() - 1

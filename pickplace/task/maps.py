@@ -74,3 +74,27 @@ def is_under(w: Tensor, d: Tensor, side: int) -> Tensor:
     """
     step = torch.arange(side, device=w.device).view(-1, *[1] * w.dim())
     return ((step < w)[:, None] & (step < d)).flatten(0, 1)
+
+
+def rectangle_sums(maps: Tensor, w: Tensor, d: Tensor, layer: Tensor | int = 0) -> Tensor:
+    """Return the sum of a map over the ``w x d`` rectangle at each cell; of what is inside the grid.
+
+    Args:
+        maps: whole numbers or bool, ``[L, W, D, N]``.
+        w, d: int64, broadcastable to ``[Q, W, D, N]``.
+        layer: int64 ``[Q, W, D, N]``, the index of the map that is meant.
+
+    Returns:
+        int64 ``[Q, W, D, N]``
+    """
+    layers, wide, deep, batch = maps.shape
+    before = maps.new_zeros(layers, wide + 1, deep + 1, batch, dtype=torch.int64)  # sums of what is before x and y
+    before[:, 1:, 1:] = maps.cumsum(1).cumsum(2)
+    x, y, number = (torch.arange(size, device=maps.device) for size in (wide, deep, batch))
+    x, y = x.view(-1, 1, 1), y.view(-1, 1)
+    end_x, end_y = (x + w).clamp_(max=wide), (y + d).clamp_(max=deep)
+    corners = [
+        before.take(((layer * (wide + 1) + i) * (deep + 1) + j) * batch + number)
+        for i, j in ((end_x, end_y), (x, y), (x, end_y), (end_x, y))
+    ]
+    return corners[0] + corners[1] - corners[2] - corners[3]

@@ -52,7 +52,7 @@ def is_supported(
 
 
 #: Of each row of a square along y, the first and the last supporting cell under the item: int16, of the shape of ``z``,
-#: counted from the square's corner; beyond the square and -1 where there is none.
+#: counted from the square's corner. Without one, the first is at least the square's side, and the last is -1.
 Rows = Iterable[tuple[Tensor, Tensor]]
 
 
@@ -61,7 +61,7 @@ def is_stable(cell: CellSpec, count: Tensor, rows: Rows, w: Tensor, d: Tensor) -
 
     Args:
         cell: has the rule, ``cell.support``.
-        count: of the supporting cells, int32.
+        count: of the supporting cells.
         rows: of the supporting cells.
         w, d: the footprint's sides, broadcastable.
     """
