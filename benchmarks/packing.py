@@ -19,11 +19,10 @@ ROOT = Path(__file__).parents[1]
 TABLE, RUNS = ROOT / "docs" / "results" / "packing.csv", ROOT / "outputs" / "packing"
 PLATES = ("plate_3x3", "plate_5x5")
 SCALED = {"gopt_30": 1000, "gopt_50": 1000, "gopt_100": 100}  # episodes: a decision on a fine grid takes longer
-#: Benchmark and end effector -> weights. docs/benchmarks.md has the commands that train those in outputs/.
+#: Benchmark and end effector -> weights.
 WEIGHTS = {(name, "point"): "pretrained/gopt_rs" for name in ("gopt_rs", *SCALED, "pct1")}
+WEIGHTS |= {("gopt_rs", plate): "pretrained/gopt_rs" for plate in PLATES}
 WEIGHTS |= {("cdrl_rs", "point"): "pretrained/cdrl_rs"}
-WEIGHTS |= {(name, "point"): f"outputs/{name}" for name in ("cut1", "cut2")}
-WEIGHTS |= {("gopt_rs", plate): f"outputs/{plate}" for plate in PLATES}
 COLUMNS = ("benchmark", "effector", "rotations", "planner", "episodes", "mean", "low", "high")
 COLUMNS += ("kept", "kept_low", "kept_high", "ms")
 
@@ -54,8 +53,9 @@ class Row(NamedTuple):
 
 def rows() -> list[Row]:
     """Return what is played: the benchmarks as they are, then with grippers that may turn an item."""
-    rotations = {name: 1 if name in ("cdrl_rs", "cut1", "cut2") else 2 for name, _ in WEIGHTS}
-    played = [Row(name, "point", rotations[name], "learned") for name in rotations]
+    rotations = {name: 1 if name == "cdrl_rs" else 2 for name, _ in WEIGHTS}
+    played = [Row(name, "point", turns, "learned") for name, turns in rotations.items()]
+    rotations |= {"cut1": 1, "cut2": 1}
     for name in ("gopt_rs", "cdrl_rs", "cut1", "cut2"):
         for effector in ("point", *PLATES):
             planners = ["joint_dbl", "individual_heuristic"]

@@ -7,6 +7,7 @@ import pytest
 import torch
 from commands import composed
 from dynamic_programming import optimal_occupancy
+from omegaconf import OmegaConf
 from problems import SETTINGS, random_states, results_by_hand
 from tensordict import TensorDict
 from torchrl.objectives.value import GAE
@@ -17,6 +18,7 @@ from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.afterstate import AfterstatePolicy, depth_after
 from pickplace.policies.base import as_critic
 from pickplace.policies.networks.tote_value import ToteValue
+from pickplace.policies.restore import restore_critic, restore_policy
 from pickplace.runs import checkpoint
 from pickplace.runs.registry import build
 from pickplace.task.cell import CellSpec
@@ -185,3 +187,19 @@ def test_it_serves_other_totes():
     env = PickPlaceEnv(num_envs=3, tote_size=(9, 7, 6), masks=())
     seen = env.reset()
     assert (env.step(seen.set("action", policy.best_feasible(seen)))["next", "failure"] == 0).all()
+
+
+def test_shipped_weights_judge_for_a_search_and_begin_a_training(tmp_path):
+    state, facts = checkpoint.read(checkpoint.locate("pretrained/gopt_rs"))
+    cfg = OmegaConf.create({**facts["config"], "device": "cpu"})
+    policy = restore_policy(cfg, CellSpec(tote_size=(10, 10, 10), rotations=2), state["policy"], facts["config"]["env"])
+    depth, height = random_totes(3, 10, 10, 10)
+    with torch.no_grad():
+        critic = restore_critic(cfg, policy, state, facts["config"]["env"])
+        found = critic({"tote_depth": depth, "tote_height": height})
+        assert torch.equal(found, policy.network(depth, height) / 0.01)
+    words = ["experiment=afterstate", "benchmark=gopt_rs", "warm_start.weights=pretrained/gopt_rs", "algo.lr=0"]
+    words += ["env.num_envs=2", "algo.rollout_length=2", "total_frames=4", "evaluation.episodes=1", "logger=none"]
+    train(composed(*words), tmp_path)
+    trained, _ = checkpoint.read(tmp_path / "checkpoints" / "last")
+    assert all(torch.equal(trained["policy"][key], value) for key, value in state["policy"].items())
