@@ -68,7 +68,7 @@ def test_weights_from_before_the_setting_support_were_trained_under_half(tmp_pat
     ("path", "settings", "message"),
     [
         (7, {}, "path=7: expected a run folder"),
-        ("pretrained/r9", {}, "pretrained/r9.*expected pretrained/fcn4d"),
+        ("pretrained/r9", {}, "pretrained/r9.*expected pretrained/cdrl_rs"),
         ("pretrained/r1", {"rotations": 2}, "env.rotations=2: the checkpoint was trained with 1"),
         ("pretrained/r4", {"tote_sizes": (6, 6, 5)}, "tote_sizes"),
         ("pretrained/r4", {"device": "abacus"}, "device=abacus: expected cpu"),

@@ -241,7 +241,7 @@ def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path):
 
 
 @pytest.mark.parametrize(("weights", "complaint"), [
-    ("pretrained/unknown", "the package ships no such weights; expected pretrained/fcn4d"),
+    ("pretrained/unknown", "the package ships no such weights; expected pretrained/cdrl_rs"),
     ("outputs/nowhere", "no checkpoint there"),
     ("pretrained/fcn4d", "The checkpoint's policy does not fit these settings"),
     (3, "=3: expected a text"),
