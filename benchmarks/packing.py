@@ -10,6 +10,7 @@ import json
 import re
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from common import console_command
 
 ROOT = Path(__file__).parents[1]
 TABLE, RUNS = ROOT / "docs" / "results" / "packing.csv", ROOT / "outputs" / "packing"
-PLATES = ("plate_3x3", "plate_5x5")
+PLATES, PLANNERS = ("plate_3x3", "plate_5x5"), ("joint_dbl", "individual_heuristic")
 SCALED = {"gopt_30": 1000, "gopt_50": 1000, "gopt_100": 100}  # episodes: a decision on a fine grid takes longer
 #: Benchmark and end effector -> weights.
 WEIGHTS = {(name, "point"): "pretrained/gopt_rs" for name in ("gopt_rs", *SCALED, "pct1")}
@@ -28,7 +29,7 @@ COLUMNS += ("kept", "kept_low", "kept_high", "ms")
 
 
 class Row(NamedTuple):
-    """What is played: a benchmark, an end effector, a number of rotations, and by whom."""
+    """Row of the table: options of ``benchmark`` and ``effector``, rotations, and the planner, or ``learned``."""
 
     benchmark: str
     effector: str
@@ -41,30 +42,25 @@ class Row(NamedTuple):
 
     def words(self) -> list[str]:
         """Return overrides of pickplace-evaluate."""
-        learned = f"checkpoint={WEIGHTS.get(self[:2])}"
-        planner = learned if self.planner == "learned" else f"planner={self.planner}"
+        learned = self.planner == "learned"
+        planner = f"checkpoint={WEIGHTS[self[:2]]}" if learned else f"planner={self.planner}"
         words = [f"benchmark={self.benchmark}", f"effector={self.effector}", f"env.rotations={self.rotations}", planner]
         if self.benchmark in SCALED:
             words += [f"evaluation.episodes={SCALED[self.benchmark]}"]
-        elif self.planner != "learned":
+        elif not learned:
             words += ["evaluation.episodes=300"]
         return [*words, "physics=settle", "evaluation.replay=0", "threads=1"]
 
 
 def rows() -> list[Row]:
-    """Return what is played: the benchmarks as they are, then with grippers that may turn an item."""
-    rotations = {name: 1 if name == "cdrl_rs" else 2 for name, _ in WEIGHTS}
-    played = [Row(name, "point", turns, "learned") for name, turns in rotations.items()]
-    rotations |= {"cut1": 1, "cut2": 1}
-    for name in ("gopt_rs", "cdrl_rs", "cut1", "cut2"):
-        for effector in ("point", *PLATES):
-            planners = ["joint_dbl", "individual_heuristic"]
-            if effector != "point" and (name, effector) in WEIGHTS:
-                planners.insert(0, "learned")
-            turns = (rotations[name],) if effector == "point" else (2, 4) if name == "gopt_rs" else (2,)
-            rows_of = (Row(name, effector, turn, planner) for turn in turns for planner in planners)
-            played += [row for row in rows_of if row.planner != "learned" or row.rotations <= 2]  # as in training
-    return played
+    """Return all rows: the learned ones, with as many rotations as in training; then those of planners to compare."""
+    own = {"gopt_rs": 2, "cdrl_rs": 1, "cut1": 1, "cut2": 1}
+    listed = [Row(name, effector, own.get(name, 2), "learned") for name, effector in WEIGHTS]
+    for name, rotations in own.items():
+        turns = (2, 4) if name == "gopt_rs" else (2,)
+        grippers = [("point", rotations), *product(PLATES, turns)]
+        listed += [Row(name, *gripper, planner) for gripper, planner in product(grippers, PLANNERS)]
+    return listed
 
 
 def play(row: Row) -> None:

@@ -63,8 +63,9 @@ def critic_serves_any_tote(cfg: DictConfig) -> bool:
         find(f"model.{key}", cfg.model[key]._target_)  # imports it, which the device "meta" does not allow
     with torch.device("meta"):
         policy = build("model.actor", cfg.model.actor, cell=cell, mask_infeasible=cfg.algo.mask_infeasible)
-        critic = build("model.critic", cfg.model.critic, cell=cell)
-    return getattr(critic, "any_size", False) and not policy.learns_values
+        if policy.learns_values:
+            return False
+        return getattr(build("model.critic", cfg.model.critic, cell=cell), "any_size", False)
 
 
 def main() -> None:

@@ -36,7 +36,7 @@ class AfterstatePolicy(CornerPolicy):
         super().__init__(cell, **network)
 
     def make_network(self, **network) -> ToteValue:  # type: ignore[override]
-        return ToteValue(place="model.actor", **network)
+        return ToteValue(**network)
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
         after = depth_after(observation["bin_depth"], observation["tote_depth"], row, footprint)
@@ -69,8 +69,3 @@ def afterstate(cell: CellSpec, mask_infeasible: bool, **settings) -> AfterstateP
             "algo.mask_infeasible=False: with model=afterstate expected true; its choices are feasible ones."
         )
     return AfterstatePolicy(cell, **settings)
-
-
-def tote_value(cell: CellSpec, **network) -> ToteValue:
-    """Return the value network that ``afterstate`` shares (config ``model=afterstate``)."""
-    return ToteValue(**network)

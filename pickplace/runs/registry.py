@@ -61,7 +61,7 @@ REGISTRY: dict[str, dict[str, str]] = {
     "model.critic": {
         "pooled": "pickplace.policies.networks.critics.pooled_critic",
         "conv4d": "pickplace.policies.networks.critics.conv4d_critic",
-        "tote_value": "pickplace.policies.afterstate.tote_value",
+        "tote_value": "pickplace.policies.networks.tote_value.ToteValue",
     },
     "curriculum": {"curriculum": "pickplace.training.curriculum.Curriculum"},
     "curriculum.advance": {

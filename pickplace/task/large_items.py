@@ -47,39 +47,29 @@ def _resting(cell: CellSpec, surface: Tensor, w: Tensor, d: Tensor) -> tuple[Ten
     for axis, size, grid in ((1, w, wide), (2, d, deep)):
         parts = (torch.where(step < size, highest.narrow(axis, step, grid), NEVER) for step in range(side))
         highest = reduce(torch.maximum, parts)
-    z = highest >> 1
-    tables = _Tables(surface, surface_from(z))
-    return z, is_stable(cell, tables.count(w, d), tables.rows(side, w, d), w, d)
+    z, levels = highest >> 1, surface.unique()
+    has_level = surface == levels.view(-1, 1, 1, 1)  # [levels, W_T, D_T, N]
+    level = torch.searchsorted(levels, surface_from(z)).clamp_(max=len(levels) - 1)  # of the supporting cells
+    count = rectangle_sums(has_level, w, d, level)
+    return z, is_stable(cell, count, _rows(has_level, level, side, w, d), w, d)
 
 
-class _Tables:
-    """Tables of the cells of each height, in which the supporting cells of footprints are looked up.
+def _rows(has_level: Tensor, level: Tensor, side: int, w: Tensor, d: Tensor) -> Rows:
+    """Yield the rows of the supporting cells under each footprint.
 
     Args:
-        surface: int32 ``[W_T, D_T, N]``.
-        supporting: the surface of supporting cells for each footprint, ``[Q, W_T, D_T, N]``.
+        has_level: whether a cell has a height, bool ``[levels, W_T, D_T, N]``.
+        level: the index of the supporting cells' height, int64 ``[Q, W_T, D_T, N]``.
     """
-
-    def __init__(self, surface: Tensor, supporting: Tensor):
-        levels = surface.unique()
-        self._has_level = surface == levels.view(-1, 1, 1, 1)  # [levels, W_T, D_T, N]
-        self._level = torch.searchsorted(levels, supporting).clamp_(max=len(levels) - 1)
-
-    def count(self, w: Tensor, d: Tensor) -> Tensor:
-        """Return the number of supporting cells under each footprint, int64."""
-        return rectangle_sums(self._has_level, w, d, self._level)
-
-    def rows(self, side: int, w: Tensor, d: Tensor) -> Rows:
-        """Yield the rows of the supporting cells under each footprint."""
-        _, wide, deep, count = self._has_level.shape
-        x_at, y_at, number = (torch.arange(size, device=self._level.device) for size in (wide, deep, count))
-        start = ((self._level * wide + x_at.view(-1, 1, 1)) * deep + y_at.view(-1, 1)) * count + number
-        y = y_at.view(-1, 1).short()
-        after = torch.where(self._has_level, y, deep).flip(2).cummin(2).values.flip(2)  # first of the level from y on
-        before = torch.where(self._has_level, y, -1).cummax(2).values
-        end = start + (d - 1) * count
-        for x in range(side):
-            row, most = x * deep * count, after.numel() - 1
-            first, last = after.take((start + row).clamp_(max=most)) - y, before.take((end + row).clamp_(max=most)) - y
-            held = (x < w) & (first < d)
-            yield torch.where(held, first, side), torch.where(held, last, -1)
+    _, wide, deep, count = has_level.shape
+    x_at, y_at, number = (torch.arange(size, device=level.device) for size in (wide, deep, count))
+    start = ((level * wide + x_at.view(-1, 1, 1)) * deep + y_at.view(-1, 1)) * count + number
+    y = y_at.view(-1, 1).short()
+    after = torch.where(has_level, y, deep).flip(2).cummin(2).values.flip(2)  # first of the level from y on
+    before = torch.where(has_level, y, -1).cummax(2).values
+    end = start + (d - 1) * count
+    for x in range(side):
+        row, most = x * deep * count, after.numel() - 1
+        first, last = after.take((start + row).clamp_(max=most)) - y, before.take((end + row).clamp_(max=most)) - y
+        held = (x < w) & (first < d)
+        yield torch.where(held, first, side), torch.where(held, last, -1)

@@ -27,6 +27,9 @@ BITS = 32  # normals in a word of a pattern
 LEAST_SUPPORT: dict = {"half": 0.5, "full": 1.0, "corners": 0.95}  # share of the footprint that suffices alone
 #: Of ``corners``: the least number of supported corners, and the share that suffices with them.
 CORNER_SUPPORT = ((4, 0.6), (3, 0.8))
+#: Of each row of a square along y, the first and the last supporting cell under the item: int16, of the shape of ``z``,
+#: counted from the square's corner. Without one, the first is at least the square's side, and the last is -1.
+Rows = Iterable[tuple[Tensor, Tensor]]
 MAX_HULL_SIDE = 16  # longest side of an item with the rules of the hull, in cells: the tables grow with its sixth power
 
 
@@ -51,11 +54,6 @@ def is_supported(
     return is_stable(cell, count, _rows(cells, under, supporting), w, d)
 
 
-#: Of each row of a square along y, the first and the last supporting cell under the item: int16, of the shape of ``z``,
-#: counted from the square's corner. Without one, the first is at least the square's side, and the last is -1.
-Rows = Iterable[tuple[Tensor, Tensor]]
-
-
 def is_stable(cell: CellSpec, count: Tensor, rows: Rows, w: Tensor, d: Tensor) -> Tensor:
     """Return whether an item is stable by a rule other than those of the whole cells' hull, of the shape of ``count``.
 
@@ -68,7 +66,7 @@ def is_stable(cell: CellSpec, count: Tensor, rows: Rows, w: Tensor, d: Tensor) -
     share = count.double() / (w * d)
     stable = is_share_enough(cell.support, share)
     if cell.support == "half_or_hull":
-        stable |= _is_in_hull_of_middles(rows, w, d, torch.full_like(share, -torch.inf, dtype=_exact(cell.max_side)))
+        stable |= _is_in_hull_of_middles(rows, w, d, cell.max_side)
     if cell.support == "corners":
         corners = torch.zeros_like(count)
         for x, (first, last) in enumerate(rows):  # one cell may have several corners
@@ -94,23 +92,19 @@ def _rows(cells: Sequence[Tensor], under: Sequence[Tensor], supporting: Tensor) 
         yield side - first, last - 1
 
 
-def _exact(side: int) -> torch.dtype:
-    """Return a type that tells apart all ratios of whole numbers up to the side."""
-    return torch.float32 if side <= 64 else torch.float64
-
-
-def _is_in_hull_of_middles(rows: Rows, w: Tensor, d: Tensor, lowest: Tensor) -> Tensor:
+def _is_in_hull_of_middles(rows: Rows, w: Tensor, d: Tensor, side: int) -> Tensor:
     """Return whether the item's centre lies in the hull of the middles of the supporting cells, or on its edge.
 
     It does if some line between two of these middles passes the centre on its far side along y, and some on its near
     side. Such a line goes from one at ``(-a, b)`` to one at ``(a', b')``, as seen from the centre, and passes at a
     height of the sign of ``b / a + b' / a'``: so the steepest on each side decide, and no pairs are compared.
     """
-    w, d = w.short(), d.short()
+    exact = torch.float32 if side <= 64 else torch.float64  # tells apart all ratios of whole numbers up to the side
+    w, d, lowest = w.short(), d.short(), torch.tensor(-torch.inf, dtype=exact, device=w.device)
     steepest = [[lowest, lowest], [lowest, lowest]]  # to the far side, left and right of the centre; to the near side
     for x, (first, last) in enumerate(rows):
-        offset = (2 * x + 1 - w).to(lowest.dtype)
-        gap = torch.where(last >= 0, 0.0, torch.inf).to(lowest.dtype)
+        offset = (2 * x + 1 - w).to(exact)
+        gap = torch.where(last >= 0, 0.0, torch.inf).to(exact)
         for parts, beyond in zip(steepest, (2 * last + 1 - d, d - 2 * first - 1), strict=True):
             slope = (beyond - gap) / offset.abs()  # on the line through the centre +-inf, and nan for 0 / 0
             slope = torch.where(slope.isnan(), torch.inf, slope)

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from pickplace.policies.networks.footprint_fcn import DTYPES, matrix_dtype
 from pickplace.task.checks import MAX_WIDTH, check_inputs, flag, number, odd_number, one_of, size_tuple, whole_number
 
-MAX_GRID, MAX_BLOCKS = 64, 32  # cells of the network's picture of a tote along each axis; residual convolutions
+MAX_GRID = 64  # cells of the network's picture of a tote along each axis
 AT_ONCE = {"cpu": 4_096, "cuda": 262_144}  # a CPU's caches hold the activations of so many totes
 
 
@@ -16,20 +16,18 @@ class ToteValue(nn.Module):
 
     It sees every tote as a picture of ``grid`` cells, whatever its size: a cell of the picture has the greatest height
     of the cells of the tote that it covers, and the heights are told apart in ``grid[2]`` steps of the tote's height.
-    So a tote of 30 cells with items of three times the size looks like one of 10. A convolution, residual ones, one
-    with stride 2 and two linear layers follow.
+    So a tote of 30 cells with items of three times the size looks like one of 10. Two convolutions, the second with
+    stride 2, and two linear layers follow.
 
     Args:
         grid: cells of the picture along x and y, and steps of the height.
         filters: width of the convolutions.
         receptive_field: side of the square that the first convolution sees, odd.
-        blocks: number of residual convolutions of 3x3 that follow it.
         hidden: width of the linear layer before the output.
         mirrored: whether batches of totes are mirrored, and transposed where the picture is square, at random while it
             learns. The value is the same, unless items, end effector or reach tell the sides of the tote apart.
         reward_scale: ``algo.reward_scale``; values are volumes times this.
         compute_dtype: as in :class:`~pickplace.policies.networks.footprint_fcn.FootprintFcn`.
-        place: of these settings in the config, for messages.
     """
 
     any_size = True
@@ -40,27 +38,23 @@ class ToteValue(nn.Module):
         grid: tuple[int, int, int] = (10, 10, 10),
         filters: int = 32,
         receptive_field: int = 5,
-        blocks: int = 0,
         hidden: int = 256,
         mirrored: bool = True,
         reward_scale: float = 1.0,
         compute_dtype: str = "auto",
-        place: str = "model.critic",
     ):
         super().__init__()
-        self.grid = size_tuple(f"{place}.grid", grid, 3, MAX_GRID)
-        odd_number(f"{place}.receptive_field", receptive_field)
+        self.grid = size_tuple("model.actor.grid", grid, 3, MAX_GRID)
+        odd_number("model.actor.receptive_field", receptive_field)
         for key, value in {"filters": filters, "hidden": hidden}.items():
-            whole_number(f"{place}.{key}", value, most=MAX_WIDTH)
-        whole_number(f"{place}.blocks", blocks, 0, MAX_BLOCKS)
-        self.mirrored = flag(f"{place}.mirrored", mirrored)
-        self.reward_scale = number(f"{place}.reward_scale", reward_scale)
-        self.compute_dtype = one_of(f"{place}.compute_dtype", compute_dtype, DTYPES)
+            whole_number(f"model.actor.{key}", value, most=MAX_WIDTH)
+        self.mirrored = flag("model.actor.mirrored", mirrored)
+        self.reward_scale = number("model.actor.reward_scale", reward_scale)
+        self.compute_dtype = one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
         wide, deep, steps = self.grid
-        check_inputs(f"{place}.receptive_field={receptive_field}", (steps + 1) * receptive_field**2)
+        check_inputs(f"model.actor.receptive_field={receptive_field}", (steps + 1) * receptive_field**2)
         halved = (wide + 1) // 2 * ((deep + 1) // 2)
         self.around = nn.Conv2d(steps + 1, filters, receptive_field, padding=receptive_field // 2)
-        self.blocks = nn.ModuleList(nn.Conv2d(filters, filters, 3, padding=1) for _ in range(blocks))
         self.wider = nn.Conv2d(filters, filters, 3, stride=2, padding=1)
         self.hidden = nn.Linear(filters * halved, hidden)
         self.head = nn.Linear(hidden, 1)
@@ -89,10 +83,7 @@ class ToteValue(nn.Module):
         dtype = matrix_dtype(self.compute_dtype, depth.device.type)
         with torch.autocast(depth.device.type, dtype, enabled=dtype != torch.float32):
             planes = self._picture(depth, height).to(dtype, memory_format=torch.channels_last)
-            x = F.relu(self.around(planes))
-            for block in self.blocks:
-                x = F.relu(x + block(x))
-            x = F.relu(self.wider(x))
+            x = F.relu(self.wider(F.relu(self.around(planes))))
             x = F.relu(self.hidden(x.flatten(1)))
         return self.reward_scale * empty * torch.sigmoid(self.head(x.float())[:, 0])
 
