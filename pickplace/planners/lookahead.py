@@ -10,7 +10,7 @@ from pickplace.task.bin import refill, remove_item, select_item
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import check_bytes, number, whole_number
 from pickplace.task.feasibility import PlacingMaps, first_action_reaching, placing_maps
-from pickplace.task.items import ItemDistribution, check_seed, search_items
+from pickplace.task.items import ItemDistribution, Kinds, check_seed, search_items
 from pickplace.task.observation import STANDARD_TERMS, observe
 from pickplace.task.placing import unchecked_top
 from pickplace.task.state import Item, Observation, State
@@ -25,8 +25,10 @@ class Lookahead(MapPlanner):
     are close. The policy's own choice stands unless another's mean difference to it is positive by ``confidence``
     standard errors: a rollout algorithm (Tesauro & Galperin 1996) that the items' noise cannot make worse than its
     policy, to that confidence. A critic that errs could, where the policy fills nearly all: what wins by its judgement
-    must gain without it too, both played out to the end. The imagined items come from the item distribution, never
-    from the stream that is played. What lies in the bin already is known, and played out before them.
+    must gain without it too, both played out to the end; unless the policy itself follows from the critic. The imagined
+    items come from the item distribution, never from the stream that is played; the first of all streams are spread
+    over its kinds, so that with as many streams as kinds their mean is exact. What lies in the bin already is known,
+    and played out before them.
 
     Args:
         cell: the sizes.
@@ -133,7 +135,7 @@ class Lookahead(MapPlanner):
             streams *= 2
         surely = (count > 0) & (mean > self.confidence * error) & (mean > 0)
         best = torch.where(surely, mean, 0.0).argmax(1)
-        return best if self.horizon is None else self._confirm(best, state, maps, choice)
+        return best if self.horizon is None or self.policy.learns_values else self._confirm(best, state, maps, choice)
 
     def _confirm(self, best: Tensor, state: State, maps: PlacingMaps, choice: Tensor) -> Tensor:
         """Return ``best``, int64 ``[N]``, without the departures that gain nothing when played out to the end.
@@ -188,7 +190,7 @@ class Lookahead(MapPlanner):
             if step == horizon and not sees_items:
                 volume[row] += self.critic(observe(self.terms, cell, state, critic_keys))[:, 0].double()
                 break
-            item, arrived = self._arrive(state.item, seed[row], stream[row], arrived)
+            item, arrived = self._arrive(state.item, seed[row], stream[row], streams, arrived)
             state = state._replace(item=item)
             maps = placing_maps(cell, state)
             mask = policy.ranked(maps)
@@ -209,8 +211,10 @@ class Lookahead(MapPlanner):
             step += 1
         return volume.view(-1, streams)
 
-    def _arrive(self, item: Item, seed: Tensor, stream: Tensor, arrived: Tensor) -> tuple[Item, Tensor]:
+    def _arrive(self, item: Item, seed: Tensor, stream: Tensor, streams: int, arrived: Tensor) -> tuple[Item, Tensor]:
         """Return what lies in the bins once imagined items have arrived, and how many have, int64 ``[N]``."""
         if item.x.dim() == 2:
             return refill(self.cell, self.items, "train", seed, stream, arrived, item)
+        if isinstance(self.items, Kinds) and not arrived.any():
+            return self.items.spread(seed, stream, streams, self.cell.bin_size), arrived + 1
         return self.items.sample("train", seed, stream, arrived, self.cell.bin_size), arrived + 1

@@ -30,7 +30,7 @@ class AfterstatePolicy(CornerPolicy):
     learns_values = True
     network: ToteValue  # type: ignore[assignment]
 
-    def __init__(self, cell: CellSpec, temperature: float = 0.01, **network):
+    def __init__(self, cell: CellSpec, temperature: float = 0.003, **network):
         refuse_several_items(cell, "model=afterstate")
         self.temperature = number("model.actor.temperature", temperature, 1e-6)
         super().__init__(cell, **network)

@@ -146,6 +146,18 @@ class Kinds(ItemDistribution):
     def _index(self, uniform, step):
         return torch.searchsorted(self._edges.to(uniform.device), uniform, right=True)
 
+    def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size) -> Item:
+        """Return the ``rank``-th of ``count`` items for each seed, int64 ``[N]``: a systematic sample of the kinds.
+
+        Each kind is there in proportion to its frequency, up to a whole number. So with as many items as there are
+        equally likely kinds each comes once.
+        """
+        first = torch.zeros_like(rank)
+        start = hashed_uniform("train", seed, torch.full_like(rank, count), first, 1)[0]
+        across, along = hashed_uniform("train", seed, rank, first, 2)
+        kind = self._index((start + rank / count) % 1, first)
+        return place_at_random(self.sizes.to(rank.device)[kind], across, along, bin_size)
+
 
 #: Greatest size of a recorded file, in bytes, and number of kinds: more would fill the memory.
 MAX_TEXT, MAX_KINDS = 100_000_000, 100_000

@@ -46,6 +46,13 @@ def test_equal_candidates_meet_equal_items_and_each_call_others():
     assert not torch.equal(played_out(search, [0, 0, 1, 2], 16)[0], volume[0])
 
 
+def test_with_as_many_streams_as_kinds_the_mean_over_the_next_item_is_exact():
+    kinds = [(1, 1, 1), (2, 1, 1), (2, 2, 1), (3, 3, 1)]
+    search = search_of(make_env(items=Kinds(kinds)), lambda observation: torch.zeros(len(observation["tote_depth"]), 1))
+    volume = played_out(search, [0, 1, 2], 4, 1)
+    assert volume.sort().values.tolist() == 3 * [[1, 2, 4, 9]]
+
+
 def test_the_horizon_adds_the_critics_value():
     seen = []
 

@@ -78,6 +78,18 @@ def test_positions_are_uniform_and_independent_of_the_kind():
         assert is_even(corner, wide * deep) and len(corner.unique()) == wide * deep
 
 
+def test_a_systematic_sample_has_each_kind_in_proportion_to_its_weight():
+    items, seed = Kinds([(1, 1, 1), (2, 1, 1), (2, 2, 1)], [1, 2, 1]), torch.arange(50)
+    for count, least, greatest in ((8, (2, 4, 2), (2, 4, 2)), (6, (1, 3, 1), (2, 3, 2)), (2, (0, 1, 0), (1, 1, 1))):
+        drawn = [items.spread(seed, torch.full_like(seed, rank), count, (5, 5)) for rank in range(count)]
+        volume = torch.stack([item.volume for item in drawn])
+        assert all((item.x + item.w).max() <= 5 and item.x.min() >= 0 for item in drawn)
+        for kind, (low, high) in enumerate(zip(least, greatest, strict=True)):
+            times = (volume == 2**kind).sum(0)
+            assert times.min() == low and times.max() == high
+    assert drawn[0].x.unique().numel() > 2  # at random places
+
+
 def test_weights_and_ranges():
     kinds = Kinds([(1, 1, 1), (2, 1, 1), (1, 2, 1)], weights=[1, 0, 3])
     item = drawn(kinds, 40_000)
