@@ -76,6 +76,15 @@ def test_heights_are_told_apart_at_whole_steps_of_the_tote():
     assert picture[:, 4].all()
 
 
+def test_edges_are_where_the_surface_is_not_level():
+    """By plain comparisons with the cell before; the wall before the first cell is an edge."""
+    net, (depth, height) = network(), random_totes(10, 6, 5, 2)
+    picture = net._picture(depth, height[:, 0])
+    for n, x, y in torch.cartesian_prod(*map(torch.arange, (10, 6, 5))).tolist():
+        assert picture[n, 5, x, y] == (x == 0 or depth[n, x, y] != depth[n, x - 1, y])
+        assert picture[n, 6, x, y] == (y == 0 or depth[n, x, y] != depth[n, x, y - 1])
+
+
 @pytest.mark.parametrize(("grid", "views"), [((5, 5, 4), 8), ((6, 5, 4), 4)])
 def test_a_tote_is_learnt_from_every_side(grid, views):
     net, (depth, height) = network(grid=grid), random_totes(1, *grid)
