@@ -16,8 +16,9 @@ class ToteValue(nn.Module):
 
     It sees every tote as a picture of ``grid`` cells, whatever its size: a cell of the picture has the greatest height
     of the cells of the tote that it covers, and the heights are told apart in ``grid[2]`` steps of the tote's height.
-    So a tote of 30 cells with items of three times the size looks like one of 10. Two more planes mark its edges: what
-    rests, must rest on level cells. Two convolutions, the second with stride 2, and two linear layers follow.
+    So a tote of 30 cells with items of three times the size looks like one of 10. With ``edges``, two more planes mark
+    the surface's edges, as items rest on level cells. Two convolutions, the second with stride 2, and two linear layers
+    follow.
 
     Args:
         grid: cells of the picture along x and y, and steps of the height.
@@ -40,7 +41,7 @@ class ToteValue(nn.Module):
         filters: int = 32,
         receptive_field: int = 3,
         hidden: int = 256,
-        edges: bool = False,
+        edges: bool = False,  # as weights have it that were trained before the option; new ones have the config's
         mirrored: bool = True,
         reward_scale: float = 1.0,
         compute_dtype: str = "auto",
