@@ -47,7 +47,7 @@ def test_totes_after_a_placement_are_those_of_the_oracle(options):
 
 def network(**settings):
     torch.manual_seed(0)
-    small = {"grid": (6, 5, 4), "filters": 4, "hidden": 8, "edges": True, "compute_dtype": "float32"}
+    small = {"grid": (6, 5, 4), "filters": 4, "hidden": 8, "compute_dtype": "float32"}
     net = ToteValue(**{**small, **settings})
     torch.nn.init.normal_(net.head.weight, std=3)
     return net
@@ -84,7 +84,6 @@ def test_edges_are_where_the_surface_is_not_level():
     for n, x, y in torch.cartesian_prod(*map(torch.arange, (10, 6, 5))).tolist():
         assert picture[n, 5, x, y] == (x == 0 or depth[n, x, y] != depth[n, x - 1, y])
         assert picture[n, 6, x, y] == (y == 0 or depth[n, x, y] != depth[n, x, y - 1])
-    assert torch.equal(network(edges=False)._picture(depth, height[:, 0]), picture[:, :5])
 
 
 @pytest.mark.parametrize(("grid", "views"), [((5, 5, 4), 8), ((6, 5, 4), 4)])
@@ -210,7 +209,6 @@ def test_shipped_weights_judge_for_a_search_and_begin_a_training(tmp_path):
         assert torch.equal(found, policy.network(depth, height) / 0.01)
     words = ["experiment=afterstate", "benchmark=gopt_rs", "warm_start.weights=pretrained/gopt_rs", "algo.lr=0"]
     words += ["env.num_envs=2", "algo.rollout_length=2", "total_frames=4", "evaluation.episodes=1", "logger=none"]
-    words += ["model.actor.edges=false", "model.actor.receptive_field=5"]
     train(composed(*words), tmp_path)
     trained, _ = checkpoint.read(tmp_path / "checkpoints" / "last")
     assert all(torch.equal(trained["policy"][key], value) for key, value in state["policy"].items())

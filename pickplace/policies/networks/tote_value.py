@@ -16,16 +16,15 @@ class ToteValue(nn.Module):
 
     It sees every tote as a picture of ``grid`` cells, whatever its size: a cell of the picture has the greatest height
     of the cells of the tote that it covers, and the heights are told apart in ``grid[2]`` steps of the tote's height.
-    So a tote of 30 cells with items of three times the size looks like one of 10. With ``edges``, two more planes mark
-    the surface's edges, as items rest on level cells. Two convolutions, the second with stride 2, and two linear layers
-    follow.
+    So a tote of 30 cells with items of three times the size looks like one of 10. Two more planes mark where the
+    surface is not level with the cell before, along x and along y, as items rest on level cells. Two convolutions, the
+    second with stride 2, and two linear layers follow.
 
     Args:
         grid: cells of the picture along x and y, and steps of the height.
         filters: width of the convolutions.
         receptive_field: side of the square that the first convolution sees, odd.
         hidden: width of the linear layer before the output.
-        edges: whether it sees where the surface is not level with the cell before, along x and along y.
         mirrored: whether batches of totes are mirrored, and transposed where the picture is square, at random while it
             learns. The value is the same, unless items, end effector or reach tell the sides of the tote apart.
         reward_scale: ``algo.reward_scale``; values are volumes times this.
@@ -41,7 +40,6 @@ class ToteValue(nn.Module):
         filters: int = 32,
         receptive_field: int = 3,
         hidden: int = 256,
-        edges: bool = False,  # as weights have it that were trained before the option; new ones have the config's
         mirrored: bool = True,
         reward_scale: float = 1.0,
         compute_dtype: str = "auto",
@@ -51,12 +49,11 @@ class ToteValue(nn.Module):
         odd_number("model.actor.receptive_field", receptive_field)
         for key, value in {"filters": filters, "hidden": hidden}.items():
             whole_number(f"model.actor.{key}", value, most=MAX_WIDTH)
-        self.edges = flag("model.actor.edges", edges)
         self.mirrored = flag("model.actor.mirrored", mirrored)
         self.reward_scale = number("model.actor.reward_scale", reward_scale)
         self.compute_dtype = one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
         wide, deep, steps = self.grid
-        planes = steps + (3 if edges else 1)
+        planes = steps + 3
         check_inputs(f"model.actor.receptive_field={receptive_field}", planes * receptive_field**2)
         halved = (wide + 1) // 2 * ((deep + 1) // 2)
         self.around = nn.Conv2d(planes, filters, receptive_field, padding=receptive_field // 2)
@@ -94,20 +91,17 @@ class ToteValue(nn.Module):
 
     @torch.no_grad()
     def _picture(self, depth: Tensor, height: Tensor) -> Tensor:
-        """Return which cells of the picture rise above each step of the height, a plane of ones, and, with ``edges``,
-        those along x and y, bool ``[N, planes, *grid[:2]]``; walls are edges."""
+        """Return which cells of the picture rise above each step of the height, a plane of ones, and the edges along x
+        and y, bool ``[N, planes, *grid[:2]]``; walls are edges."""
         wide, deep, steps = self.grid
         if depth.shape[1:] != (wide, deep):
             depth = -F.adaptive_max_pool2d(-depth[:, None], (wide, deep))[:, 0]
         raised = steps * (height[:, None, None] - depth)  # in parts of the tote's height, so that it stays exact
         least = torch.arange(steps, device=depth.device)[:, None] * height
         above = raised[:, None] > least.t()[:, :, None, None]
-        planes = torch.cat([above, torch.ones_like(above[:, :1])], 1)
-        if not self.edges:
-            return planes
         along_x = F.pad(depth.diff(dim=1) != 0, (0, 0, 1, 0), value=True)
         along_y = F.pad(depth.diff(dim=2) != 0, (1, 0), value=True)
-        return torch.cat([planes, torch.stack([along_x, along_y], 1)], 1)
+        return torch.cat([above, torch.ones_like(above[:, :1]), torch.stack([along_x, along_y], 1)], 1)
 
     def _mirror(self, depth: Tensor) -> Tensor:
         """Return the totes in one of the views under which their value is the same, drawn at random."""
