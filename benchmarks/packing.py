@@ -1,7 +1,7 @@
 """Play the public packing benchmarks, without a gripper and with one: python benchmarks/packing.py
 
-Writes docs/results/packing.csv, and prints what is in it. What was played before is not played again; `--match` names
-some rows, such as `^cut1`.
+Writes docs/results/packing.csv, and prints what is in it. What was played here before is not played again; `--match`
+names some rows, such as `^cut1`, and the others of the file stay as they are.
 """
 
 import argparse
@@ -20,10 +20,7 @@ ROOT = Path(__file__).parents[1]
 TABLE, RUNS = ROOT / "docs" / "results" / "packing.csv", ROOT / "outputs" / "packing"
 PLATES, PLANNERS = ("plate_3x3", "plate_5x5"), ("joint_dbl", "individual_heuristic")
 SCALED = {"gopt_30": 1000, "gopt_50": 1000, "gopt_100": 100}  # episodes: a decision on a fine grid takes longer
-#: Benchmark and end effector -> weights.
-WEIGHTS = {(name, "point"): "pretrained/gopt_rs" for name in ("gopt_rs", *SCALED, "pct1")}
-WEIGHTS |= {("gopt_rs", plate): "pretrained/gopt_rs" for plate in PLATES}
-WEIGHTS |= {("cdrl_rs", "point"): "pretrained/cdrl_rs"}
+OWN = {"gopt_rs": 2, "cdrl_rs": 1, "cut1": 1, "cut2": 1}  # rotations; each has weights of its own
 COLUMNS = ("benchmark", "effector", "rotations", "planner", "episodes", "mean", "low", "high")
 COLUMNS += ("kept", "kept_low", "kept_high", "ms")
 
@@ -43,7 +40,8 @@ class Row(NamedTuple):
     def words(self) -> list[str]:
         """Return overrides of pickplace-evaluate."""
         learned = self.planner == "learned"
-        planner = f"checkpoint={WEIGHTS[self[:2]]}" if learned else f"planner={self.planner}"
+        weights = self.benchmark if self.benchmark in OWN else "gopt_rs"
+        planner = f"checkpoint=pretrained/{weights}" if learned else f"planner={self.planner}"
         words = [f"benchmark={self.benchmark}", f"effector={self.effector}", f"env.rotations={self.rotations}", planner]
         if self.benchmark in SCALED:
             words += [f"evaluation.episodes={SCALED[self.benchmark]}"]
@@ -53,14 +51,13 @@ class Row(NamedTuple):
 
 
 def rows() -> list[Row]:
-    """Return all rows: the learned ones, with as many rotations as in training; then those of planners to compare."""
-    own = {"gopt_rs": 2, "cdrl_rs": 1, "cut1": 1, "cut2": 1}
-    listed = [Row(name, effector, own.get(name, 2), "learned") for name, effector in WEIGHTS]
-    for name, rotations in own.items():
+    """Return all rows: without a gripper and with one, learned and of planners to compare; then the larger totes."""
+    listed = []
+    for name, rotations in OWN.items():
         turns = (2, 4) if name == "gopt_rs" else (2,)
-        grippers = [("point", rotations), *product(PLATES, turns)]
-        listed += [Row(name, *gripper, planner) for gripper, planner in product(grippers, PLANNERS)]
-    return listed
+        for gripper in [("point", rotations), *product(PLATES, turns)]:
+            listed += [Row(name, *gripper, planner) for planner in ("learned", *PLANNERS)]
+    return listed + [Row(name, "point", 2, "learned") for name in (*SCALED, "pct1")]
 
 
 def play(row: Row) -> None:
@@ -90,15 +87,17 @@ def main() -> None:
     for row in rows():
         if re.search(match, row.name):
             play(row)
-    lines = [line for row in rows() if (line := result_of(row))]
+    with TABLE.open(newline="") as file:
+        before = {Row(*list(line.values())[:4]).name: line for line in csv.DictReader(file)}
+    lines = [line for row in rows() if (line := result_of(row) or before.get(row.name))]
     with TABLE.open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
         writer.writerows({key: round(v, 4) if isinstance(v, float) else v for key, v in line.items()} for line in lines)
     for line in lines:
-        share = " ".join(f"{100 * line[key]:.1f}" for key in ("mean", "low", "high", "kept", "kept_low", "kept_high"))
+        share = " ".join(f"{100 * float(line[key]):.1f}" for key in COLUMNS[5:11])
         words = [line["benchmark"], line["effector"], f"R={line['rotations']}", line["planner"], line["episodes"]]
-        sys.stdout.write(" | ".join(map(str, [*words, share, f"{line['ms']:.1f} ms"])) + "\n")
+        sys.stdout.write(" | ".join(map(str, [*words, share, f"{float(line['ms']):.1f} ms"])) + "\n")
 
 
 if __name__ == "__main__":
