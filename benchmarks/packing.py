@@ -51,12 +51,16 @@ class Row(NamedTuple):
 
 
 def rows() -> list[Row]:
-    """Return all rows: without a gripper and with one, learned and of planners to compare; then the larger totes."""
+    """Return all rows: without a gripper and with one, learned and of planners to compare; then the larger totes.
+
+    Weights serve no more rotations than they were trained with.
+    """
     listed = []
     for name, rotations in OWN.items():
         turns = (2, 4) if name == "gopt_rs" else (2,)
         for gripper in [("point", rotations), *product(PLATES, turns)]:
-            listed += [Row(name, *gripper, planner) for planner in ("learned", *PLANNERS)]
+            planners = ("learned", *PLANNERS) if gripper[1] == rotations else PLANNERS
+            listed += [Row(name, *gripper, planner) for planner in planners]
     return listed + [Row(name, "point", 2, "learned") for name in (*SCALED, "pct1")]
 
 
