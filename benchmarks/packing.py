@@ -1,7 +1,7 @@
 """Play the public packing benchmarks, without a gripper and with one: python benchmarks/packing.py
 
-Writes docs/results/packing.csv, and prints what is in it. What was played here before is not played again; `--match`
-names some rows, such as `^cut1`, and the others of the file stay as they are.
+Writes docs/results/packing.csv after each row, and prints it. All rows take hours; `--match` plays some, such as
+`^cut1`, and the others of the file stay as they are.
 """
 
 import argparse
@@ -10,6 +10,7 @@ import json
 import re
 import subprocess
 import sys
+import tempfile
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +18,7 @@ from typing import NamedTuple
 from common import console_command
 
 ROOT = Path(__file__).parents[1]
-TABLE, RUNS = ROOT / "docs" / "results" / "packing.csv", ROOT / "outputs" / "packing"
+TABLE = ROOT / "docs" / "results" / "packing.csv"
 PLATES, PLANNERS = ("plate_3x3", "plate_5x5"), ("joint_dbl", "individual_heuristic")
 SCALED = {"gopt_30": 1000, "gopt_50": 1000, "gopt_100": 100}  # episodes: a decision on a fine grid takes longer
 OWN = {"gopt_rs": 2, "cdrl_rs": 1, "cut1": 1, "cut2": 1}  # rotations; each has weights of its own
@@ -64,24 +65,27 @@ def rows() -> list[Row]:
     return listed + [Row(name, "point", 2, "learned") for name in (*SCALED, "pct1")]
 
 
-def play(row: Row) -> None:
-    """Play a row, if it has not been played."""
-    folder = RUNS / row.name
-    if not (folder / "evaluation.json").is_file():
-        words = [console_command("pickplace-evaluate"), *row.words(), f"hydra.run.dir={folder}"]
+def play(row: Row) -> dict:
+    """Return a line of the table."""
+    with tempfile.TemporaryDirectory() as folder:
+        words = [console_command("pickplace-evaluate"), *row.words(), f"hydra.run.dir={folder}/run"]
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
-
-
-def result_of(row: Row) -> dict | None:
-    """Return a line of the table; None of what was not played."""
-    path = RUNS / row.name / "evaluation.json"
-    if not path.is_file():
-        return None
-    result = json.loads(path.read_text())
+        result = json.loads(Path(folder, "run", "evaluation.json").read_text())
     occupancy, kept = result["occupancy"], result["physics"]["carried_out"]
     line = {**row._asdict(), "episodes": result["episodes"], "ms": result["latency_ms"]["p50"]}
     line |= {"mean": occupancy["mean"], "low": occupancy["ci95"][0], "high": occupancy["ci95"][1]}
     return line | {"kept": kept["mean"], "kept_low": kept["ci95"][0], "kept_high": kept["ci95"][1]}
+
+
+def update(row: Row, line: dict) -> None:
+    """Write a line into the table, which has those of :func:`rows` in their order."""
+    with TABLE.open(newline="") as file:
+        lines = {Row(*list(old.values())[:4]).name: old for old in csv.DictReader(file)}
+    lines[row.name] = {key: round(value, 4) if isinstance(value, float) else value for key, value in line.items()}
+    with TABLE.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines[name] for each in rows() if (name := each.name) in lines)
 
 
 def main() -> None:
@@ -90,18 +94,11 @@ def main() -> None:
     match = parser.parse_args().match
     for row in rows():
         if re.search(match, row.name):
-            play(row)
-    with TABLE.open(newline="") as file:
-        before = {Row(*list(line.values())[:4]).name: line for line in csv.DictReader(file)}
-    lines = [line for row in rows() if (line := result_of(row) or before.get(row.name))]
-    with TABLE.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({key: round(v, 4) if isinstance(v, float) else v for key, v in line.items()} for line in lines)
-    for line in lines:
-        share = " ".join(f"{100 * float(line[key]):.1f}" for key in COLUMNS[5:11])
-        words = [line["benchmark"], line["effector"], f"R={line['rotations']}", line["planner"], line["episodes"]]
-        sys.stdout.write(" | ".join(map(str, [*words, share, f"{float(line['ms']):.1f} ms"])) + "\n")
+            line = play(row)
+            update(row, line)
+            share = " ".join(f"{100 * line[key]:.1f}" for key in COLUMNS[5:11])
+            sys.stdout.write(f"{row.name} | {line['episodes']} | {share} | {line['ms']:.1f} ms\n")
+            sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -118,8 +118,7 @@ class Lookahead(MapPlanner):
             row, column = open_.nonzero(as_tuple=True)
             if len(row) == 0:
                 break
-            after = self._place(state.rows(row), maps.rows(row), choice[row, column])
-            volume = self._play_out(after, row, streams, self.horizon)  # [rows, streams]
+            volume = self._returns(state, maps, row, choice[row, column], streams, self.horizon)  # [rows, streams]
             first = volume[(column == 0).nonzero()[:, 0]]  # one for each problem that is open
             problem = torch.unique_consecutive(row, return_inverse=True)[1]
             difference = volume - first[problem]
@@ -148,10 +147,20 @@ class Lookahead(MapPlanner):
             return best
         both = row.repeat_interleave(2)  # the policy's own choice and the candidate, on the same items
         column = torch.stack([torch.zeros_like(row), best[row]], 1).flatten()
-        after = self._place(state.rows(both), maps.rows(both), choice[both, column])
-        volume = self._play_out(after, both, self.samples, None).mean(1)
+        volume = self._returns(state, maps, both, choice[both, column], self.samples, None).mean(1)
         gain = volume[1::2] - volume[::2]
         return best.index_put((row,), torch.where(gain > 0, best[row], 0))
+
+    def _returns(self, state: State, maps: PlacingMaps, row: Tensor, choice: Tensor, streams: int, horizon) -> Tensor:
+        """Return the volume that choices place, and the policy after them, float64 ``[M, streams]``.
+
+        Args:
+            row, choice: int64 ``[M]``, of which problem, and which footprint.
+            streams, horizon: as in :meth:`_play_out`.
+        """
+        state, maps = state.rows(row), maps.rows(row)
+        placed = select_item(state.items, choice // self.cell.num_footprints).volume.double()
+        return placed[:, None] + self._play_out(self._place(state, maps, choice), row, streams, horizon)
 
     def _place(self, state: State, maps: PlacingMaps, choice: Tensor) -> State:
         """Return the state after the choices ``[N]``, before anything arrives: what is left in the bins.

@@ -20,7 +20,7 @@ from pickplace.task.maps import FAR
 from pickplace.task.state import Observation, State
 
 LAST = FAR**2  # order of a footprint in no corner
-AT_ONCE = 2**23  # rectangles that are looked at together, over all problems
+MAX_RECTANGLES = 2**23  # that are looked at together, over all problems
 
 
 class Rectangles(NamedTuple):
@@ -133,7 +133,7 @@ class SpacePlanner(MapPlanner):
         wide, deep = (rectangles.x1 - rectangles.x0)[:, None], (rectangles.y1 - rectangles.y0)[:, None]
         corner = (rectangles.x0 * cell.tote_size[1] + rectangles.y0)[:, None]
         order = torch.full((cell.parities, cell.num_places, len(each.surface)), LAST, device=corner.device)
-        for rows in torch.arange(len(each.surface), device=corner.device).split(max(1, AT_ONCE // len(corner))):
+        for rows in torch.arange(len(each.surface), device=corner.device).split(max(1, MAX_RECTANGLES // len(corner))):
             part = each.rows(rows)
             for floor, space in empty_spaces(part.heights, rectangles, maps.level_step):
                 for parity in range(cell.parities):
@@ -160,7 +160,8 @@ class BestFit(SpacePlanner):
 
 class OnlineBPH(SpacePlanner):
     """Tries the maximal empty spaces from the deepest-bottom-left one: the heuristic of Ha et al., 2017, "An online
-    packing heuristic for the three-dimensional container loading problem"."""
+    packing heuristic for the three-dimensional container loading problem in dynamic environments and the Physical
+    Internet"."""
 
     name, needs_room = "online_bph", False
 

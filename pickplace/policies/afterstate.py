@@ -22,7 +22,7 @@ class AfterstatePolicy(CornerPolicy):
 
     Args:
         cell: the sizes.
-        temperature: of the exploration in training; reward times ``algo.reward_scale``.
+        temperature: of the softmax over the values in training, in units of the scaled reward.
         **network: arguments of :class:`~pickplace.policies.networks.tote_value.ToteValue`.
     """
 

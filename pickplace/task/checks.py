@@ -144,6 +144,6 @@ def check_bytes(setting: str, needed: int, device="cpu") -> None:
         raise ValueError(f"{MEMORY_VARIABLE}={excerpt(given)}: expected a number of gigabytes.") from error
     if needed > most * 1e9:
         raise ValueError(
-            f"{setting}: it would take {needed / 1e9:,.1f} GB; expected at most {most:.1f} GB, or a greater limit in "
+            f"{setting}: it would take {needed / 1e9:,.2f} GB; expected at most {most:.4g} GB, or a greater limit in "
             f"the environment variable {MEMORY_VARIABLE}."
         )

@@ -94,12 +94,13 @@ def check_settings(cfg: DictConfig) -> None:
         )
 
 
-def check_learner(algo: DictConfig, warm_start: DictConfig, policy: Policy) -> None:
+def check_learner(cfg: DictConfig, policy: Policy) -> None:
     """Check that the policy learns by the loss, and that nothing is asked for which that has no use.
 
     Raises:
         ValueError: naming the key, its value, and what was expected.
     """
+    algo, warm_start = cfg.algo, cfg.warm_start
     if policy.learns_values != (algo.loss == "td"):
         expected = (
             "'td' with model=afterstate" if policy.learns_values else "'ppo' or 'a2c'; 'td' is for model=afterstate"
@@ -114,6 +115,14 @@ def check_learner(algo: DictConfig, warm_start: DictConfig, policy: Policy) -> N
         raise ValueError(f"algo.rollout_length={excerpt(algo.rollout_length)}: expected at least 2 with algo.loss=td.")
     if algo.vine_samples is not None:
         raise ValueError(f"algo.vine_samples={excerpt(algo.vine_samples)}: expected null with algo.loss=td.")
+    scale = cfg.model.actor.get("reward_scale", 1.0)
+    if scale != algo.reward_scale:
+        raise ValueError(f"model.actor.reward_scale={excerpt(scale)}: expected algo.reward_scale={algo.reward_scale}.")
+    if dict(cfg.model.critic) != {"_target_": "tote_value"}:
+        raise ValueError(
+            f"model.critic={excerpt(dict(cfg.model.critic))}: expected {{'_target_': 'tote_value'}} with algo.loss=td, "
+            "as the actor's network is the critic."
+        )
 
 
 def check_memory(cfg: DictConfig, env: PickPlaceEnv, policy: Policy) -> None:

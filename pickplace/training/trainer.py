@@ -105,7 +105,7 @@ class Trainer:
         )
         weights = self.state if self.resumed else self._first_weights()
         self.policy: Policy = self._restored("policy", make_actor, weights)
-        check_learner(self.algo, cfg.warm_start, self.policy)
+        check_learner(cfg, self.policy)
         for warning in self.policy.check_sizes():
             log.warning(warning)
         self.planner = build("planner", cfg.planner, cell=self.cell, policy=self.policy)

@@ -73,6 +73,7 @@ def test_larger_benchmarks_are_gopt_rs_on_a_finer_grid(side):
     ("name", "least", "rotations", "support", "episodes"),
     [
         ("gopt_rs", 1, 2, "half_or_hull", 1000),
+        ("pct1", 1, 2, "bearing", 1000),
         *((name, 2, 1, "corners", 2000) for name in ("cdrl_rs", "cut1", "cut2")),
     ],
 )
@@ -84,6 +85,7 @@ def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, 
     assert cfg["items"].get("container", cfg.env.tote_size) == cfg.env.tote_size
     assert cfg.evaluation.episodes == episodes
     assert (cfg.env.tote_size, cfg.env.rotations, cfg.env.support) == ([10, 10, 10], rotations, support)
+    assert name != "pct1" or cfg.env.support_margin == 0.25
     short = [f"benchmark={name}", "evaluation.episodes=2", *SMALL[1:]]
     first = evaluation("planner=joint_dbl", *short)
     assert first["failures"] == {"stuck": 2} and first["env"]["support"] == support

@@ -8,8 +8,9 @@ from problems import occupancies
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.planners.lookahead import Lookahead
 from pickplace.planners.policy import PolicyPlanner
+from pickplace.policies.afterstate import AfterstatePolicy
 from pickplace.policies.fcn_grasp import FootprintPolicy
-from pickplace.policies.restore import restore_critic, restore_policy
+from pickplace.policies.restore import RestoredCritic, restore_critic, restore_policy
 from pickplace.runs import checkpoint
 from pickplace.task.feasibility import choice_mask, placing_maps
 from pickplace.task.items import Kinds, Recorded
@@ -65,6 +66,27 @@ def test_the_horizon_adds_the_critics_value():
     assert (volume[volume >= 100] <= 100 + 2 * 4).all()
 
 
+def test_a_critic_that_sees_the_tote_alone_judges_it_before_the_next_item_arrives():
+    def empty_volume(observation):
+        assert set(observation) == set(empty_volume.in_keys)
+        return observation["tote_depth"].sum((1, 2))[:, None]
+
+    empty_volume.in_keys = ("tote_depth", "tote_height")
+    volume = played_out(search_of(make_env(), empty_volume, horizon=1), [0, 1], 16, 1)
+    assert (volume == 16).all()  # the item, and what is empty after it
+
+
+def test_what_wins_by_the_values_of_afterstates_is_not_played_to_the_end(monkeypatch):
+    """The policy follows from the same values."""
+    monkeypatch.setattr(Lookahead, "_confirm", None)
+    env, sizes = make_env(1, (4, 4, 2)), {"grid": (4, 4, 2), "filters": 4, "hidden": 8}
+    policy = AfterstatePolicy(env.cell, **sizes).eval()
+    critic = RestoredCritic(policy.network, list(policy.network.in_keys), 1.0)
+    search = Lookahead(env.cell, policy, env.items, critic, horizon=3, candidates=8, rounds=1)
+    alone = occupancies(PolicyPlanner(env.cell, policy), make_env(64, (4, 4, 2)))
+    assert gain_bounds(occupancies(search, make_env(64, (4, 4, 2))) - alone)[0] > 0
+
+
 def test_what_lies_in_the_bin_is_played_before_anything_is_imagined():
     """A batch of three kinds of volumes 1, 2 and 4: after one of them is placed the other two follow, in any stream."""
     kinds = [(1, 1, 1), (2, 1, 1), (2, 2, 1)]
@@ -77,6 +99,8 @@ def test_what_lies_in_the_bin_is_played_before_anything_is_imagined():
     left = state.item.volume.sum(1) - state.item.volume.gather(1, choice[:, None] // env.cell.num_footprints)[:, 0]
     volume = search._play_out(search._place(state, maps, choice), torch.arange(64), 4, 2)
     assert torch.equal(volume, left.double()[:, None].expand(64, 4))
+    returns = search._returns(state, maps, torch.arange(64), choice, 4, 2)
+    assert torch.equal(returns, state.item.volume.sum(1).double()[:, None].expand(64, 4))  # whichever is first
     further = search._play_out(search._place(state, maps, choice), torch.arange(64), 4, 3)
     assert further.std(1).max() > 0  # then comes an imagined batch
 

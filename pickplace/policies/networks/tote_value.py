@@ -8,7 +8,7 @@ from pickplace.policies.networks.footprint_fcn import DTYPES, matrix_dtype
 from pickplace.task.checks import MAX_WIDTH, check_inputs, flag, number, odd_number, one_of, size_tuple, whole_number
 
 MAX_GRID = 64  # cells of the network's picture of a tote along each axis
-AT_ONCE = {"cpu": 4_096, "cuda": 262_144}  # a CPU's caches hold the activations of so many totes
+TOTES_AT_ONCE = {"cpu": 4_096, "cuda": 262_144}  # a CPU's caches hold the activations of this many
 
 
 class ToteValue(nn.Module):
@@ -25,13 +25,12 @@ class ToteValue(nn.Module):
         filters: width of the convolutions.
         receptive_field: side of the square that the first convolution sees, odd.
         hidden: width of the linear layer before the output.
-        mirrored: whether batches of totes are mirrored, and transposed where the picture is square, at random while it
-            learns. The value is the same, unless items, end effector or reach tell the sides of the tote apart.
+        mirrored: whether totes are mirrored, and transposed where they are square, at random while it learns. The value
+            is the same, unless items, end effector or reach tell the sides of the tote apart.
         reward_scale: ``algo.reward_scale``; values are volumes times this.
         compute_dtype: as in :class:`~pickplace.policies.networks.footprint_fcn.FootprintFcn`.
     """
 
-    any_size = True
     in_keys: tuple[str, ...] = ("tote_depth", "tote_height")
 
     def __init__(
@@ -46,6 +45,8 @@ class ToteValue(nn.Module):
     ):
         super().__init__()
         self.grid = size_tuple("model.actor.grid", grid, 3, MAX_GRID)
+        if min(self.grid[:2]) < 2:
+            raise ValueError(f"model.actor.grid={list(self.grid)}: expected at least 2 cells along x and y.")
         odd_number("model.actor.receptive_field", receptive_field)
         for key, value in {"filters": filters, "hidden": hidden}.items():
             whole_number(f"model.actor.{key}", value, most=MAX_WIDTH)
@@ -75,7 +76,7 @@ class ToteValue(nn.Module):
         if self.training and torch.is_grad_enabled():
             depth = self._mirror(depth) if self.mirrored else depth
             return self._values(depth, height).view(*batch, 1)
-        at_once = AT_ONCE.get(depth.device.type, AT_ONCE["cpu"])
+        at_once = TOTES_AT_ONCE.get(depth.device.type, TOTES_AT_ONCE["cpu"])
         parts = zip(depth.split(at_once), height.split(at_once), strict=True)
         return torch.cat([self._values(*part) for part in parts]).view(*batch, 1)
 
@@ -107,4 +108,5 @@ class ToteValue(nn.Module):
         """Return the totes in one of the views under which their value is the same, drawn at random."""
         turned, *flips = torch.rand(3).lt(0.5).tolist()
         depth = depth.flip([axis for axis, flipped in zip((1, 2), flips, strict=True) if flipped])
-        return depth.transpose(1, 2) if turned and self.grid[0] == self.grid[1] else depth
+        square = depth.shape[1] == depth.shape[2] and self.grid[0] == self.grid[1]
+        return depth.transpose(1, 2) if turned and square else depth
