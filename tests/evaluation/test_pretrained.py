@@ -12,6 +12,7 @@ from pickplace.runs.allowlist import trusted_config
 
 CARDS = sorted(checkpoint.PRETRAINED.glob(f"*/{export.CARD}"))
 EPISODES = 8
+POLICY_ALONE = ("fcn4d", "gopt_rs", "cdrl_rs", "cut1", "cut2")
 each_card = pytest.mark.parametrize("path", CARDS, ids=lambda path: path.parent.name)
 
 
@@ -40,7 +41,7 @@ def test_card_describes_the_weights(path):
     assert card["trained"] == {key: facts.get(key, facts["config"].get(key)) for key in ("frames", "seed", "commit")}
     assert not card["trained"]["commit"].endswith("+")  # trained from a clean checkout
     with safe_open(path.parent / checkpoint.TENSORS, "pt") as tensors:
-        expected = {"policy"} if path.parent.name in ("fcn4d", "gopt_rs", "cdrl_rs") else {"critic", "policy"}
+        expected = {"policy"} if path.parent.name in POLICY_ALONE else {"critic", "policy"}
         assert {key.split("|")[0] for key in tensors.keys()} == expected == set(state)  # noqa: SIM118
     assert export.critic_serves_any_tote(trusted_config(facts["config"])) == ("critic" in expected)
 

@@ -37,7 +37,7 @@ def command(monkeypatch, capsys, tmp_path):
     ("arguments", "message"),
     [
         (["nowhere"], "nowhere"),
-        (["pretrained/none"], "expected pretrained/cdrl_rs, pretrained/fcn4d, pretrained/gopt_rs, pretrained/mixed"),
+        (["pretrained/none"], "expected pretrained/cdrl_rs, pretrained/cut1, pretrained/cut2, pretrained/fcn4d"),
         (["pretrained/r4", "--bin", "bin.npy"], "--tote: no file"),
         (["pretrained/r4", "--bin", "bin.npy", "--tote", "missing.npy"], "missing.npy: cannot be read"),
         (["pretrained/r4", "--bin", "bin.npy", "--tote", "pickle.npy"], "pickle.npy: cannot be read; expected a .npy"),
