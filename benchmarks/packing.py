@@ -19,9 +19,16 @@ from common import console_command
 
 ROOT = Path(__file__).parents[1]
 TABLE = ROOT / "docs" / "results" / "packing.csv"
-PLATES, PLANNERS = ("plate_3x3", "plate_5x5"), ("joint_dbl", "individual_heuristic")
-SCALED = {"gopt_30": 1000, "gopt_50": 1000, "gopt_100": 100}  # episodes: a decision on a fine grid takes longer
-OWN = {"gopt_rs": 2, "cdrl_rs": 1, "cut1": 1, "cut2": 1}  # rotations; each has weights of its own
+PLATES = ("plate_3x3", "plate_5x5")
+SCALED = ("gopt_30", "gopt_50", "gopt_100")
+#: Beside the learned one. Both take the first feasible footprint in the order of deepest-bottom-left; ``pick_first``
+#: grips the item in its middle, whatever lies in the tote.
+PLANNERS = {
+    "joint_dbl": ["planner=joint_dbl"],
+    "pick_first": ["planner=individual_heuristic", "planner.candidates=cells", "planner.pick=middle"],
+}
+#: Rotations of the weights; ``pct1`` and the larger totes have those of ``gopt_rs``.
+TRAINED = {"gopt_rs": 2, "pct1": 2, "cdrl_rs": 1, "cut1": 1, "cut2": 1}
 COLUMNS = ("benchmark", "effector", "rotations", "planner", "episodes", "mean", "low", "high")
 COLUMNS += ("kept", "kept_low", "kept_high", "ms")
 
@@ -41,28 +48,26 @@ class Row(NamedTuple):
     def words(self) -> list[str]:
         """Return overrides of pickplace-evaluate."""
         learned = self.planner == "learned"
-        weights = self.benchmark if self.benchmark in OWN else "gopt_rs"
-        planner = f"checkpoint=pretrained/{weights}" if learned else f"planner={self.planner}"
-        words = [f"benchmark={self.benchmark}", f"effector={self.effector}", f"env.rotations={self.rotations}", planner]
-        if self.benchmark in SCALED:
-            words += [f"evaluation.episodes={SCALED[self.benchmark]}"]
-        elif not learned:
-            words += ["evaluation.episodes=300"]
+        weights = self.benchmark if self.benchmark in ("cdrl_rs", "cut1", "cut2") else "gopt_rs"
+        words = [f"benchmark={self.benchmark}", f"effector={self.effector}", f"env.rotations={self.rotations}"]
+        words += (
+            [f"checkpoint=pretrained/{weights}"] if learned else [*PLANNERS[self.planner], "evaluation.episodes=300"]
+        )
         return [*words, "physics=settle", "evaluation.replay=0", "threads=1"]
 
 
 def rows() -> list[Row]:
     """Return all rows: without a gripper and with one, learned and of planners to compare; then the larger totes.
 
-    Weights serve no more rotations than they were trained with.
+    Weights serve no more rotations than they were trained with. A point has but one way to pick.
     """
     listed = []
-    for name, rotations in OWN.items():
-        turns = (2, 4) if name == "gopt_rs" else (2,)
-        for gripper in [("point", rotations), *product(PLATES, turns)]:
-            planners = ("learned", *PLANNERS) if gripper[1] == rotations else PLANNERS
-            listed += [Row(name, *gripper, planner) for planner in planners]
-    return listed + [Row(name, "point", 2, "learned") for name in (*SCALED, "pct1")]
+    for name, rotations in TRAINED.items():
+        listed += [Row(name, "point", rotations, planner) for planner in ("learned", "joint_dbl")]
+        for plate, turns in product(PLATES, (2, 4)):
+            planners = ("learned", *PLANNERS) if turns == rotations else PLANNERS
+            listed += [Row(name, plate, turns, planner) for planner in planners]
+    return listed + [Row(name, "point", 2, "learned") for name in SCALED]
 
 
 def play(row: Row) -> dict:

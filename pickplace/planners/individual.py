@@ -8,15 +8,16 @@ from pickplace.planners.heuristics import dbl_order
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import one_of
 from pickplace.task.feasibility import PlacingMaps, action_footprints, action_mask
-from pickplace.task.grasps import all_grasps, heuristic_pick, join_pick, select_pick, split_footprint
+from pickplace.task.grasps import all_grasps, central_pick, heuristic_pick, join_pick, select_pick, split_footprint
 from pickplace.task.maps import FAR
 from pickplace.task.state import Observation, State
 
 CANDIDATES = ("corners", "cells")
+PICKS = {"least_offset": heuristic_pick, "middle": central_pick}
 
 
 class IndividualHeuristic(MapPlanner):
-    """Heuristic pick, then deepest-bottom-left over the corners of the tote's free rectangles.
+    """A pick that does not look at the tote, then deepest-bottom-left over the corners of the tote's free rectangles.
 
     A candidate is a footprint in a corner of a maximal rectangle (MaxRects, Jylanki 2010) of the cells that are not
     higher than the level on which the item would rest; the first in the order (top, footprint y, footprint x) that
@@ -30,13 +31,16 @@ class IndividualHeuristic(MapPlanner):
         candidates: ``"corners"``, or ``"cells"`` for every footprint.
         item: which item is the first: ``"first"``, the one that arrived first, or ``"nearest"``, the one nearest to the
             bin's origin.
+        pick: which pick of it: ``"least_offset"``, the paper's (:func:`~pickplace.task.grasps.heuristic_pick`), or
+            ``"middle"``, the one nearest to the middle of the item.
     """
 
     name = "individual_heuristic"
 
-    def __init__(self, cell: CellSpec, candidates: str = "corners", item: str = "first"):
+    def __init__(self, cell: CellSpec, candidates: str = "corners", item: str = "first", pick: str = "least_offset"):
         self.cell, self.candidates = cell, one_of("planner.candidates", candidates, CANDIDATES)
         self.item = one_of("planner.item", item, ("first", "nearest"))
+        self.pick = PICKS[one_of("planner.pick", pick, PICKS)]
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         if maps.bin_items > 1:
@@ -44,7 +48,7 @@ class IndividualHeuristic(MapPlanner):
             lifted = restrict_items(self.item, state, lifted.reshape(len(state.surface), -1))
             number = lifted.unflatten(1, (maps.bin_items, -1)).any(2).int().argmax(1)
             maps = maps.of_choice(cell, number * cell.num_footprints)[0]
-        pick = heuristic_pick(cell, maps.item, maps.blocked)
+        pick = self.pick(cell, maps.item, maps.blocked)
         footprint = select_pick(cell, action_footprints(cell, maps.item, maps.blocked), pick)
         succeeds = select_pick(cell, action_mask(cell, maps), pick)
         allowed = footprint >= 0

@@ -90,17 +90,21 @@ class SpacePlanner(MapPlanner):
         cell: the sizes.
         item: which of several items in the bin are considered, see
             :func:`~pickplace.planners.base.restrict_items`.
-        elsewhere: where no item fits a corner of a space: whether deepest-bottom-left decides over all feasible
+        dbl_fallback: where no item fits a corner of a space: whether deepest-bottom-left decides over all feasible
             footprints. Else an action is played that fails, and ends the episode, as in the literature.
 
     Raises:
         ValueError: for settings of other types.
     """
 
-    needs_room = True  # whether a space must hold the item; else it may begin there and stick out
+    holds_item = True  # whether a space must hold the item; else it may begin there and stick out
 
-    def __init__(self, cell: CellSpec, item: str = "any", elsewhere: bool = True):
-        self.cell, self.item, self.elsewhere = cell, check_item_rule(item), flag("planner.elsewhere", elsewhere)
+    def __init__(self, cell: CellSpec, item: str = "any", dbl_fallback: bool = True):
+        self.cell, self.item, self.dbl_fallback = (
+            cell,
+            check_item_rule(item),
+            flag("planner.dbl_fallback", dbl_fallback),
+        )
 
     @abstractmethod
     def space_order(self, floor: int, left_x: Tensor, left_y: Tensor) -> Tensor | int:
@@ -122,7 +126,7 @@ class SpacePlanner(MapPlanner):
         in_corner, elsewhere = orders
         has_corner = (in_corner < last).any(1, keepdim=True)
         action = first_action_reaching(cell, maps, torch.where(has_corner, in_corner, elsewhere).argmin(1))
-        if self.elsewhere or has_corner.all():
+        if self.dbl_fallback or has_corner.all():
             return action
         return torch.where(has_corner[:, 0], action, action_mask(cell, maps).int().argmin(1))
 
@@ -141,7 +145,7 @@ class SpacePlanner(MapPlanner):
                     left_x, left_y = wide - w, deep - d
                     fits = (left_x >= 0) & (left_y >= 0) & (floor + part.item.h <= part.tote_height)
                     found = torch.where(
-                        space & fits if self.needs_room else space, self.space_order(floor, left_x, left_y), LAST
+                        space & fits if self.holds_item else space, self.space_order(floor, left_x, left_y), LAST
                     )
                     least = order[parity][:, rows].scatter_reduce(0, corner.expand_as(found), found, "amin")
                     order[parity, :, rows] = least
@@ -163,7 +167,7 @@ class OnlineBPH(SpacePlanner):
     packing heuristic for the three-dimensional container loading problem in dynamic environments and the Physical
     Internet"."""
 
-    name, needs_room = "online_bph", False
+    name, holds_item = "online_bph", False
 
     def space_order(self, floor: int, left_x: Tensor, left_y: Tensor) -> int:
         return floor

@@ -27,7 +27,9 @@ class AfterstatePolicy(CornerPolicy):
     """
 
     map_keys = ("bin_depth", "tote_depth", "tote_height")
+    chooses_items = False
     learns_values = True
+    score_index = None  # the value of a tote is scaled by its sides
     network: ToteValue  # type: ignore[assignment]
 
     def __init__(self, cell: CellSpec, temperature: float = 0.003, **network):
@@ -37,6 +39,12 @@ class AfterstatePolicy(CornerPolicy):
 
     def make_network(self, **network) -> ToteValue:  # type: ignore[override]
         return ToteValue(**network)
+
+    def learning_bytes(self, samples: int | None = None) -> int:
+        """Return about how many bytes a frame takes, measured at totes of 10 to 100 cells."""
+        wide, deep, steps = self.network.grid
+        tote_w, tote_d, _ = self.cell.tote_size
+        return 8 * (tote_w * tote_d + wide * deep * (steps + 3 + self.network.around.out_channels))
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
         after = depth_after(observation["bin_depth"], observation["tote_depth"], row, footprint)

@@ -155,6 +155,7 @@ class GraspPolicy(Policy):
 
     choice_key = "grasp"
     map_keys = MAP_KEYS
+    chooses_items = False
     scored: Tensor  # see `_scored`
 
     def __init__(self, cell: CellSpec, **network):

@@ -220,6 +220,19 @@ def heuristic_pick(cell: CellSpec, item: Item, blocked: Tensor | None = None) ->
     return torch.where(succeeds, (ox + oy) * FAR + oy, FAR**2).argmin(1)
 
 
+def central_pick(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> Tensor:
+    """Return the pick cell with the middle of the end effector nearest to that of the item, int64 ``[N]``.
+
+    The distance is the sum along x and y, and ties go to the lowest index. Like :func:`heuristic_pick`, it does not
+    look at the tote.
+    """
+    succeeds, offset = all_grasps(cell, item, blocked)
+    ox, oy = offset[:, :, 0].unbind(-1)  # before turning, [N, P]
+    ee_w, ee_d = cell.effector_size
+    away = (2 * ox + item.w[:, None] - ee_w).abs() + (2 * oy + item.d[:, None] - ee_d).abs()
+    return torch.where(succeeds, away, FAR).argmin(1)
+
+
 def select_pick(cell: CellSpec, actions: Tensor, pick: Tensor) -> Tensor:
     """Return the part of values of all actions ``[N, N_a]`` at the pick cells ``[N]``: ``[N, W_T * D_T * R]``."""
     return actions.unflatten(1, (cell.num_picks, -1))[torch.arange(len(pick), device=pick.device), pick]

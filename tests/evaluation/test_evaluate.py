@@ -85,6 +85,7 @@ def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, 
     assert cfg["items"].get("container", cfg.env.tote_size) == cfg.env.tote_size
     assert cfg.evaluation.episodes == episodes
     assert (cfg.env.tote_size, cfg.env.rotations, cfg.env.support) == ([10, 10, 10], rotations, support)
+    assert (cfg.env.effector_size, cfg.env.pick_rule, cfg.env.bin_size) == ([1, 1], "overlap", [5, 5, 1])
     assert name != "pct1" or cfg.env.support_margin == 0.25
     short = [f"benchmark={name}", "evaluation.episodes=2", *SMALL[1:]]
     first = evaluation("planner=joint_dbl", *short)

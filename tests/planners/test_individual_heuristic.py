@@ -11,7 +11,7 @@ from problems import late_state, occupancies, random_states
 from pickplace import CellSpec, Item, PickPlaceEnv, State
 from pickplace.planners.individual import IndividualHeuristic, corner_footprints
 from pickplace.task.feasibility import placing_maps
-from pickplace.task.grasps import all_grasps, heuristic_pick
+from pickplace.task.grasps import all_grasps, central_pick, heuristic_pick
 from pickplace.task.items import Uniform
 from pickplace.task.state import Failure, surface_from
 from pickplace.task.transition import apply
@@ -62,17 +62,20 @@ def test_every_cell_meets_the_reference(rotations, reference):
 
 
 @pytest.mark.parametrize("candidates", ["corners", "cells"])
-@pytest.mark.parametrize(("rotations", "tote"), [(1, (6, 6, 5)), (3, (5, 7, 3)), (4, (7, 5, 3))])
-def test_the_first_candidate_that_succeeds_is_played(candidates, rotations, tote):
+@pytest.mark.parametrize(
+    ("rotations", "tote", "pick"),
+    [(1, (6, 6, 5), "least_offset"), (3, (5, 7, 3), "middle"), (4, (7, 5, 3), "least_offset")],
+)
+def test_the_first_candidate_that_succeeds_is_played(candidates, rotations, tote, pick):
     """In the order (top, y, x, flat index); if all fail the first; and corners are fewer than cells."""
     env, observation = late_state(7, rotations=rotations, tote_size=tote, num_envs=48, seed=1)
     cell, state = env.cell, env.state
     maps = placing_maps(cell, state)
     top, corners, each = maps.top, corner_footprints(cell, state.heights, maps), cell.num_places * rotations
-    first = heuristic_pick(cell, state.item) * each
+    first = (heuristic_pick if pick == "least_offset" else central_pick)(cell, state.item) * each
     steps = [apply(cell, state, first + n) for n in range(each)]
     failed, lies = (torch.stack([getattr(step, key) for step in steps], 1) for key in ("failure", "footprint"))
-    chosen = IndividualHeuristic(cell, candidates).decide(observation) - first
+    chosen = IndividualHeuristic(cell, candidates, pick=pick).decide(observation) - first
     missed = 0
     for row in range(48):
         found = []
@@ -110,6 +113,8 @@ def test_of_several_items_it_takes_the_first_that_can_be_picked(rule):
     assert others > 0
 
 
-def test_bad_candidates_are_refused():
+def test_bad_settings_are_refused():
     with pytest.raises(ValueError, match=r"planner.candidates='all': expected 'corners' or 'cells'"):
         IndividualHeuristic(CellSpec(), "all")
+    with pytest.raises(ValueError, match=r"planner.pick='center': expected 'least_offset' or 'middle'"):
+        IndividualHeuristic(CellSpec(), pick="center")

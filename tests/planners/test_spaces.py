@@ -41,7 +41,7 @@ def best_space(planner, spaces, found, height, tote_height):
 def test_the_first_space_is_filled(planner, options):
     for env, observation in random_states(**options):
         chosen = planner(env.cell).decide(observation)
-        strict = planner(env.cell, elsewhere=False).decide(observation)
+        strict = planner(env.cell, dbl_fallback=False).decide(observation)
         for n in range(env.num_envs):
             spaces = list(spaces_by_hand(env.state.heights[n].tolist()))
             items, in_corner, elsewhere = env.state.items.table[n].tolist(), {}, {}
@@ -62,12 +62,12 @@ def test_the_first_space_is_filled(planner, options):
 def test_an_episode_may_end_where_no_corner_is_left():
     env = {"num_envs": 40, "masks": (), "stream": "test", "tote_size": (6, 6, 6), "effector_size": (1, 1)}
     packed = []
-    for elsewhere in (True, False):
+    for fallback in (True, False):
         episodes = PickPlaceEnv(**env, pick_rule="overlap", rotations=1)
-        packed.append(occupancies(BestFit(episodes.cell, elsewhere=elsewhere), episodes).mean())
-    assert packed[0] >= packed[1] > 0.3
-    with pytest.raises(ValueError, match="planner.elsewhere='no'"):
-        BestFit(PickPlaceEnv(num_envs=1).cell, elsewhere="no")
+        packed.append(occupancies(BestFit(episodes.cell, dbl_fallback=fallback), episodes).mean())
+    assert packed[0] > packed[1] > 0.3
+    with pytest.raises(ValueError, match="planner.dbl_fallback='no'"):
+        BestFit(PickPlaceEnv(num_envs=1).cell, dbl_fallback="no")
     with pytest.raises(ValueError, match="planner.item='last'"):
         OnlineBPH(PickPlaceEnv(num_envs=1).cell, item="last")
 

@@ -182,6 +182,7 @@ def test_fcn4d_scores_every_flat_action(tmp_path):
     ("arguments", "message"),
     [
         (["pretrained/unmasked", "x.onnx"], "pretrained/unmasked: GraspPolicy has no scores for totes of any size"),
+        (["pretrained/gopt_rs", "x.onnx"], "pretrained/gopt_rs: AfterstatePolicy has no scores for totes of any size"),
         (["pretrained/r4", "nowhere/x.onnx"], "nowhere/x.onnx: expected a file in a folder that exists"),
         (["pretrained/r4", "."], "expected a file in a folder that exists"),
         (["pretrained/none", "x.onnx"], "expected pretrained/fcn4d"),

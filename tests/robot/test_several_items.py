@@ -296,8 +296,11 @@ def test_those_that_cannot_choose_refuse_in_one_sentence():
     depth, labels = bin_maps({1: (0, 0, 1, 1, 1), 2: (3, 3, 2, 2, 1)}, (5, 5))
     grid = {"bin_depth": depth, "bin_labels": labels, "tote_depth": np.full((6, 6), 5)}
     boxes = {"items": [Box(0.05, 0.05, 0.03, 0.03, 0.05), Box(0.2, 0.2, 0.05, 0.05, 0.05)], **FLAT}
+    small = {"tote_size": (6, 6, 5)}
     for planner, seen, message in (
         (Planner.load("pretrained/unmasked"), grid, "bin: got 2 items, among which GraspPolicy does not choose"),
+        (Planner.load("pretrained/gopt_rs", **small), grid, "2 items, among which AfterstatePolicy does not choose"),
+        (Planner.load("pretrained/gopt_rs", planner="lookahead", **small), boxes, "AfterstatePolicy does not choose"),
         (Planner.load("pretrained/fcn4d"), boxes, "bin: got 2 items in metres, each on a grid of its own, while Act"),
         (Planner(CellSpec(), planner=JointDBL(CellSpec())), grid, "was made for a cell with bin_items=1; expected one"),
         (Planner(CellSpec(rotations=1), planner="joint_dbl"), {**boxes, "items": [BOXES[1], BOXES[0]]},

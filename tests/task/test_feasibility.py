@@ -29,7 +29,7 @@ from pickplace.task.feasibility import (
     num_feasible,
     placing_maps,
 )
-from pickplace.task.grasps import all_grasps, heuristic_pick
+from pickplace.task.grasps import all_grasps, central_pick, heuristic_pick
 from pickplace.task.items import Uniform
 from pickplace.task.placing import resting_top
 from pickplace.task.state import EMPTY, surface_from
@@ -303,17 +303,23 @@ def test_a_pile_that_leans_over(support, third):
 
 @settings(max_examples=50)
 @given(problems(limited=st.booleans(), count=3, shaped=st.booleans()))
-def test_the_heuristic_pick_has_the_least_offset(problem):
-    """Least ``ox + oy``, then ``oy``, among the picks that succeed: the effector's corner where it can be."""
+def test_picks_that_do_not_look_at_the_tote(problem):
+    """Of those that succeed: least ``ox + oy``, then ``oy``; and least from the item's middle to the effector's."""
     cell, cases = problem
     item, (_, bin_d, _), (ee_w, ee_d) = state_of(*cases).item, cell.bin_size, cell.effector_size
-    picks, lifted = heuristic_pick(cell, item).tolist(), all_grasps(cell, item)[0]
-    for row, (x, y, *_) in enumerate(case.item for case in cases):
-        order = {}
+    picks, central, lifted = (
+        heuristic_pick(cell, item).tolist(),
+        central_pick(cell, item).tolist(),
+        all_grasps(cell, item)[0],
+    )
+    for row, (x, y, w, d, _) in enumerate(case.item for case in cases):
+        order, away = {}, {}
         for pick in lifted[row].nonzero()[:, 0].tolist():
             ox, oy = x - pick // bin_d + (ee_w - 1) // 2, y - pick % bin_d + (ee_d - 1) // 2
             order[pick] = (ox + oy, oy)
+            away[pick] = abs(ox + w / 2 - ee_w / 2) + abs(oy + d / 2 - ee_d / 2)
         assert not order or picks[row] == min(order, key=order.get)
+        assert not away or central[row] == min(away, key=away.get)
 
 
 def test_an_empty_bin_has_no_feasible_action():
