@@ -21,11 +21,12 @@ ROOT = Path(__file__).parents[1]
 TABLE = ROOT / "docs" / "results" / "packing.csv"
 PLATES = ("plate_3x3", "plate_5x5")
 SCALED = ("gopt_30", "gopt_50", "gopt_100")
-#: Beside the learned one. Both take the first feasible footprint in the order of deepest-bottom-left; ``pick_first``
-#: grips the item in its middle, whatever lies in the tote.
+#: By their names in the table. Those that pick first grip the item in its middle, whatever lies in the tote.
 PLANNERS = {
+    "learned": [],
+    "learned_pick_first": ["planner.pick=middle"],
     "joint_dbl": ["planner=joint_dbl"],
-    "pick_first": ["planner=individual_heuristic", "planner.candidates=cells", "planner.pick=middle"],
+    "dbl_pick_first": ["planner=individual_heuristic", "planner.candidates=cells", "planner.pick=middle"],
 }
 #: Rotations of the weights; ``pct1`` and the larger totes have those of ``gopt_rs``.
 TRAINED = {"gopt_rs": 2, "pct1": 2, "cdrl_rs": 1, "cut1": 1, "cut2": 1}
@@ -34,7 +35,7 @@ COLUMNS += ("kept", "kept_low", "kept_high", "ms")
 
 
 class Row(NamedTuple):
-    """Row of the table: options of ``benchmark`` and ``effector``, rotations, and the planner, or ``learned``."""
+    """Row of the table: options of ``benchmark`` and ``effector``, rotations, and the planner's name in the table."""
 
     benchmark: str
     effector: str
@@ -47,17 +48,15 @@ class Row(NamedTuple):
 
     def words(self) -> list[str]:
         """Return overrides of pickplace-evaluate."""
-        learned = self.planner == "learned"
         weights = self.benchmark if self.benchmark in ("cdrl_rs", "cut1", "cut2") else "gopt_rs"
+        learned = self.planner.startswith("learned")
         words = [f"benchmark={self.benchmark}", f"effector={self.effector}", f"env.rotations={self.rotations}"]
-        words += (
-            [f"checkpoint=pretrained/{weights}"] if learned else [*PLANNERS[self.planner], "evaluation.episodes=300"]
-        )
-        return [*words, "physics=settle", "evaluation.replay=0", "threads=1"]
+        words += [f"checkpoint=pretrained/{weights}" if learned else "evaluation.episodes=300"]
+        return [*words, *PLANNERS[self.planner], "physics=settle", "evaluation.replay=0", "threads=1"]
 
 
 def rows() -> list[Row]:
-    """Return all rows: without a gripper and with one, learned and of planners to compare; then the larger totes.
+    """Return all rows: without a gripper and with one; then the larger totes.
 
     Weights serve no more rotations than they were trained with. A point has but one way to pick.
     """
@@ -65,8 +64,11 @@ def rows() -> list[Row]:
     for name, rotations in TRAINED.items():
         listed += [Row(name, "point", rotations, planner) for planner in ("learned", "joint_dbl")]
         for plate, turns in product(PLATES, (2, 4)):
-            planners = ("learned", *PLANNERS) if turns == rotations else PLANNERS
-            listed += [Row(name, plate, turns, planner) for planner in planners]
+            listed += [
+                Row(name, plate, turns, planner)
+                for planner in PLANNERS
+                if turns == rotations or not planner.startswith("learned")
+            ]
     return listed + [Row(name, "point", 2, "learned") for name in SCALED]
 
 

@@ -8,12 +8,11 @@ from pickplace.planners.heuristics import dbl_order
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import one_of
 from pickplace.task.feasibility import PlacingMaps, action_footprints, action_mask
-from pickplace.task.grasps import all_grasps, central_pick, heuristic_pick, join_pick, select_pick, split_footprint
+from pickplace.task.grasps import PICKS, all_grasps, join_pick, select_pick, split_footprint
 from pickplace.task.maps import FAR
 from pickplace.task.state import Observation, State
 
 CANDIDATES = ("corners", "cells")
-PICKS = {"least_offset": heuristic_pick, "middle": central_pick}
 
 
 class IndividualHeuristic(MapPlanner):

@@ -8,9 +8,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace.planners.base import MapPlanner, check_item_rule, restrict_items
 from pickplace.policies.base import Policy
+from pickplace.policies.fcn_grasp import FootprintPolicy, count_ways
 from pickplace.task.cell import CellSpec
-from pickplace.task.checks import check_bytes, excerpt, is_whole
-from pickplace.task.feasibility import PlacingMaps, action_mask, first_action_reaching, placing_maps
+from pickplace.task.checks import check_bytes, excerpt, is_whole, one_of
+from pickplace.task.feasibility import PlacingMaps, action_footprints, action_mask, first_action_reaching, placing_maps
+from pickplace.task.grasps import PICKS, join_pick, select_pick
 from pickplace.task.state import Observation, State
 from pickplace.task.transition import apply
 
@@ -25,20 +27,34 @@ class PolicyPlanner(MapPlanner):
             if none succeeds the most probable one is played, and fails. ``"all"`` plays the best feasible one.
         item: which of several items in the bin are considered, see
             :func:`~pickplace.planners.base.restrict_items`.
+        pick: ``"any"``; or a pick that is chosen first, without a look at the tote, of one item in the bin:
+            ``"least_offset"`` or ``"middle"``, as of ``individual_heuristic``. Then only the footprints that it reaches
+            are considered; if it reaches none, an action is played that fails.
     """
 
     name = "policy"
     needs = ("policy",)
 
-    def __init__(self, cell: CellSpec, policy: Policy, candidates: int | Literal["all"] = "all", item: str = "any"):
+    def __init__(
+        self,
+        cell: CellSpec,
+        policy: Policy,
+        candidates: int | Literal["all"] = "all",
+        item: str = "any",
+        pick: str = "any",
+    ):
         if candidates != "all" and not (is_whole(candidates) and candidates >= 1):
             raise ValueError(f"planner.candidates={excerpt(candidates)}: expected 'all' or a whole number >= 1.")
         self.cell, self.policy, self.candidates, self.item = cell, policy, candidates, check_item_rule(item)
-        if item != "any" and not (policy.ranks_footprints and candidates == "all"):
-            raise ValueError(
-                f"planner.item={item!r}: expected 'any', or planner.candidates=all and a checkpoint of model=fcn_grasp "
-                "or corners that was trained with a mask."
-            )
+        self.pick = one_of("planner.pick", pick, ("any", *PICKS))
+        for key, value in (("item", item), ("pick", pick)):
+            if value != "any" and not (policy.ranks_footprints and candidates == "all"):
+                raise ValueError(
+                    f"planner.{key}={value!r}: expected 'any', or planner.candidates=all and a checkpoint of "
+                    "model=fcn_grasp, corners or afterstate, with a mask."
+                )
+        if pick != "any" and cell.bin_items > 1:
+            raise ValueError(f"planner.pick={pick!r}: expected 'any' with env.bin_items={cell.bin_items}.")
 
     @torch.no_grad()
     def decide(self, observation: Observation) -> Tensor:
@@ -56,6 +72,8 @@ class PolicyPlanner(MapPlanner):
     @torch.no_grad()
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         policy = self.policy.with_cell(cell)
+        if self.pick != "any":
+            return self._pick_first(policy, maps, observation)
         if self.item != "any":
             mask = restrict_items(self.item, state, policy.ranked(maps))
             return first_action_reaching(cell, maps, policy.footprint_logits(observation, mask).argmax(1))
@@ -65,6 +83,18 @@ class PolicyPlanner(MapPlanner):
         score, tried = policy.action_log_probs(observation).topk(min(self.candidates, cell.num_actions), dim=1)
         succeeds = action_mask(cell, maps).gather(1, tried) & (score > -torch.inf)
         return tried.gather(1, succeeds.int().argmax(1, keepdim=True))[:, 0]
+
+    def _pick_first(self, policy: FootprintPolicy, maps: PlacingMaps, observation: Observation) -> Tensor:
+        """Return the actions with a pick that does not look at the tote, int64 ``[N]``."""
+        cell = policy.cell
+        pick = PICKS[self.pick](cell, maps.item, maps.blocked)
+        footprint = select_pick(cell, action_footprints(cell, maps.item, maps.blocked), pick)
+        succeeds = select_pick(cell, action_mask(cell, maps), pick)
+        reached = count_ways(cell.num_footprints, footprint, succeeds) > 0
+        ranked = policy.ranked(maps) & reached
+        mask = torch.where(ranked.any(1, keepdim=True), ranked, reached)
+        choice = policy.footprint_logits(observation, mask).argmax(1, keepdim=True)
+        return join_pick(cell, pick, (succeeds & (footprint == choice)).int().argmax(1))
 
     def evaluation_facts(self) -> dict:
         """Return ``K`` and the mask with which actions are chosen: True, False, or what the policy never chooses."""

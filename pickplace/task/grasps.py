@@ -233,6 +233,10 @@ def central_pick(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> T
     return torch.where(succeeds, away, FAR).argmin(1)
 
 
+#: Picks that do not look at the tote, by the name that a planner's setting has for them.
+PICKS = {"least_offset": heuristic_pick, "middle": central_pick}
+
+
 def select_pick(cell: CellSpec, actions: Tensor, pick: Tensor) -> Tensor:
     """Return the part of values of all actions ``[N, N_a]`` at the pick cells ``[N]``: ``[N, W_T * D_T * R]``."""
     return actions.unflatten(1, (cell.num_picks, -1))[torch.arange(len(pick), device=pick.device), pick]

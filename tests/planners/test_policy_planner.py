@@ -9,7 +9,11 @@ from pickplace import PickPlaceEnv
 from pickplace.planners.heuristics import JointDBL
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy
+from pickplace.policies.corners import corners
+from pickplace.task.feasibility import placing_maps
+from pickplace.task.grasps import PICKS
 from pickplace.task.items import Uniform
+from pickplace.task.transition import apply
 
 
 class Fixed(Policy):
@@ -77,6 +81,44 @@ def test_only_one_item_is_considered(rule):
         JointDBL(env.cell, item="last")
     with pytest.raises(ValueError, match="planner.item='first': expected 'any', or planner.candidates=all and a"):
         PolicyPlanner(env.cell, policy, 3, "first")
+
+
+@pytest.mark.parametrize("rule", ["least_offset", "middle"])
+@pytest.mark.parametrize("make", [untrained_policy, lambda cell: corners(cell, True).eval()])
+def test_a_pick_may_be_chosen_first(rule, make):
+    """Of the actions with this pick that succeed the one whose footprint the policy likes best; else one that fails."""
+    stuck = others = 0
+    for env, observation in random_states(effector_size=(5, 5), cup_size=(1, 1), pick_rule="overlap", rotations=2):
+        cell, policy = env.cell, make(env.cell)
+        chosen = PolicyPlanner(cell, policy, pick=rule).decide(observation)
+        picks, scores = PICKS[rule](cell, env.state.item).tolist(), policy.unmasked_scores(observation)
+        ranked = policy.ranked(placing_maps(cell, env.state))
+        for n, pick in enumerate(picks):
+            actions = torch.arange(pick * cell.num_places * 2, (pick + 1) * cell.num_places * 2)
+            step = apply(cell, env.state.rows([n] * len(actions)), actions)
+            good = actions[step.failure == 0]
+            if len(good) == 0:
+                stuck += 1
+                assert not observation["action_mask"][n, chosen[n]]
+                continue
+            footprints = policy.to_choice(good, observation[[n] * len(good)]).tolist()
+            inside = [f for f in footprints if ranked[n, f]] or footprints
+            best = max(sorted(inside), key=lambda f: scores[n, f].item())  # ties: the lowest footprint, then action
+            assert chosen[n] == good[footprints.index(best)]
+        free = policy.to_choice(PolicyPlanner(cell, policy).decide(observation), observation)
+        others += int((policy.to_choice(chosen, observation) != free).sum())
+    assert others > 0 and stuck > 0
+
+
+def test_a_pick_that_is_chosen_first_needs_a_policy_that_ranks_footprints():
+    cell = PickPlaceEnv(num_envs=1).cell
+    with pytest.raises(ValueError, match="planner.pick='center': expected 'any' or 'least_offset' or 'middle'"):
+        PolicyPlanner(cell, untrained_policy(cell), pick="center")
+    with pytest.raises(ValueError, match="planner.pick='middle': expected 'any', or planner.candidates=all and a"):
+        PolicyPlanner(cell, untrained_policy(cell), 3, pick="middle")
+    several = PickPlaceEnv(num_envs=1, bin_items=2).cell
+    with pytest.raises(ValueError, match="planner.pick='middle': expected 'any' with env.bin_items=2"):
+        PolicyPlanner(several, untrained_policy(several), pick="middle")
 
 
 @pytest.mark.parametrize("candidates", [0, -1, 1.5, True, "some"])
