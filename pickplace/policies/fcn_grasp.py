@@ -57,7 +57,7 @@ class FootprintPolicy(Policy):
     masks: tuple[str, ...] = ("footprint",)
     excludes: str | None = "failed picks and footprints outside the tote"
     ranks_footprints = True
-    score_index = (
+    score_index: str | None = (
         "(parity * W_T + x) * D_T + y: minimum corner of the item in the tote; parity 1: turned by 90 degrees; of "
         "several items one after the other"
     )

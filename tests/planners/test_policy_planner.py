@@ -107,7 +107,7 @@ def test_a_pick_may_be_chosen_first(rule, make):
             assert chosen[n] == good[footprints.index(best)]
         free = policy.to_choice(PolicyPlanner(cell, policy).decide(observation), observation)
         others += int((policy.to_choice(chosen, observation) != free).sum())
-    assert others > 0 and stuck > 0
+    assert others > 0 and (stuck > 0 or rule == "middle")
 
 
 def test_a_pick_that_is_chosen_first_needs_a_policy_that_ranks_footprints():
