@@ -131,7 +131,7 @@ def leaderboard(lines: dict[str, dict]) -> list[str]:
 def gripper_table(lines: dict[str, dict]) -> list[str]:
     """Return the table with and without a gripper."""
     made = ["| `benchmark=` | effector | rotations | learned | learned, picks first | DBL | DBL, picks first |"]
-    made[0] += " `settle` keeps, %: learned | DBL |"
+    made[0] += " `settle` keeps, %: learned | `settle` keeps, %: DBL |"
     made.append("|---" * 9 + "|")
     for where in dict.fromkeys(row[:3] for row in rows() if row.benchmark not in SCALED):
         found = {planner: lines.get(Row(*where, planner).name) for planner in PLANNERS}
