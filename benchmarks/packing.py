@@ -1,7 +1,7 @@
 """Play the public packing benchmarks, without a gripper and with one: python benchmarks/packing.py
 
 Writes docs/results/packing.csv and the tables of docs/benchmarks.md after each row, and prints the row. All rows take
-hours; `--match` plays some, such as `^cut1`, and the others stay as they are. `--match nothing` writes the tables.
+hours; `--match` plays some, such as `^cut1`, and the others stay as they are. `--tables` plays none.
 """
 
 import argparse
@@ -153,9 +153,10 @@ def write_page() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--match", default="", help="regular expression; plays the rows in whose name it is found")
-    match = parser.parse_args().match
-    for row in rows():
-        if re.search(match, row.name):
+    parser.add_argument("--tables", action="store_true", help="write the tables only")
+    options = parser.parse_args()
+    for row in [] if options.tables else rows():
+        if re.search(options.match, row.name):
             line = play(row)
             update(row, line)
             share = " ".join(f"{100 * line[key]:.1f}" for key in COLUMNS[5:11])

@@ -13,7 +13,8 @@ from pickplace.runs.errors import sentence
 from pickplace.runs.registry import find
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import one_of
-from pickplace.task.feasibility import PlacingMaps, placing_maps
+from pickplace.task.feasibility import PlacingMaps, action_footprints, action_mask, placing_maps
+from pickplace.task.grasps import PICKS, select_pick
 from pickplace.task.items import ItemDistribution
 from pickplace.task.observation import Term
 from pickplace.task.state import Observation, State
@@ -101,6 +102,22 @@ def restrict_items(rule: str, state: State, mask: Tensor) -> Tensor:
     order = torch.where(mask.any(2), order, torch.iinfo(order.dtype).max)
     chosen = order == order.amin(1, keepdim=True)
     return (mask & chosen[:, :, None]).flatten(1)
+
+
+def pick_first(cell: CellSpec, maps: PlacingMaps, rule: str) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a pick that does not look at the tote, and what can be done with it.
+
+    Args:
+        maps: of one item in each bin.
+        rule: a key of :data:`~pickplace.task.grasps.PICKS`.
+
+    Returns:
+        the pick cell, int64 ``[N]``; and of every place and rotation, ``[N, W_T * D_T * R]``, the item's footprint,
+        int64, and whether it succeeds, bool.
+    """
+    pick = PICKS[rule](cell, maps.item, maps.blocked)
+    footprint = select_pick(cell, action_footprints(cell, maps.item, maps.blocked), pick)
+    return pick, footprint, select_pick(cell, action_mask(cell, maps), pick)
 
 
 def decide(

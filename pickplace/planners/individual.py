@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor
 
-from pickplace.planners.base import MapPlanner, restrict_items
+from pickplace.planners.base import MapPlanner, pick_first, restrict_items
 from pickplace.planners.heuristics import dbl_order
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import one_of
-from pickplace.task.feasibility import PlacingMaps, action_footprints, action_mask
-from pickplace.task.grasps import PICKS, all_grasps, join_pick, select_pick, split_footprint
+from pickplace.task.feasibility import PlacingMaps
+from pickplace.task.grasps import PICKS, all_grasps, join_pick, split_footprint
 from pickplace.task.maps import FAR
 from pickplace.task.state import Observation, State
 
@@ -39,7 +39,7 @@ class IndividualHeuristic(MapPlanner):
     def __init__(self, cell: CellSpec, candidates: str = "corners", item: str = "first", pick: str = "least_offset"):
         self.cell, self.candidates = cell, one_of("planner.candidates", candidates, CANDIDATES)
         self.item = one_of("planner.item", item, ("first", "nearest"))
-        self.pick = PICKS[one_of("planner.pick", pick, PICKS)]
+        self.pick = one_of("planner.pick", pick, PICKS)
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         if maps.bin_items > 1:
@@ -47,9 +47,7 @@ class IndividualHeuristic(MapPlanner):
             lifted = restrict_items(self.item, state, lifted.reshape(len(state.surface), -1))
             number = lifted.unflatten(1, (maps.bin_items, -1)).any(2).int().argmax(1)
             maps = maps.of_choice(cell, number * cell.num_footprints)[0]
-        pick = self.pick(cell, maps.item, maps.blocked)
-        footprint = select_pick(cell, action_footprints(cell, maps.item, maps.blocked), pick)
-        succeeds = select_pick(cell, action_mask(cell, maps), pick)
+        pick, footprint, succeeds = pick_first(cell, maps, self.pick)
         allowed = footprint >= 0
         if self.candidates == "corners":
             corners = corner_footprints(cell, state.heights, maps).flatten(1)

@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pickplace.planners.base import MapPlanner, check_item_rule, restrict_items
+from pickplace.planners.base import MapPlanner, check_item_rule, pick_first, restrict_items
 from pickplace.policies.base import Policy
 from pickplace.policies.fcn_grasp import FootprintPolicy, count_ways
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import check_bytes, excerpt, is_whole, one_of
-from pickplace.task.feasibility import PlacingMaps, action_footprints, action_mask, first_action_reaching, placing_maps
-from pickplace.task.grasps import PICKS, join_pick, select_pick
+from pickplace.task.feasibility import PlacingMaps, action_mask, first_action_reaching, placing_maps
+from pickplace.task.grasps import PICKS, join_pick
 from pickplace.task.state import Observation, State
 from pickplace.task.transition import apply
 
@@ -51,7 +51,7 @@ class PolicyPlanner(MapPlanner):
             if value != "any" and not (policy.ranks_footprints and candidates == "all"):
                 raise ValueError(
                     f"planner.{key}={value!r}: expected 'any', or planner.candidates=all and a checkpoint of "
-                    "model=fcn_grasp, corners or afterstate, with a mask."
+                    "model=fcn_grasp or corners that was trained with a mask."
                 )
         if pick != "any" and cell.bin_items > 1:
             raise ValueError(f"planner.pick={pick!r}: expected 'any' with env.bin_items={cell.bin_items}.")
@@ -87,9 +87,7 @@ class PolicyPlanner(MapPlanner):
     def _pick_first(self, policy: FootprintPolicy, maps: PlacingMaps, observation: Observation) -> Tensor:
         """Return the actions with a pick that does not look at the tote, int64 ``[N]``."""
         cell = policy.cell
-        pick = PICKS[self.pick](cell, maps.item, maps.blocked)
-        footprint = select_pick(cell, action_footprints(cell, maps.item, maps.blocked), pick)
-        succeeds = select_pick(cell, action_mask(cell, maps), pick)
+        pick, footprint, succeeds = pick_first(cell, maps, self.pick)
         reached = count_ways(cell.num_footprints, footprint, succeeds) > 0
         ranked = policy.ranked(maps) & reached
         mask = torch.where(ranked.any(1, keepdim=True), ranked, reached)
@@ -105,11 +103,15 @@ class PolicyPlanner(MapPlanner):
     def heat_map(self, observation: Observation) -> Tensor:
         """Return the policy's greatest probability over picks and rotations for each place cell, ``[N, W_T, D_T]``.
 
-        With ``candidates="all"`` only feasible actions count, as it chooses among those.
+        With ``candidates="all"`` only feasible actions count, as it chooses among those, and of a pick that is chosen
+        first only its own.
         """
         cell = self.cell
         score = self.policy.action_log_probs(observation).exp()
+        maps = placing_maps(cell, State.from_observation(observation))
         if self.candidates == "all":
-            feasible = action_mask(cell, placing_maps(cell, State.from_observation(observation)))
-            score = torch.where(feasible, score, 0.0)
-        return score.view(len(score), cell.num_picks, *cell.tote_size[:2], cell.rotations).amax((1, 4))
+            score = torch.where(action_mask(cell, maps), score, 0.0)
+        score = score.view(len(score), cell.num_picks, *cell.tote_size[:2], cell.rotations)
+        if self.pick != "any":
+            score = score[torch.arange(len(score)), PICKS[self.pick](cell, maps.item)][:, None]
+        return score.amax((1, 4))

@@ -27,7 +27,7 @@ class AfterstatePolicy(CornerPolicy):
     """
 
     map_keys = ("bin_depth", "tote_depth", "tote_height")
-    chooses_items = False
+    single_item = True
     learns_values = True
     score_index = None  # the value of a tote is scaled by its sides
     network: ToteValue  # type: ignore[assignment]

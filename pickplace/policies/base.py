@@ -54,7 +54,7 @@ class Policy(TensorDictModuleBase, ABC):
         map_keys: entries of the observation that its network reads.
         masks: masks that the environment must emit for training it, of ``"action"``, ``"footprint"`` and ``"corner"``.
         excludes: what :meth:`action_log_probs` gives probability 0 by construction; None if nothing.
-        chooses_items: whether it can choose among several items in a bin.
+        single_item: whether it judges one item in the bin, and cannot choose among several.
         ranks_footprints: whether it chooses among all footprints, by ``footprint_logits(observation, mask)``.
         learns_values: whether its network is the critic, and ``algo.loss=td`` trains it.
         needs_sizes: whether it cannot learn where :meth:`check_sizes` finds fault.
@@ -65,7 +65,7 @@ class Policy(TensorDictModuleBase, ABC):
     map_keys: tuple[str, ...] = DEPTH_KEYS
     masks: tuple[str, ...] = ()
     excludes: str | None = None
-    chooses_items = True
+    single_item = False
     ranks_footprints = False
     learns_values = False
     needs_sizes = False

@@ -155,7 +155,6 @@ class GraspPolicy(Policy):
 
     choice_key = "grasp"
     map_keys = MAP_KEYS
-    chooses_items = False
     scored: Tensor  # see `_scored`
 
     def __init__(self, cell: CellSpec, **network):

@@ -30,7 +30,6 @@ class PlaceRotationPolicy(Policy):
     """
 
     choice_key = "place_rotation"
-    chooses_items = False
     excludes: str | None = EXCLUDES
 
     @abstractmethod
@@ -107,7 +106,6 @@ class IndividualFootprintPolicy(FootprintPolicy):
 
     masks = ("action",)
     excludes = EXCLUDES
-    chooses_items = False
     ranks_footprints = False
 
     def __init__(self, cell: CellSpec, **network):

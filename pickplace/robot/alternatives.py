@@ -34,7 +34,7 @@ class Alternative:
 def list_alternatives(
     planner: MapPlanner, problem: Problem, observation: Observation, chosen: Tensor | None, count: int
 ) -> list[Alternative]:
-    """Return the most probable choices, in the order in which the planner prefers them."""
+    """Return the most probable choices, in the order in which its policy prefers them."""
     if count == 0 or not isinstance(planner, PolicyPlanner):
         return []
     cell, candidates = problem.cell, planner.candidates

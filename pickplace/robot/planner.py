@@ -285,11 +285,11 @@ def _check_choice(planner: MapPlanner, count: int, is_metric: bool) -> None:
             f"bin: got {count} items, expected one: the planner was made for a cell with bin_items=1; expected one "
             f"made with bin_items={count}, or its name."
         )
-    if policy is None or (policy.ranks_footprints and policy.chooses_items):
+    if policy is None or (policy.ranks_footprints and not policy.single_item):
         return
     name = type(policy).__name__
     others = "expected one item, or a checkpoint of model=fcn_grasp or corners that was trained with a mask"
-    if not policy.chooses_items:
+    if policy.single_item or policy.choice_key != "action":
         raise DepthMapError(f"bin: got {count} items, among which {name} does not choose; {others}.")
     if is_metric:
         raise DepthMapError(
