@@ -181,7 +181,7 @@ def test_many_kinds_are_refused():
 
 
 def test_a_real_cell_and_a_large_batch_are_accepted(tmp_path, monkeypatch):
-    """A bin of 60x40 and a tote of 120x80 cells; and the paper's cell, as a GPU trains it."""
+    """A bin of 60x40 and a tote of 120x80 cells; the paper's cell, as a GPU trains it; and values on a fine grid."""
     sizes = {"bin_size": (60, 40, 20), "tote_size": (120, 80, 60), "effector_size": (12, 8)}
     assert CellSpec(**sizes).num_actions == 92_160_000
     env = PickPlaceEnv(items=Kinds([(4, 3, 2)]), num_envs=2, masks=("footprint",), **sizes)
@@ -190,6 +190,7 @@ def test_a_real_cell_and_a_large_batch_are_accepted(tmp_path, monkeypatch):
     monkeypatch.setattr(Trainer, "_make_learner", lambda trainer: None)
     with pytest.raises(ValueError, match="GB; expected at most 0.8 GB"):
         Trainer(large, tmp_path)
+    Trainer(composed("experiment=afterstate", "benchmark=gopt_30", "env.num_envs=128"), tmp_path)
     monkeypatch.setenv(checks.MEMORY_VARIABLE, "40")
     Trainer(large, tmp_path)
 

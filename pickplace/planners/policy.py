@@ -12,7 +12,7 @@ from pickplace.policies.fcn_grasp import FootprintPolicy, count_ways
 from pickplace.task.cell import CellSpec
 from pickplace.task.checks import check_bytes, excerpt, is_whole, one_of
 from pickplace.task.feasibility import PlacingMaps, action_mask, first_action_reaching, placing_maps
-from pickplace.task.grasps import PICKS, join_pick
+from pickplace.task.grasps import PICKS, join_pick, select_pick
 from pickplace.task.state import Observation, State
 from pickplace.task.transition import apply
 
@@ -108,10 +108,9 @@ class PolicyPlanner(MapPlanner):
         """
         cell = self.cell
         score = self.policy.action_log_probs(observation).exp()
-        maps = placing_maps(cell, State.from_observation(observation))
         if self.candidates == "all":
+            maps = placing_maps(cell, State.from_observation(observation))
             score = torch.where(action_mask(cell, maps), score, 0.0)
-        score = score.view(len(score), cell.num_picks, *cell.tote_size[:2], cell.rotations)
-        if self.pick != "any":
-            score = score[torch.arange(len(score)), PICKS[self.pick](cell, maps.item)][:, None]
-        return score.amax((1, 4))
+            if self.pick != "any":
+                score = select_pick(cell, score, PICKS[self.pick](cell, maps.item, maps.blocked))
+        return score.view(len(score), -1, *cell.tote_size[:2], cell.rotations).amax((1, 4))

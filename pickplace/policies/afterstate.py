@@ -29,7 +29,7 @@ class AfterstatePolicy(CornerPolicy):
     map_keys = ("bin_depth", "tote_depth", "tote_height")
     single_item = True
     learns_values = True
-    score_index = None  # the value of a tote is scaled by its sides
+    score_index = None  # the network's pooling is exported for one size of tote only
     network: ToteValue  # type: ignore[assignment]
 
     def __init__(self, cell: CellSpec, temperature: float = 0.003, **network):

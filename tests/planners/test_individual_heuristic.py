@@ -11,7 +11,7 @@ from problems import late_state, occupancies, random_states
 from pickplace import CellSpec, Item, PickPlaceEnv, State
 from pickplace.planners.individual import IndividualHeuristic, corner_footprints
 from pickplace.task.feasibility import placing_maps
-from pickplace.task.grasps import all_grasps, central_pick, heuristic_pick
+from pickplace.task.grasps import PICKS, all_grasps
 from pickplace.task.items import Uniform
 from pickplace.task.state import Failure, surface_from
 from pickplace.task.transition import apply
@@ -72,7 +72,7 @@ def test_the_first_candidate_that_succeeds_is_played(candidates, rotations, tote
     cell, state = env.cell, env.state
     maps = placing_maps(cell, state)
     top, corners, each = maps.top, corner_footprints(cell, state.heights, maps), cell.num_places * rotations
-    first = (heuristic_pick if pick == "least_offset" else central_pick)(cell, state.item) * each
+    first = PICKS[pick](cell, state.item) * each
     steps = [apply(cell, state, first + n) for n in range(each)]
     failed, lies = (torch.stack([getattr(step, key) for step in steps], 1) for key in ("failure", "footprint"))
     chosen = IndividualHeuristic(cell, candidates, pick=pick).decide(observation) - first
