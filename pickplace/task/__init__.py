@@ -1,1 +1,0 @@
-"""The rules of picking and placing: torch and nothing else of pickplace."""
