@@ -46,7 +46,7 @@ test-extras: export OMP_NUM_THREADS ?= 1
 test-extras: $(STAMP)  ## install every optional extra (a gigabyte), and run the tests that need them
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,wandb,mlflow,optuna,joblib,submitit,ray,serve,onnx]'
 	$(BIN)/python -m pytest -q tests/runs/test_loggers.py tests/training/test_sweep.py tests/training/test_ray.py \
-	  tests/robot/test_serve.py tests/policies/test_export.py $(ARGS)
+	  tests/serve/test_serve.py tests/policies/test_export.py $(ARGS)
 
 test-slow: export OMP_NUM_THREADS ?= 2
 test-slow: $(STAMP)  ## run the tests marked slow (an hour)

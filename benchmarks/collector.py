@@ -12,8 +12,8 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
 
 from pickplace import PickPlaceEnv, State
-from pickplace.task.feasibility import actions_reaching, placing_maps
-from pickplace.task.observation import STANDARD_TERMS
+from pickplace.rules.masks import actions_reaching, placing_maps
+from pickplace.rules.observation import STANDARD_TERMS
 from pickplace.training.collectors import single
 from pickplace.training.curriculum import Current, Curriculum, NoAdvance
 

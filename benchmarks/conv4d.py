@@ -14,8 +14,8 @@ import torch.nn.functional as F
 from common import interleave, save, use_one_core
 
 from pickplace import PickPlaceEnv
-from pickplace.policies.fcn4d import FEW_PLACES, ActionPolicy
-from pickplace.policies.networks.depth import clip_depth, pad_depth
+from pickplace.policies.depth import clip_depth, pad_depth
+from pickplace.policies.fcn4d.policy import FEW_PLACES, ActionPolicy
 
 CASES = {"5x5 bin, 6x6 tote, batch 64": ((6, 6, 5), 64, 5), "5x5 bin, 30x30 tote, batch 1": ((30, 30, 5), 1, 5)}
 

@@ -10,8 +10,8 @@ from common import interleave, save, use_one_core
 
 from pickplace import PickPlaceEnv
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.fcn4d import ActionPolicy
-from pickplace.policies.fcn_grasp import FootprintPolicy
+from pickplace.policies.fcn4d.policy import ActionPolicy
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy
 
 TOTES = ((6, 6, 5), (10, 10, 10), (30, 30, 10))
 POLICIES = {

@@ -16,10 +16,10 @@ import torch
 
 from pickplace import PickPlaceEnv
 from pickplace.evaluation.statistics import confidence95
+from pickplace.rules.maps import NEVER
+from pickplace.rules.masks import footprint_mask, placing_maps
+from pickplace.rules.state import Item, State, surface_from
 from pickplace.runs.provenance import commit
-from pickplace.task.feasibility import footprint_mask, placing_maps
-from pickplace.task.maps import NEVER
-from pickplace.task.state import Item, State, surface_from
 
 
 def py3dbp(size, turns: bool):

@@ -12,8 +12,8 @@ from hydra import compose, initialize_config_dir
 from torchrl.envs import TransformedEnv
 
 from pickplace.policies.base import Policy
-from pickplace.policies.fcn4d import ActionPolicy
-from pickplace.policies.fcn_grasp import FootprintPolicy
+from pickplace.policies.fcn4d.policy import ActionPolicy
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.loggers import read_csv
 from pickplace.training.train import train

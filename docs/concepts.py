@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 
 from pickplace import CellSpec, Failure, Item, State
-from pickplace.task.grasps import join_action
-from pickplace.task.state import surface_from
-from pickplace.task.transition import apply
+from pickplace.rules.grasps import join_action
+from pickplace.rules.state import surface_from
+from pickplace.rules.step import apply
 
 INK, GREY, PAPER = "#263238", "#9aa3ab", "#eef1f3"
 ITEM, PLACED, BAD, GOOD = "#e69f00", "#a9d4ee", "#c2410c", "#2e7d32"

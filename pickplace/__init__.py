@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from pickplace.robot.camera import Camera
     from pickplace.robot.measure import Box, DepthMapError
     from pickplace.robot.planner import Plan, Planner
-    from pickplace.task.cell import CellSpec
-    from pickplace.task.state import Failure, Item, State
+    from pickplace.rules.cell import CellSpec
+    from pickplace.rules.state import Failure, Item, State
 
 gymnasium.register(
     "pickplace/PickPlace-v0",
@@ -35,14 +35,14 @@ __version__ = "0.1.0"
 _MODULES = {
     "Box": "robot.measure",
     "Camera": "robot.camera",
-    "CellSpec": "task.cell",
+    "CellSpec": "rules.cell",
     "DepthMapError": "robot.measure",
-    "Failure": "task.state",
-    "Item": "task.state",
+    "Failure": "rules.state",
+    "Item": "rules.state",
     "PickPlaceEnv": "envs.torchrl",
     "Plan": "robot.planner",
     "Planner": "robot.planner",
-    "State": "task.state",
+    "State": "rules.state",
     "load_policy": "policies.restore",
 }
 __all__ = [

@@ -26,8 +26,8 @@ def evaluate() -> None:
 
 
 def plan() -> None:
-    """Entry point of ``pickplace-plan``, see :mod:`pickplace.robot.json_lines`."""
-    _run("pickplace.robot.json_lines", "pickplace.robot.planner")
+    """Entry point of ``pickplace-plan``, see :mod:`pickplace.serve.json_lines`."""
+    _run("pickplace.serve.json_lines", "pickplace.robot.planner")
 
 
 def physics() -> None:
@@ -41,8 +41,8 @@ def export() -> None:
 
 
 def serve() -> None:
-    """Entry point of ``pickplace-serve``, see :mod:`pickplace.robot.serve`."""
-    _run("pickplace.robot.serve", "pickplace.robot.planner")
+    """Entry point of ``pickplace-serve``, see :mod:`pickplace.serve.serve`."""
+    _run("pickplace.serve.serve", "pickplace.robot.planner")
 
 
 def _run(module: str, *needed: str, config_name: str | None = None) -> None:

@@ -12,10 +12,10 @@ from oracle import SUCCESS, Oracle, Rules, cells, shape_cells
 from torchrl.envs.utils import step_mdp
 
 from pickplace import CellSpec, Item, PickPlaceEnv, State
+from pickplace.items.distributions import Uniform
 from pickplace.planners.heuristics import RandomFeasible
-from pickplace.task.cell import CELL_SETTINGS, Limits
-from pickplace.task.items import Uniform
-from pickplace.task.state import surface_from
+from pickplace.rules.cell import CELL_SETTINGS, Limits
+from pickplace.rules.state import surface_from
 
 SIDES, NEVER = st.integers(1, 4), st.just(False)
 

@@ -17,16 +17,16 @@ from commands import composed
 from omegaconf import OmegaConf
 
 import pickplace
+from pickplace.common.files import read_file, replaced_file
+from pickplace.config.errors import one_sentence
 from pickplace.evaluation import evaluate
 from pickplace.evaluation.evaluate import episode_settings, read_comparison
+from pickplace.items.distributions import Recorded
 from pickplace.robot import json_lines
+from pickplace.rules.observation import ToteDepth
 from pickplace.runs import checkpoint
-from pickplace.runs.errors import one_sentence
 from pickplace.runs.folder import changed_values, is_claimed, noted_config_folders, noted_overrides, refuse_links
 from pickplace.runs.resume import StopRequest, load_optimizer
-from pickplace.task.files import read_file, replaced_file
-from pickplace.task.items import Recorded
-from pickplace.task.observation import ToteDepth
 from pickplace.training import trainer
 from pickplace.training.train import resume_run
 

@@ -10,17 +10,18 @@ from commands import composed
 from omegaconf import OmegaConf
 
 from pickplace import CellSpec, PickPlaceEnv, Planner
+from pickplace.common import validate as checks
+from pickplace.common.validate import excerpt
+from pickplace.config import errors
+from pickplace.config.allowlist import MAX_DEPTH, MAX_NODES, MAX_TEXT, trusted_config
+from pickplace.config.references import saved_form
+from pickplace.config.registry import build
 from pickplace.evaluation.evaluate import prepare
+from pickplace.items.distributions import Kinds, Uniform
 from pickplace.planners.mcts import MCTS
-from pickplace.policies.fcn_grasp import FootprintPolicy
-from pickplace.policies.networks import footprint_fcn
-from pickplace.runs import checkpoint, errors
-from pickplace.runs.allowlist import MAX_DEPTH, MAX_NODES, MAX_TEXT, trusted_config
-from pickplace.runs.references import saved_form
-from pickplace.runs.registry import build
-from pickplace.task import checks
-from pickplace.task.checks import excerpt
-from pickplace.task.items import Kinds, Uniform
+from pickplace.policies.fcn_grasp import network as footprint_fcn
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy
+from pickplace.runs import checkpoint
 from pickplace.training.collectors import refuse_other_workers
 from pickplace.training.settings import check_settings
 from pickplace.training.trainer import Trainer

@@ -14,11 +14,11 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from pickplace import PickPlaceEnv, Planner, load_policy
+from pickplace.config.registry import build
 from pickplace.robot import json_lines
+from pickplace.rules.observation import STANDARD_TERMS
 from pickplace.runs import checkpoint
 from pickplace.runs.hydra_app import conf_dir
-from pickplace.runs.registry import build
-from pickplace.task.observation import STANDARD_TERMS
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "docs" / "examples"

@@ -4,12 +4,12 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from pickplace.config.registry import build
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.fcn_grasp import fcn_grasp
+from pickplace.policies.fcn_grasp.policy import fcn_grasp
 from pickplace.runs import checkpoint
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.provenance import commit, versions
-from pickplace.runs.registry import build
 
 
 def untrained_policy(cell, mask=True, seed=0):

@@ -1,0 +1,1 @@
+"""Learning algorithms: what a training does with a batch."""

@@ -12,17 +12,17 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from pickplace.common.validate import excerpt, whole_number
+from pickplace.config.allowlist import trusted_config
+from pickplace.config.registry import accepted_arguments, build, find
+from pickplace.items.distributions import ItemDistribution
 from pickplace.planners.base import BatchPlanner, decide, planner_parts
 from pickplace.policies.base import MASKED, Policy
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.observation import Term
+from pickplace.rules.state import State
+from pickplace.rules.step import apply
 from pickplace.runs import checkpoint
-from pickplace.runs.allowlist import trusted_config
-from pickplace.runs.registry import accepted_arguments, build, find
-from pickplace.task.cell import CellSpec
-from pickplace.task.checks import excerpt, whole_number
-from pickplace.task.items import ItemDistribution
-from pickplace.task.observation import Term
-from pickplace.task.state import State
-from pickplace.task.transition import apply
 
 
 class Phase(Enum):

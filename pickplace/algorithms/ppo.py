@@ -9,9 +9,9 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import A2CLoss, ClipPPOLoss
 from torchrl.objectives.value import GAE
 
+from pickplace.algorithms.imitation import Phase, imitation_loss
+from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS, as_sampled_actor
 from pickplace.policies.base import Policy, as_actor
-from pickplace.policies.sampled_softmax import CANDIDATE_KEYS, as_sampled_actor
-from pickplace.training.imitation import Phase, imitation_loss
 
 #: Logged diagnostics, by their names in the loss's output.
 DIAGNOSTICS = {

@@ -12,12 +12,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.modules import ValueOperator
 
+from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS
 from pickplace.policies.base import Policy
-from pickplace.policies.sampled_softmax import CANDIDATE_KEYS
-from pickplace.task.feasibility import footprint_mask, placing_maps
-from pickplace.task.observation import Term, observe
-from pickplace.task.state import Failure, Item, State
-from pickplace.task.transition import apply
+from pickplace.rules.masks import footprint_mask, placing_maps
+from pickplace.rules.observation import Term, observe
+from pickplace.rules.state import Failure, Item, State
+from pickplace.rules.step import apply
 
 
 @torch.no_grad()

@@ -1,0 +1,1 @@
+"""Validators, files and the machine; nothing else of pickplace."""

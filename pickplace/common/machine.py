@@ -4,7 +4,7 @@ import torch
 from loky import cpu_count
 from omegaconf import DictConfig
 
-from pickplace.task.checks import short_text, whole_number
+from pickplace.common.validate import short_text, whole_number
 
 
 def use_machine(cfg: DictConfig) -> torch.device:

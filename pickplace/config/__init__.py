@@ -1,0 +1,1 @@
+"""Configs: registry, composition, allowlist, errors."""

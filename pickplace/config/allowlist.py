@@ -10,9 +10,9 @@ from importlib.metadata import packages_distributions
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.runs.references import children, refusal, refuse_interpolations, select_groups
-from pickplace.runs.registry import names_at, qualified_names
-from pickplace.task.checks import excerpt
+from pickplace.common.validate import excerpt
+from pickplace.config.references import children, refusal, refuse_interpolations, select_groups
+from pickplace.config.registry import names_at, qualified_names
 
 #: Modules that are never a user's own: with their functions a config could do anything.
 RESERVED_MODULES = {"pickplace", "hydra", "numpy", "omegaconf", "tensordict", "torch", "torchrl"}

@@ -14,7 +14,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.task.checks import excerpt, short_text
+from pickplace.common.validate import excerpt, short_text
 
 
 class JobFailed(Exception):

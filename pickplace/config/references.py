@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.task.checks import excerpt, short_text
+from pickplace.common.validate import excerpt, short_text
 
 #: A reference to another key of the same config, and nothing else.
 REFERENCE = re.compile(r"\$\{(\.*)([A-Za-z_]\w*(?:\.\w+)*)\}")

@@ -16,8 +16,8 @@ from importlib import import_module
 
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.runs.errors import unknown_key
-from pickplace.task.checks import short_text
+from pickplace.common.validate import short_text
+from pickplace.config.errors import unknown_key
 
 PLANNERS = {
     "policy": "pickplace.planners.policy.PolicyPlanner",
@@ -37,31 +37,31 @@ PLANNERS = {
 REGISTRY: dict[str, dict[str, str]] = {
     "env": {"pick_place": "pickplace.envs.torchrl.PickPlaceEnv"},
     "env.observation.*": {
-        "bin_depth": "pickplace.task.observation.BinDepth",
-        "tote_depth": "pickplace.task.observation.ToteDepth",
-        "tote_bearing": "pickplace.task.observation.ToteBearing",
-        "tote_height": "pickplace.task.observation.ToteHeight",
+        "bin_depth": "pickplace.rules.observation.BinDepth",
+        "tote_depth": "pickplace.rules.observation.ToteDepth",
+        "tote_bearing": "pickplace.rules.observation.ToteBearing",
+        "tote_height": "pickplace.rules.observation.ToteHeight",
     },
-    "env.reach": {"annulus": "pickplace.task.reach.Annulus", "table": "pickplace.task.reach.ReachTable"},
+    "env.reach": {"annulus": "pickplace.rules.reach.Annulus", "table": "pickplace.rules.reach.ReachTable"},
     "items": {
-        "kinds": "pickplace.task.items.Kinds",
-        "uniform": "pickplace.task.items.Uniform",
-        "recorded": "pickplace.task.items.Recorded",
-        "cut": "pickplace.task.cuts.Cut",
+        "kinds": "pickplace.items.distributions.Kinds",
+        "uniform": "pickplace.items.distributions.Uniform",
+        "recorded": "pickplace.items.distributions.Recorded",
+        "cut": "pickplace.items.cut.Cut",
     },
     "model.actor": {
-        "fcn_grasp": "pickplace.policies.fcn_grasp.fcn_grasp",
-        "corners": "pickplace.policies.corners.corners",
-        "afterstate": "pickplace.policies.afterstate.afterstate",
-        "fcn4d": "pickplace.policies.fcn4d.ActionPolicy",
-        "typical": "pickplace.policies.fcn4d.TypicalPolicy",
-        "individual_rl": "pickplace.policies.individual.IndividualRlPolicy",
-        "individual_grasp": "pickplace.policies.individual.individual_grasp",
+        "fcn_grasp": "pickplace.policies.fcn_grasp.policy.fcn_grasp",
+        "corners": "pickplace.policies.corners.policy.corners",
+        "afterstate": "pickplace.policies.afterstate.policy.afterstate",
+        "fcn4d": "pickplace.policies.fcn4d.policy.ActionPolicy",
+        "typical": "pickplace.policies.fcn4d.policy.TypicalPolicy",
+        "individual_rl": "pickplace.policies.individual.policy.IndividualRlPolicy",
+        "individual_grasp": "pickplace.policies.individual.policy.individual_grasp",
     },
     "model.critic": {
-        "pooled": "pickplace.policies.networks.critics.pooled_critic",
-        "conv4d": "pickplace.policies.networks.critics.conv4d_critic",
-        "tote_value": "pickplace.policies.networks.tote_value.ToteValue",
+        "pooled": "pickplace.policies.critics.pooled_critic",
+        "conv4d": "pickplace.policies.critics.conv4d_critic",
+        "tote_value": "pickplace.policies.afterstate.network.ToteValue",
     },
     "curriculum": {"curriculum": "pickplace.training.curriculum.Curriculum"},
     "curriculum.advance": {

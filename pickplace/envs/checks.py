@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from pickplace.task.cell import HULL_RULES, CellSpec
-from pickplace.task.feasibility import footprint_mask, placing_maps
-from pickplace.task.grasps import available_offsets
-from pickplace.task.items import ItemDistribution
-from pickplace.task.state import EMPTY, Item, State
+from pickplace.items.distributions import ItemDistribution
+from pickplace.rules.cell import HULL_RULES, CellSpec
+from pickplace.rules.grasps import available_offsets
+from pickplace.rules.masks import footprint_mask, placing_maps
+from pickplace.rules.state import EMPTY, Item, State
 
 MAX_POSITIONS = 2_000_000  # of items in the bin, all kinds together, that are checked one by one
 

@@ -11,8 +11,8 @@ from gymnasium.vector.utils import batch_space
 from tensordict import TensorDict
 
 from pickplace.envs.torchrl import PickPlaceEnv
-from pickplace.task.items import Kinds, check_seed
-from pickplace.task.state import Failure
+from pickplace.items.distributions import Kinds, check_seed
+from pickplace.rules.state import Failure
 
 
 def _make_env(num_envs: int, items, settings: dict) -> PickPlaceEnv:

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from pickplace.envs.torchrl import PickPlaceEnv
+from pickplace.items.distributions import MAX_SEED
+from pickplace.rules.observation import observe, standard_terms
+from pickplace.rules.state import Item, State, bin_labels_from_items
 from pickplace.runs.checkpoint import CheckpointError
-from pickplace.task.items import MAX_SEED
-from pickplace.task.observation import observe, standard_terms
-from pickplace.task.state import Item, State, bin_labels_from_items
 
 
 def check_saved_states(env: PickPlaceEnv, collector: Mapping) -> None:

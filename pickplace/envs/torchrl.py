@@ -10,17 +10,18 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from pickplace.common.machine import usable_device
+from pickplace.common.validate import check_bytes, excerpt, one_of, whole_number
 from pickplace.envs.checks import check_items, problem_bytes
-from pickplace.runs.machine import usable_device
-from pickplace.task.bin import refill, remove_item
-from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
-from pickplace.task.checks import check_bytes, excerpt, one_of, whole_number
-from pickplace.task.corners import corner_mask
-from pickplace.task.feasibility import PlacingMaps, action_mask, choice_mask, placing_maps
-from pickplace.task.items import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
-from pickplace.task.observation import Term, check_terms, observe
-from pickplace.task.state import EMPTY, Failure, Item, State
-from pickplace.task.transition import apply
+from pickplace.items.arrival import refill
+from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
+from pickplace.rules.bin import remove_item
+from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
+from pickplace.rules.corners import corner_mask
+from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, placing_maps
+from pickplace.rules.observation import Term, check_terms, observe
+from pickplace.rules.state import EMPTY, Failure, Item, State
+from pickplace.rules.step import apply
 
 CACHE_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes
 
@@ -74,17 +75,17 @@ class PickPlaceEnv(EnvBase):
         ``truncated`` when the item stream has ended. ``failure``, int64 ``[N, 1]``, is a :class:`Failure`.
 
     Args:
-        items: an :class:`~pickplace.task.items.ItemDistribution`; by default the paper's four kinds.
+        items: an :class:`~pickplace.items.distributions.ItemDistribution`; by default the paper's four kinds.
         num_envs: ``N``.
         seed: seed of the item stream.
         device: where the tensors live.
         stream: family of item streams, ``"train"``, ``"validation"`` or ``"test"``; they never meet.
         masks: which masks to emit, any of ``"action"``, ``"footprint"`` and ``"corner"``.
-        observation: what the agent sees, :class:`~pickplace.task.observation.Term` by key; by default the four
+        observation: what the agent sees, :class:`~pickplace.rules.observation.Term` by key; by default the four
             terms above, which are always among them.
         first_episode: number of the episode that slot 0 plays first; slot ``i`` plays ``first_episode + i``.
         episode_stride: after an episode a slot plays the one that comes this much later; by default ``num_envs``.
-        **settings: sizes and options of the robot cell, see :class:`~pickplace.task.cell.CellSpec`.
+        **settings: sizes and options of the robot cell, see :class:`~pickplace.rules.cell.CellSpec`.
 
     Raises:
         ValueError: for impossible settings, among them a kind of item that has no feasible action on the empty tote
@@ -119,7 +120,7 @@ class PickPlaceEnv(EnvBase):
         items = Kinds(PAPER_KINDS) if items is None else items
         if not isinstance(items, ItemDistribution):
             raise ValueError(
-                f"items={excerpt(items)}: expected an ItemDistribution, such as pickplace.task.items.Kinds."
+                f"items={excerpt(items)}: expected an ItemDistribution, such as pickplace.items.distributions.Kinds."
             )
         check_items(cell, items)
         self.terms = check_terms(observation, cell.bin_items)

@@ -9,23 +9,23 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from pickplace.common.files import read_file, replaced_file
+from pickplace.common.machine import use_machine
+from pickplace.common.validate import excerpt, flag, is_name, is_number, whole_number
+from pickplace.config.allowlist import own_modules, trusted_config
+from pickplace.config.composition import PARTS_OF_ENV, keys_set_in_env, task_overrides
+from pickplace.config.errors import sentence
+from pickplace.config.registry import build
 from pickplace.evaluation.play import Episodes, MakeEnv, check_episode_settings, check_play, decision_latency, play
 from pickplace.evaluation.statistics import paired_difference, summarise, summarise_physics
 from pickplace.physics.plans import CELL_SIZE, PLANS, to_lines
 from pickplace.physics.recorded import motion_for_replay, plan_of
 from pickplace.planners.base import BatchPlanner, planner_parts
+from pickplace.rules.cell import CELL_SETTINGS, HULL_RULES, CellSpec
 from pickplace.runs import checkpoint
-from pickplace.runs.allowlist import own_modules, trusted_config
-from pickplace.runs.composition import PARTS_OF_ENV, keys_set_in_env, task_overrides
-from pickplace.runs.errors import sentence
 from pickplace.runs.folder import EVALUATION, claim, refuse_occupied
 from pickplace.runs.hydra_app import apply_overrides, command
-from pickplace.runs.machine import use_machine
 from pickplace.runs.provenance import commit, first_weights, imitated_planner, versions
-from pickplace.runs.registry import build
-from pickplace.task.cell import CELL_SETTINGS, HULL_RULES, CellSpec
-from pickplace.task.checks import excerpt, flag, is_name, is_number, whole_number
-from pickplace.task.files import read_file, replaced_file
 from pickplace.views.replay import animation, page, picture
 from pickplace.views.tables import evaluation_table
 

@@ -11,12 +11,12 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from pickplace.common.files import read_text
+from pickplace.config.allowlist import trusted_config
+from pickplace.config.errors import one_sentence
+from pickplace.config.registry import build, find
 from pickplace.policies.restore import build_cell
 from pickplace.runs import checkpoint
-from pickplace.runs.allowlist import trusted_config
-from pickplace.runs.errors import one_sentence
-from pickplace.runs.registry import build, find
-from pickplace.task.files import read_text
 
 CARD = "card.json"
 

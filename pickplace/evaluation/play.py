@@ -9,14 +9,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
+from pickplace.common.validate import check_bytes, one_of, whole_number
 from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import PickPlaceEnv
+from pickplace.items.distributions import check_seed
 from pickplace.planners.base import BatchPlanner, decide
-from pickplace.task.cell import CellSpec
-from pickplace.task.checks import check_bytes, one_of, whole_number
-from pickplace.task.feasibility import num_feasible, placing_maps
-from pickplace.task.items import check_seed
-from pickplace.task.state import Failure
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.masks import num_feasible, placing_maps
+from pickplace.rules.state import Failure
 from pickplace.views.recording import Recording, items_in_bin, record_moves
 
 #: ``make_env(first_episode, num_envs)`` makes the environment for a share of the episodes.

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pickplace.evaluation.play import Episodes
 from pickplace.physics.outcome import Outcome
-from pickplace.task.state import Failure
+from pickplace.rules.state import Failure
 
 
 def confidence95(values: Tensor, least: float = 0.0, most: float = 1.0) -> tuple[float, float]:

@@ -1,0 +1,1 @@
+"""Items: distributions, their streams, and the arrival in the bin."""

@@ -6,9 +6,9 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from pickplace.task.checks import one_of, size_tuple
-from pickplace.task.items import ItemDistribution, check_count, check_range, hashed_uniform, place_at_random
-from pickplace.task.state import Item
+from pickplace.common.validate import one_of, size_tuple
+from pickplace.items.distributions import ItemDistribution, check_count, check_range, hashed_uniform, place_at_random
+from pickplace.rules.state import Item
 
 #: Orders of arrival: CUT-1 and CUT-2.
 ORDERS = ("z", "stacking")

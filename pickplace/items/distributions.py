@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pickplace.task.checks import excerpt, flag, is_number, is_whole
-from pickplace.task.files import read_text
-from pickplace.task.state import Item
+from pickplace.common.files import read_text
+from pickplace.common.validate import excerpt, flag, is_number, is_whole
+from pickplace.rules.state import Item
 
 #: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
 STREAMS = ("train", "validation", "test")

@@ -3,7 +3,7 @@
 import argparse
 import json
 
-from pickplace.runs.errors import one_sentence, write_output
+from pickplace.config.errors import one_sentence, write_output
 
 
 def main() -> None:
@@ -17,8 +17,8 @@ def run(arguments: argparse.Namespace) -> None:
     from omegaconf import OmegaConf  # not before help is answered
     from yaml import YAMLError
 
+    from pickplace.config.registry import build
     from pickplace.physics.plans import read_plans
-    from pickplace.runs.registry import build
 
     for word in arguments.settings:
         key, equals, _ = word.partition("=")

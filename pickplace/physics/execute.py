@@ -7,11 +7,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from pickplace.common.validate import number
 from pickplace.physics.outcome import Loss
 from pickplace.physics.plans import TOLERANCE, EpisodePlan, Placement, Point
 from pickplace.physics.scene import STIFF, TIMESTEP, WALL, Scene, mujoco
 from pickplace.physics.simulation import Simulation, wait
-from pickplace.task.checks import number
 
 HEADROOM = 0.02  # distance between what is carried and the rims, m
 TURNING_SPEED = 4.0  # greatest speed of the hinge, rad/s

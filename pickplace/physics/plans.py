@@ -26,9 +26,9 @@ from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 
-from pickplace.task.cell import MAX_BIN_ITEMS
-from pickplace.task.checks import excerpt, is_number, is_whole
-from pickplace.task.files import read_text
+from pickplace.common.files import read_text
+from pickplace.common.validate import excerpt, is_number, is_whole
+from pickplace.rules.cell import MAX_BIN_ITEMS
 
 PLANS = "plans.jsonl"
 CELL_SIZE = 0.05  # side of a cell unless a robot cell says otherwise, m

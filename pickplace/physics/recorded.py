@@ -2,7 +2,7 @@
 
 from pickplace.physics.outcome import Outcome
 from pickplace.physics.plans import EpisodePlan, Placement, Point
-from pickplace.task.cell import CellSpec
+from pickplace.rules.cell import CellSpec
 from pickplace.views.motion import CarriedOut
 from pickplace.views.recording import Recording
 

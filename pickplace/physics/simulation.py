@@ -12,10 +12,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from pickplace.common.validate import flag, number, whole_number
 from pickplace.physics.outcome import Loss, Outcome
 from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement
 from pickplace.physics.scene import Scene, mujoco
-from pickplace.task.checks import flag, number, whole_number
 from pickplace.views.motion import Motion
 
 #: Linear and angular speeds below which an item is at rest; m/s and rad/s.

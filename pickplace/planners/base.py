@@ -8,16 +8,16 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
+from pickplace.common.validate import one_of
+from pickplace.config.errors import sentence
+from pickplace.config.registry import find
+from pickplace.items.distributions import ItemDistribution
 from pickplace.policies.restore import restore_critic, restore_policy
-from pickplace.runs.errors import sentence
-from pickplace.runs.registry import find
-from pickplace.task.cell import CellSpec
-from pickplace.task.checks import one_of
-from pickplace.task.feasibility import PlacingMaps, action_footprints, action_mask, placing_maps
-from pickplace.task.grasps import PICKS, select_pick
-from pickplace.task.items import ItemDistribution
-from pickplace.task.observation import Term
-from pickplace.task.state import Observation, State
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.grasps import PICKS, select_pick
+from pickplace.rules.masks import PlacingMaps, action_footprints, action_mask, placing_maps
+from pickplace.rules.observation import Term
+from pickplace.rules.state import Observation, State
 
 
 @runtime_checkable
@@ -109,7 +109,7 @@ def pick_first(cell: CellSpec, maps: PlacingMaps, rule: str) -> tuple[Tensor, Te
 
     Args:
         maps: of one item in each bin.
-        rule: a key of :data:`~pickplace.task.grasps.PICKS`.
+        rule: a key of :data:`~pickplace.rules.grasps.PICKS`.
 
     Returns:
         the pick cell, int64 ``[N]``; and of every place and rotation, ``[N, W_T * D_T * R]``, the item's footprint,

@@ -5,20 +5,20 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
+from pickplace.common.validate import number
+from pickplace.items.distributions import check_seed
 from pickplace.planners.base import MapPlanner, check_item_rule, restrict_items
-from pickplace.task.cell import CellSpec
-from pickplace.task.checks import number
-from pickplace.task.feasibility import (
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.maps import FAR, rectangle_sums
+from pickplace.rules.masks import (
     PlacingMaps,
     action_mask,
     actions_reaching,
     choice_mask,
     first_action_reaching,
 )
-from pickplace.task.items import check_seed
-from pickplace.task.maps import FAR, rectangle_sums
-from pickplace.task.placing import footprint_sizes
-from pickplace.task.state import Observation, State
+from pickplace.rules.placing import footprint_sizes
+from pickplace.rules.state import Observation, State
 
 
 def dbl_order(cell: CellSpec, top: Tensor, x: Tensor, y: Tensor) -> Tensor:

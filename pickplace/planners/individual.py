@@ -3,14 +3,14 @@
 import torch
 from torch import Tensor
 
+from pickplace.common.validate import one_of
 from pickplace.planners.base import MapPlanner, pick_first, restrict_items
 from pickplace.planners.heuristics import dbl_order
-from pickplace.task.cell import CellSpec
-from pickplace.task.checks import one_of
-from pickplace.task.feasibility import PlacingMaps
-from pickplace.task.grasps import PICKS, all_grasps, join_pick, split_footprint
-from pickplace.task.maps import FAR
-from pickplace.task.state import Observation, State
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.grasps import PICKS, all_grasps, join_pick, split_footprint
+from pickplace.rules.maps import FAR
+from pickplace.rules.masks import PlacingMaps
+from pickplace.rules.state import Observation, State
 
 CANDIDATES = ("corners", "cells")
 
@@ -30,7 +30,7 @@ class IndividualHeuristic(MapPlanner):
         candidates: ``"corners"``, or ``"cells"`` for every footprint.
         item: which item is the first: ``"first"``, the one that arrived first, or ``"nearest"``, the one nearest to the
             bin's origin.
-        pick: which pick of it: ``"least_offset"``, the paper's (:func:`~pickplace.task.grasps.heuristic_pick`), or
+        pick: which pick of it: ``"least_offset"``, the paper's (:func:`~pickplace.rules.grasps.heuristic_pick`), or
             ``"middle"``, the one nearest to the middle of the item.
     """
 

@@ -3,18 +3,19 @@
 import torch
 from torch import Tensor
 
+from pickplace.common.validate import check_bytes, number, whole_number
+from pickplace.items.arrival import refill
+from pickplace.items.distributions import ItemDistribution, Kinds, check_seed, search_items
 from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import MASKED
-from pickplace.policies.fcn_grasp import FootprintPolicy
-from pickplace.task.bin import refill, remove_item, select_item
-from pickplace.task.cell import CellSpec
-from pickplace.task.checks import check_bytes, number, whole_number
-from pickplace.task.feasibility import PlacingMaps, first_action_reaching, placing_maps
-from pickplace.task.items import ItemDistribution, Kinds, check_seed, search_items
-from pickplace.task.observation import STANDARD_TERMS, observe
-from pickplace.task.placing import unchecked_top
-from pickplace.task.state import Item, Observation, State
-from pickplace.task.transition import put_down
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy
+from pickplace.rules.bin import remove_item, select_item
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
+from pickplace.rules.observation import STANDARD_TERMS, observe
+from pickplace.rules.placing import unchecked_top
+from pickplace.rules.state import Item, Observation, State
+from pickplace.rules.step import put_down
 
 
 class Lookahead(MapPlanner):

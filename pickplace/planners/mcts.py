@@ -7,16 +7,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pickplace.common.validate import flag, number, whole_number
+from pickplace.items.arrival import refill
+from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner
-from pickplace.task.bin import refill, remove_item, select_item
-from pickplace.task.cell import CellSpec
-from pickplace.task.checks import flag, number, whole_number
-from pickplace.task.feasibility import PlacingMaps, action_mask, choice_mask, first_action_reaching, placing_maps
-from pickplace.task.items import ItemDistribution, check_seed, search_items
-from pickplace.task.observation import standard_terms
-from pickplace.task.placing import unchecked_top
-from pickplace.task.state import Item, Observation, State
-from pickplace.task.transition import apply, put_down
+from pickplace.rules.bin import remove_item, select_item
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, first_action_reaching, placing_maps
+from pickplace.rules.observation import standard_terms
+from pickplace.rules.placing import unchecked_top
+from pickplace.rules.state import Item, Observation, State
+from pickplace.rules.step import apply, put_down
 
 MAX_NODES = 1_000_000  # of all trees of a decision
 

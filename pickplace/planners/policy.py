@@ -6,15 +6,15 @@ import torch
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from pickplace.common.validate import check_bytes, excerpt, is_whole, one_of
 from pickplace.planners.base import MapPlanner, check_item_rule, pick_first, restrict_items
 from pickplace.policies.base import Policy
-from pickplace.policies.fcn_grasp import FootprintPolicy, count_ways
-from pickplace.task.cell import CellSpec
-from pickplace.task.checks import check_bytes, excerpt, is_whole, one_of
-from pickplace.task.feasibility import PlacingMaps, action_mask, first_action_reaching, placing_maps
-from pickplace.task.grasps import PICKS, join_pick, select_pick
-from pickplace.task.state import Observation, State
-from pickplace.task.transition import apply
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy, count_ways
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.grasps import PICKS, join_pick, select_pick
+from pickplace.rules.masks import PlacingMaps, action_mask, first_action_reaching, placing_maps
+from pickplace.rules.state import Observation, State
+from pickplace.rules.step import apply
 
 
 class PolicyPlanner(MapPlanner):

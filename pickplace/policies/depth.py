@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pickplace.task.state import Item
+from pickplace.rules.state import Item
 
 
 class Contents(NamedTuple):

@@ -2,7 +2,7 @@
 
 import argparse
 
-from pickplace.runs.errors import one_sentence, write_output
+from pickplace.config.errors import one_sentence, write_output
 
 
 def main() -> None:

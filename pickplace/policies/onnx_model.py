@@ -11,11 +11,11 @@ from torch import Tensor
 from torch.export import Dim
 
 import pickplace
+from pickplace.common.files import replaced_file
+from pickplace.common.validate import short_text
 from pickplace.policies.base import Policy
 from pickplace.policies.restore import TrainedPolicy, load_policy
-from pickplace.task.cell import CELL_SETTINGS
-from pickplace.task.checks import short_text
-from pickplace.task.files import replaced_file
+from pickplace.rules.cell import CELL_SETTINGS
 
 TOLERANCE = 1e-5  # greatest difference between onnxruntime and torch, as a share of the greatest score
 #: Cells by which the totes, and the bins, of the check are larger than those of the training.

@@ -14,16 +14,16 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from pickplace.common.machine import usable_device
+from pickplace.config.allowlist import trusted_config
+from pickplace.config.registry import build
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
 from pickplace.policies.base import Policy, as_collection_policy, as_critic
+from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
+from pickplace.rules.masks import placing_maps
+from pickplace.rules.observation import Term, check_terms
+from pickplace.rules.state import Observation, State
 from pickplace.runs import checkpoint
-from pickplace.runs.allowlist import trusted_config
-from pickplace.runs.machine import usable_device
-from pickplace.runs.registry import build
-from pickplace.task.cell import CELL_SETTINGS, CellSpec, cell_from_settings
-from pickplace.task.feasibility import placing_maps
-from pickplace.task.observation import Term, check_terms
-from pickplace.task.state import Observation, State
 
 SIZES = ("effector_size", "bin_size", "tote_size", "body", "cup", "cup_size", "pick_rule", "min_seal")
 
@@ -127,7 +127,7 @@ def build_cell(env: dict, **given) -> CellSpec:
         **given: settings of the cell that replace them, made already.
 
     Raises:
-        ValueError: as of :func:`~pickplace.runs.registry.build` and of the cell.
+        ValueError: as of :func:`~pickplace.config.registry.build` and of the cell.
     """
     env = {"support": "half"} | env
     own = {key: env[key] for key in CELL_SETTINGS if key in env and key not in given}
@@ -142,7 +142,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
         device: where to compute, ``"cpu"`` or ``"cuda"``.
         trust: your own modules whose classes the checkpoint's config may name.
         **sizes: settings that differ from the training's, such as ``tote_size=(30, 30, 10)``; see
-            :class:`~pickplace.task.cell.CellSpec`. A fully convolutional policy serves any bin and tote, and any
+            :class:`~pickplace.rules.cell.CellSpec`. A fully convolutional policy serves any bin and tote, and any
             end effector if it was trained with a mask.
 
     Raises:

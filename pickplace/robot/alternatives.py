@@ -9,9 +9,9 @@ from pickplace.planners.base import MapPlanner
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy
 from pickplace.robot.problem import Problem
-from pickplace.task.feasibility import action_footprints, action_mask
-from pickplace.task.grasps import split_action
-from pickplace.task.state import Failure, Observation
+from pickplace.rules.grasps import split_action
+from pickplace.rules.masks import action_footprints, action_mask
+from pickplace.rules.state import Failure, Observation
 
 MAX_ALTERNATIVES = 100_000  # greatest number of choices that a plan may report
 

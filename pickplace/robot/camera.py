@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from pickplace.robot.measure import MAX_PATCHES, SNAPPED, Box, DepthMapError, HiddenBox, is_inside, smallest_rectangle
-from pickplace.task.cell import CellSpec
+from pickplace.rules.cell import CellSpec
 
 #: Greatest share of a tote that the camera may not see.
 MOST_UNSEEN = 0.25

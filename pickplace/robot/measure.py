@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pickplace.task.cell import MAX_BIN_ITEMS
-from pickplace.task.checks import excerpt, is_number
+from pickplace.common.validate import excerpt, is_number
+from pickplace.rules.cell import MAX_BIN_ITEMS
 
 #: A length is taken for the whole number of units that it is so close to: three cells of 0.05 m are not exactly 0.15 m
 #: in binary fractions.

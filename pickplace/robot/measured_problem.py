@@ -28,14 +28,14 @@ from pickplace.robot.measure import (
     whole_units,
 )
 from pickplace.robot.problem import Problem, check_longest, check_tote_height, join_items, read_bearing
-from pickplace.task.bin import taken_item
-from pickplace.task.cell import MAX_SIDE, CellSpec, Limits, effector_centre, reference_cell
-from pickplace.task.feasibility import PlacingMaps, footprint_mask
-from pickplace.task.grasps import carry, footprint_index
-from pickplace.task.maps import FAR
-from pickplace.task.measured import MeasuredMaps, MeasuredTote, bearing_after, failures, floor_height, measured_maps
-from pickplace.task.placing import is_within_reach
-from pickplace.task.state import Item, State, surface_from
+from pickplace.rules.bin import taken_item
+from pickplace.rules.cell import MAX_SIDE, CellSpec, Limits, effector_centre, reference_cell
+from pickplace.rules.grasps import carry, footprint_index
+from pickplace.rules.maps import FAR
+from pickplace.rules.masks import PlacingMaps, footprint_mask
+from pickplace.rules.measured import MeasuredMaps, MeasuredTote, bearing_after, failures, floor_height, measured_maps
+from pickplace.rules.placing import is_within_reach
+from pickplace.rules.state import Item, State, surface_from
 
 
 @dataclass(frozen=True, kw_only=True)

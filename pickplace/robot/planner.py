@@ -15,6 +15,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from pickplace.common.validate import excerpt, is_whole
+from pickplace.config.registry import build, find
+from pickplace.items.distributions import ItemDistribution
 from pickplace.planners.base import MapPlanner, decide
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy
@@ -25,12 +28,9 @@ from pickplace.robot.measure import Box, DepthMapError, checked_number
 from pickplace.robot.measured_problem import read_metric
 from pickplace.robot.problem import Pose, Problem, check_tote_height, read_grid
 from pickplace.robot.training import Training
-from pickplace.runs.registry import build, find
-from pickplace.task.cell import CellSpec
-from pickplace.task.checks import excerpt, is_whole
-from pickplace.task.items import ItemDistribution
-from pickplace.task.observation import Term, check_terms, observe
-from pickplace.task.state import Failure, Observation
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.observation import Term, check_terms, observe
+from pickplace.rules.state import Failure, Observation
 
 __all__ = ["Alternative", "Box", "DepthMapError", "Plan", "Planner", "Pose"]
 

@@ -14,13 +14,13 @@ from pickplace.robot.measure import (
     labels_of_map,
     whole_map,
 )
-from pickplace.task.bin import select_item, taken_item
-from pickplace.task.cell import MAX_SIDE, CellSpec, effector_centre
-from pickplace.task.feasibility import PlacingMaps, footprint_mask, placing_maps
-from pickplace.task.grasps import split_action
-from pickplace.task.maps import FAR
-from pickplace.task.state import EMPTY, Item, State, item_from_depth, surface_from
-from pickplace.task.transition import apply
+from pickplace.rules.bin import select_item, taken_item
+from pickplace.rules.cell import MAX_SIDE, CellSpec, effector_centre
+from pickplace.rules.grasps import split_action
+from pickplace.rules.maps import FAR
+from pickplace.rules.masks import PlacingMaps, footprint_mask, placing_maps
+from pickplace.rules.state import EMPTY, Item, State, item_from_depth, surface_from
+from pickplace.rules.step import apply
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
+from pickplace.items.distributions import ItemDistribution
 from pickplace.policies.restore import build_cell
-from pickplace.task.cell import CellSpec
-from pickplace.task.items import ItemDistribution
-from pickplace.task.state import Item
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.state import Item
 
 #: Options of the cell that are no sizes; a policy should meet its own.
 RULES = ("support", "body", "cup", "cup_size", "pick_rule", "min_seal")

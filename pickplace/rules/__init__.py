@@ -1,0 +1,1 @@
+"""The rules of picking and placing: torch, and nothing else of pickplace but ``common``."""

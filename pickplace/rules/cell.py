@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.checks import excerpt, is_number, is_whole, number, one_of, short_text, size_tuple, whole_number
-from pickplace.task.effector import (
+from pickplace.common.validate import excerpt, is_number, is_whole, number, one_of, short_text, size_tuple, whole_number
+from pickplace.rules.effector import (
     Box,
     Mask,
     boxes,
@@ -151,7 +151,7 @@ class CellSpec:
             must be cells of the body.
         cup_size: ``(w, d)`` of the cup, in the middle of the body; None: ``effector_size``. None with a mask.
         min_seal: with ``pick_rule="seal"``: least share of the cup's cells that must lie on the item, above 0.
-        reach: of the robot, such as :class:`~pickplace.task.reach.Annulus`; None: it reaches everything.
+        reach: of the robot, such as :class:`~pickplace.rules.reach.Annulus`; None: it reaches everything.
         bin_items: ``M``, how many items a bin holds at most.
         refill: of several items: a new one arrives after ``"each"`` pick, or a ``"batch"`` when the bin is empty.
         longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and unless an

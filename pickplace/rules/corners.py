@@ -9,9 +9,9 @@ container loading algorithms", have both terms).
 
 from torch import Tensor
 
-from pickplace.task.cell import CellSpec
-from pickplace.task.feasibility import PlacingMaps, footprint_mask
-from pickplace.task.maps import FAR
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.maps import FAR
+from pickplace.rules.masks import PlacingMaps, footprint_mask
 
 
 def corner_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:

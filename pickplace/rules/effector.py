@@ -6,7 +6,7 @@ A mask is a tuple of columns, ``mask[x][y]``, of 0 and 1. Plain integers: no ten
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from pickplace.task.checks import excerpt
+from pickplace.common.validate import excerpt
 
 Mask = tuple[tuple[int, ...], ...]
 

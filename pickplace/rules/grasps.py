@@ -13,10 +13,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.cell import CellSpec, reference_cell
-from pickplace.task.maps import FAR
-from pickplace.task.placing import is_within_reach
-from pickplace.task.state import Item
+from pickplace.rules.cell import CellSpec, reference_cell
+from pickplace.rules.maps import FAR
+from pickplace.rules.placing import is_within_reach
+from pickplace.rules.state import Item
 
 
 # ---------------------------------------------------------------------- the checks of a pick, one function each
@@ -100,7 +100,7 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | No
     Args:
         item: parts ``[N]``; the batch is the last axis.
         x, y: tensors that broadcast with ``[..., N]``.
-        blocked: bool ``[N, P]``, see :func:`~pickplace.task.bin.blocked_picks`; None: the item lies alone.
+        blocked: bool ``[N, P]``, see :func:`~pickplace.rules.bin.blocked_picks`; None: the item lies alone.
     """
     (bin_w, bin_d, wall), (ee_w, ee_d) = cell.bin_size, cell.effector_size
     left, front = x - reference_cell(ee_w), y - reference_cell(ee_d)  # the end effector's minimum corner

@@ -1,6 +1,6 @@
 """The placements of large items on fine grids: what an item rests on, and which cells hold it.
 
-:mod:`~pickplace.task.placing` looks at each cell of the square under an item, for all footprints at once. That is
+:mod:`~pickplace.rules.placing` looks at each cell of the square under an item, for all footprints at once. That is
 fastest for items of a few cells. Here the work grows with the side of the square instead of its area: the greatest
 height under a rectangle is a maximum along one axis, then along the other; and for each height in a tote tables are
 made of the cells that have it, in which a row of any footprint is looked up.
@@ -11,10 +11,10 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from pickplace.task.cell import HULL_RULES, CellSpec
-from pickplace.task.maps import FAR, NEVER, rectangle_sums, surround
-from pickplace.task.state import surface_from
-from pickplace.task.support import Rows, is_stable
+from pickplace.rules.cell import HULL_RULES, CellSpec
+from pickplace.rules.maps import FAR, NEVER, rectangle_sums, surround
+from pickplace.rules.state import surface_from
+from pickplace.rules.support import Rows, is_stable
 
 LEAST_SIDE = 8  # of the square; from there on this way is faster
 MAX_ENTRIES = 2**22  # of a table; more problems are looked at in turn

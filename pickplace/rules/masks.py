@@ -1,8 +1,8 @@
 """Masks: which actions succeed, and which footprints some action reaches.
 
 Symbols used in shapes: ``N`` problems, ``P`` pick cells, ``R`` rotations, ``Q`` parities of a rotation, ``K`` offsets
-of the item under the end effector, ``T`` turns and ``T * K`` grasp classes (see :mod:`pickplace.task.grasps`), ``B``
-distinct shapes of the turned end effector (see :attr:`pickplace.task.cell.CellSpec.effectors`).
+of the item under the end effector, ``T`` turns and ``T * K`` grasp classes (see :mod:`pickplace.rules.grasps`), ``B``
+distinct shapes of the turned end effector (see :attr:`pickplace.rules.cell.CellSpec.effectors`).
 
 Two ideas keep the joint feasibility of all ``N_a = P * W_T * D_T * R`` actions cheap. The bin matters only through the
 grasp class. And the end effector collides if and only if the highest thing under it, the rim counting as a wall around
@@ -16,10 +16,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.bin import blocked_picks
-from pickplace.task.cell import CellSpec, Limits
-from pickplace.task.checks import check_bytes
-from pickplace.task.grasps import (
+from pickplace.common.validate import check_bytes
+from pickplace.rules.bin import blocked_picks
+from pickplace.rules.cell import CellSpec, Limits
+from pickplace.rules.grasps import (
     all_grasps,
     available_offsets,
     footprint_index,
@@ -31,9 +31,9 @@ from pickplace.task.grasps import (
     split_footprint,
     turned_size,
 )
-from pickplace.task.maps import FAR, NEVER, surround, windows
-from pickplace.task.placing import clearance, is_within_reach, resting_top, unchecked_top
-from pickplace.task.state import Item, State
+from pickplace.rules.maps import FAR, NEVER, surround, windows
+from pickplace.rules.placing import clearance, is_within_reach, resting_top, unchecked_top
+from pickplace.rules.state import Item, State
 
 CLASS_BYTES = 2**28  # of the masks of grasp classes that are held at a time
 
@@ -320,7 +320,7 @@ def action_footprints(cell: CellSpec, item: Item, blocked: Tensor | None = None)
     Args:
         cell: the sizes.
         item: ``[N]``, or ``[N, M]`` in bins with several items.
-        blocked: as :func:`~pickplace.task.bin.blocked_picks` has it, which is asked for several items.
+        blocked: as :func:`~pickplace.rules.bin.blocked_picks` has it, which is asked for several items.
     """
     tote_w, tote_d, _ = cell.tote_size
     if item.x.dim() == 2:

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.cell import HULL_RULES, CellSpec
-from pickplace.task.feasibility import PlacingMaps
-from pickplace.task.grasps import carry, footprint_index, is_clear, is_outside, split_action
-from pickplace.task.maps import FAR, NEVER
-from pickplace.task.placing import clearance, footprint_cells, footprint_sizes, is_within_reach, overflows, rest
-from pickplace.task.state import Failure, Item, State, surface_from
-from pickplace.task.support import is_share_enough
+from pickplace.rules.cell import HULL_RULES, CellSpec
+from pickplace.rules.grasps import carry, footprint_index, is_clear, is_outside, split_action
+from pickplace.rules.maps import FAR, NEVER
+from pickplace.rules.masks import PlacingMaps
+from pickplace.rules.placing import clearance, footprint_cells, footprint_sizes, is_within_reach, overflows, rest
+from pickplace.rules.state import Failure, Item, State, surface_from
+from pickplace.rules.support import is_share_enough
 
 DIRECTIONS = 128  # in which the hull of what supports an item is looked at
 #: Least distance of an item's centre from the hull's edge, in patches: as far as a patch may be covered in part.

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.cell import CellSpec
-from pickplace.task.checks import excerpt, short_text
-from pickplace.task.state import State, bin_depth_from_item, bin_labels_from_items, depth_from_heights
+from pickplace.common.validate import excerpt, short_text
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.state import State, bin_depth_from_item, bin_labels_from_items, depth_from_heights
 
 
 class Bounds(NamedTuple):
@@ -172,7 +172,9 @@ def check_terms(terms: Mapping[str, Term] | None, bin_items: int = 1) -> dict[st
     for key, term in terms.items():
         place = f"observation.{short_text(key)}"
         if not isinstance(term, Term):
-            raise ValueError(f"{place}={excerpt(term)}: expected a Term, such as pickplace.task.observation.ToteDepth.")
+            raise ValueError(
+                f"{place}={excerpt(term)}: expected a Term, such as pickplace.rules.observation.ToteDepth."
+            )
         if not isinstance(key, str) or key in RESERVED or not key.isidentifier():
             raise ValueError(f"{place}: expected another name; taken are {', '.join(RESERVED)}.")
     for key, term in standard.items():

@@ -1,6 +1,6 @@
 """Placing: how high an item rests on a footprint, whether it is stable there, and what the end effector must clear.
 
-Surfaces, see :func:`~pickplace.task.state.surface_from`, are halved where heights are needed.
+Surfaces, see :func:`~pickplace.rules.state.surface_from`, are halved where heights are needed.
 """
 
 from collections.abc import Sequence
@@ -9,11 +9,11 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from pickplace.task import large_items
-from pickplace.task.cell import CellSpec
-from pickplace.task.maps import FAR, NEVER, is_under, surround, windows
-from pickplace.task.state import Item, State, surface_from
-from pickplace.task.support import is_supported
+from pickplace.rules import large_items
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.maps import FAR, NEVER, is_under, surround, windows
+from pickplace.rules.state import Item, State, surface_from
+from pickplace.rules.support import is_supported
 
 
 # ---------------------------------------------------------------------- the checks of a placement, one function each
@@ -38,7 +38,7 @@ def overflows(top: Tensor, tote_height: Tensor) -> Tensor:
 
 
 def is_within_reach(lowest: Tensor, highest: Tensor, top: Tensor) -> Tensor:
-    """Return whether the robot may bring an item's top to that height, see :class:`~pickplace.task.cell.Limits`."""
+    """Return whether the robot may bring an item's top to that height, see :class:`~pickplace.rules.cell.Limits`."""
     return (lowest <= top) & (top <= highest)
 
 
@@ -95,7 +95,7 @@ def clearance(cell: CellSpec, state: State) -> Tensor:
     """Return the least top at which the end effector hits nothing, per shape and place cell.
 
     That is the highest tote cell under the end effector; where it leaves the tote, the rim. The result is int32
-    ``[N, B, W_T, D_T]``, for each of :attr:`~pickplace.task.cell.CellSpec.effectors`.
+    ``[N, B, W_T, D_T]``, for each of :attr:`~pickplace.rules.cell.CellSpec.effectors`.
     """
     (tote_w, tote_d, _), surface = cell.tote_size, state.surface
     maps = surface.new_empty(len(cell.effectors), tote_w, tote_d, len(surface))

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from pickplace.task.cell import CellSpec, Limits, Reach, effector_centre
-from pickplace.task.checks import excerpt, is_number
-from pickplace.task.files import read_text
-from pickplace.task.maps import FAR, NEVER
+from pickplace.common.files import read_text
+from pickplace.common.validate import excerpt, is_number
+from pickplace.rules.cell import CellSpec, Limits, Reach, effector_centre
+from pickplace.rules.maps import FAR, NEVER
 
 #: Greatest coordinate, in sides of a cell, and greatest size of a table, in bytes.
 MAX_COORDINATE, MAX_TEXT = 1e5, 100_000_000

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pickplace.task.maps import rectangle
+from pickplace.rules.maps import rectangle
 
 EMPTY = 1  # surface of an empty tote, see `surface_from`
 

@@ -6,10 +6,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.task.bin import blocked_picks, select_item, taken_item
-from pickplace.task.cell import CellSpec, EffectorShape
-from pickplace.task.feasibility import PlacingMaps
-from pickplace.task.grasps import (
+from pickplace.rules.bin import blocked_picks, select_item, taken_item
+from pickplace.rules.cell import CellSpec, EffectorShape
+from pickplace.rules.grasps import (
     carry,
     footprint_index,
     is_clear,
@@ -18,10 +17,11 @@ from pickplace.task.grasps import (
     split_footprint,
     turned_size,
 )
-from pickplace.task.maps import is_under, rectangle, square_cells, squares
-from pickplace.task.placing import is_within_reach, overflows, rest
-from pickplace.task.state import Failure, Item, State, surface_from
-from pickplace.task.support import bearing_cells, is_supported
+from pickplace.rules.maps import is_under, rectangle, square_cells, squares
+from pickplace.rules.masks import PlacingMaps
+from pickplace.rules.placing import is_within_reach, overflows, rest
+from pickplace.rules.state import Failure, Item, State, surface_from
+from pickplace.rules.support import bearing_cells, is_supported
 
 
 class Step(NamedTuple):

@@ -20,8 +20,8 @@ from math import gcd
 import torch
 from torch import Tensor
 
-from pickplace.task.cell import HULL_RULES, CellSpec
-from pickplace.task.state import surface_from
+from pickplace.rules.cell import HULL_RULES, CellSpec
+from pickplace.rules.state import surface_from
 
 BITS = 32  # normals in a word of a pattern
 LEAST_SUPPORT: dict = {"half": 0.5, "full": 1.0, "corners": 0.95}  # share of the footprint that suffices alone

@@ -19,8 +19,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from pickplace.task.checks import excerpt
-from pickplace.task.files import read_file
+from pickplace.common.files import read_file
+from pickplace.common.validate import excerpt
 
 SCHEMA = 1
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"  # weights that the package ships

@@ -13,8 +13,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.runs.references import REFERENCE, children
-from pickplace.task.files import read_file
+from pickplace.common.files import read_file
+from pickplace.config.references import REFERENCE, children
 
 LOCK = ".lock"  # held by the process that trains in the folder
 FAILURE = "failure.txt"  # the error of a failed run of a sweep

@@ -17,7 +17,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.runs.composition import (
+from pickplace.common.files import replaced_file
+from pickplace.config.composition import (
     compose_for_hint,
     conf_dir,
     constant_keys,
@@ -25,7 +26,8 @@ from pickplace.runs.composition import (
     list_options,
     task_overrides,
 )
-from pickplace.runs.errors import JobFailed, UsageError, one_sentence, sentence, unknown_key
+from pickplace.config.errors import JobFailed, UsageError, one_sentence, sentence, unknown_key
+from pickplace.config.registry import REGISTRY
 from pickplace.runs.folder import (
     FAILURE,
     OccupiedError,
@@ -35,8 +37,6 @@ from pickplace.runs.folder import (
     refuse_parts,
     remove_empty_folders,
 )
-from pickplace.runs.registry import REGISTRY
-from pickplace.task.files import replaced_file
 
 log = logging.getLogger(__name__)
 
@@ -223,7 +223,7 @@ class SweepCallback(Callback):
 def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> None:
     """Refuse misspelt keys: Hydra adds any key of a preset, or after a ``+``.
 
-    Nodes with a ``_target_`` are left to :func:`pickplace.runs.registry.build`, which knows their arguments.
+    Nodes with a ``_target_`` are left to :func:`pickplace.config.registry.build`, which knows their arguments.
 
     Raises:
         ValueError: naming the key, and the ones that there are.

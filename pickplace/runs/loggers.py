@@ -10,9 +10,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
-from pickplace.runs.errors import missing_extra
-from pickplace.task.checks import excerpt
-from pickplace.task.files import read_text, replaced_file
+from pickplace.common.files import read_text, replaced_file
+from pickplace.common.validate import excerpt
+from pickplace.config.errors import missing_extra
 
 if TYPE_CHECKING:
     from torchrl.record.loggers.common import Logger

@@ -10,7 +10,7 @@ import torch
 import torchrl
 
 import pickplace
-from pickplace.task.checks import is_name, short_text
+from pickplace.common.validate import is_name, short_text
 
 
 def versions() -> dict[str, str]:

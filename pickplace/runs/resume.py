@@ -14,15 +14,15 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from loky import cpu_count
 from omegaconf import DictConfig, OmegaConf
 
+from pickplace.common.validate import excerpt, is_name, is_whole, short_text
+from pickplace.config.allowlist import modules_to_trust, own_modules, trusted_config
+from pickplace.config.composition import PARTS_OF_ENV, compose_plain
+from pickplace.config.errors import WorkerDied, sentence
+from pickplace.config.references import saved_form
+from pickplace.rules.cell import CELL_SETTINGS
 from pickplace.runs import checkpoint
-from pickplace.runs.allowlist import modules_to_trust, own_modules, trusted_config
-from pickplace.runs.composition import PARTS_OF_ENV, compose_plain
-from pickplace.runs.errors import WorkerDied, sentence
 from pickplace.runs.folder import occupied, refuse_occupied
 from pickplace.runs.hydra_app import apply_overrides, refuse_unknown_keys
-from pickplace.runs.references import saved_form
-from pickplace.task.cell import CELL_SETTINGS
-from pickplace.task.checks import excerpt, is_name, is_whole, short_text
 
 log = logging.getLogger(__name__)
 

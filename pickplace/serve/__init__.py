@@ -1,0 +1,1 @@
+"""Services for a robot: JSON lines, HTTP and the live page."""

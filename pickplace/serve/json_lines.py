@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from pickplace.runs.errors import one_sentence, sentence, write_output
-from pickplace.task.files import read_file, read_text
+from pickplace.common.files import read_file, read_text
+from pickplace.config.errors import one_sentence, sentence, write_output
 
 if TYPE_CHECKING:
     from pickplace.robot.planner import Planner
@@ -86,9 +86,9 @@ def load_planner(args: argparse.Namespace) -> tuple["Planner", dict]:
     Raises:
         ValueError: for arguments or a checkpoint that cannot be used.
     """
+    from pickplace.common.machine import use_threads
     from pickplace.robot.planner import Planner  # here, so that --help need not wait for torch
-    from pickplace.runs.machine import use_threads
-    from pickplace.task.cell import CellSpec
+    from pickplace.rules.cell import CellSpec
 
     use_threads("--threads", args.threads)
     sizes = {key: getattr(args, key) for key in ("bin_size", "tote_size", "effector_size", "rotations")}
@@ -242,7 +242,7 @@ def read_reach(path: str):
     """
     from yaml import YAMLError, safe_load
 
-    from pickplace.runs.registry import build
+    from pickplace.config.registry import build
 
     expected = "expected a file with the key reach, such as conf/reach/annulus.yaml."
     try:

@@ -9,8 +9,8 @@ import time
 
 import numpy as np
 
-from pickplace.task.cell import CellSpec
-from pickplace.task.checks import excerpt
+from pickplace.common.validate import excerpt
+from pickplace.rules.cell import CellSpec
 from pickplace.views.replay import effector_parts, filled
 
 MOST_COLUMNS = 60  # greatest number of columns along a side of the tote that the page draws

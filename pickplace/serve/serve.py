@@ -5,9 +5,9 @@ import ipaddress
 import os
 import socket
 
-from pickplace.robot.json_lines import add_planner_options, load_planner
-from pickplace.runs.errors import one_sentence, write_output
-from pickplace.task.checks import excerpt, number, short_text, whole_number
+from pickplace.common.validate import excerpt, number, short_text, whole_number
+from pickplace.config.errors import one_sentence, write_output
+from pickplace.serve.json_lines import add_planner_options, load_planner
 
 TOKEN = "PICKPLACE_TOKEN"  # the environment variable; a command line can be read by every user of the machine
 LEAST_TOKEN = 16  # letters
@@ -55,8 +55,8 @@ def run(args: argparse.Namespace) -> None:
     try:
         import uvicorn
 
-        from pickplace.robot.connections import Connection
-        from pickplace.robot.service import make_app
+        from pickplace.serve.connections import Connection
+        from pickplace.serve.service import make_app
     except ImportError as error:
         if (error.name or "").startswith("pickplace"):
             raise

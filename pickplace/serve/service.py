@@ -22,14 +22,14 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 import pickplace
-from pickplace.robot.json_lines import MAX_LINE, answer_request, parse_request
+from pickplace.common.validate import excerpt
+from pickplace.config.errors import sentence
+from pickplace.config.registry import names_at
 from pickplace.robot.measure import Box
 from pickplace.robot.planner import Plan, Planner
-from pickplace.runs.errors import sentence
-from pickplace.runs.registry import names_at
-from pickplace.task.cell import CELL_SETTINGS, Reach
-from pickplace.task.checks import excerpt
-from pickplace.views import live
+from pickplace.rules.cell import CELL_SETTINGS, Reach
+from pickplace.serve import live
+from pickplace.serve.json_lines import MAX_LINE, answer_request, parse_request
 
 MAX_WAITING = 16  # requests whose body is read, or that wait for their turn
 BODY_SECONDS = 30  # time that a client has to send its request
@@ -128,7 +128,7 @@ class Service:
     """The planner, one request at a time in a thread of its own, and the last answers.
 
     Args:
-        planner, defaults: as :func:`pickplace.robot.json_lines.load_planner` returns them.
+        planner, defaults: as :func:`pickplace.serve.json_lines.load_planner` returns them.
         history: how many answers are kept.
     """
 
@@ -191,7 +191,7 @@ def make_app(
     """Return the service as an ASGI application.
 
     Args:
-        planner, defaults: as :func:`pickplace.robot.json_lines.load_planner` returns them.
+        planner, defaults: as :func:`pickplace.serve.json_lines.load_planner` returns them.
         name, checkpoint: what decides, for ``/health``.
         token: what clients must send as ``Authorization: Bearer <token>``; None: nothing.
         rate: most plans a minute.

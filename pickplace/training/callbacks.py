@@ -4,10 +4,10 @@ import json
 from numbers import Real
 from typing import Any
 
+from pickplace.common.validate import excerpt, number, whole_number
+from pickplace.config.errors import sentence
+from pickplace.config.registry import build
 from pickplace.evaluation.play import Episodes
-from pickplace.runs.errors import sentence
-from pickplace.runs.registry import build
-from pickplace.task.checks import excerpt, number, whole_number
 
 
 class Callback:

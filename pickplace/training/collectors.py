@@ -13,11 +13,11 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 
+from pickplace.common.validate import excerpt, whole_number
+from pickplace.config.errors import WorkerDied, missing_extra
+from pickplace.config.registry import names_at
 from pickplace.runs.checkpoint import CheckpointError
-from pickplace.runs.errors import WorkerDied, missing_extra
-from pickplace.runs.registry import names_at
 from pickplace.runs.resume import STOP_SIGNALS
-from pickplace.task.checks import excerpt, whole_number
 
 
 class ResumableCollector(Collector):

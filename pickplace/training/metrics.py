@@ -4,7 +4,7 @@ from tensordict import TensorDictBase
 
 from pickplace.evaluation.play import Episodes
 from pickplace.evaluation.statistics import confidence95
-from pickplace.task.state import Failure
+from pickplace.rules.state import Failure
 from pickplace.training.curriculum import Curriculum
 
 

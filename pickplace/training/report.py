@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from pickplace.common.files import replaced_file
+from pickplace.rules.cell import CellSpec
 from pickplace.runs.folder import changed_values, noted_config_folders, noted_overrides
 from pickplace.runs.loggers import read_csv
-from pickplace.task.cell import CellSpec
-from pickplace.task.files import replaced_file
 from pickplace.views.figures import failure_mix
 from pickplace.views.replay import ASSETS, page
 

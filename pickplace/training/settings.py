@@ -4,13 +4,13 @@ from functools import partial
 
 from omegaconf import DictConfig, OmegaConf
 
+from pickplace.common.validate import check_bytes, excerpt, flag, number, one_of, whole_number
+from pickplace.config.allowlist import own_modules
 from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
 from pickplace.evaluation.play import check_episode_settings, check_play
+from pickplace.items.distributions import check_seed
 from pickplace.policies.base import Policy
-from pickplace.runs.allowlist import own_modules
-from pickplace.task.checks import check_bytes, excerpt, flag, number, one_of, whole_number
-from pickplace.task.items import check_seed
 
 
 def _node(key: str, value) -> None:

@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig, read_write
 
+from pickplace.common.files import read_text, replaced_file
+from pickplace.config.errors import one_sentence, sentence
 from pickplace.runs.checkpoint import read_facts
-from pickplace.runs.errors import one_sentence, sentence
 from pickplace.runs.folder import FAILURE, is_claimed, read_note
 from pickplace.runs.hydra_app import SweepCallback
 from pickplace.runs.loggers import read_csv
-from pickplace.task.files import read_text, replaced_file
 from pickplace.views.figures import figure_of
 
 log = logging.getLogger(__name__)

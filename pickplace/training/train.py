@@ -7,8 +7,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from pickplace.config.errors import one_sentence
 from pickplace.runs import checkpoint
-from pickplace.runs.errors import one_sentence
 from pickplace.runs.folder import FAILURE, claim, refuse_links
 from pickplace.runs.hydra_app import command
 from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config

@@ -14,15 +14,19 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
+from pickplace.algorithms.imitation import Phase, WarmStart
+from pickplace.algorithms.ppo import add_advantages, afterstates, learning_rate, make_losses, of_taken_choice, update
+from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS, as_sampling_policy
+from pickplace.algorithms.vine import vine_advantages
+from pickplace.common.files import replaced_file
+from pickplace.common.machine import use_machine
+from pickplace.config.registry import build
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.evaluation.play import Episodes, play
 from pickplace.policies.base import Policy, as_collection_policy, as_critic, refuse_large_network
-from pickplace.policies.sampled_softmax import CANDIDATE_KEYS, as_sampling_policy
 from pickplace.runs import checkpoint
-from pickplace.runs.machine import use_machine
 from pickplace.runs.provenance import commit, versions
-from pickplace.runs.registry import build
 from pickplace.runs.resume import (
     COUNTERS,
     StopRequest,
@@ -32,16 +36,12 @@ from pickplace.runs.resume import (
     load_optimizer,
     stale_best_frames,
 )
-from pickplace.task.files import replaced_file
 from pickplace.training import callbacks
 from pickplace.training.collectors import refuse_other_workers, rng_state, set_rng_state, watch_workers
 from pickplace.training.curriculum import Curriculum, push_level
-from pickplace.training.imitation import Phase, WarmStart
 from pickplace.training.metrics import has_passed, progress_line, validation_metrics
-from pickplace.training.ppo import add_advantages, afterstates, learning_rate, make_losses, of_taken_choice, update
 from pickplace.training.report import REPORT, write_report
 from pickplace.training.settings import check_learner, check_memory, check_settings
-from pickplace.training.vine import vine_advantages
 from pickplace.views.figures import learning_curve
 
 log = logging.getLogger(__name__)

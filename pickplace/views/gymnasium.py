@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from pickplace.envs.gymnasium import PickPlaceGymEnv
-from pickplace.task.state import Failure, bin_depth_from_item
+from pickplace.rules.state import Failure, bin_depth_from_item
 from pickplace.views.figures import INK
 from pickplace.views.recording import Box, Recording, items_in_bin, record_moves
 from pickplace.views.scene import draw_scene, item_colours

@@ -7,10 +7,10 @@ import numpy as np
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pickplace.task.cell import CellSpec, reference_cell
-from pickplace.task.grasps import split_action
-from pickplace.task.state import Failure, Item, State
-from pickplace.task.transition import apply
+from pickplace.rules.cell import CellSpec, reference_cell
+from pickplace.rules.grasps import split_action
+from pickplace.rules.state import Failure, Item, State
+from pickplace.rules.step import apply
 from pickplace.views.motion import CarriedOut
 
 FULL = "The tote is full."

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pickplace.task.cell import CellSpec
-from pickplace.task.state import Failure
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.state import Failure
 from pickplace.views.motion import CarriedOut
 from pickplace.views.recording import FULL, Box, InBin, Recording
 from pickplace.views.scene import draw_scene, item_colours

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pickplace.task.cell import CellSpec
+from pickplace.rules.cell import CellSpec
 from pickplace.views.figures import COLOURS, INK, WALL, figure_of
 from pickplace.views.recording import Box, Recording
 

@@ -10,15 +10,15 @@ from problems import late_state
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace import PickPlaceEnv
+from pickplace.algorithms.imitation import Phase, WarmStart, imitation_loss
+from pickplace.config.registry import PLANNERS
 from pickplace.planners.heuristics import JointDBL
-from pickplace.policies.corners import corners
-from pickplace.policies.fcn4d import ActionPolicy
-from pickplace.policies.fcn_grasp import fcn_grasp
-from pickplace.policies.individual import IndividualRlPolicy, individual_grasp
+from pickplace.policies.corners.policy import corners
+from pickplace.policies.fcn4d.policy import ActionPolicy
+from pickplace.policies.fcn_grasp.policy import fcn_grasp
+from pickplace.policies.individual.policy import IndividualRlPolicy, individual_grasp
+from pickplace.rules.step import apply
 from pickplace.runs.provenance import imitated_planner
-from pickplace.runs.registry import PLANNERS
-from pickplace.task.transition import apply
-from pickplace.training.imitation import Phase, WarmStart, imitation_loss
 
 FCN = {"filters": 8, "hidden": 8}
 MODELS = {  # constructor, mask_infeasible, sizes

@@ -7,16 +7,16 @@ from tensordict import TensorDict
 from test_policies import CELLS, POLICIES, every_policy, small
 from torch.distributions import Categorical
 
-from pickplace.policies.base import MASKED, as_collection_policy
-from pickplace.policies.fcn4d import ActionPolicy
-from pickplace.policies.networks.conv4d import Conv4dPolicy
-from pickplace.policies.sampled_softmax import (
+from pickplace.algorithms.sampled_softmax import (
     CANDIDATE_KEYS,
     SampledSoftmax,
     as_sampled_actor,
     as_sampling_policy,
     draw_candidates,
 )
+from pickplace.policies.base import MASKED, as_collection_policy
+from pickplace.policies.fcn4d.network import Conv4dPolicy
+from pickplace.policies.fcn4d.policy import ActionPolicy
 
 
 def random_logits(*shape: int) -> torch.Tensor:

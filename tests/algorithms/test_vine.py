@@ -9,15 +9,15 @@ from test_presets import TINY
 from torch import nn
 from torchrl.modules import ValueOperator
 
+from pickplace.algorithms.ppo import make_losses, of_taken_choice
+from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS, as_sampling_policy, draw_candidates
+from pickplace.algorithms.vine import vine_advantages
 from pickplace.policies.base import Policy
-from pickplace.policies.fcn4d import ActionPolicy
-from pickplace.policies.individual import IndividualRlPolicy
-from pickplace.policies.sampled_softmax import CANDIDATE_KEYS, as_sampling_policy, draw_candidates
-from pickplace.task.observation import STANDARD_TERMS
+from pickplace.policies.fcn4d.policy import ActionPolicy
+from pickplace.policies.individual.policy import IndividualRlPolicy
+from pickplace.rules.observation import STANDARD_TERMS
 from pickplace.training import trainer
-from pickplace.training.ppo import make_losses, of_taken_choice
 from pickplace.training.train import train
-from pickplace.training.vine import vine_advantages
 
 
 def value_by_hand(bin_depth, tote_depth):

@@ -5,12 +5,12 @@ import sys
 import pytest
 import torch
 
-from pickplace.runs.machine import use_threads
+from pickplace.common.machine import use_threads
 
 THREADS = """
 import os
 import pickplace.cli, torch
-from pickplace.runs.machine import use_threads
+from pickplace.common.machine import use_threads
 os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 use_threads("threads", None)
 print(torch.get_num_threads(), os.environ["OMP_WAIT_POLICY"])
@@ -36,7 +36,7 @@ def test_command_uses_its_processors_only_and_waits_as_the_user_says(policy):
 
 def test_quota_limits_the_default_only(threads, monkeypatch):
     torch.set_num_threads(4)
-    monkeypatch.setattr("pickplace.runs.machine.cpu_count", lambda: 2)
+    monkeypatch.setattr("pickplace.common.machine.cpu_count", lambda: 2)
     use_threads("threads", None)
     assert torch.get_num_threads() == 2
     use_threads("threads", 3)

@@ -11,9 +11,9 @@ from commands import composed, options
 from omegaconf import OmegaConf
 
 from pickplace import Planner
+from pickplace.config.allowlist import REQUIRED_KEYS, modules_to_trust, own_modules, trusted_config
+from pickplace.config.references import saved_form
 from pickplace.runs import checkpoint
-from pickplace.runs.allowlist import REQUIRED_KEYS, modules_to_trust, own_modules, trusted_config
-from pickplace.runs.references import saved_form
 
 SHIPPED = checkpoint.PRETRAINED / "r4"
 original = functools.cache(lambda: saved_form(composed("experiment=quick")))
@@ -51,7 +51,7 @@ def mine(tmp_path, monkeypatch):
 
 FOREIGN = [
     "os.system", "pickplace.runs.checkpoint.shutil.rmtree", "builtins.eval", "pickplace", None, 5, "", ["os.system"],
-    "pickplace.evaluation.export.export", "pickplace.task.items.Kinds", "joint_dbl", "items/kinds",
+    "pickplace.evaluation.export.export", "pickplace.items.distributions.Kinds", "joint_dbl", "items/kinds",
 ]  # fmt: skip
 
 

@@ -8,10 +8,10 @@ from commands import composed, options
 from omegaconf import OmegaConf
 
 from pickplace import PickPlaceEnv
-from pickplace.runs.composition import PARTS_OF_ENV
+from pickplace.config.composition import PARTS_OF_ENV
+from pickplace.config.registry import REGISTRY, accepted_arguments, build, find, names_at
+from pickplace.items.distributions import ItemDistribution
 from pickplace.runs.hydra_app import conf_dir
-from pickplace.runs.registry import REGISTRY, accepted_arguments, build, find, names_at
-from pickplace.task.items import ItemDistribution
 from pickplace.training.curriculum import Curriculum
 
 

@@ -12,8 +12,8 @@ from problems import SUPPORTS, random_effector
 from tensordict import TensorDict
 
 from pickplace import PickPlaceEnv
-from pickplace.task.cell import Limits
-from pickplace.task.items import Kinds
+from pickplace.items.distributions import Kinds
+from pickplace.rules.cell import Limits
 
 NUM_ENVS, STEPS = (1, 6, 12, 24), 25  # per configuration: 25 to 600 transitions
 

@@ -13,10 +13,10 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from pickplace import Failure, PickPlaceEnv
-from pickplace.runs.registry import build
-from pickplace.task.cell import CELL_SETTINGS
-from pickplace.task.items import Kinds, Recorded
-from pickplace.task.reach import Annulus
+from pickplace.config.registry import build
+from pickplace.items.distributions import Kinds, Recorded
+from pickplace.rules.cell import CELL_SETTINGS
+from pickplace.rules.reach import Annulus
 
 ID = "pickplace/PickPlace-v0"
 SMALL = {"tote_size": (4, 5, 2), "items": [(1, 1, 1), (2, 1, 1), (2, 2, 1)]}

@@ -11,8 +11,8 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs, step_mdp
 
 from pickplace import CellSpec, PickPlaceEnv
-from pickplace.task.feasibility import action_mask, footprint_mask, placing_maps
-from pickplace.task.items import PAPER_KINDS, Kinds
+from pickplace.items.distributions import PAPER_KINDS, Kinds
+from pickplace.rules.masks import action_mask, footprint_mask, placing_maps
 
 OBSERVATION = ("bin_depth", "tote_depth", "tote_height", "action_mask")
 

@@ -10,13 +10,13 @@ from hydra import compose, initialize_config_dir
 from untrained import write_checkpoint
 
 from pickplace import CellSpec, PickPlaceEnv
+from pickplace.config.registry import build
 from pickplace.evaluation.evaluate import episode_settings, read_comparison
 from pickplace.evaluation.play import play
 from pickplace.physics.plans import read_plans
 from pickplace.physics.settle import Settle
 from pickplace.planners.heuristics import JointDBL
 from pickplace.runs.hydra_app import conf_dir
-from pickplace.runs.registry import build
 from pickplace.views.tables import evaluation_table
 
 

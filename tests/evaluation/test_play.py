@@ -8,9 +8,9 @@ import torch
 from pickplace import Failure, PickPlaceEnv, State
 from pickplace.evaluation import play as module
 from pickplace.evaluation.play import decision_latency, play
+from pickplace.items.distributions import Recorded
 from pickplace.planners.heuristics import JointDBL, RandomFeasible
-from pickplace.task.feasibility import action_mask, placing_maps
-from pickplace.task.items import Recorded
+from pickplace.rules.masks import action_mask, placing_maps
 
 
 def make_env(first, count, **settings):

@@ -6,9 +6,9 @@ import sys
 import pytest
 from safetensors import safe_open
 
+from pickplace.config.allowlist import trusted_config
 from pickplace.evaluation import export
 from pickplace.runs import checkpoint
-from pickplace.runs.allowlist import trusted_config
 
 CARDS = sorted(checkpoint.PRETRAINED.glob(f"*/{export.CARD}"))
 EPISODES = 8

@@ -8,9 +8,9 @@ from commands import composed
 from untrained import write_checkpoint
 
 from pickplace import CellSpec, Planner, load_policy
+from pickplace.rules.reach import Annulus, ReachTable
 from pickplace.runs import checkpoint
 from pickplace.runs.resume import resumed_config
-from pickplace.task.reach import Annulus, ReachTable
 from pickplace.training.train import resume_run
 
 TINY = ["env.tote_size=[6,6,2]", "total_frames=128", "reach=annulus", "env.reach.radii=[4.6,9.7]"]

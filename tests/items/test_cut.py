@@ -10,12 +10,12 @@ import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from pickplace.task import cuts as module
 from scipy.stats import chi2_contingency, chisquare
 
 from pickplace import PickPlaceEnv
-from pickplace.task import cuts as module
-from pickplace.task.cuts import ORDERS, Cut
-from pickplace.task.items import STREAMS, Kinds, search_items
+from pickplace.items.cut import ORDERS, Cut
+from pickplace.items.distributions import STREAMS, Kinds, search_items
 
 BIN = (5, 5, 5)
 

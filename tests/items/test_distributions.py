@@ -2,11 +2,11 @@
 
 import pytest
 import torch
+from pickplace.task import items as module
 from scipy.stats import chisquare
 
 from pickplace import PickPlaceEnv
-from pickplace.task import items as module
-from pickplace.task.items import STREAMS, Kinds, Recorded, Uniform, hashed_uniform
+from pickplace.items.distributions import STREAMS, Kinds, Recorded, Uniform, hashed_uniform
 
 ZERO = torch.tensor(0)
 

@@ -30,12 +30,12 @@ from commands import composed  # noqa: E402
 
 from pickplace import CellSpec, Planner, State, cli  # noqa: E402
 from pickplace.evaluation import evaluate  # noqa: E402, F401
-from pickplace.policies.fcn_grasp import FootprintPolicy  # noqa: E402
-from pickplace.robot import json_lines  # noqa: E402
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy  # noqa: E402
+from pickplace.rules.masks import action_mask, footprint_mask, placing_maps  # noqa: E402
+from pickplace.rules.state import EMPTY, item_from_depth, surface_from  # noqa: E402
+from pickplace.rules.step import apply  # noqa: E402
 from pickplace.runs import checkpoint  # noqa: E402
-from pickplace.task.feasibility import action_mask, footprint_mask, placing_maps  # noqa: E402
-from pickplace.task.state import EMPTY, item_from_depth, surface_from  # noqa: E402
-from pickplace.task.transition import apply  # noqa: E402
+from pickplace.serve import json_lines  # noqa: E402
 from pickplace.training import train  # noqa: E402
 
 SECONDS, BYTES = 20, 1.5e9
@@ -49,7 +49,7 @@ VALUES = [
     None, True, False, 0, -0.0, -1, 0.5, 2, 7, 1e-320, 1e308, -1e308, 2**31, 2**53 + 1, 2**63, 2**64, 10**400, "", "x",
     "6", "\ud800", "\u0000", "\x1b[31m", "x" * 100_000, [], {}, [[]], [[1, 2], [3]], {"a": 1}, 0.24999999999, 1048575,
     1_000, 3_000, 65_536, 1_000_000, float("inf"), float("nan"), [3_000, 3_000, 1], [1_000, 1_000], [0, 1], "${seed}",
-    "${oc.env:HOME}", "pickplace.task.items.Kinds", "os.system", "/proc/kmsg", "../x", ["a"] * 1_000,
+    "${oc.env:HOME}", "pickplace.items.distributions.Kinds", "os.system", "/proc/kmsg", "../x", ["a"] * 1_000,
 ]  # fmt: skip
 #: Texts in place of a digit of a JSON line, which json.dumps would not write.
 TEXTS = ["NaN", "-Infinity", "1e999", "9" * 4299, "9" * 5000, "[" * 900, "[" * 200_000, "1.", "00", "{}"]

@@ -30,7 +30,7 @@ SMALL = {
     "pickplace-evaluate": "evaluation.episodes=4 evaluation.latency_decisions=0 threads=1",
     "make demo": 'DEMO=outputs/demo ARGS="evaluation.episodes=2 threads=1"',
     "make train": 'RUN=outputs/made ARGS="total_frames=2048 evaluation.episodes=4 threads=1"',
-    "make test": 'ARGS="tests/task"',
+    "make test": 'ARGS="tests/rules"',
 }
 
 #: Files of which the pages speak.

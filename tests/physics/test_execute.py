@@ -7,12 +7,12 @@ import pytest
 
 from pickplace import PickPlaceEnv
 from pickplace.evaluation.play import play
+from pickplace.items.distributions import Uniform
 from pickplace.physics.execute import Execute
 from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.physics.recorded import plan_of
 from pickplace.physics.settle import Settle
 from pickplace.planners.heuristics import RandomFeasible
-from pickplace.task.items import Uniform
 from pickplace.views.motion import Motion
 
 pytest.importorskip("mujoco")

@@ -11,7 +11,7 @@ from pickplace import CellSpec
 from pickplace.physics import command
 from pickplace.physics.plans import KEYS, OPTIONAL_KEYS, ROBOT_KEYS, EpisodePlan, Placement, read_plans, to_lines
 from pickplace.physics.recorded import plan_of
-from pickplace.task.state import Failure
+from pickplace.rules.state import Failure
 from pickplace.views.recording import Move, Recording
 
 LINE = {"episode": 0, "tote": [0.3, 0.3, 0.2], "corner": [0.0, 0.0, 0.0], "size": [0.1, 0.1, 0.05]}

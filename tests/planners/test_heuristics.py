@@ -6,8 +6,8 @@ from problems import SETTINGS, choice_by_hand, occupancies, random_states, resul
 from scipy.stats import chisquare
 
 from pickplace import PickPlaceEnv
+from pickplace.items.distributions import Uniform
 from pickplace.planners.heuristics import Corner, HeightmapMinimisation, JointDBL, RandomFeasible, UniformRandom
-from pickplace.task.items import Uniform
 
 # Planner and items; tote, R, occupancy and its standard error, from an independent prototype of the rules. Where no
 # error is known (None): that of 100 episodes, as those of joint_dbl with mixed items are, and of rounding to 0.01.

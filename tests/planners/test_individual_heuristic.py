@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from problems import late_state, occupancies, random_states
 
 from pickplace import CellSpec, Item, PickPlaceEnv, State
+from pickplace.items.distributions import Uniform
 from pickplace.planners.individual import IndividualHeuristic, corner_footprints
-from pickplace.task.feasibility import placing_maps
-from pickplace.task.grasps import PICKS, all_grasps
-from pickplace.task.items import Uniform
-from pickplace.task.state import Failure, surface_from
-from pickplace.task.transition import apply
+from pickplace.rules.grasps import PICKS, all_grasps
+from pickplace.rules.masks import placing_maps
+from pickplace.rules.state import Failure, surface_from
+from pickplace.rules.step import apply
 
 
 def maximal_rectangles(free):

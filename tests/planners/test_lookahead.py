@@ -6,15 +6,15 @@ from omegaconf import OmegaConf
 from problems import occupancies
 
 from pickplace import CellSpec, PickPlaceEnv
+from pickplace.items.distributions import Kinds, Recorded
 from pickplace.planners.lookahead import Lookahead
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.afterstate import AfterstatePolicy
-from pickplace.policies.fcn_grasp import FootprintPolicy
+from pickplace.policies.afterstate.policy import AfterstatePolicy
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy
 from pickplace.policies.restore import RestoredCritic, restore_critic, restore_policy
+from pickplace.rules.masks import choice_mask, placing_maps
+from pickplace.rules.state import EMPTY, Item, State
 from pickplace.runs import checkpoint
-from pickplace.task.feasibility import choice_mask, placing_maps
-from pickplace.task.items import Kinds, Recorded
-from pickplace.task.state import EMPTY, Item, State
 
 
 def untrained(cell):

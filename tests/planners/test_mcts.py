@@ -5,11 +5,11 @@ import torch
 from problems import occupancies
 
 from pickplace import PickPlaceEnv
+from pickplace.items.distributions import Kinds, Recorded
 from pickplace.planners.mcts import MCTS, _Edge, _Node
-from pickplace.task.feasibility import actions_reaching, placing_maps
-from pickplace.task.items import Kinds, Recorded
-from pickplace.task.state import Item, State
-from pickplace.task.transition import apply
+from pickplace.rules.masks import actions_reaching, placing_maps
+from pickplace.rules.state import Item, State
+from pickplace.rules.step import apply
 
 OPTIMUM = 0.9456  # 4x4x1, R=4, by tests/dynamic_programming.py
 

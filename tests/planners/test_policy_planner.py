@@ -6,14 +6,14 @@ from problems import SETTINGS, random_states
 from untrained import untrained_policy
 
 from pickplace import PickPlaceEnv
+from pickplace.items.distributions import Uniform
 from pickplace.planners.heuristics import JointDBL
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy
-from pickplace.policies.corners import corners
-from pickplace.task.feasibility import placing_maps
-from pickplace.task.grasps import PICKS
-from pickplace.task.items import Uniform
-from pickplace.task.transition import apply
+from pickplace.policies.corners.policy import corners
+from pickplace.rules.grasps import PICKS
+from pickplace.rules.masks import placing_maps
+from pickplace.rules.step import apply
 
 
 class Fixed(Policy):

@@ -13,17 +13,17 @@ from tensordict import TensorDict
 from torchrl.objectives.value import GAE
 
 from pickplace import PickPlaceEnv
+from pickplace.algorithms.ppo import afterstates
+from pickplace.config.registry import build
 from pickplace.evaluation.play import play
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.afterstate import AfterstatePolicy, depth_after
+from pickplace.policies.afterstate.network import ToteValue
+from pickplace.policies.afterstate.policy import AfterstatePolicy, depth_after
 from pickplace.policies.base import as_critic
-from pickplace.policies.networks.tote_value import ToteValue
 from pickplace.policies.restore import restore_critic, restore_policy
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.grasps import footprint_index
 from pickplace.runs import checkpoint
-from pickplace.runs.registry import build
-from pickplace.task.cell import CellSpec
-from pickplace.task.grasps import footprint_index
-from pickplace.training.ppo import afterstates
 from pickplace.training.train import train
 
 

@@ -9,9 +9,9 @@ import torch
 from pickplace import CellSpec
 from pickplace.policies import fcn4d
 from pickplace.policies.base import MASKED
-from pickplace.policies.fcn4d import ActionPolicy, TypicalPolicy
-from pickplace.policies.networks.conv4d import Conv4dCritic, Conv4dPolicy
-from pickplace.policies.networks.depth import clip_depth, pad_depth
+from pickplace.policies.depth import clip_depth, pad_depth
+from pickplace.policies.fcn4d.network import Conv4dCritic, Conv4dPolicy
+from pickplace.policies.fcn4d.policy import ActionPolicy, TypicalPolicy
 
 SIZES = [  # bin, tote, R, clips, floor
     ((5, 5), (6, 6), 4, (1.0, 5.0), None),

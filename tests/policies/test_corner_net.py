@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from problems import problems, state_of
 
 from pickplace import CellSpec
-from pickplace.policies.networks.corner_net import PLANES, CornerNet
-from pickplace.task.observation import STANDARD_TERMS, observe
+from pickplace.policies.corners.network import PLANES, CornerNet
+from pickplace.rules.observation import STANDARD_TERMS, observe
 
 INSIDE, NEAR = 3, 2
 

@@ -12,13 +12,13 @@ from test_footprint_fcn import by_hand, random_maps
 from pickplace import CellSpec, __version__, load_policy
 from pickplace.policies import export, onnx_model
 from pickplace.policies.base import MASKED
-from pickplace.policies.corners import CornerPolicy
-from pickplace.policies.fcn4d import ActionPolicy
-from pickplace.policies.fcn_grasp import FootprintPolicy
+from pickplace.policies.corners.policy import CornerPolicy
+from pickplace.policies.fcn4d.policy import ActionPolicy
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy
 from pickplace.policies.onnx_model import SHAPES, Scores
-from pickplace.task.feasibility import footprint_mask
-from pickplace.task.reach import Annulus
-from pickplace.task.state import item_from_depth
+from pickplace.rules.masks import footprint_mask
+from pickplace.rules.reach import Annulus
+from pickplace.rules.state import item_from_depth
 
 MAKERS = {
     "fcn_grasp": lambda: FootprintPolicy(CellSpec(), head_std=1.0, compute_dtype="float32"),

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from problems import late_state
 
 from pickplace import CellSpec, Item
+from pickplace.items.distributions import Kinds, Uniform
 from pickplace.policies.base import MASKED, as_collection_policy
-from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy
-from pickplace.policies.networks.critics import PooledCritic
-from pickplace.policies.networks.depth import Contents
-from pickplace.policies.networks.footprint_fcn import MAP_KEYS, FootprintFcn, matrix_dtype
+from pickplace.policies.critics import PooledCritic
+from pickplace.policies.depth import Contents
+from pickplace.policies.fcn_grasp.network import MAP_KEYS, FootprintFcn, matrix_dtype
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy, GraspPolicy
+from pickplace.rules.state import item_from_depth
 from pickplace.runs import checkpoint
-from pickplace.task.items import Kinds, Uniform
-from pickplace.task.state import item_from_depth
 
 FLOAT = {"head_std": 1.0, "compute_dtype": "float32"}
 

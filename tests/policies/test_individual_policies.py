@@ -5,10 +5,10 @@ import torch
 from problems import late_state
 
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.fcn4d import ActionPolicy
-from pickplace.policies.fcn_grasp import fcn_grasp
-from pickplace.policies.individual import IndividualRlPolicy, individual_grasp
-from pickplace.task.grasps import heuristic_pick, select_pick
+from pickplace.policies.fcn4d.policy import ActionPolicy
+from pickplace.policies.fcn_grasp.policy import fcn_grasp
+from pickplace.policies.individual.policy import IndividualRlPolicy, individual_grasp
+from pickplace.rules.grasps import heuristic_pick, select_pick
 
 NETWORKS = {IndividualRlPolicy: ActionPolicy, individual_grasp: fcn_grasp}
 both = pytest.mark.parametrize("individual", NETWORKS)

@@ -9,7 +9,7 @@ from untrained import write_checkpoint
 from pickplace import CellSpec, Planner, load_policy
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import as_collection_policy
-from pickplace.task.observation import STANDARD_TERMS
+from pickplace.rules.observation import STANDARD_TERMS
 
 SIZES = {"env.tote_size": (4, 4, 2), "env.bin_size": (4, 4, 1)}
 

@@ -9,12 +9,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import as_actor, as_collection_policy, refuse_large_network
-from pickplace.policies.corners import CornerPolicy
-from pickplace.policies.fcn4d import ActionPolicy, TypicalPolicy
-from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy
-from pickplace.policies.individual import IndividualFootprintPolicy, IndividualGraspPolicy, IndividualRlPolicy
-from pickplace.task.feasibility import action_footprints
-from pickplace.task.grasps import all_grasps, heuristic_pick, split_action
+from pickplace.policies.corners.policy import CornerPolicy
+from pickplace.policies.fcn4d.policy import ActionPolicy, TypicalPolicy
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy, GraspPolicy
+from pickplace.policies.individual.policy import IndividualFootprintPolicy, IndividualGraspPolicy, IndividualRlPolicy
+from pickplace.rules.grasps import all_grasps, heuristic_pick, split_action
+from pickplace.rules.masks import action_footprints
 
 GRASP, CONV4D = {"filters": 8, "hidden": 8, "head_std": 1.0}, {"filters": 4, "head_std": 1.0}
 POLICIES = {

@@ -11,7 +11,7 @@ from scenes import Gripper, Scene, disc, fault, random_scene, rectangle, squares
 from pickplace import CellSpec, DepthMapError, Planner
 from pickplace.robot.measure import box_of_map
 from pickplace.robot.planner import Box
-from pickplace.task.cell import Limits
+from pickplace.rules.cell import Limits
 
 CELL, TOTE = 0.05, (0.3, 0.3, 0.25)
 SIZES = {"tote_size": (6, 6, 5)}

@@ -16,7 +16,7 @@ from untrained import untrained_policy, write_checkpoint
 from pickplace import CellSpec, DepthMapError, Failure, Planner
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.robot.planner import Box
-from pickplace.task.observation import STANDARD_TERMS, observe
+from pickplace.rules.observation import STANDARD_TERMS, observe
 
 EMPTY = np.full((6, 6), 5)
 ITEM = np.zeros((5, 5), dtype=np.int64)

@@ -17,12 +17,12 @@ from untrained import untrained_policy
 
 from pickplace import CellSpec, DepthMapError, Failure, Planner
 from pickplace.planners.heuristics import JointDBL
-from pickplace.policies.fcn4d import ActionPolicy
-from pickplace.robot.json_lines import answer
+from pickplace.policies.fcn4d.policy import ActionPolicy
 from pickplace.robot.measure import Box, HiddenBox, touches
 from pickplace.robot.measured_problem import read_metric
-from pickplace.task.grasps import all_grasps
-from pickplace.task.reach import Annulus
+from pickplace.rules.grasps import all_grasps
+from pickplace.rules.reach import Annulus
+from pickplace.serve.json_lines import answer
 
 CELL, TOTE, NOISE = 0.05, (0.3, 0.3, 0.25), 0.002
 FLAT = {"tote_depth": np.full((30, 30), 0.25), "cell_size": CELL}

@@ -9,9 +9,10 @@ from oracle import cells, shape_cells
 from problems import random_effector
 
 from pickplace import CellSpec, Item, PickPlaceEnv
-from pickplace.task.bin import blocked_picks, refill, remove_item, select_item, taken_item
-from pickplace.task.cell import reference_cell
-from pickplace.task.items import Kinds, Recorded, Uniform, hashed_uniform
+from pickplace.items.arrival import refill
+from pickplace.items.distributions import Kinds, Recorded, Uniform, hashed_uniform
+from pickplace.rules.bin import blocked_picks, remove_item, select_item, taken_item
+from pickplace.rules.cell import reference_cell
 
 
 def random_contents(rng: Random, size, count, most=3):

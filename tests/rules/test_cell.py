@@ -7,9 +7,9 @@ import torch
 from problems import late_state
 
 from pickplace import CellSpec, PickPlaceEnv
-from pickplace.task.cell import CELL_SETTINGS, Limits, cell_from_settings, reference_cell
-from pickplace.task.effector import disc_mask
-from pickplace.task.reach import Annulus
+from pickplace.rules.cell import CELL_SETTINGS, Limits, cell_from_settings, reference_cell
+from pickplace.rules.effector import disc_mask
+from pickplace.rules.reach import Annulus
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from problems import problems, state_of
 
 from pickplace import CellSpec, Item, State
-from pickplace.task.cell import Limits
-from pickplace.task.corners import corner_mask
-from pickplace.task.feasibility import footprint_mask, placing_maps
-from pickplace.task.state import surface_from
+from pickplace.rules.cell import Limits
+from pickplace.rules.corners import corner_mask
+from pickplace.rules.masks import footprint_mask, placing_maps
+from pickplace.rules.state import surface_from
 
 
 def plain_corners(heights, sizes, feasible, free, level_step):

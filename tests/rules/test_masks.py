@@ -12,15 +12,17 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from oracle import SUCCESS, UNSTABLE
+from pickplace.task import large_items
 from problems import Case, oracle_of, problems, random_effector, state_of
 from scipy.spatial import ConvexHull, QhullError
 
 from pickplace import CellSpec, Failure, Item, PickPlaceEnv, State
+from pickplace.items.distributions import Uniform
 from pickplace.planners.base import decide
 from pickplace.planners.heuristics import JointDBL
-from pickplace.task import large_items
-from pickplace.task.cell import Limits, reference_cell
-from pickplace.task.feasibility import (
+from pickplace.rules.cell import Limits, reference_cell
+from pickplace.rules.grasps import all_grasps, central_pick, heuristic_pick
+from pickplace.rules.masks import (
     action_footprints,
     action_mask,
     actions_reaching,
@@ -29,12 +31,10 @@ from pickplace.task.feasibility import (
     num_feasible,
     placing_maps,
 )
-from pickplace.task.grasps import all_grasps, central_pick, heuristic_pick
-from pickplace.task.items import Uniform
-from pickplace.task.placing import resting_top
-from pickplace.task.state import EMPTY, surface_from
-from pickplace.task.support import bearing_cells
-from pickplace.task.transition import apply, put_down
+from pickplace.rules.placing import resting_top
+from pickplace.rules.state import EMPTY, surface_from
+from pickplace.rules.step import apply, put_down
+from pickplace.rules.support import bearing_cells
 
 
 @settings(max_examples=150)

@@ -8,7 +8,7 @@ from problems import late_state, problems, state_of
 from torchrl.envs.utils import check_env_specs
 
 from pickplace import PickPlaceEnv, State
-from pickplace.task.observation import RESERVED, STANDARD_TERMS, Bounds, Term, check_terms, observe
+from pickplace.rules.observation import RESERVED, STANDARD_TERMS, Bounds, Term, check_terms, observe
 
 
 class FreeVolume(Term):

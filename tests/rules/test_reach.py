@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from problems import problems, state_of
 
 from pickplace import CellSpec, Failure
-from pickplace.task.feasibility import action_mask, footprint_mask, num_feasible, placing_maps
-from pickplace.task.grasps import split_action
-from pickplace.task.placing import is_within_reach
-from pickplace.task.reach import Annulus, ReachTable
-from pickplace.task.transition import apply
+from pickplace.rules.grasps import split_action
+from pickplace.rules.masks import action_mask, footprint_mask, num_feasible, placing_maps
+from pickplace.rules.placing import is_within_reach
+from pickplace.rules.reach import Annulus, ReachTable
+from pickplace.rules.step import apply
 
 HEADER = "where,x,y,rotation,lowest,highest\n"
 

@@ -8,7 +8,7 @@ from oracle import Oracle, Rules, rotate
 from problems import Case, problems, state_of
 
 from pickplace import CellSpec
-from pickplace.task.transition import apply
+from pickplace.rules.step import apply
 
 ODD = st.sampled_from([1, 3])
 

@@ -10,7 +10,7 @@ from commands import composed
 from omegaconf import OmegaConf
 
 import pickplace
-from pickplace.runs.errors import sentence
+from pickplace.config.errors import sentence
 from pickplace.runs.folder import noted_overrides
 from pickplace.runs.hydra_app import apply_overrides
 from pickplace.training import train

@@ -16,11 +16,11 @@ from long import chaos
 from omegaconf import OmegaConf
 
 from pickplace import PickPlaceEnv
+from pickplace.config.references import saved_form
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import claim
 from pickplace.runs.loggers import read_csv
-from pickplace.runs.references import saved_form
 from pickplace.runs.resume import checkpoint_config, resumed_config
 from pickplace.training.train import resume_run, train
 from pickplace.training.trainer import Trainer

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from pickplace.robot import json_lines
+from pickplace.serve import json_lines
 
 EMPTY = np.full((6, 6), 5)
 ITEM = np.zeros((5, 5), dtype=np.int64)

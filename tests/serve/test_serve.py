@@ -17,7 +17,7 @@ import pytest
 from browser import errors, wait_until
 
 from pickplace import Planner, __version__
-from pickplace.robot import serve
+from pickplace.serve import serve
 
 pytest.importorskip("fastapi")
 pytest.importorskip("uvicorn")
@@ -194,8 +194,8 @@ def test_the_page_gets_the_last_answers_in_cells(client):
 def test_openapi_describes_requests_and_answers(client):
     from dataclasses import fields
 
-    from pickplace.robot.json_lines import REQUEST_KEYS
     from pickplace.robot.planner import Plan
+    from pickplace.serve.json_lines import REQUEST_KEYS
 
     status, _, described = client.ask("GET", "/openapi.json")
     schemas = described["components"]["schemas"]
@@ -243,7 +243,7 @@ def is_ended(one):
     return True
 
 
-IMPATIENT = "from pickplace.robot import connections; connections.CLIENT_SECONDS = 1"
+IMPATIENT = "from pickplace.serve import connections; connections.CLIENT_SECONDS = 1"
 LINE = b"GET /health HTTP/1.1\r\n"
 FIRST = LINE + b"Host: localhost\r\n\r\n"
 LONG = b"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: text/plain\r\nContent-Length: 9999\r\n\r\n"
@@ -341,7 +341,7 @@ def test_too_many_plans_are_put_off():
 
 
 def test_the_rate_fills_up_evenly(monkeypatch):
-    from pickplace.robot.service import Rate
+    from pickplace.serve.service import Rate
 
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
@@ -404,7 +404,7 @@ def test_the_command_refuses_in_one_sentence(monkeypatch, capsys, arguments, tok
 
 def test_a_missing_extra_is_one_sentence(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["pickplace-serve", "pretrained/r4"])
-    monkeypatch.delitem(sys.modules, "pickplace.robot.service", raising=False)
+    monkeypatch.delitem(sys.modules, "pickplace.serve.service", raising=False)
     monkeypatch.setitem(sys.modules, "fastapi", None)
     with pytest.raises(SystemExit, match="2"):
         serve.main()

@@ -9,7 +9,7 @@ from commands import composed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pickplace.runs.registry import build
+from pickplace.config.registry import build
 from pickplace.training.curriculum import Advance, Current, Curriculum, Frames, NoAdvance, Plateau, Staged, Threshold
 
 

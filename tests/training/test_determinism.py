@@ -5,13 +5,13 @@ from commands import assert_same
 from omegaconf import OmegaConf
 
 from pickplace import PickPlaceEnv, Planner
+from pickplace.config.allowlist import trusted_config
 from pickplace.evaluation.play import RESULTS, play
 from pickplace.planners.heuristics import RandomFeasible
 from pickplace.planners.lookahead import Lookahead
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.restore import restore_policy
 from pickplace.runs import checkpoint
-from pickplace.runs.allowlist import trusted_config
 from pickplace.training.trainer import Trainer
 
 

@@ -20,9 +20,9 @@ from torchrl.collectors import RandomPolicy
 from torchrl.envs import TransformedEnv
 
 from pickplace import PickPlaceEnv, Planner
+from pickplace.config.errors import WorkerDied
 from pickplace.evaluation.evaluate import main as evaluate_main
 from pickplace.runs import checkpoint
-from pickplace.runs.errors import WorkerDied
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.training import collectors
 from pickplace.training.collectors import ignore_signals, watch_workers

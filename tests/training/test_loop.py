@@ -10,19 +10,19 @@ from torch import nn
 from torchrl.modules import ValueOperator
 
 from pickplace import PickPlaceEnv
+from pickplace.algorithms.imitation import Phase, imitation_loss
+from pickplace.algorithms.ppo import add_advantages, learning_rate, make_losses, update
+from pickplace.config.registry import build
 from pickplace.evaluation.play import play
 from pickplace.planners.heuristics import JointDBL
 from pickplace.policies.base import as_collection_policy
-from pickplace.policies.fcn_grasp import fcn_grasp
-from pickplace.policies.networks.critics import PooledCritic
+from pickplace.policies.critics import PooledCritic
+from pickplace.policies.fcn_grasp.policy import fcn_grasp
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
-from pickplace.runs.registry import build
 from pickplace.training import trainer
 from pickplace.training.curriculum import Current, Curriculum, NoAdvance
-from pickplace.training.imitation import Phase, imitation_loss
 from pickplace.training.metrics import episode_metrics, has_passed
-from pickplace.training.ppo import add_advantages, learning_rate, make_losses, update
 from pickplace.training.trainer import Trainer, training_env
 
 OBSERVED = ["bin_depth", "tote_depth"]  # by a critic

@@ -7,11 +7,11 @@ from commands import composed
 from dynamic_programming import optimal_occupancy
 
 from pickplace import PickPlaceEnv
+from pickplace.config.registry import build
 from pickplace.evaluation.play import play
 from pickplace.planners.heuristics import JointDBL, RandomFeasible
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.runs import checkpoint
-from pickplace.runs.registry import build
 from pickplace.training.train import train
 
 OPTIMA = {  # rules of the task, "Exact optimum"

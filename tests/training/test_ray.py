@@ -10,8 +10,8 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
 
 from pickplace import PickPlaceEnv
+from pickplace.config.errors import WorkerDied
 from pickplace.runs import checkpoint
-from pickplace.runs.errors import WorkerDied
 from pickplace.runs.loggers import read_csv
 from pickplace.training import collectors
 from pickplace.training.curriculum import Current, ToteHeightCurriculum, push_level

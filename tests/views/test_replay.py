@@ -14,8 +14,8 @@ from untrained import untrained_planner
 
 from pickplace import CellSpec, Failure, PickPlaceEnv
 from pickplace.evaluation.play import play
+from pickplace.items.distributions import Kinds, Uniform
 from pickplace.planners.heuristics import JointDBL, UniformRandom
-from pickplace.task.items import Kinds, Uniform
 from pickplace.views import replay
 from pickplace.views.motion import CarriedOut, Motion
 from pickplace.views.recording import Move, Recording

@@ -1,7 +1,7 @@
 """An item distribution of your own: several items of the same kind arrive in a row."""
 
 from pickplace import Item
-from pickplace.task.items import Kinds, hashed_uniform
+from pickplace.items.distributions import Kinds, hashed_uniform
 
 
 class Batches(Kinds):

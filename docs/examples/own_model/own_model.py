@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from pickplace.policies.base import MASKED, Policy
-from pickplace.policies.networks.depth import clip_depth
+from pickplace.policies.depth import clip_depth
 
 
 class Mlp(Policy):

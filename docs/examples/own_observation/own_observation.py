@@ -3,8 +3,8 @@
 import torch
 from torch import nn
 
-from pickplace.policies.fcn_grasp import FootprintPolicy
-from pickplace.task.observation import Bounds, Term
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy
+from pickplace.rules.observation import Bounds, Term
 
 
 class PitDepth(Term):

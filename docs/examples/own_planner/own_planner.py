@@ -2,8 +2,8 @@
 
 import torch
 
-from pickplace.task.feasibility import first_action_reaching, footprint_mask, placing_maps
-from pickplace.task.state import State
+from pickplace.rules.masks import first_action_reaching, footprint_mask, placing_maps
+from pickplace.rules.state import State
 
 
 class SoftDBL:

@@ -1,0 +1,1 @@
+"""``afterstate``: values of the tote after a placement."""

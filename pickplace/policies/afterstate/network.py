@@ -4,8 +4,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.policies.networks.footprint_fcn import DTYPES, matrix_dtype
-from pickplace.task.checks import MAX_WIDTH, check_inputs, flag, number, odd_number, one_of, size_tuple, whole_number
+from pickplace.common.validate import (
+    MAX_WIDTH,
+    check_inputs,
+    flag,
+    number,
+    odd_number,
+    one_of,
+    size_tuple,
+    whole_number,
+)
+from pickplace.policies.fcn_grasp.network import DTYPES, matrix_dtype
 
 MAX_GRID = 64  # cells of the network's picture of a tote along each axis
 TOTES_AT_ONCE = {"cpu": 4_096, "cuda": 262_144}  # a CPU's caches hold the activations of this many
@@ -28,7 +37,7 @@ class ToteValue(nn.Module):
         mirrored: whether totes are mirrored, and transposed where they are square, at random while it learns. The value
             is the same, unless items, end effector or reach tell the sides of the tote apart.
         reward_scale: ``algo.reward_scale``; values are volumes times this.
-        compute_dtype: as in :class:`~pickplace.policies.networks.footprint_fcn.FootprintFcn`.
+        compute_dtype: as in :class:`~pickplace.policies.fcn_grasp.network.FootprintFcn`.
     """
 
     in_keys: tuple[str, ...] = ("tote_depth", "tote_height")

@@ -3,14 +3,14 @@
 import torch
 from torch import Tensor
 
+from pickplace.common.validate import number
+from pickplace.policies.afterstate.network import ToteValue
 from pickplace.policies.base import refuse_several_items
-from pickplace.policies.corners import CornerPolicy
-from pickplace.policies.networks.tote_value import ToteValue
-from pickplace.task.cell import CellSpec
-from pickplace.task.checks import number
-from pickplace.task.grasps import split_footprint, turned_size
-from pickplace.task.maps import FAR, rectangle
-from pickplace.task.state import Observation, item_from_depth
+from pickplace.policies.corners.policy import CornerPolicy
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.grasps import split_footprint, turned_size
+from pickplace.rules.maps import FAR, rectangle
+from pickplace.rules.state import Observation, item_from_depth
 
 
 class AfterstatePolicy(CornerPolicy):
@@ -23,7 +23,7 @@ class AfterstatePolicy(CornerPolicy):
     Args:
         cell: the sizes.
         temperature: of the softmax over the values in training, in units of the scaled reward.
-        **network: arguments of :class:`~pickplace.policies.networks.tote_value.ToteValue`.
+        **network: arguments of :class:`~pickplace.policies.afterstate.network.ToteValue`.
     """
 
     map_keys = ("bin_depth", "tote_depth", "tote_height")

@@ -1,0 +1,1 @@
+"""``corners``: scores of corner footprints on fine grids."""

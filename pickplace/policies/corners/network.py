@@ -4,10 +4,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.policies.networks.depth import Contents
-from pickplace.task.checks import MAX_WIDTH, check_inputs, excerpt, number, whole_number
-from pickplace.task.grasps import split_footprint
-from pickplace.task.state import item_from_depth
+from pickplace.common.validate import MAX_WIDTH, check_inputs, excerpt, number, whole_number
+from pickplace.policies.depth import Contents
+from pickplace.rules.grasps import split_footprint
+from pickplace.rules.state import item_from_depth
 
 PLANES = 6  # of each point, see `CornerNet`
 SIZES = 13  # numbers beside the points

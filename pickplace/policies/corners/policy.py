@@ -2,19 +2,19 @@
 
 from torch import Tensor
 
-from pickplace.policies.fcn_grasp import FootprintPolicy
-from pickplace.policies.networks.corner_net import CornerNet
-from pickplace.task.cell import CellSpec
-from pickplace.task.corners import corner_mask
-from pickplace.task.feasibility import PlacingMaps
+from pickplace.policies.corners.network import CornerNet
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.corners import corner_mask
+from pickplace.rules.masks import PlacingMaps
 
 
 class CornerPolicy(FootprintPolicy):
-    """``corners``: as ``fcn_grasp`` with a mask, but among some dozens of footprints (:mod:`pickplace.task.corners`).
+    """``corners``: as ``fcn_grasp`` with a mask, but among some dozens of footprints (:mod:`pickplace.rules.corners`).
 
     Args:
         cell: the sizes.
-        network: arguments of :class:`~pickplace.policies.networks.corner_net.CornerNet`.
+        network: arguments of :class:`~pickplace.policies.corners.network.CornerNet`.
     """
 
     masks: tuple[str, ...] = ("corner",)

@@ -24,8 +24,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.policies.networks.depth import clip_depth, pad_depth
-from pickplace.task.checks import MAX_WIDTH, number, number_or_null, one_of, whole_number
+from pickplace.common.validate import MAX_WIDTH, number, number_or_null, one_of, whole_number
+from pickplace.policies.depth import clip_depth, pad_depth
 
 BIN_PADDING, TOTE_PADDING = -1.0, 0.0
 DTYPES = ("float32", "bfloat16")

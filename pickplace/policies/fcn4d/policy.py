@@ -6,11 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from pickplace.policies.base import MASKED, Policy
-from pickplace.policies.networks.conv4d import Conv4dPolicy
-from pickplace.task.cell import CellSpec
-from pickplace.task.feasibility import PlacingMaps
-from pickplace.task.grasps import split_flat
-from pickplace.task.state import Observation
+from pickplace.policies.fcn4d.network import Conv4dPolicy
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.grasps import split_flat
+from pickplace.rules.masks import PlacingMaps
+from pickplace.rules.state import Observation
 
 FEW_PLACES = 64  # up to 8x8, single pairs of a pick and a place are faster than all places of a pick
 
@@ -21,7 +21,7 @@ class ActionPolicy(Policy):
     Args:
         cell: the sizes.
         mask_infeasible: choose among feasible actions only (the paper does not).
-        network: arguments of :class:`~pickplace.policies.networks.conv4d.Conv4dPolicy`.
+        network: arguments of :class:`~pickplace.policies.fcn4d.network.Conv4dPolicy`.
     """
 
     choice_key = "action"

@@ -4,11 +4,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.policies.networks.depth import Contents, clip_depth
-from pickplace.task.cell import reference_cell
-from pickplace.task.checks import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_number
-from pickplace.task.grasps import split_footprint
-from pickplace.task.state import Item, item_from_depth
+from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_number
+from pickplace.policies.depth import Contents, clip_depth
+from pickplace.rules.cell import reference_cell
+from pickplace.rules.grasps import split_footprint
+from pickplace.rules.state import Item, item_from_depth
 
 #: Entries of the observation that the networks of ``fcn_grasp`` read.
 MAP_KEYS = ("bin_depth", "tote_depth", "tote_bearing")

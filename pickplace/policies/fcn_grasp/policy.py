@@ -5,18 +5,10 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from pickplace.policies.base import MASKED, Policy, pick_one, refuse_several_items
-from pickplace.policies.networks.depth import Contents
-from pickplace.policies.networks.footprint_fcn import MAP_KEYS, FootprintFcn, every_footprint
-from pickplace.task.cell import CellSpec
-from pickplace.task.feasibility import (
-    PlacingMaps,
-    action_footprints,
-    actions_reaching,
-    choice_mask,
-    first_action_reaching,
-    unchecked_maps,
-)
-from pickplace.task.grasps import (
+from pickplace.policies.depth import Contents
+from pickplace.policies.fcn_grasp.network import MAP_KEYS, FootprintFcn, every_footprint
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.grasps import (
     class_index,
     footprint_index,
     is_outside,
@@ -25,8 +17,16 @@ from pickplace.task.grasps import (
     pick_classes,
     split_flat,
 )
-from pickplace.task.state import Observation, State, item_from_depth, items_from_observation, listed_items
-from pickplace.task.transition import apply
+from pickplace.rules.masks import (
+    PlacingMaps,
+    action_footprints,
+    actions_reaching,
+    choice_mask,
+    first_action_reaching,
+    unchecked_maps,
+)
+from pickplace.rules.state import Observation, State, item_from_depth, items_from_observation, listed_items
+from pickplace.rules.step import apply
 
 
 def count_ways(choices: int, footprint: Tensor, allowed: Tensor) -> Tensor:
@@ -49,7 +49,7 @@ class FootprintPolicy(Policy):
 
     Args:
         cell: the sizes.
-        network: arguments of :class:`~pickplace.policies.networks.footprint_fcn.FootprintFcn`.
+        network: arguments of :class:`~pickplace.policies.fcn_grasp.network.FootprintFcn`.
     """
 
     choice_key = "footprint"
@@ -149,7 +149,7 @@ class GraspPolicy(Policy):
 
     Args:
         cell: the sizes.
-        network: arguments of :class:`~pickplace.policies.networks.footprint_fcn.FootprintFcn`, which scores each
+        network: arguments of :class:`~pickplace.policies.fcn_grasp.network.FootprintFcn`, which scores each
             footprint once for every offset of the item under the end effector.
     """
 

@@ -1,0 +1,1 @@
+"""Policies whose pick is heuristic."""

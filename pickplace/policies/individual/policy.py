@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from pickplace.policies.base import MASKED, Policy, pick_one, refuse_several_items
-from pickplace.policies.fcn4d import ActionPolicy
-from pickplace.policies.fcn_grasp import FootprintPolicy, GraspPolicy, count_ways
-from pickplace.task.cell import CellSpec
-from pickplace.task.feasibility import PlacingMaps, action_footprints
-from pickplace.task.grasps import heuristic_pick, join_pick, pick_classes, select_pick
-from pickplace.task.state import Observation, item_from_depth
+from pickplace.policies.fcn4d.policy import ActionPolicy
+from pickplace.policies.fcn_grasp.policy import FootprintPolicy, GraspPolicy, count_ways
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.grasps import heuristic_pick, join_pick, pick_classes, select_pick
+from pickplace.rules.masks import PlacingMaps, action_footprints
+from pickplace.rules.state import Observation, item_from_depth
 
 EXCLUDES = "every pick but the heuristic one"
 
@@ -68,7 +68,7 @@ class IndividualRlPolicy(PlaceRotationPolicy, ActionPolicy):
     The network is that of ``fcn4d``; its features after the last ``3x3x3x3`` convolution are selected at the pick cell,
     so that nothing else of them is computed.
 
-    Args: as :class:`~pickplace.policies.fcn4d.ActionPolicy`.
+    Args: as :class:`~pickplace.policies.fcn4d.policy.ActionPolicy`.
     """
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
@@ -87,7 +87,7 @@ class IndividualRlPolicy(PlaceRotationPolicy, ActionPolicy):
 class IndividualGraspPolicy(PlaceRotationPolicy, GraspPolicy):
     """``individual_grasp`` without a mask: the network of ``fcn_grasp`` scores where the heuristic pick can place.
 
-    Args: as :class:`~pickplace.policies.fcn_grasp.GraspPolicy`.
+    Args: as :class:`~pickplace.policies.fcn_grasp.policy.GraspPolicy`.
     """
 
     def place_scores(self, observation: Observation, pick: Tensor) -> Tensor:
@@ -101,7 +101,7 @@ class IndividualFootprintPolicy(FootprintPolicy):
 
     In a state in which none of them is feasible it chooses among them all; the action then fails.
 
-    Args: as :class:`~pickplace.policies.fcn_grasp.FootprintPolicy`.
+    Args: as :class:`~pickplace.policies.fcn_grasp.policy.FootprintPolicy`.
     """
 
     masks = ("action",)

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pickplace.task.checks import excerpt, integral_number, number
+from pickplace.common.validate import excerpt, integral_number, number
 
 TOLERANCE = 1e-6  # occupancies arrive as float32, in which 0.9 is slightly below 0.9
 

@@ -6,7 +6,7 @@ from numbers import Integral, Real
 
 from torch import Tensor
 
-from pickplace.task.checks import excerpt, integral_number, is_number, number
+from pickplace.common.validate import excerpt, integral_number, is_number, number
 from pickplace.training.curriculum.advance import Advance, Tally
 from pickplace.training.curriculum.transform import ToteHeightCurriculum
 

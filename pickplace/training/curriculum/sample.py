@@ -6,7 +6,7 @@ A sampler is called as ``sampler(level, min_height, count)`` and returns heights
 import torch
 from torch import Tensor
 
-from pickplace.task.checks import number
+from pickplace.common.validate import number
 
 
 class Current:

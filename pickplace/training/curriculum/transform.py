@@ -5,7 +5,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-from pickplace.task.checks import excerpt, integral_number
+from pickplace.common.validate import excerpt, integral_number
 
 
 class ToteHeightCurriculum(Transform):
