@@ -15,6 +15,7 @@ from pickplace.common.files import read_text
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.errors import one_sentence
 from pickplace.config.registry import build, find
+from pickplace.policies.base import EstimatesValue
 from pickplace.policies.restore import build_cell
 from pickplace.runs import checkpoint
 
@@ -63,7 +64,7 @@ def critic_serves_any_tote(cfg: DictConfig) -> bool:
         find(f"model.{key}", cfg.model[key]._target_)  # imports it, which the device "meta" does not allow
     with torch.device("meta"):
         policy = build("model.actor", cfg.model.actor, cell=cell, mask_infeasible=cfg.algo.mask_infeasible)
-        if policy.learns_values:
+        if isinstance(policy, EstimatesValue):
             return False
         return getattr(build("model.critic", cfg.model.critic, cell=cell), "any_size", False)
 

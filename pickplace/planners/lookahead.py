@@ -7,7 +7,7 @@ from pickplace.common.validate import check_bytes, number, whole_number
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, Kinds, check_seed, search_items
 from pickplace.planners.base import MapPlanner
-from pickplace.policies.base import MASKED
+from pickplace.policies.base import MASKED, EstimatesValue
 from pickplace.policies.fcn_grasp.policy import FootprintPolicy
 from pickplace.rules.bin import remove_item, select_item
 from pickplace.rules.cell import CellSpec
@@ -135,7 +135,9 @@ class Lookahead(MapPlanner):
             streams *= 2
         surely = (count > 0) & (mean > self.confidence * error) & (mean > 0)
         best = torch.where(surely, mean, 0.0).argmax(1)
-        return best if self.horizon is None or self.policy.learns_values else self._confirm(best, state, maps, choice)
+        if self.horizon is None or isinstance(self.policy, EstimatesValue):
+            return best
+        return self._confirm(best, state, maps, choice)
 
     def _confirm(self, best: Tensor, state: State, maps: PlacingMaps, choice: Tensor) -> Tensor:
         """Return ``best``, int64 ``[N]``, without the departures that gain nothing when played out to the end.

@@ -8,7 +8,7 @@ of the choice.
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import copy
-from typing import Self
+from typing import Protocol, Self, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
@@ -56,7 +56,6 @@ class Policy(TensorDictModuleBase, ABC):
         excludes: what :meth:`action_log_probs` gives probability 0 by construction; None if nothing.
         single_item: whether it judges one item in the bin, and cannot choose among several.
         ranks_footprints: whether it chooses among all footprints, by ``footprint_logits(observation, mask)``.
-        learns_values: whether its network is the critic, and ``algo.loss=td`` trains it.
         needs_sizes: whether it cannot learn where :meth:`check_sizes` finds fault.
         score_index: how an index of :meth:`unmasked_scores` is made; None if it has none for totes of any size.
     """
@@ -67,7 +66,6 @@ class Policy(TensorDictModuleBase, ABC):
     excludes: str | None = None
     single_item = False
     ranks_footprints = False
-    learns_values = False
     needs_sizes = False
     score_index: str | None = None
     network: torch.nn.Module
@@ -191,6 +189,15 @@ class Policy(TensorDictModuleBase, ABC):
         if found and self.needs_sizes:
             raise ValueError(" ".join(found))
         return found
+
+
+@runtime_checkable
+class EstimatesValue(Protocol):
+    """A policy that follows from the value of states: its network is the critic, too, and learns by TD(lambda)."""
+
+    def value_network(self) -> torch.nn.Module:
+        """Return the module from the entries of the observation in its ``in_keys`` to values ``[..., 1]``."""
+        ...
 
 
 class Choice(Categorical):

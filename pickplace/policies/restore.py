@@ -18,7 +18,7 @@ from pickplace.common.machine import usable_device
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import build
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
-from pickplace.policies.base import Policy, as_collection_policy, as_critic
+from pickplace.policies.base import EstimatesValue, Policy, as_collection_policy, as_critic
 from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.rules.masks import placing_maps
 from pickplace.rules.observation import Term, check_terms
@@ -199,8 +199,8 @@ def restore_critic(cfg: DictConfig, policy: Policy, state: dict, trained_env: di
     Returns:
         None where there is no critic, or it does not serve this tote.
     """
-    if policy.learns_values:
-        critic = as_critic(policy.network)
+    if isinstance(policy, EstimatesValue):
+        critic = as_critic(policy.value_network())
         return RestoredCritic(critic.module, list(critic.in_keys), cfg.algo.reward_scale)
     if "critic" not in state:
         return None

@@ -10,7 +10,7 @@ from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
 from pickplace.evaluation.play import check_episode_settings, check_play
 from pickplace.items.distributions import check_seed
-from pickplace.policies.base import Policy
+from pickplace.policies.base import EstimatesValue, Policy
 
 
 def _node(key: str, value) -> None:
@@ -101,10 +101,9 @@ def check_learner(cfg: DictConfig, policy: Policy) -> None:
         ValueError: naming the key, its value, and what was expected.
     """
     algo, warm_start = cfg.algo, cfg.warm_start
-    if policy.learns_values != (algo.loss == "td"):
-        expected = (
-            "'td' with model=afterstate" if policy.learns_values else "'ppo' or 'a2c'; 'td' is for model=afterstate"
-        )
+    estimates_value = isinstance(policy, EstimatesValue)
+    if estimates_value != (algo.loss == "td"):
+        expected = "'td' with model=afterstate" if estimates_value else "'ppo' or 'a2c'; 'td' is for model=afterstate"
         raise ValueError(f"algo.loss={excerpt(algo.loss)}: expected {expected}.")
     if algo.loss != "td":
         return

@@ -24,7 +24,7 @@ from pickplace.config.registry import build
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.evaluation.play import Episodes, play
-from pickplace.policies.base import Policy, as_collection_policy, as_critic, refuse_large_network
+from pickplace.policies.base import EstimatesValue, Policy, as_collection_policy, as_critic, refuse_large_network
 from pickplace.runs import checkpoint
 from pickplace.runs.provenance import commit, versions
 from pickplace.runs.resume import (
@@ -110,8 +110,8 @@ class Trainer:
             log.warning(warning)
         self.planner = build("planner", cfg.planner, cell=self.cell, policy=self.policy)
         self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, self.items, self.terms, cfg.seed, cfg.trust)
-        if self.policy.learns_values:
-            self.critic = as_critic(self.policy.network)
+        if isinstance(self.policy, EstimatesValue):
+            self.critic = as_critic(self.policy.value_network())
         else:
             make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
             self.critic = self._restored("critic", lambda: as_critic(make_critic()), weights)

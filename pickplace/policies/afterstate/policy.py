@@ -28,7 +28,6 @@ class AfterstatePolicy(CornerPolicy):
 
     map_keys = ("bin_depth", "tote_depth", "tote_height")
     single_item = True
-    learns_values = True
     score_index = None  # the network's pooling is exported for one size of tote only
     network: ToteValue  # type: ignore[assignment]
 
@@ -39,6 +38,9 @@ class AfterstatePolicy(CornerPolicy):
 
     def make_network(self, **network) -> ToteValue:  # type: ignore[override]
         return ToteValue(**network)
+
+    def value_network(self) -> ToteValue:
+        return self.network
 
     def learning_bytes(self, samples: int | None = None) -> int:
         """Return about how many bytes a frame takes, measured at totes of 10 to 100 cells."""
