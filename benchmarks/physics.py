@@ -28,7 +28,7 @@ import numpy as np
 import torch
 
 from pickplace import PickPlaceEnv
-from pickplace.evaluation.statistics import confidence95, proportion95
+from pickplace.evaluation.result import confidence95, proportion95
 from pickplace.physics.execute import Execute
 from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement, read_plans
 from pickplace.physics.settle import Settle

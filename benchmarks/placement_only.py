@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from pickplace import PickPlaceEnv
-from pickplace.evaluation.statistics import confidence95
+from pickplace.evaluation.result import confidence95
 from pickplace.rules.maps import NEVER
 from pickplace.rules.masks import footprint_mask, placing_maps
 from pickplace.rules.state import Item, State, surface_from

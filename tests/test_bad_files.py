@@ -20,7 +20,7 @@ import pickplace
 from pickplace.common.files import read_file, replaced_file
 from pickplace.config.errors import one_sentence
 from pickplace.evaluation import evaluate
-from pickplace.evaluation.evaluate import episode_settings, read_comparison
+from pickplace.evaluation.result import episode_settings, read_comparison
 from pickplace.items.distributions import Recorded
 from pickplace.robot import json_lines
 from pickplace.rules.observation import ToteDepth

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 import yaml
 
-from pickplace.evaluation.statistics import confidence95
+from pickplace.evaluation.result import confidence95
 
 FEW = 20  # episodes below which nothing is decided
 

@@ -1,7 +1,8 @@
 """Episodes played to their end by a planner, and the time of its decisions."""
 
+import logging
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -13,11 +14,16 @@ from pickplace.common.validate import check_bytes, one_of, whole_number
 from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.distributions import check_seed
+from pickplace.physics.outcome import Outcome
+from pickplace.physics.plans import EpisodePlan
+from pickplace.physics.recorded import motion_for_replay
 from pickplace.planners.base import BatchPlanner, decide
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.masks import num_feasible, placing_maps
 from pickplace.rules.state import Failure
 from pickplace.views.recording import Recording, items_in_bin, record_moves
+
+log = logging.getLogger(__name__)
 
 #: ``make_env(first_episode, num_envs)`` makes the environment for a share of the episodes.
 MakeEnv = Callable[[int, int], PickPlaceEnv]
@@ -194,3 +200,16 @@ def decision_latency(make_env: MakeEnv, planner: BatchPlanner, decisions: int) -
     wall, cpu = torch.tensor([times, cpu_times], dtype=torch.float64)
     quantiles = {"p50": wall.quantile(0.5), "p95": wall.quantile(0.95), "cpu_p50": cpu.quantile(0.5)}
     return {key: float(value) for key, value in {**quantiles, "cpu_mean": cpu.mean()}.items()}
+
+
+def carry_out(engine, plans: Sequence[EpisodePlan], recordings: Sequence[Recording]) -> list[Outcome]:
+    """Return how a physics engine carries out plans, and add the motion to the recordings of the same episodes."""
+    outcomes: list[Outcome] = []
+    shown = {recording.episode: recording for recording in recordings}
+    for outcome in engine.carry_out(plans, record=shown):
+        outcomes.append(outcome)
+        if outcome.motion:
+            shown[outcome.episode].carried_out = motion_for_replay(outcome, engine.cell_size)
+        if len(outcomes) % 10 == 0 or len(outcomes) == len(plans):
+            log.info("physics=%s: %s of %s episodes", engine.name, f"{len(outcomes):,}", f"{len(plans):,}")
+    return outcomes

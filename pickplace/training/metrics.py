@@ -3,7 +3,7 @@
 from tensordict import TensorDictBase
 
 from pickplace.evaluation.play import Episodes
-from pickplace.evaluation.statistics import confidence95
+from pickplace.evaluation.result import confidence95
 from pickplace.rules.state import Failure
 from pickplace.training.curriculum import Curriculum
 

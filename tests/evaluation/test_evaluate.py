@@ -11,13 +11,13 @@ from untrained import write_checkpoint
 
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.config.registry import build
-from pickplace.evaluation.evaluate import episode_settings, read_comparison
+from pickplace.evaluation.artifacts import evaluation_table
 from pickplace.evaluation.play import play
+from pickplace.evaluation.result import episode_settings, read_comparison
 from pickplace.physics.plans import read_plans
 from pickplace.physics.settle import Settle
 from pickplace.planners.heuristics import JointDBL
 from pickplace.runs.hydra_app import conf_dir
-from pickplace.views.tables import evaluation_table
 
 
 def compose_evaluation(*words):

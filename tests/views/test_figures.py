@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from pickplace import CellSpec, Failure
+from pickplace.evaluation.artifacts import evaluation_table
 from pickplace.views.figures import FAILURES, learning_curve
 from pickplace.views.recording import Move, Recording
 from pickplace.views.replay import picture
 from pickplace.views.scene import draw_scene, far_to_near, item_colours, visible_triangles
-from pickplace.views.tables import evaluation_table
 
 
 @pytest.mark.parametrize("seed", range(2))

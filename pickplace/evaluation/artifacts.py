@@ -1,6 +1,83 @@
-"""Tables of results."""
+"""Files that an evaluation writes: its result, a table, pictures, the replay page and the plans."""
 
+import json
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pickplace.common.files import replaced_file
+from pickplace.common.validate import flag, whole_number
+from pickplace.config.errors import sentence
+from pickplace.physics.plans import PLANS, EpisodePlan, to_lines
+from pickplace.rules.cell import CellSpec
+from pickplace.runs.folder import EVALUATION
+from pickplace.views.recording import Recording
+from pickplace.views.replay import animation, page, picture
+
+
+@dataclass(frozen=True)
+class Artifacts:
+    """Files to write beside the result.
+
+    Attributes:
+        replay: number of episodes on the replay page; 0: no page.
+        gif: whether to write an animation of the first episode.
+        plans: whether to write the plans of all episodes.
+    """
+
+    replay: int
+    gif: bool
+    plans: bool
+
+    @classmethod
+    def asked(cls, evaluation: Mapping) -> "Artifacts":
+        """Return what the config group ``evaluation`` asks for; a key that it lacks is as good as off.
+
+        Raises:
+            ValueError: naming the key, its value, and what was expected.
+        """
+        flags = {key: flag(f"evaluation.{key}", evaluation.get(key, False)) for key in ("gif", "plans")}
+        return cls(whole_number("evaluation.replay", evaluation.get("replay", 0), 0, 1_000), **flags)
+
+    def write(
+        self, run_dir: Path, result: dict, cell: CellSpec, recordings: list[Recording], plans: list[EpisodePlan],
+        title: str,
+    ) -> None:  # fmt: skip
+        """Write the result, its table, a picture of the first tote, and what is asked for.
+
+        Args:
+            run_dir: the folder.
+            result: the content of ``evaluation.json``.
+            cell: the sizes.
+            recordings: of at least one episode, and of those of the replay.
+            plans: of all episodes.
+            title: of the replay page.
+
+        Raises:
+            ValueError: if a file cannot be written.
+        """
+        texts = {EVALUATION: json.dumps(result, indent=1, default=to_json), "evaluation.md": evaluation_table(result)}
+        if self.replay:
+            how = f", carried out by {result['physics']['method']}" if "physics" in result else ""
+            texts["replay.html"] = page(recordings[: self.replay], cell, title + how)
+        if self.plans:
+            texts[PLANS] = to_lines(plans)
+        try:
+            for name, text in texts.items():
+                with replaced_file(run_dir / name) as new:
+                    new.write_text(text, encoding="utf-8")
+            for name, draw in {"tote.png": picture, **({"replay.gif": animation} if self.gif else {})}.items():
+                with replaced_file(run_dir / name) as new:
+                    draw(recordings[0], cell, new)
+        except OSError as error:
+            raise ValueError(f"{sentence(error)} The table above and the files that are there are whole.") from error
+
+
+def to_json(value: Any) -> Any:
+    """Return a tensor or a number of numpy's as plain values for JSON; anything else as text."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def evaluation_table(result: dict) -> str:

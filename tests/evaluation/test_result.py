@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pickplace.evaluation.statistics import confidence95, paired_difference, proportion95
+from pickplace.evaluation.result import confidence95, paired_difference, proportion95
 
 
 def test_confidence_interval_by_hand():

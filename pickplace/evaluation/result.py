@@ -1,0 +1,201 @@
+"""The result of an evaluation (``evaluation.json``): figures, intervals, and the comparison with another result."""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from pickplace.common.files import read_file
+from pickplace.common.validate import excerpt, is_name, is_number
+from pickplace.evaluation.play import Episodes
+from pickplace.physics.outcome import Outcome
+from pickplace.planners.base import BatchPlanner
+from pickplace.rules.cell import CELL_SETTINGS, HULL_RULES, CellSpec
+from pickplace.rules.state import Failure
+from pickplace.runs.provenance import commit, versions
+
+MAX_EVALUATION = 2**26  # greatest size of an evaluation.json that is read, in bytes
+
+#: Settings of the cell that older files lack; they were played with the default.
+YOUNG_SETTINGS = ("body", "cup", "cup_size", "min_seal", "reach", "bin_items", "refill")
+
+
+def confidence95(values: Tensor, least: float = 0.0, most: float = 1.0) -> tuple[float, float]:
+    """Return the 95% confidence interval of the mean, by Student's t, cut to the range of the values.
+
+    Args:
+        values: ``[E]``; with fewer than two the interval is the whole range.
+        least, most: the range of a value.
+    """
+    if len(values) < 2:
+        return least, most
+    from scipy.stats import t  # takes a second to import, and only evaluation needs it
+
+    mean, error = values.double().mean(), values.double().std() / len(values) ** 0.5
+    margin = t.ppf(0.975, len(values) - 1) * error
+    return max(float(mean - margin), least), min(float(mean + margin), most)
+
+
+def describe(planner: BatchPlanner, facts: dict, episodes: Episodes) -> dict:
+    """Return the content of ``evaluation.json``, but for the times of decisions.
+
+    Args:
+        planner: the planner; it may add ``statistics``.
+        facts: about the planner and its checkpoint, and :func:`episode_settings`.
+        episodes: the results.
+    """
+    return {
+        "planner": planner.name,
+        **facts,
+        **summarise(episodes),
+        **(planner.statistics() if hasattr(planner, "statistics") else {}),
+        "versions": versions(),
+        "commit": commit(),
+    }
+
+
+def summarise(result: Episodes) -> dict:
+    """Return the figures of ``evaluation.json`` that come from the episodes."""
+    low, high = confidence95(result.occupancy)
+    reasons = Counter(Failure(code).name.lower() for code in result.failure.tolist())
+    return {
+        "occupancy": {
+            "mean": float(result.occupancy.mean()),
+            "ci95": [low, high],
+            "min": float(result.occupancy.min()),
+            "per_episode": result.occupancy.tolist(),
+        },
+        "items_placed": float(result.items_placed.double().mean()),
+        "failures": dict(sorted(reasons.items())),
+        "feasible_action_share": result.feasible_share,
+    }
+
+
+def summarise_physics(engine, settings: dict, outcomes: Sequence[Outcome]) -> dict:
+    """Return the figures of ``evaluation.json`` that come from carrying out the episodes in a physics engine.
+
+    Args:
+        engine: the physics engine.
+        settings: its config.
+        outcomes: one an episode.
+    """
+    occupancy = torch.tensor([outcome.occupancy for outcome in outcomes], dtype=torch.float64)
+    done = torch.tensor([outcome.ending == "done" for outcome in outcomes])
+    low, high = proportion95(int(done.sum()), len(done))
+    return {
+        "method": engine.name,
+        "settings": {key: value for key, value in settings.items() if key != "_target_"},
+        "carried_out": {"mean": float(done.double().mean()), "ci95": [low, high]},
+        "occupancy": {
+            "mean": float(occupancy.mean()),
+            "ci95": list(confidence95(occupancy)),
+            "per_episode": occupancy.tolist(),
+        },
+        "endings": dict(sorted(Counter(outcome.ending for outcome in outcomes).items())),
+        "drift": max(outcome.drift for outcome in outcomes),
+        "cpu_seconds": sum(outcome.cpu_seconds for outcome in outcomes) / len(outcomes),
+        "episodes": [outcome.facts() for outcome in outcomes],
+    }
+
+
+def proportion95(successes: int, count: int) -> tuple[float, float]:
+    """Return the 95% confidence interval of a share, by Clopper and Pearson; it has a width at 0 and at 1, too."""
+    from scipy.stats import beta
+
+    low = beta.ppf(0.025, successes, count - successes + 1) if successes else 0.0
+    high = beta.ppf(0.975, successes + 1, count - successes) if successes < count else 1.0
+    return float(low), float(high)
+
+
+def paired_difference(result: dict, other: dict) -> dict:
+    """Return the mean occupancy of a result minus that of another one, episode by episode, with its 95% interval.
+
+    Both have seen the same items, so that the difference does not depend on how hard the items are.
+
+    Args:
+        result, other: the contents of two ``evaluation.json``.
+    """
+    ours, theirs = (torch.tensor(r["occupancy"]["per_episode"], dtype=torch.float64) for r in (result, other))
+    difference = ours - theirs
+    return {
+        "against": other["planner"],
+        "mean": float(difference.mean()),
+        "ci95": list(confidence95(difference, least=-1.0)),
+    }
+
+
+def episode_settings(cfg: DictConfig) -> dict:
+    """Return the settings that determine which episodes an evaluation plays."""
+    return {
+        "env": {key: with_hash(value) for key, value in resolved(cfg.env).items()},
+        "items": with_hash(resolved(cfg["items"])),
+        "stream": cfg.evaluation.stream,
+        "episodes": cfg.evaluation.episodes,
+        "seed": cfg.evaluation.seed,
+    }
+
+
+def with_hash(node: Any) -> Any:
+    """Return a part of a config with the hash of its file, if it has one: the content counts, not its place."""
+    path = node.get("path") if isinstance(node, dict) else None
+    if isinstance(path, str) and Path(path).is_file():
+        return {**node, "sha256": hashlib.sha256(read_file(path)).hexdigest()}
+    return node
+
+
+def is_same(ours: Any, theirs: Any) -> bool:
+    """Return whether two parts of configs agree, files by content if both know it, else by path."""
+    if isinstance(ours, dict) and isinstance(theirs, dict):
+        ignored = "path" if "sha256" in ours and "sha256" in theirs else "sha256"
+        ours, theirs = ({key: node[key] for key in node if key != ignored} for node in (ours, theirs))
+    return ours == theirs
+
+
+def read_comparison(path: Path, expected: dict) -> dict:
+    """Return another ``evaluation.json`` of the same episodes, for :func:`paired_difference`.
+
+    Args:
+        path: the file.
+        expected: :func:`episode_settings` of the evaluation at hand.
+
+    Raises:
+        ValueError: for a file that cannot be read, or that is about other episodes.
+    """
+    refused = f"compare={excerpt(str(path))}: expected an evaluation.json"
+    try:
+        other = json.loads(read_file(path, MAX_EVALUATION, empty=False))
+        cell, values, name = dict(other["env"]), other["occupancy"]["per_episode"], other.get("planner")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{refused} ({error}).") from error
+    for key in ("stream", "seed", "episodes", "items"):
+        if not is_same(expected[key], other.get(key)):
+            found = excerpt(other.get(key))
+            raise ValueError(f"compare={excerpt(str(path))}: its {key} is {found}, expected {excerpt(expected[key])}.")
+    unused = {
+        "support_margin": cell.get("support") not in HULL_RULES,
+        "min_seal": cell.get("pick_rule") != "seal",
+        "refill": cell.get("bin_items", 1) == 1,
+    }
+    for key in CELL_SETTINGS:
+        # A setting that is younger than the file, or the checkpoint, has its default.
+        default = getattr(CellSpec, key) if key in YOUNG_SETTINGS else None
+        ours, theirs = (env.get(key, default) for env in (expected["env"], cell))
+        if not is_same(ours, theirs) and not unused.get(key):
+            raise ValueError(f"compare={excerpt(str(path))}: env.{key}={excerpt(theirs)}, expected {ours}.")
+    count = expected["episodes"]
+    if not isinstance(values, list) or len(values) != count or not all(is_number(v) and 0 <= v <= 1 for v in values):
+        raise ValueError(f"{refused} whose occupancy.per_episode is a list of {count} numbers between 0 and 1.")
+    if not is_name(name):
+        raise ValueError(f"{refused} whose planner is a name to print, got {excerpt(name)}.")
+    return other
+
+
+def resolved(node: DictConfig) -> Any:
+    """Return a part of a config as plain values."""
+    return OmegaConf.to_container(node, resolve=True)
