@@ -15,6 +15,7 @@ from hydra import compose, initialize_config_dir
 
 from pickplace import PickPlaceEnv, Planner, load_policy
 from pickplace.config.registry import build
+from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.robot import json_lines
 from pickplace.rules.observation import STANDARD_TERMS
 from pickplace.runs import checkpoint
@@ -53,6 +54,18 @@ def test_own_planner(example):
         example("evaluate", "own_planner", "planner=soft_dbl", f"planner.seed={seed}", *EVALUATION) for seed in (0, 1)
     )
     assert ours["occupancy"] == again["occupancy"] and ours["occupancy"] != other["occupancy"]
+
+
+def test_own_engine(example, monkeypatch):
+    ours = example("evaluate", "own_engine", "planner=joint_dbl", "physics=load_limit", *EVALUATION)
+    found = ours["physics"]
+    assert (found["method"], found["settings"]["max_load"]) == ("load_limit", 2.0)
+    assert found["endings"] == {"crushed": 3} and found["occupancy"]["mean"] < ours["occupancy"]["mean"]
+    monkeypatch.syspath_prepend(str(EXAMPLES / "own_engine"))
+    engine = importlib.import_module("own_engine").LoadLimit(max_load=0.08)
+    tower = [Placement((0.0, 0.0, 0.05 * level), (0.05, 0.05, 0.05)) for level in range(4)]  # of 37.5 g each
+    (outcome,) = engine.carry_out([EpisodePlan(0, (0.1, 0.1, 0.2), placements=tower)])
+    assert (outcome.ending, outcome.lost, outcome.during, outcome.occupancy) == ("crushed", 0, 3, pytest.approx(3 / 16))
 
 
 def test_own_planner_draws_by_its_seed(monkeypatch):

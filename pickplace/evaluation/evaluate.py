@@ -6,7 +6,6 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from pickplace.config.composition import PARTS_OF_ENV
-from pickplace.config.registry import build
 from pickplace.evaluation.artifacts import Artifacts, evaluation_table
 from pickplace.evaluation.parts import prepare
 from pickplace.evaluation.play import carry_out, decision_latency, play
@@ -18,6 +17,7 @@ from pickplace.evaluation.result import (
     resolved,
     summarise_physics,
 )
+from pickplace.physics.engine import build_engine
 from pickplace.physics.plans import CELL_SIZE
 from pickplace.physics.recorded import plan_of
 from pickplace.runs.folder import claim, refuse_occupied
@@ -47,7 +47,7 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
 
 def _evaluate(cfg: DictConfig, run_dir: Path) -> float:
     ev, artifacts = cfg.evaluation, Artifacts.asked(cfg.evaluation)
-    engine = build("physics", cfg.physics) if cfg.physics else None
+    engine = build_engine(cfg.physics) if cfg.physics else None
     make_env, planner, facts = prepare(cfg)
     cell, settings = make_env(0, 1).cell, episode_settings(cfg)
     other = None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), settings)

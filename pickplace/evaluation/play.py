@@ -14,13 +14,13 @@ from pickplace.common.validate import check_bytes, one_of, whole_number
 from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.distributions import check_seed
-from pickplace.physics.outcome import Outcome
+from pickplace.physics.engine import Engine
 from pickplace.physics.plans import EpisodePlan
-from pickplace.physics.recorded import motion_for_replay
 from pickplace.planners.base import BatchPlanner, decide
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.masks import num_feasible, placing_maps
 from pickplace.rules.state import Failure
+from pickplace.views.motion import Outcome
 from pickplace.views.recording import Recording, items_in_bin, record_moves
 
 log = logging.getLogger(__name__)
@@ -202,14 +202,20 @@ def decision_latency(make_env: MakeEnv, planner: BatchPlanner, decisions: int) -
     return {key: float(value) for key, value in {**quantiles, "cpu_mean": cpu.mean()}.items()}
 
 
-def carry_out(engine, plans: Sequence[EpisodePlan], recordings: Sequence[Recording]) -> list[Outcome]:
-    """Return how a physics engine carries out plans, and add the motion to the recordings of the same episodes."""
+def carry_out(engine: Engine, plans: Sequence[EpisodePlan], recordings: Sequence[Recording]) -> list[Outcome]:
+    """Return the outcomes of plans that a physics engine carries out, and add those of recorded episodes to them.
+
+    Raises:
+        ValueError: if the engine yields anything but an outcome for each plan.
+    """
     outcomes: list[Outcome] = []
     shown = {recording.episode: recording for recording in recordings}
     for outcome in engine.carry_out(plans, record=shown):
         outcomes.append(outcome)
-        if outcome.motion:
-            shown[outcome.episode].carried_out = motion_for_replay(outcome, engine.cell_size)
+        if outcome.episode in shown:
+            shown[outcome.episode].carried_out = outcome
         if len(outcomes) % 10 == 0 or len(outcomes) == len(plans):
             log.info("physics=%s: %s of %s episodes", engine.name, f"{len(outcomes):,}", f"{len(plans):,}")
+    if (found := [outcome.episode for outcome in outcomes]) != (wanted := [plan.episode for plan in plans]):
+        raise ValueError(f"physics={engine.name}: outcomes of the episodes {found}, expected {wanted}.")
     return outcomes

@@ -14,11 +14,12 @@ from torch import Tensor
 from pickplace.common.files import read_file
 from pickplace.common.validate import excerpt, is_name, is_number
 from pickplace.evaluation.play import Episodes
-from pickplace.physics.outcome import Outcome
+from pickplace.physics.engine import Engine
 from pickplace.planners.base import BatchPlanner
 from pickplace.rules.cell import CELL_SETTINGS, HULL_RULES, CellSpec
 from pickplace.rules.state import Failure
 from pickplace.runs.provenance import commit, versions
+from pickplace.views.motion import Outcome
 
 MAX_EVALUATION = 2**26  # greatest size of an evaluation.json that is read, in bytes
 
@@ -77,7 +78,7 @@ def summarise(result: Episodes) -> dict:
     }
 
 
-def summarise_physics(engine, settings: dict, outcomes: Sequence[Outcome]) -> dict:
+def summarise_physics(engine: Engine, settings: dict, outcomes: Sequence[Outcome]) -> dict:
     """Return the figures of ``evaluation.json`` that come from carrying out the episodes in a physics engine.
 
     Args:

@@ -17,7 +17,7 @@ def run(arguments: argparse.Namespace) -> None:
     from omegaconf import OmegaConf  # not before help is answered
     from yaml import YAMLError
 
-    from pickplace.config.registry import build
+    from pickplace.physics.engine import build_engine
     from pickplace.physics.plans import read_plans
 
     for word in arguments.settings:
@@ -28,8 +28,7 @@ def run(arguments: argparse.Namespace) -> None:
         settings = OmegaConf.from_dotlist([*arguments.settings, f"_target_={arguments.method}"])
     except YAMLError as error:
         raise ValueError(f"{' '.join(arguments.settings)}: expected <key>=<value>, such as friction=0.3.") from error
-    simulation = build("physics", settings)
-    for outcome in simulation.carry_out(read_plans(arguments.plans)):
+    for outcome in build_engine(settings).carry_out(read_plans(arguments.plans)):
         write_output(json.dumps(outcome.facts()) + "\n")
 
 
@@ -44,8 +43,9 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("plans", help="plans.jsonl: one placement a line, in metres")
     options.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="settings, such as friction=0.3 workers=2")
     options.add_argument(
-        "--method", choices=("settle", "execute"), default="settle",
-        help="items appear at their places, or a gantry brings them from the bin (default %(default)s)",
+        "--method", metavar="NAME", default="settle",
+        help="settle: items appear at their places; execute: a gantry brings them from the bin; or the dotted path of "
+        "a class of your own (default %(default)s)",
     )  # fmt: skip
     return options
 

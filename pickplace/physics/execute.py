@@ -8,10 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pickplace.common.validate import number
-from pickplace.physics.outcome import Loss
 from pickplace.physics.plans import TOLERANCE, EpisodePlan, Placement, Point
 from pickplace.physics.scene import STIFF, TIMESTEP, WALL, Scene, mujoco
-from pickplace.physics.simulation import Simulation, wait
+from pickplace.physics.simulation import Loss, Simulation, wait
 
 HEADROOM = 0.02  # distance between what is carried and the rims, m
 TURNING_SPEED = 4.0  # greatest speed of the hinge, rad/s
@@ -59,6 +58,12 @@ class Execute(Simulation):
     slow_speed: float = 0.2
 
     name: ClassVar[str] = "execute"
+    endings: ClassVar[dict[str, tuple[str, str]]] = Simulation.endings | {
+        "dropped": ("The suction did not hold item {}.", "item {} not held"),
+        "effector_contact": ("The gripper hit something while it moved item {}.", "gripper hit something"),
+        "disturbed": ("Another item in the bin moved when item {} was taken.", "moved another item"),
+        "wedged": ("Item {} was not in its place when it was released.", "item {} wedged"),
+    }
     limits: ClassVar[dict[str, tuple[float, float]]] = Simulation.limits | {
         "plate_thickness": (1e-3, 1), "plate_mass": (0.2, 50), "lip": (0, 0.01), "release_height": (0, 0.1),
         "suction": (0, 1e5), "contact_force": (0, 1e5), "tolerance": (1e-4, 1), "speed": (0.01, 5),

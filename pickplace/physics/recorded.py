@@ -1,21 +1,8 @@
-"""Plans of recorded episodes, and how they were carried out."""
+"""Plans of recorded episodes."""
 
-from pickplace.physics.outcome import Outcome
 from pickplace.physics.plans import EpisodePlan, Placement, Point
 from pickplace.rules.cell import CellSpec
-from pickplace.views.motion import CarriedOut
 from pickplace.views.recording import Recording
-
-#: What the reader of a replay is told: a sentence about the lost item, and a word or two.
-ENDINGS = {
-    "done": ("Carried out: every item stayed in its place.", "carried out"),
-    "collapsed": ("Item {} left its place.", "item {} left its place"),
-    "effector_contact": ("The gripper hit something while it moved item {}.", "gripper hit something"),
-    "wedged": ("Item {} was not in its place when it was released.", "item {} wedged"),
-    "disturbed": ("Another item in the bin moved when item {} was taken.", "moved another item"),
-    "dropped": ("The suction did not hold item {}.", "item {} not held"),
-    "diverged": ("The simulation became impossible.", "simulation diverged"),
-}
 
 
 def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePlan:
@@ -50,13 +37,3 @@ def body_of(cell: CellSpec, cell_size: float) -> tuple[Point, ...]:
     """Return the rectangles of the end effector's body in metres; none if it is one rectangle."""
     boxes = cell.effector(0).body
     return tuple(tuple(round(part * cell_size, 9) for part in box) for box in boxes) if len(boxes) > 1 else ()
-
-
-def motion_for_replay(outcome: Outcome, cell_size: float) -> CarriedOut:
-    """Return what a replay shows of an outcome and its motion; ``cell_size`` is the side of a cell in metres."""
-    assert outcome.motion is not None
-    number = None if outcome.lost is None else outcome.lost + 1
-    ending, label = (
-        text.format(number) for text in ENDINGS.get(outcome.ending, (f"Item {{}}: {outcome.ending}.", outcome.ending))
-    )
-    return CarriedOut(ending, label, outcome.lost, outcome.placed, outcome.occupancy, cell_size, outcome.motion)

@@ -5,10 +5,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from pickplace.physics.outcome import Loss
 from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.physics.scene import Scene
-from pickplace.physics.simulation import Simulation, wait
+from pickplace.physics.simulation import Loss, Simulation, wait
 
 DROP_HEIGHT = 0.002  # height above its planned pose at which an item appears, m
 

@@ -8,15 +8,14 @@ from dataclasses import dataclass
 from math import prod
 from multiprocessing import get_context
 from time import process_time
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from pickplace.common.validate import flag, number, whole_number
-from pickplace.physics.outcome import Loss, Outcome
 from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement
 from pickplace.physics.scene import Scene, mujoco
-from pickplace.views.motion import Motion
+from pickplace.views.motion import Motion, Outcome
 
 #: Linear and angular speeds below which an item is at rest; m/s and rad/s.
 REST_SPEEDS = np.repeat((0.002, 0.02), 3)
@@ -26,9 +25,16 @@ AFTERMATH = 1.0  # time that a recorded motion goes on after a collapse, s
 LOOK = 0.02  # time between two looks at the speeds, s
 
 
+class Loss(NamedTuple):
+    """The first loss of an episode: its reason, and the number of the lost item, from 0."""
+
+    reason: str
+    item: int
+
+
 @dataclass(frozen=True)
 class Simulation(ABC):
-    """Options that every simulation has.
+    """A physics engine (:class:`~pickplace.physics.engine.Engine`) with MuJoCo, and the options of every such one.
 
     An episode ends at the first loss. ``collapsed``: an item has moved or tilted too far from its planned pose.
     ``diverged``: the simulation has become impossible.
@@ -62,6 +68,12 @@ class Simulation(ABC):
     workers: int = 1
 
     name: ClassVar[str]
+    #: What the reader of a replay is told of each ending: a sentence about the lost item, and a word or two.
+    endings: ClassVar[dict[str, tuple[str, str]]] = {
+        "done": ("Carried out: every item stayed in its place.", "carried out"),
+        "collapsed": ("Item {} left its place.", "item {} left its place"),
+        "diverged": ("The simulation became impossible.", "simulation diverged"),
+    }
     #: Least and greatest value of each option that is a number.
     limits: ClassVar[dict[str, tuple[float, float]]] = {
         "cell_size": (1e-3, 10), "friction": (0, 10), "density": (1, 1e5), "gap": (0, 0.1), "noise": (0, 0.1),
@@ -110,7 +122,8 @@ class Simulation(ABC):
         started, count = process_time(), len(plan.placements)
         errors = self.noise * np.random.default_rng((self.seed, plan.episode)).standard_normal((count, 2))
         scene, loss, placed = self.make_scene(plan), None, 0
-        scene.motion = Motion(None if scene.bin is None else tuple(scene.bin.tolist())) if record else None
+        if record:
+            scene.motion = Motion(self.cell_size, None if scene.bin is None else tuple(scene.bin.tolist()))
         for placement, error in zip(plan.placements, errors, strict=True):
             if loss := self.place(scene, placement, error) or self.find_loss(scene):
                 break
@@ -121,15 +134,19 @@ class Simulation(ABC):
             scene.run(FINAL_WAIT)
             loss = self.find_loss(scene)
         kept = [number for number in range(placed) if loss is None or number != loss.item]
+        ending = loss.reason if loss else "done"
+        sentence, label = (text.format(loss.item + 1 if loss else "") for text in self.endings[ending])
         outcome = Outcome(
             episode=plan.episode,
-            ending=loss.reason if loss else "done",
+            ending=ending,
             lost=loss.item if loss else None,
             during=placed if loss else None,
             placed=placed,
             occupancy=min(1.0, sum(placement.volume for placement in plan.placements[:placed]) / prod(plan.tote)),
             drift=float(scene.shifts[kept].max(initial=0.0)),
             cpu_seconds=process_time() - started,
+            sentence=sentence,
+            label=label,
             motion=scene.motion,
         )
         if scene.motion:

@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pickplace.physics.execute import Execute, Gantry
-from pickplace.physics.outcome import Loss
 from pickplace.physics.plans import EpisodePlan
 from pickplace.physics.recorded import body_of
 from pickplace.physics.scene import mujoco
-from pickplace.physics.simulation import wait
+from pickplace.physics.simulation import Loss, wait
 from pickplace.robot.camera import Camera
 from pickplace.robot.planner import Plan, Planner
 

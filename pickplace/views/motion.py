@@ -1,6 +1,7 @@
-"""How a physics engine carried out an episode: the poses of the bodies, picture by picture."""
+"""An episode that a physics engine carried out: its end, and the poses of the bodies, picture by picture."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ class Motion:
     has not moved are left out.
 
     Attributes:
+        cell_size: side of a cell, m.
         bin: near corner of the bin, ``[2]``, m; None without a gantry.
         pictures: number of pictures, at most :data:`INTERVAL` apart.
         plate: poses of the end effector: of the middle of its lower face.
@@ -24,6 +26,7 @@ class Motion:
         ends: number of pictures when each placement had ended.
     """
 
+    cell_size: float
     bin: tuple[float, float] | None = None
     pictures: int = 0
     plate: list[tuple[float, ...]] = field(default_factory=list)
@@ -46,24 +49,23 @@ class Motion:
         self.pictures += 1
 
 
-@dataclass
-class CarriedOut:
-    """The end of an episode that a physics engine carried out.
+@dataclass(frozen=True)
+class Outcome:
+    """The end of an episode that a physics engine carried out."""
 
-    Attributes:
-        ending: what was lost, or that nothing was; a sentence.
-        label: the same in a word or two.
-        lost: number of the lost item, from 0.
-        placed: items placed before it.
-        occupancy: share of the tote that they fill.
-        cell_size: side of a cell, m.
-        motion: the poses.
-    """
+    episode: int
+    ending: str  # "done", or the reason of the first loss
+    lost: int | None  # number of the lost item, from 0
+    during: int | None  # number of the placement during which it was lost; the number of placements: at the end
+    placed: int  # items placed before the loss
+    occupancy: float  # share of the tote that they fill
+    drift: float = 0.0  # greatest distance of a placed item that was not lost from its planned pose, m
+    cpu_seconds: float = 0.0
+    sentence: str = ""  # the ending for the reader of a replay
+    label: str = ""  # the same in a word or two
+    motion: Motion | None = field(default=None, repr=False)  # of an episode that was to be recorded
 
-    ending: str
-    label: str
-    lost: int | None
-    placed: int
-    occupancy: float
-    cell_size: float
-    motion: Motion
+    def facts(self) -> dict[str, Any]:
+        """Return the figures, as ``pickplace-physics`` prints them."""
+        hidden = ("sentence", "label", "motion")
+        return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name not in hidden}

@@ -11,7 +11,7 @@ from pickplace.rules.cell import CellSpec, reference_cell
 from pickplace.rules.grasps import split_action
 from pickplace.rules.state import Failure, Item, State
 from pickplace.rules.step import apply
-from pickplace.views.motion import CarriedOut
+from pickplace.views.motion import Outcome
 
 FULL = "The tote is full."
 NONE_FITS = "None of these items fits anywhere any more."
@@ -61,7 +61,7 @@ class Recording:
     ending: Failure | None = None  # None while it goes on; Failure.NONE where the item stream ended
     waiting: list[InBin] = field(default_factory=list)  # what lies in the bin at the end, of a stuck episode
     occupancy: float = 0.0
-    carried_out: CarriedOut | None = None  # by a physics engine
+    carried_out: Outcome | None = None  # by a physics engine
 
     @property
     def boxes(self) -> list[Box]:

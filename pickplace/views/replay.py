@@ -13,7 +13,7 @@ import numpy as np
 
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.state import Failure
-from pickplace.views.motion import CarriedOut
+from pickplace.views.motion import Motion, Outcome
 from pickplace.views.recording import FULL, Box, InBin, Recording
 from pickplace.views.scene import draw_scene, item_colours
 
@@ -31,10 +31,10 @@ def page(recordings: list[Recording], cell: CellSpec, title: str) -> str:
     """
     colours = item_colours([box for recording in recordings for box in recording.boxes + _items_not_placed(recording)])
     kinds = {f"{w},{d},{_cells(h, cell)}": colour for (w, d, h), colour in colours.items()}
-    carried_out = [recording.carried_out for recording in recordings if recording.carried_out]
+    motions = [one.carried_out.motion for one in recordings if one.carried_out and one.carried_out.motion]
     data = {
         "title": title,
-        "binAt": _bin_corner(carried_out[0]) if carried_out else None,
+        "binAt": _bin_corner(motions[0]) if motions else None,
         "bin": [*cell.bin_size[:2], _cells(cell.bin_size[2], cell)],
         "tote": cell.tote_size[:2],
         **effector_parts(cell),
@@ -87,7 +87,6 @@ def _episode(recording: Recording, cell: CellSpec) -> dict:
     """Return an episode for the page; all lengths are in cells."""
     heat = [move.heat for move in recording.moves if move.heat is not None]
     ending = recording.describe_ending(cell.num_places)
-    carried_out = recording.carried_out
     # One flat list a move: 5 of the item, 2 pick, 2 place, rotation, 4 of the footprint, z, failure code.
     moves = [
         [*_item(move.item, cell), *move.pick, *move.place, move.rotation, *move.footprint, _cells(move.z, cell),
@@ -107,27 +106,30 @@ def _episode(recording: Recording, cell: CellSpec) -> dict:
         "others": [[_item(item, cell) for item in move.others] for move in recording.moves],
         "heat": base64.b64encode(np.stack(heat).tobytes()).decode() if heat else None,
     }
-    return facts if carried_out is None else facts | _physics(carried_out, facts)
+    return facts | (_physics(recording.carried_out, facts) if recording.carried_out else {})
 
 
-def _physics(carried_out: CarriedOut, facts: dict) -> dict:
+def _physics(outcome: Outcome, facts: dict) -> dict:
     """Return what physics changes in the facts of an episode for the page, and its motion."""
-    lost, motion = carried_out.lost is not None, carried_out.motion
-    return {
-        "occupancy": carried_out.occupancy,
-        "ending": carried_out.ending if lost else f"{carried_out.ending} {facts['ending']}".strip(),
-        "label": carried_out.label if lost else facts["label"],
+    lost, motion = outcome.lost is not None, outcome.motion
+    sentence = outcome.sentence or f"Carried out: {outcome.ending}."
+    changed = {
+        "occupancy": outcome.occupancy,
+        "ending": sentence if lost else f"{sentence} {facts['ending']}".strip(),
+        "label": (outcome.label or outcome.ending) if lost else facts["label"],
         "failed": lost or facts["failed"],
         "stuck": facts["stuck"] and not lost,
-        "motion": {
-            "lost": carried_out.lost,
-            "placed": carried_out.placed,
-            "ends": motion.ends,
-            "plate": _poses(motion.plate, carried_out.cell_size),
-            "boxes": [_poses(poses, carried_out.cell_size) for poses in motion.boxes],
-            "left": [[round(side / carried_out.cell_size, 6) for side in sides] for sides in motion.left],
-        },
     }
+    if motion:
+        changed["motion"] = {
+            "lost": outcome.lost,
+            "placed": outcome.placed,
+            "ends": motion.ends,
+            "plate": _poses(motion.plate, motion.cell_size),
+            "boxes": [_poses(poses, motion.cell_size) for poses in motion.boxes],
+            "left": [[round(side / motion.cell_size, 6) for side in sides] for sides in motion.left],
+        }
+    return changed
 
 
 def _poses(poses: list[tuple[float, ...]], cell_size: float) -> list[int]:
@@ -136,10 +138,9 @@ def _poses(poses: list[tuple[float, ...]], cell_size: float) -> list[int]:
     return np.rint(np.array(poses).reshape(-1, 8) * scale).astype(int).ravel().tolist()
 
 
-def _bin_corner(carried_out: CarriedOut) -> list[float] | None:
+def _bin_corner(motion: Motion) -> list[float] | None:
     """Return where the bin stands, in cells from the tote's corner, if there is one."""
-    corner = carried_out.motion.bin
-    return None if corner is None else [round(at / carried_out.cell_size, 6) for at in corner]
+    return None if motion.bin is None else [round(at / motion.cell_size, 6) for at in motion.bin]
 
 
 def _item(item: InBin, cell: CellSpec) -> list[int | float]:

@@ -18,6 +18,7 @@ from pickplace.physics.plans import read_plans
 from pickplace.physics.settle import Settle
 from pickplace.planners.heuristics import JointDBL
 from pickplace.runs.hydra_app import conf_dir
+from pickplace.views.motion import Outcome
 
 
 def compose_evaluation(*words):
@@ -233,3 +234,33 @@ def test_own_planners_add_to_the_result(evaluation):
     assert [result[key] for key in ("known_first", "seen", "share", "device")] == [5, [3, 4], 0.5, "cpu"]
     refused = "planner: Nameless has no name; expected"
     assert evaluation(*arguments, "planner._target_=test_evaluate.Nameless", refused=refused) is None
+
+
+class Clumsy:
+    """A physics engine without bodies: the second item of every episode is lost."""
+
+    name = "clumsy"
+
+    def __init__(self, cell_size: float = 0.1, skip: bool = False):
+        self.cell_size, self.skip = cell_size, skip
+
+    def carry_out(self, plans, record=()):
+        for plan in plans[self.skip :]:
+            volume = plan.placements[0].volume / (plan.tote[0] * plan.tote[1] * plan.tote[2])
+            yield Outcome(plan.episode, "slipped", 1, 1, 1, volume)
+
+
+def test_a_physics_engine_of_ones_own(evaluation):
+    """One class; it needs no MuJoCo, and its config may be a file."""
+    words = [*SMALL[:2], "planner=joint_dbl", "evaluation.episodes=3", "evaluation.plans=true", "evaluation.replay=2"]
+    result = evaluation(*words, "+physics._target_=test_evaluate.Clumsy", "+physics.cell_size=0.2")
+    found, plans = result["physics"], read_plans(result["path"].parent / "plans.jsonl")
+    assert (found["method"], found["settings"], found["endings"]) == ("clumsy", {"cell_size": 0.2}, {"slipped": 3})
+    assert plans[0].tote == (0.8, 0.8, 0.4) and found["carried_out"]["mean"] == 0
+    volumes = [plan.placements[0].volume / 0.256 for plan in plans]
+    assert found["occupancy"]["per_episode"] == pytest.approx(volumes)
+    assert "clumsy" in (result["path"].parent / "replay.html").read_text()
+    own = "+physics._target_=test_evaluate."
+    evaluation(*words, f"{own}Clumsy", "+physics.skip=true", refused="physics=clumsy: outcomes of the episodes [1, 2]")
+    evaluation(*words, f"{own}Clumsy", "+physics.speed=1", refused="physics.speed: there is no key")
+    evaluation(*words, f"{own}Counting", refused="physics._target_=test_evaluate.Counting: ")

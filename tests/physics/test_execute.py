@@ -169,7 +169,7 @@ def test_an_item_waits_in_the_bin_until_it_is_taken():
     execute = Execute()
     scene = execute.make_scene(plan)
     start = scene.bin
-    scene.motion = Motion(tuple(start))
+    scene.motion = Motion(0.05, tuple(start))
     assert execute.place(scene, first, np.zeros(2)) is None
     (waiting,) = scene.waiting.values()
     assert len(scene.bodies) == 2 and np.allclose(

@@ -167,6 +167,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
         ((path, "fricton=1"), "physics.fricton: there is no key 'fricton' in physics; did you mean 'friction'?"),
         *(((path, word), f"{word}: expected <key>=<value>") for word in ("friction", "friction=[1", "_target_=x")),
         ((path, "--method", "execute", "friction=0.3"), "physics=execute: episode 0 has no bin"),
+        ((path, "--method", "setle"), "physics._target_=setle: "),
         ((path, "gap=0.02", "cell_size=1"), None),
         ((path, "gap=0.06", "cell_size=1"), "episode 0, item 1: 0.1 m wide; expected sides of at least twice physics"),
         ((tmp_path / "none.jsonl",), "none.jsonl: No such file"),

@@ -17,7 +17,7 @@ from pickplace.evaluation.play import play
 from pickplace.items.distributions import Kinds, Uniform
 from pickplace.planners.heuristics import JointDBL, UniformRandom
 from pickplace.views import replay
-from pickplace.views.motion import CarriedOut, Motion
+from pickplace.views.motion import Motion, Outcome
 from pickplace.views.recording import Move, Recording
 
 ODD = {"bin_size": (4, 6, 2), "tote_size": (5, 7, 3), "effector_size": (2, 3), "rotations": 3, "height_unit": 0.25}
@@ -223,8 +223,10 @@ def test_page_shows_what_physics_did(browser, tmp_path):
     first = [(0, -0.3, 0.05, 0.025, 1, 0, 0, 0), (4, 0.05, 0.025, 0.025, 1, 0, 0, 0)]
     second = [(5, -0.3, 0.05, 0.025, 1, 0, 0, 0), (9, 0.2, 0.1, 0.025, *turned)]
     plate = [(0, -0.3, 0.05, 0.3, 1, 0, 0, 0), (8, -0.3, 0.05, 0.3, *turned)]
-    motion = Motion((-0.5, 0.1), 10, plate, [first, second], [5, 10])
-    carried_out = CarriedOut("Item 2 left its place.", "item 2 left its place", 1, 1, 0.25, 0.05, motion)
+    motion = Motion(0.05, (-0.5, 0.1), 10, plate, [first, second], [5, 10])
+    carried_out = Outcome(
+        0, "collapsed", 1, 1, 1, 0.25, 0.0, 0.0, "Item 2 left its place.", "item 2 left its place", motion
+    )
     recording = Recording(0, 5, moves, Failure.STUCK, [], 0.5, carried_out)
     path = written(tmp_path, [recording], CellSpec())
     assert unpack(path.read_text())["binAt"] == [-10, 2]
@@ -258,9 +260,8 @@ def test_page_shows_what_physics_did(browser, tmp_path):
 
     # A failing move is not carried out, and the episode still counts as failed.
     failing = replace(moves[1], failure=Failure.TOTE_COLLISION)
-    kept = CarriedOut(
-        "Carried out.", "carried out", None, 1, 2 / 180, 0.05, Motion((-0.5, 0.1), 5, plate, [first], [5])
-    )
+    motion = Motion(0.05, (-0.5, 0.1), 5, plate, [first], [5])
+    kept = Outcome(0, "done", None, None, 1, 2 / 180, 0.0, 0.0, "Carried out.", "carried out", motion)
     recording = Recording(0, 5, [moves[0], failing], Failure.TOTE_COLLISION, [], 2 / 180, kept)
     state = open_page(browser, written(tmp_path, [recording], CellSpec()), "#step=9")
     assert state()["ending"] == f"Carried out. {Failure.TOTE_COLLISION.sentence}"
@@ -315,9 +316,9 @@ def test_page_shows_all_that_lies_in_the_bin(browser, tmp_path):
     boxes = [[pose(0, b), (6, 0.025, 0.025, 0.05, 1, 0, 0, 0)], [pose(0, a), (15, 0.2, 0.175, 0.025, 1, 0, 0, 0)],
              [pose(0, c)], [pose(10, d)]]  # fmt: skip
     motion = Motion(
-        (-0.35, 0.025), 20, [(0, -0.3, 0.05, 0.5, 1, 0, 0, 0)], boxes, [10, 20], [(0.05, 0.1, 0.15), (0.05,) * 3]
+        0.05, (-0.35, 0.025), 20, [(0, -0.3, 0.05, 0.5, 1, 0, 0, 0)], boxes, [10, 20], [(0.05, 0.1, 0.15), (0.05,) * 3]
     )
-    kept = CarriedOut("Carried out.", "carried out", None, 2, 0.1, 0.05, motion)
+    kept = Outcome(0, "done", None, None, 2, 0.1, 0.0, 0.0, "Carried out.", "carried out", motion)
     state = open_page(browser, written(tmp_path, [replace(recording, carried_out=kept)], cell))
     browser.execute_script(WATCH + "document.getElementById('seek').step = 'any'")
     assert state()["moves"] == 2 and lying(0.1) == {a, b, c} and lying(0.8) == {a, c}

@@ -1,0 +1,40 @@
+"""The protocol of physics engines, which carry out plans."""
+
+from collections.abc import Collection, Iterable, Iterator
+from typing import Protocol, runtime_checkable
+
+from omegaconf import DictConfig
+
+from pickplace.config.registry import build
+from pickplace.physics.plans import EpisodePlan
+from pickplace.views.motion import Outcome
+
+
+@runtime_checkable
+class Engine(Protocol):
+    """Carries out the plans of episodes. The arguments of its class are the keys of its config.
+
+    Attributes:
+        name: its name in tables and in ``evaluation.json``.
+        cell_size: side of a cell in the plans that an evaluation makes for it, m.
+    """
+
+    name: str
+    cell_size: float
+
+    def carry_out(self, plans: Iterable[EpisodePlan], record: Collection[int] = ()) -> Iterator[Outcome]:
+        """Yield the outcome of each plan, in their order; with the motion, for the episodes in ``record``."""
+        ...
+
+
+def build_engine(node: DictConfig) -> Engine:
+    """Return the engine that a config of the group ``physics`` names.
+
+    Raises:
+        ValueError: for settings that make no sense, or a class that is no engine.
+    """
+    engine = build("physics", node)
+    if not isinstance(engine, Engine):
+        expected = "expected name, cell_size and carry_out(plans, record)"
+        raise ValueError(f"physics._target_={node._target_}: no physics engine; {expected}.")
+    return engine
