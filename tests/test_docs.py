@@ -18,8 +18,8 @@ from pickplace import Planner
 from pickplace.config.registry import build
 from pickplace.physics import command as physics
 from pickplace.policies import export
-from pickplace.robot import json_lines, serve
 from pickplace.runs.hydra_app import conf_dir
+from pickplace.serve import json_lines, serve
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"

@@ -16,7 +16,7 @@ class LoadLimit:
 
     name = "load_limit"  # shown in tables and in evaluation.json
 
-    def __init__(self, cell_size: float = 0.05, density: float = 300.0, max_load: float = 2.0):
+    def __init__(self, cell_size: float = 0.05, density: float = 300.0, max_load: float = 0.2):
         self.cell_size, self.density, self.max_load = cell_size, density, max_load
 
     def carry_out(self, plans, record=()):
