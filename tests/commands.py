@@ -16,7 +16,7 @@ from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.loggers import read_csv
 from pickplace.training.trainer import Trainer
 
-ITERATION = 8 * 16  # frames: env.num_envs * algo.rollout_length of experiment=smoke
+ITERATION = 8 * 16  # frames: env.num_envs * rollout_length of experiment=smoke
 
 #: A small training that draws in all its parts, and saves and validates at intervals that do not meet.
 SETTINGS = [

@@ -126,7 +126,7 @@ def test_every_argument_of_the_environment(key, value):
     check_sentence(caught.value, key)
 
 
-LARGE_FCN4D = "model=fcn4d algo.mask_infeasible=false env.bin_size=[30,30,1] env.tote_size=[30,30,2]"
+LARGE_FCN4D = "model=fcn4d model.mask_infeasible=false env.bin_size=[30,30,1] env.tote_size=[30,30,2]"
 
 #: Settings each of which is possible, but not together, or that would fill the memory; and words of the refusal.
 LARGE = [
@@ -142,9 +142,9 @@ LARGE = [
     ),
     ("items=mixed items.width=[1,100000] items.depth=[1,100000]", "items.width=.* kinds of items"),
     ("env.num_envs=10000000", "env.num_envs=10000000: .*<= 32,768"),
-    ("env.num_envs=32768", "env.num_envs=32768, algo.rollout_length=8: .* GB"),
-    ("algo.minibatch_size=1000000 algo.rollout_length=64", "algo.minibatch_size=16384: .* GB"),
-    ("algo.rollout_length=1000000", r"algo.rollout_length=1000000: .* GB; expected at most"),
+    ("env.num_envs=32768", "env.num_envs=32768, rollout_length=8: .* GB"),
+    ("algo.minibatch_size=1000000 rollout_length=64", "algo.minibatch_size=16384: .* GB"),
+    ("rollout_length=1000000", r"rollout_length=1000000: .* GB; expected at most"),
     ("evaluation.batch_size=1000000 evaluation.episodes=1000000", "evaluation.batch_size=1000000: .* GB"),
     ("evaluation.episodes=10000000", "evaluation.episodes=10000000: .*<= 1,000,000"),
     ("model.actor.receptive_field=1001", "model.actor.receptive_field=1001"),
@@ -163,7 +163,7 @@ LARGE = [
     ("algo.vine_samples=0", "algo.vine_samples=0"),
     ("algo.vine_temperature=0", "algo.vine_temperature=0"),
     ("algo.max_grad_norm=0", "algo.max_grad_norm=0"),
-    ("algo.reward_scale=0", "algo.reward_scale=0"),
+    ("reward_scale=0", "reward_scale=0"),
 ]
 
 
@@ -187,7 +187,7 @@ def test_a_real_cell_and_a_large_batch_are_accepted(tmp_path, monkeypatch):
     assert CellSpec(**sizes).num_actions == 92_160_000
     env = PickPlaceEnv(items=Kinds([(4, 3, 2)]), num_envs=2, masks=("footprint",), **sizes)
     assert env.reset()["footprint_mask"].any(1).all()
-    large = composed("experiment=quick", "env.num_envs=4096", "algo.rollout_length=32", "threads=1")
+    large = composed("experiment=quick", "env.num_envs=4096", "rollout_length=32", "threads=1")
     monkeypatch.setattr(Trainer, "_make_learner", lambda trainer: None)
     with pytest.raises(ValueError, match="GB; expected at most 0.8 GB"):
         Trainer(large, tmp_path)

@@ -28,7 +28,7 @@ def write_checkpoint(folder, cell, *overrides):
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         cfg = compose("train", ["experiment=smoke", "model.actor.head_std=1.0", *overrides])
     torch.manual_seed(0)
-    policy = build("model.actor", cfg.model.actor, cell=cell, mask_infeasible=cfg.algo.mask_infeasible)
+    policy = build("model.actor", cfg.model.actor, cell=cell, mask_infeasible=cfg.model.mask_infeasible)
     facts = {"frames": 256, "config": OmegaConf.to_container(cfg), "versions": versions(), "commit": commit()}
     checkpoint.write(folder, {"policy": policy.state_dict()}, facts)
     return folder

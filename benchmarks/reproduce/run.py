@@ -99,7 +99,7 @@ def training_columns(cell: Cell) -> dict:
     config, levels = state["config"], metrics(folder, "curriculum/level")
     row |= {"frames": state["frames"], "frames_asked": config["total_frames"], "training_seed": config["seed"]}
     row |= {"training_tote_height": config["env"]["tote_size"][2], "height_reached": int(levels[-1][1])}
-    row |= {"trained_with_mask": table.text(config["algo"]["mask_infeasible"])}
+    row |= {"trained_with_mask": table.text(config["model"]["mask_infeasible"])}
     teacher = (config.get("warm_start") or {}).get("teacher") or {}
     return row | {"warm_start": teacher.get("_target_")}
 

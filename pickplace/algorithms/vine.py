@@ -22,7 +22,12 @@ from pickplace.rules.step import apply
 
 @torch.no_grad()
 def vine_advantages(
-    frames: TensorDictBase, policy: Policy, critic: ValueOperator, terms: Mapping[str, Term], algo: DictConfig
+    frames: TensorDictBase,
+    policy: Policy,
+    critic: ValueOperator,
+    terms: Mapping[str, Term],
+    algo: DictConfig,
+    reward_scale: float,
 ) -> Tensor:
     """Return the weighted advantage of each candidate over its state's value, ``[B, 1 + samples, 1]``.
 
@@ -38,10 +43,13 @@ def vine_advantages(
         critic: the value network.
         terms: of the observation, by key.
         algo: the config group ``algo``; with ``normalize_advantage`` what is returned has a mean square of 1.
+        reward_scale: of the rewards.
     """
     items = _arrivals(frames)
     parts = torch.arange(len(frames), device=items.x.device).split(algo.minibatch_size)
-    value = torch.cat([_values(frames[part], items.rows(part), policy, critic, terms, algo) for part in parts])
+    value = torch.cat(
+        [_values(frames[part], items.rows(part), policy, critic, terms, algo, reward_scale) for part in parts]
+    )
     weight = frames[CANDIDATE_KEYS[2]].exp()
     advantage = value - (weight * value).sum(1, keepdim=True)
     weight *= weight.shape[1]
@@ -69,6 +77,7 @@ def _values(
     critic: ValueOperator,
     terms: Mapping[str, Term],
     algo: DictConfig,
+    reward_scale: float,
 ) -> Tensor:
     """Return the reward of each candidate and the critic's value of what follows, ``[B, 1 + samples]``.
 
@@ -82,7 +91,7 @@ def _values(
     after = State(step.surface, state.tote_height, items.rows(row))
     placed = step.failure == 0
     goes_on = placed & footprint_mask(cell, placing_maps(cell, after)).flatten(1).any(1)
-    value = placed * state.item.volume * algo.reward_scale
+    value = placed * state.item.volume * reward_scale
     if goes_on.any():
         after = after.rows(goes_on.nonzero()[:, 0])
         seen = TensorDict(observe(terms, cell, after, critic.in_keys), [len(after.tote_height)])

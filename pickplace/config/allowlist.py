@@ -20,10 +20,10 @@ RESERVED_MODULES |= sys.stdlib_module_names
 
 #: Keys that the config of every training has.
 REQUIRED_KEYS = ["env._target_", "env.rotations", "env.tote_size", "items._target_", "model.actor._target_"]
-REQUIRED_KEYS += ["algo.mask_infeasible", "seed"]
+REQUIRED_KEYS += ["model.mask_infeasible", "reward_scale", "seed"]
 
 #: The groups and keys that a policy is restored from. The others are of use to the training alone.
-POLICY_GROUPS = ("env", "items", "model", "algo", "seed", "device")
+POLICY_GROUPS = ("env", "items", "model", "reward_scale", "seed", "device")
 
 #: Greatest depth and number of nodes of a config, and length of a text in it: more would fill the memory.
 MAX_DEPTH, MAX_NODES, MAX_TEXT = 32, 50_000, 10_000

@@ -19,6 +19,9 @@ from omegaconf.errors import OmegaConfBaseException
 #: Config groups whose options set parts of the group ``env`` (``# @package env``), and their plainest options.
 PARTS_OF_ENV = {"effector": "paper", "reach": "everywhere"}
 
+#: Groups whose options have plain settings in common, such as ``algo.lr``: what a preset says of these stays.
+SHARED = ("algo", "model")
+
 LONGEST_NAME = 150  # letters of the name of a run folder; file systems allow 255 bytes
 
 
@@ -36,7 +39,8 @@ def drop_replaced_values(cfg: DictConfig) -> DictConfig:
     ``curriculum.advance.occupancy`` for ``threshold``, into the option that the command line chose instead. A group of
     parts with a ``_target_`` gets the values of the chosen option's own files, and the values on the command line, if
     without that choice it had another option. ``env`` is exempt: its options differ in sizes only, and a preset's sizes
-    belong to the experiment. Hydra's note on the config is corrected.
+    belong to the experiment. So do the plain settings that the options of :data:`SHARED` have in common. Hydra's note
+    on the config is corrected.
     """
     given = OverridesParser.create().parse_overrides(task_overrides(HydraConfig.get()))
     name = HydraConfig.get().job.config_name
@@ -61,6 +65,8 @@ def drop_replaced_values(cfg: DictConfig) -> DictConfig:
         has_parts = _has_parts(own) or _has_parts(_part_at(before, place))
         if has_parts and str(options.get(place)) != str(choice.value()):
             cfg = cfg if replaced else cfg.copy()
+            if place in SHARED:
+                own |= _shared_values(_part_at(cfg, place), own)
             OmegaConf.update(cfg, place, own, merge=False, force_add=True)
             replaced = True
     if replaced:
@@ -71,6 +77,12 @@ def drop_replaced_values(cfg: DictConfig) -> DictConfig:
         if notes is not None and not OmegaConf.is_missing(runtime, "output_dir"):  # which --cfg has none of
             OmegaConf.save(cfg, Path(runtime.output_dir) / notes / "config.yaml")
     return cfg
+
+
+def _shared_values(merged: dict, own: dict) -> dict:
+    """Return the values of a merged part, other than parts and their names, whose keys an option has, too."""
+    keys = [key for key in own if key in merged and key != "_target_"]
+    return {key: merged[key] for key in keys if not isinstance(own[key], dict) and not isinstance(merged[key], dict)}
 
 
 def task_overrides(hydra_cfg: Any) -> list[str]:

@@ -63,7 +63,7 @@ def critic_serves_any_tote(cfg: DictConfig) -> bool:
     for key in ("actor", "critic"):
         find(f"model.{key}", cfg.model[key]._target_)  # imports it, which the device "meta" does not allow
     with torch.device("meta"):
-        policy = build("model.actor", cfg.model.actor, cell=cell, mask_infeasible=cfg.algo.mask_infeasible)
+        policy = build("model.actor", cfg.model.actor, cell=cell, mask_infeasible=cfg.model.mask_infeasible)
         if isinstance(policy, EstimatesValue):
             return False
         return getattr(build("model.critic", cfg.model.critic, cell=cell), "any_size", False)

@@ -99,7 +99,7 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
     facts = {
         "checkpoint": str(folder),
         "trained": {"frames": saved["frames"], "seed": merged.seed, "commit": saved["commit"]},
-        "mask_in_training": merged.algo.mask_infeasible,
+        "mask_in_training": merged.model.mask_infeasible,
         "warm_start": imitated_planner(saved["config"]),
         "first_weights": first_weights(saved["config"]),
     }

@@ -47,7 +47,7 @@ def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: di
         )
 
     def restored(cell: CellSpec) -> Policy:
-        make = partial(build, "model.actor", cfg.model.actor, cell=cell, mask_infeasible=cfg.algo.mask_infeasible)
+        make = partial(build, "model.actor", cfg.model.actor, cell=cell, mask_infeasible=cfg.model.mask_infeasible)
         return checkpoint.restore(make, state, "policy").eval()
 
     try:
@@ -154,7 +154,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     cfg = trusted_config(facts["config"], trust)
     env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
     cell = build_cell(env, **sizes)
-    if not (cell.has_known_offsets or cfg.algo.mask_infeasible):  # the policy chooses among grasps: so many are there
+    if not (cell.has_known_offsets or cfg.model.mask_infeasible):  # the policy chooses among grasps: so many are there
         longest = int(build("items", cfg["items"]).sizes[:, :2].max())
         cell = replace(cell, longest_side=longest)
     policy = restore_policy(cfg, cell, state["policy"], env)
@@ -201,7 +201,7 @@ def restore_critic(cfg: DictConfig, policy: Policy, state: dict, trained_env: di
     """
     if isinstance(policy, EstimatesValue):
         critic = as_critic(policy.value_network())
-        return RestoredCritic(critic.module, list(critic.in_keys), cfg.algo.reward_scale)
+        return RestoredCritic(critic.module, list(critic.in_keys), cfg.reward_scale)
     if "critic" not in state:
         return None
     cell = policy.cell
@@ -214,4 +214,4 @@ def restore_critic(cfg: DictConfig, policy: Policy, state: dict, trained_env: di
     if tuple(trained_env["tote_size"][:2]) != cell.tote_size[:2] and not any_size:
         return None
     critic = checkpoint.restore(make, state["critic"], "critic").to(cfg.device).eval()
-    return RestoredCritic(critic.module, list(critic.in_keys), cfg.algo.reward_scale)
+    return RestoredCritic(critic.module, list(critic.in_keys), cfg.reward_scale)

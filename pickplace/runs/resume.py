@@ -52,7 +52,7 @@ LOCAL_VALUES = {
 #: Settings that a resumed run cannot change, since the state of its episodes depends on them.
 FIXED_KEYS = (
     "seed", *(f"env.{key}" for key in CELL_SETTINGS), "env.num_envs", "env.observation", "items",
-    "algo.mask_infeasible", "collector.workers", "warm_start.weights",
+    "model.mask_infeasible", "collector.workers", "warm_start.weights",
 )  # fmt: skip
 
 

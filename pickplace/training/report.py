@@ -51,7 +51,7 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
         "title": escape(f"Training {policy} for a {sizes} tote"),
         "subtitle": escape(
             f"R={cell.rotations}, {rows[-1]['frames']:,} frames, seed {cfg.seed}, "
-            f"mask in training: {'yes' if cfg.algo.mask_infeasible else 'no'}, K={cfg.planner.candidates}"
+            f"mask in training: {'yes' if cfg.model.mask_infeasible else 'no'}, K={cfg.planner.candidates}"
         ),
         "tiles": "".join(f"<div><b>{value}</b><span>{text}</span></div>" for value, text in tiles),
         "curve": base64.b64encode((run_dir / "learning_curve.png").read_bytes()).decode(),

@@ -55,19 +55,19 @@ CHECKS = {
     **dict.fromkeys(("warm_start.frames", "warm_start.critic_frames"), partial(whole_number, least=0)),
     **dict.fromkeys(("total_frames", "evaluation_interval", "checkpoint_interval", "progress_interval"), whole_number),
     "env.num_envs": partial(whole_number, most=32_768),
-    **dict.fromkeys(("algo.rollout_length", "algo.minibatch_size"), whole_number),
+    **dict.fromkeys(("rollout_length", "algo.minibatch_size"), whole_number),
     "algo.epochs": partial(whole_number, most=1_000),
     "algo.vine_samples": _or_null(partial(whole_number, most=10_000)),
     "algo.vine_temperature": partial(number, least=0.01, most=100.0),
     "algo.advantages": partial(one_of, choices=("vine", "gae")),
     "algo.loss": partial(one_of, choices=("ppo", "a2c", "td")),
-    **dict.fromkeys(("algo.mask_infeasible", "algo.normalize_advantage"), flag),
+    **dict.fromkeys(("model.mask_infeasible", "algo.normalize_advantage"), flag),
     "planner._target_": _only("policy", "since training validates its own policy"),
     "evaluation.stream": _only("validation", "on which training selects its best policy"),
     "algo.lr_decay_start": _or_null(_share),
     **dict.fromkeys(("algo.gamma", "algo.lmbda", "algo.clip_epsilon"), _share),
     **dict.fromkeys(("algo.lr", "algo.entropy_coeff", "algo.critic_coeff"), _weight),
-    **dict.fromkeys(("algo.max_grad_norm", "algo.reward_scale"), _positive),
+    **dict.fromkeys(("algo.max_grad_norm", "reward_scale"), _positive),
     "seed": lambda key, value: check_seed(value, key),
 }
 
@@ -87,9 +87,9 @@ def check_settings(cfg: DictConfig) -> None:
             f"algo.advantages=vine: expected gae with env.bin_items={excerpt(several)}; vine knows one item in the bin."
         )
     own_modules(cfg.trust)
-    if cfg.algo.loss == "a2c" and cfg.algo.normalize_advantage and cfg.env.num_envs * cfg.algo.rollout_length == 1:
+    if cfg.algo.loss == "a2c" and cfg.algo.normalize_advantage and cfg.env.num_envs * cfg.rollout_length == 1:
         raise ValueError(
-            "algo.normalize_advantage=True: a batch of one frame (env.num_envs x algo.rollout_length) has no variance; "
+            "algo.normalize_advantage=True: a batch of one frame (env.num_envs x rollout_length) has no variance; "
             "expected more frames, or false."
         )
 
@@ -110,13 +110,13 @@ def check_learner(cfg: DictConfig, policy: Policy) -> None:
     for key in ("frames", "critic_frames"):
         if warm_start[key]:
             raise ValueError(f"warm_start.{key}={excerpt(warm_start[key])}: expected 0 with algo.loss=td.")
-    if algo.rollout_length < 2:
-        raise ValueError(f"algo.rollout_length={excerpt(algo.rollout_length)}: expected at least 2 with algo.loss=td.")
+    if cfg.rollout_length < 2:
+        raise ValueError(f"rollout_length={excerpt(cfg.rollout_length)}: expected at least 2 with algo.loss=td.")
     if algo.vine_samples is not None:
         raise ValueError(f"algo.vine_samples={excerpt(algo.vine_samples)}: expected null with algo.loss=td.")
     scale = cfg.model.actor.get("reward_scale", 1.0)
-    if scale != algo.reward_scale:
-        raise ValueError(f"model.actor.reward_scale={excerpt(scale)}: expected algo.reward_scale={algo.reward_scale}.")
+    if scale != cfg.reward_scale:
+        raise ValueError(f"model.actor.reward_scale={excerpt(scale)}: expected reward_scale={cfg.reward_scale}.")
     if dict(cfg.model.critic) != {"_target_": "tote_value"}:
         raise ValueError(
             f"model.critic={excerpt(dict(cfg.model.critic))}: expected {{'_target_': 'tote_value'}} with algo.loss=td, "
@@ -137,11 +137,11 @@ def check_memory(cfg: DictConfig, env: PickPlaceEnv, policy: Policy) -> None:
     Raises:
         ValueError: naming the keys, their values, and the memory.
     """
-    cell, masks, slots, steps = env.cell, policy.masks, cfg.env.num_envs, cfg.algo.rollout_length
+    cell, masks, slots, steps = env.cell, policy.masks, cfg.env.num_envs, cfg.rollout_length
     samples = cfg.algo.vine_samples
     frame = 2 * env.observation_bytes + sum(MASKS[name].size(cell) for name in masks) + 200 * cell.num_places
     frame += 20 * (1 + (samples or 0))
-    check_bytes(f"env.num_envs={slots}, algo.rollout_length={steps}", slots * steps * frame, env.device)
+    check_bytes(f"env.num_envs={slots}, rollout_length={steps}", slots * steps * frame, env.device)
     part = min(cfg.algo.minibatch_size, slots * steps)
     learning = policy.learning_bytes(None if cfg.warm_start.frames else samples)  # imitation needs all logits
     check_bytes(f"algo.minibatch_size={part}", part * learning, env.device)

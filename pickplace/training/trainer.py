@@ -101,7 +101,7 @@ class Trainer:
         probe = self.build_env(num_envs=1, masks=())
         self.cell, self.terms, self.min_tote_height = probe.cell, probe.terms, probe.min_tote_height
         make_actor = partial(
-            build, "model.actor", cfg.model.actor, cell=self.cell, mask_infeasible=self.algo.mask_infeasible
+            build, "model.actor", cfg.model.actor, cell=self.cell, mask_infeasible=cfg.model.mask_infeasible
         )
         weights = self.state if self.resumed else self._first_weights()
         self.policy: Policy = self._restored("policy", make_actor, weights)
@@ -155,7 +155,7 @@ class Trainer:
                     "checkpoints/best is of frame %s and of other settings; the next validation replaces it",
                     f"{stale:,}",
                 )
-        batch_frames = cfg.env.num_envs * self.algo.rollout_length
+        batch_frames = cfg.env.num_envs * cfg.rollout_length
         if shortage := self.curriculum.check_budget(cfg.total_frames, batch_frames):
             log.warning(shortage)
         if learning_rate(self.algo, batch_frames, cfg.total_frames) == 0 < self.algo.lr:
@@ -184,7 +184,7 @@ class Trainer:
             make_env=make_env,
             policy=self.acting,
             num_envs=cfg.env.num_envs,
-            rollout_length=algo.rollout_length,
+            rollout_length=cfg.rollout_length,
             seed=cfg.seed,
         )
 
@@ -273,16 +273,17 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         if self.algo.loss == "td":
-            data = afterstates(batch, self.advantage, self.algo.reward_scale)
+            data = afterstates(batch, self.advantage, self.cfg.reward_scale)
             metrics = update(self.loss, self.optimizer, data, self.algo, self.policy, phase)
             return {**metrics, "train/lr": rate}
-        add_advantages(batch, self.advantage, self.algo.reward_scale)
+        add_advantages(batch, self.advantage, self.cfg.reward_scale)
         seen = {*self.policy.in_keys, *self.critic.in_keys}
         drawn = ("log_prob",) if self.algo.vine_samples is None else CANDIDATE_KEYS
         data = batch.select(*seen, self.policy.choice_key, *drawn, "advantage", "value_target").reshape(-1)
         if self.algo.vine_samples is not None:
             if self.algo.advantages == "vine":
-                data["advantage"] = vine_advantages(batch.reshape(-1), self.policy, self.critic, self.terms, self.algo)
+                parts = (self.policy, self.critic, self.terms, self.algo, self.cfg.reward_scale)
+                data["advantage"] = vine_advantages(batch.reshape(-1), *parts)
             else:
                 count = data[CANDIDATE_KEYS[0]].shape[1]
                 data["advantage"] = of_taken_choice(data["advantage"], count, self.algo.normalize_advantage)

@@ -32,7 +32,7 @@ class MeanDepth(nn.Module):
 
 
 CRITIC = ValueOperator(MeanDepth(), ["bin_depth", "tote_depth"])
-SETTINGS = ["algo.gamma=0.9", "algo.reward_scale=0.5", "algo.normalize_advantage=false", "algo.minibatch_size=7"]
+SETTINGS = ["algo.gamma=0.9", "reward_scale=0.5", "algo.normalize_advantage=false", "algo.minibatch_size=7"]
 
 
 def drawn(kind, steps):

@@ -153,7 +153,7 @@ def test_it_comes_within_1_percent_of_the_optimum(tmp_path):
         "total_frames=32_768",
         "algo.minibatch_size=128",
         "algo.lr=3e-3",
-        "algo.reward_scale=0.5",
+        "reward_scale=0.5",
         "evaluation.episodes=1",
     ]
     cfg = composed(*words)
@@ -182,9 +182,9 @@ def shared(state):
     (["algo=td"], "algo.loss='td': expected 'ppo' or 'a2c'"),
     (["model=afterstate", "algo=td", "warm_start=imitate"], "warm_start.frames=200000: expected 0"),
     (["model=afterstate", "algo=td", "algo.vine_samples=2"], "algo.vine_samples=2: expected null"),
-    (["model=afterstate", "algo=td", "algo.rollout_length=1"], "algo.rollout_length=1: expected at least 2"),
+    (["model=afterstate", "algo=td", "rollout_length=1"], "rollout_length=1: expected at least 2"),
     (["model=afterstate", "algo=td", "warm_start.critic_frames=64"], "warm_start.critic_frames=64: expected 0"),
-    (["model=afterstate", "algo=td", "algo.mask_infeasible=false"], "algo.mask_infeasible=False: with model=aft"),
+    (["model=afterstate", "algo=td", "model.mask_infeasible=false"], "model.mask_infeasible=False: with model=aft"),
     (["model=afterstate", "algo=td", "env.bin_items=2"], "env.bin_items=2: expected 1 with model=afterstate"),
     (["model=afterstate", "algo=td", "model.actor.grid=[10,10]"], r"model.actor.grid=\[10, 10\]: expected 3"),
     (["model=afterstate", "algo=td", "model.actor.grid=[10,1,10]"], r"model.actor.grid=\[10, 1, 10\]: expected at le"),
@@ -214,7 +214,7 @@ def test_shipped_weights_judge_for_a_search_and_begin_a_training(tmp_path):
         found = critic({"tote_depth": depth, "tote_height": height})
         assert torch.equal(found, policy.network(depth, height) / 0.01)
     words = ["experiment=afterstate", "benchmark=gopt_rs", "warm_start.weights=pretrained/gopt_rs", "algo.lr=0"]
-    words += ["env.num_envs=2", "algo.rollout_length=2", "total_frames=4", "evaluation.episodes=1", "logger=none"]
+    words += ["env.num_envs=2", "rollout_length=2", "total_frames=4", "evaluation.episodes=1", "logger=none"]
     train(composed(*words), tmp_path)
     trained, _ = checkpoint.read(tmp_path / "checkpoints" / "last")
     assert all(torch.equal(trained["policy"][key], value) for key, value in state["policy"].items())

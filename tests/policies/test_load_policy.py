@@ -16,7 +16,7 @@ SIZES = {"env.tote_size": (4, 4, 2), "env.bin_size": (4, 4, 1)}
 
 @pytest.fixture(scope="module", params=[True, False], ids=["mask", "no mask"])
 def policy(request, tmp_path_factory):
-    words = [f"{key}={list(size)}" for key, size in SIZES.items()] + [f"algo.mask_infeasible={request.param}"]
+    words = [f"{key}={list(size)}" for key, size in SIZES.items()] + [f"model.mask_infeasible={request.param}"]
     cell = CellSpec(tote_size=(4, 4, 2), bin_size=(4, 4, 1))
     return load_policy(write_checkpoint(tmp_path_factory.mktemp("run") / "checkpoint", cell, *words))
 
@@ -38,7 +38,7 @@ def test_it_plays_the_best_feasible_action_and_draws_as_in_training(policy):
             draws.append(act(data[:, 0].clone())["action"])
     assert torch.equal(draws[0], draws[1]) and not torch.equal(draws[0], draws[2])
     feasible = data[:, 0]["action_mask"].gather(1, draws[0][:, None])
-    assert feasible.all() == policy.config.algo.mask_infeasible
+    assert feasible.all() == policy.config.model.mask_infeasible
 
 
 def test_a_collector_runs_it(policy):

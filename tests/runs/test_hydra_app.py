@@ -99,7 +99,7 @@ BAD = [
         ["warm_start.teacher.simulations=100000000", "<= "],
     ),
     ("train", "collector=multi_sync collector.workers=3", ["collector.workers=3", "divisor"]),
-    ("train", "algo=a2c env.num_envs=1 algo.rollout_length=1", ["algo.normalize_advantage=True", "one frame"]),
+    ("train", "algo=a2c env.num_envs=1 rollout_length=1", ["algo.normalize_advantage=True", "one frame"]),
     # resume
     ("train", "resume=nowhere", ["nowhere'", "run folder"]),
     ("train", "resume=nowhere -m", ["resume", "flags"]),

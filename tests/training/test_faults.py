@@ -101,7 +101,7 @@ def test_a_worker_s_death_that_torchrl_sees_first_is_told(deaf):
 
 def test_a_loss_that_is_not_finite_stops_the_run_with_a_summary(smoke, tmp_path):
     with pytest.raises(FloatingPointError) as caught:
-        smoke(tmp_path / "run", "algo.reward_scale=1e38")
+        smoke(tmp_path / "run", "reward_scale=1e38")
     message = str(caught.value)
     assert message.startswith("the loss or its gradient is not finite: loss_")
     assert "advantage" in message and "not finite)" in message

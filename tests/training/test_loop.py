@@ -154,7 +154,7 @@ def test_a_run_counts_logs_scales_and_saves(smoke, tmp_path, monkeypatch):
     levels = ["curriculum=paper", "curriculum.advance.frames_per_level=256", "env.tote_size=[4,4,3]"]
     quick = ["algo.minibatch_size=128", "evaluation.episodes=1", "evaluation_interval=128"]
     for scale, frames, final in ((0.5, 512, 0.7), (5, 128, 0.1)):
-        overrides = [*levels, *quick, f"algo.reward_scale={scale}", f"total_frames={frames}"]
+        overrides = [*levels, *quick, f"reward_scale={scale}", f"total_frames={frames}"]
         assert smoke(tmp_path / str(scale), *overrides) == final
         rows.append(read_csv(tmp_path / str(scale) / "metrics.csv"))
     low, high = rows

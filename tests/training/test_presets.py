@@ -10,7 +10,7 @@ from pickplace.runs.loggers import read_csv
 from pickplace.training.train import train
 
 TINY = [
-    "env.num_envs=4", "algo.rollout_length=4", "algo.minibatch_size=8", "algo.epochs=1", "total_frames=16",
+    "env.num_envs=4", "rollout_length=4", "algo.minibatch_size=8", "algo.epochs=1", "total_frames=16",
     "evaluation.episodes=2", "evaluation_interval=16", "checkpoint_interval=16", "progress_interval=16",
     "env.tote_size=[6,6,2]", "model.actor.filters=8", "model.critic.filters=8", "model.critic.hidden=8", "threads=1",
 ]  # fmt: skip
@@ -41,7 +41,7 @@ def test_a_benchmark_is_trained_on(name, tmp_path):
 @pytest.mark.parametrize("name", options("effector"))
 def test_every_effector_trains(name, masked, tmp_path):
     kinds = ["items.kinds=[[5,4,1],[4,4,2]]", "env.bin_size=[9,9,1]", "env.tote_size=[11,10,2]"]
-    words = [f"effector={name}", f"algo.mask_infeasible={masked}", "curriculum=none", "logger=none", *TINY]
+    words = [f"effector={name}", f"model.mask_infeasible={masked}", "curriculum=none", "logger=none", *TINY]
     assert 0 <= train(composed(*words, *(kinds if name == "cup_round" else [])), tmp_path) <= 1
 
 
@@ -55,11 +55,11 @@ def test_the_paper_s_effector_is_the_default(env):
 ])  # fmt: skip
 def test_every_model_trains_with_and_without_a_mask(model, masked, samples, tmp_path):
     algo = ["algo=td"] if model == "afterstate" else ["algo=a2c"] if model == "fcn_grasp" and masked else []
-    algo += [f"algo.mask_infeasible={masked}", f"algo.vine_samples={samples}"]
+    algo += [f"model.mask_infeasible={masked}", f"algo.vine_samples={samples}"]
     overrides = [f"model={model}", "curriculum=none", "logger=none", *algo]
     overrides += ONE_NETWORK if model == "afterstate" else TINY
     if model in ("corners", "afterstate") and not masked:
-        with pytest.raises(ValueError, match=f"^algo.mask_infeasible=False: with model={model} expected true"):
+        with pytest.raises(ValueError, match=f"^model.mask_infeasible=False: with model={model} expected true"):
             train(composed(*overrides), tmp_path)
         return
     assert 0 <= train(composed(*overrides, "env.rotations=2"), tmp_path) <= 1
@@ -86,6 +86,6 @@ def test_the_console_tells_of_a_tote_that_did_not_grow(smoke, caplog, tmp_path, 
 
 def test_the_paper_preset_is_the_paper_s():
     paper = composed("experiment=paper")
-    assert (paper.algo.lr, paper.algo.gamma, paper.algo.rollout_length, paper.env.num_envs) == (2.5e-4, 0.99, 32, 16)
-    assert (paper.algo.critic_coeff, paper.algo.entropy_coeff, paper.algo.mask_infeasible) == (0.005, 0.002, False)
+    assert (paper.algo.lr, paper.algo.gamma, paper.rollout_length, paper.env.num_envs) == (2.5e-4, 0.99, 32, 16)
+    assert (paper.algo.critic_coeff, paper.algo.entropy_coeff, paper.model.mask_infeasible) == (0.005, 0.002, False)
     assert paper.curriculum.advance.frames_per_level == 5_000_000

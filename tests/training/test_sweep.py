@@ -204,8 +204,8 @@ def test_a_run_without_metrics_is_known_by_its_checkpoint(smoke_run, tmp_path):
 
 def test_a_run_that_fails_leaves_the_others_alone(run, tmp_path):
     quick = ["total_frames=128", "evaluation.episodes=2"]
-    code, _, err = run("train", "-m", *SMOKE, *quick, "algo.reward_scale=1e38,1", "hydra.sweep.dir=sweep")
-    assert code == 2 and "error: run algo.reward_scale-1e+38: the loss or its gradient is not finite" in err
+    code, _, err = run("train", "-m", *SMOKE, *quick, "reward_scale=1e38,1", "hydra.sweep.dir=sweep")
+    assert code == 2 and "error: run reward_scale-1e+38: the loss or its gradient is not finite" in err
     finished, failed = table(tmp_path / "sweep")
     assert failed["status"] == "failed" and failed["error"].startswith("the loss or its gradient is not finite")
     assert (finished["status"], finished["frames"]) == ("finished", "128")
@@ -242,7 +242,7 @@ def test_launchers_in_other_processes(launcher, run, tmp_path):
     pytest.importorskip(f"hydra_plugins.hydra_{extra}_launcher")
     settings = ["total_frames=256", "evaluation.episodes=2", "hydra.sweep.dir=sweep", f"hydra/launcher={launcher}"]
     own = "hydra.launcher.n_jobs=2" if extra == "joblib" else "hydra.launcher.timeout_min=5"
-    code, _, err = run("train", "-m", *SMOKE, *settings, own, "algo.reward_scale=1")
+    code, _, err = run("train", "-m", *SMOKE, *settings, own, "reward_scale=1")
     assert code == 0, err
     (row,) = table(tmp_path / "sweep")
-    assert (row["status"], row["frames"], row["algo.reward_scale"]) == ("finished", "256", "1")
+    assert (row["status"], row["frames"], row["reward_scale"]) == ("finished", "256", "1")

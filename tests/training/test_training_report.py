@@ -18,7 +18,7 @@ from pickplace.views.figures import failure_mix, figure_of, learning_curve
 def test_a_report_agrees_with_the_run(run, tmp_path):
     """Without a mask, so that episodes end in many ways, in a folder whose name is hard to quote."""
     folder = tmp_path / "run {{title}} <1>"
-    settings = ["experiment=smoke", "algo.mask_infeasible=false", "seed=3", "threads=1"]
+    settings = ["experiment=smoke", "model.mask_infeasible=false", "seed=3", "threads=1"]
     assert run("train", *settings, f"hydra.run.dir='{folder}'")[0] == 0
     text = (folder / "report.html").read_text()
     rows = [row for row in read_csv(folder / "metrics.csv") if "eval/occupancy" in row]

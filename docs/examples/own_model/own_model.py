@@ -12,7 +12,7 @@ class Mlp(Policy):
 
     Args:
         cell: the sizes; pickplace passes them.
-        mask_infeasible: choose among feasible actions only; pickplace passes ``algo.mask_infeasible``.
+        mask_infeasible: choose among feasible actions only; pickplace passes ``model.mask_infeasible``.
         hidden: width of the hidden layer.
     """
 

@@ -27,13 +27,13 @@ class PitPolicy(FootprintPolicy):
 
     Args:
         cell: the sizes; pickplace passes them.
-        mask_infeasible: must be true; pickplace passes ``algo.mask_infeasible``.
+        mask_infeasible: must be true; pickplace passes ``model.mask_infeasible``.
         network: settings of ``fcn_grasp``'s network.
     """
 
     def __init__(self, cell, mask_infeasible: bool, **network):
         if not mask_infeasible:
-            raise ValueError("algo.mask_infeasible=False: PitPolicy expects true.")
+            raise ValueError("model.mask_infeasible=False: PitPolicy expects true.")
         super().__init__(cell, **network)
         self.in_keys = [*self.in_keys, "pit_depth"]  # the key under which env/pits.yaml lists the term
         self.pits = nn.Conv2d(1, cell.parities, kernel_size=5, padding=2)  # a score for each footprint's first cell

@@ -36,7 +36,7 @@ class ToteValue(nn.Module):
         hidden: width of the linear layer before the output.
         mirrored: whether totes are mirrored, and transposed where they are square, at random while it learns. The value
             is the same, unless items, end effector or reach tell the sides of the tote apart.
-        reward_scale: ``algo.reward_scale``; values are volumes times this.
+        reward_scale: the config's ``reward_scale``; values are volumes times this.
         compute_dtype: as in :class:`~pickplace.policies.fcn_grasp.network.FootprintFcn`.
     """
 

@@ -76,6 +76,6 @@ def afterstate(cell: CellSpec, mask_infeasible: bool, **settings) -> AfterstateP
     """
     if not mask_infeasible:
         raise ValueError(
-            "algo.mask_infeasible=False: with model=afterstate expected true; its choices are feasible ones."
+            "model.mask_infeasible=False: with model=afterstate expected true; its choices are feasible ones."
         )
     return AfterstatePolicy(cell, **settings)

@@ -34,5 +34,7 @@ def corners(cell: CellSpec, mask_infeasible: bool, **network) -> CornerPolicy:
         ValueError: without a mask, as its few choices come from what is feasible.
     """
     if not mask_infeasible:
-        raise ValueError("algo.mask_infeasible=False: with model=corners expected true; its choices are feasible ones.")
+        raise ValueError(
+            "model.mask_infeasible=False: with model=corners expected true; its choices are feasible ones."
+        )
     return CornerPolicy(cell, **network)

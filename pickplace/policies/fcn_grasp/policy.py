@@ -159,7 +159,7 @@ class GraspPolicy(Policy):
 
     def __init__(self, cell: CellSpec, **network):
         super().__init__(cell)
-        refuse_several_items(cell, "model=fcn_grasp and algo.mask_infeasible=False")
+        refuse_several_items(cell, "model=fcn_grasp and model.mask_infeasible=False")
         self.classes = num_grasp_turns(cell) * cell.num_offsets**2
         self.network = FootprintFcn(cell.num_offsets**2, **network)
         self.miss, self.outside = (nn.Parameter(torch.zeros(())) for _ in range(2))
