@@ -255,10 +255,10 @@ def nested(depth):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("algo", {"mask_infeasible": True, **{f"k{n}": n for n in range(10**6)}}, f"at most {MAX_NODES:,}"),
-        ("algo", nested(1000), f"levels or more; expected at most {MAX_DEPTH}"),
-        ("algo", {"k" * 100_000: 1}, f"100,000 characters .* at most {MAX_TEXT:,}"),
-        ("algo", {"k": "v" * 100_000}, f"100,000 characters .* at most {MAX_TEXT:,}"),
+        ("model", {"mask_infeasible": True, **{f"k{n}": n for n in range(10**6)}}, f"at most {MAX_NODES:,}"),
+        ("model", nested(1000), f"levels or more; expected at most {MAX_DEPTH}"),
+        ("model", {"k" * 100_000: 1}, f"100,000 characters .* at most {MAX_TEXT:,}"),
+        ("model", {"k": "v" * 100_000}, f"100,000 characters .* at most {MAX_TEXT:,}"),
         ("seed", [[[[0] * 100] * 100] * 100], f"at most {MAX_NODES:,}"),
     ],
 )
@@ -270,7 +270,7 @@ def test_a_large_config_is_refused_before_it_is_made(key, value, message):
         assert time.perf_counter() - started < 10
 
 
-@pytest.mark.parametrize("group", ["warm_start", "curriculum", "collector", "logger", "callbacks", "planner", "other"])
+@pytest.mark.parametrize("group", ["algo", "warm_start", "curriculum", "collector", "logger", "callbacks", "planner", "other"])
 @pytest.mark.parametrize(
     "part", [{"_target_": "theirs.Thing"}, {"x": "${oc.env:HOME}"}, nested(900), {str(n): n for n in range(10**5)}, 5]
 )
