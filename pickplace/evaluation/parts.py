@@ -21,7 +21,7 @@ from pickplace.runs.provenance import first_weights, imitated_planner
 log = logging.getLogger(__name__)
 
 #: Config groups that an evaluation takes from the checkpoint; :data:`PARTS_OF_ENV` are in the first.
-TRAINED = ("env", "items", "model", "algo")
+TRAINED = ("env", "items", "model")
 
 
 def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
