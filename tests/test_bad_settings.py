@@ -270,7 +270,9 @@ def test_a_large_config_is_refused_before_it_is_made(key, value, message):
         assert time.perf_counter() - started < 10
 
 
-@pytest.mark.parametrize("group", ["algo", "warm_start", "curriculum", "collector", "logger", "callbacks", "planner", "other"])
+@pytest.mark.parametrize(
+    "group", ["algo", "warm_start", "curriculum", "collector", "logger", "callbacks", "planner", "other"]
+)
 @pytest.mark.parametrize(
     "part", [{"_target_": "theirs.Thing"}, {"x": "${oc.env:HOME}"}, nested(900), {str(n): n for n in range(10**5)}, 5]
 )

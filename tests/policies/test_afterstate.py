@@ -188,7 +188,7 @@ def shared(state):
     (["model=afterstate", "algo=td", "env.bin_items=2"], "env.bin_items=2: expected 1 with model=afterstate"),
     (["model=afterstate", "algo=td", "model.actor.grid=[10,10]"], r"model.actor.grid=\[10, 10\]: expected 3"),
     (["model=afterstate", "algo=td", "model.actor.grid=[10,1,10]"], r"model.actor.grid=\[10, 1, 10\]: expected at le"),
-    (["model=afterstate", "algo=td", "model.actor.reward_scale=1"], "model.actor.reward_scale=1: expected reward_scale"),
+    (["model=afterstate", "algo=td", "model.actor.reward_scale=1"], "model.actor.reward_scale=1: expected reward_s"),
     (["model=afterstate", "algo=td", "+model.critic.filters=8"], "model.critic=.*filters.*: expected .*tote_value"),
     (["model=afterstate", "algo=td", "model.actor.temperature=0"], "model.actor.temperature=0: expected a number"),
 ])  # fmt: skip
