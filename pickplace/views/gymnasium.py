@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from pickplace.envs.gymnasium import PickPlaceGymEnv
 from pickplace.rules.state import Failure, bin_depth_from_item
 from pickplace.views.figures import INK
-from pickplace.views.recording import Box, Recording, items_in_bin, record_moves
+from pickplace.views.recording import PlacedItem, Recording, items_in_bin, record_moves
 from pickplace.views.scene import draw_scene, item_colours
 
 
@@ -35,7 +35,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         self._recording: Recording | None = None  # of the running episode
         self._window: tuple | None = None  # the figure and the image in it
         sizes = self._env.items.sizes.tolist()
-        self._colours = item_colours([Box(0, 0, 0, *size) for size in sizes]) if render_mode else {}
+        self._colours = item_colours([PlacedItem(0, 0, 0, *size) for size in sizes]) if render_mode else {}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         result = super().reset(seed=seed, options=options)

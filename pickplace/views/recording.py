@@ -20,7 +20,7 @@ NONE_FITS = "None of these items fits anywhere any more."
 InBin = tuple[int, int, int, int, int]
 
 
-class Box(NamedTuple):
+class PlacedItem(NamedTuple):
     """An item in the tote: its minimum corner and its sides; in cells and height units."""
 
     x: int
@@ -64,13 +64,13 @@ class Recording:
     carried_out: Outcome | None = None  # by a physics engine
 
     @property
-    def boxes(self) -> list[Box]:
+    def boxes(self) -> list[PlacedItem]:
         """The items placed, in order."""
         boxes = []
         for move in self.moves:
             if not move.failure:
                 x, y, w, d = move.footprint
-                boxes.append(Box(x, y, move.z, w, d, move.item[4]))
+                boxes.append(PlacedItem(x, y, move.z, w, d, move.item[4]))
         return boxes
 
     def describe_ending(self, num_places: int) -> str:

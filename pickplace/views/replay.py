@@ -14,7 +14,7 @@ import numpy as np
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.state import Failure
 from pickplace.views.motion import Motion, Outcome
-from pickplace.views.recording import FULL, Box, InBin, Recording
+from pickplace.views.recording import FULL, InBin, PlacedItem, Recording
 from pickplace.views.scene import draw_scene, item_colours
 
 ASSETS = Path(__file__).resolve().parent / "assets"
@@ -70,10 +70,10 @@ def _cells(height: int, cell: CellSpec) -> int | float:
     return int(cells) if cells.is_integer() else cells
 
 
-def _items_not_placed(recording: Recording) -> list[Box]:
+def _items_not_placed(recording: Recording) -> list[PlacedItem]:
     """Return the items that are seen but not placed, as boxes at the origin."""
     items = [item for move in recording.moves for item in ([move.item] if move.failure else []) + move.others]
-    return [Box(0, 0, 0, w, d, h) for _, _, w, d, h in items + recording.waiting]
+    return [PlacedItem(0, 0, 0, w, d, h) for _, _, w, d, h in items + recording.waiting]
 
 
 def _label(recording: Recording, ending: str) -> str:

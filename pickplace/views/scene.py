@@ -4,7 +4,7 @@ import numpy as np
 
 from pickplace.rules.cell import CellSpec
 from pickplace.views.figures import COLOURS, INK, WALL, figure_of
-from pickplace.views.recording import Box, Recording
+from pickplace.views.recording import PlacedItem, Recording
 
 #: Size of an item ``(w, d, h)`` with ``w <= d``, so that it does not depend on how the item is turned.
 Kind = tuple[int, int, int]
@@ -28,10 +28,7 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
     figure = figure_of(12, 6)
     solid, plan = figure.subplots(1, 2, width_ratios=[1.2, 1])
     draw_tote(solid, (*size[:2], size[2] * cell.height_unit))
-    if cell.height_unit == 1:
-        draw_boxes(solid, boxes, colours, size)
-    else:
-        draw_blocks(solid, boxes, colours, size, cell.height_unit)
+    draw_items(solid, boxes, colours, size, cell.height_unit)
     if 0 < len(colours) <= 20:
         _draw_legend(figure, colours, cell)
     _draw_plan(plan, heights, recording.tote_height, cell)
@@ -44,13 +41,13 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
     return figure
 
 
-def kind_of(box: Box) -> Kind:
+def kind_of(box: PlacedItem) -> Kind:
     """Return the size of a box, whichever way it is turned."""
     *_, w, d, h = box
     return min(w, d), max(w, d), h
 
 
-def item_colours(boxes: list[Box]) -> dict[Kind, str]:
+def item_colours(boxes: list[PlacedItem]) -> dict[Kind, str]:
     """Return a colour for each kind of item, the small ones first; many kinds share a spectrum."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
@@ -61,42 +58,12 @@ def item_colours(boxes: list[Box]) -> dict[Kind, str]:
     return dict(zip(kinds, colours, strict=False))
 
 
-#: Faces of a unit cube that the viewer sees: outward normal, share of the light, corners as a cycle. The diagonal from
-#: the first corner to the third runs along the lattice that the corners of all cubes project onto.
+#: Faces of a unit cube that the viewer sees: outward normal, share of the light, corners as a cycle.
 FACES = [
     ((0, 0, 1), 1.0, [(0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]),
     ((1, 0, 0), 0.72, [(1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)]),
     ((0, 1, 0), 0.86, [(0, 1, 0), (1, 1, 0), (1, 1, 1), (0, 1, 1)]),
 ]
-
-
-def visible_triangles(boxes) -> dict:
-    """Return what is visible of boxes on a unit grid from the direction (1, 1, 1), exactly.
-
-    In this projection the corners of all cells fall on one triangular lattice, so each of its triangles shows one face
-    of one box, or nothing.
-
-    Args:
-        boxes: ``(x, y, z, w, d, h)`` each, whole numbers, not overlapping.
-
-    Returns:
-        ``{triangle: (box, face)}``: three lattice points ``(x - z, y - z)``; indices into ``boxes`` and ``FACES``.
-    """
-    cells = {}
-    for number, (x, y, z, w, d, h) in enumerate(boxes):
-        cells.update(dict.fromkeys([(x + i, y + j, z + k) for i, j, k in np.ndindex(w, d, h)], number))
-    nearest: dict[tuple, tuple[int, int, int]] = {}  # triangle -> depth, box, face
-    for (x, y, z), number in cells.items():
-        for face, ((i, j, k), _, corners) in enumerate(FACES):
-            if (x + i, y + j, z + k) in cells:
-                continue  # the next cell covers it
-            points = [(x + a - z - c, y + b - z - c, z + c) for a, b, c in corners]
-            for triangle in (points[:3], [points[0], *points[2:]]):
-                key = tuple(sorted((a, b) for a, b, _ in triangle))
-                depth = sum(c for *_, c in triangle)  # along one line of sight, the higher the nearer
-                if key not in nearest or depth > nearest[key][0]:
-                    nearest[key] = depth, number, face
-    return {key: (number, face) for key, (_, number, face) in nearest.items()}
 
 
 def _to_paper(a, b) -> tuple[float, float]:
@@ -129,63 +96,61 @@ def draw_tote(axes, size: tuple[float, float, float]) -> None:
     axes.set_axis_off()
 
 
-def far_to_near(low: np.ndarray, sides: np.ndarray) -> list[int]:
-    """Return the order in which boxes hide each other, seen from the direction (1, 1, 1): their numbers.
+def draw_items(axes, items: list[PlacedItem], colours: dict[Kind, str], size: tuple[int, ...], unit: float) -> None:
+    """Draw items in a tote of this size, in the projection of :func:`draw_tote`; ``unit`` is a height unit in cells.
 
-    A box can hide another one only if it is nowhere wholly beyond it; so there is an order, unless three or more hide
-    each other in a circle, which one of them then ends.
-
-    Args:
-        low, sides: ``[n, 3]``, of boxes that do not overlap.
+    They are drawn in columns of one cell by one cell. From the direction (1, 1, 1) a column can hide only those that
+    are farther along x + y, and lower parts of its own cell. So there is an order in which all of them are drawn right.
     """
-    hides = ((low + sides)[:, None] > low + 1e-9).all(2) & ~np.eye(len(low), dtype=bool)  # [nearer, farther]
-    order, left = [], list(range(len(low)))
-    while left:
-        free = (number for number in left if not hides[number, left].any())
-        order.append(next(free, min(left, key=lambda index: low[index].sum())))
-        left.remove(order[-1])
-    return order
-
-
-def draw_blocks(axes, boxes: list[Box], colours: dict[Kind, str], size: tuple[int, int, int], unit: float) -> None:
-    """Draw the items one over the other, the farthest first: for heights in units that are no cells."""
     from matplotlib.collections import PolyCollection
     from matplotlib.colors import to_rgb
 
     wide, deep, _ = size
-    low = np.array([(x, deep - y - d, z * unit) for x, y, z, _, d, _ in boxes]).reshape(-1, 3)
-    sides = np.array([(w, d, h * unit) for *_, w, d, h in boxes]).reshape(-1, 3)
-    faces, fills = [], []
-    for number in far_to_near(low, sides):
-        for _, light, corners in FACES:
-            points = low[number] + np.array(corners) * sides[number]
-            faces.append([_to_paper(x - z, y - z) for x, y, z in points])
-            fills.append(np.array(to_rgb(colours[kind_of(boxes[number])])) * light)
     width = float(np.clip(10 / (wide + deep), 0.35, 1.1))
-    axes.add_collection(PolyCollection(faces, facecolors=fills, edgecolors=INK, linewidths=width, zorder=2))
+    spans: dict[tuple[int, int], list[tuple[int, int]]] = {}  # cell -> heights that are filled; y is turned around
+    columns = []
+    for item in items:
+        x, y = item.x, deep - item.y - item.d
+        for i, j in np.ndindex(item.w, item.d):
+            spans.setdefault((x + i, y + j), []).append((item.z, item.z + item.h))
+            columns.append((x + i + y + j, item.z, (x + i, y + j), (i, j), item))
+
+    def is_covered(x: int, y: int, low: int, high: int) -> bool:
+        return sum(max(0, min(high, top) - max(low, z)) for z, top in spans.get((x, y), ())) == high - low
+
+    polygons, fills, lines, widths = [], [], [], []
+    for _, low, cell, place, item in sorted(columns):
+        top = low + item.h
+        for (i, j, k), light, corners in FACES:
+            if is_covered(cell[0] + i, cell[1] + j, *((top, top + 1) if k else (low, top))):
+                continue
+            heights = [unit * (top if c else low) for *_, c in corners]
+            points = [
+                _to_paper(cell[0] + a - z, cell[1] + b - z) for (a, b, _), z in zip(corners, heights, strict=True)
+            ]
+            fill = (*np.multiply(to_rgb(colours[kind_of(item)]), light), 1.0)
+            polygons.append(points)
+            fills.append(fill)
+            lines.append(fill)  # closes the seam between columns
+            widths.append(0.6)
+            for start, end in ((0, 1), (1, 2), (2, 3), (3, 0)):
+                if _is_edge(place, corners[start], corners[end], item):
+                    polygons.append([points[start], points[end]])
+                    fills.append((0.0, 0.0, 0.0, 0.0))
+                    lines.append((*to_rgb(INK), 1.0))
+                    widths.append(width)
+    look = {"facecolors": fills, "edgecolors": lines, "linewidths": widths, "capstyle": "round"}
+    axes.add_collection(PolyCollection(polygons, zorder=2, **look))
 
 
-def draw_boxes(axes, boxes: list[Box], colours: dict[Kind, str], size: tuple[int, int, int]) -> None:
-    """Draw the items in a tote of this size, in the projection of :func:`draw_tote`; heights are in cells."""
-    from matplotlib.collections import LineCollection, PolyCollection
-    from matplotlib.colors import to_rgb
+def _is_edge(place, start, end, item: PlacedItem) -> bool:
+    """Return whether a side of a column's face, between two corners, is part of an edge of its item.
 
-    wide, deep, _ = size
-    seen = visible_triangles([(x, deep - y - d, z, w, d, h) for x, y, z, w, d, h in boxes])
-    fills = []
-    owners: dict[tuple, list[tuple[int, int]]] = {}  # side of a triangle -> box and face on either hand
-    for triangle, (number, face) in seen.items():
-        fills.append(np.array(to_rgb(colours[kind_of(boxes[number])])) * FACES[face][1])
-        for i, j in ((0, 1), (1, 2), (0, 2)):
-            owners.setdefault((triangle[i], triangle[j]), []).append((number, face))
-    triangles = [[_to_paper(*point) for point in triangle] for triangle in seen]
-    # A stroke of the fill's own colour closes the seams between triangles.
-    axes.add_collection(PolyCollection(triangles, facecolors=fills, edgecolors=fills, linewidths=0.6, zorder=2))
-    # A line where a face ends: nothing beyond, or another face.
-    ends = [side for side, faces in owners.items() if len(faces) == 1 or faces[0] != faces[1]]
-    edges = [[_to_paper(*p), _to_paper(*q)] for p, q in ends]
-    width = float(np.clip(10 / (wide + deep), 0.35, 1.1))
-    axes.add_collection(LineCollection(edges, colors=INK, linewidths=width, capstyle="round", zorder=3))
+    Args:
+        place: the column's cell in its item, along x and y.
+    """
+    fixed = [(axis, place[axis] + start[axis]) for axis in (0, 1) if start[axis] == end[axis]]
+    return all(at in (0, (item.w, item.d)[axis]) for axis, at in fixed)
 
 
 def _sides(size: tuple[int, ...], cell: CellSpec) -> str:

@@ -1,43 +1,15 @@
-"""Figures and tables: exact visibility, small and odd input."""
+"""Figures and tables: which items are seen, small and odd input."""
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
 from pickplace import CellSpec, Failure
 from pickplace.evaluation.artifacts import evaluation_table
 from pickplace.views.figures import FAILURES, learning_curve
-from pickplace.views.recording import Move, Recording
+from pickplace.views.recording import Move, PlacedItem, Recording
 from pickplace.views.replay import picture
-from pickplace.views.scene import draw_scene, far_to_near, item_colours, visible_triangles
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_visible_triangles_against_lines_of_sight(seed):
-    size = (5, 4, 6)
-    rng, boxes, taken = np.random.default_rng(seed), [], np.zeros(size, dtype=bool)
-    for corner, sides in zip(rng.integers(0, size, (40, 3)), rng.integers(1, 4, (40, 3)), strict=True):
-        space = tuple(slice(c, c + s) for c, s in zip(corner, sides, strict=True))
-        if (corner + sides <= size).all() and not taken[space].any():  # hanging in the air or not
-            taken[space] = True
-            boxes.append((*corner.tolist(), *sides.tolist()))
-    expected = {}
-    reach = range(-max(size), max(size) + 1)
-    for i in reach:
-        for j in reach:
-            for triangle in (((i, j), (i, j + 1), (i + 1, j + 1)), ((i, j), (i + 1, j), (i + 1, j + 1))):
-                # The line of sight through the triangle's middle, (a + t, b + t, t): of the boxes it meets, the one
-                # that it leaves last, and the coordinate that it leaves it by.
-                origin = np.array([*np.mean(triangle, axis=0), 0.0])
-                hits = []
-                for number, box in enumerate(boxes):
-                    low = np.array(box[:3]) - origin
-                    high = low + box[3:]
-                    if low.max() < high.min():
-                        hits.append((high.min(), number, (1, 2, 0)[high.argmin()]))  # FACES: z, x, y
-                if hits:
-                    expected[tuple(sorted(triangle))] = max(hits)[1:]
-    assert len(boxes) > 5
-    assert visible_triangles(boxes) == expected
+from pickplace.views.scene import FACES, draw_scene, item_colours, kind_of
 
 
 def recording_of(boxes, size, failure=Failure.STUCK):
@@ -97,10 +69,44 @@ def test_the_picture_in_3d_shows_items_where_they_lie(x, y):
     boxes, size = [(x, y, 0, 1, 1, 1)], (3, 4, 1)
     figure = draw_scene(recording_of(boxes, size), CellSpec(tote_size=size), item_colours(boxes))
     tote, cube = (part for part in figure.axes[0].collections if type(part).__name__ == "PolyCollection")
+    faces = [path.vertices[:4] for path, fill in zip(cube.get_paths(), cube.get_facecolors(), strict=True) if fill[3]]
     corner, along_x, _, along_y = tote.get_paths()[0].vertices[:4]
     floor = corner + (along_x - corner) * (x + 0.5) / 3 + (along_y - corner) * (y + 0.5) / 4
-    middle = np.mean([path.vertices[:3] for path in cube.get_paths()], axis=(0, 1))
+    middle = np.mean(faces, axis=(0, 1))
     assert middle == pytest.approx(floor + [0, 0.5])
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("unit", [1, 0.4])
+def test_the_picture_in_3d_shows_the_nearest_item(seed, unit):
+    """On lines of sight through items that hang in the air or not, the last face drawn is the one that is seen."""
+    size, deep = (5, 4, 6), 4
+    draw, items, taken = np.random.default_rng(seed), [], np.zeros(size, dtype=bool)
+    for corner, sides in zip(draw.integers(0, size, (40, 3)), draw.integers(1, 4, (40, 3)), strict=True):
+        space = tuple(slice(c, c + s) for c, s in zip(corner, sides, strict=True))
+        if (corner + sides <= size).all() and not taken[space].any():
+            taken[space] = True
+            items.append(PlacedItem(*corner.tolist(), *sides.tolist()))
+    colours = item_colours(items)
+    cell = CellSpec(tote_size=size, height_unit=unit)
+    drawn = draw_scene(recording_of(items, size), cell, colours).axes[0].collections[-1]
+    faces = [(path, fill) for path, fill in zip(drawn.get_paths(), drawn.get_facecolors(), strict=True) if fill[3]]
+    met = 0
+    for a, b in draw.uniform(-6, 5, (400, 2)):  # the line (a + t, b + t, t), with y turned around
+        hits = []
+        for x, y, z, w, d, h in items:
+            low = np.array([x - a, deep - y - d - b, z * unit])
+            high = low + (w, d, h * unit)
+            if low.max() < high.min():  # it leaves the item at `high.min()`, by one of the three faces
+                light = [FACES[face][1] for face in (1, 2, 0)][high.argmin()]
+                hits.append((high.min(), np.multiply(to_rgb(colours[kind_of(PlacedItem(x, y, z, w, d, h))]), light)))
+        point = ((a - b) * 3**0.5 / 2, -(a + b) / 2)
+        shown = [fill[:3] for path, fill in faces if path.contains_point(point)]
+        assert bool(shown) == bool(hits)
+        if hits:
+            met += len(hits) > 1
+            assert shown[-1] == pytest.approx(max(hits, key=lambda hit: hit[0])[1])
+    assert met > 20 and len(items) > 5
 
 
 CURVES = {
@@ -146,27 +152,3 @@ def test_evaluation_table():
         "mask; candidates K": "in training yes, at decision no; 10",
         "checkpoint": "run/checkpoints/best (1,200,000 frames, seed 3)",
     }  # fmt: skip
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_nearer_boxes_are_drawn_over_farther_ones(seed):
-    """On lines of sight through the parts of a block that was cut at random, the last one drawn is the one seen."""
-    draw, boxes = np.random.default_rng(seed), [np.array([[0.0, 0, 0], [4, 3, 2]])]  # low and high corner
-    for _ in range(20):
-        low, high = boxes.pop(draw.integers(len(boxes)))
-        axis = draw.integers(3)
-        cut = draw.uniform(low[axis], high[axis])
-        halves = np.array([[low, high], [low, high]])
-        halves[0, 1, axis] = halves[1, 0, axis] = cut
-        boxes += [*halves]
-    low, high = np.array(boxes)[draw.random(len(boxes)) < 0.8].transpose(1, 0, 2)
-    order = far_to_near(low, high - low)
-    assert sorted(order) == list(range(len(low)))
-    met = 0
-    for origin in np.pad(draw.uniform(-2, 4, (2000, 2)), ((0, 0), (0, 1))):  # the line (a + t, b + t, t)
-        begin, end = (low - origin).max(1), (high - origin).min(1)
-        hit = np.nonzero(begin < end)[0]
-        if len(hit) > 1:
-            met += 1
-            assert max(hit, key=order.index) == max(hit, key=lambda number: end[number])
-    assert met > 100
