@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Rectangle
 
-from pickplace import Planner
+from pickplace import Planner, Scene
 
 INK, GREY, ITEM, PLACED, GRIPPER = "#263238", "#9aa3ab", "#e69f00", "#56b4e9", "#c2410c"
 
@@ -24,7 +24,7 @@ heights = np.array([
 ])  # fmt: skip
 HEIGHT = 5
 planner = Planner.load("pretrained/r4")
-plan = planner.plan(bin_depth, HEIGHT - heights)  # in cells; drawn in metres
+plan = planner.plan(Scene.from_maps(bin_depth, HEIGHT - heights))  # in cells; drawn in metres
 turn, ee = int(plan.rotation_degrees), planner.cell.effector_size
 x, y, w, d, h = (plan.item[key] for key in "xywdh")
 pick, place = np.array(plan.pick.center), np.array(plan.place.center)

@@ -15,9 +15,10 @@ import gymnasium  # noqa: E402
 if TYPE_CHECKING:
     from pickplace.envs.torchrl import PickPlaceEnv
     from pickplace.policies.restore import load_policy
+    from pickplace.robot.box import Box, DepthMapError
     from pickplace.robot.camera import Camera
-    from pickplace.robot.measure import Box, DepthMapError
     from pickplace.robot.planner import Plan, Planner
+    from pickplace.robot.scene import Scene
     from pickplace.rules.cell import CellSpec
     from pickplace.rules.state import Failure, Item, State
 
@@ -33,21 +34,22 @@ __version__ = "0.1.0"
 
 #: The module of each public name; it is imported when it is asked for, since torch and torchrl take seconds.
 _MODULES = {
-    "Box": "robot.measure",
+    "Box": "robot.box",
     "Camera": "robot.camera",
     "CellSpec": "rules.cell",
-    "DepthMapError": "robot.measure",
+    "DepthMapError": "robot.box",
     "Failure": "rules.state",
     "Item": "rules.state",
     "PickPlaceEnv": "envs.torchrl",
     "Plan": "robot.planner",
     "Planner": "robot.planner",
+    "Scene": "robot.scene",
     "State": "rules.state",
     "load_policy": "policies.restore",
 }
 __all__ = [
-    "Box", "Camera", "CellSpec", "DepthMapError", "Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "State",
-    "__version__", "load_policy",
+    "Box", "Camera", "CellSpec", "DepthMapError", "Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "Scene",
+    "State", "__version__", "load_policy",
 ]  # fmt: skip
 
 

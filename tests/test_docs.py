@@ -14,7 +14,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 import pickplace
-from pickplace import Planner
+from pickplace import Planner, Scene
 from pickplace.config.registry import build
 from pickplace.physics import command as physics
 from pickplace.policies import export
@@ -148,4 +148,5 @@ def test_the_drawing_of_the_concepts_agrees_with_the_rules(monkeypatch):
 def test_the_robot_page_shows_the_planners_answer():
     request, answer = re.findall(r"^(\{\"id\": 1.*\})$", (DOCS / "robot.md").read_text(), re.MULTILINE)
     asked, told = ({key: value for key, value in json.loads(line).items() if key != "id"} for line in (request, answer))
-    assert json.loads(json.dumps(Planner.load("pretrained/r4").plan(**asked, alternatives=0).as_dict())) == told
+    plan = Planner.load("pretrained/r4").plan(Scene.from_maps(**asked), alternatives=0)
+    assert json.loads(json.dumps(plan.as_dict())) == told

@@ -13,7 +13,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from pickplace import PickPlaceEnv, Planner, load_policy
+from pickplace import PickPlaceEnv, Planner, Scene, load_policy
 from pickplace.config.registry import build
 from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.rules.observation import STANDARD_TERMS
@@ -111,7 +111,7 @@ def test_own_model_is_trusted_by_name_and_each_time(example, capsys, tmp_path):
     example("train", "own_model", *taught, "trust=own_model")
     ours = example("evaluate", "own_model", f"checkpoint={folder}", "trust=own_model", *EVALUATION)
     assert ours["planner"] == "policy" and set(ours["failures"]) == {"stuck"}
-    assert Planner.load(folder, trust=["own_model"]).plan(BIN, TOTE).status == "ok"
+    assert Planner.load(folder, trust=["own_model"]).plan(Scene.from_maps(BIN, TOTE)).status == "ok"
     np.save(tmp_path / "bin.npy", BIN)
     np.save(tmp_path / "tote.npy", TOTE)
     maps = ["--bin", str(tmp_path / "bin.npy"), "--tote", str(tmp_path / "tote.npy")]
@@ -135,7 +135,8 @@ def test_own_observation(example):
             load(folder)
     policy = load_policy(folder, trust=["own_observation"])
     assert "pit_depth" in policy.in_keys and policy.make_env(num_envs=2).rollout(20, policy).shape[1] > 2
-    assert Planner.load(folder, trust=["own_observation"]).plan(BIN, np.full((6, 6), 2)).status == "ok"
+    scene = Scene.from_maps(BIN, np.full((6, 6), 2))
+    assert Planner.load(folder, trust=["own_observation"]).plan(scene).status == "ok"
 
 
 def test_own_items(example):

@@ -64,11 +64,15 @@ def integral_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> i
     return whole_number(key, int(value) if is_integral else value, least, most)
 
 
-def number(key: str, value, least: float = 0.0, most: float | None = None) -> float:
-    """Return ``value`` if it is a finite number in ``[least, most]``; ``most=None`` means no upper limit."""
+def number(key: str, value, least: float = 0.0, most: float | None = None, what: str = "a number") -> float:
+    """Return ``value`` if it is a finite number in ``[least, most]``; ``most=None`` means no upper limit.
+
+    Args:
+        what: for the message: a number, or its unit.
+    """
     if not is_number(value) or value < least or (most is not None and value > most):
         limits = f">= {least:g}" if most is None else f"between {least:g} and {most:g}"
-        raise ValueError(f"{key}={excerpt(value)}: expected a number {limits}.")
+        raise ValueError(f"{key}={excerpt(value)}: expected {what} {limits}.")
     return value
 
 

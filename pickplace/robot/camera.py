@@ -13,7 +13,9 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy import ndimage
 
-from pickplace.robot.measure import MAX_PATCHES, SNAPPED, Box, DepthMapError, HiddenBox, is_inside, smallest_rectangle
+from pickplace.robot.box import ACCURACY, Box, DepthMapError, HiddenBox
+from pickplace.robot.measure import MAX_PATCHES, SNAPPED, is_inside, smallest_rectangle
+from pickplace.robot.scene import ToteMap
 from pickplace.rules.cell import CellSpec
 
 #: Greatest share of a tote that the camera may not see.
@@ -25,14 +27,6 @@ LEAST_PIXELS = 2
 HIDDEN_PIXELS = 1.5  # distance from a box at which its edge should be seen, pixels
 EDGE_POINTS = 32  # along each side of a box, and along each ray
 MIN_ITEM_PIXELS = 9  # pixels of the smallest thing in a bin that counts
-
-
-@dataclass(frozen=True)
-class ToteMap:
-    """The greatest and the least height in each patch of a tote, ``[k W_T, k D_T]``; metres."""
-
-    highest: np.ndarray
-    lowest: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -115,7 +109,7 @@ class Camera:
         return (self.pose[2, 3] - height) / min(self.fx, self.fy)
 
     def tote_map(self, depth, cell: CellSpec, cell_size: float, tote_height: float | None = None) -> ToteMap:
-        """Return the heights in the tote, for ``planner.plan(tote=...)``.
+        """Return the heights in the tote, for a :class:`~pickplace.robot.scene.Scene`.
 
         Where the camera sees nothing there may be as much as beside it, and it supports nothing.
 
@@ -164,9 +158,9 @@ class Camera:
         return ToteMap(highest.clip(0, None), lowest.clip(0, None))
 
     def items(
-        self, depth, cell: CellSpec, cell_size: float, labels=None, accuracy: float = 0.003, sizes=None
+        self, depth, cell: CellSpec, cell_size: float, labels=None, accuracy: float = ACCURACY, sizes=None
     ) -> list[Box]:
-        """Return the items in the bin, for ``planner.plan(items=...)``.
+        """Return the items in the bin, for a :class:`~pickplace.robot.scene.Scene`.
 
         What a higher item hides in part is a :class:`~pickplace.robot.measure.HiddenBox`, as large as it may be: the
         planner takes others first. An item that is wholly hidden is not known of.

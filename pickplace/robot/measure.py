@@ -1,87 +1,23 @@
 """Measured boxes, depth maps and lengths: checked, and counted in whole height units."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import excerpt, is_number
+from pickplace.robot.box import MILLIMETRE, Box, DepthMapError, HiddenBox
 from pickplace.rules.cell import MAX_BIN_ITEMS
 
 #: A length is taken for the whole number of units that it is so close to: three cells of 0.05 m are not exactly 0.15 m
 #: in binary fractions.
 ROUNDING = 1e-6
-MILLIMETRE = 1e-3  # height unit of measured maps, m
 MAX_PATCHES = 8  # greatest number of patches along a cell; finer maps are reduced to it
-MAX_VALUE = 1e3  # greatest coordinate of a box, m, and greatest yaw, degrees
 MAX_LABEL = 2**31 - 1
 #: Width of the border of an item that is taken to be parallel to the walls, as a share of its side: sine of a degree.
 SNAPPED = 0.02
-
-
-class DepthMapError(ValueError):
-    """A depth map, or an argument beside it, that cannot be planned with; the message is one sentence."""
-
-
-@dataclass(frozen=True)
-class Box:
-    """A measured cuboid that stands in the bin; in metres and degrees, in the bin's frame."""
-
-    x: float  #: of its centre
-    y: float
-    w: float  #: side along x, before it is turned by the yaw
-    d: float  #: side along y
-    h: float  #: height of its top above the bin's floor
-    yaw: float = 0.0  #: turn about the vertical axis, counter-clockwise seen from above
-
-    def upright(self) -> "Box":
-        """Return the same cuboid with a yaw above -45 and at most 45 degrees."""
-        quarters = math.ceil(self.yaw / 90 - 0.5 - 1e-9)
-        w, d = (self.d, self.w) if quarters % 2 else (self.w, self.d)
-        return replace(self, w=w, d=d, yaw=self.yaw - 90 * quarters)
-
-
-@dataclass(frozen=True)
-class HiddenBox(Box):
-    """A box behind a higher one, of which a camera may not see all: it is in the way, and is not picked."""
-
-
-def checked_number(name: str, value, wanted: str, accepts: Callable[[float], bool]) -> float:
-    """Return a value as a finite number that ``accepts`` accepts; ``wanted`` describes such numbers."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = float("nan")
-    if isinstance(value, (bool, np.bool_, str, bytes)) or not np.isfinite(number) or not accepts(number):
-        raise DepthMapError(f"{name}={excerpt(value)}: expected {wanted}.")
-    return number
-
-
-def checked_boxes(items, bin_sides: Sequence[float]) -> list[Box]:
-    """Return the measured items, which stand in the bin.
-
-    Raises:
-        DepthMapError: for anything else.
-    """
-    if not isinstance(items, (list, tuple)) or not all(isinstance(item, Box) for item in items):
-        raise DepthMapError(f"items={excerpt(items)}: expected a list of Box.")
-    if not 1 <= len(items) <= MAX_BIN_ITEMS:
-        found = "an empty bin" if not items else "too many"
-        raise DepthMapError(f"items: got {len(items)} boxes, expected 1 to {MAX_BIN_ITEMS}: {found}.")
-    for number, box in enumerate(items):
-        for key, value in vars(box).items():
-            if not is_number(value) or abs(value) > MAX_VALUE or (key in "wdh" and value < MILLIMETRE):
-                expected = "a length of at least 0.001 m" if key in "wdh" else "a finite number"
-                raise DepthMapError(f"items[{number}].{key}={excerpt(value)}: expected {expected}.")
-        for key, side in zip("xy", bin_sides, strict=True):
-            if not 0 <= getattr(box, key) <= side:
-                raise DepthMapError(
-                    f"items[{number}].{key}={getattr(box, key):g}: expected 0 to {side:g} m, in the bin."
-                )
-    return [box.upright() for box in items]
 
 
 def as_array(name: str, values, grid: Sequence[int], kinds: str = "iuf") -> np.ndarray:

@@ -10,24 +10,21 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pickplace.robot.camera import ToteMap
+from pickplace.common.validate import number as checked_number
+from pickplace.robot.box import MILLIMETRE, Box, DepthMapError, HiddenBox
 from pickplace.robot.measure import (
-    MILLIMETRE,
     ROUNDING,
-    Box,
-    DepthMapError,
-    HiddenBox,
     as_array,
     box_of_map,
     boxes_of_map,
-    checked_boxes,
     metric_map,
     patches,
     refuse_stacked,
     touches,
     whole_units,
 )
-from pickplace.robot.problem import Problem, check_longest, check_tote_height, join_items, read_bearing
+from pickplace.robot.problem import Problem, check_longest, join_items, read_bearing
+from pickplace.robot.scene import BinMap, Scene, ToteMap
 from pickplace.rules.bin import taken_item
 from pickplace.rules.cell import MAX_SIDE, CellSpec, Limits, effector_centre, reference_cell
 from pickplace.rules.grasps import carry, footprint_index
@@ -161,15 +158,13 @@ class _PlacedItem(NamedTuple):
     inset: tuple[int, int]  # cells at each edge that the item, narrower by its clearance, does not cover as a whole
 
 
-def read_metric(
-    cell: CellSpec, cell_size: float, accuracy: float, clearance: float, bin_depth, bin_labels, items, tote_depth,
-    tote_height, tote_bearing, device,
-) -> Problem:  # fmt: skip
-    """Return the problem of maps and boxes in metres; arguments and errors as of :meth:`Planner.plan`."""
+def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
+    """Return the problem of a scene in metres; errors as of :meth:`Planner.plan`."""
+    cell_size, accuracy = scene.cell_size, scene.accuracy
+    assert cell_size is not None
     unit = cell_size * cell.height_unit
-    boxes, clearance = _read_boxes(cell, cell_size, accuracy, clearance, bin_depth, bin_labels, items)
-    height = check_tote_height(cell, cell.tote_size[2] * unit if tote_height is None else tote_height, cell_size)
-    tote = _read_tote(cell, accuracy, tote_depth, height, tote_bearing, device)
+    boxes, clearance = _read_boxes(cell, scene)
+    tote = _read_tote(cell, scene, device)
     placed = [_place(cell, box, cell_size, clearance, f"items[{number}]", device) for number, box in enumerate(boxes)]
 
     ratio = unit / MILLIMETRE
@@ -214,28 +209,25 @@ def read_metric(
     return parts[0] if len(parts) == 1 else MeasuredBin.of(parts)
 
 
-def _read_boxes(
-    cell: CellSpec, side: float, accuracy: float, clearance: float, bin_depth, bin_labels, items
-) -> tuple[list[Box], float]:
+def _read_boxes(cell: CellSpec, scene: Scene) -> tuple[list[Box], float]:
     """Return the items, and the clearance that they need: none if a map with one value a cell shows them."""
-    bin_sides = [size * side for size in cell.bin_size[:2]]
-    if (bin_depth is None) == (items is None):
-        got = "neither" if items is None else "both"
-        raise DepthMapError(f"bin_depth, items: got {got}, expected one of the two.")
-    if items is not None:
-        if bin_labels is not None:
-            raise DepthMapError("bin_labels, items: got both, expected bin_labels with bin_depth only.")
-        boxes = checked_boxes(items, bin_sides)
-        refuse_stacked(boxes, max(clearance, accuracy))
-    else:
+    side, accuracy, clearance = scene.cell_size, scene.accuracy, scene.clearance
+    if isinstance(scene.items, BinMap):
         least = -max(4 * accuracy, 0.01)
-        heights = metric_map("bin_depth", bin_depth, cell.bin_size[:2], least, MAX_SIDE * MILLIMETRE)
+        heights = metric_map("bin_depth", scene.items.depth, cell.bin_size[:2], least, MAX_SIDE * MILLIMETRE)
         is_cell_map, square = len(heights) == cell.bin_size[0], side * cell.bin_size[0] / len(heights)
         clearance = 0.0 if is_cell_map else clearance
-        if bin_labels is None:
+        if scene.items.labels is None:
             boxes = [box_of_map(heights, square, accuracy, is_cell_map)]
         else:
-            boxes = boxes_of_map(heights, bin_labels, square, accuracy, is_cell_map)
+            boxes = boxes_of_map(heights, scene.items.labels, square, accuracy, is_cell_map)
+    else:
+        boxes = [box.upright() for box in scene.items]
+        for number, box in enumerate(boxes):
+            for key, size in zip("xy", cell.bin_size[:2], strict=True):
+                if not 0 <= (at := getattr(box, key)) <= size * side:
+                    raise DepthMapError(f"items[{number}].{key}={at:g}: expected 0 to {size * side:g} m, in the bin.")
+        refuse_stacked(boxes, max(clearance, accuracy))
     for number, box in enumerate(boxes):
         if cell.rotations == 1 and abs(box.yaw) > ROUNDING:
             raise DepthMapError(
@@ -244,21 +236,24 @@ def _read_boxes(
     return boxes, clearance
 
 
-def _read_tote(cell: CellSpec, accuracy: float, tote_depth, height: float, tote_bearing, device) -> MeasuredTote:
-    """Return the tote; ``height`` is that of its rim, m."""
-    grid, slack = cell.tote_size[:2], math.ceil(accuracy / MILLIMETRE - ROUNDING)
+def _read_tote(cell: CellSpec, scene: Scene, device) -> MeasuredTote:
+    """Return the tote, in millimetres."""
+    grid, slack, height = cell.tote_size[:2], math.ceil(scene.accuracy / MILLIMETRE - ROUNDING), scene.tote_height
+    if height is None:
+        unit = scene.cell_size * cell.height_unit
+        height = checked_number("tote_height", cell.tote_size[2] * unit, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
     rim, over_rim = (int(whole_units(height, MILLIMETRE, up)) for up in (False, True))
-    if isinstance(tote_depth, ToteMap):
-        highest, lowest = (as_array("tote", part, grid) for part in (tote_depth.highest, tote_depth.lowest))
+    if isinstance(scene.tote, ToteMap):
+        highest, lowest = (as_array("tote", part, grid) for part in scene.tote)
     else:
-        beyond = max(4 * accuracy, 0.01)  # a floor or a rim that noise puts a little out of range
-        depth = metric_map("tote_depth", tote_depth, grid, -beyond, height + beyond)
+        beyond = max(4 * scene.accuracy, 0.01)  # a floor or a rim that noise puts a little out of range
+        depth = metric_map("tote_depth", scene.tote, grid, -beyond, height + beyond)
         highest, lowest = patches(height - depth, grid)
     high, low = (whole_units(part.clip(0, None), MILLIMETRE, up) for part, up in ((highest, True), (lowest, False)))
     count = len(high) // grid[0]
     on_floor = (high <= floor_height(slack)).unflatten(0, (-1, count)).unflatten(2, (-1, count)).all(3).all(1)
-    bears = read_bearing(cell, tote_bearing, on_floor).bool()
-    if tote_bearing is None and count == 1:
+    bears = read_bearing(cell, scene.tote_bearing, on_floor).bool()
+    if scene.tote_bearing is None and count == 1:
         bears = on_floor  # one value a cell does not tell whether the cell is level
     return MeasuredTote(high.to(device), low.to(device), bears.to(device), rim, over_rim, slack)
 

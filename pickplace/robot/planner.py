@@ -15,7 +15,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import excerpt, is_whole
+from pickplace.common.validate import excerpt, whole_number
 from pickplace.config.registry import build, find
 from pickplace.items.distributions import ItemDistribution
 from pickplace.planners.base import MapPlanner, decide
@@ -23,16 +23,16 @@ from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy
 from pickplace.policies.restore import load_critic, load_policy
 from pickplace.robot.alternatives import MAX_ALTERNATIVES, Alternative, list_alternatives
-from pickplace.robot.camera import ToteMap
-from pickplace.robot.measure import Box, DepthMapError, checked_number
+from pickplace.robot.box import Box, DepthMapError
 from pickplace.robot.measured_problem import read_metric
-from pickplace.robot.problem import Pose, Problem, check_tote_height, read_grid
+from pickplace.robot.problem import Pose, Problem, read_grid
+from pickplace.robot.scene import Scene
 from pickplace.robot.training import Training
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.observation import Term, check_terms, observe
 from pickplace.rules.state import Failure, Observation
 
-__all__ = ["Alternative", "Box", "DepthMapError", "Plan", "Planner", "Pose"]
+__all__ = ["Alternative", "Box", "DepthMapError", "Plan", "Planner", "Pose", "Scene"]
 
 
 @dataclass(frozen=True)
@@ -130,67 +130,28 @@ class Planner:
         return cls(trained.cell, trained.policy, candidates, trained.terms, planner, items, training, critic)
 
     @torch.inference_mode()
-    def plan(
-        self,
-        bin_depth=None,
-        tote_depth=None,
-        tote_height=None,
-        cell_size: float | None = None,
-        accuracy: float = 0.003,
-        clearance: float = 0.005,
-        alternatives: int = 10,
-        tote_bearing=None,
-        items: Sequence[Box] | None = None,
-        tote: ToteMap | None = None,
-        bin_labels=None,
-    ) -> Plan:
+    def plan(self, scene: Scene, *, alternatives: int = 10) -> Plan:
         """Return which item in the bin to pick and where, where to place it and how to turn it.
 
         Args:
-            bin_depth: ``[W_B, D_B]``, or a whole multiple of it: height above the bin's floor, 0 where empty; numpy,
-                torch or lists.
-            tote_depth: ``[W_T, D_T]``, or a whole multiple of it: remaining height, from the surface up to the rim.
-                Of a map with one value a cell each value is the least that was measured in the cell.
-            tote_height: height of the tote's rim above its floor; None: that of ``cell.tote_size``.
-            cell_size: side of a cell in metres, if the maps and ``tote_height`` are in metres; None: they are whole
-                numbers of height units, as in training.
-            accuracy: greatest error of a measured height, m.
-            clearance: least distance that an item keeps from what stands beside it, on each side; m.
+            scene: what lies in bin and tote.
             alternatives: how many of the most probable choices to report, and the chosen one if it is further down;
                 0 is fastest. Where no action is feasible, planning takes longest: all are simulated for the reasons.
-            tote_bearing: with ``support="bearing"``, ``[W_T, D_T]``, 1 where a cell bears weight, else 0: what the
-                plan before this one returned; None: every cell bears weight. In metres, of a map with one value a
-                cell, only the floor does then: nothing tells whether a cell is level.
-            items: instead of ``bin_depth``: a list of :class:`Box`, in metres: everything that lies in the bin.
-            tote: instead of ``tote_depth``: what a :class:`~pickplace.robot.camera.Camera` sees.
-            bin_labels: where several items lie in the bin, whole numbers in the shape of ``bin_depth``: 0 where it is
-                empty, another number for each item. None: one item lies there.
 
         Raises:
             DepthMapError: for a map of another shape or type, a value that is not finite or out of range, an empty
                 bin, or anything but one cuboid in it, or for each label; it names the cell. Also for several items
                 among which the planner cannot choose.
+            ValueError: for another argument that cannot be used.
         """
-        self.check_settings(tote_height, cell_size, accuracy, clearance, alternatives)
+        if not isinstance(scene, Scene):
+            found = type(scene).__name__
+            raise ValueError(f"scene: got {found}, expected a Scene, such as Scene.from_maps(bin_depth, tote_depth).")
+        whole_number("alternatives", alternatives, 0, MAX_ALTERNATIVES)
         device = torch.device("cpu") if self.policy is None else next(self.policy.parameters()).device
-        if (tote_depth is None) == (tote is None):
-            got = "neither" if tote is None else "both"
-            raise DepthMapError(f"tote_depth, tote: got {got}, expected one of the two.")
-        if cell_size is None:
-            for key, given in (("items", items), ("tote", tote)):
-                if given is not None:
-                    raise DepthMapError(
-                        f"cell_size=None: expected the side of a cell in metres, as {key} are measured."
-                    )
-            if bin_depth is None:
-                raise DepthMapError("bin_depth: missing; expected a depth map.")
-            problem = read_grid(self.cell, bin_depth, bin_labels, tote_depth, tote_height, tote_bearing, device)
-        else:
-            problem = read_metric(
-                self.cell, cell_size, accuracy, clearance, bin_depth, bin_labels, items,
-                tote if tote_depth is None else tote_depth, tote_height, tote_bearing, device,
-            )  # fmt: skip
-        planner, terms = self._planner_of(problem.bin_items, cell_size is not None)
+        is_metric = scene.cell_size is not None
+        problem = (read_metric if is_metric else read_grid)(self.cell, scene, device)
+        planner, terms = self._planner_of(problem.bin_items, is_metric)
         observation = observe(terms, problem.cell, problem.seen)
         status, action = _decide(planner, problem, observation)
         number = None if action is None else int(problem.taken_items(action))
@@ -235,22 +196,6 @@ class Planner:
         if count > 1:
             _check_choice(planner, count, is_metric)
         return planner, terms
-
-    def check_settings(self, tote_height, cell_size, accuracy, clearance, alternatives) -> None:
-        """Check the arguments of :meth:`plan` beside the maps.
-
-        Raises:
-            DepthMapError: naming the argument that is out of range.
-        """
-        if cell_size is not None:
-            checked_number("cell_size", cell_size, "a length in metres, 0.001 to 10", lambda v: 1e-3 <= v <= 10)
-        checked_number("accuracy", accuracy, "metres, 0 to 0.1", lambda v: 0 <= v <= 0.1)
-        checked_number("clearance", clearance, "metres, 0 to 0.1", lambda v: 0 <= v <= 0.1)
-        if tote_height is not None:
-            check_tote_height(self.cell, tote_height, cell_size)
-        if not is_whole(alternatives) or not 0 <= alternatives <= MAX_ALTERNATIVES:
-            expected = f"expected a whole number >= 0 and <= {MAX_ALTERNATIVES:,}."
-            raise DepthMapError(f"alternatives={excerpt(alternatives)}: {expected}")
 
 
 def _maker(name: str, candidates: int | Literal["all"], **given) -> Callable[..., MapPlanner]:

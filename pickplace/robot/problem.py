@@ -5,17 +5,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pickplace.robot.measure import (
-    MILLIMETRE,
-    Box,
-    DepthMapError,
-    checked_number,
-    flags_of_map,
-    labels_of_map,
-    whole_map,
-)
+from pickplace.robot.box import Box, DepthMapError
+from pickplace.robot.measure import flags_of_map, labels_of_map, whole_map
+from pickplace.robot.scene import BinMap, Scene
 from pickplace.rules.bin import select_item, taken_item
-from pickplace.rules.cell import MAX_SIDE, CellSpec, effector_centre
+from pickplace.rules.cell import CellSpec, effector_centre
 from pickplace.rules.grasps import split_action
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, footprint_mask, placing_maps
@@ -133,28 +127,17 @@ def unit_of(cell: CellSpec) -> str:
     return "cells" if cell.height_unit == 1 else "height units"
 
 
-def check_tote_height(cell: CellSpec, height, cell_size: float | None) -> float:
-    """Return the height of a tote's rim if it is possible; arguments and errors as of :meth:`Planner.plan`."""
-    if cell_size is None:
-        wanted = f"a whole number of {unit_of(cell)}, 1 to {FAR - 1}"
-        return checked_number("tote_height", height, wanted, lambda value: 1 <= value < FAR and value == round(value))
-    most = MAX_SIDE * MILLIMETRE
-    return checked_number("tote_height", height, f"metres, 0.001 to {most:g}", lambda value: 1e-3 <= value <= most)
-
-
-def read_grid(
-    cell: CellSpec, bin_depth, bin_labels, tote_depth, tote_height: int | None, tote_bearing, device
-) -> Problem:
-    """Return the problem of maps in whole height units; arguments and errors as of :meth:`Planner.plan`."""
-    unit_name, height = unit_of(cell), cell.tote_size[2]
-    if tote_height is not None:
-        height = round(check_tote_height(cell, tote_height, None))
-    bin_map = whole_map("bin_depth", bin_depth, cell.bin_size[:2], FAR, unit_name)
-    tote_map = whole_map("tote_depth", tote_depth, cell.tote_size[:2], height, unit_name)
-    items = _read_items(bin_map, bin_labels, unit_name)
+def read_grid(cell: CellSpec, scene: Scene, device) -> Problem:
+    """Return the problem of a scene in whole cells; errors as of :meth:`Planner.plan`."""
+    assert isinstance(scene.items, BinMap)
+    unit_name = unit_of(cell)
+    height = cell.tote_size[2] if scene.tote_height is None else round(scene.tote_height)
+    bin_map = whole_map("bin_depth", scene.items.depth, cell.bin_size[:2], FAR, unit_name)
+    tote_map = whole_map("tote_depth", scene.tote, cell.tote_size[:2], height, unit_name)
+    items = _read_items(bin_map, scene.items.labels, unit_name)
     for item in items:
         check_longest(cell, item, "bin_depth")
-    bearing = read_bearing(cell, tote_bearing, tote_map == height)
+    bearing = read_bearing(cell, scene.tote_bearing, tote_map == height)
     state = State(
         surface_from(height - tote_map, bearing)[None].to(device),
         torch.tensor([height], device=device),

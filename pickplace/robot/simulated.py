@@ -15,8 +15,10 @@ from pickplace.physics.plans import EpisodePlan
 from pickplace.physics.recorded import body_of
 from pickplace.physics.scene import mujoco
 from pickplace.physics.simulation import Loss, wait
+from pickplace.robot.box import ACCURACY, CLEARANCE
 from pickplace.robot.camera import Camera
 from pickplace.robot.planner import Plan, Planner
+from pickplace.robot.scene import Scene
 
 CAMERA_HEIGHT = 1.2  # above the floors, m
 IMAGE = (240, 320)  # rows and columns of a depth image
@@ -44,14 +46,14 @@ class SimulatedCell:
         planner: decides.
         cell_size: side of a cell, m.
         noise: standard deviation of every value of the depth images, m.
-        accuracy, clearance: of :meth:`Planner.plan`, m.
+        accuracy, clearance: of the :class:`~pickplace.robot.scene.Scene`, m.
         seed: of the noise.
         **options: of :class:`~pickplace.physics.execute.Execute`.
     """
 
     def __init__(
-        self, planner: Planner, cell_size: float = 0.05, noise: float = 0.002, accuracy: float = 0.003,
-        clearance: float = 0.005, seed: int = 0, **options,
+        self, planner: Planner, cell_size: float = 0.05, noise: float = 0.002, accuracy: float = ACCURACY,
+        clearance: float = CLEARANCE, seed: int = 0, **options,
     ):  # fmt: skip
         self.planner, self.cell_size, self.noise = planner, cell_size, noise
         self.accuracy, self.clearance = accuracy, clearance
@@ -93,14 +95,12 @@ class SimulatedCell:
 
     def look_and_plan(self, tote_bearing=None) -> Plan:
         """Return the plan for what the cameras see."""
-        cell, cell_size = self.planner.cell, self.cell_size
-        images = {name: self.depth_image(name) for name in self.cameras}
-        items = self.cameras["bin"].items(images["bin"], cell, cell_size, accuracy=self.accuracy)
-        tote = self.cameras["tote"].tote_map(images["tote"], cell, cell_size)
-        return self.planner.plan(
-            items=items, tote=tote, cell_size=cell_size, accuracy=self.accuracy, clearance=self.clearance,
-            tote_bearing=tote_bearing, alternatives=0,
+        views = [(camera, self.depth_image(name)) for name, camera in self.cameras.items()]
+        scene = Scene.from_images(
+            self.planner.cell, *views, self.cell_size, self.accuracy, clearance=self.clearance,
+            tote_bearing=tote_bearing,
         )  # fmt: skip
+        return self.planner.plan(scene, alternatives=0)
 
     def carry_out(self, plan: Plan, size: Sequence[float]) -> Loss | None:
         """Do what a plan says; return the loss if there is one."""

@@ -15,7 +15,7 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import HTTPException, RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, TypeAdapter
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.requests import ClientDisconnect
@@ -25,16 +25,14 @@ import pickplace
 from pickplace.common.validate import excerpt
 from pickplace.config.errors import sentence
 from pickplace.config.registry import names_at
-from pickplace.robot.measure import Box
 from pickplace.robot.planner import Plan, Planner
 from pickplace.rules.cell import CELL_SETTINGS, Reach
 from pickplace.serve import live
-from pickplace.serve.json_lines import MAX_LINE, answer_request, parse_request
+from pickplace.serve.request import MAX_REQUEST, PlanRequest, answer, parse_json
 
 MAX_WAITING = 16  # requests whose body is read, or that wait for their turn
 BODY_SECONDS = 30  # time that a client has to send its request
 
-Map = list[list[float]]
 EMPTY = [[5] * 6] * 6
 GRID = {"bin_depth": [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0] * 5, [0] * 5], "tote_depth": EMPTY}
 METRES = {
@@ -42,24 +40,6 @@ METRES = {
     "tote_depth": [[0.25] * 6] * 6,
     "cell_size": 0.05,
 }
-
-
-class PlanRequest(BaseModel):
-    """A bin and a tote, as a line of ``pickplace-plan``; without ``cell_size`` in whole cells, else in metres."""
-
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [GRID, METRES]})
-
-    id: object = Field(None, description="comes back as it is")
-    bin_depth: Map | None = Field(None, description="height above the bin's floor, [W_B, D_B] or a multiple of it")
-    bin_labels: list[list[int]] | None = Field(None, description="a number for each of several items, 0 elsewhere")
-    items: list[Box] | None = Field(None, description="instead of bin_depth: the measured items, in metres")
-    tote_depth: Map = Field(description="height left up to the rim, [W_T, D_T] or a multiple of it")
-    tote_bearing: list[list[int]] | None = Field(None, description="tote_bearing of the plan before")
-    tote_height: float | None = Field(None, description="height of the rim above the tote's floor")
-    cell_size: float | None = Field(None, description="side of a cell in metres, if the maps are in metres")
-    accuracy: float = Field(0.003, description="greatest error of a measured height, in metres")
-    clearance: float = Field(0.005, description="least distance from what stands beside the item, in metres")
-    alternatives: int = Field(10, description="number of most probable choices reported")
 
 
 class Refusal(BaseModel):
@@ -145,8 +125,8 @@ class Service:
     def _answer(self, body: bytes) -> tuple[int, str]:
         start, request = time.perf_counter(), {}
         try:
-            request = parse_request(body)
-            reply = answer_request(self.planner, request, self.defaults)
+            request = parse_json(body)
+            reply = answer(self.planner, request, self.defaults)
             status = 422 if "error" in reply else 200
         except ValueError as error:
             status, reply = 400, {"error": sentence(error)}
@@ -161,7 +141,7 @@ async def read_body(request: Request) -> bytes:
     """Return the body of a request.
 
     Raises:
-        HTTPException: 413 for more than :data:`MAX_LINE` bytes, 408 for a client that is too slow, 400 for one that
+        HTTPException: 413 for more than :data:`MAX_REQUEST` bytes, 408 for a client that is too slow, 400 for one that
             leaves.
     """
     body = bytearray()
@@ -169,8 +149,8 @@ async def read_body(request: Request) -> bytes:
         async with asyncio.timeout(BODY_SECONDS):
             async for chunk in request.stream():
                 body += chunk
-                if len(body) > MAX_LINE:
-                    raise HTTPException(413, f"the body has more than {MAX_LINE:,} bytes; expected a shorter one.")
+                if len(body) > MAX_REQUEST:
+                    raise HTTPException(413, f"the body has more than {MAX_REQUEST:,} bytes; expected a shorter one.")
     except TimeoutError as error:
         raise HTTPException(408, f"the body took more than {BODY_SECONDS} s; expected a faster one.") from error
     except ClientDisconnect as error:  # nobody reads the answer, but it is no fault of the service
@@ -299,7 +279,8 @@ def kind_of_reach(reach: Reach | None) -> str:
 def _describe_requests(app: FastAPI) -> None:
     """Add the schema of requests to the OpenAPI description: FastAPI does not see it, as it does not parse them."""
     described = app.openapi()
-    schema = PlanRequest.model_json_schema(ref_template="#/components/schemas/{model}")
+    schema = TypeAdapter(PlanRequest).json_schema(ref_template="#/components/schemas/{model}")
+    schema |= {"examples": [GRID, METRES], "required": ["tote_depth"], "additionalProperties": False}
     schemas = described["components"]["schemas"]
     schemas |= schema.pop("$defs", {}) | {"PlanRequest": schema}
     content = {"application/json": {"schema": {"$ref": "#/components/schemas/PlanRequest"}}}

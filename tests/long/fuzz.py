@@ -28,7 +28,7 @@ sys.path.insert(0, str(TESTS))
 
 from commands import composed  # noqa: E402
 
-from pickplace import CellSpec, Planner, State, cli  # noqa: E402
+from pickplace import CellSpec, Planner, Scene, State, cli  # noqa: E402
 from pickplace.evaluation import evaluate  # noqa: E402, F401
 from pickplace.policies.fcn_grasp.policy import FootprintPolicy  # noqa: E402
 from pickplace.rules.masks import action_mask, footprint_mask, placing_maps  # noqa: E402
@@ -198,8 +198,9 @@ def maps(draw: random.Random, folder: Path) -> None:
     cell = CellSpec()
     planner = Planner(cell, FootprintPolicy(cell, filters=8, hidden=8).eval())
     given = {key: request[key] for key in DEFAULTS if key in request}
+    alternatives = {"alternatives": given.pop("alternatives")} if "alternatives" in given else {}
     try:
-        plan = planner.plan(**values, **given)
+        plan = planner.plan(Scene.from_maps(**values, **given), **alternatives)
     except ValueError as error:
         raise SystemExit(_sentence(str(error))) from None
     json.dumps(plan.as_dict(), allow_nan=False)
@@ -231,7 +232,7 @@ def json_line(draw: random.Random, folder: Path) -> None:
     planner = Planner(policy.cell, policy, draw.choice(("all", 5)))
     line = line_of(draw, damage(draw, good_request(draw, cell)))
     report([cell.describe(), repr(line[:300])])
-    reply = json_lines.answer(planner, line, DEFAULTS)
+    reply = json_lines.answer_line(planner, line, DEFAULTS)
     text = json.dumps(reply, allow_nan=False)
     assert "\n" not in text and json.loads(text).keys() == reply.keys()
     if "error" in reply:

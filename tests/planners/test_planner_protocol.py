@@ -4,7 +4,7 @@ import pytest
 import torch
 from untrained import untrained_policy
 
-from pickplace import CellSpec, PickPlaceEnv, Planner
+from pickplace import CellSpec, PickPlaceEnv, Planner, Scene
 from pickplace.evaluation.play import decision_latency, play
 from pickplace.planners.base import decide
 from pickplace.planners.heuristics import JointDBL
@@ -63,7 +63,7 @@ def ask_robot(planner):
     robot, item = Planner(CellSpec(), untrained_policy(CellSpec())), torch.zeros(5, 5)
     item[0, 0] = 1
     robot._planner.choose = lambda cell, state, maps, observation: planner.decide(observation)
-    robot.plan(item, torch.full((6, 6), 5), alternatives=0)
+    robot.plan(Scene.from_maps(item, torch.full((6, 6), 5)), alternatives=0)
 
 
 @pytest.mark.parametrize(

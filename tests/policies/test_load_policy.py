@@ -6,7 +6,7 @@ from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from untrained import write_checkpoint
 
-from pickplace import CellSpec, Planner, load_policy
+from pickplace import CellSpec, Planner, Scene, load_policy
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import as_collection_policy
 from pickplace.rules.observation import STANDARD_TERMS
@@ -57,11 +57,11 @@ def test_weights_from_before_the_setting_support_were_trained_under_half(tmp_pat
     """Also where a robot's planner compares its cell with that of the training."""
     old = write_checkpoint(tmp_path / "run", CellSpec(support="half"), "~env.support", "env.tote_size=[6,6,5]")
     assert load_policy(old).cell.support == load_policy(old).make_env().cell.support == "half"
-    item = {"bin_depth": torch.eye(5) * (torch.arange(5) == 2), "tote_depth": torch.full((6, 6), 5)}
-    assert Planner.load(old).plan(**item).warnings == []
+    scene = Scene.from_maps(torch.eye(5) * (torch.arange(5) == 2), torch.full((6, 6), 5))
+    assert Planner.load(old).plan(scene).warnings == []
     other = Planner.load(old, support="bearing")
     assert other.cell.support == "bearing"
-    assert other.plan(**item).warnings == ["support=bearing: the policy met support=half."]
+    assert other.plan(scene).warnings == ["support=bearing: the policy met support=half."]
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,24 @@ from math import cos, radians, sin
 
 import numpy as np
 
+from pickplace import Plan, Planner, Scene
+
 EPSILON = 1e-6  # m
 
 
+def plan_for(
+    planner: Planner, bin_depth=None, tote_depth=None, tote_height=None, cell_size=None, *, items=None,
+    bin_labels=None, alternatives: int = 10, **settings,
+) -> Plan:  # fmt: skip
+    """The plan for boxes, or for maps."""
+    settings |= {"tote_height": tote_height, "cell_size": cell_size}
+    if items is not None:
+        return planner.plan(Scene(items, tote_depth, **settings), alternatives=alternatives)
+    return planner.plan(Scene.from_maps(bin_depth, tote_depth, bin_labels, **settings), alternatives=alternatives)
+
+
 @dataclass
-class Scene:
+class World:
     """A bin with one box, or with several of which a plan takes one, and a tote with boxes, in metres."""
 
     bin: tuple[float, float, float]
@@ -26,7 +39,7 @@ class Scene:
         """Size, centre and yaw of everything in the bin."""
         return [(self.item, self.centre, self.yaw), *self.others]
 
-    def taking(self, number: int) -> "Scene":
+    def taking(self, number: int) -> "World":
         """Return the scene with another box as the item."""
         (item, centre, yaw), *others = (self.in_bin()[at] for at in (number, *range(number), *range(number + 1, 9))
                                         if at <= len(self.others))  # fmt: skip
@@ -117,7 +130,7 @@ def meet(a: np.ndarray, b: np.ndarray) -> bool:
 
 def random_scene(
     draw: np.random.Generator, tote: tuple[float, float, float], most: tuple = (0.14, 0.14, 0.1), **fields
-) -> Scene:
+) -> World:
     """A bin with one box, turned at random or not, and up to a dozen boxes dropped into the tote at random.
 
     Some totes are hardly higher than the item, or too low for it.
@@ -126,7 +139,7 @@ def random_scene(
     yaw = float(draw.choice((0, draw.uniform(-180, 180))))
     tote = (*tote[:2], float(draw.choice((tote[2], tote[2], item[2] + draw.uniform(-0.005, 0.01)))))
     sizes = {"bin": (0.25, 0.25, 0.05), "effector": (0.15, 0.15)} | fields
-    scene = Scene(tote=tote, item=item, centre=tuple(draw.uniform(0.07, 0.18, 2)), yaw=yaw, **sizes)
+    scene = World(tote=tote, item=item, centre=tuple(draw.uniform(0.07, 0.18, 2)), yaw=yaw, **sizes)
     for _ in range(draw.integers(0, 12)):
         size = draw.uniform((0.02, 0.02, 0.004), (0.15, 0.15, 0.08))
         corner = draw.uniform((0, 0), np.array(tote[:2]) - size[:2])
@@ -144,7 +157,7 @@ def rectangle(centre, sides, yaw) -> np.ndarray:
     return np.array(centre) + half @ axes
 
 
-def fault(scene: Scene, plan, accuracy: float = 0.002) -> str | None:
+def fault(scene: World, plan, accuracy: float = 0.002) -> str | None:
     """The first thing that goes wrong when a robot does exactly as the plan says; None if nothing does.
 
     What lies further below the highest thing under an item than heights may be wrong does not carry it.
@@ -209,7 +222,7 @@ def fault(scene: Scene, plan, accuracy: float = 0.002) -> str | None:
     return None
 
 
-def over_the_tote(scene: Scene, plan) -> list[np.ndarray]:
+def over_the_tote(scene: World, plan) -> list[np.ndarray]:
     """The corners of item and effector over the tote: they turned together about the effector's centre."""
     pick, place = np.array(plan.pick.center[:2]), np.array(plan.place.center[:2])
     turn = radians(plan.rotation_degrees)

@@ -6,9 +6,9 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from scenes import Scene, fault, inside, meet, rectangle
+from scenes import World, fault, inside, meet, plan_for, rectangle
 
-from pickplace import CellSpec, DepthMapError
+from pickplace import CellSpec, DepthMapError, Scene
 from pickplace.robot.camera import Camera
 from pickplace.robot.planner import Box, Planner
 
@@ -123,7 +123,7 @@ def test_steps_or_labels_tell_items_apart():
     with pytest.raises(DepthMapError, match="it could be two items that touch, or one that is no cuboid"):
         eye.items(image(eye, shifted, BIN, 0.001), CELL, SIZE)
     seen = {"tote_depth": np.full((6, 6), 0.25), "cell_size": SIZE}
-    assert Planner(CELL, planner="joint_dbl").plan(items=labelled, **seen).status == "impossible"  # it lifts both
+    assert plan_for(Planner(CELL, planner="joint_dbl"), items=labelled, **seen).status == "impossible"  # it lifts both
 
 
 def test_several_items_are_measured_or_known_to_be_hidden_in_part():
@@ -131,7 +131,7 @@ def test_several_items_are_measured_or_known_to_be_hidden_in_part():
     room, cell, draw, counts = (0.4, 0.4, 0.05), CellSpec(bin_size=(8, 8, 1)), np.random.default_rng(2), Counter()
     planner, eye = Planner(cell, planner="joint_dbl"), camera(room)
     for seed in range(50):
-        scene = Scene(room, TOTE, (0.15, 0.15), (0.09, 0.07, 0.12), (0.285, 0.2), float(draw.uniform(-5, 5)))
+        scene = World(room, TOTE, (0.15, 0.15), (0.09, 0.07, 0.12), (0.285, 0.2), float(draw.uniform(-5, 5)))
         scene.add_others(draw, 3, (0.1, 0.1, 0.12))
         size = (0.06, 0.05, 0.03)  # a low one, close behind the first
         scene.others.append((size, (0.394 - size[0] / 2, 0.2), 0.0))
@@ -153,7 +153,7 @@ def test_several_items_are_measured_or_known_to_be_hidden_in_part():
             grown = rectangle((box.x, box.y), (box.w + 0.01, box.d + 0.01), box.yaw)  # by the clearance
             assert inside(shapes[number], grown), (seed, box)
             counts[type(box).__name__] += 1
-        plan = planner.plan(items=found, tote_depth=np.full((30, 30), 0.25), cell_size=SIZE)
+        plan = plan_for(planner, items=found, tote_depth=np.full((30, 30), 0.25), cell_size=SIZE)
         if plan.status == "ok":
             box, seen = plan.box, scene.taking(true[plan.item_number])
             item = {"item": (box.w, box.d, seen.item[2]), "centre": (box.x, box.y), "yaw": box.yaw}  # nearly
@@ -190,7 +190,21 @@ def test_what_is_no_image_of_the_tote_is_refused():
     with pytest.raises(DepthMapError, match="labels: got shape"):
         camera(BIN).items(image(camera(BIN), [], BIN), CELL, SIZE, labels=np.zeros((3, 3)))
     found = eye.tote_map(shown, CELL, SIZE)
-    with pytest.raises(
-        DepthMapError, match="cell_size=None: expected the side of a cell in metres, as tote are measured"
-    ):
-        Planner(CELL, planner="joint_dbl").plan(np.zeros((5, 5)), tote=found)
+    with pytest.raises(ValueError, match="cell_size=None: .* as tote are measured"):
+        Scene.from_maps(np.zeros((5, 5)), found)
+
+
+def test_a_scene_of_two_images():
+    """It has what each camera sees, measured with the accuracy of the scene."""
+    eyes = camera(BIN), camera()
+    images = image(eyes[0], [box_of((0.1, 0.08, 0.06), 0.12, 0.1)], BIN), image(eyes[1], [])
+    views = [*zip(eyes, images, strict=True)]
+    scene = Scene.from_images(CELL, *views, SIZE, 0.002, clearance=0.004, tote_height=0.2)
+    assert scene.items == eyes[0].items(images[0], CELL, SIZE, accuracy=0.002)
+    assert all(map(np.array_equal, scene.tote, eyes[1].tote_map(images[1], CELL, SIZE, 0.2)))
+    assert (scene.cell_size, scene.accuracy, scene.clearance, scene.tote_height) == (SIZE, 0.002, 0.004, 0.2)
+    assert Planner(CELL, planner="joint_dbl").plan(scene).status == "ok"
+    with pytest.raises(DepthMapError, match="labels: got shape"):
+        Scene.from_images(CELL, *views, SIZE, labels=np.zeros((3, 3)))
+    with pytest.raises(DepthMapError, match="is no item of the given sizes"):
+        Scene.from_images(CELL, *views, SIZE, sizes=[(0.2, 0.2, 0.2)])

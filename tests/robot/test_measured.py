@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scenes import Gripper, Scene, disc, fault, random_scene, rectangle, squares
+from scenes import Gripper, World, disc, fault, plan_for, random_scene, rectangle, squares
 
 from pickplace import CellSpec, DepthMapError, Planner
 from pickplace.robot.measure import box_of_map
@@ -23,13 +23,13 @@ def make_planner(name: str, **options) -> Planner:
     return Planner(cell, planner=name) if name == "joint_dbl" else Planner.load(name, **SIZES)
 
 
-def plan_of(planner: Planner, scene: Scene, draw: np.random.Generator, along: int = 5, accuracy=NOISE, **settings):
+def plan_of(planner: Planner, scene: World, draw: np.random.Generator, along: int = 5, accuracy=NOISE, **settings):
     """A plan from a map with ``along`` values along a cell and from a measured box, both with noise."""
     noise = draw.uniform(-accuracy, accuracy, (6 * along, 6 * along))
     box = Box(*scene.centre, *scene.item[:2], scene.item[2] + draw.uniform(-accuracy, accuracy), scene.yaw)
     maps = scene.tote_map(round(along / CELL), noise)
     settings = {"accuracy": accuracy, "alternatives": 0} | settings
-    return planner.plan(items=[box], tote_depth=maps, tote_height=scene.tote[2], cell_size=CELL, **settings)
+    return plan_for(planner, items=[box], tote_depth=maps, tote_height=scene.tote[2], cell_size=CELL, **settings)
 
 
 def count_faults(name: str, scenes: int, seed: int, along: int = 5, accuracy: float = NOISE, **options) -> Counter:
@@ -92,7 +92,7 @@ def scenes_of(name: str, scenes: int, seed: int, **options) -> Counter:
         )
         noise, error = draw.uniform(-NOISE, NOISE, (60, 60)), draw.uniform(-0.0035, 0.0035, 2)
         box = Box(*(scene.centre + error), *scene.item[:2], scene.item[2] + draw.uniform(-NOISE, NOISE), scene.yaw)
-        plan = planner.plan(
+        plan = plan_for(planner,
             items=[box], tote_depth=scene.tote_map(200, noise), tote_height=scene.tote[2], cell_size=side,
             accuracy=NOISE, alternatives=0,
         )  # fmt: skip
@@ -134,7 +134,7 @@ def play(planner: Planner, draw: np.random.Generator) -> int:
     bearing = None
     while True:
         centre, yaw = tuple(draw.uniform(0.073, 0.177, 2)), draw.uniform(-180, 180)
-        scene = Scene((0.25, 0.25, 0.05), TOTE, (0.15, 0.15), (0.12, 0.08, 0.06), centre, yaw, boxes)
+        scene = World((0.25, 0.25, 0.05), TOTE, (0.15, 0.15), (0.12, 0.08, 0.06), centre, yaw, boxes)
         plan = plan_of(planner, scene, draw, tote_bearing=bearing)
         if plan.status != "ok":
             assert plan.status == "stuck" and sum(plan.reasons.values()) == planner.cell.num_actions
@@ -145,19 +145,19 @@ def play(planner: Planner, draw: np.random.Generator) -> int:
 
 
 def test_a_low_box_is_no_floor_and_a_patch_that_is_covered_in_part_is_not_whole():
-    low = Scene((0.25, 0.25, 0.05), (0.1, 0.1, 0.25), (0.1, 0.1), (0.08, 0.08, 0.06), (0.125, 0.125), 0.0)
+    low = World((0.25, 0.25, 0.05), (0.1, 0.1, 0.25), (0.1, 0.1), (0.08, 0.08, 0.06), (0.125, 0.125), 0.0)
     low.boxes.append((0, 0, 0.04, 0.1, 0.015))
     planner = Planner(CellSpec(tote_size=(2, 2, 5), effector_size=(2, 2)), planner="joint_dbl")
     assert (
-        planner.plan(items=[Box(*low.centre, *low.item)], tote_depth=low.tote_map(200, 0), cell_size=CELL).status
+        plan_for(planner, items=[Box(*low.centre, *low.item)], tote_depth=low.tote_map(200, 0), cell_size=CELL).status
         == "stuck"
     )
     for along in (2, 5, 10):
-        wide = Scene((0.25, 0.25, 0.05), (0.15, 0.15, 0.25), (0.15, 0.15), (0.1, 0.1, 0.06), (0.125, 0.125), 0.0)
+        wide = World((0.25, 0.25, 0.05), (0.15, 0.15, 0.25), (0.15, 0.15), (0.1, 0.1, 0.06), (0.125, 0.125), 0.0)
         wide.boxes.append((0, 0, 0.051, 0.15, 0.1))
         planner = Planner(CellSpec(tote_size=(3, 3, 5), support="half"), planner="joint_dbl")
         seen = {"tote_depth": wide.tote_map(20 * along, 0), "cell_size": CELL}
-        plan = planner.plan(items=[Box(*wide.centre, *wide.item)], **seen)
+        plan = plan_for(planner, items=[Box(*wide.centre, *wide.item)], **seen)
         assert plan.status != "ok" or fault(wide, plan) is None
 
 
@@ -166,16 +166,16 @@ def test_limits_of_the_robot_hold_for_the_pose_and_the_release():
     boxes = [Box(0.11, 0.125, 0.06, 0.06, 0.06, yaw) for yaw in (0, 20, 40)]
     flat = {"tote_depth": np.full((30, 30), 0.25), "cell_size": CELL, "accuracy": 0.005}
     for box in boxes:
-        assert Planner(CellSpec(limits=open_limits), planner="joint_dbl").plan(items=[box], **flat).status == "ok"
+        assert plan_for(Planner(CellSpec(limits=open_limits), planner="joint_dbl"), items=[box], **flat).status == "ok"
         column = torch.zeros(5, 5, dtype=torch.bool)
         column[2] = True  # reference cells at x of 100 to 150 mm
         planner = Planner(CellSpec(limits=replace(open_limits, pick_ok=column.flatten())), planner="joint_dbl")
-        plan = planner.plan(items=[box], **flat)
+        plan = plan_for(planner, items=[box], **flat)
         assert plan.status != "ok" or plan.pick.center[0] == pytest.approx(0.125)
     for top, status in ((0.07, "ok"), (0.069, "impossible")):
         low = replace(open_limits, highest_top=torch.full((4, 6, 6), 7))
         cell = CellSpec(limits=low, height_unit=top / 7 / CELL)
-        plan = Planner(cell, planner="joint_dbl").plan(items=boxes[:1], tote_height=0.25, **flat)
+        plan = plan_for(Planner(cell, planner="joint_dbl"), items=boxes[:1], tote_height=0.25, **flat)
         assert plan.status == status  # the suction face lets go at 60 mm and twice the accuracy
 
 
@@ -184,7 +184,7 @@ def test_few_boxes_are_refused():
     planner, draw, refused = make_planner("pretrained/r4"), np.random.default_rng(1), 0
     for _ in range(200):
         centre = tuple(draw.uniform(0.073, 0.177, 2))
-        scene = Scene((0.25, 0.25, 0.05), TOTE, (0.15, 0.15), (0.12, 0.08, 0.06), centre, draw.uniform(-180, 180))
+        scene = World((0.25, 0.25, 0.05), TOTE, (0.15, 0.15), (0.12, 0.08, 0.06), centre, draw.uniform(-180, 180))
         plan = plan_of(planner, scene, draw)
         refused += plan.status != "ok"
         assert plan.status != "ok" or fault(scene, plan) is None
@@ -214,10 +214,10 @@ def test_two_items_that_are_seen_as_such_are_refused():
     heights[22:30, 10:20] = 0.06
     planner = make_planner("joint_dbl")
     with pytest.raises(DepthMapError, match=r"bin_depth\[20, 11\]: got 0 m, expected 0.06 m: one cuboid, 0.1 x 0.05 m"):
-        planner.plan(heights, np.full((6, 6), 0.25), cell_size=CELL)
+        plan_for(planner, heights, np.full((6, 6), 0.25), cell_size=CELL)
     heights[20:22, 10:20] = 0.04  # a lower one between them
     with pytest.raises(DepthMapError, match="got 0.04 m, expected 0.06 m"):
-        planner.plan(heights, np.full((6, 6), 0.25), cell_size=CELL)
+        plan_for(planner, heights, np.full((6, 6), 0.25), cell_size=CELL)
 
 
 @pytest.mark.parametrize("along", [10, 11, 13, 16])
@@ -225,7 +225,7 @@ def test_maps_of_any_resolution_show_what_carries(along):
     """An item on another one, whose height is no whole number of millimetres, measured exactly."""
     planner, scene = (
         make_planner("joint_dbl"),
-        Scene((0.25, 0.25, 0.05), (0.3, 0.3, 0.25), (0.15, 0.15), (0.14, 0.14, 0.05), (0.125, 0.125), 0),
+        World((0.25, 0.25, 0.05), (0.3, 0.3, 0.25), (0.15, 0.15), (0.14, 0.14, 0.05), (0.125, 0.125), 0),
     )
     scene.boxes = [(x, y, x + 0.15, y + 0.15, 0.0605) for x in (0, 0.15) for y in (0, 0.15)]
     plan = plan_of(planner, scene, np.random.default_rng(0), along, accuracy=0.0)
@@ -235,21 +235,21 @@ def test_maps_of_any_resolution_show_what_carries(along):
 def test_a_robot_that_turns_nothing():
     planner = Planner(CellSpec(rotations=1), planner="joint_dbl")
     flat = {"tote_depth": np.full((6, 6), 0.25), "cell_size": CELL}
-    plan = planner.plan(items=[Box(0.1, 0.1, 0.08, 0.12, 0.06, yaw=180)], **flat)
+    plan = plan_for(planner, items=[Box(0.1, 0.1, 0.08, 0.12, 0.06, yaw=180)], **flat)
     assert plan.status == "ok" and plan.rotation_degrees == 0
     with pytest.raises(DepthMapError, match=r"items\[0\].yaw=30: expected 0 with rotations=1"):
-        planner.plan(items=[Box(0.1, 0.1, 0.08, 0.12, 0.06, yaw=30)], **flat)
+        plan_for(planner, items=[Box(0.1, 0.1, 0.08, 0.12, 0.06, yaw=30)], **flat)
 
 
 @pytest.mark.parametrize("name", ["joint_dbl", "corner", "random", "individual_heuristic", "lookahead", "mcts"])
 def test_any_planner_serves_a_robot(name):
     flat = {"tote_depth": np.full((30, 30), 0.25), "cell_size": CELL, "alternatives": 0}
-    scene = Scene((0.25, 0.25, 0.05), TOTE, (0.15, 0.15), (0.12, 0.08, 0.06), (0.11, 0.12), 20.0)
+    scene = World((0.25, 0.25, 0.05), TOTE, (0.15, 0.15), (0.12, 0.08, 0.06), (0.11, 0.12), 20.0)
     if name in ("joint_dbl", "corner", "random", "individual_heuristic"):
         planner = Planner(CellSpec(**SIZES), planner=name)
     else:
         planner = Planner.load("pretrained/mixed", planner=name, **SIZES)
-    plan = planner.plan(items=[Box(*scene.centre, *scene.item, scene.yaw)], **flat)
+    plan = plan_for(planner, items=[Box(*scene.centre, *scene.item, scene.yaw)], **flat)
     assert plan.status == "ok" and fault(scene, plan) is None
     assert plan.rotation_degrees % 90 == pytest.approx(70)
 
@@ -257,19 +257,19 @@ def test_any_planner_serves_a_robot(name):
 def test_warnings_name_what_lies_outside_the_training():
     flat = {"cell_size": CELL, "alternatives": 0}
     planner = Planner.load("pretrained/r4", tote_size=(7, 6, 5), effector_size=(4, 4))
-    plan = planner.plan(items=[Box(0.1, 0.1, 0.12, 0.08, 0.06)], tote_depth=np.full((7, 6), 0.25), **flat)
+    plan = plan_for(planner, items=[Box(0.1, 0.1, 0.12, 0.08, 0.06)], tote_depth=np.full((7, 6), 0.25), **flat)
     assert [warning.partition(" cells")[0] for warning in plan.warnings] == [
         "item of 3x2x1", "tote of 7x6x5", "end effector of 4x4",
     ]  # fmt: skip
-    known = Planner.load("pretrained/r4").plan(
-        items=[Box(0.1, 0.1, 0.09, 0.04, 0.05)], tote_depth=np.full((6, 6), 0.25), **flat
+    known = plan_for(
+        Planner.load("pretrained/r4"), items=[Box(0.1, 0.1, 0.09, 0.04, 0.05)], tote_depth=np.full((6, 6), 0.25), **flat
     )
     assert known.warnings == []
     with pytest.raises(ValueError, match="planner='uniform': it does not choose among|does not choose among feasible"):
         Planner(CellSpec(), planner="uniform")
     with pytest.raises(DepthMapError, match=r"items\[0\]: the item is 3 cells long, longer .*; expected at most 2"):
         overlap = Planner(CellSpec(pick_rule="overlap", longest_side=2), planner="joint_dbl")
-        overlap.plan(items=[Box(0.1, 0.1, 0.1, 0.04, 0.05)], tote_depth=np.full((6, 6), 0.25), **flat)
+        plan_for(overlap, items=[Box(0.1, 0.1, 0.1, 0.04, 0.05)], tote_depth=np.full((6, 6), 0.25), **flat)
     with pytest.raises(ValueError, match="policy=None: expected a policy"):
         Planner(CellSpec())
     with pytest.raises(ValueError, match="items=None: planner='mcts' needs it"):

@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from problems import oracle_of, problems, state_of
+from scenes import plan_for
 from untrained import untrained_policy, write_checkpoint
 
 from pickplace import CellSpec, DepthMapError, Failure, Planner
@@ -37,7 +38,9 @@ def test_plans_agree_with_the_oracle_and_with_plane_geometry(problem, candidates
     bin_depth = np.zeros(cell.bin_size[:2])
     bin_depth[x : x + w, y : y + d] = h
     policy = untrained_policy(cell, mask, seed)
-    result = Planner(cell, policy, candidates).plan(bin_depth, rim - heights, rim, alternatives=6, tote_bearing=bearing)
+    result = plan_for(
+        Planner(cell, policy, candidates), bin_depth, rim - heights, rim, alternatives=6, tote_bearing=bearing
+    )
     oracle, empty = (
         oracle_of(cell, case),
         oracle_of(cell, case._replace(heights=np.zeros_like(heights), bearing=np.ones_like(heights))),
@@ -94,7 +97,10 @@ def test_whole_cells_in_metres_give_the_plan_of_whole_cells(height_unit):
     low = EMPTY - 2  # something two units high lies everywhere
     ones = np.ones((6, 6))
     exact = {"cell_size": 0.05, "accuracy": 0, "tote_bearing": ones}
-    plain, metric = planner.plan(ITEM, low), planner.plan(ITEM * unit, torch.from_numpy(low * unit), 5 * unit, **exact)
+    plain, metric = (
+        plan_for(planner, ITEM, low),
+        plan_for(planner, ITEM * unit, torch.from_numpy(low * unit), 5 * unit, **exact),
+    )
     assert metric.action == plain.action and metric.status == "ok" and metric.tote_bearing == plain.tote_bearing
     assert plain.drop_height == 2 and metric.drop_height == pytest.approx(2 * unit)
     for pose, other in ((plain.pick, metric.pick), (plain.place, metric.place)):
@@ -104,23 +110,23 @@ def test_whole_cells_in_metres_give_the_plan_of_whole_cells(height_unit):
     assert (metric.item, metric.occupancy_before) == (plain.item, pytest.approx(0.4))
     assert metric.occupancy_after == pytest.approx(plain.occupancy_after)
     assert [other.rejected for other in metric.alternatives] == [other.rejected for other in plain.alternatives]
-    full = planner.plan(ITEM * unit, ones * 0, 5 * unit, **exact), planner.plan(ITEM, ones * 0)
+    full = plan_for(planner, ITEM * unit, ones * 0, 5 * unit, **exact), plan_for(planner, ITEM, ones * 0)
     assert full[0].reasons == full[1].reasons and full[0].status == "stuck"
 
 
 def test_stuck_in_this_tote_or_in_any(planner):
     """A robot that is told to bring an empty tote must not be told so for ever."""
-    full = planner.plan(ITEM, np.zeros((6, 6)))
+    full = plan_for(planner, ITEM, np.zeros((6, 6)))
     assert full.status == "stuck" and sum(full.reasons.values()) == planner.cell.num_actions
     long = np.zeros((5, 5))
     long[:4, 1] = 1  # an end effector of 3x3 does not cover it
-    assert planner.plan(long, EMPTY).status == planner.plan(long, np.zeros((6, 6))).status == "impossible"
-    assert planner.plan(ITEM * 6, EMPTY).status == "impossible"
-    assert planner.plan(ITEM * 6, EMPTY + 1, tote_height=6).status == "ok"
+    assert plan_for(planner, long, EMPTY).status == plan_for(planner, long, np.zeros((6, 6))).status == "impossible"
+    assert plan_for(planner, ITEM * 6, EMPTY).status == "impossible"
+    assert plan_for(planner, ITEM * 6, EMPTY + 1, tote_height=6).status == "ok"
 
 
 def test_maps_of_other_kinds(planner):
-    plain = planner.plan(ITEM, EMPTY)
+    plain = plan_for(planner, ITEM, EMPTY)
     makes = (
         lambda a: torch.tensor(a, dtype=torch.bfloat16),
         lambda a: torch.tensor(a, dtype=torch.float32, requires_grad=True),
@@ -128,7 +134,7 @@ def test_maps_of_other_kinds(planner):
         lambda a: np.asfortranarray(a.astype(">u2")),
     )
     for make in makes:
-        assert planner.plan(make(ITEM), make(EMPTY)) == plain
+        assert plan_for(planner, make(ITEM), make(EMPTY)) == plain
 
 
 def changed(array, cell, value, dtype=float):
@@ -160,11 +166,10 @@ BAD = [
     ({"tote_depth": changed(EMPTY, (3, 1), 6)}, "tote_depth[3, 1]: got 6 cells, expected 0 to 5 cells"),
     ({"tote_depth": EMPTY * 0.05 + 0.04, "bin_depth": ITEM * 0.05, "cell_size": 0.05},
      "tote_depth[0, 0]: got 0.29 m, expected -0.012 to 0.262 m"),
-    ({"tote_depth": EMPTY * 0.05, "bin_depth": np.full((10, 10), 0.05), "cell_size": 0.05, "items": []}, "got both"),
     ({"tote_depth": EMPTY * 0.05, "bin_depth": np.zeros((7, 7)), "cell_size": 0.05}, "or a multiple of it"),
     ({"tote_depth": np.full((12, 12), 5)}, "expected [6, 6]; finer maps are in metres, with cell_size"),
-    ({"bin_depth": None}, "bin_depth: missing; expected a depth map"),
-    ({"tote_depth": None}, "tote_depth, tote: got neither, expected one of the two"),
+    ({"bin_depth": None}, "bin_depth: got shape [], expected [5, 5]"),
+    ({"tote_depth": None}, "tote_depth: got shape [], expected [6, 6]"),
     ({"bin_depth": None, "items": [BOX]}, "cell_size=None: expected the side of a cell in metres, as items are"),
     (boxes(), "items: got 0 boxes, expected 1 to 100: an empty bin"),
     (boxes(*[BOX] * 101), "items: got 101 boxes, expected 1 to 100: too many"),
@@ -173,24 +178,26 @@ BAD = [
     (boxes(replace(BOX, yaw=float("nan"))), "items[0].yaw=nan: expected a finite number"),
     (boxes(replace(BOX, x=0.3)), "items[0].x=0.3: expected 0 to 0.25 m, in the bin"),
     (boxes(replace(BOX, w=0.25)), "items[0].w=0.25: with its clearance it takes 6 cells; expected at most 5"),
-    ({"accuracy": -1}, "accuracy=-1: expected metres, 0 to 0.1"),
-    ({"clearance": 2}, "clearance=2: expected metres, 0 to 0.1"),
-    ({"cell_size": 0.05, "tote_height": 3}, "tote_height=3: expected metres, 0.001 to 2"),
-    ({"cell_size": "5cm"}, "cell_size='5cm': expected a length"),
-    ({"cell_size": 1e-320}, "cell_size=1e-320: expected a length in metres, 0.001 to 10"),
-    ({"tote_height": 0}, "tote_height=0: expected a whole number of cells, 1 to 1048575"),
+    ({"accuracy": -1}, "accuracy=-1: expected metres between 0 and 0.1"),
+    ({"clearance": 2}, "clearance=2: expected metres between 0 and 0.1"),
+    ({"cell_size": 0.05, "tote_height": 3}, "tote_height=3: expected metres between 0.001 and 2"),
+    ({"cell_size": "5cm"}, "cell_size='5cm': expected metres"),
+    ({"cell_size": 1e-320}, "cell_size=1e-320: expected metres between 0.001 and 10"),
+    ({"tote_height": 0}, "tote_height=0: expected a whole number >= 1 and <= 1,048,575"),
     ({"tote_height": 10**400}, "tote_height=1000"),
     ({"alternatives": -1}, "alternatives=-1: expected a whole number >= 0"),
 ]  # fmt: skip
 
 
+#: What is wrong with every image: no DepthMapError, after which a robot takes another one.
+SETTINGS = ("accuracy", "clearance", "cell_size", "tote_height", "alternatives")
 HALVES = [
     (
         {"tote_depth": EMPTY * 1.1},
         "got 5.5 height units, expected a whole number of height units; measured heights are",
     ),
     ({"tote_depth": EMPTY * 2}, "got 10 height units, expected 0 to 5 height units"),
-    ({"tote_height": 0.13}, "expected a whole number of height units, 1 to 1048575"),
+    ({"tote_height": 0.13}, "tote_height=0.13: expected a whole number >= 1"),
 ]
 CASES = [(1.0, *case) for case in BAD] + [(0.5, *case) for case in HALVES]
 
@@ -200,19 +207,29 @@ CASES = [(1.0, *case) for case in BAD] + [(0.5, *case) for case in HALVES]
 def test_bad_maps_are_refused_in_one_sentence(planner, unit, given, message):
     cell = CellSpec(height_unit=unit)
     chosen = planner if unit == 1 else Planner(cell, untrained_policy(cell))
-    with pytest.raises(DepthMapError) as caught:
-        chosen.plan(**{"bin_depth": ITEM, "tote_depth": EMPTY, **given})
+    with pytest.raises(ValueError) as caught:
+        plan_for(chosen, **{"bin_depth": ITEM, "tote_depth": EMPTY, **given})
     assert message in str(caught.value) and "\n" not in str(caught.value)
+    is_setting = any(message.startswith(f"{key}=") for key in SETTINGS)
+    assert isinstance(caught.value, DepthMapError) != is_setting
+
+
+def test_a_planner_takes_a_scene(planner):
+    for wrong in (ITEM, {"bin_depth": ITEM, "tote_depth": EMPTY}, None):
+        with pytest.raises(
+            ValueError, match="^scene: got (ndarray|dict|NoneType), expected a Scene, such as Scene.from_maps"
+        ):
+            planner.plan(wrong)
 
 
 def test_load():
-    four = Planner.load("pretrained/fcn4d").plan(ITEM, EMPTY, alternatives=3)  # a policy of another kind
+    four = plan_for(Planner.load("pretrained/fcn4d"), ITEM, EMPTY, alternatives=3)  # a policy of another kind
     assert four.status == "ok" and sum(other.chosen for other in four.alternatives) == 1
     shipped = Planner.load("pretrained/r4", tote_size=(8, 7, 9), candidates=10)
     assert shipped.cell.tote_size == (8, 7, 9) and shipped.cell.bin_size == (5, 5, 1)
-    assert shipped.plan(ITEM, np.full((8, 7), 9)).status == "ok"
+    assert plan_for(shipped, ITEM, np.full((8, 7), 9)).status == "ok"
     turned = Planner.load("pretrained/unmasked", effector_size=(2, 3), tote_size=(7, 8, 5))
-    assert turned.plan(ITEM, np.full((7, 8), 5)).status == "ok"  # without a mask, end effectors as long as its own
+    assert plan_for(turned, ITEM, np.full((7, 8), 5)).status == "ok"  # without a mask, end effectors as long as its own
 
 
 @pytest.mark.parametrize(("path", "sizes", "message"), [
@@ -235,6 +252,6 @@ def test_load_of_a_policy_whose_grasps_depend_on_the_items(tmp_path):
     cell = CellSpec(tote_size=(5, 5, 2), pick_rule="overlap", longest_side=2)
     overrides = ["env.pick_rule=overlap", "model.mask_infeasible=false", "env.tote_size=[5,5,2]"]
     loaded = Planner.load(write_checkpoint(tmp_path / "it", cell, *overrides))
-    assert loaded.plan(ITEM, np.full((5, 5), 2)).status == "ok"
+    assert plan_for(loaded, ITEM, np.full((5, 5), 2)).status == "ok"
     with pytest.raises(DepthMapError, match="the item is 3 cells long, longer than .*; expected at most 2"):
-        loaded.plan(changed(ITEM, (3, 2), 1), np.full((5, 5), 2))
+        plan_for(loaded, changed(ITEM, (3, 2), 1), np.full((5, 5), 2))

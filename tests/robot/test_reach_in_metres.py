@@ -5,7 +5,7 @@ from math import hypot
 
 import numpy as np
 import pytest
-from scenes import fault, random_scene
+from scenes import fault, plan_for, random_scene
 
 from pickplace import Box, CellSpec, Planner
 from pickplace.rules.reach import Annulus, ReachTable
@@ -19,7 +19,7 @@ def plan_of(planner, scene, draw):
     noise = draw.uniform(-ACCURACY, ACCURACY, (30, 30))
     box = Box(*scene.centre, *scene.item, scene.yaw)
     settings = {"tote_height": scene.tote[2], "cell_size": CELL, "accuracy": ACCURACY, "alternatives": 0}
-    return planner.plan(items=[box], tote_depth=scene.tote_map(100, noise), **settings)
+    return plan_for(planner, items=[box], tote_depth=scene.tote_map(100, noise), **settings)
 
 
 def pose_fault(reach, plan):
@@ -63,7 +63,7 @@ def test_the_annulus_decides_to_the_millimetre():
 
     def status(**values):
         reach = Annulus(**{"radii": [0, 99], **flat, **values})
-        return Planner(CellSpec(reach=reach), planner="joint_dbl").plan(**seen).status
+        return plan_for(Planner(CellSpec(reach=reach), planner="joint_dbl"), **seen).status
 
     # The box fills the effector, but for its clearance: one pick, or the four about it, decides.
     assert status(radii=[0, 2.5], tote=[-3, -3, 0]) == "ok" and status(radii=[0, 2.48], tote=[-3, -3, 0]) != "ok"
@@ -86,7 +86,7 @@ def test_a_table_in_metres_needs_all_pick_cells_around(tmp_path):
         path = tmp_path / "reach.csv"
         path.write_text("\n".join(["where,x,y,rotation,lowest,highest", *rows]))
         planner = Planner(CellSpec(reach=ReachTable(str(path))), planner="joint_dbl")
-        return planner.plan(items=[Box(*centre, 0.14, 0.14, 0.06)], **seen).status
+        return plan_for(planner, items=[Box(*centre, 0.14, 0.14, 0.06)], **seen).status
 
     around = [(2, 2), (2, 3), (3, 2), (3, 3)]
     assert plan([(2, 2)], (0.125, 0.125)) == "ok"
@@ -108,4 +108,4 @@ def test_lookahead_ranks_what_the_robot_reaches():
         setattr(planners[1]._planner, key, value)
     for place in ((0.07, 0.07), (0.18, 0.06), (0.06, 0.18)):
         seen = {"items": [Box(*place, 0.1, 0.08, 0.06)], "tote_depth": depth, "cell_size": CELL, "alternatives": 0}
-        assert [planner.plan(**seen).status for planner in planners] == ["ok", "ok"]
+        assert [plan_for(planner, **seen).status for planner in planners] == ["ok", "ok"]

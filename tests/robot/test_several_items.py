@@ -12,17 +12,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import Oracle, Rules
-from scenes import fault, meet, random_scene, rectangle
+from scenes import fault, meet, plan_for, random_scene, rectangle
 from untrained import untrained_policy
 
-from pickplace import CellSpec, DepthMapError, Failure, Planner
+from pickplace import CellSpec, DepthMapError, Failure, Planner, Scene
 from pickplace.planners.heuristics import JointDBL
 from pickplace.policies.fcn4d.policy import ActionPolicy
 from pickplace.robot.measure import Box, HiddenBox, touches
 from pickplace.robot.measured_problem import read_metric
 from pickplace.rules.grasps import all_grasps
 from pickplace.rules.reach import Annulus
-from pickplace.serve.json_lines import answer
+from pickplace.serve.json_lines import answer_line
 
 CELL, TOTE, NOISE = 0.05, (0.3, 0.3, 0.25), 0.002
 FLAT = {"tote_depth": np.full((30, 30), 0.25), "cell_size": CELL}
@@ -72,7 +72,7 @@ def test_plans_agree_with_the_oracle(name, seed, most, rule, rotations):
     items = random_bin(draw, sides, most, 2)
     depth, labels = bin_maps(items, sides)
     heights = draw.choice([0, *draw.integers(0, 5, 2)], (4, 4))
-    plan = make_planner(name, cell).plan(depth, 4 - heights, 4, bin_labels=labels, alternatives=6)
+    plan = plan_for(make_planner(name, cell), depth, 4 - heights, 4, bin_labels=labels, alternatives=6)
 
     (item, position), *others = ((item[2:], item[:2]) for item in items.values())
     oracle = Oracle(
@@ -116,8 +116,8 @@ def test_whole_cells_in_metres_give_the_plan_of_whole_cells(name, seed):
     items = random_bin(draw, sides, 3, 2)
     depth, labels = bin_maps(items, sides)
     heights = draw.choice([0, 1, 4], (4, 4), p=[0.5, 0.3, 0.2])
-    plain = planner.plan(depth, 4 - heights, bin_labels=labels, alternatives=4)
-    metric = planner.plan(
+    plain = plan_for(planner, depth, 4 - heights, bin_labels=labels, alternatives=4)
+    metric = plan_for(planner,
         depth * CELL, (4 - heights) * CELL, 4 * CELL, CELL, accuracy=0, alternatives=4, bin_labels=labels,
         tote_bearing=np.ones((4, 4)),
     )  # fmt: skip
@@ -135,8 +135,10 @@ def test_whole_cells_in_metres_give_the_plan_of_whole_cells(name, seed):
 def test_one_label_is_one_item():
     depth, labels = bin_maps({5: (1, 2, 2, 1, 1)}, (5, 5))
     planner = Planner.load("pretrained/mixed", tote_size=(6, 6, 5))
-    assert planner.plan(depth, np.full((6, 6), 5), bin_labels=labels) == planner.plan(depth, np.full((6, 6), 5))
-    one = planner.plan(items=BOXES[:1], **FLAT)
+    assert plan_for(planner, depth, np.full((6, 6), 5), bin_labels=labels) == plan_for(
+        planner, depth, np.full((6, 6), 5)
+    )
+    one = plan_for(planner, items=BOXES[:1], **FLAT)
     assert one.status == "ok" and one.item_number == 0
 
 
@@ -162,13 +164,14 @@ def changed(array, cell, value):
     ({"bin_depth": LABELS[0] * 0, "bin_labels": LABELS[1] * 0}, "bin_labels: got 0 labels, expected 1 to 100"),
     ({"bin_depth": LABELS[0] * CELL, "tote_depth": np.full((6, 6), 0.25), "cell_size": CELL, "accuracy": 0.001,
       "bin_labels": changed(LABELS[1], (3, 4), 1)}, "m with label 1, expected 0.1 m: one cuboid"),
-    ({"bin_depth": None, "items": BOXES[:1], **FLAT}, "bin_labels, items: got both, expected bin_labels with"),
 ])  # fmt: skip
 @pytest.mark.filterwarnings("error")
 def test_bad_labels_are_refused_in_one_sentence(given, message):
     planner = Planner(CellSpec(), planner="joint_dbl")
     with pytest.raises(DepthMapError) as caught:
-        planner.plan(**{"bin_depth": LABELS[0], "bin_labels": LABELS[1], "tote_depth": np.full((6, 6), 5), **given})
+        plan_for(
+            planner, **{"bin_depth": LABELS[0], "bin_labels": LABELS[1], "tote_depth": np.full((6, 6), 5), **given}
+        )
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -186,7 +189,7 @@ def count_plans(name: str, scenes: int, seed: int, side: int = 6, most=(0.1, 0.1
         for (w, d, h), centre, yaw in scene.in_bin():
             x, y = centre + draw.uniform(-0.0035, 0.0035, 2)  # within the clearance
             boxes.append(Box(x, y, w, d, h + draw.uniform(-accuracy, accuracy), yaw))
-        plan = planner.plan(
+        plan = plan_for(planner,
             items=boxes, tote_depth=scene.tote_map(100, noise), tote_height=scene.tote[2], cell_size=CELL,
             accuracy=accuracy, alternatives=0,
         )  # fmt: skip
@@ -239,9 +242,7 @@ def test_an_action_means_one_item():
         boxes = [Box(*draw.uniform(0.02, 0.23, 2), 0.02, 0.02, h, draw.uniform(-45, 45)) for h in (0.05, 0.1, 0.07)]
         if any(touches(np.array([[a.x, a.y]]), (a.w, a.d), a.yaw, b).any() for a, b in combinations(boxes, 2)):
             continue
-        problem = read_metric(
-            cell, CELL, NOISE, 0.005, None, None, boxes, FLAT["tote_depth"], None, None, torch.device("cpu")
-        )
+        problem = read_metric(cell, Scene(boxes, FLAT["tote_depth"], CELL, NOISE), torch.device("cpu"))
         lifted = all_grasps(problem.cell, problem.maps.item, problem.maps.blocked)[0]  # [M, P]
         several += int((all_grasps(problem.cell, problem.maps.item)[0].sum(0) > 1).sum())
         assert (lifted.sum(0) <= 1).all()
@@ -257,12 +258,15 @@ def test_any_planner_chooses_among_items(name):
         planner, known = (Planner.load("pretrained/mixed", planner=name, **MIXED, bin_items=count) for count in (1, 3))
     else:
         planner, known = (Planner(CellSpec(**MIXED, bin_items=count), planner=name) for count in (1, 3))
-    plan = planner.plan(items=BOXES, **FLAT, alternatives=0)
+    plan = plan_for(planner, items=BOXES, **FLAT, alternatives=0)
     assert plan.status == "ok" and plan.box == BOXES[plan.item_number]
-    assert {**known.plan(items=BOXES, **FLAT, alternatives=0).as_dict(), "warnings": plan.warnings} == plan.as_dict()
-    assert known.plan(items=BOXES[:1], **FLAT, alternatives=0).status == "ok"
+    assert {
+        **plan_for(known, items=BOXES, **FLAT, alternatives=0).as_dict(),
+        "warnings": plan.warnings,
+    } == plan.as_dict()
+    assert plan_for(known, items=BOXES[:1], **FLAT, alternatives=0).status == "ok"
     depth, labels = bin_maps({3: (0, 0, 2, 2, 1), 9: (5, 5, 2, 1, 3)}, (8, 8))
-    plan = planner.plan(depth, np.full((6, 6), 5), bin_labels=labels)
+    plan = plan_for(planner, depth, np.full((6, 6), 5), bin_labels=labels)
     assert plan.status == "ok" and plan.item["h"] == (1, 3)[plan.item_number]
 
 
@@ -270,13 +274,13 @@ def test_an_item_between_higher_ones_waits():
     """It can be picked once they are gone; one that is surely lower is in nobody's way."""
     low, high = Box(0.2, 0.2, 0.08, 0.08, 0.05), [Box(x, 0.2, 0.05, 0.08, 0.06) for x in (0.12, 0.28)]
     planner = Planner(CellSpec(**MIXED), planner="joint_dbl")
-    plan = planner.plan(items=[low, *high], **FLAT)
+    plan = plan_for(planner, items=[low, *high], **FLAT)
     assert plan.status == "ok" and plan.item_number in (1, 2)
-    alone = planner.plan(items=[low, *(replace(box, h=0.04) for box in high)], **FLAT)
+    alone = plan_for(planner, items=[low, *(replace(box, h=0.04) for box in high)], **FLAT)
     assert alone.status == "ok"
-    equal = planner.plan(items=[Box(x, 0.2, 0.09, 0.09, 0.05) for x in (0.2, 0.1, 0.3)], **FLAT)
+    equal = plan_for(planner, items=[Box(x, 0.2, 0.09, 0.09, 0.05) for x in (0.2, 0.1, 0.3)], **FLAT)
     many = [Box(0.05 + 0.075 * x, 0.05 + 0.075 * y, 0.07, 0.07, 0.06) for x in range(5) for y in range(5)]
-    packed = planner.plan(items=many, **FLAT)  # the effector reaches over the others wherever it is
+    packed = plan_for(planner, items=many, **FLAT)  # the effector reaches over the others wherever it is
     assert equal.status == "ok" and equal.item_number != 0
     assert packed.status == "impossible" and packed.item is packed.item_number is None
     assert packed.reasons["bin_collision"] > 0 and sum(packed.reasons.values()) == planner.cell.num_actions
@@ -286,9 +290,9 @@ def test_the_reach_of_a_pick_depends_on_its_item():
     """The suction face may be 70 mm high in the bin: the item of 80 mm is out of reach."""
     reach = Annulus(radii=[0, 99], heights=[-9, 1.4], bin=[0, -2.5, 0], tote=[0, -3, -5])
     planner = Planner(CellSpec(bin_size=(8, 8, 1), reach=reach), planner="joint_dbl")
-    seen = planner.plan(items=BOXES, **FLAT)
+    seen = plan_for(planner, items=BOXES, **FLAT)
     assert seen.status == "ok" and seen.item_number != 2
-    tall = planner.plan(items=[replace(box, h=0.08) for box in BOXES], **FLAT)
+    tall = plan_for(planner, items=[replace(box, h=0.08) for box in BOXES], **FLAT)
     assert tall.status == "impossible" and tall.reasons["out_of_reach"] > 0
 
 
@@ -307,17 +311,17 @@ def test_those_that_cannot_choose_refuse_in_one_sentence():
          "items[0].yaw=30: expected 0 with rotations=1"),
     ):  # fmt: skip
         with pytest.raises(DepthMapError) as caught:
-            planner.plan(**seen)
+            plan_for(planner, **seen)
         assert message in str(caught.value) and "\n" not in str(caught.value)
-    assert Planner.load("pretrained/fcn4d").plan(**grid, alternatives=2).status == "ok"
+    assert plan_for(Planner.load("pretrained/fcn4d"), **grid, alternatives=2).status == "ok"
     made = Planner(CellSpec(), planner=JointDBL(CellSpec(bin_items=2)))
-    assert made.plan(**grid).status == "ok"
+    assert plan_for(made, **grid).status == "ok"
 
 
 def test_warnings_count_the_items():
     planner = Planner.load("pretrained/mixed", bin_size=(8, 8, 1))
     depth, labels = bin_maps({1: (0, 0, 1, 1, 1), 2: (3, 3, 2, 2, 4), 3: (6, 6, 2, 2, 4)}, (8, 8))
-    plan = planner.plan(depth, np.full((8, 8), 8), bin_labels=labels)
+    plan = plan_for(planner, depth, np.full((8, 8), 8), bin_labels=labels)
     assert plan.warnings == [
         "item of 2x2x4 cells: the policy met other sizes, up to 3x3x3.",
         "3 items in the bin: the policy met at most 1.",
@@ -346,9 +350,9 @@ def test_an_item_that_stands_on_another_is_refused(upper, refused):
         with pytest.raises(
             DepthMapError, match=r"^items\[1\] overlaps items\[0\] in plan view; expected items that stand"
         ):
-            planner.plan(**given)
+            plan_for(planner, **given)
     else:
-        assert planner.plan(**given).status == "ok"
+        assert plan_for(planner, **given).status == "ok"
 
 
 def test_the_critic_of_a_search_sees_each_item():
@@ -357,7 +361,7 @@ def test_the_critic_of_a_search_sees_each_item():
     for label, (corner, height) in enumerate(((slice(0, 1), 1), (slice(3, 5), 2)), 1):
         depth[corner, corner], labels[corner, corner] = height, label
     critics = [planner._planner.critic]
-    assert planner.plan(depth, np.full((6, 6), 5), bin_labels=labels).status == "ok"
+    assert plan_for(planner, depth, np.full((6, 6), 5), bin_labels=labels).status == "ok"
     critics.append(planner._others[2].critic)
     assert [critic.in_keys[3:] for critic in critics] == [[], ["items"]]
     assert critics[0].network is critics[1].network
@@ -374,13 +378,13 @@ def test_items_of_a_fine_map_and_of_a_line():
         heights[x : x + w, y : y + d], labels[x : x + w, y : y + d] = h, label
     planner = Planner.load("pretrained/mixed", **MIXED)
     tote = {"tote_depth": np.full((30, 30), 0.25).tolist(), "cell_size": CELL}
-    plan = planner.plan(heights, bin_labels=labels, **tote, alternatives=3)
+    plan = plan_for(planner, heights, bin_labels=labels, **tote, alternatives=3)
     assert plan.status == "ok" and plan.item_number in (1, 2)  # the first one is lower than its neighbour
     assert plan.box.h == (0.05, 0.08)[plan.item_number == 2] and plan.alternatives[0].item_number == plan.item_number
     line = {"bin_depth": heights.tolist(), "bin_labels": labels.tolist(), **tote, "alternatives": 3}
-    assert json.dumps(answer(planner, json.dumps(line).encode(), {})) == json.dumps(plan.as_dict())
+    assert json.dumps(answer_line(planner, json.dumps(line).encode(), {})) == json.dumps(plan.as_dict())
     boxes = [vars(box) for box in BOXES]
-    reply = answer(planner, json.dumps({"items": boxes, **tote}).encode(), {})
+    reply = answer_line(planner, json.dumps({"items": boxes, **tote}).encode(), {})
     assert reply["status"] == "ok" and reply["box"] == boxes[reply["item_number"]]
-    bad = answer(planner, json.dumps({"items": [*boxes, {"x": 1}], **tote}).encode(), {})
+    bad = answer_line(planner, json.dumps({"items": [*boxes, {"x": 1}], **tote}).encode(), {})
     assert bad == {"error": "items[3]: expected the keys x, y, w, d, h and, if it is turned, yaw."}

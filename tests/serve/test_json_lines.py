@@ -69,6 +69,9 @@ def test_command_answers_json_lines_and_survives_bad_ones(command):
     requests = [
         ({"id": "a", **good}, None), ({"id": 7, "tote_depth": good["tote_depth"]}, "bin_depth: missing"),
         ({"id": 8, **good, "tote": 1}, "there is no such key"),
+        ({"id": 8, **good, "items": []}, "bin_depth, items: got both, expected one of the two"),
+        ({"id": 8, "tote_depth": good["tote_depth"], "items": [], "bin_labels": []}, "bin_labels, items: got both"),
+        ({"id": 8, **good, "items": None, "cell_size": None}, None),
         ({"id": 9, **good, "bin_depth": [[0.0] * 5] * 5}, "one item"),
         ({**good, "tote_height": float("nan")}, "NaN"), ({**good, "alternatives": 10**9}, "<= 100,000"),
         ({"id": 11, **good, "tote_depth": [[0] * 6] * 6}, None),

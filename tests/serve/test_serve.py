@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from browser import errors, wait_until
 
-from pickplace import Planner, __version__
+from pickplace import Planner, Scene, __version__
 from pickplace.serve import serve
 
 pytest.importorskip("fastapi")
@@ -88,7 +88,7 @@ def client():
 
 def test_a_plan_is_that_of_the_planner(client):
     status, _, reply = client.plan({"id": "a", **GRID, "alternatives": 2})
-    expected = Planner.load("pretrained/r4").plan(**GRID, alternatives=2).as_dict()
+    expected = Planner.load("pretrained/r4").plan(Scene.from_maps(**GRID), alternatives=2).as_dict()
     assert status == 200 and reply == {"id": "a", **json.loads(json.dumps(expected))}
     metres = {"items": [{"x": 0.1, "y": 0.12, "w": 0.09, "d": 0.04, "h": 0.05, "yaw": 20}], "cell_size": 0.05}
     status, _, reply = client.plan({**metres, "tote_depth": [[0.25] * 6] * 6})
@@ -195,11 +195,11 @@ def test_openapi_describes_requests_and_answers(client):
     from dataclasses import fields
 
     from pickplace.robot.planner import Plan
-    from pickplace.serve.json_lines import REQUEST_KEYS
+    from pickplace.serve.request import PlanRequest
 
     status, _, described = client.ask("GET", "/openapi.json")
     schemas = described["components"]["schemas"]
-    assert status == 200 and set(schemas["PlanRequest"]["properties"]) == set(REQUEST_KEYS)
+    assert status == 200 and set(schemas["PlanRequest"]["properties"]) == {key.name for key in fields(PlanRequest)}
     assert set(schemas["Plan"]["properties"]) == {field.name for field in fields(Plan)}
     references = set(json.dumps(described).split('"#/components/schemas/')[1:])
     assert {reference.partition('"')[0] for reference in references} <= set(schemas)

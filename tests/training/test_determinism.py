@@ -4,7 +4,7 @@ import torch
 from commands import assert_same
 from omegaconf import OmegaConf
 
-from pickplace import PickPlaceEnv, Planner
+from pickplace import PickPlaceEnv, Planner, Scene
 from pickplace.config.allowlist import trusted_config
 from pickplace.evaluation.play import RESULTS, play
 from pickplace.planners.heuristics import RandomFeasible
@@ -53,6 +53,6 @@ def test_a_plan_depends_on_its_own_maps_alone():
         item[1 : 1 + w, 2 : 2 + d] = 1
         maps.append((item, torch.randint(0, 6, (6, 6), generator=generator)))
     planner = Planner.load("pretrained/r4")
-    forwards = [planner.plan(*pair) for pair in maps]
+    forwards = [planner.plan(Scene.from_maps(*pair)) for pair in maps]
     torch.manual_seed(99)
-    assert forwards == [planner.plan(*pair) for pair in reversed(maps)][::-1]
+    assert forwards == [planner.plan(Scene.from_maps(*pair)) for pair in reversed(maps)][::-1]

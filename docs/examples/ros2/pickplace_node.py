@@ -11,7 +11,7 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
-from pickplace import Camera, DepthMapError, Planner
+from pickplace import Camera, DepthMapError, Planner, Scene
 
 #: Type of a pixel, and metres of its unit, by the encoding of a depth image (REP 118).
 ENCODINGS = {"16UC1": (np.uint16, 1e-3), "32FC1": (np.float32, 1.0)}
@@ -64,12 +64,11 @@ class PickPlaceNode(Node):
         try:
             depth = {place: self.depth_of(place) for place in self.poses}
             cameras = {place: self.camera_of(place) for place in self.poses}
-            cell, side = self.planner.cell, self.cell_size
-            plan = self.planner.plan(
-                items=cameras["bin"].items(depth["bin"], cell, side, accuracy=self.accuracy),
-                tote=cameras["tote"].tote_map(depth["tote"], cell, side),
-                cell_size=side, accuracy=self.accuracy, clearance=self.clearance, tote_bearing=self.bearing,
+            scene = Scene.from_images(
+                self.planner.cell, *((cameras[place], depth[place]) for place in ("bin", "tote")), self.cell_size,
+                self.accuracy, clearance=self.clearance, tote_bearing=self.bearing,
             )  # fmt: skip
+            plan = self.planner.plan(scene)
         except (DepthMapError, ValueError) as error:
             response.success, response.message = False, str(error)
             return response

@@ -1,0 +1,35 @@
+"""Measured boxes, and the defaults of a measurement. Needs no torch: ``--help`` is answered without it."""
+
+import math
+from dataclasses import dataclass, replace
+
+MILLIMETRE = 1e-3  # height unit of measured maps, m
+ACCURACY = 0.003  # greatest error of a measured height unless a scene says otherwise, m
+CLEARANCE = 0.005  # least distance of an item from what stands beside it unless a scene says otherwise, m
+
+
+class DepthMapError(ValueError):
+    """A depth map, or an argument beside it, that cannot be planned with; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A measured cuboid that stands in the bin; in metres and degrees, in the bin's frame."""
+
+    x: float  #: of its centre
+    y: float
+    w: float  #: side along x, before it is turned by the yaw
+    d: float  #: side along y
+    h: float  #: height of its top above the bin's floor
+    yaw: float = 0.0  #: turn about the vertical axis, counter-clockwise seen from above
+
+    def upright(self) -> "Box":
+        """Return the same cuboid with a yaw above -45 and at most 45 degrees."""
+        quarters = math.ceil(self.yaw / 90 - 0.5 - 1e-9)
+        w, d = (self.d, self.w) if quarters % 2 else (self.w, self.d)
+        return replace(self, w=w, d=d, yaw=self.yaw - 90 * quarters)
+
+
+@dataclass(frozen=True)
+class HiddenBox(Box):
+    """A box behind a higher one, of which a camera may not see all: it is in the way, and is not picked."""

@@ -1,0 +1,134 @@
+"""A scene: what lies in the bin and in the tote, as it was measured, and how exactly."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from pickplace.common.validate import excerpt, integral_number, is_number, number
+from pickplace.robot.box import ACCURACY, CLEARANCE, MILLIMETRE, Box, DepthMapError
+from pickplace.rules.cell import MAX_BIN_ITEMS, MAX_SIDE, CellSpec
+from pickplace.rules.maps import FAR
+
+if TYPE_CHECKING:
+    from pickplace.robot.camera import Camera
+
+MAX_VALUE = 1e3  # greatest coordinate of a box, m, and greatest yaw, degrees
+
+
+class BinMap(NamedTuple):
+    """Heights above the bin's floor, ``[W_B, D_B]`` or a whole multiple of it, 0 where it is empty."""
+
+    depth: Any  #: numpy, torch or lists
+    #: where several items lie in the bin, whole numbers in the same shape: 0 where it is empty, another number for each
+    #: item; None: one item lies there
+    labels: Any = None
+
+
+class ToteMap(NamedTuple):
+    """The greatest and the least height in each patch of a tote, ``[k W_T, k D_T]``; metres."""
+
+    highest: np.ndarray
+    lowest: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What lies in the bin and in the tote, for :meth:`~pickplace.robot.planner.Planner.plan`.
+
+    With ``cell_size`` all lengths are in metres. Without it maps and ``tote_height`` are whole numbers of height units,
+    as in training.
+
+    Raises:
+        ValueError: for a setting that is missing or out of range.
+        DepthMapError: for items that are no boxes, or none or too many. The planner checks what depends on its cell.
+    """
+
+    #: everything that lies in the bin: boxes in metres, or a map, see :meth:`from_maps`
+    items: Sequence[Box] | BinMap
+    #: ``[W_T, D_T]``, or a whole multiple of it: remaining height, from the surface up to the rim; numpy, torch or
+    #: lists. Of a map with one value a cell each value is the least that was measured in the cell. Or a `ToteMap`
+    tote: Any
+    cell_size: float | None = None  #: side of a cell, m; None: maps of whole cells
+    accuracy: float = ACCURACY  #: greatest error of a measured height, m
+    clearance: float = CLEARANCE  #: least distance that an item keeps from what stands beside it, on each side; m
+    tote_height: float | None = None  #: height of the tote's rim above its floor; None: that of ``cell.tote_size``
+    #: with ``support="bearing"``, ``[W_T, D_T]``, 1 where a cell bears weight, else 0: what the plan before this one
+    #: returned; None: every cell bears weight. In metres, of a map with one value a cell, only the floor does then:
+    #: nothing tells whether a cell is level
+    tote_bearing: Any = None
+
+    def __post_init__(self):
+        check_settings(self.tote_height, self.cell_size, self.accuracy, self.clearance)
+        for key, is_metric in (
+            ("items", not isinstance(self.items, BinMap)),
+            ("tote", isinstance(self.tote, ToteMap)),
+        ):
+            if is_metric and self.cell_size is None:
+                raise ValueError(f"cell_size=None: expected the side of a cell in metres, as {key} are measured.")
+        if not isinstance(self.items, BinMap):
+            check_boxes(self.items)
+
+    @classmethod
+    def from_maps(cls, bin_depth, tote_depth, bin_labels=None, **settings) -> "Scene":
+        """Return a scene that two maps show: of whole cells, or in metres.
+
+        Args:
+            bin_depth, bin_labels: see :class:`BinMap`.
+            tote_depth: see :attr:`tote`.
+            **settings: the other fields.
+        """
+        return cls(BinMap(bin_depth, bin_labels), tote_depth, **settings)
+
+    @classmethod
+    def from_images(
+        cls, cell: CellSpec, bin_view: tuple["Camera", Any], tote_view: tuple["Camera", Any], cell_size: float,
+        accuracy: float = ACCURACY, labels=None, sizes=None, tote_height: float | None = None, **settings,
+    ) -> "Scene":  # fmt: skip
+        """Return the scene that two cameras see.
+
+        Args:
+            cell: the sizes.
+            bin_view, tote_view: a camera above each, and its depth image.
+            labels, sizes: of the items, see :meth:`~pickplace.robot.camera.Camera.items`, as for errors.
+            **settings: the other fields.
+        """
+        (over_bin, bin_image), (over_tote, tote_image) = bin_view, tote_view
+        items = over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes)
+        tote = over_tote.tote_map(tote_image, cell, cell_size, tote_height)
+        return cls(items, tote, cell_size, accuracy, tote_height=tote_height, **settings)
+
+
+def check_settings(tote_height, cell_size, accuracy, clearance) -> None:
+    """Check the settings of a scene.
+
+    Raises:
+        ValueError: naming the one that is out of range.
+    """
+    if cell_size is not None:
+        number("cell_size", cell_size, 1e-3, 10, "metres")
+    number("accuracy", accuracy, 0, 0.1, "metres")
+    number("clearance", clearance, 0, 0.1, "metres")
+    if tote_height is not None and cell_size is None:
+        integral_number("tote_height", tote_height, 1, FAR - 1)
+    elif tote_height is not None:
+        number("tote_height", tote_height, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
+
+
+def check_boxes(items) -> None:
+    """Check measured items.
+
+    Raises:
+        DepthMapError: for anything but boxes whose values are lengths.
+    """
+    if not isinstance(items, (list, tuple)) or not all(isinstance(item, Box) for item in items):
+        raise DepthMapError(f"items={excerpt(items)}: expected a list of Box.")
+    if not 1 <= len(items) <= MAX_BIN_ITEMS:
+        found = "an empty bin" if not items else "too many"
+        raise DepthMapError(f"items: got {len(items)} boxes, expected 1 to {MAX_BIN_ITEMS}: {found}.")
+    for at, box in enumerate(items):
+        for key, value in vars(box).items():
+            if not is_number(value) or abs(value) > MAX_VALUE or (key in "wdh" and value < MILLIMETRE):
+                expected = "a length of at least 0.001 m" if key in "wdh" else "a finite number"
+                raise DepthMapError(f"items[{at}].{key}={excerpt(value)}: expected {expected}.")
