@@ -22,11 +22,11 @@ from pickplace.config.errors import one_sentence
 from pickplace.evaluation import evaluate
 from pickplace.evaluation.result import episode_settings, read_comparison
 from pickplace.items.distributions import Recorded
-from pickplace.robot import json_lines
 from pickplace.rules.observation import ToteDepth
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import changed_values, is_claimed, noted_config_folders, noted_overrides, refuse_links
 from pickplace.runs.resume import StopRequest, load_optimizer
+from pickplace.serve import json_lines, request
 from pickplace.training import trainer
 from pickplace.training.train import resume_run
 
@@ -405,7 +405,8 @@ def test_maps_are_named_by_their_files(plan, tmp_path):
 
 
 def test_an_endless_line_is_answered_and_skipped(monkeypatch):
-    monkeypatch.setattr(json_lines, "MAX_LINE", 8)
+    for module in (json_lines, request):
+        monkeypatch.setattr(module, "MAX_REQUEST", 8)
 
     class Endless:
         """A stream whose first line has 100 bytes; no more than a few may be asked for at a time."""
@@ -420,7 +421,7 @@ def test_an_endless_line_is_answered_and_skipped(monkeypatch):
 
     lines = list(json_lines.read_lines(Endless()))
     assert lines == [b"x" * 9, b"{}\n", b" " * 8 + b"\n", b"y" * 9]
-    assert "more than 8 bytes" in json_lines.answer(None, lines[0], {})["error"]
+    assert "more than 8 bytes" in json_lines.answer_line(None, lines[0], {})["error"]
 
 
 @pytest.mark.parametrize("name", ["stdin", "stdout"])

@@ -1,6 +1,6 @@
 """Print plans of robot cells as JSON lines, so that two versions of the package can be compared.
 
-python tests/long/robot_plans.py [scenes] [seed] > plans.jsonl
+python tests/long/robot_plans.py <scenes of each of 16 planners> <plans.jsonl>
 
 Each line is a plan with every field, or the sentence of an error. The scenes are random: boxes in bin and tote,
 measured as boxes, as maps in metres, as maps of whole cells, or by cameras; several planners, policies, grippers and
@@ -194,27 +194,24 @@ def metres(draw: np.random.Generator, world: scenes.World, cell, side: float) ->
 VIEWS = [as_boxes, as_boxes, as_maps, as_cells, as_images]
 
 
-def plans(count: int, seed: int = 0):
+def plans(scenes: int):
     """Yield one dict for each scene: a plan with every field, or the sentence of an error."""
-    planners = {}
-    for number in range(count):
-        at = number % len(CELLS)
-        name, options, sizes, side = CELLS[at]
-        if at not in planners:
-            planners[at] = make_planner(name, options, sizes)
-        planner, draw = planners[at], np.random.default_rng((seed, number))
-        world = random_world(draw, planner.cell, side)
-        view = VIEWS[(number // len(CELLS)) % len(VIEWS)]
-        start = {"number": number, "planner": name, "view": view.__name__}
-        try:
-            found = plan(planner, int(draw.integers(0, 4)), **view(draw, world, planner.cell, side))
-        except Exception as error:  # a fault must not hide what comes after it
-            yield {**start, "error": str(error) if isinstance(error, DepthMapError) else repr(error)}
-        else:
-            yield {**start, **found.as_dict()}
+    for at, (name, options, sizes, side) in enumerate(CELLS):
+        planner = make_planner(name, options, sizes)
+        for number in range(scenes):
+            draw, view = np.random.default_rng((at, number)), VIEWS[number % len(VIEWS)]
+            world = random_world(draw, planner.cell, side)
+            start = {"planner": name, "cell": at, "number": number, "view": view.__name__}
+            try:
+                found = plan(planner, int(draw.integers(0, 4)), **view(draw, world, planner.cell, side))
+            except Exception as error:  # a fault must not hide what comes after it
+                yield {**start, "error": str(error) if isinstance(error, DepthMapError) else repr(error)}
+            else:
+                yield {**start, **found.as_dict()}
 
 
 if __name__ == "__main__":
-    for line in plans(*map(int, sys.argv[1:])):
-        sys.stdout.write(json.dumps(line) + "\n")
-        sys.stdout.flush()
+    with Path(sys.argv[2]).open("w") as file:
+        for line in plans(int(sys.argv[1])):
+            file.write(json.dumps(line) + "\n")
+            file.flush()
