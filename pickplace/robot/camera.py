@@ -14,8 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from pickplace.robot.box import ACCURACY, Box, DepthMapError, HiddenBox
-from pickplace.robot.measure import MAX_PATCHES, SNAPPED, is_inside, smallest_rectangle
-from pickplace.robot.scene import ToteMap
+from pickplace.robot.measure import MAX_PATCHES, SNAPPED, ToteMap, is_inside, smallest_rectangle
 from pickplace.rules.cell import CellSpec
 
 #: Greatest share of a tote that the camera may not see.

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,6 +19,13 @@ MAX_PATCHES = 8  # greatest number of patches along a cell; finer maps are reduc
 MAX_LABEL = 2**31 - 1
 #: Width of the border of an item that is taken to be parallel to the walls, as a share of its side: sine of a degree.
 SNAPPED = 0.02
+
+
+class ToteMap(NamedTuple):
+    """The greatest and the least height in each patch of a tote, ``[k W_T, k D_T]``; metres."""
+
+    highest: np.ndarray
+    lowest: np.ndarray
 
 
 def as_array(name: str, values, grid: Sequence[int], kinds: str = "iuf") -> np.ndarray:

@@ -14,6 +14,7 @@ from pickplace.common.validate import number as checked_number
 from pickplace.robot.box import MILLIMETRE, Box, DepthMapError, HiddenBox
 from pickplace.robot.measure import (
     ROUNDING,
+    ToteMap,
     as_array,
     box_of_map,
     boxes_of_map,
@@ -24,7 +25,7 @@ from pickplace.robot.measure import (
     whole_units,
 )
 from pickplace.robot.problem import Problem, check_longest, join_items, read_bearing
-from pickplace.robot.scene import BinMap, Scene, ToteMap
+from pickplace.robot.scene import BinMap, Scene
 from pickplace.rules.bin import taken_item
 from pickplace.rules.cell import MAX_SIDE, CellSpec, Limits, effector_centre, reference_cell
 from pickplace.rules.grasps import carry, footprint_index

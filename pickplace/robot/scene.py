@@ -2,17 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from pickplace.common.validate import excerpt, integral_number, is_number, number
 from pickplace.robot.box import ACCURACY, CLEARANCE, MILLIMETRE, Box, DepthMapError
+from pickplace.robot.camera import Camera
+from pickplace.robot.measure import ToteMap
 from pickplace.rules.cell import MAX_BIN_ITEMS, MAX_SIDE, CellSpec
 from pickplace.rules.maps import FAR
-
-if TYPE_CHECKING:
-    from pickplace.robot.camera import Camera
 
 MAX_VALUE = 1e3  # greatest coordinate of a box, m, and greatest yaw, degrees
 
@@ -24,13 +21,6 @@ class BinMap(NamedTuple):
     #: where several items lie in the bin, whole numbers in the same shape: 0 where it is empty, another number for each
     #: item; None: one item lies there
     labels: Any = None
-
-
-class ToteMap(NamedTuple):
-    """The greatest and the least height in each patch of a tote, ``[k W_T, k D_T]``; metres."""
-
-    highest: np.ndarray
-    lowest: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +73,7 @@ class Scene:
 
     @classmethod
     def from_images(
-        cls, cell: CellSpec, bin_view: tuple["Camera", Any], tote_view: tuple["Camera", Any], cell_size: float,
+        cls, cell: CellSpec, bin_view: tuple[Camera, Any], tote_view: tuple[Camera, Any], cell_size: float,
         accuracy: float = ACCURACY, labels=None, sizes=None, tote_height: float | None = None, **settings,
     ) -> "Scene":  # fmt: skip
         """Return the scene that two cameras see.
