@@ -19,14 +19,12 @@ from pickplace.rules.effector import (
     read_shape,
     turned,
 )
+from pickplace.rules.support import Bearing, Support, read_support
 
 PICK_RULES = ("contain", "overlap", "seal")
 
 REFILLS = ("each", "batch")
 MAX_BIN_ITEMS = 100
-
-HULL_RULES = ("hull", "bearing")
-SUPPORT_RULES = ("half", "more_than_half", "hull", "bearing", "half_or_hull", "corners", "full")
 
 #: Greatest side of a grid or height, in cells or height units, and greatest side of an end effector.
 MAX_SIDE, MAX_EFFECTOR = 2_000, 64
@@ -133,15 +131,8 @@ class CellSpec:
         rotations: ``R``, the number of quarter turns to choose from, 1 to 4.
         pick_rule: on the cup's cells that lie on the item: ``"contain"`` (they cover the whole item), ``"overlap"``
             (there is one) or ``"seal"`` (they are the share ``min_seal`` of the cup, or more).
-        support: the stability rule, on the cells below the footprint that are as high as the highest of them:
-            ``"half"`` (at least half of the footprint), ``"more_than_half"``, ``"full"``, ``"hull"`` (the item's
-            centre lies inside their convex hull), ``"bearing"`` (the same, and a cell of another item counts only
-            where it lies inside the hull of that item's own supporting cells), ``"half_or_hull"`` (more than half of
-            the footprint, or the item's centre lies inside the convex hull of the middles of these cells, or on its
-            edge), ``"corners"`` (60% of the footprint and its four corners, 80% and three of them, or 95%), or a
-            number, the least share of the footprint.
-        support_margin: of ``"hull"`` and ``"bearing"``: distance from the hull's edge that the centre must exceed, in
-            cells.
+        support: the stability rule, an object of :mod:`pickplace.rules.support`; or a short form of it, the name of one
+            of :data:`~pickplace.rules.support.RULES` or the least share of the footprint.
         height_unit: length of a height unit, in sides of a cell. The rules only count units; what converts heights to
             lengths (the robot's planner, the replay page) multiplies by it.
         body: the cells of ``effector_size`` that must not hit anything: ``"rectangle"``, all; ``"disc"``, those that
@@ -169,8 +160,7 @@ class CellSpec:
     effector_size: tuple[int, int] = (3, 3)
     rotations: int = 4
     pick_rule: str = "contain"
-    support: str | float = "bearing"
-    support_margin: float = 0.25
+    support: Support = Bearing()
     height_unit: float = 1.0
     body: str | Mask = "rectangle"
     cup: str | Mask = "rectangle"
@@ -192,9 +182,7 @@ class CellSpec:
                 f"rotations={excerpt(self.rotations)}: expected 1, 2, 3 or 4 (quarter turns to choose from)."
             )
         one_of("pick_rule", self.pick_rule, PICK_RULES)
-        if isinstance(self.support, str) or not is_number(self.support) or not 0 <= self.support <= 1:
-            one_of("support", self.support, SUPPORT_RULES, "a number between 0 and 1")
-        number("support_margin", self.support_margin, 0, 100)
+        object.__setattr__(self, "support", read_support(self.support))
         object.__setattr__(self, "height_unit", float(number("height_unit", self.height_unit, 1e-3, 1e3)))
         whole_number("bin_items", self.bin_items, most=MAX_BIN_ITEMS)
         one_of("refill", self.refill, REFILLS)

@@ -12,17 +12,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.rules.cell import HULL_RULES, CellSpec
+from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import carry, footprint_index, is_clear, is_outside, split_action
 from pickplace.rules.maps import FAR, NEVER
 from pickplace.rules.masks import PlacingMaps
 from pickplace.rules.placing import clearance, footprint_cells, footprint_sizes, is_within_reach, overflows, rest
 from pickplace.rules.state import Failure, Item, State, surface_from
-from pickplace.rules.support import is_share_enough
+from pickplace.rules.support.contact import Patches
 
 DIRECTIONS = 128  # in which the hull of what supports an item is looked at
-#: Least distance of an item's centre from the hull's edge, in patches: as far as a patch may be covered in part.
-PATCH_MARGIN = 1.5
 
 
 def level_step(accuracy: int) -> int:
@@ -91,20 +89,9 @@ def measured_maps(cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[f
     return MeasuredMaps(maps, stable, highest, over_rim)
 
 
-class _Contact(NamedTuple):
-    """The patches wholly under an item at each place."""
-
-    supports: Tensor  # bool [W, D, patches]: of footprints inside the tote
-    along: Tensor  # float64 [DIRECTIONS, patches]: how far a patch reaches from the item's centre; patches
-    cells: Tensor  # int64 [patches]: cell of the footprint in which it lies, row by row
-    slack: float  # by which a direction between two others may differ; patches
-    touched: float  # number of patches that the item covers, in part too
-    fewest: int  # number of patches along its shorter side
-
-
 def _contact(
     cell: CellSpec, tote: MeasuredTote, footprint: tuple[int, int], sides: tuple[float, float], z: Tensor
-) -> _Contact:
+) -> Patches:
     """Return what supports an item of ``sides`` in the middle of footprints ``[W, D]`` that rest on heights ``z``."""
     count = tote.highest.shape[0] // cell.tote_size[0]
     spans = []
@@ -116,7 +103,7 @@ def _contact(
     if x1 <= x0 or y1 <= y0:  # an item that is narrower than a patch
         none = torch.zeros(0, dtype=torch.int64, device=device)
         along = torch.zeros(DIRECTIONS, 0, dtype=torch.float64, device=device)
-        return _Contact(none.bool().expand(*shape, 0), along, none, 0.0, 1.0, 0)
+        return Patches(none.bool().expand(*shape, 0), along, none, count)
     near = [torch.arange(*span, dtype=torch.float64, device=device) for span in spans]
     under = tote.lowest[x0:, y0:].unfold(0, x1 - x0, count).unfold(1, y1 - y0, count)[: shape[0], : shape[1]]
     number = [(part.long() // count) for part in near]
@@ -133,7 +120,7 @@ def _contact(
     along = (reach[0][:, :, None] + reach[1][:, None, :]).flatten(1)
     slack = math.hypot(*sides) * count / 2 * math.sin(math.pi / DIRECTIONS)
     touched = math.prod(side * count for side in sides)
-    return _Contact(supports, along, cells, slack, touched, min(x1 - x0, y1 - y0))
+    return Patches(supports, along, cells, count, slack, touched, min(x1 - x0, y1 - y0))
 
 
 def _oriented(item: Item, sides: tuple[float, float], parity: int) -> tuple[tuple[int, int], tuple[float, float]]:
@@ -154,20 +141,9 @@ def _is_stable(
         return stable
     contact = _contact(cell, tote, footprint, sides, z)
     on_floor = z <= floor_height(tote.accuracy)  # the one surface that has no gaps
-    flags = contact.supports
-    # Two patches along both sides: something then carries each quarter of the item, though a patch may be covered in
-    # part. (With one value a cell only cells that are level bear weight.)
-    count = tote.highest.shape[0] // cell.tote_size[0]
-    full = flags.all(-1) & (contact.fewest >= (2 if count > 1 else 1))
-    # By every rule the centre must be above what carries the item: a patch that is covered in part counts as whole.
-    margin = cell.support_margin * count if cell.support in HULL_RULES else 0.0
-    margin = max(margin, PATCH_MARGIN if count > 1 else 0.0) + contact.slack
-    reached = flags.double() @ (contact.along > margin).double().t()  # [W, D, directions]
-    enough = (reached > 0).all(-1)
-    if cell.support not in HULL_RULES:
-        # Of ``half_or_hull`` and ``corners``, too, the share that suffices alone: stricter than the rule.
-        enough &= is_share_enough(cell.support, flags.sum(-1).double() / contact.touched)
-    stable[inside] = on_floor | full | enough
+    # By every rule the centre must be above what carries the item.
+    enough = contact.is_centre_in_hull() & cell.support.measured(contact)
+    stable[inside] = on_floor | contact.full | enough
     return stable
 
 

@@ -13,7 +13,7 @@ from pickplace.rules import large_items
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.maps import FAR, NEVER, is_under, surround, windows
 from pickplace.rules.state import Item, State, surface_from
-from pickplace.rules.support import is_supported
+from pickplace.rules.support.contact import Contact
 
 
 # ---------------------------------------------------------------------- the checks of a placement, one function each
@@ -55,7 +55,7 @@ def resting_top(cell: CellSpec, state: State) -> tuple[Tensor, Tensor]:
     else:
         cells, under = footprint_cells(cell, state.surface, w, d)
         z = rest(cells, under)
-        stable = is_supported(cell, cells, under, z, w, d)
+        stable = cell.support.stable(Contact(cells, under, z, w, d))
     top = z + item.h.to(z.dtype)
     good = stable & ~overflows(top, state.tote_height) & ~item.is_empty
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)

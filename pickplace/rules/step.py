@@ -21,7 +21,7 @@ from pickplace.rules.maps import is_under, rectangle, square_cells, squares
 from pickplace.rules.masks import PlacingMaps
 from pickplace.rules.placing import is_within_reach, overflows, rest
 from pickplace.rules.state import Failure, Item, State, surface_from
-from pickplace.rules.support import bearing_cells, is_supported
+from pickplace.rules.support.contact import Contact
 
 
 class Step(NamedTuple):
@@ -59,6 +59,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     side, reach = cell.max_side, max(ee_w, ee_d)
     cells, under = squares(surface, x, y, side).unbind(0), is_under(w, d, side).unbind(0)
     z = rest(cells, under)
+    contact = Contact(cells, under, z, w, d)
     top = z.long() + item.h
     covered = body_cells(cell.effectors, reach, action.device)  # [side * side, B]
     if len(cell.effectors) > 1:
@@ -68,7 +69,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     effector_leaves = is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d)
 
     checks = [  # from the last to the first, so that the first failure has the last word
-        (Failure.UNSTABLE, ~is_supported(cell, cells, under, z, w, d)),
+        (Failure.UNSTABLE, ~cell.support.stable(contact)),
         (Failure.ITEM_COLLISION, ~is_clear(top, highest)),
         (Failure.OVERFLOW, overflows(top, tote_height)),
         (Failure.TOTE_COLLISION, item_leaves | (effector_leaves & ~is_clear(top, tote_height))),
@@ -125,8 +126,8 @@ def _add_item(cell: CellSpec, surface: Tensor, footprint: Tensor, z: Tensor, hei
     (x, y, w, d), side, grid = footprint.unbind(-1), cell.max_side, cell.tote_size[:2]
     inside = rectangle(grid, x, y, w, d) & (height > 0)
     after = torch.where(inside, surface_from(z + height), surface.permute(1, 2, 0)).flatten(0, 1)  # [W_T * D_T, N]
-    if cell.support == "bearing":
+    if cell.support.marks_bearing:
         cells, under = square_cells(grid, x, y, side), is_under(w, d, side) & (height > 0)
-        weak = under & ~bearing_cells(surface.flatten(1).t().gather(0, cells), under, z)
-        after.scatter_add_(0, cells, -weak.int())
+        bearing = cell.support.bearing(Contact(surface.flatten(1).t().gather(0, cells), under, z, w, d))
+        after.scatter_add_(0, cells, -(under & ~bearing).int())
     return after.t().unflatten(1, grid).contiguous()

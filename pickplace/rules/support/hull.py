@@ -1,16 +1,10 @@
-"""Support: whether what an item rests on keeps it stable, and where it may bear weight itself.
+"""Hulls of supporting cells: whether they contain an item's centre, or cells.
 
-The *supporting cells* are the cells under the footprint that are as high as the highest of them, and bear weight. A
-rule decides by their number, by the corners of the footprint among them, or by their convex hull: an item tilts unless
-the vertical line through its centre passes the hull. With ``bearing`` the top of an item bears weight only above the
-hull of its own supporting cells. Then whatever is put on it presses inside that hull, down to the floor, and no item
-tips the pile below it. With every other rule all cells bear weight.
-
-The hull is never computed. A point lies in a convex polygon if the polygon reaches as far along the normal of each of
-its edges. Those of a hull of cells are parallel to the axes, or to a line from one cell to another: a few directions.
-For the centre, a supporting cell reaches beyond it along some of their normals, which is a pattern of bits; the item is
-stable if the patterns of its supporting cells cover all of them. That is exact, and as fast as counting for items of
-up to 3 cells.
+An item tilts unless the vertical line through its centre passes the hull of what supports it. The hull is never
+computed. A point lies in a convex polygon if the polygon reaches as far along the normal of each of its edges. Those of
+a hull of cells are parallel to the axes, or to a line from one cell to another: a few directions. For the centre, a
+supporting cell reaches beyond it along some of their normals, which is a pattern of bits; the item is stable if the
+patterns of its supporting cells cover all of them. That is exact, and as fast as counting for items of up to 3 cells.
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,79 +14,11 @@ from math import gcd
 import torch
 from torch import Tensor
 
-from pickplace.rules.cell import HULL_RULES, CellSpec
-from pickplace.rules.state import surface_from
-
 BITS = 32  # normals in a word of a pattern
-LEAST_SUPPORT: dict = {"half": 0.5, "full": 1.0, "corners": 0.95}  # share of the footprint that suffices alone
-#: Of ``corners``: the least number of supported corners, and the share that suffices with them.
-CORNER_SUPPORT = ((4, 0.6), (3, 0.8))
-#: Of each row of a square along y, the first and the last supporting cell under the item: int16, of the shape of ``z``,
-#: counted from the square's corner. Without one, the first is at least the square's side, and the last is -1.
-Rows = Iterable[tuple[Tensor, Tensor]]
 MAX_HULL_SIDE = 16  # longest side of an item with the rules of the hull, in cells: the tables grow with its sixth power
 
 
-def is_supported(
-    cell: CellSpec, cells: Sequence[Tensor], under: Sequence[Tensor], z: Tensor, w: Tensor, d: Tensor
-) -> Tensor:
-    """Return whether an item is stable where it comes to rest, of the shape of ``z``.
-
-    Args:
-        cell: has the rule, ``cell.support``.
-        cells: for each cell of a square at the footprint's minimum corner its surface, int32, all of one shape.
-        under: whether the item covers that cell, bool, broadcastable.
-        z: the height on which the item rests, int32.
-        w, d: the footprint's sides, broadcastable; 0 for no item.
-    """
-    supporting = surface_from(z)
-    if cell.support in HULL_RULES:
-        return _is_in_hull(cells, supporting, w, d, cell.support_margin)
-    count = torch.zeros_like(z)
-    for surface, used in zip(cells, under, strict=True):
-        count += (surface == supporting) & used
-    return is_stable(cell, count, _rows(cells, under, supporting), w, d)
-
-
-def is_stable(cell: CellSpec, count: Tensor, rows: Rows, w: Tensor, d: Tensor) -> Tensor:
-    """Return whether an item is stable by a rule other than those of the whole cells' hull, of the shape of ``count``.
-
-    Args:
-        cell: has the rule, ``cell.support``.
-        count: of the supporting cells.
-        rows: of the supporting cells.
-        w, d: the footprint's sides, broadcastable.
-    """
-    share = count.double() / (w * d)
-    stable = is_share_enough(cell.support, share)
-    if cell.support == "half_or_hull":
-        stable |= _is_in_hull_of_middles(rows, w, d, cell.max_side)
-    if cell.support == "corners":
-        corners = torch.zeros_like(count)
-        for x, (first, last) in enumerate(rows):  # one cell may have several corners
-            corners += ((first == 0).int() + (last == d - 1)) * ((w == x + 1).int() + (x == 0))
-        for least, enough in CORNER_SUPPORT:
-            stable |= (corners >= least) & (share >= enough)
-    return stable
-
-
-def is_share_enough(rule: str | float, share: Tensor) -> Tensor:
-    """Return whether a supported share of the footprint, float64, keeps an item stable whatever else a rule allows."""
-    return share > 0.5 if rule in ("more_than_half", "half_or_hull") else share >= LEAST_SUPPORT.get(rule, rule)
-
-
-def _rows(cells: Sequence[Tensor], under: Sequence[Tensor], supporting: Tensor) -> Rows:
-    """Yield the rows of the supporting cells of squares."""
-    side = round(len(cells) ** 0.5)
-    for x in range(side):
-        first = last = torch.zeros_like(supporting, dtype=torch.int16)  # counted from the ends of the square; 0: none
-        for y in range(side):
-            here = ((cells[x * side + y] == supporting) & under[x * side + y]).short()
-            first, last = torch.maximum(first, here * (side - y)), torch.maximum(last, here * (y + 1))
-        yield side - first, last - 1
-
-
-def _is_in_hull_of_middles(rows: Rows, w: Tensor, d: Tensor, side: int) -> Tensor:
+def is_centre_in_hull_of_middles(rows: Iterable[tuple[Tensor, Tensor]], w: Tensor, d: Tensor, side: int) -> Tensor:
     """Return whether the item's centre lies in the hull of the middles of the supporting cells, or on its edge.
 
     It does if some line between two of these middles passes the centre on its far side along y, and some on its near
@@ -114,7 +40,7 @@ def _is_in_hull_of_middles(rows: Rows, w: Tensor, d: Tensor, side: int) -> Tenso
     return (left + right >= 0) & (near_left + near_right >= 0)
 
 
-def _is_in_hull(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor, margin: float) -> Tensor:
+def is_centre_inside(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor, margin: float) -> Tensor:
     """Return whether the item's centre lies inside the hull, further than ``margin`` from its edge."""
     side = round(len(cells) ** 0.5)
     sizes = w.clamp(1, side) - 1, d.clamp(1, side) - 1
@@ -132,19 +58,14 @@ def _is_in_hull(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tenso
     return torch.stack([bits == whole for bits, (_, whole) in zip(reached, words, strict=True)]).all(0)
 
 
-def bearing_cells(cells: Tensor, under: Tensor, z: Tensor) -> Tensor:
-    """Return where the top of an item bears weight, with ``bearing``: the cells inside the hull of its supporting ones.
+def cells_inside(supporting: Tensor, under: Tensor) -> Tensor:
+    """Return which cells of squares lie under the items and inside the hull, bool ``[side * side, N]``.
 
     Args:
-        cells: int32 ``[side * side, N]``, as of :func:`is_supported`.
-        under: bool ``[side * side, N]``.
-        z: int32 ``[N]``.
-
-    Returns:
-        bool ``[side * side, N]``
+        supporting, under: which cells support the item, and which it covers; of that shape, by cell row by row.
     """
-    inside, supporting = under.clone(), (cells == surface_from(z)) & under
-    for along in _extents(round(len(cells) ** 0.5), cells.device):
+    inside = under.clone()
+    for along in _extents(round(len(under) ** 0.5), under.device):
         reached = torch.where(supporting, along[:, :, None], along.min() - 1).amax(1, keepdim=True)  # [normals, 1, N]
         inside &= (along[:, :, None] <= reached).all(0)
     return inside

@@ -1,0 +1,38 @@
+"""The stability rule of a cell as an object: the base class of all rules."""
+
+from abc import ABC, abstractmethod
+
+from torch import Tensor
+
+from pickplace.rules.support.contact import Contact, Patches
+
+
+class Support(ABC):
+    """A stability rule: whether what an item rests on keeps it stable, and where the item may bear weight itself.
+
+    A subclass is a frozen dataclass, whose fields are the rule's settings.
+    """
+
+    @abstractmethod
+    def stable(self, contact: Contact) -> Tensor:
+        """Return whether items on the grid are stable where they come to rest, bool of the shape of ``contact.z``."""
+
+    def bearing(self, contact: Contact) -> Tensor | None:
+        """Return which cells under an item bear weight once it lies there, bool ``[S * S, N]``; None: all of them.
+
+        ``S`` is the side of the square of cells at each footprint's minimum corner.
+        """
+        return None
+
+    def measured(self, patches: Patches) -> Tensor:
+        """Return whether an item is stable on a surface that was measured, bool of the shape of ``patches.share``.
+
+        It is asked where patches under the item support nothing. Whatever it returns, the item's centre must be inside
+        the hull of what carries it. Without a rule of its own, everything under the item must carry it.
+        """
+        return patches.full
+
+    @property
+    def marks_bearing(self) -> bool:
+        """Whether some cells on top of an item may bear no weight."""
+        return type(self).bearing is not Support.bearing

@@ -1,0 +1,111 @@
+"""The stability rules that have a short name."""
+
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from pickplace.common.validate import number
+from pickplace.rules.support.base import Support
+from pickplace.rules.support.contact import Contact, Patches
+
+
+@dataclass(frozen=True)
+class Share(Support):
+    """At least a share of the footprint is supported.
+
+    Args:
+        least: the share, 0 to 1.
+    """
+
+    least: float
+
+    def __post_init__(self):
+        number("support.least", self.least, 0, 1)
+
+    def is_enough(self, share: Tensor) -> Tensor:
+        """Return whether a supported share of the footprint, float64, suffices alone."""
+        return share >= self.least
+
+    def stable(self, contact: Contact) -> Tensor:
+        return self.is_enough(contact.share)
+
+    def measured(self, patches: Patches) -> Tensor:
+        return self.is_enough(patches.share)
+
+
+@dataclass(frozen=True)
+class Half(Share):
+    """At least half of the footprint is supported: the paper's rule."""
+
+    least: float = field(default=0.5, init=False)
+
+
+@dataclass(frozen=True)
+class MoreThanHalf(Half):
+    """More than half of the footprint is supported."""
+
+    def is_enough(self, share: Tensor) -> Tensor:
+        return share > self.least
+
+
+@dataclass(frozen=True)
+class Full(Share):
+    """The whole footprint is supported."""
+
+    least: float = field(default=1.0, init=False)
+
+
+@dataclass(frozen=True)
+class HalfOrHull(MoreThanHalf):
+    """As :class:`MoreThanHalf`, or the centre is in the hull of the middles of the supporting cells, or on its edge.
+
+    A measured surface has no cells; there the share decides alone.
+    """
+
+    def stable(self, contact: Contact) -> Tensor:
+        return super().stable(contact) | contact.is_centre_in_hull_of_middles()
+
+
+@dataclass(frozen=True)
+class Corners(Share):
+    """60% of the footprint and its four corners are supported, or 80% and three corners, or 95%.
+
+    On a measured surface the 95% are needed.
+    """
+
+    least: float = field(default=0.95, init=False)
+
+    def stable(self, contact: Contact) -> Tensor:
+        corners, share = contact.corners, contact.share
+        return super().stable(contact) | ((corners >= 4) & (share >= 0.6)) | ((corners >= 3) & (share >= 0.8))
+
+
+@dataclass(frozen=True)
+class Hull(Support):
+    """The item's centre lies inside the convex hull of the supporting cells.
+
+    Args:
+        margin: distance from the hull's edge that the centre must exceed, in cells, 0 to 100.
+    """
+
+    margin: float = 0.25
+
+    def __post_init__(self):
+        number("support.margin", self.margin, 0, 100)
+
+    def stable(self, contact: Contact) -> Tensor:
+        return contact.is_centre_in_hull(self.margin)
+
+    def measured(self, patches: Patches) -> Tensor:
+        return patches.is_centre_in_hull(self.margin)
+
+
+@dataclass(frozen=True)
+class Bearing(Hull):
+    """As :class:`Hull`; and the top of an item bears weight only above the hull of its own supporting cells.
+
+    Whatever is put on it then presses inside that hull, down to the floor, and no item tips the pile below it.
+    """
+
+    def bearing(self, contact: Contact) -> Tensor:
+        return contact.in_hull()
