@@ -36,7 +36,7 @@ from pickplace.physics.settle import Settle
 ROOT = Path(__file__).parents[1]
 TABLE, RUNS = ROOT / "docs" / "results" / "physics.csv", ROOT / "outputs" / "physics"
 ITEMS = {"kinds": "6x6x5", "mixed": "8x8x8", "tall": "6x6x5"}
-RULES = ("half", "more_than_half", "hull", "bearing", "bearing+0.25", "full")  # and env.support_margin after the +
+RULES = ("half", "more_than_half", "hull", "bearing", "bearing+0.25", "full")  # and the margin after the +
 OF_METHODS = "bearing+0.25"  # the rule under which methods are compared
 #: What decides, as words for pickplace-evaluate; rectpack plans places alone.
 METHODS = {
@@ -132,7 +132,8 @@ def plan(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
     if (words := METHODS[cell.method]) is None:
         return pack_without_gripper(cell, totes)
     if not (cell.folder / "plans.jsonl").is_file():
-        rule, _, margin = cell.support.partition("+")
+        name, _, margin = cell.support.partition("+")
+        rule = f"{{_target_: {name}, margin: {margin or 0}}}" if name in ("hull", "bearing") else name
         weights = "mixed" if cell.items == "mixed" else f"r{cell.R}"
         trained = RUNS / "train" / f"individual_grasp-R{cell.R}"
         if cell.method == "individual_grasp" and not trained.exists():
@@ -141,7 +142,7 @@ def plan(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
         run(
             "pickplace-evaluate", *(word.format(R=cell.R, weights=weights) for word in words),
             f"items={cell.items}", f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"env.rotations={cell.R}",
-            f"env.support={rule}", f"env.support_margin={margin or 0}", "evaluation.episodes=200",
+            f"env.support={rule}", "evaluation.episodes=200",
             "evaluation.plans=true", "evaluation.replay=0", "evaluation.latency_decisions=0", "threads=1",
             f"hydra.run.dir={cell.folder}",
         )  # fmt: skip

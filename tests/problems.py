@@ -16,6 +16,7 @@ from pickplace.items.distributions import Uniform
 from pickplace.planners.heuristics import RandomFeasible
 from pickplace.rules.cell import CELL_SETTINGS, Limits
 from pickplace.rules.state import surface_from
+from pickplace.rules.support import RULES, Support, read_support
 
 SIDES, NEVER = st.integers(1, 4), st.just(False)
 
@@ -46,6 +47,11 @@ class Case(NamedTuple):
     others: tuple[tuple[int, int, int, int, int], ...] = ()
 
 
+def support_of(name: str | float, margin: float) -> Support:
+    """Return an entry of :data:`SUPPORTS` as a rule of the package."""
+    return RULES[name](margin) if name in ("hull", "bearing") else read_support(name)
+
+
 def state_of(*cases: Case) -> State:
     """Return cases as the state of a batch."""
     heights, bearing = (
@@ -58,8 +64,10 @@ def state_of(*cases: Case) -> State:
 def oracle_of(cell: CellSpec, case: Case) -> Oracle:
     """Return a case as the oracle sees it."""
     tables = {} if cell.limits is None else {k: v.tolist() for k, v in vars(cell.limits).items() if v is not None}
-    names = (name for name in CELL_SETTINGS if name not in ("height_unit", "reach"))
-    rules = Rules(**{name: getattr(cell, name) for name in names}, **tables)
+    names = (name for name in CELL_SETTINGS if name not in ("height_unit", "reach", "support"))
+    rule, margin = next(entry for entry in SUPPORTS if support_of(*entry) == cell.support)
+    settings = {name: getattr(cell, name) for name in names}
+    rules = Rules(**settings, support=rule, support_margin=margin, **tables)
     others = [(item[2:], item[:2]) for item in case.others]
     heights, bearing = case.heights.tolist(), case.bearing.tolist()
     return Oracle(rules, case.rim, case.item[2:], case.item[:2], heights, bearing=bearing, others=others)
@@ -114,10 +122,10 @@ def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=NEVER, 
     bin_w, bin_d, tote_w, tote_d = (draw(st.integers(least, most)) for least, most in ((2, 5), (2, 4), (3, 5), (2, 4)))
     shape = random_effector(Random(draw(st.integers(0, 99_999))), effector) if draw(shaped) else {}
     rule = draw(st.sampled_from(["contain", "overlap", "seal"] if shape else ["contain", "overlap"]))
-    support, margin = draw(st.sampled_from(SUPPORTS))
+    support = support_of(*draw(st.sampled_from(SUPPORTS)))
     cell = CellSpec(
         (bin_w, bin_d, draw(st.sampled_from([1, 2, 1, 3]))), (tote_w, tote_d, 6), effector,
-        draw(st.sampled_from(rotations)), rule, support, margin, **shape,
+        draw(st.sampled_from(rotations)), rule, support, **shape,
     )  # fmt: skip
     if draw(limited):
         cell = replace(cell, limits=random_limits(cell, draw(st.integers(0, 999))))
@@ -129,7 +137,7 @@ def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=NEVER, 
         rim = draw(st.integers(2, 6))
         levels = [0, *draw(st.lists(st.integers(0, rim), max_size=3))]
         heights = np.random.default_rng(draw(st.integers(0, 999))).choice(levels, size=(tote_w, tote_d))
-        weak = draw(st.sampled_from([0.0, 0.3])) * (support == "bearing")
+        weak = draw(st.sampled_from([0.0, 0.3])) * support.marks_bearing
         bearing = (np.random.default_rng(draw(st.integers(0, 999))).random((tote_w, tote_d)) >= weak).astype(int)
         cases.append(Case(rim, heights, np.where(heights == 0, 1, bearing), item))
     return cell, cases

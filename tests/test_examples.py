@@ -13,7 +13,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from pickplace import PickPlaceEnv, Planner, Scene, load_policy
+from pickplace import Box, PickPlaceEnv, Planner, Scene, load_policy
 from pickplace.config.registry import build
 from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.rules.observation import STANDARD_TERMS
@@ -139,6 +139,26 @@ def test_own_observation(example):
     assert Planner.load(folder, trust=["own_observation"]).plan(scene).status == "ok"
 
 
+def test_own_support(example):
+    """A stability rule: trained, evaluated, settled, searched and planned with."""
+    small = ["model.actor.filters=8", "env.tote_size=[5,5,4]", "curriculum=none", "items=mixed"]
+    folder = example("train", "own_support", "support=corners_or_hull", *TRAINING, *small)
+    given = [f"checkpoint={folder}", *EVALUATION]
+    example("evaluate", "own_support", *given, refused="if own_support is yours, say trust=own_support")
+    given += ["trust=own_support"]
+    ours = example("evaluate", "own_support", *given, "physics=settle")
+    assert ours["env"]["support"] == {"_target_": "own_support.CornersOrHull", "corners": 3, "share": 0.6}
+    assert ours["physics"]["method"] == "settle"
+    stricter = example("evaluate", "own_support", *given, "env.support.corners=4", "planner=joint_dbl")
+    assert stricter["env"]["support"]["corners"] == 4
+    planner = Planner.load(folder, trust=["own_support"])
+    assert type(planner.cell.support).__name__ == "CornersOrHull"
+    tote = np.full((5, 5), 0.2)
+    tote[:2] = 0.15  # something lies there
+    plan = planner.plan(Scene([Box(0.1, 0.1, 0.09, 0.09, 0.05)], tote, cell_size=0.05))
+    assert plan.status == "ok"
+
+
 def test_own_items(example):
     small = ["model.actor.filters=8", "env.tote_size=[4,4,2]"]
     folder = example("train", "own_items", "items=batches", *TRAINING, *small)
@@ -243,7 +263,7 @@ def test_ros_node_plans_and_places(ros_node, checkpoint):
     assert (node.open.box.x, node.open.box.y) == pytest.approx((0.125 - off, 0.125 + off), abs=0.002)
     assert pick.pose.position.z == pytest.approx(0.06, abs=0.01)
     assert node.services["~/placed"]().success and not node.services["~/placed"]().success
-    assert (node.bearing is not None) == (node.planner.cell.support == "bearing")
+    assert (node.bearing is not None) == (node.planner.cell.support.marks_bearing)
     assert node.services["~/plan"]().success and node.services["~/new_tote"]().success
     assert node.bearing is None and not node.services["~/placed"]().success
 

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 #: Config groups whose options set parts of the group ``env`` (``# @package env``), and their plainest options.
-PARTS_OF_ENV = {"effector": "paper", "reach": "everywhere"}
+PARTS_OF_ENV = {"effector": "paper", "support": "bearing", "reach": "everywhere"}
 
 #: Groups whose options have plain settings in common, such as ``algo.lr``: what a preset says of these stays.
 SHARED = ("algo", "model")
@@ -49,7 +49,7 @@ def drop_replaced_values(cfg: DictConfig) -> DictConfig:
     replaced = False
     for choice in sorted(choices, key=lambda choice: _package(choice).count(".")):  # an outer part before its own parts
         place = _package(choice)
-        if choice.is_delete() or place == "env" or not OmegaConf.is_dict(OmegaConf.select(cfg, place)):
+        if choice.is_delete() or place == "env" or OmegaConf.select(cfg, place) is None:
             continue
         inner = [str(other.input_line) for other in choices if f"{_package(other)}.".startswith(f"{place}.")]
         others = [str(other.input_line) for other in choices if other.input_line not in inner]

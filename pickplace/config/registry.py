@@ -43,6 +43,16 @@ REGISTRY: dict[str, dict[str, str]] = {
         "tote_height": "pickplace.rules.observation.ToteHeight",
     },
     "env.reach": {"annulus": "pickplace.rules.reach.Annulus", "table": "pickplace.rules.reach.ReachTable"},
+    "env.support": {
+        "half": "pickplace.rules.support.Half",
+        "more_than_half": "pickplace.rules.support.MoreThanHalf",
+        "hull": "pickplace.rules.support.Hull",
+        "bearing": "pickplace.rules.support.Bearing",
+        "half_or_hull": "pickplace.rules.support.HalfOrHull",
+        "corners": "pickplace.rules.support.Corners",
+        "full": "pickplace.rules.support.Full",
+        "share": "pickplace.rules.support.Share",
+    },
     "items": {
         "kinds": "pickplace.items.distributions.Kinds",
         "uniform": "pickplace.items.distributions.Uniform",

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from pickplace.items.distributions import ItemDistribution
-from pickplace.rules.cell import HULL_RULES, CellSpec
+from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import available_offsets
 from pickplace.rules.masks import footprint_mask, placing_maps
 from pickplace.rules.state import EMPTY, Item, State
@@ -54,11 +54,9 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
                 f"bin_size={[*cell.bin_size]}: the kinds of items have more than {MAX_POSITIONS:,} positions in the "
                 "bin; expected a smaller bin, or fewer kinds."
             )
-    description = cell.describe()
+    description = f"{cell.describe()}, support={cell.support}"
     if cell.pick_rule != "contain":
         description += f", pick_rule={cell.pick_rule}"
-    if cell.support in HULL_RULES:
-        description += f", support={cell.support}, support_margin={cell.support_margin:g}"
     if cell.reach is not None:
         description += f", reach={cell.reach}"
     cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))

@@ -48,7 +48,7 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     state = State(surface, tote_height, Item.from_table(saved["item"]))
     heights = state.heights
     check("surface", (heights >= 0) & (heights <= tote_height[:, None, None]), "heights of 0 to tote_height")
-    bearing = state.bearing | ((heights > 0) & (cell.support == "bearing"))
+    bearing = state.bearing | ((heights > 0) & cell.support.marks_bearing)
     check("surface", bearing, "cells that bear weight")
     check("volume", (volume >= 0) & (volume <= heights.sum((1, 2))), "at most the volume below the surface")
     check("steps", (steps >= 0) & (steps <= volume), "at most one for each unit of volume")

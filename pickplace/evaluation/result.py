@@ -13,11 +13,13 @@ from torch import Tensor
 
 from pickplace.common.files import read_file
 from pickplace.common.validate import excerpt, is_name, is_number
+from pickplace.config.registry import build
 from pickplace.evaluation.play import Episodes
 from pickplace.physics.engine import Engine
 from pickplace.planners.base import BatchPlanner
-from pickplace.rules.cell import CELL_SETTINGS, HULL_RULES, CellSpec
+from pickplace.rules.cell import CELL_SETTINGS, CellSpec
 from pickplace.rules.state import Failure
+from pickplace.rules.support import read_support, support_setting
 from pickplace.runs.provenance import commit, versions
 from pickplace.views.motion import Outcome
 
@@ -133,8 +135,10 @@ def paired_difference(result: dict, other: dict) -> dict:
 
 def episode_settings(cfg: DictConfig) -> dict:
     """Return the settings that determine which episodes an evaluation plays."""
+    env = {key: with_hash(value) for key, value in resolved(cfg.env).items()}
+    env["support"] = support_setting(read_support(build("env.support", env["support"])))  # the same for a short form
     return {
-        "env": {key: with_hash(value) for key, value in resolved(cfg.env).items()},
+        "env": env,
         "items": with_hash(resolved(cfg["items"])),
         "stream": cfg.evaluation.stream,
         "episodes": cfg.evaluation.episodes,
@@ -179,7 +183,6 @@ def read_comparison(path: Path, expected: dict) -> dict:
             found = excerpt(other.get(key))
             raise ValueError(f"compare={excerpt(str(path))}: its {key} is {found}, expected {excerpt(expected[key])}.")
     unused = {
-        "support_margin": cell.get("support") not in HULL_RULES,
         "min_seal": cell.get("pick_rule") != "seal",
         "refill": cell.get("bin_items", 1) == 1,
     }

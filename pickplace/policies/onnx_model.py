@@ -16,6 +16,7 @@ from pickplace.common.validate import short_text
 from pickplace.policies.base import Policy
 from pickplace.policies.restore import TrainedPolicy, load_policy
 from pickplace.rules.cell import CELL_SETTINGS
+from pickplace.rules.support import support_setting
 
 TOLERANCE = 1e-5  # greatest difference between onnxruntime and torch, as a share of the greatest score
 #: Cells by which the totes, and the bins, of the check are larger than those of the training.
@@ -89,7 +90,7 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
         "pickplace": pickplace.__version__,
         "checkpoint": str(checkpoint),
         "policy": type(policy).__name__,
-        "cell": json.dumps(facts),
+        "cell": json.dumps(facts, default=support_setting),
         "index": policy.score_index,
     })  # fmt: skip
     differences: dict[tuple[int, ...], float] = {}

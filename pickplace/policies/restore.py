@@ -120,8 +120,6 @@ class TrainedPolicy(TensorDictModuleBase):
 def build_cell(env: dict, **given) -> CellSpec:
     """Return the cell of a config's group ``env``.
 
-    A checkpoint from before there was the setting ``support`` was trained under ``half``, not under today's default.
-
     Args:
         env: the settings, resolved; those of no cell are ignored.
         **given: settings of the cell that replace them, made already.
@@ -129,7 +127,6 @@ def build_cell(env: dict, **given) -> CellSpec:
     Raises:
         ValueError: as of :func:`~pickplace.config.registry.build` and of the cell.
     """
-    env = {"support": "half"} | env
     own = {key: env[key] for key in CELL_SETTINGS if key in env and key not in given}
     return cell_from_settings({**build("env", own), **given})
 

@@ -172,7 +172,7 @@ class Planner:
             occupancy_after=before if action is None else before + item.item_share(),
             alternatives=list_alternatives(planner, problem, observation, action, alternatives),
             reasons=_reasons(problem) if status in ("stuck", "impossible") else None,
-            tote_bearing=bearing.int().tolist() if self.cell.support == "bearing" else None,
+            tote_bearing=bearing.int().tolist() if self.cell.support.marks_bearing else None,
             warnings=[] if self.training is None else self.training.warnings(self.cell, problem.seen.items),
             item_number=number,
         )

@@ -193,6 +193,6 @@ def read_bearing(cell: CellSpec, tote_bearing, on_floor: Tensor) -> Tensor:
         return torch.ones_like(on_floor, dtype=torch.int64)
     bearing = flags_of_map("tote_bearing", tote_bearing, cell.tote_size[:2])
     bearing = torch.where(on_floor, 1, bearing)  # this may be another tote
-    if cell.support != "bearing" and not bearing.all():
+    if not cell.support.marks_bearing and not bearing.all():
         raise DepthMapError(f"tote_bearing: got a 0 with support={cell.support}, expected support=bearing.")
     return bearing

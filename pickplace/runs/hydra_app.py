@@ -27,7 +27,7 @@ from pickplace.config.composition import (
     task_overrides,
 )
 from pickplace.config.errors import JobFailed, UsageError, one_sentence, sentence, unknown_key
-from pickplace.config.registry import REGISTRY
+from pickplace.config.registry import REGISTRY, names_at
 from pickplace.runs.folder import (
     FAILURE,
     OccupiedError,
@@ -253,9 +253,10 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: dict[str, D
     OmegaConf.set_struct(cfg, True)
     for override in OverridesParser.create().parse_overrides(overrides):
         key, line = override.key_or_group, override.input_line
+        is_part = key.startswith("env.") and bool(names_at(key))  # a part of the cell, in its short or its long form
         if groups and key in groups:
             cfg[key] = groups[key]
-        elif "/" in key or isinstance(OmegaConf.select(cfg, key), DictConfig):
+        elif "/" in key or (isinstance(OmegaConf.select(cfg, key), DictConfig) and not is_part):
             raise ValueError(
                 f"{line!r}: the checkpoint's config group {key!r} cannot be exchanged; expected overrides of its "
                 f"values, such as {key.replace('/', '.')}.<key>=<value>."
@@ -264,7 +265,7 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: dict[str, D
             raise ValueError(f"{line!r}: expected <key>=<value> with one value, on top of the checkpoint's config.")
         else:
             try:
-                OmegaConf.update(cfg, key, override.value())
+                OmegaConf.update(cfg, key, override.value(), merge=not is_part)
             except OmegaConfBaseException as error:
                 raise ValueError(unknown_key(key, cfg)) from error
     return cfg

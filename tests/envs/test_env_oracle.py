@@ -8,7 +8,7 @@ from random import Random
 import pytest
 import torch
 from oracle import SUCCESS, Oracle, Rules, can_always_start, cells
-from problems import SUPPORTS, random_effector
+from problems import SUPPORTS, random_effector, support_of
 from tensordict import TensorDict
 
 from pickplace import PickPlaceEnv
@@ -55,6 +55,7 @@ def make_env(rules, kinds, **settings):
     tables = {field.name: given.pop(field.name) for field in fields(Limits)}
     tables = {name: torch.tensor(table) for name, table in tables.items() if table is not None}
     limits = Limits(**tables) if tables else None
+    given["support"] = support_of(given.pop("support"), given.pop("support_margin"))
     return PickPlaceEnv(**given, limits=limits, items=Kinds(kinds), **settings)
 
 

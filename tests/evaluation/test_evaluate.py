@@ -85,12 +85,11 @@ def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, 
     assert cfg["items"].get("order") == {"cut1": "z", "cut2": "stacking"}.get(name)
     assert cfg["items"].get("container", cfg.env.tote_size) == cfg.env.tote_size
     assert cfg.evaluation.episodes == episodes
-    assert (cfg.env.tote_size, cfg.env.rotations, cfg.env.support) == ([10, 10, 10], rotations, support)
+    assert (cfg.env.tote_size, cfg.env.rotations) == ([10, 10, 10], rotations)
     assert (cfg.env.effector_size, cfg.env.pick_rule, cfg.env.bin_size) == ([1, 1], "overlap", [5, 5, 1])
-    assert name != "pct1" or cfg.env.support_margin == 0.25
     short = [f"benchmark={name}", "evaluation.episodes=2", *SMALL[1:]]
     first = evaluation("planner=joint_dbl", *short)
-    assert first["failures"] == {"stuck": 2} and first["env"]["support"] == support
+    assert first["failures"] == {"stuck": 2} and first["env"]["support"]["_target_"] == support
     second = evaluation("checkpoint=pretrained/mixed", *short, "env.tote_size=[10,10,6]")
     container = {"container": [10, 10, 6]} if "container" in first["items"] else {}  # the tote's size
     assert second["items"] == {**first["items"], **container}
@@ -184,7 +183,7 @@ def test_paired_difference(evaluation):
 
 @pytest.mark.parametrize("word", [
     "env.rotations=2", "env.effector_size=[2,3]", "env.bin_size=[5,4,1]", "env.tote_size=[4,5,1]",
-    "env.pick_rule=overlap", "env.support=hull", "env.support_margin=0.1",
+    "env.pick_rule=overlap", "env.support=hull", "env.support={_target_: bearing, margin: 0.1}",
     "evaluation.seed=1", "evaluation.episodes=3", "evaluation.stream=validation", "items=mixed",
 ])  # fmt: skip
 def test_only_the_same_episodes_are_compared(word, tmp_path):

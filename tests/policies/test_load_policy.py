@@ -10,6 +10,7 @@ from pickplace import CellSpec, Planner, Scene, load_policy
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import as_collection_policy
 from pickplace.rules.observation import STANDARD_TERMS
+from pickplace.rules.support import Bearing, Half
 
 SIZES = {"env.tote_size": (4, 4, 2), "env.bin_size": (4, 4, 1)}
 
@@ -53,15 +54,15 @@ def test_other_sizes_and_shipped_weights():
     assert policy.cell == CellSpec(tote_size=(7, 8, 3), rotations=3) and data["next", "occupancy"].max() > 0.7
 
 
-def test_weights_from_before_the_setting_support_were_trained_under_half(tmp_path):
-    """Also where a robot's planner compares its cell with that of the training."""
-    old = write_checkpoint(tmp_path / "run", CellSpec(support="half"), "~env.support", "env.tote_size=[6,6,5]")
-    assert load_policy(old).cell.support == load_policy(old).make_env().cell.support == "half"
+def test_another_stability_rule_than_that_of_the_training(tmp_path):
+    run = write_checkpoint(tmp_path / "run", CellSpec(support="half"), "env=paper", "env.tote_size=[6,6,5]")
+    assert load_policy(run).cell.support == load_policy(run).make_env().cell.support == Half()
     scene = Scene.from_maps(torch.eye(5) * (torch.arange(5) == 2), torch.full((6, 6), 5))
-    assert Planner.load(old).plan(scene).warnings == []
-    other = Planner.load(old, support="bearing")
-    assert other.cell.support == "bearing"
-    assert other.plan(scene).warnings == ["support=bearing: the policy met support=half."]
+    assert Planner.load(run).plan(scene).warnings == []
+    other = Planner.load(run, support="bearing")
+    assert other.cell.support == Bearing(0.25)
+    (warning,) = other.plan(scene).warnings
+    assert all(words in warning for words in ("support=Bearing(margin=0.25)", "support=Half(")), warning
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from pickplace import CellSpec, DepthMapError, Planner
 from pickplace.robot.measure import box_of_map
 from pickplace.robot.planner import Box
 from pickplace.rules.cell import Limits
+from pickplace.rules.support import Hull
 
 CELL, TOTE = 0.05, (0.3, 0.3, 0.25)
 SIZES = {"tote_size": (6, 6, 5)}
@@ -44,7 +45,7 @@ def count_faults(name: str, scenes: int, seed: int, along: int = 5, accuracy: fl
 @pytest.mark.parametrize(("along", "accuracy", "options"), [
     (1, 0.002, {}), (2, 0.002, {}), (5, 0.002, {}), (8, 0.005, {}), (11, 0.0, {}),
     (5, 0.002, {"support": "half"}), (4, 0.003, {"support": "full", "rotations": 2}),
-    (5, 0.002, {"support": "hull", "support_margin": 0.0, "rotations": 3}),
+    (5, 0.002, {"support": Hull(0.0), "rotations": 3}),
     (5, 0.002, {"support": "half_or_hull"}), (5, 0.002, {"support": "corners"}),
 ])  # fmt: skip
 def test_no_plan_that_is_ok_goes_wrong(along, accuracy, options):

@@ -57,7 +57,7 @@ def test_plans_agree_with_the_oracle_and_with_plane_geometry(problem, candidates
     assert result.status == ("ok" if ok else "rejected" if feasible else nothing)
     assert result.action == (action if ok else None)
     left = oracle.bearing_after(action) if ok else bearing.tolist()
-    assert result.tote_bearing == (left if cell.support == "bearing" else None)
+    assert result.tote_bearing == (left if cell.support.marks_bearing else None)
     names = {failure: Failure(failure).name.lower() for failure in set(codes)}
     assert result.reasons == (None if feasible else {names[code]: count for code, count in Counter(codes).items()})
 

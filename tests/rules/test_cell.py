@@ -10,6 +10,7 @@ from pickplace import CellSpec, PickPlaceEnv
 from pickplace.rules.cell import CELL_SETTINGS, Limits, cell_from_settings, reference_cell
 from pickplace.rules.effector import disc_mask
 from pickplace.rules.reach import Annulus
+from pickplace.rules.support import Hull
 
 
 @pytest.mark.parametrize(
@@ -56,7 +57,6 @@ from pickplace.rules.reach import Annulus
         ),
         ({"effector_size": (7, 7), "body": "disc"}, r"cell \(0, 0\) of the cup is not in body='disc'"),
         *(({"min_seal": value}, f"min_seal={value}: expected a number > 0 and <= 1") for value in (0, 1.1, True)),
-        ({"support": "hull", "support_margin": -1}, "support_margin=-1: .* between 0 and 100"),
         *(({"height_unit": value}, f"height_unit={value}: .* between 0.001 and 1000") for value in (1e-4, 2000)),
         ({"longest_side": 0}, "longest_side=0: expected a whole number >= 1"),
         ({"bin_items": 0}, "bin_items=0: expected a whole number >= 1 and <= 100"),
@@ -72,7 +72,7 @@ def test_impossible_settings_are_refused(settings, message):
 def test_every_setting_reaches_the_cell_of_the_environment():
     given = {
         "bin_size": [4, 6, 2], "tote_size": [5, 7, 6], "effector_size": [2, 4], "rotations": 3, "pick_rule": "overlap",
-        "support": "hull", "support_margin": 0.25, "height_unit": 0.5, "body": "disc", "cup": "disc",
+        "support": Hull(0.3), "height_unit": 0.5, "body": "disc", "cup": "disc",
         "cup_size": [2, 4], "min_seal": 0.5,
         "reach": Annulus([0, 99], [0, 9], [-9, 0, 0], [2, 0, 0]), "bin_items": 2, "refill": "batch",
     }  # fmt: skip

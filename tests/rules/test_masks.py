@@ -12,7 +12,6 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from oracle import SUCCESS, UNSTABLE
-from pickplace.task import large_items
 from problems import Case, oracle_of, problems, random_effector, state_of
 from scipy.spatial import ConvexHull, QhullError
 
@@ -20,6 +19,7 @@ from pickplace import CellSpec, Failure, Item, PickPlaceEnv, State
 from pickplace.items.distributions import Uniform
 from pickplace.planners.base import decide
 from pickplace.planners.heuristics import JointDBL
+from pickplace.rules import large_items
 from pickplace.rules.cell import Limits, reference_cell
 from pickplace.rules.grasps import all_grasps, central_pick, heuristic_pick
 from pickplace.rules.masks import (
@@ -34,7 +34,8 @@ from pickplace.rules.masks import (
 from pickplace.rules.placing import resting_top
 from pickplace.rules.state import EMPTY, surface_from
 from pickplace.rules.step import apply, put_down
-from pickplace.rules.support import bearing_cells
+from pickplace.rules.support import Hull
+from pickplace.rules.support.contact import Contact
 
 
 @settings(max_examples=150)
@@ -155,10 +156,10 @@ def test_limits_by_hand():
     assert heuristic_pick(replace(cell, limits=limits), state.item) != pick
 
 
-def rest_on(heights, item, support, margin=0.0):
+def rest_on(heights, item, support):
     """Return the failure of an item that is set down on the near corner of a tote of these heights."""
     (w, d, h), (wide, deep) = item, heights.shape
-    cell = CellSpec((w, d, h), (wide, deep, 9), (w, d), 1, "contain", support, margin)
+    cell = CellSpec((w, d, h), (wide, deep, 9), (w, d), 1, "contain", support)
     state = State(surface_from(heights)[None], torch.tensor([9]), Item(*torch.tensor([[0, 0, *item]]).unbind(1)))
     pick = reference_cell(w) * d + reference_cell(d)
     action = torch.tensor([pick * wide * deep + reference_cell(w) * deep + reference_cell(d)])
@@ -250,10 +251,10 @@ def test_a_hull_by_hand(cells, size, distance):
     for x, y in cells:
         heights[x, y] = 2
     item = (*size, 1)
-    assert rest_on(heights, item, "hull") == (SUCCESS if distance > 0 else UNSTABLE)
+    assert rest_on(heights, item, Hull(0.0)) == (SUCCESS if distance > 0 else UNSTABLE)
     if distance > 0:
-        assert rest_on(heights, item, "hull", distance - 1e-6) == SUCCESS
-        assert rest_on(heights, item, "hull", distance + 1e-6) == UNSTABLE
+        assert rest_on(heights, item, Hull(distance - 1e-6)) == SUCCESS
+        assert rest_on(heights, item, Hull(distance + 1e-6)) == UNSTABLE
 
 
 @settings(max_examples=200)
@@ -269,7 +270,7 @@ def test_the_hull_rule_equals_scipys_hull(data):
     outside = (ConvexHull(corners).equations @ [w / 2, d / 2, 1]).max()  # minus the distance to the hull's edge
     assume(abs(outside + margin) > 1e-9 or margin == 0)
     expected = SUCCESS if outside < -margin - 1e-9 else UNSTABLE
-    assert rest_on(heights, (w, d, 1), "hull", margin) == expected
+    assert rest_on(heights, (w, d, 1), Hull(margin)) == expected
 
 
 @settings(max_examples=200)
@@ -283,13 +284,14 @@ def test_an_item_bears_weight_inside_scipys_hull(data):
     hull = ConvexHull([(x + a, y + b) for x, y in held for a in (0, 1) for b in (0, 1)]).equations
     corners = np.array([[(x + a, y + b, 1) for a in (0, 1) for b in (0, 1)] for x, y in square])
     expected = under[:, 0].numpy() & ((corners @ hull.T).max((1, 2)) < 1e-9)
-    assert bearing_cells(cells, under, torch.ones(1, dtype=torch.int32))[:, 0].tolist() == expected.tolist()
+    contact = Contact(cells, under, torch.ones(1, dtype=torch.int32), torch.tensor([w]), torch.tensor([d]))
+    assert contact.in_hull()[:, 0].tolist() == expected.tolist()
 
 
 @pytest.mark.parametrize(("support", "third"), [("hull", SUCCESS), ("bearing", UNSTABLE)])
 def test_a_pile_that_leans_over(support, third):
     """Bricks of three cells, each one cell further. The third one would have the upper two balance on an edge."""
-    cell = CellSpec((3, 1, 1), (6, 1, 9), (3, 1), 1, "contain", support, 0.25)
+    cell = CellSpec((3, 1, 1), (6, 1, 9), (3, 1), 1, "contain", support)
     item = Item(*torch.tensor([[0, 0, 3, 1, 1]]).unbind(1))
     state, failures = State(torch.full((1, 6, 1), EMPTY, dtype=torch.int32), torch.tensor([9]), item), []
     for middle in (1, 2, 3):

@@ -49,7 +49,7 @@ def quarter(cell, case):
     (bin_w, bin_d, wall), (tote_w, tote_d, top), (ee_w, ee_d) = cell.bin_size, cell.tote_size, cell.effector_size
     turned = CellSpec(
         (bin_d, bin_w, wall), (tote_d, tote_w, top), (ee_d, ee_w),
-        cell.rotations, cell.pick_rule, cell.support, cell.support_margin,
+        cell.rotations, cell.pick_rule, cell.support,
     )  # fmt: skip
     x, y, w, d, h = case.item
     return turned, Case(case.rim, np.rot90(case.heights), np.rot90(case.bearing), (bin_d - y - d, x, d, w, h))
