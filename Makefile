@@ -7,7 +7,7 @@ DEMO ?= outputs/demo_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
 PYTEST := $(BIN)/python -m pytest -q -n logical --maxprocesses 4 --dist worksteal
 
-.PHONY: help install demo train test test-slow test-extras coverage chaos fuzz memory mutations bench reproduce results docs walk release lock audit lint format clean
+.PHONY: help install demo train test test-slow test-extras coverage chaos fuzz memory mutations bench results docs walk release lock audit lint format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -77,13 +77,8 @@ bench: $(STAMP)  ## run the benchmarks on a quiet machine (half an hour), and wr
 		$(BIN)/python benchmarks/$$part.py || exit 1; \
 	done
 
-reproduce: $(STAMP)  ## compute the cells of the paper's comparison that have no row (ARGS="--match '^joint_dbl' --again")
-	$(BIN)/pip install --quiet --disable-pip-version-check 'py3dbp>=1.1,<2' 'rectpack>=0.2,<1' || echo "placement-only packers: not available"
-	$(BIN)/python benchmarks/reproduce/run.py $(ARGS)
-	$(BIN)/python benchmarks/reproduce/results.py
-
-results: $(STAMP)  ## draw the figures and write the tables of docs/results.md
-	$(BIN)/python benchmarks/reproduce/results.py
+results: $(STAMP)  ## draw the figures and write the tables of docs/results.md (ARGS="--add NAME evaluation.json" adds rows)
+	$(BIN)/python benchmarks/results.py $(ARGS)
 
 docs: $(STAMP)  ## write docs/reference.md, and build the site in outputs/site
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[docs]'

@@ -28,10 +28,10 @@ import numpy as np
 import torch
 
 from pickplace import PickPlaceEnv
+from pickplace.config.registry import build
 from pickplace.evaluation.result import confidence95, proportion95
-from pickplace.physics.execute import Execute
 from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement, read_plans
-from pickplace.physics.settle import Settle
+from pickplace.rules.state import Item
 
 ROOT = Path(__file__).parents[1]
 TABLE, RUNS = ROOT / "docs" / "results" / "physics.csv", ROOT / "outputs" / "physics"
@@ -158,17 +158,36 @@ def run(program: str, *words: str) -> None:
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
 
 
+def planned_placements(env: PickPlaceEnv) -> Iterator[tuple[Item, int, int, int, int, int]]:
+    """Yield the items of the environment's first episode and their places by rectpack: x, y, z and the sides.
+
+    It places by MaxRects, bottom left, in the first layer where an item fits (https://pypi.org/project/rectpack).
+    """
+    from rectpack import MaxRectsBl, PackingBin, PackingMode, newPacker
+
+    wide, deep, high = env.cell.tote_size
+    packer = newPacker(PackingMode.Online, PackingBin.BFF, MaxRectsBl, rotation=env.cell.rotations > 1)
+    packer.add_bin(wide, deep, count=high)
+    for step in range(wide * deep * high):
+        address = [torch.tensor([value]) for value in (0, env.first_episode, step)]
+        item = env.items.sample("test", *address, env.cell.bin_size)
+        packer.add_rect(int(item.w), int(item.d), step)
+        found = [rect[:5] for rect in packer.rect_list() if rect[5] == step]
+        if not found:
+            return
+        layer, x, y, *sides = found[0]
+        yield item, x, y, layer, *sides
+
+
 def pack_without_gripper(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
     """Return what rectpack plans, which knows no gripper; it is held over the middle of each item."""
-    from placement_only import planned_placements, rectpack
-
     occupancy, plans = [], []
     for episode in range(totes):
         size = [int(side) for side in cell.tote.split("x")]
         env = PickPlaceEnv(tote_size=size, rotations=cell.R, num_envs=1, stream="test", first_episode=episode, masks=())
         metres = [[side * CELL_SIZE for side in sides] for sides in (size, env.cell.bin_size, env.cell.effector_size)]
         placements, volume = [], 0
-        for item, x, y, z, wide, deep in planned_placements(env, rectpack):
+        for item, x, y, z, wide, deep in planned_placements(env):
             corner = tuple(at * CELL_SIZE for at in (x, y, z))
             sides = tuple(side * CELL_SIZE for side in (wide, deep, int(item.h)))
             lies = tuple(int(at) * CELL_SIZE for at in (item.x, item.y))
@@ -186,7 +205,7 @@ def measure(cell: Cell, totes: int) -> dict[str, float]:
     """Return the figures of a cell."""
     planned, plans = plan(cell, totes)
     settings = {"friction": cell.friction, "gap": cell.gap_mm / 1e3, "noise": cell.noise_mm / 1e3}
-    simulation = {"settle": Settle, "execute": Execute}[cell.simulation](**settings)
+    simulation = build("physics", {"_target_": cell.simulation, **settings})
     outcomes = list(simulation.carry_out(plans))
     figures = {"totes": totes, "lost": sum(outcome.ending != "done" for outcome in outcomes)}
     for name, values in (("planned", planned), ("kept", [outcome.occupancy for outcome in outcomes])):
