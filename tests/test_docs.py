@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import pickplace
 from pickplace import Planner, Scene
@@ -84,6 +85,14 @@ def check_command(command, search, words, is_new):
         assert curriculum.check_budget(cfg.total_frames, 2048) is None, words
 
 
+def run_of_sweep(word, number):
+    """Return an override as one run of a sweep has it."""
+    override = OverridesParser.create().parse_override(word)
+    if not override.is_sweep_override():
+        return word
+    return f"{override.get_key_element()}={list(override.sweep_string_iterator())[number]}"
+
+
 @each_page
 def test_commands_compose_and_reach_their_last_height(page, monkeypatch):
     for path, command, words in commands_of(page):
@@ -100,8 +109,7 @@ def test_commands_compose_and_reach_their_last_height(page, monkeypatch):
         left_out = "-m$|hydra[./].*(sweeper|launcher|run[.]dir)|.*=tag" + "|model[.]|items[.]|algo[.]" * (not is_new)
         words = [word for word in words if not re.match(left_out, word)]
         for end in (0, -1):  # the first and the last run of a sweep
-            chosen = [word if "[" in word else word.split(",")[end] for word in words]
-            chosen = [one if "=" in one else words[n].partition("=")[0] + "=" + one for n, one in enumerate(chosen)]
+            chosen = [run_of_sweep(word, end) for word in words]
             check_command(command, search, tuple(chosen), is_new)
 
 
