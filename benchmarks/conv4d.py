@@ -15,7 +15,7 @@ from common import interleave, save, use_one_core
 
 from pickplace import PickPlaceEnv
 from pickplace.policies.depth import clip_depth, pad_depth
-from pickplace.policies.fcn4d.policy import FEW_PLACES, ActionPolicy
+from pickplace.policies.fcn4d.policy import FEW_PLACES, Fcn4d
 
 CASES = {"5x5 bin, 6x6 tote, batch 64": ((6, 6, 5), 64, 5), "5x5 bin, 30x30 tote, batch 1": ((30, 30, 5), 1, 5)}
 
@@ -78,7 +78,7 @@ def measure(tote_size, batch: int, repeats: int) -> dict:
     """Return the times and the memory of one case."""
     cell, state = states(tote_size, batch)
     mask = state["action_mask"]
-    policies = {dtype: ActionPolicy(cell, True, compute_dtype=dtype) for dtype in ("float32", "bfloat16")}
+    policies = {dtype: Fcn4d(cell, True, compute_dtype=dtype) for dtype in ("float32", "bfloat16")}
     policies["bfloat16"].load_state_dict(policies["float32"].state_dict())
     network = policies["float32"].network
     calls = {"naive": partial(naive, network, state["bin_depth"], state["tote_depth"])}

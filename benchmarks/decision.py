@@ -10,13 +10,13 @@ from common import interleave, save, use_one_core
 
 from pickplace import PickPlaceEnv
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.fcn4d.policy import ActionPolicy
-from pickplace.policies.fcn_grasp.policy import FootprintPolicy
+from pickplace.policies.fcn4d.policy import Fcn4d
+from pickplace.policies.fcn_grasp.policy import FcnGrasp
 
 TOTES = ((6, 6, 5), (10, 10, 10), (30, 30, 10))
 POLICIES = {
-    "fcn_grasp": FootprintPolicy,
-    "fcn4d": partial(ActionPolicy, mask_infeasible=True, compute_dtype="bfloat16"),
+    "fcn_grasp": FcnGrasp,
+    "fcn4d": partial(Fcn4d, mask_infeasible=True, compute_dtype="bfloat16"),
 }
 CANDIDATES = (10, "all")
 

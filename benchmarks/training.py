@@ -12,14 +12,14 @@ from hydra import compose, initialize_config_dir
 from torchrl.envs import TransformedEnv
 
 from pickplace.policies.base import Policy
-from pickplace.policies.fcn4d.policy import ActionPolicy
-from pickplace.policies.fcn_grasp.policy import FootprintPolicy
+from pickplace.policies.fcn4d.policy import Fcn4d
+from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.loggers import read_csv
 from pickplace.training.train import train
 
 #: Preset, the class of its policy, frames.
-TRAININGS = (("quick", FootprintPolicy, 300_000), ("paper", ActionPolicy, 8_000), ("paper_fast", ActionPolicy, 60_000))
+TRAININGS = (("quick", FcnGrasp, 300_000), ("paper", Fcn4d, 8_000), ("paper_fast", Fcn4d, 60_000))
 
 
 def timed(owner, name: str, part: str, spent: dict) -> None:

@@ -20,7 +20,7 @@ from pickplace.evaluation.parts import prepare
 from pickplace.items.distributions import Kinds, Uniform
 from pickplace.planners.mcts import MCTS
 from pickplace.policies.fcn_grasp import network as footprint_fcn
-from pickplace.policies.fcn_grasp.policy import FootprintPolicy
+from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.runs import checkpoint
 from pickplace.training.collectors import refuse_other_workers
 from pickplace.training.settings import check_settings
@@ -328,14 +328,14 @@ def test_a_search_that_would_fill_the_memory_is_refused():
     planner = build(
         "planner",
         {"_target_": "lookahead", "samples": 10_000},
-        cell=cell, items=items, policy=FootprintPolicy(cell, filters=8, hidden=8),
+        cell=cell, items=items, policy=FcnGrasp(cell, filters=8, hidden=8),
     )  # fmt: skip
     with pytest.raises(ValueError, match="planner.samples=10000.* GB"):
         planner.decide(state)
 
 
 def test_scores_of_many_footprints_are_computed_in_parts(monkeypatch):
-    policy, state = FootprintPolicy(CellSpec(), filters=8, hidden=8, compute_dtype="float32"), PickPlaceEnv(num_envs=9)
+    policy, state = FcnGrasp(CellSpec(), filters=8, hidden=8, compute_dtype="float32"), PickPlaceEnv(num_envs=9)
     seen = state.reset()
     with torch.no_grad():
         whole = policy.best_feasible(seen), policy.action_log_probs(seen)

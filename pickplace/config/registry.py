@@ -61,11 +61,11 @@ REGISTRY: dict[str, dict[str, str]] = {
     },
     "model.actor": {
         "fcn_grasp": "pickplace.policies.fcn_grasp.policy.fcn_grasp",
-        "corners": "pickplace.policies.corners.policy.corners",
-        "afterstate": "pickplace.policies.afterstate.policy.afterstate",
-        "fcn4d": "pickplace.policies.fcn4d.policy.ActionPolicy",
-        "typical": "pickplace.policies.fcn4d.policy.TypicalPolicy",
-        "individual_rl": "pickplace.policies.individual.policy.IndividualRlPolicy",
+        "corners": "pickplace.policies.corners.policy.Corners",
+        "afterstate": "pickplace.policies.afterstate.policy.Afterstate",
+        "fcn4d": "pickplace.policies.fcn4d.policy.Fcn4d",
+        "typical": "pickplace.policies.fcn4d.policy.Typical",
+        "individual_rl": "pickplace.policies.individual.policy.IndividualRl",
         "individual_grasp": "pickplace.policies.individual.policy.individual_grasp",
     },
     "model.critic": {

@@ -7,8 +7,7 @@ from pickplace.common.validate import check_bytes, number, whole_number
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, Kinds, check_seed, search_items
 from pickplace.planners.base import MapPlanner
-from pickplace.policies.base import MASKED, EstimatesValue
-from pickplace.policies.fcn_grasp.policy import FootprintPolicy
+from pickplace.policies.base import MASKED, EstimatesValue, Policy, ScoresFootprints
 from pickplace.rules.bin import remove_item, select_item
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
@@ -51,7 +50,7 @@ class Lookahead(MapPlanner):
     def __init__(
         self,
         cell: CellSpec,
-        policy: FootprintPolicy,
+        policy: Policy,
         items: ItemDistribution,
         critic=None,
         terms=STANDARD_TERMS,
@@ -71,7 +70,7 @@ class Lookahead(MapPlanner):
         if horizon is not None:
             whole_number("planner.horizon", horizon)
         number("planner.confidence", confidence)
-        if not getattr(policy, "ranks_footprints", False):
+        if not isinstance(policy, ScoresFootprints):
             raise ValueError(
                 "planner=lookahead: expected a checkpoint of model=fcn_grasp, corners or afterstate, with a mask."
             )

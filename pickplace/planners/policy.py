@@ -8,8 +8,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace.common.validate import check_bytes, excerpt, is_whole, one_of
 from pickplace.planners.base import MapPlanner, check_item_rule, pick_first, restrict_items
-from pickplace.policies.base import Policy
-from pickplace.policies.fcn_grasp.policy import FootprintPolicy, count_ways
+from pickplace.policies.base import Policy, ScoresFootprints
+from pickplace.policies.footprints import FootprintPolicy, count_ways
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, join_pick, select_pick
 from pickplace.rules.masks import PlacingMaps, action_mask, first_action_reaching, placing_maps
@@ -48,7 +48,7 @@ class PolicyPlanner(MapPlanner):
         self.cell, self.policy, self.candidates, self.item = cell, policy, candidates, check_item_rule(item)
         self.pick = one_of("planner.pick", pick, ("any", *PICKS))
         for key, value in (("item", item), ("pick", pick)):
-            if value != "any" and not (policy.ranks_footprints and candidates == "all"):
+            if value != "any" and not (isinstance(policy, ScoresFootprints) and candidates == "all"):
                 raise ValueError(
                     f"planner.{key}={value!r}: expected 'any', or planner.candidates=all and a checkpoint of "
                     "model=fcn_grasp or corners that was trained with a mask."

@@ -6,7 +6,7 @@ of the choice.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Protocol, Self, runtime_checkable
 
@@ -40,42 +40,45 @@ MAX_PARAMETERS = 110_000_000
 #: The entries of the observation that every network reads.
 DEPTH_KEYS = ("bin_depth", "tote_depth")
 
+#: Entries of the observation that the networks of ``fcn_grasp`` read.
+MAP_KEYS = ("bin_depth", "tote_depth", "tote_bearing")
+
 
 class Policy(TensorDictModuleBase, ABC):
     """A distribution over choices, given an observation; as a module it writes ``logits`` ``[N, choices]``.
 
     Args:
         cell: the sizes.
-        masks: see below; None: those of the class.
+        masks: masks that the environment must emit for training it, of ``"action"``, ``"footprint"`` and ``"corner"``.
 
     Attributes:
         choice_key: name of the choice in the TensorDict.
         in_keys: entries of the observation that :meth:`logits` reads.
         map_keys: entries of the observation that its network reads.
-        masks: masks that the environment must emit for training it, of ``"action"``, ``"footprint"`` and ``"corner"``.
         excludes: what :meth:`action_log_probs` gives probability 0 by construction; None if nothing.
-        single_item: whether it judges one item in the bin, and cannot choose among several.
-        ranks_footprints: whether it chooses among all footprints, by ``footprint_logits(observation, mask)``.
-        needs_sizes: whether it cannot learn where :meth:`check_sizes` finds fault.
-        score_index: how an index of :meth:`unmasked_scores` is made; None if it has none for totes of any size.
+
+    Raises:
+        ValueError: as of :meth:`check_cell`.
     """
 
     choice_key: str
     map_keys: tuple[str, ...] = DEPTH_KEYS
-    masks: tuple[str, ...] = ()
     excludes: str | None = None
-    single_item = False
-    ranks_footprints = False
-    needs_sizes = False
-    score_index: str | None = None
     network: torch.nn.Module
 
-    def __init__(self, cell: CellSpec, masks: tuple[str, ...] | None = None):
+    def __init__(self, cell: CellSpec, masks: Sequence[str] = ()):
         super().__init__()
+        self.check_cell(cell)
         self.cell = cell
-        if masks is not None:
-            self.masks = masks
-        self.in_keys, self.out_keys = [*self.map_keys, *(f"{mask}_mask" for mask in self.masks)], ["logits"]
+        self.in_keys, self.out_keys = [*self.map_keys, *(f"{mask}_mask" for mask in masks)], ["logits"]
+
+    def check_cell(self, cell: CellSpec) -> None:
+        """Refuse a cell that the policy does not serve, with a ``ValueError``."""
+
+    @property
+    def masks(self) -> tuple[str, ...]:
+        """The masks among :attr:`in_keys`, which the environment must emit for training it."""
+        return tuple(key.removesuffix("_mask") for key in self.in_keys if key.endswith("_mask"))
 
     @abstractmethod
     def logits(self, observation: Observation) -> Tensor:
@@ -91,13 +94,6 @@ class Policy(TensorDictModuleBase, ABC):
             choices: int64 ``[N, M]``.
         """
         return self.logits(observation).gather(1, choices)
-
-    def unmasked_scores(self, observation: Observation) -> Tensor:
-        """Return the score of everything that the policy scores, feasible or not, float32 ``[N, scores]``.
-
-        It reads the entries ``in_keys`` but for the masks, and takes bins and totes of any size.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has no scores for totes of any size.")
 
     @abstractmethod
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
@@ -136,9 +132,16 @@ class Policy(TensorDictModuleBase, ABC):
         return placing_maps(self.cell, State.from_observation(observation))
 
     def with_cell(self, cell: CellSpec) -> Self:
-        """Return this policy, with the same networks, for a cell that differs in its limits only."""
+        """Return this policy, with the same networks, for a cell that differs in its limits or in the number of items.
+
+        Raises:
+            ValueError: as of :meth:`check_cell`.
+        """
+        self.check_cell(cell)
         other = copy(self)
         other.cell = cell
+        if cell.bin_items > 1:
+            other.in_keys = [*dict.fromkeys([*self.in_keys, "items"])]
         return other
 
     def act(self, choice: Tensor, *values: Tensor) -> Tensor:
@@ -168,9 +171,6 @@ class Policy(TensorDictModuleBase, ABC):
 
         Returns:
             A sentence for each condition that is not met; the policy can be trained all the same.
-
-        Raises:
-            ValueError: for a policy that cannot learn then.
         """
         field = getattr(self.network, "receptive_field", None)
         if field is None:
@@ -186,8 +186,6 @@ class Policy(TensorDictModuleBase, ABC):
                 found.append(
                     f"env.{key}={list(size)}: expected sides of at least {field} (receptive field {field}, eq. 3)."
                 )
-        if found and self.needs_sizes:
-            raise ValueError(" ".join(found))
         return found
 
 
@@ -197,6 +195,44 @@ class EstimatesValue(Protocol):
 
     def value_network(self) -> torch.nn.Module:
         """Return the module from the entries of the observation in its ``in_keys`` to values ``[..., 1]``."""
+        ...
+
+
+@runtime_checkable
+class ScoresFootprints(Protocol):
+    """A policy that chooses among all footprints that some action reaches, or among those of them that it ranks."""
+
+    def ranked(self, maps: PlacingMaps) -> Tensor:
+        """Return the footprints among which it chooses, bool ``[N, M * Q * W_T * D_T]``; some, if any is feasible."""
+        ...
+
+    def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
+        """Return logits of the footprints, float32 in the shape of the mask; :data:`MASKED` where it forbids one."""
+        ...
+
+
+@runtime_checkable
+class ScoresActions(Protocol):
+    """A policy whose network scores flat actions one by one."""
+
+    def action_scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
+        """Return logits, float32 ``[N, N_a]``; with a mask of that shape, :data:`MASKED` where it forbids an action."""
+        ...
+
+
+@runtime_checkable
+class ScoresAnySize(Protocol):
+    """A policy that scores bins and totes of any size, so that its network can be exported.
+
+    Attributes:
+        score_index: how an index of the scores is made.
+    """
+
+    score_index: str
+
+    def unmasked_scores(self, observation: Observation) -> Tensor:
+        """Return the score of everything that it scores, feasible or not, float32 ``[N, scores]``; it reads the entries
+        ``in_keys`` but for the masks."""
         ...
 
 
@@ -220,12 +256,12 @@ class Choice(Categorical):
         return torch.searchsorted(edges, uniform[..., None], right=True)[..., 0].clamp(max=edges.shape[-1] - 1)
 
 
-def refuse_several_items(cell: CellSpec, model: str) -> None:
-    """Refuse a bin with several items for a policy that does not choose among them, with a ``ValueError``."""
+def refuse_several_items(policy: Policy, cell: CellSpec) -> None:
+    """Refuse a bin with several items: the ``check_cell`` of a policy that does not choose among them."""
     if cell.bin_items > 1:
         raise ValueError(
-            f"env.bin_items={cell.bin_items}: expected 1 with {model}; model=fcn_grasp or corners with a mask, and "
-            "fcn4d, choose among several items."
+            f"env.bin_items={cell.bin_items}: expected 1 with {type(policy).__name__}; model=fcn_grasp or corners with "
+            "a mask, and fcn4d, choose among several items."
         )
 
 

@@ -5,9 +5,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pickplace.common.validate import MAX_WIDTH, check_inputs, odd_number, one_of, whole_number
+from pickplace.policies.base import MAP_KEYS
 from pickplace.policies.depth import depth_levels, item_code, one_hot
 from pickplace.policies.fcn4d.network import Conv4dCritic
-from pickplace.policies.fcn_grasp.network import DTYPES, MAP_KEYS, MAX_LEVELS, matrix_dtype
+from pickplace.policies.fcn_grasp.network import DTYPES, MAX_LEVELS, matrix_dtype
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.state import Item, item_from_depth
 

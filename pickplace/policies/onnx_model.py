@@ -13,7 +13,7 @@ from torch.export import Dim
 import pickplace
 from pickplace.common.files import replaced_file
 from pickplace.common.validate import short_text
-from pickplace.policies.base import Policy
+from pickplace.policies.base import ScoresAnySize
 from pickplace.policies.restore import TrainedPolicy, load_policy
 from pickplace.rules.cell import CELL_SETTINGS
 from pickplace.rules.support import support_setting
@@ -32,14 +32,14 @@ SHAPES = {
 
 
 class Scores(torch.nn.Module):
-    """:meth:`Policy.unmasked_scores` as a module: one argument for each entry of the observation.
+    """:meth:`ScoresAnySize.unmasked_scores` as a module: one argument for each entry of the observation.
 
     Args:
-        policy: has a ``score_index``.
+        policy: scores bins and totes of any size.
         keys: the entries that it reads, in order.
     """
 
-    def __init__(self, policy: Policy, keys: Sequence[str]):
+    def __init__(self, policy: ScoresAnySize, keys: Sequence[str]):
         super().__init__()
         self.policy, self.keys = policy, keys
 
@@ -77,12 +77,12 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
         raise ValueError(f"{path}: expected a file in a folder that exists.")
     trained = _load(checkpoint, trust, **sizes)
     policy, cell = trained.policy, trained.cell
-    if policy.score_index is None:
+    if not isinstance(policy, ScoresAnySize):
         raise ValueError(
             f"{short_text(checkpoint)}: {type(policy).__name__} has no scores for totes of any size; expected "
             "model=fcn_grasp or corners that was trained with a mask, or model=fcn4d."
         )
-    keys = _inputs(policy)
+    keys = [key for key in policy.in_keys if not key.endswith("_mask")]
     seen = _observations(trained, keys, 1)
     facts = {key: getattr(cell, key) for key in CELL_SETTINGS if key != "reach"}  # scores do not depend on it
     model = _convert(Scores(policy, keys).eval(), keys, seen)
@@ -126,12 +126,6 @@ def _load(checkpoint, trust: Sequence[str], **sizes) -> TrainedPolicy:
         if hasattr(module, "compute_dtype"):
             module.compute_dtype = "float32"
     return trained
-
-
-def _inputs(policy: Policy) -> list[str]:
-    """Return the entries of the observation that the scores are made of."""
-    masks = {f"{mask}_mask" for mask in policy.masks}
-    return [key for key in policy.in_keys if key not in masks]
 
 
 def _observations(trained: TrainedPolicy, keys: Sequence[str], steps: int) -> list[Tensor]:

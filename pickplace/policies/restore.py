@@ -85,8 +85,7 @@ class TrainedPolicy(TensorDictModuleBase):
     def __init__(self, policy: Policy, terms: Mapping[str, Term], config: DictConfig):
         super().__init__()
         self.policy, self.cell, self.terms, self.config = policy, policy.cell, terms, config
-        masks = {f"{name}_mask" for name in policy.masks}
-        self.in_keys = [key for key in policy.act_keys if key not in masks]
+        self.in_keys = [key for key in policy.act_keys if not key.endswith("_mask")]
         self.out_keys = ["action"]
         self._draw = as_collection_policy(policy)
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from pickplace.planners.base import MapPlanner
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.base import Policy
+from pickplace.policies.base import Policy, ScoresFootprints
 from pickplace.robot.problem import Problem
 from pickplace.rules.grasps import split_action
 from pickplace.rules.masks import action_footprints, action_mask
@@ -39,7 +39,7 @@ def list_alternatives(
         return []
     cell, candidates = problem.cell, planner.candidates
     policy = planner.policy.with_cell(cell)
-    if candidates == "all" and policy.ranks_footprints:
+    if candidates == "all" and isinstance(policy, ScoresFootprints):
         actions, probability = _probable_footprints(policy, observation, problem, chosen, count)
     else:
         log_probs = policy.action_log_probs(observation)[0]

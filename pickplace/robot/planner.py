@@ -20,7 +20,7 @@ from pickplace.config.registry import build, find
 from pickplace.items.distributions import ItemDistribution
 from pickplace.planners.base import MapPlanner, decide
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.base import Policy
+from pickplace.policies.base import Policy, ScoresActions, ScoresFootprints
 from pickplace.policies.restore import load_critic, load_policy
 from pickplace.robot.alternatives import MAX_ALTERNATIVES, Alternative, list_alternatives
 from pickplace.robot.box import Box, DepthMapError
@@ -31,6 +31,8 @@ from pickplace.robot.training import Training
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.observation import Term, check_terms, observe
 from pickplace.rules.state import Failure, Observation
+
+CHOOSERS = "expected one item, or a checkpoint of model=fcn_grasp or corners that was trained with a mask"
 
 __all__ = ["Alternative", "Box", "DepthMapError", "Plan", "Planner", "Pose", "Scene"]
 
@@ -189,9 +191,10 @@ class Planner:
             terms = check_terms(terms, max(count, self.cell.bin_items))
             if self._make is not None and count not in self._others:
                 cell, policy = replace(self.cell, bin_items=count), self.policy
-                if policy is not None:
-                    policy = policy.with_cell(cell)
-                    policy.in_keys = [*dict.fromkeys([*policy.in_keys, "items"])]
+                try:
+                    policy = policy and policy.with_cell(cell)
+                except ValueError as error:
+                    raise _several_items(policy, count) from error
                 planner = self._others[count] = self._make(cell, policy, terms)
         if count > 1:
             _check_choice(planner, count, is_metric)
@@ -230,17 +233,20 @@ def _check_choice(planner: MapPlanner, count: int, is_metric: bool) -> None:
             f"bin: got {count} items, expected one: the planner was made for a cell with bin_items=1; expected one "
             f"made with bin_items={count}, or its name."
         )
-    if policy is None or (policy.ranks_footprints and not policy.single_item):
+    if policy is None or isinstance(policy, ScoresFootprints):
         return
-    name = type(policy).__name__
-    others = "expected one item, or a checkpoint of model=fcn_grasp or corners that was trained with a mask"
-    if policy.single_item or policy.choice_key != "action":
-        raise DepthMapError(f"bin: got {count} items, among which {name} does not choose; {others}.")
+    if not isinstance(policy, ScoresActions):
+        raise _several_items(policy, count)
     if is_metric:
         raise DepthMapError(
-            f"bin: got {count} items in metres, each on a grid of its own, while {name} sees the bin as one grid; "
-            f"{others}."
+            f"bin: got {count} items in metres, each on a grid of its own, while {type(policy).__name__} sees the bin "
+            f"as one grid; {CHOOSERS}."
         )
+
+
+def _several_items(policy, count: int) -> DepthMapError:
+    """Return the error of a policy that does not choose among several items in the bin."""
+    return DepthMapError(f"bin: got {count} items, among which {type(policy).__name__} does not choose; {CHOOSERS}.")
 
 
 def _decide(planner: MapPlanner, problem: Problem, observation: Observation) -> tuple[str, Tensor | None]:

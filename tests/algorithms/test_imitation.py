@@ -13,17 +13,17 @@ from pickplace import PickPlaceEnv
 from pickplace.algorithms.imitation import Phase, WarmStart, imitation_loss
 from pickplace.config.registry import PLANNERS
 from pickplace.planners.heuristics import JointDBL
-from pickplace.policies.corners.policy import corners
-from pickplace.policies.fcn4d.policy import ActionPolicy
+from pickplace.policies.corners.policy import Corners
+from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.fcn_grasp.policy import fcn_grasp
-from pickplace.policies.individual.policy import IndividualRlPolicy, individual_grasp
+from pickplace.policies.individual.policy import IndividualRl, individual_grasp
 from pickplace.rules.step import apply
 from pickplace.runs.provenance import imitated_planner
 
 FCN = {"filters": 8, "hidden": 8}
 MODELS = {  # constructor, mask_infeasible, sizes
-    "footprint": (fcn_grasp, True, FCN), "corners": (corners, True, FCN), "grasp": (fcn_grasp, False, FCN),
-    "flat": (ActionPolicy, False, {"filters": 4}), "individual": (IndividualRlPolicy, False, {"filters": 4}),
+    "footprint": (fcn_grasp, True, FCN), "corners": (Corners, True, FCN), "grasp": (fcn_grasp, False, FCN),
+    "flat": (Fcn4d, False, {"filters": 4}), "individual": (IndividualRl, False, {"filters": 4}),
     "individual_grasp": (individual_grasp, False, FCN), "individual_footprint": (individual_grasp, True, FCN),
 }  # fmt: skip
 

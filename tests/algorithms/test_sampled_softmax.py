@@ -15,8 +15,8 @@ from pickplace.algorithms.sampled_softmax import (
     draw_candidates,
 )
 from pickplace.policies.base import MASKED, as_collection_policy
-from pickplace.policies.fcn4d.network import Conv4dPolicy
-from pickplace.policies.fcn4d.policy import ActionPolicy
+from pickplace.policies.fcn4d.network import Conv4dNet
+from pickplace.policies.fcn4d.policy import Fcn4d
 
 
 def random_logits(*shape: int) -> torch.Tensor:
@@ -102,7 +102,7 @@ def test_logits_of_some_choices_are_those_of_all(kind, options):
 
 def test_logits_of_some_choices_of_a_masked_policy():
     for env, observation in random_states(steps=3, masks=("action",), **CELLS[1]):
-        policy = ActionPolicy(env.cell, True, **POLICIES[ActionPolicy])
+        policy = Fcn4d(env.cell, True, **POLICIES[Fcn4d])
         logits = policy.logits(observation)
         choices = torch.distributions.Categorical(logits=logits).sample((7,)).T
         assert observation["action_mask"].gather(1, choices).all()
@@ -112,7 +112,7 @@ def test_logits_of_some_choices_of_a_masked_policy():
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_logits_of_single_actions_and_their_gradients(dtype):
     torch.manual_seed(0)
-    network = Conv4dPolicy(3, filters=5, compute_dtype=dtype, head_std=0.5)
+    network = Conv4dNet(3, filters=5, compute_dtype=dtype, head_std=0.5)
     bins, totes = torch.randint(0, 2, (70, 4, 3)).float(), torch.randint(0, 4, (70, 5, 6)).float()
     actions = [torch.randint(0, count, (1_080,)) for count in (12, 30, 3)]  # more pairs than computed at once
     row, weights = torch.randint(0, 70, (1_080,)), torch.rand(1_080)
@@ -129,7 +129,7 @@ def test_logits_of_single_actions_and_their_gradients(dtype):
 
 def test_logits_of_a_pair_are_the_same_in_any_batch():
     torch.manual_seed(0)
-    network = Conv4dPolicy(4, compute_dtype="bfloat16", head_std=0.3)
+    network = Conv4dNet(4, compute_dtype="bfloat16", head_std=0.3)
     maps = torch.randint(0, 2, (9, 5, 5)).float(), torch.randint(0, 6, (9, 6, 6)).float()
     index = [torch.randint(0, count, (700,)) for count in (9, 25, 36)]
     with torch.no_grad():
@@ -146,10 +146,7 @@ def test_the_collector_s_candidates_are_drawn_from_the_policy(kind):
     frame = as_sampling_policy(policy, 5, 2.0)(observation.clone())
     candidates, log_prob, log_weight = (frame[key] for key in CANDIDATE_KEYS)
     assert candidates.shape == log_prob.shape == log_weight.shape == (env.num_envs, 6)
-    assert (
-        torch.equal(frame[policy.choice_key], policy.to_choice(frame["action"], observation))
-        or kind is not ActionPolicy
-    )
+    assert torch.equal(frame[policy.choice_key], policy.to_choice(frame["action"], observation)) or kind is not Fcn4d
     assert torch.equal(candidates[:, 0], frame[policy.choice_key]) and torch.equal(log_prob[:, 0], frame["log_prob"])
     exact = Categorical(logits=policy.logits(observation))
     torch.testing.assert_close(log_prob, exact.logits.gather(1, candidates))

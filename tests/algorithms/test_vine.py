@@ -13,8 +13,8 @@ from pickplace.algorithms.ppo import make_losses, of_taken_choice
 from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS, as_sampling_policy, draw_candidates
 from pickplace.algorithms.vine import vine_advantages
 from pickplace.policies.base import Policy
-from pickplace.policies.fcn4d.policy import ActionPolicy
-from pickplace.policies.individual.policy import IndividualRlPolicy
+from pickplace.policies.fcn4d.policy import Fcn4d
+from pickplace.policies.individual.policy import IndividualRl
 from pickplace.rules.observation import STANDARD_TERMS
 from pickplace.training import trainer
 from pickplace.training.train import train
@@ -47,7 +47,7 @@ def drawn(kind, steps):
     return env, policy, frames
 
 
-@pytest.mark.parametrize("kind", [ActionPolicy, IndividualRlPolicy])
+@pytest.mark.parametrize("kind", [Fcn4d, IndividualRl])
 def test_advantages_are_those_of_single_steps(kind, monkeypatch):
     """The item that follows is that of a frame in turn, instead of one drawn at random."""
     env, policy, frames = drawn(kind, 1)
@@ -78,7 +78,7 @@ def test_advantages_are_those_of_single_steps(kind, monkeypatch):
 
 def test_nothing_follows_where_the_next_item_has_no_place():
     """Each tote is full but for a cell that the item fills."""
-    _, policy, frames = drawn(ActionPolicy, 1)
+    _, policy, frames = drawn(Fcn4d, 1)
     for key in ("tote_depth", "bin_depth"):
         frames[key] = torch.zeros(24, 5, 5)
         frames[key][:, 2, 2] = 1.0

@@ -30,7 +30,7 @@ from commands import composed  # noqa: E402
 
 from pickplace import CellSpec, Planner, Scene, State, cli  # noqa: E402
 from pickplace.evaluation import evaluate  # noqa: E402, F401
-from pickplace.policies.fcn_grasp.policy import FootprintPolicy  # noqa: E402
+from pickplace.policies.fcn_grasp.policy import FcnGrasp  # noqa: E402
 from pickplace.rules.masks import action_mask, footprint_mask, placing_maps  # noqa: E402
 from pickplace.rules.state import EMPTY, item_from_depth, surface_from  # noqa: E402
 from pickplace.rules.step import apply  # noqa: E402
@@ -196,7 +196,7 @@ def maps(draw: random.Random, folder: Path) -> None:
         return
     values = {key: as_array(draw, request.get(key)) for key in ("bin_depth", "tote_depth")}
     cell = CellSpec()
-    planner = Planner(cell, FootprintPolicy(cell, filters=8, hidden=8).eval())
+    planner = Planner(cell, FcnGrasp(cell, filters=8, hidden=8).eval())
     given = {key: request[key] for key in DEFAULTS if key in request}
     alternatives = {"alternatives": given.pop("alternatives")} if "alternatives" in given else {}
     try:
@@ -228,7 +228,7 @@ def json_line(draw: random.Random, folder: Path) -> None:
     """Answer a damaged line, and check the answer."""
     sizes = draw.choice((((5, 5, 1),), ((4, 6, 2), (5, 7, 6), (2, 3), 2), ((3, 3, 1), (4, 4, 3), (1, 1), 1, "overlap")))
     cell = CellSpec(*sizes)
-    policy = FootprintPolicy(cell, filters=8, hidden=8).eval()
+    policy = FcnGrasp(cell, filters=8, hidden=8).eval()
     planner = Planner(policy.cell, policy, draw.choice(("all", 5)))
     line = line_of(draw, damage(draw, good_request(draw, cell)))
     report([cell.describe(), repr(line[:300])])

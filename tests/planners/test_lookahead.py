@@ -9,8 +9,8 @@ from pickplace import CellSpec, PickPlaceEnv
 from pickplace.items.distributions import Kinds, Recorded
 from pickplace.planners.lookahead import Lookahead
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.afterstate.policy import AfterstatePolicy
-from pickplace.policies.fcn_grasp.policy import FootprintPolicy
+from pickplace.policies.afterstate.policy import Afterstate
+from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.policies.restore import RestoredCritic, restore_critic, restore_policy
 from pickplace.rules.masks import choice_mask, placing_maps
 from pickplace.rules.state import EMPTY, Item, State
@@ -19,7 +19,7 @@ from pickplace.runs import checkpoint
 
 def untrained(cell):
     torch.manual_seed(0)
-    return FootprintPolicy(cell, filters=8, hidden=8, head_std=1.0)
+    return FcnGrasp(cell, filters=8, hidden=8, head_std=1.0)
 
 
 def make_env(count=1, tote_size=(4, 4, 1), **settings):
@@ -80,7 +80,7 @@ def test_what_wins_by_the_values_of_afterstates_is_not_played_to_the_end(monkeyp
     """The policy follows from the same values."""
     monkeypatch.setattr(Lookahead, "_confirm", None)
     env, sizes = make_env(1, (4, 4, 2)), {"grid": (4, 4, 2), "filters": 4, "hidden": 8}
-    policy = AfterstatePolicy(env.cell, **sizes).eval()
+    policy = Afterstate(env.cell, **sizes).eval()
     critic = RestoredCritic(policy.network, list(policy.network.in_keys), 1.0)
     search = Lookahead(env.cell, policy, env.items, critic, horizon=3, candidates=8, rounds=1)
     alone = occupancies(PolicyPlanner(env.cell, policy), make_env(64, (4, 4, 2)))

@@ -10,7 +10,7 @@ from pickplace.items.distributions import Uniform
 from pickplace.planners.heuristics import JointDBL
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy
-from pickplace.policies.corners.policy import corners
+from pickplace.policies.corners.policy import Corners
 from pickplace.rules.grasps import PICKS
 from pickplace.rules.masks import placing_maps
 from pickplace.rules.step import apply
@@ -84,7 +84,7 @@ def test_only_one_item_is_considered(rule):
 
 
 @pytest.mark.parametrize("rule", ["least_offset", "middle"])
-@pytest.mark.parametrize("make", [untrained_policy, lambda cell: corners(cell, True).eval()])
+@pytest.mark.parametrize("make", [untrained_policy, lambda cell: Corners(cell).eval()])
 @pytest.mark.parametrize(("effector", "rotations"), [((5, 5), 2), ((5, 3), 4)])
 def test_a_pick_may_be_chosen_first(rule, make, effector, rotations):
     """Of the actions with this pick that succeed the one whose footprint the policy likes best; else one that fails."""

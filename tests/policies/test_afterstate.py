@@ -18,7 +18,7 @@ from pickplace.config.registry import build
 from pickplace.evaluation.play import play
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.afterstate.network import ToteValue
-from pickplace.policies.afterstate.policy import AfterstatePolicy, depth_after
+from pickplace.policies.afterstate.policy import Afterstate, depth_after
 from pickplace.policies.base import as_critic
 from pickplace.policies.restore import restore_critic, restore_policy
 from pickplace.rules.cell import CellSpec
@@ -184,8 +184,8 @@ def shared(state):
     (["model=afterstate", "algo=td", "algo.vine_samples=2"], "algo.vine_samples=2: expected null"),
     (["model=afterstate", "algo=td", "rollout_length=1"], "rollout_length=1: expected at least 2"),
     (["model=afterstate", "algo=td", "warm_start.critic_frames=64"], "warm_start.critic_frames=64: expected 0"),
-    (["model=afterstate", "algo=td", "model.mask_infeasible=false"], "model.mask_infeasible=False: with model=aft"),
-    (["model=afterstate", "algo=td", "env.bin_items=2"], "env.bin_items=2: expected 1 with model=afterstate"),
+    (["model=afterstate", "algo=td", "model.mask_infeasible=false"], "model.mask_infeasible=False: expected true"),
+    (["model=afterstate", "algo=td", "env.bin_items=2"], "env.bin_items=2: expected 1 with Afterstate"),
     (["model=afterstate", "algo=td", "model.actor.grid=[10,10]"], r"model.actor.grid=\[10, 10\]: expected 3"),
     (["model=afterstate", "algo=td", "model.actor.grid=[10,1,10]"], r"model.actor.grid=\[10, 1, 10\]: expected at le"),
     (["model=afterstate", "algo=td", "model.actor.reward_scale=1"], "model.actor.reward_scale=1: expected reward_s"),
@@ -198,7 +198,7 @@ def test_settings_that_do_not_fit_are_refused(words, refusal, tmp_path):
 
 
 def test_it_serves_other_totes():
-    policy = AfterstatePolicy(CellSpec(tote_size=(9, 7, 6)), grid=(6, 5, 4), filters=4, hidden=8)
+    policy = Afterstate(CellSpec(tote_size=(9, 7, 6)), grid=(6, 5, 4), filters=4, hidden=8)
     env = PickPlaceEnv(num_envs=3, tote_size=(9, 7, 6), masks=())
     seen = env.reset()
     assert (env.step(seen.set("action", policy.best_feasible(seen)))["next", "failure"] == 0).all()

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from pickplace import CellSpec
-from pickplace.policies import fcn4d
 from pickplace.policies.base import MASKED
 from pickplace.policies.depth import clip_depth, pad_depth
-from pickplace.policies.fcn4d.network import Conv4dCritic, Conv4dPolicy
-from pickplace.policies.fcn4d.policy import ActionPolicy, TypicalPolicy
+from pickplace.policies.fcn4d import policy as fcn4d
+from pickplace.policies.fcn4d.network import Conv4dCritic, Conv4dNet
+from pickplace.policies.fcn4d.policy import Fcn4d, Typical
 
 SIZES = [  # bin, tote, R, clips, floor
     ((5, 5), (6, 6), 4, (1.0, 5.0), None),
@@ -36,7 +36,7 @@ def depths(bin_size, tote_size, batch=3, dtype=torch.float32):
 
 def network(rotations=2, filters=5, **options):
     torch.manual_seed(0)
-    return Conv4dPolicy(rotations, filters, **{"head_std": None, **options})
+    return Conv4dNet(rotations, filters, **{"head_std": None, **options})
 
 
 def convolve4d(x, weight, bias):
@@ -181,12 +181,12 @@ def test_a_masked_policy_computes_only_what_it_needs_and_the_same(rotations, emp
     monkeypatch.setattr(fcn4d, "FEW_PLACES", few_places)
     cell = CellSpec(bin_size=(4, 5, 1), tote_size=(5, 6, 3), rotations=rotations)
     torch.manual_seed(0)
-    policy = ActionPolicy(cell, True, filters=6, head_std=0.3)
+    policy = Fcn4d(cell, True, filters=6, head_std=0.3)
     maps = {"bin_depth": torch.randint(0, 2, (7, 4, 5)).float(), "tote_depth": torch.randint(0, 4, (7, 5, 6)).float()}
     mask, weights = torch.rand(7, cell.num_actions) < 0.01, torch.rand(7, cell.num_actions)
     if empty_row:
         mask[3] = False
-    logits, whole = policy.logits({**maps, "action_mask": mask}), policy.scores(maps)
+    logits, whole = policy.logits({**maps, "action_mask": mask}), policy.action_scores(maps)
     assert_close(logits[mask], whole[mask])
     assert (logits[~mask] == MASKED).all()
     gradients = [
@@ -198,7 +198,7 @@ def test_a_masked_policy_computes_only_what_it_needs_and_the_same(rotations, emp
 
 
 def test_typical_is_fcn4d_and_one_fully_connected_layer(monkeypatch):
-    policy = TypicalPolicy(CellSpec(bin_size=(3, 3, 1), tote_size=(4, 4, 2)), filters=8)
+    policy = Typical(CellSpec(bin_size=(3, 3, 1), tote_size=(4, 4, 2)), filters=8)
     maps = torch.randint(0, 2, (5, 3, 3)).float(), torch.randint(0, 3, (5, 4, 4)).float()
     wanted = policy.network(*maps) @ policy.join.weight.T + policy.join.bias
     assert_close(policy.logits({"bin_depth": maps[0], "tote_depth": maps[1]}), wanted)
@@ -208,4 +208,4 @@ def test_typical_is_fcn4d_and_one_fully_connected_layer(monkeypatch):
 
     monkeypatch.setattr(torch.nn, "Linear", refuse)
     with pytest.raises(ValueError, match=r"90,000\^2 weights, 32.4 GB.* smaller env.tote_size"):
-        TypicalPolicy(CellSpec(tote_size=(30, 30, 5)), filters=8)
+        Typical(CellSpec(tote_size=(30, 30, 5)), filters=8)

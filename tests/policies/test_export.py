@@ -12,18 +12,18 @@ from test_footprint_fcn import by_hand, random_maps
 from pickplace import CellSpec, __version__, load_policy
 from pickplace.policies import export, onnx_model
 from pickplace.policies.base import MASKED
-from pickplace.policies.corners.policy import CornerPolicy
-from pickplace.policies.fcn4d.policy import ActionPolicy
-from pickplace.policies.fcn_grasp.policy import FootprintPolicy
+from pickplace.policies.corners.policy import Corners
+from pickplace.policies.fcn4d.policy import Fcn4d
+from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.policies.onnx_model import SHAPES, Scores
 from pickplace.rules.masks import footprint_mask
 from pickplace.rules.reach import Annulus
 from pickplace.rules.state import item_from_depth
 
 MAKERS = {
-    "fcn_grasp": lambda: FootprintPolicy(CellSpec(), head_std=1.0, compute_dtype="float32"),
-    "corners": lambda: CornerPolicy(CellSpec(), head_std=1.0),
-    "fcn4d": lambda: ActionPolicy(CellSpec(rotations=3), filters=4, head_std=1.0, compute_dtype="float32"),
+    "fcn_grasp": lambda: FcnGrasp(CellSpec(), head_std=1.0, compute_dtype="float32"),
+    "corners": lambda: Corners(CellSpec(), head_std=1.0),
+    "fcn4d": lambda: Fcn4d(CellSpec(rotations=3), filters=4, head_std=1.0, compute_dtype="float32"),
 }
 
 
@@ -59,7 +59,7 @@ def test_the_check_is_at_three_sizes_that_the_export_has_not_seen(exported):
     assert (facts["pickplace"], facts["checkpoint"], facts["policy"]) == (
         __version__,
         "pretrained/mixed",
-        "FootprintPolicy",
+        "FcnGrasp",
     )
     assert json.loads(facts["cell"])["tote_size"] == [8, 8, 8] and facts["index"].startswith(
         "(parity * W_T + x) * D_T + y"
@@ -181,11 +181,14 @@ def test_fcn4d_scores_every_flat_action(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["pretrained/unmasked", "x.onnx"], "pretrained/unmasked: GraspPolicy has no scores for totes of any size"),
-        (["pretrained/gopt_rs", "x.onnx"], "pretrained/gopt_rs: AfterstatePolicy has no scores for totes of any size"),
+        (
+            ["pretrained/unmasked", "x.onnx"],
+            "pretrained/unmasked: UnmaskedFcnGrasp has no scores for totes of any size",
+        ),
+        (["pretrained/gopt_rs", "x.onnx"], "pretrained/gopt_rs: Afterstate has no scores for totes of any size"),
         (["pretrained/r4", "nowhere/x.onnx"], "nowhere/x.onnx: expected a file in a folder that exists"),
         (["pretrained/r4", "."], "expected a file in a folder that exists"),
-        (["pretrained/none", "x.onnx"], "expected pretrained/fcn4d"),
+        (["pretrained/none", "x.onnx"], "expected pretrained/cdrl_rs"),
         (["pretrained/r1", "x.onnx", "--rotations", "4"], "env.rotations=4: the checkpoint was trained with 1"),
         (["pretrained/r4"], "required: file"),
     ],

@@ -12,11 +12,11 @@ from problems import late_state
 
 from pickplace import CellSpec, Item
 from pickplace.items.distributions import Kinds, Uniform
-from pickplace.policies.base import MASKED, as_collection_policy
+from pickplace.policies.base import MAP_KEYS, MASKED, as_collection_policy
 from pickplace.policies.critics import PooledCritic
 from pickplace.policies.depth import Contents
-from pickplace.policies.fcn_grasp.network import MAP_KEYS, FootprintFcn, matrix_dtype
-from pickplace.policies.fcn_grasp.policy import FootprintPolicy, GraspPolicy
+from pickplace.policies.fcn_grasp.network import FootprintFcn, matrix_dtype
+from pickplace.policies.fcn_grasp.policy import FcnGrasp, UnmaskedFcnGrasp
 from pickplace.rules.state import item_from_depth
 from pickplace.runs import checkpoint
 
@@ -107,7 +107,7 @@ def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes,
 @pytest.mark.parametrize("rotations", [1, 2, 4])
 def test_only_what_the_mask_allows_is_computed_and_it_is_the_same(rotations, monkeypatch):
     env, state = late_state(tote_size=(7, 5, 3), rotations=rotations, masks=("action", "footprint"))
-    policy, mask = FootprintPolicy(env.cell, **FLOAT), state["footprint_mask"]
+    policy, mask = FcnGrasp(env.cell, **FLOAT), state["footprint_mask"]
     asked, at = [], policy.network.at
     monkeypatch.setattr(policy.network, "at", lambda *args: asked.append(len(args[3])) or at(*args))
     logits = policy.logits(state)
@@ -122,7 +122,7 @@ def test_only_what_the_mask_allows_is_computed_and_it_is_the_same(rotations, mon
 @pytest.mark.parametrize("bias", [-1e30, -1e12, 1e30])
 def test_no_score_is_so_bad_that_what_the_mask_forbids_is_chosen(bias):
     env, state = late_state(tote_size=(4, 4, 3), num_envs=64, masks=("action", "footprint"))
-    policy = FootprintPolicy(env.cell, **FLOAT)
+    policy = FcnGrasp(env.cell, **FLOAT)
     policy.network.head.bias.data.fill_(bias)
     chosen = as_collection_policy(policy)(state.clone())
     assert state["action_mask"].gather(1, chosen["action"][:, None]).all()
@@ -136,7 +136,7 @@ def test_without_a_mask_every_grasp_has_the_score_of_its_footprint(rotations, ef
     items = Kinds([[1, 1, 1]]) if effector == (3, 1) else None
     sizes = {"tote_size": (4, 5, 2), "rotations": rotations, "effector_size": effector}
     env, state = late_state(1, num_envs=3, items=items, **sizes)
-    policy, count = GraspPolicy(env.cell, filters=8, **FLOAT), env.cell.num_offsets
+    policy, count = UnmaskedFcnGrasp(env.cell, filters=8, **FLOAT), env.cell.num_offsets
     policy.outside.data.fill_(7.0)
     logits = policy.class_scores(state).flatten(1)
     scores = policy.network(*(state[key] for key in MAP_KEYS), env.cell.parities)
@@ -156,8 +156,8 @@ def test_without_a_mask_every_grasp_has_the_score_of_its_footprint(rotations, ef
 def test_bfloat16_is_close_and_any_number_of_rows_will_do(num_envs, least, most):
     env, state = late_state(4, num_envs=num_envs, masks=("action", "footprint"), seed=0)
     torch.manual_seed(1)
-    exact = FootprintPolicy(env.cell, **FLOAT)
-    rough = FootprintPolicy(env.cell, **{**FLOAT, "compute_dtype": "bfloat16"})
+    exact = FcnGrasp(env.cell, **FLOAT)
+    rough = FcnGrasp(env.cell, **{**FLOAT, "compute_dtype": "bfloat16"})
     rough.load_state_dict(exact.state_dict())
     wanted, got = exact.logits(state), rough.logits(state)
     count = int(state["footprint_mask"].sum())
@@ -230,8 +230,8 @@ def test_the_policy_sees_the_mean_of_the_other_items():
     """Its pairs are scored by item and footprint; what the others do is learned from zero, and needs several items."""
     sizes = {"items": Uniform(), "tote_size": (6, 6, 6), "bin_size": (7, 7, 1), "masks": ("footprint", "action")}
     env, state = late_state(bin_items=3, **sizes)
-    alone = FootprintPolicy(replace(env.cell, bin_items=1), **FLOAT)
-    policy = checkpoint.restore(lambda: FootprintPolicy(env.cell, **FLOAT), alone.state_dict(), "policy")
+    alone = FcnGrasp(replace(env.cell, bin_items=1), **FLOAT)
+    policy = checkpoint.restore(lambda: FcnGrasp(env.cell, **FLOAT), alone.state_dict(), "policy")
     places = env.cell.num_footprints
     for number in range(3):  # as if each item lay alone
         one = state.exclude("items", "bin_labels")
@@ -251,21 +251,21 @@ def test_the_policy_sees_the_mean_of_the_other_items():
         for part, size in enumerate(item[2:]):
             by_hand[part * 3 + min(size, 3) - 1] += 1 / len(others)
     torch.testing.assert_close(code[0], by_hand)
-    again = checkpoint.restore(lambda: FootprintPolicy(alone.cell, **FLOAT), policy.state_dict(), "policy")
+    again = checkpoint.restore(lambda: FcnGrasp(alone.cell, **FLOAT), policy.state_dict(), "policy")
     torch.testing.assert_close(again.logits(one), alone.logits(one))  # one item has no others
 
 
 def test_weights_that_are_older_than_the_marks_serve():
     """They give the scores that they gave, as if every cell bore weight."""
     env, state = late_state(tote_size=(6, 6, 6), items=Uniform((1, 3), (1, 3), (1, 2)), masks=("action", "footprint"))
-    policy = FootprintPolicy(env.cell, **FLOAT)
+    policy = FcnGrasp(env.cell, **FLOAT)
     older = {key: value for key, value in policy.state_dict().items() if key != "network.weak"}
-    restored = checkpoint.restore(lambda: FootprintPolicy(env.cell, **FLOAT), older, "policy")
+    restored = checkpoint.restore(lambda: FcnGrasp(env.cell, **FLOAT), older, "policy")
     assert not state["tote_bearing"].all()
     assert torch.equal(restored.logits(state), policy.logits(state.set("tote_bearing", torch.ones(16, 6, 6))))
     del older["network.patch.bias"]
     with pytest.raises(checkpoint.CheckpointError, match="patch.bias is missing"):
-        checkpoint.restore(lambda: FootprintPolicy(env.cell, **FLOAT), older, "policy")
+        checkpoint.restore(lambda: FcnGrasp(env.cell, **FLOAT), older, "policy")
 
 
 @pytest.mark.parametrize("make", [FootprintFcn, PooledCritic])
@@ -287,4 +287,4 @@ def test_bad_settings_are_refused(make, key, values, expected):
 def test_bad_settings_of_the_actor_are_refused():
     for key, value in (("reach", 0), ("headroom_bins", 0), ("head_std", -1), ("receptive_field", 1)):
         with pytest.raises(ValueError, match=rf"model.actor.{key}={value}: expected"):
-            FootprintPolicy(CellSpec(), **{key: value})
+            FcnGrasp(CellSpec(), **{key: value})

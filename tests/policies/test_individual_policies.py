@@ -5,12 +5,12 @@ import torch
 from problems import late_state
 
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.fcn4d.policy import ActionPolicy
+from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.fcn_grasp.policy import fcn_grasp
-from pickplace.policies.individual.policy import IndividualRlPolicy, individual_grasp
+from pickplace.policies.individual.policy import IndividualRl, individual_grasp
 from pickplace.rules.grasps import heuristic_pick, select_pick
 
-NETWORKS = {IndividualRlPolicy: ActionPolicy, individual_grasp: fcn_grasp}
+NETWORKS = {IndividualRl: Fcn4d, individual_grasp: fcn_grasp}
 both = pytest.mark.parametrize("individual", NETWORKS)
 
 

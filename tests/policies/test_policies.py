@@ -1,5 +1,7 @@
 """Properties of every policy: its choices, its distribution over flat actions, its best action."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from problems import SETTINGS, late_state, random_states
@@ -8,20 +10,29 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.base import as_actor, as_collection_policy, refuse_large_network
-from pickplace.policies.corners.policy import CornerPolicy
-from pickplace.policies.fcn4d.policy import ActionPolicy, TypicalPolicy
-from pickplace.policies.fcn_grasp.policy import FootprintPolicy, GraspPolicy
-from pickplace.policies.individual.policy import IndividualFootprintPolicy, IndividualGraspPolicy, IndividualRlPolicy
+from pickplace.policies.afterstate.policy import Afterstate
+from pickplace.policies.base import (
+    EstimatesValue,
+    ScoresActions,
+    ScoresAnySize,
+    ScoresFootprints,
+    as_actor,
+    as_collection_policy,
+    refuse_large_network,
+)
+from pickplace.policies.corners.policy import Corners
+from pickplace.policies.fcn4d.policy import Fcn4d, Typical
+from pickplace.policies.fcn_grasp.policy import FcnGrasp, UnmaskedFcnGrasp
+from pickplace.policies.individual.policy import IndividualGrasp, IndividualRl, UnmaskedIndividualGrasp
 from pickplace.rules.grasps import all_grasps, heuristic_pick, split_action
 from pickplace.rules.masks import action_footprints
 
 GRASP, CONV4D = {"filters": 8, "hidden": 8, "head_std": 1.0}, {"filters": 4, "head_std": 1.0}
 POLICIES = {
-    FootprintPolicy: GRASP, GraspPolicy: GRASP, IndividualGraspPolicy: GRASP, IndividualFootprintPolicy: GRASP,
-    CornerPolicy: GRASP, ActionPolicy: CONV4D, TypicalPolicy: CONV4D, IndividualRlPolicy: CONV4D,
+    FcnGrasp: GRASP, UnmaskedFcnGrasp: GRASP, UnmaskedIndividualGrasp: GRASP, IndividualGrasp: GRASP,
+    Corners: GRASP, Fcn4d: CONV4D, Typical: CONV4D, IndividualRl: CONV4D,
 }  # fmt: skip
-INDIVIDUAL = (IndividualFootprintPolicy, IndividualGraspPolicy, IndividualRlPolicy)
+INDIVIDUAL = (IndividualGrasp, UnmaskedIndividualGrasp, IndividualRl)
 CELLS = [
     {"tote_size": (4, 4, 2), "bin_size": (4, 4, 1), "num_envs": 4},
     {"tote_size": (4, 5, 3), "bin_size": (4, 3, 1), "effector_size": (3, 2), "rotations": 3, "num_envs": 4},
@@ -39,7 +50,7 @@ SEVERAL = {
     "tote_size": (4, 5, 3), "bin_size": (5, 6, 1), "bin_items": 3, "refill": "batch", "num_envs": 4, "rotations": 2,
 }  # fmt: skip
 #: The policies that choose among several items.
-CHOOSERS = (FootprintPolicy, CornerPolicy, ActionPolicy, TypicalPolicy)
+CHOOSERS = (FcnGrasp, Corners, Fcn4d, Typical)
 every_policy = pytest.mark.parametrize("kind", POLICIES)
 MASKS = {"masks": ("action", "footprint", "corner")}
 
@@ -62,9 +73,7 @@ def refuses(kind, options) -> bool:
     """Return whether a policy does not serve a cell; it says so."""
     if options.get("bin_items", 1) == 1 or kind in CHOOSERS:
         return False
-    with pytest.raises(
-        ValueError, match=r"^env.bin_items=3: expected 1 with model=.*; model=fcn_grasp or corners with"
-    ):
+    with pytest.raises(ValueError, match=r"^env.bin_items=3: expected 1 with .*; model=fcn_grasp or corners with"):
         small(kind, CellSpec(bin_items=3, longest_side=2))
     return True
 
@@ -84,16 +93,18 @@ def test_the_distribution_over_flat_actions_is_one_and_its_best_is_played(kind, 
         possible = at_pick(kind, env, mask).any(1)
         assert possible.all() or kind in INDIVIDUAL
         assert torch.equal(mask.gather(1, action[:, None])[:, 0], possible)
-        if policy.ranks_footprints:  # which never lists the actions: the best feasible footprint, by any way to it
+        if isinstance(
+            policy, ScoresFootprints
+        ):  # which never lists the actions: the best feasible footprint, by any way to it
             reached = action_footprints(env.cell, env.current_item).gather(1, action[:, None])[:, 0]
             assert torch.equal(reached, policy.logits(observation).argmax(1))
-        elif kind is not IndividualFootprintPolicy:
+        elif kind is not IndividualGrasp:
             best = log_probs.masked_fill(~mask, -torch.inf).argmax(1)
             assert torch.equal(action[possible], best[possible])
 
 
 @pytest.mark.parametrize("options", SETTINGS)
-@pytest.mark.parametrize("kind", [kind for kind in POLICIES if kind is not TypicalPolicy])  # its layer is large here
+@pytest.mark.parametrize("kind", [kind for kind in POLICIES if kind is not Typical])  # its layer is large here
 def test_choices_are_classes_of_actions(kind, options):
     """The choices of all feasible actions, and back: a random action of the class when exploring, else the lowest."""
     if refuses(kind, options):
@@ -106,7 +117,7 @@ def test_choices_are_classes_of_actions(kind, options):
         lowest = {}
         for action, choice in zip(actions.tolist(), choices.tolist(), strict=True):
             lowest.setdefault(choice, action)
-        if kind is FootprintPolicy:
+        if kind is FcnGrasp:
             assert sorted(lowest) == observation["footprint_mask"][row].nonzero()[:, 0].tolist()
         several, distinct = observation[[row] * len(lowest)], torch.tensor([*lowest], dtype=torch.int64)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -119,7 +130,7 @@ def test_choices_are_classes_of_actions(kind, options):
 @pytest.mark.parametrize("exploration", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
 def test_to_miss_the_item_is_one_choice_of_the_unmasked_policy(exploration):
     env, observation = late_state(3, **SETTINGS[3])
-    policy = small(GraspPolicy, env.cell)
+    policy = small(UnmaskedFcnGrasp, env.cell)
     missing = torch.full((env.num_envs,), policy.classes * env.cell.num_places)
     assert torch.equal(missing, torch.full_like(missing, policy.logits(observation).shape[1] - 1))
     with set_exploration_type(exploration):
@@ -131,7 +142,7 @@ def test_to_miss_the_item_is_one_choice_of_the_unmasked_policy(exploration):
     assert torch.equal(policy.to_choice(actions, observation), missing)
 
 
-@pytest.mark.parametrize("kind", [FootprintPolicy, GraspPolicy, ActionPolicy, IndividualGraspPolicy])
+@pytest.mark.parametrize("kind", [FcnGrasp, UnmaskedFcnGrasp, Fcn4d, UnmaskedIndividualGrasp])
 def test_sampled_actions_follow_the_distribution_over_flat_actions(kind):
     """Chi-square of 20,000 draws; for the masked policy, the flat distribution restricted to what is feasible."""
     env = PickPlaceEnv(num_envs=1, tote_size=(3, 3, 2), bin_size=(3, 3, 1), seed=5, **MASKS)
@@ -141,7 +152,7 @@ def test_sampled_actions_follow_the_distribution_over_flat_actions(kind):
             draws.append(as_collection_policy(policy)(observation.expand(5_000).contiguous())["action"])
         share = policy.action_log_probs(observation)[0].double().exp()
     count = torch.bincount(torch.cat(draws), minlength=env.cell.num_actions)
-    if kind is FootprintPolicy:
+    if kind is FcnGrasp:
         mask = observation["action_mask"][0]
         assert not count[~mask].any()
         # A footprint's probability is spread over all actions that lead there, of which the feasible ones are played.
@@ -169,7 +180,7 @@ def test_the_log_probability_of_a_choice_is_what_the_loss_sees(kind):
     assert torch.equal(again[policy.choice_key], policy.logits(observation).argmax(1))
 
 
-@pytest.mark.parametrize("kind", [FootprintPolicy, GraspPolicy, ActionPolicy])
+@pytest.mark.parametrize("kind", [FcnGrasp, UnmaskedFcnGrasp, Fcn4d])
 def test_weights_serve_fewer_rotations_and_other_totes(kind):
     """The logits of the actions that remain are those of the policy trained with all four rotations."""
     env = PickPlaceEnv(num_envs=2)
@@ -181,7 +192,7 @@ def test_weights_serve_fewer_rotations_and_other_totes(kind):
         seen = {"bin_depth": observation["bin_depth"], "tote_depth": tote[2] * empty, "tote_bearing": empty}
         found = fewer.action_log_probs(seen)
         assert found.shape == (2, fewer.cell.num_actions)
-        if tote == (6, 6, 5) and kind is ActionPolicy:
+        if tote == (6, 6, 5) and kind is Fcn4d:
             every = policy.action_log_probs(seen).unflatten(1, (-1, 4))[..., :rotations]
             torch.testing.assert_close(found, every.flatten(1).log_softmax(1), rtol=1e-4, atol=1e-4)
 
@@ -189,15 +200,34 @@ def test_weights_serve_fewer_rotations_and_other_totes(kind):
 def test_the_papers_conditions_on_sizes():
     good, low = CellSpec(longest_side=3), CellSpec(tote_size=(6, 4, 5))
     wide = CellSpec(longest_side=4, bin_size=(6, 6, 1))
-    for kind in (FootprintPolicy, ActionPolicy):
+    for kind in (FcnGrasp, Fcn4d):
         assert small(kind, good).check_sizes() == []
-    assert small(FootprintPolicy, wide).check_sizes() == [
+    assert small(FcnGrasp, wide).check_sizes() == [
         "items: the longest side is 4, expected at most 3.5 (receptive field 5, eq. 2)."
     ]
     sentence = r"env.tote_size=\[6, 4, 5\]: expected sides of at least 5 \(receptive field 5, eq. 3\)."
-    assert len(small(GraspPolicy, low).check_sizes()) == 1
+    assert len(small(UnmaskedFcnGrasp, low).check_sizes()) == 1
     with pytest.raises(ValueError, match=sentence):  # fcn4d cannot learn then
-        small(ActionPolicy, low).check_sizes()
+        small(Fcn4d, low).check_sizes()
+
+
+def test_protocols_say_what_a_policy_can_do():
+    cell = CellSpec(longest_side=2, tote_size=(4, 4, 2), bin_size=(3, 3, 1))
+    can = {
+        protocol: {kind for kind in POLICIES if isinstance(small(kind, cell), protocol)}
+        for protocol in (ScoresFootprints, ScoresActions, ScoresAnySize, EstimatesValue)
+    }
+    assert can == {
+        ScoresFootprints: {FcnGrasp, Corners},
+        ScoresActions: {Fcn4d, Typical, IndividualRl},
+        ScoresAnySize: {FcnGrasp, Corners, Fcn4d, IndividualGrasp, IndividualRl},
+        EstimatesValue: set(),
+    }
+    afterstate = Afterstate(cell)
+    assert isinstance(afterstate, ScoresFootprints) and isinstance(afterstate, EstimatesValue)
+    assert not isinstance(afterstate, ScoresAnySize)
+    with pytest.raises(ValueError, match="expected 1 with Afterstate"):
+        afterstate.with_cell(replace(cell, bin_items=2))
 
 
 class NeedsValues(torch.nn.Linear):

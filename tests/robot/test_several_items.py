@@ -17,7 +17,7 @@ from untrained import untrained_policy
 
 from pickplace import CellSpec, DepthMapError, Failure, Planner, Scene
 from pickplace.planners.heuristics import JointDBL
-from pickplace.policies.fcn4d.policy import ActionPolicy
+from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.robot.measure import Box, HiddenBox, touches
 from pickplace.robot.measured_problem import read_metric
 from pickplace.rules.grasps import all_grasps
@@ -56,7 +56,7 @@ def make_planner(name: str, cell: CellSpec) -> Planner:
     if name == "joint_dbl":
         return Planner(cell, planner=name)
     torch.manual_seed(0)
-    policy = untrained_policy(cell) if name == "fcn_grasp" else ActionPolicy(cell, filters=4).eval()
+    policy = untrained_policy(cell) if name == "fcn_grasp" else Fcn4d(cell, filters=4).eval()
     return Planner(cell, policy, candidates=7 if name == "fcn4d, 7" else "all")
 
 
@@ -302,10 +302,10 @@ def test_those_that_cannot_choose_refuse_in_one_sentence():
     boxes = {"items": [Box(0.05, 0.05, 0.03, 0.03, 0.05), Box(0.2, 0.2, 0.05, 0.05, 0.05)], **FLAT}
     small = {"tote_size": (6, 6, 5)}
     for planner, seen, message in (
-        (Planner.load("pretrained/unmasked"), grid, "bin: got 2 items, among which GraspPolicy does not choose"),
-        (Planner.load("pretrained/gopt_rs", **small), grid, "2 items, among which AfterstatePolicy does not choose"),
-        (Planner.load("pretrained/gopt_rs", planner="lookahead", **small), boxes, "AfterstatePolicy does not choose"),
-        (Planner.load("pretrained/fcn4d"), boxes, "bin: got 2 items in metres, each on a grid of its own, while Act"),
+        (Planner.load("pretrained/unmasked"), grid, "bin: got 2 items, among which UnmaskedFcnGrasp does not choose"),
+        (Planner.load("pretrained/gopt_rs", **small), grid, "2 items, among which Afterstate does not choose"),
+        (Planner.load("pretrained/gopt_rs", planner="lookahead", **small), boxes, "Afterstate does not choose"),
+        (Planner.load("pretrained/fcn4d"), boxes, "bin: got 2 items in metres, each on a grid of its own, while Fcn4d"),
         (Planner(CellSpec(), planner=JointDBL(CellSpec())), grid, "was made for a cell with bin_items=1; expected one"),
         (Planner(CellSpec(rotations=1), planner="joint_dbl"), {**boxes, "items": [BOXES[1], BOXES[0]]},
          "items[0].yaw=30: expected 0 with rotations=1"),

@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from pickplace.policies.fcn_grasp.policy import FootprintPolicy
+from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.rules.observation import Bounds, Term
 
 
@@ -22,7 +22,7 @@ class PitDepth(Term):
         return (torch.minimum(along_x, along_y) - state.heights).clamp(min=0).float()
 
 
-class PitPolicy(FootprintPolicy):
+class PitPolicy(FcnGrasp):
     """``fcn_grasp`` with a mask, which also sees the pits around each footprint.
 
     Args:
@@ -32,9 +32,7 @@ class PitPolicy(FootprintPolicy):
     """
 
     def __init__(self, cell, mask_infeasible: bool, **network):
-        if not mask_infeasible:
-            raise ValueError("model.mask_infeasible=False: PitPolicy expects true.")
-        super().__init__(cell, **network)
+        super().__init__(cell, mask_infeasible, **network)
         self.in_keys = [*self.in_keys, "pit_depth"]  # the key under which env/pits.yaml lists the term
         self.pits = nn.Conv2d(1, cell.parities, kernel_size=5, padding=2)  # a score for each footprint's first cell
 

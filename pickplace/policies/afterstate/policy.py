@@ -6,14 +6,14 @@ from torch import Tensor
 from pickplace.common.validate import number
 from pickplace.policies.afterstate.network import ToteValue
 from pickplace.policies.base import refuse_several_items
-from pickplace.policies.corners.policy import CornerPolicy
+from pickplace.policies.footprints import FootprintPolicy
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_footprint, turned_size
 from pickplace.rules.maps import FAR, rectangle
 from pickplace.rules.state import Observation, item_from_depth
 
 
-class AfterstatePolicy(CornerPolicy):
+class Afterstate(FootprintPolicy):
     """``afterstate``: chooses, among the footprints that occupy a corner, the one whose tote is worth most.
 
     The reward of an item is its volume wherever it lies, so that placements differ only in the tote that they leave,
@@ -22,22 +22,20 @@ class AfterstatePolicy(CornerPolicy):
 
     Args:
         cell: the sizes.
+        mask_infeasible: must be true.
         temperature: of the softmax over the values in training, in units of the scaled reward.
         **network: arguments of :class:`~pickplace.policies.afterstate.network.ToteValue`.
     """
 
     map_keys = ("bin_depth", "tote_depth", "tote_height")
-    single_item = True
-    score_index = None  # the network's pooling is exported for one size of tote only
-    network: ToteValue  # type: ignore[assignment]
+    mask = "corner"
+    check_cell = refuse_several_items
+    network: ToteValue
 
-    def __init__(self, cell: CellSpec, temperature: float = 0.003, **network):
-        refuse_several_items(cell, "model=afterstate")
+    def __init__(self, cell: CellSpec, mask_infeasible: bool = True, temperature: float = 0.003, **network):
+        super().__init__(cell, mask_infeasible)
         self.temperature = number("model.actor.temperature", temperature, 1e-6)
-        super().__init__(cell, **network)
-
-    def make_network(self, **network) -> ToteValue:  # type: ignore[override]
-        return ToteValue(**network)
+        self.network = ToteValue(**network)
 
     def value_network(self) -> ToteValue:
         return self.network
@@ -66,16 +64,3 @@ def depth_after(bin_depth: Tensor, tote_depth: Tensor, row: Tensor, footprint: T
     inside = rectangle(depth.shape[1:], x, y, *turned_size(item, parity == 1)).permute(2, 0, 1)
     rest = torch.where(inside, depth, FAR).amin((1, 2))
     return torch.where(inside, (rest - item.h)[:, None, None], depth)
-
-
-def afterstate(cell: CellSpec, mask_infeasible: bool, **settings) -> AfterstatePolicy:
-    """Return the policy over afterstates (config ``model=afterstate``).
-
-    Raises:
-        ValueError: without a mask, as its choices come from what is feasible.
-    """
-    if not mask_infeasible:
-        raise ValueError(
-            "model.mask_infeasible=False: with model=afterstate expected true; its choices are feasible ones."
-        )
-    return AfterstatePolicy(cell, **settings)

@@ -44,7 +44,7 @@ def check_clips(place: str, bin_clip: float | None, tote_clip: float | None, flo
 class Conv4dParameters(nn.Module):
     """Weight ``[out, in, k, k, k, k]`` and bias ``[out]`` of a 4D convolution, drawn as `nn.Conv2d` does.
 
-    The kernel's axes are pick x, pick y, place x, place y. It only holds them: `Conv4dPolicy` computes.
+    The kernel's axes are pick x, pick y, place x, place y. It only holds them: `Conv4dNet` computes.
     """
 
     def __init__(self, in_channels: int, out_channels: int, kernel: int):
@@ -56,7 +56,7 @@ class Conv4dParameters(nn.Module):
         nn.init.uniform_(self.bias, -bound, bound)
 
 
-class Conv4dPolicy(nn.Module):
+class Conv4dNet(nn.Module):
     """Logits of every (pick, place, rotation) from local information (the paper's policy network).
 
     Clip (eq. 4), floor, pad by 2 cells (bin -1, tote 0), broadcast to two 4D channels; then valid 4D
@@ -302,7 +302,7 @@ class Conv4dCritic(nn.Module):
         tote_size: ``(W_T, D_T, ...)``; likewise.
         filters: channels of the 2D convolutions.
         hidden: width of the fully connected layer.
-        bin_clip, tote_clip, floor: as in `Conv4dPolicy`.
+        bin_clip, tote_clip, floor: as in `Conv4dNet`.
         depth_scale: the two unclipped figures are divided by it.
         compute_dtype: of all but the last layer, ``float32`` or ``bfloat16``; parameters and values stay float32.
     """

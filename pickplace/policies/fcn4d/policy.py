@@ -5,37 +5,32 @@ import math
 import torch
 from torch import Tensor, nn
 
-from pickplace.policies.base import MASKED, Policy
-from pickplace.policies.fcn4d.network import Conv4dPolicy
+from pickplace.policies.actions import ActionPolicy
+from pickplace.policies.base import MASKED
+from pickplace.policies.fcn4d.network import Conv4dNet
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_flat
-from pickplace.rules.masks import PlacingMaps
 from pickplace.rules.state import Observation
 
 FEW_PLACES = 64  # up to 8x8, single pairs of a pick and a place are faster than all places of a pick
 
 
-class ActionPolicy(Policy):
-    """Chooses among all ``N_a`` flat actions (config ``model=fcn4d``; Sec. III of the paper).
+class Conv4dPolicy(ActionPolicy):
+    """Chooses among all ``N_a`` flat actions, by the paper's network.
 
     Args:
         cell: the sizes.
         mask_infeasible: choose among feasible actions only (the paper does not).
-        network: arguments of :class:`~pickplace.policies.fcn4d.network.Conv4dPolicy`.
+        network: arguments of :class:`~pickplace.policies.fcn4d.network.Conv4dNet`.
     """
 
-    choice_key = "action"
-    needs_sizes = True
-    score_index: str | None = (
-        "(((x_B * D_B + y_B) * W_T + x_T) * D_T + y_T) * R + r: pick cell, place cell, quarter turns"
-    )
-    network: Conv4dPolicy
+    network: Conv4dNet
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
-        super().__init__(cell, masks=("action",) if mask_infeasible else ())
-        self.network = Conv4dPolicy(4, **network)  # of which the first R count: the weights serve fewer rotations too
+        super().__init__(cell, mask_infeasible)
+        self.network = Conv4dNet(4, **network)  # of which the first R count: the weights serve fewer rotations too
 
-    def scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
+    def action_scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
         """Return logits ``[N, N_a]``, of the actions that a mask allows if there is one."""
         maps, rotations = (observation["bin_depth"], observation["tote_depth"]), self.cell.rotations
         if mask is None:
@@ -70,38 +65,38 @@ class ActionPolicy(Policy):
     def acting_bytes(self) -> int:
         return 40 * self.cell.num_actions
 
-    def logits(self, observation: Observation) -> Tensor:
-        return self.scores(observation, observation["action_mask"] if self.masks else None)
+    def check_sizes(self) -> list[str]:
+        """Check the paper's conditions on sizes.
+
+        Raises:
+            ValueError: where one is not met: this policy cannot learn then.
+        """
+        if found := super().check_sizes():
+            raise ValueError(" ".join(found))
+        return found
+
+
+class Fcn4d(Conv4dPolicy):
+    """The paper's policy (config ``model=fcn4d``; Sec. III); arguments as of :class:`Conv4dPolicy`."""
+
+    score_index = "(((x_B * D_B + y_B) * W_T + x_T) * D_T + y_T) * R + r: pick cell, place cell, quarter turns"
 
     def unmasked_scores(self, observation: Observation) -> Tensor:
-        return self.scores(observation)
-
-    def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        return choice
-
-    def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
-        return action
-
-    def action_log_probs(self, observation: Observation) -> Tensor:
-        return self.scores(observation).log_softmax(-1)
-
-    def best_feasible(self, observation: Observation, maps: PlacingMaps | None = None) -> Tensor:
-        return self.scores(observation, self.feasible(observation, maps)).argmax(1)
+        """Return the scores of all flat actions, float32 ``[N, N_a]``; bins and totes may have any size."""
+        return self.action_scores(observation)
 
 
-class TypicalPolicy(ActionPolicy):
+class Typical(Conv4dPolicy):
     """``fcn4d`` with one fully connected layer over all logits (config ``model=typical``; Sec. IV of the paper).
 
     The layer is a square of side ``N_a``, so that it is tied to the sizes that it is trained at, and its memory grows
     with the fourth power of the tote's side: 50 MB at ``6x6``, 400 MB at ``10x10``, 32 GB at ``30x30`` with ``R=4``.
 
-    Args: as :class:`ActionPolicy`.
+    Args: as :class:`Conv4dPolicy`.
 
     Raises:
         ValueError: for a layer that memory does not hold.
     """
-
-    score_index = None  # its last layer serves one size
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
         super().__init__(cell, mask_infeasible, **network)
@@ -114,12 +109,12 @@ class TypicalPolicy(ActionPolicy):
                 "not hold; expected a smaller env.tote_size or env.bin_size."
             ) from error
 
-    def scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
-        logits = self.join(super().scores(observation))
+    def action_scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
+        logits = self.join(super().action_scores(observation))
         return logits if mask is None else torch.where(mask, logits, MASKED)
 
     # The last layer joins all logits.
-    choice_logits = Policy.choice_logits
+    choice_logits = ActionPolicy.choice_logits
 
     def learning_bytes(self, samples: int | None = None) -> int:
         return super().learning_bytes()

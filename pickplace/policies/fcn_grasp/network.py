@@ -6,12 +6,11 @@ from torch import Tensor, nn
 
 from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_number
 from pickplace.policies.depth import Contents, clip_depth
+from pickplace.policies.footprints import every_footprint
 from pickplace.rules.cell import reference_cell
 from pickplace.rules.grasps import split_footprint
 from pickplace.rules.state import Item, item_from_depth
 
-#: Entries of the observation that the networks of ``fcn_grasp`` read.
-MAP_KEYS = ("bin_depth", "tote_depth", "tote_bearing")
 DTYPES = ("auto", "float32", "bfloat16")
 CHUNK_BYTES = 2**29  # inputs of the first layer that are held at a time when gradients are off
 MAX_LEVELS = 255  # levels are uint8
@@ -200,13 +199,6 @@ class FootprintFcn(nn.Module):
             begin = reference_cell(side) - reference_cell(size)
             maps.append((tap >= begin) & (tap < begin + size))
         return (maps[0][:, None, :, None] & maps[1][None, :, None]).flatten(2)
-
-
-def every_footprint(tote_depth: Tensor, parities: int) -> tuple[Tensor, Tensor]:
-    """Return row and index of every footprint of totes ``[N, W_T, D_T]``, int64 ``[N * parities * W_T * D_T]`` each."""
-    batch, wide, long = tote_depth.shape  # not len(), of which torch.export would make a constant
-    row, footprint = (torch.arange(size, device=tote_depth.device) for size in (batch, parities * wide * long))
-    return row[:, None].expand(batch, footprint.shape[0]).flatten(), footprint.expand(batch, -1).flatten()
 
 
 def matrix_dtype(name: str, device: str) -> torch.dtype:

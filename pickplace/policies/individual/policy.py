@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 
 from pickplace.policies.base import MASKED, Policy, pick_one, refuse_several_items
-from pickplace.policies.fcn4d.policy import ActionPolicy
-from pickplace.policies.fcn_grasp.policy import FootprintPolicy, GraspPolicy, count_ways
+from pickplace.policies.fcn4d.policy import Fcn4d
+from pickplace.policies.fcn_grasp.network import FootprintFcn
+from pickplace.policies.fcn_grasp.policy import UnmaskedFcnGrasp
+from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintScorer, count_ways
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import heuristic_pick, join_pick, pick_classes, select_pick
 from pickplace.rules.masks import PlacingMaps, action_footprints
@@ -31,6 +33,7 @@ class PlaceRotationPolicy(Policy):
 
     choice_key = "place_rotation"
     excludes: str | None = EXCLUDES
+    check_cell = refuse_several_items
 
     @abstractmethod
     def place_scores(self, observation: Observation, pick: Tensor) -> Tensor:
@@ -59,35 +62,31 @@ class PlaceRotationPolicy(Policy):
         pick = self._pick(observation)
         return spread_over_actions(self.cell, self.place_scores(observation, pick).log_softmax(-1), pick)
 
-    best_feasible = Policy.best_feasible  # that of :class:`ActionPolicy` scores every pick
+    best_feasible = Policy.best_feasible  # that of :class:`Fcn4d` scores every pick
 
 
-class IndividualRlPolicy(PlaceRotationPolicy, ActionPolicy):
+class IndividualRl(PlaceRotationPolicy, Fcn4d):
     """``individual_rl``, with which the paper compares: only place and rotation are learnt (Sec. IV).
 
     The network is that of ``fcn4d``; its features after the last ``3x3x3x3`` convolution are selected at the pick cell,
     so that nothing else of them is computed.
 
-    Args: as :class:`~pickplace.policies.fcn4d.policy.ActionPolicy`.
+    Args: as :class:`~pickplace.policies.fcn4d.policy.Fcn4d`.
     """
-
-    def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
-        refuse_several_items(cell, "model=individual_rl")
-        super().__init__(cell, mask_infeasible, **network)
 
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
         actions = join_pick(self.cell, self._pick(observation)[:, None], choices)
-        return ActionPolicy.choice_logits(self, observation, actions)
+        return Fcn4d.choice_logits(self, observation, actions)
 
     def place_scores(self, observation: Observation, pick: Tensor) -> Tensor:
         logits = self.network(observation["bin_depth"], observation["tote_depth"], pick).unflatten(1, (-1, 4))
         return logits[..., : self.cell.rotations].flatten(1)
 
 
-class IndividualGraspPolicy(PlaceRotationPolicy, GraspPolicy):
+class UnmaskedIndividualGrasp(PlaceRotationPolicy, UnmaskedFcnGrasp):
     """``individual_grasp`` without a mask: the network of ``fcn_grasp`` scores where the heuristic pick can place.
 
-    Args: as :class:`~pickplace.policies.fcn_grasp.policy.GraspPolicy`.
+    Args: as :class:`~pickplace.policies.fcn_grasp.policy.UnmaskedFcnGrasp`.
     """
 
     def place_scores(self, observation: Observation, pick: Tensor) -> Tensor:
@@ -96,21 +95,23 @@ class IndividualGraspPolicy(PlaceRotationPolicy, GraspPolicy):
         return self.class_scores(observation)[row, classes].transpose(1, 2).flatten(1)
 
 
-class IndividualFootprintPolicy(FootprintPolicy):
+class IndividualGrasp(FootprintScorer):
     """``individual_grasp`` with a mask: chooses among the distinct footprints that the heuristic pick reaches.
 
     In a state in which none of them is feasible it chooses among them all; the action then fails.
 
-    Args: as :class:`~pickplace.policies.fcn_grasp.policy.FootprintPolicy`.
+    Args: as :class:`~pickplace.policies.fcn_grasp.policy.FcnGrasp`.
     """
 
-    masks = ("action",)
+    mask = "action"
     excludes = EXCLUDES
-    ranks_footprints = False
+    check_cell = refuse_several_items
+    score_index = FOOTPRINT_INDEX
+    network: FootprintFcn
 
-    def __init__(self, cell: CellSpec, **network):
-        refuse_several_items(cell, "model=individual_grasp")
-        super().__init__(cell, **network)
+    def __init__(self, cell: CellSpec, mask_infeasible: bool = True, **network):
+        super().__init__(cell, mask_infeasible)
+        self.network = FootprintFcn(**network)
 
     def _reached(self, observation: Observation, mask: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Return the heuristic pick, the footprints that it leaves, and those to choose among.
@@ -156,8 +157,6 @@ class IndividualFootprintPolicy(FootprintPolicy):
         return spread_over_actions(self.cell, score, pick)
 
 
-def individual_grasp(
-    cell: CellSpec, mask_infeasible: bool, **network
-) -> IndividualFootprintPolicy | IndividualGraspPolicy:
+def individual_grasp(cell: CellSpec, mask_infeasible: bool, **network) -> IndividualGrasp | UnmaskedIndividualGrasp:
     """Return individual planning with the network of ``fcn_grasp`` (config ``model=individual_grasp``)."""
-    return (IndividualFootprintPolicy if mask_infeasible else IndividualGraspPolicy)(cell, **network)
+    return (IndividualGrasp if mask_infeasible else UnmaskedIndividualGrasp)(cell, **network)

@@ -1,0 +1,154 @@
+"""The bases of policies that choose among footprints.
+
+A success leaves a tote that depends on the footprint alone; the grasp only decides whether it can be reached, and the
+mask knows that. Where bins hold several items, a choice is a pair of an item and a footprint, with the index
+``item * num_footprints + footprint``.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pickplace.envs.torchrl import MASKS
+from pickplace.policies.base import MAP_KEYS, MASKED, Policy, pick_one
+from pickplace.policies.depth import Contents
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.grasps import footprint_index
+from pickplace.rules.masks import (
+    PlacingMaps,
+    action_footprints,
+    actions_reaching,
+    first_action_reaching,
+    unchecked_maps,
+)
+from pickplace.rules.state import Observation, State, items_from_observation, listed_items
+from pickplace.rules.step import apply
+
+#: How an index of the scores of all footprints is made.
+FOOTPRINT_INDEX = (
+    "(parity * W_T + x) * D_T + y: minimum corner of the item in the tote; parity 1: turned by 90 degrees; of several "
+    "items one after the other"
+)
+
+
+def count_ways(choices: int, footprint: Tensor, allowed: Tensor) -> Tensor:
+    """Return how many of the allowed actions, bool ``[N, A]``, leave each footprint, int64 ``[N, choices]``.
+
+    Args:
+        choices: the number of footprints, over all items in a bin.
+        footprint: int64 ``[N, A]``, the footprint that each action leaves, or -1.
+    """
+    ways = footprint.new_zeros(len(footprint), choices + 1)
+    return ways.scatter_add_(1, footprint + 1, allowed.long())[:, 1:]
+
+
+def every_footprint(tote_depth: Tensor, parities: int) -> tuple[Tensor, Tensor]:
+    """Return row and index of every footprint of totes ``[N, W_T, D_T]``, int64 ``[N * parities * W_T * D_T]`` each."""
+    batch, wide, long = tote_depth.shape  # not len(), of which torch.export would make a constant
+    row, footprint = (torch.arange(size, device=tote_depth.device) for size in (batch, parities * wide * long))
+    return row[:, None].expand(batch, footprint.shape[0]).flatten(), footprint.expand(batch, -1).flatten()
+
+
+class FootprintScorer(Policy):
+    """Scores footprints by a network with a method ``at``; a subclass chooses among some of them.
+
+    Args:
+        cell: the sizes.
+        mask_infeasible: must be true, as the choices come from what is feasible.
+
+    Attributes:
+        mask: the mask that it needs in training.
+
+    Raises:
+        ValueError: without a mask.
+    """
+
+    choice_key = "footprint"
+    map_keys = MAP_KEYS
+    mask: str
+    network: Any
+
+    def __init__(self, cell: CellSpec, mask_infeasible: bool = True):
+        if not mask_infeasible:
+            raise ValueError(
+                f"model.mask_infeasible=False: expected true with {type(self).__name__}; its choices are feasible ones."
+            )
+        super().__init__(cell, masks=(self.mask,))
+        if cell.bin_items > 1:
+            self.in_keys.append("items")
+
+    def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
+        """Return the scores of some footprints, float32 ``[M]``; a subclass may add what further terms tell.
+
+        Args:
+            row: int64 ``[M]``, index of the problem.
+            footprint: int64 ``[M]``, index ``(parity * W_T + x) * D_T + y``; of several items that of a choice.
+        """
+        bins, totes, bearing = (observation[key] for key in MAP_KEYS)
+        contents = None
+        if (items := listed_items(observation)) is not None:
+            places = self.cell.parities * totes.shape[1] * totes.shape[2]
+            number = footprint // places
+            contents = Contents(items, number)
+            footprint = footprint - number * places
+        return self.network.at(bins, totes, bearing, row, footprint, contents)[:, 0]
+
+    def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
+        """Return logits of the footprints that a mask ``[N, M * Q * W_T * D_T]`` allows; the others are not
+        computed."""
+        row, footprint = mask.nonzero(as_tuple=True)
+        scores = self.scores(observation, row, footprint)
+        return scores.new_full(mask.shape, MASKED).index_put((row, footprint), scores)
+
+    def unmasked_scores(self, observation: Observation) -> Tensor:
+        """Return the scores of all footprints, float32 ``[N, scores]``; bins and totes may have any size."""
+        totes, items = observation["tote_depth"], listed_items(observation)
+        parities = self.cell.parities * (1 if items is None else items.x.shape[1])  # of each item
+        return self.scores(observation, *every_footprint(totes, parities)).view(totes.shape[0], -1)
+
+    def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
+        row = torch.arange(len(choices), device=choices.device).repeat_interleave(choices.shape[1])
+        return self.scores(observation, row, choices.flatten()).view(choices.shape)
+
+    def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
+        step = apply(self.cell, State.from_observation(observation), action)
+        x, y, w, _ = step.footprint.unbind(-1)
+        turned = (w != step.item.w).long()  # a square item is the same either way
+        footprint = footprint_index(self.cell.tote_size, turned, x, y)
+        return footprint if step.taken is None else footprint + step.taken * self.cell.num_footprints
+
+
+class FootprintPolicy(FootprintScorer):
+    """Chooses among the footprints that its mask allows; arguments as of :class:`FootprintScorer`."""
+
+    mask = "footprint"
+    excludes: str | None = "failed picks and footprints outside the tote"
+
+    def ranked(self, maps: PlacingMaps) -> Tensor:
+        """Return the footprints among which it chooses, bool ``[N, M * Q * W_T * D_T]``; some, if any is feasible."""
+        return MASKS[self.mask].make(self.cell, maps)
+
+    def logits(self, observation: Observation) -> Tensor:
+        return self.footprint_logits(observation, observation[f"{self.mask}_mask"])
+
+    def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
+        maps = unchecked_maps(self.cell, State.from_observation(observation))  # the mask has looked
+        return pick_one(actions_reaching(self.cell, maps, choice))
+
+    def action_log_probs(self, observation: Observation) -> Tensor:
+        """Return the distribution over flat actions ``[N, N_a]``.
+
+        An action whose pick misses, or whose item leaves the tote, has no footprint, so probability 0.
+        """
+        footprint = action_footprints(self.cell, items_from_observation(observation))
+        scores = self.unmasked_scores(observation)
+        ways = count_ways(scores.shape[1], footprint, footprint >= 0)
+        logits = torch.where(ways > 0, scores, MASKED)
+        share = logits.log_softmax(-1) - ways.clamp(min=1).log()
+        return torch.where(footprint >= 0, share.gather(1, footprint.clamp(min=0)), MASKED)
+
+    def best_feasible(self, observation: Observation, maps: PlacingMaps | None = None) -> Tensor:
+        maps = self.maps_of(observation) if maps is None else maps
+        choice = self.footprint_logits(observation, self.ranked(maps)).argmax(1)
+        return first_action_reaching(self.cell, maps, choice)
