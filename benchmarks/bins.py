@@ -6,16 +6,13 @@ bin. Writes docs/results/bins.csv and docs/bins.png, and prints the table of doc
 
 import argparse
 import csv
-import json
-import subprocess
 import sys
 from pathlib import Path
 
-from common import console_command
+from common import ROOT, evaluate
 
 from pickplace.views.figures import COLOURS, INK, figure_of
 
-ROOT = Path(__file__).parents[1]
 TABLE, FIGURE, RUNS = ROOT / "docs" / "results" / "bins.csv", ROOT / "docs" / "bins.png", ROOT / "outputs" / "bins"
 COUNTS = (1, 2, 3, 5)
 TRAINED, MIXED = ["checkpoint={checkpoint}"], ["items=mixed", "env.tote_size=[8,8,8]"]
@@ -39,13 +36,10 @@ def measure(method: str, count: int, checkpoint: str) -> dict:
     folder = RUNS / Path(checkpoint).name / f"{method}-{count}"
     learned = folder.parent / f"learned-{count}" / "evaluation.json"
     words = [word.format(checkpoint=checkpoint) for word in METHODS[method][1]]
-    words += ["env.bin_size=[8,8,1]", f"env.bin_items={count}", "evaluation.replay=0", "threads=1"]
-    words += [f"hydra.run.dir={folder}"]
+    words += ["env.bin_size=[8,8,1]", f"env.bin_items={count}"]
     if method != "learned":
         words.append(f"compare={learned}")
-    if not (folder / "evaluation.json").is_file():
-        subprocess.run([console_command("pickplace-evaluate"), *words], check=True, stdout=subprocess.DEVNULL)
-    result = json.loads((folder / "evaluation.json").read_text())
+    result = evaluate(folder, *words)
     occupancy, paired = result["occupancy"], result.get("paired_difference")
     row = {"method": method, "bin_items": count, "episodes": result["episodes"], "ms": result["latency_ms"]["p50"]}
     row |= {"mean": occupancy["mean"], "low": occupancy["ci95"][0], "high": occupancy["ci95"][1]}

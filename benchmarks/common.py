@@ -1,9 +1,10 @@
-"""Shared by the benchmarks: one core, interleaved timing, medians with percentiles, and where results are written."""
+"""Shared by the benchmarks: running commands, one core, interleaved timing, percentiles, and where results go."""
 
 import json
 import os
 import platform
 import statistics
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -13,6 +14,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "ACTIVE")
 
 import torch  # noqa: E402
 
+ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -26,6 +28,19 @@ def use_one_core() -> None:
 def console_command(name: str) -> str:
     """Return the path of a command that this environment's packages install, such as ``pickplace-train``."""
     return str(Path(sys.executable).with_name(name))
+
+
+def run(name: str, *words: str) -> None:
+    """Run a command of the package in the root of the checkout."""
+    subprocess.run([console_command(name), *words], check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
+
+
+def evaluate(folder: Path, *words: str) -> dict:
+    """Return the ``evaluation.json`` in a folder; it is played unless that was done before."""
+    path = folder / "evaluation.json"
+    if not path.is_file():
+        run("pickplace-evaluate", *words, "evaluation.replay=0", "threads=1", f"hydra.run.dir={folder}")
+    return json.loads(path.read_text())
 
 
 def interleave(functions: dict, repeats: int, warmup: int = 2) -> dict[str, dict[str, float]]:

@@ -6,18 +6,15 @@ hours; `--match` plays some, such as `^cut1`, and the others stay as they are. `
 
 import argparse
 import csv
-import json
 import re
-import subprocess
 import sys
 import tempfile
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
-from common import console_command
+from common import ROOT, evaluate
 
-ROOT = Path(__file__).parents[1]
 TABLE, PAGE = ROOT / "docs" / "results" / "packing.csv", ROOT / "docs" / "benchmarks.md"
 PLATES = {"plate_3x3": 3, "plate_5x5": 5}
 SCALED = {"gopt_30": 3, "gopt_50": 5, "gopt_100": 10}  # times as many cells along each side as gopt_rs
@@ -66,7 +63,7 @@ class Row(NamedTuple):
         if self.benchmark in SCALED and self.effector in PLATES:  # the plate grows with the tote
             scale, side = SCALED[self.benchmark], PLATES[self.effector] * SCALED[self.benchmark]
             words += [f"env.effector_size=[{side},{side}]", f"env.cup_size=[{scale},{scale}]"]
-        return [*words, *PLANNERS[self.planner], "physics=settle", "evaluation.replay=0", "threads=1"]
+        return [*words, *PLANNERS[self.planner], "physics=settle"]
 
 
 def rows() -> list[Row]:
@@ -93,9 +90,7 @@ def rows() -> list[Row]:
 def play(row: Row) -> dict:
     """Return a line of the table."""
     with tempfile.TemporaryDirectory() as folder:
-        words = [console_command("pickplace-evaluate"), *row.words(), f"hydra.run.dir={folder}/run"]
-        subprocess.run(words, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
-        result = json.loads(Path(folder, "run", "evaluation.json").read_text())
+        result = evaluate(Path(folder, "run"), *row.words())
     occupancy, kept = result["occupancy"], result["physics"]["carried_out"]
     line = {**row._asdict(), "episodes": result["episodes"], "ms": result["latency_ms"]["p50"]}
     line |= {"mean": occupancy["mean"], "low": occupancy["ci95"][0], "high": occupancy["ci95"][1]}

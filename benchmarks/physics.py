@@ -14,9 +14,7 @@ and draws docs/physics.png.
 import argparse
 import csv
 import fcntl
-import json
 import re
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -26,6 +24,7 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from common import ROOT, evaluate, run
 
 from pickplace import PickPlaceEnv
 from pickplace.config.registry import build
@@ -33,7 +32,6 @@ from pickplace.evaluation.result import confidence95, proportion95
 from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement, read_plans
 from pickplace.rules.state import Item
 
-ROOT = Path(__file__).parents[1]
 TABLE, RUNS = ROOT / "docs" / "results" / "physics.csv", ROOT / "outputs" / "physics"
 ITEMS = {"kinds": "6x6x5", "mixed": "8x8x8", "tall": "6x6x5"}
 RULES = ("half", "more_than_half", "hull", "bearing", "bearing+0.25", "full")  # and the margin after the +
@@ -131,31 +129,22 @@ def plan(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
     """Return the occupancy by the rules, and the plans, of episodes; they are played unless that was done before."""
     if (words := METHODS[cell.method]) is None:
         return pack_without_gripper(cell, totes)
-    if not (cell.folder / "plans.jsonl").is_file():
-        name, _, margin = cell.support.partition("+")
-        rule = f"{{_target_: {name}, margin: {margin or 0}}}" if name in ("hull", "bearing") else name
-        weights = "mixed" if cell.items == "mixed" else f"r{cell.R}"
-        trained = RUNS / "train" / f"individual_grasp-R{cell.R}"
-        if cell.method == "individual_grasp" and not trained.exists():
-            training = ["experiment=quick", "model=individual_grasp", "curriculum.advance.max_frames_per_level=50_000"]
-            run("pickplace-train", *training, f"env.rotations={cell.R}", f"hydra.run.dir={trained}")
-        run(
-            "pickplace-evaluate", *(word.format(R=cell.R, weights=weights) for word in words),
-            f"items={cell.items}", f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"env.rotations={cell.R}",
-            f"env.support={rule}", "evaluation.episodes=200",
-            "evaluation.plans=true", "evaluation.replay=0", "evaluation.latency_decisions=0", "threads=1",
-            f"hydra.run.dir={cell.folder}",
-        )  # fmt: skip
-    occupancy = json.loads((cell.folder / "evaluation.json").read_text())["occupancy"]["per_episode"][:totes]
+    trained = RUNS / "train" / f"individual_grasp-R{cell.R}"
+    if cell.method == "individual_grasp" and not trained.exists():
+        training = ["experiment=quick", "model=individual_grasp", "curriculum.advance.max_frames_per_level=50_000"]
+        run("pickplace-train", *training, f"env.rotations={cell.R}", f"hydra.run.dir={trained}")
+    rule, _, margin = cell.support.partition("+")
+    weights = "mixed" if cell.items == "mixed" else f"r{cell.R}"
+    result = evaluate(
+        cell.folder, *(word.format(R=cell.R, weights=weights) for word in words),
+        f"items={cell.items}", f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"env.rotations={cell.R}",
+        f"support={rule}", *([f"env.support.margin={margin or 0}"] if rule in ("hull", "bearing") else []),
+        "evaluation.episodes=200", "evaluation.plans=true", "evaluation.latency_decisions=0",
+    )  # fmt: skip
+    occupancy = result["occupancy"]["per_episode"][:totes]
     plans = {one.episode: one for one in read_plans(cell.folder / "plans.jsonl")}
     empty = replace(next(iter(plans.values())), placements=[])  # an episode without placements has no line
     return occupancy, [plans.get(number, replace(empty, episode=number)) for number in range(totes)]
-
-
-def run(program: str, *words: str) -> None:
-    """Run a command of the package."""
-    command = [str(Path(sys.executable).with_name(program)), *words]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
 
 
 def planned_placements(env: PickPlaceEnv) -> Iterator[tuple[Item, int, int, int, int, int]]:

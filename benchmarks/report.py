@@ -9,7 +9,7 @@ PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 HEAD = """# Performance
 
 Written by `make bench` from `benchmarks/results/`. Times are medians, with the 10th to 90th percentile in brackets.
-Peers run in turn with ours, on an idle machine. "All cores" means `threads=null OMP_WAIT_POLICY=ACTIVE`.
+The peer runs in turn with ours, on an idle machine. "All cores" means `threads=null OMP_WAIT_POLICY=ACTIVE`.
 The figures are of `env=paper`, the default when they were measured.
 """
 
@@ -37,19 +37,16 @@ def section(title: str, *paragraphs: str) -> str:
 
 def learning(result: dict) -> str:
     marks = list(result["ours"][0]["reached"])
-    runs = [(f"pickplace, seed {run['seed']}", run) for run in result["ours"]]
-    if result["peer"]:
-        runs.append((result["peer"]["name"], result["peer"]))
     rows = []
-    for name, run in runs:
+    for run in result["ours"]:
         seconds, frames, occupancy = run["curve"][-1]
         cells = [f"{value:.0f} s" if value else "never" for value in run["reached"].values()]
-        rows.append([name, *cells, f"{occupancy:.3f}", f"{seconds:.0f} s, {frames:,} frames"])
+        rows.append([run["seed"], *cells, f"{occupancy:.3f}", f"{seconds:.0f} s, {frames:,} frames"])
     return section(
         "Time until the tote is packed well",
         "`experiment=quick` at `6x6x5`, `R=4`, on all cores, from the start of the process. Every 50,000 "
-        "frames 128 episodes are played for validation. Settings of the peer: `benchmarks/learning.py`.",
-        table(f"method | {' | '.join(f'until {mark}' for mark in marks)} | last occupancy | after", rows),
+        "frames 128 episodes are played for validation. All seeds but the first stop at the last mark.",
+        table(f"seed | {' | '.join(f'until {mark}' for mark in marks)} | last occupancy | after", rows),
     )
 
 
@@ -81,21 +78,6 @@ def workers(result: dict) -> str:
     )
 
 
-def neighbours(result: dict) -> str:
-    speeds = result["frames per second"]
-    rows = [
-        (case, *(f"{row[when]:,.0f}" for when in ("idle", "busy")), f"{row['busy'] / row['idle']:.0%}")
-        for case, row in speeds.items()
-    ]
-    return section(
-        "Busy neighbours",
-        "Frames/s of a training with `experiment=quick`, alone and beside two processes that keep 2 cores busy; the "
-        f"median batch of {result['repeats']} trainings. The commands let waiting threads sleep "
-        "(`OMP_WAIT_POLICY=PASSIVE`). With `ACTIVE` they spin: faster on an idle machine, slower on a busy one.",
-        table("training | alone | beside two | share", rows),
-    )
-
-
 def environment(result: dict) -> str:
     rows = []
     for batch, row in result["batches"].items():
@@ -108,38 +90,6 @@ def environment(result: dict) -> str:
         "`step_and_maybe_reset` with the mask over all 3,600 actions, at the paper's sizes. The peer, "
         f"{result['peer'] or 'not installed'}, plays `BinPack-v2`, a different task.",
         table("batch | ms | steps/s | peer, ms | peer, steps/s | ratio", rows),
-    )
-
-
-def collector(result: dict) -> str:
-    rows = (
-        (name, time(row["raw loop"]), time(row["collector"]), f"{row['added ms']:.2f}")
-        for name, row in result["rows"].items()
-    )
-    return section(
-        "Collector",
-        "A vector step with random feasible actions, in a plain loop and through the `Collector`, which keeps all "
-        "frames. `fcn_grasp` trains on footprint masks (72 entries), `fcn4d` on action masks (3,600 entries).",
-        table("batch, mask | loop, ms | collector, ms | added, ms", rows),
-    )
-
-
-def conv4d(result: dict) -> str:
-    parts = []
-    for title, row in result["cases"].items():
-        rows = []
-        for name, figures in row["forward"].items():
-            both, share = row["forward and backward"].get(name), figures.get("share of matrix product")
-            cells = [name, time(figures), f"{figures['ratio']:.1f}", f"{share:.0%}" if share else ""]
-            cells += [time(both), f"{both['ratio']:.1f}"] if both else ["", ""]
-            rows.append([*cells, row["peak MiB, forward"][name]])
-        head = "variant | forward, ms | speed-up | of peak | with backward, ms | speed-up | MiB"
-        parts += [f"{title}:", table(head, rows)]
-    return section(
-        "`fcn4d` against a naive 4D convolution",
-        "*Masked*: logits of what a mask allows only. *Of peak*: operations a second, as a share of a "
-        "2048x2048 matrix product's of the same type. *MiB*: peak of a forward pass, beyond inputs and weights.",
-        *parts,
     )
 
 
@@ -164,7 +114,7 @@ def startup(result: dict) -> str:
 def main() -> None:
     sections: list[str] = []
     machines: dict[str, list[str]] = {}
-    for write in (learning, training, neighbours, workers, environment, collector, conv4d, decision, startup):
+    for write in (learning, training, workers, environment, decision, startup):
         path = RESULTS / f"{write.__name__}.json"
         if path.is_file():
             result = json.loads(path.read_text())
