@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from pickplace.robot.planner import Plan, Planner
     from pickplace.robot.scene import Scene
     from pickplace.rules.cell import CellSpec
-    from pickplace.rules.state import Failure, Item, State
+    from pickplace.rules.item import Item
+    from pickplace.rules.state import Failure, State
 
 gymnasium.register(
     "pickplace/PickPlace-v0",
@@ -39,7 +40,7 @@ _MODULES = {
     "CellSpec": "rules.cell",
     "DepthMapError": "robot.box",
     "Failure": "rules.state",
-    "Item": "rules.state",
+    "Item": "rules.item",
     "PickPlaceEnv": "envs.torchrl",
     "Plan": "robot.planner",
     "Planner": "robot.planner",

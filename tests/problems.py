@@ -58,7 +58,8 @@ def state_of(*cases: Case) -> State:
         torch.from_numpy(np.stack([getattr(case, key) for case in cases])) for key in ("heights", "bearing")
     )
     items = torch.tensor([case.item for case in cases])
-    return State(surface_from(heights, bearing), torch.tensor([case.rim for case in cases]), Item(*items.unbind(1)))
+    rims = torch.tensor([case.rim for case in cases])
+    return State(surface_from(heights, bearing), rims, Item.from_table(items[:, None]))
 
 
 def oracle_of(cell: CellSpec, case: Case) -> Oracle:
@@ -176,7 +177,7 @@ def late_state(steps=8, **settings):
 def results_by_hand(env, observation, row: int) -> dict[int, tuple[int, int, int, int, int, int]]:
     """Return every feasible flat action of a problem, in plain Python: ``{action: (top, y, x, w, d, number)}``, of
     where the item comes to lie, and its number in the bin."""
-    first, *others = [tuple(item) for item in env.state.items.table[row].tolist() if item[4]]
+    first, *others = [tuple(item) for item in env.state.items.cuboids[row].tolist() if item[4]]
     heights, bearing = env.state.heights[row].numpy(), env.state.bearing[row].int().numpy()
     case = Case(int(env.tote_height[row]), heights, bearing, first, tuple(others))
     plain, found = oracle_of(env.cell, case), {}

@@ -120,9 +120,8 @@ class WarmStart:
         # A policy with a pick of its own may not reach the same footprint.
         action = self.policy.to_action(choice, data).clamp(min=0)
         reached = apply(self.cell, state, action)
-        same = (reached.footprint == wanted.footprint).all(1) & (reached.failure == 0) & (wanted.failure == 0)
-        if reached.taken is not None:
-            same &= reached.taken == wanted.taken
+        same = (reached.footprint == wanted.footprint).all(1) & (reached.taken == wanted.taken)
+        same &= (reached.failure == 0) & (wanted.failure == 0)
         return torch.where(same, choice, -1)
 
 

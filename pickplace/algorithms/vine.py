@@ -60,14 +60,14 @@ def vine_advantages(
 
 
 def _arrivals(frames: TensorDictBase) -> Item:
-    """Return an item for each frame, drawn from those that arrived after a success; without any, the frames' own."""
+    """Return an item for each frame, ``[B, 1]``: one that arrived after some success; without any, the frame's own."""
     after = frames["next"]
     placed = (after["failure"] == Failure.NONE) | (after["failure"] == Failure.STUCK)
     rows = (placed & (after["bin_depth"].flatten(1) > 0).any(1, keepdim=True)).nonzero()[:, 0]
     if not len(rows):
-        return State.from_observation(frames).item
+        return State.from_observation(frames).items
     draw = torch.randint(len(rows), (len(frames),), device=rows.device)
-    return State.from_observation(after[rows[draw]]).item
+    return State.from_observation(after[rows[draw]]).items
 
 
 def _values(
@@ -91,7 +91,7 @@ def _values(
     after = State(step.surface, state.tote_height, items.rows(row))
     placed = step.failure == 0
     goes_on = placed & footprint_mask(cell, placing_maps(cell, after)).flatten(1).any(1)
-    value = placed * state.item.volume * reward_scale
+    value = placed * step.item.volume * reward_scale
     if goes_on.any():
         after = after.rows(goes_on.nonzero()[:, 0])
         seen = TensorDict(observe(terms, cell, after, critic.in_keys), [len(after.tote_height)])

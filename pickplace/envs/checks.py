@@ -9,8 +9,9 @@ import torch
 from pickplace.items.distributions import ItemDistribution
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import available_offsets
+from pickplace.rules.item import Item
 from pickplace.rules.masks import footprint_mask, placing_maps
-from pickplace.rules.state import EMPTY, Item, State
+from pickplace.rules.state import EMPTY, State
 
 MAX_POSITIONS = 2_000_000  # of items in the bin, all kinds together, that are checked one by one
 
@@ -69,7 +70,7 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
     # Positions in which the end effector can hold an item in the same ways have the same feasible footprints.
     distinct: dict[bytes, int] = {}
     for numbers in torch.arange(len(rows)).split(max(1, 2**22 // (cell.rotations * cell.num_offsets**2))):
-        available, _ = available_offsets(cell, Item(*rows[numbers, :5].unbind(-1)))  # [K, M]
+        available, _ = available_offsets(cell, Item.from_table(rows[numbers, :5]))  # [K, M]
         ways = np.packbits(available.numpy(), axis=0).T
         sizes = rows[numbers, 2 : 4 if cell.limits is None else 5].contiguous()
         keys = np.concatenate([sizes.numpy().view(np.uint8), ways], 1)
@@ -77,9 +78,9 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
         for index in sorted(first.tolist()):
             distinct.setdefault(keys[index].tobytes(), int(numbers[index]))
     for chunk in rows[list(distinct.values())].split(max(1, min(1024, 2**24 // cell.num_footprints))):
-        item = Item(*chunk[:, :5].unbind(-1))
+        items = Item.from_table(chunk[:, None, :5])
         empty = torch.full((len(chunk), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
-        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), item))
+        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), items))
         feasible = footprint_mask(cell, maps).flatten(1).any(1)
         if not feasible.all():
             x, y, *_, kind = chunk[~feasible][0].tolist()

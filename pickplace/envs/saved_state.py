@@ -7,8 +7,10 @@ from torch import Tensor
 
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.distributions import MAX_SEED
+from pickplace.rules.bin import select_item
+from pickplace.rules.item import Item, bin_labels_from_items
 from pickplace.rules.observation import observe, standard_terms
-from pickplace.rules.state import Item, State, bin_labels_from_items
+from pickplace.rules.state import State
 from pickplace.runs.checkpoint import CheckpointError
 
 
@@ -54,18 +56,19 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     check("steps", (steps >= 0) & (steps <= volume), "at most one for each unit of volume")
     check("episode", episode >= 0, "at least 0")
     check("item_seed", (seed >= 0) & (seed < MAX_SEED), "at least 0 and below 2**62")
-    if cell.bin_items == 1:
-        item = env.items.sample(env.stream, seed.expand_as(episode), episode, steps, cell.bin_size)
-        check("item", saved["item"] == item.table, "the item of this episode and step")
-    else:
-        items, limits = state.item, torch.tensor(cell.bin_size[:2])
-        corner, size = saved["item"][..., :2], saved["item"][..., 2:4]
-        check("item", (corner >= 0) & (size >= 0) & (corner + size <= limits), "items inside the bin")
-        sizes = torch.cat([env.items.sizes, torch.zeros(1, 3, dtype=torch.int64)])
-        check("item", (saved["item"][..., None, 2:] == sizes).all(-1).any(-1), "sizes of the distribution")
-        covered = (bin_labels_from_items(items, cell.bin_size) > 0).sum((1, 2))
-        check("item", covered == (items.w * items.d).sum(1), "items that do not overlap")
-        check("arrived", saved["arrived"] == steps + (items.h > 0).sum(1), "the items placed and those in the bin")
+    items, limits = state.items, torch.tensor(cell.bin_size[:2])
+    corner, size, cuboids = saved["item"][..., :2], saved["item"][..., 2:4], items.cuboids
+    check("item", (corner >= 0) & (size >= 0) & (corner + size <= limits), "items inside the bin")
+    sizes = torch.cat([env.items.sizes, torch.zeros(1, 3, dtype=torch.int64)])
+    check("item", (cuboids[..., None, 2:] == sizes).all(-1).any(-1), "sizes of the distribution")
+    covered = (bin_labels_from_items(items, cell.bin_size) > 0).sum((1, 2))
+    check("item", covered == (items.w * items.d).sum(1), "items that do not overlap")
+    count = (~items.is_empty).sum(1)
+    check("arrived", saved["arrived"] == steps + count, "the items placed and those in the bin")
+    newest = select_item(items, (count - 1).clamp(min=0)).table
+    arrival = env.items.sample(env.stream, seed.expand_as(episode), episode, saved["arrived"] - 1, cell.bin_size)
+    same = (newest == arrival.table)[:, 2:].all(1)  # wherever it lies
+    check("item", same | (count == 0), "the newest item of this episode")
     seen = observe(standard_terms(cell.bin_items), cell, state)
     seen["occupancy"] = (volume / cell.tote_volume(tote_height))[:, None]
     seen |= {key: torch.zeros(len(steps), 1) for key in ("failure", "done", "terminated", "truncated")}

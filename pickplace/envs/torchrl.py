@@ -18,9 +18,10 @@ from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDi
 from pickplace.rules.bin import remove_item
 from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.rules.corners import corner_mask
+from pickplace.rules.item import Item
 from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, placing_maps
 from pickplace.rules.observation import Term, check_terms, observe
-from pickplace.rules.state import EMPTY, Failure, Item, State
+from pickplace.rules.state import EMPTY, Failure, State
 from pickplace.rules.step import apply
 
 CACHE_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes
@@ -139,10 +140,8 @@ class PickPlaceEnv(EnvBase):
         # All run-time state, in buffers, so that state_dict() has it.
         self.register_buffer("surface", zeros(*cell.tote_size[:2], dtype=torch.int32) + EMPTY)
         self.register_buffer("tote_height", zeros() + cell.tote_size[2])
-        several = cell.bin_items > 1
-        self.register_buffer("item", zeros(cell.bin_items, 5) if several else zeros(5))  # x, y, w, d, h
-        if several:
-            self.register_buffer("arrived", zeros())  # items of the episode so far
+        self.register_buffer("item", zeros(cell.bin_items, len(Item._fields)))
+        self.register_buffer("arrived", zeros())  # items of the episode so far
         self.register_buffer("volume", zeros())
         self.register_buffer("steps", zeros())
         self.register_buffer("episode", zeros())
@@ -234,17 +233,14 @@ class PickPlaceEnv(EnvBase):
         self.volume.masked_fill_(rows, 0)
         self.steps.masked_fill_(rows, 0)
         self.episode.add_(rows * self.episode_stride)
-        if self.cell.bin_items == 1:
-            self.item.copy_(torch.where(rows[:, None], self._arriving().table, self.item))
-            self._update_masks(rows, empty=True)
-        else:
-            self.item[rows], self.arrived[rows] = 0, 0
-            self._refill(rows)
-            self._update_masks(rows)
-            if (jammed := rows & ~self.feasible).any():  # the first one alone always has a feasible action
-                self.item[:, 1:] *= ~jammed[:, None, None]
-                self.arrived.copy_(torch.where(jammed, 1, self.arrived))
-                self._update_masks(jammed)
+        self.item.masked_fill_(rows[:, None, None], 0)
+        self.arrived.masked_fill_(rows, 0)
+        self._refill(rows)
+        self._update_masks(rows, empty=True)
+        if (jammed := rows & ~self.feasible).any():  # the first one alone always has a feasible action
+            self.item[:, 1:] *= ~jammed[:, None, None]
+            self.arrived.masked_fill_(jammed, 1)
+            self._update_masks(jammed, empty=True)
         done = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         return self._observation().update({"done": done, "terminated": done.clone(), "truncated": done.clone()})
 
@@ -262,13 +258,10 @@ class PickPlaceEnv(EnvBase):
         self.surface.copy_(step.surface)
         self.volume.add_(gained)
         self.steps.add_(placed)
-        if step.taken is None:
-            self.item.copy_(torch.where(placed[:, None], self._arriving().table, self.item))
-        else:
-            self.item.copy_(remove_item(state.item, step.taken, placed).table)
-            self._refill(placed)
+        self.item.copy_(remove_item(state.items, step.taken, placed).table)
+        self._refill(placed)
         self._update_masks(placed)
-        ended = placed & self.state.items.is_empty.all(1)  # the stream has no further item
+        ended = placed & self.current_items.is_empty.all(1)  # the stream has no further item
         stuck = placed & ~self.feasible & ~ended
         failure = torch.where(stuck, int(Failure.STUCK), step.failure)
         result = {
@@ -288,32 +281,26 @@ class PickPlaceEnv(EnvBase):
         super()._load_from_state_dict(*args, **kwargs)
 
     @property
-    def current_item(self) -> Item:
-        """The item that lies in each bin, ``[N]``; of several ``[N, M]``."""
+    def current_items(self) -> Item:
+        """The items that lie in each bin, ``[N, M]``."""
         return Item.from_table(self.item)
 
     @property
     def state(self) -> State:
         """The state of all problems."""
-        return State(self.surface, self.tote_height, self.current_item)
+        return State(self.surface, self.tote_height, self.current_items)
 
     @property
     def exact_occupancy(self) -> Tensor:
         """The volume placed / the volume of the tote, float64 ``[N]``."""
         return self.volume.double() / self.cell.tote_volume(self.tote_height)
 
-    def _arriving(self) -> Item:
-        """The item at each slot's (episode, step)."""
-        seed = self.item_seed.expand_as(self.episode)
-        return self.items.sample(self.stream, seed, self.episode, self.steps, self.cell.bin_size)
-
     def _refill(self, rows: Tensor) -> None:
         """Let items arrive in the bins in ``rows``, bool ``[N]``."""
-        index = rows.nonzero()[:, 0]
-        seed, episode, arrived = self.item_seed.expand_as(index), self.episode[index], self.arrived[index]
-        items = Item.from_table(self.item[index])
-        items, self.arrived[index] = refill(self.cell, self.items, self.stream, seed, episode, arrived, items)
-        self.item[index] = items.table
+        address = self.item_seed.expand_as(self.episode), self.episode, self.arrived
+        items, arrived = refill(self.cell, self.items, self.stream, *address, self.current_items, rows)
+        self.item.copy_(items.table)
+        self.arrived.copy_(arrived)
 
     def _update_masks(self, rows: Tensor, empty: bool = False):
         """Recompute the masks of the problems in ``rows``, bool ``[N]``; the others' states did not change.
@@ -338,7 +325,7 @@ class PickPlaceEnv(EnvBase):
 
     def _masks_of_empty_totes(self, surface: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
         """Return the same as :meth:`_masks_of`; episodes begin in few ways, so what was computed is kept."""
-        keys = [tuple(key) for key in torch.cat([item, tote_height[:, None]], 1).tolist()]
+        keys = [tuple(key) for key in torch.cat([item.flatten(1), tote_height[:, None]], 1).tolist()]
         if unseen := {key: row for row, key in enumerate(keys) if key not in self._starts}:
             rows = torch.tensor(list(unseen.values()))
             masks = self._masks_of(surface[rows], tote_height[rows], item[rows])

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from pickplace.common.validate import one_of, size_tuple
 from pickplace.items.distributions import ItemDistribution, check_count, check_range, hashed_uniform, place_at_random
-from pickplace.rules.state import Item
 
 #: Orders of arrival: CUT-1 and CUT-2.
 ORDERS = ("z", "stacking")
@@ -95,7 +94,7 @@ class Cut(ItemDistribution):
         )
         if len(self._kept) > max(KEPT_EPISODES, 2 * len(keys)):
             self._kept = {key: self._kept[key] for key in keys}
-        return Item(*(torch.where(item.is_empty, 0, part) for part in item))
+        return item.map(lambda part: torch.where(item.is_empty, 0, part))
 
     def _keep(self, stream: str, keys: list[tuple[str, int, int]]) -> None:
         """Cut the episodes of these keys, ``(stream, seed, episode)``, and keep the sizes of their items."""

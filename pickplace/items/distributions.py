@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pickplace.common.files import read_text
 from pickplace.common.validate import excerpt, flag, is_number, is_whole
-from pickplace.rules.state import Item
+from pickplace.rules.item import Item
 
 #: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
 STREAMS = ("train", "validation", "test")
@@ -50,12 +50,12 @@ def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, cou
     return ((key >> 11) & ((1 << 53) - 1)).double() / float(1 << 53)
 
 
-def place_at_random(size: Tensor, across: Tensor, along: Tensor, bin_size) -> Item:
+def place_at_random(size: Tensor, across: Tensor, along: Tensor, bin_size, kind: Tensor | None = None) -> Item:
     """Return items of given sizes, int64 ``[N, 3]``, in the bin, at places that two uniform numbers decide, ``[N]``."""
     w, d, h = size.unbind(-1)
     x = (across * (bin_size[0] - w + 1)).long()
     y = (along * (bin_size[1] - d + 1)).long()
-    return Item(x, y, w, d, h)
+    return Item(x, y, w, d, h, kind)
 
 
 def _is_length(value) -> bool:
@@ -97,12 +97,17 @@ class ItemDistribution:
 
     def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size) -> Item:
         """Return the ``step``-th item (from 0) of each ``episode``, int64 ``[N]``; size 0 after the last one."""
-        kind, across, along = hashed_uniform(stream, seed, episode, step, 3)
-        return place_at_random(self.sizes.to(step.device)[self._index(kind, step)], across, along, bin_size)
+        uniform, across, along = hashed_uniform(stream, seed, episode, step, 3)
+        kind = self._index(uniform, step)
+        return place_at_random(self.sizes.to(step.device)[kind], across, along, bin_size, kind)
 
     def _index(self, uniform: Tensor, step: Tensor) -> Tensor:
         """Return which row of ``sizes`` arrives, int64 ``[N]``."""
         raise NotImplementedError
+
+    def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size) -> Item:
+        """Return the ``rank``-th of ``count`` items for each seed, int64 ``[N]``; here simply independent ones."""
+        return self.sample("train", seed, rank, torch.zeros_like(rank), bin_size)
 
     def corners(self, kind: int, bin_size) -> list[tuple[int, int]]:
         """Return every bin position ``(x, y)`` at which kind number ``kind`` may arrive."""
@@ -156,7 +161,7 @@ class Kinds(ItemDistribution):
         start = hashed_uniform("train", seed, torch.full_like(rank, count), first, 1)[0]
         across, along = hashed_uniform("train", seed, rank, first, 2)
         kind = self._index((start + rank / count) % 1, first)
-        return place_at_random(self.sizes.to(rank.device)[kind], across, along, bin_size)
+        return place_at_random(self.sizes.to(rank.device)[kind], across, along, bin_size, kind)
 
 
 #: Greatest size of a recorded file, in bytes, and number of kinds: more would fill the memory.
@@ -235,12 +240,12 @@ class Recorded(ItemDistribution):
     def sample(self, stream, seed, episode, step, bin_size):
         item = super().sample(stream, seed, episode, step, bin_size)
         if self._corner is not None:
-            x, y = self._corner.to(step.device)[self._index(None, step)].unbind(-1)
+            x, y = self._corner.to(step.device)[item.kind].unbind(-1)
             item = item._replace(x=x, y=y)
         if self.length is None:
             return item
         left = step < self.length
-        return Item(*(torch.where(left, part, 0) for part in item))
+        return item.map(lambda part: torch.where(left, part, 0))
 
     def _index(self, uniform, step):
         return step % len(self.sizes) if self._loop else step.clamp(max=len(self.sizes) - 1)

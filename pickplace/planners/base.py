@@ -92,7 +92,7 @@ def restrict_items(rule: str, state: State, mask: Tensor) -> Tensor:
     """
     items = state.items
     count = items.x.shape[1]
-    if rule == "any" or count == 1:
+    if rule == "any":
         return mask
     mask = mask.unflatten(1, (count, -1))
     order = torch.arange(count, device=mask.device).expand_as(items.x)
@@ -116,7 +116,8 @@ def pick_first(cell: CellSpec, maps: PlacingMaps, rule: str) -> tuple[Tensor, Te
         int64, and whether it succeeds, bool.
     """
     pick = PICKS[rule](cell, maps.item, maps.blocked)
-    footprint = select_pick(cell, action_footprints(cell, maps.item, maps.blocked), pick)
+    alone = maps.item.rows((slice(None), None))
+    footprint = select_pick(cell, action_footprints(cell, alone, maps.blocked), pick)
     return pick, footprint, select_pick(cell, action_mask(cell, maps), pick)
 
 

@@ -188,8 +188,8 @@ def added_volume(cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:
 
     That is the item's volume and the empty space that it encloses below itself.
     """
-    each = state.each_item()
-    w, d = footprint_sizes(cell, each.item)
-    before = rectangle_sums((each.surface >> 1).permute(1, 2, 0)[None], w, d)
-    area = each.item.w * each.item.d
+    surface, _, item = state.each_item()
+    w, d = footprint_sizes(cell, item)
+    before = rectangle_sums((surface >> 1).permute(1, 2, 0)[None], w, d)
+    area = item.w * item.d
     return area.view(-1, 1, 1, 1) * maps.top - before.permute(3, 0, 1, 2)

@@ -42,11 +42,10 @@ class IndividualHeuristic(MapPlanner):
         self.pick = one_of("planner.pick", pick, PICKS)
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        if maps.bin_items > 1:
-            lifted = all_grasps(cell, maps.item, maps.blocked)[0]  # [N * M, P]
-            lifted = restrict_items(self.item, state, lifted.reshape(len(state.surface), -1))
-            number = lifted.unflatten(1, (maps.bin_items, -1)).any(2).int().argmax(1)
-            maps = maps.of_choice(cell, number * cell.num_footprints)[0]
+        lifted = all_grasps(cell, maps.item, maps.blocked)[0]  # [N * M, P]
+        lifted = restrict_items(self.item, state, lifted.reshape(len(state.surface), -1))
+        number = lifted.unflatten(1, (maps.bin_items, -1)).any(2).int().argmax(1)
+        maps, _ = maps.of_choice(cell, number * cell.num_footprints)
         pick, footprint, succeeds = pick_first(cell, maps, self.pick)
         allowed = footprint >= 0
         if self.candidates == "corners":

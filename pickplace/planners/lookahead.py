@@ -5,15 +5,14 @@ from torch import Tensor
 
 from pickplace.common.validate import check_bytes, number, whole_number
 from pickplace.items.arrival import refill
-from pickplace.items.distributions import ItemDistribution, Kinds, check_seed, search_items
+from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import MASKED, EstimatesValue, Policy, ScoresFootprints
-from pickplace.rules.bin import remove_item, select_item
 from pickplace.rules.cell import CellSpec
+from pickplace.rules.item import Item, Observation
 from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
 from pickplace.rules.observation import STANDARD_TERMS, observe
-from pickplace.rules.placing import unchecked_top
-from pickplace.rules.state import Item, Observation, State
+from pickplace.rules.state import State
 from pickplace.rules.step import put_down
 
 
@@ -93,16 +92,14 @@ class Lookahead(MapPlanner):
         value, choice = torch.sort(logits, dim=1, descending=True, stable=True)
         value, choice = value[:, : self.candidates], choice[:, : self.candidates]
         seen = State.from_observation(observation)  # what is imagined goes on from there
-        each = seen.each_item()
-        tops = maps._replace(top=unchecked_top(self.cell, each), item=each.item)
-        best = self._best(seen, tops, choice, value > MASKED / 2)
+        best = self._best(seen, choice, value > MASKED / 2)
         return first_action_reaching(cell, maps, choice.gather(1, best[:, None])[:, 0])
 
     def evaluation_facts(self) -> dict:
         """Return the same facts as of a policy's planner: the best of all feasible actions is played."""
         return {"candidates": "all", "mask_at_decision": True}
 
-    def _best(self, state: State, maps: PlacingMaps, choice: Tensor, open_: Tensor) -> Tensor:
+    def _best(self, state: State, choice: Tensor, open_: Tensor) -> Tensor:
         """Return which candidate to play, int64 ``[N]``.
 
         Args:
@@ -118,7 +115,7 @@ class Lookahead(MapPlanner):
             row, column = open_.nonzero(as_tuple=True)
             if len(row) == 0:
                 break
-            volume = self._returns(state, maps, row, choice[row, column], streams, self.horizon)  # [rows, streams]
+            volume = self._returns(state, row, choice[row, column], streams, self.horizon)  # [rows, streams]
             first = volume[(column == 0).nonzero()[:, 0]]  # one for each problem that is open
             problem = torch.unique_consecutive(row, return_inverse=True)[1]
             difference = volume - first[problem]
@@ -136,9 +133,9 @@ class Lookahead(MapPlanner):
         best = torch.where(surely, mean, 0.0).argmax(1)
         if self.horizon is None or isinstance(self.policy, EstimatesValue):
             return best
-        return self._confirm(best, state, maps, choice)
+        return self._confirm(best, state, choice)
 
-    def _confirm(self, best: Tensor, state: State, maps: PlacingMaps, choice: Tensor) -> Tensor:
+    def _confirm(self, best: Tensor, state: State, choice: Tensor) -> Tensor:
         """Return ``best``, int64 ``[N]``, without the departures that gain nothing when played out to the end.
 
         Two standard errors guard against the items' noise, not against the critic's own error. Where the policy fills
@@ -149,37 +146,25 @@ class Lookahead(MapPlanner):
             return best
         both = row.repeat_interleave(2)  # the policy's own choice and the candidate, on the same items
         column = torch.stack([torch.zeros_like(row), best[row]], 1).flatten()
-        volume = self._returns(state, maps, both, choice[both, column], self.samples, None).mean(1)
+        volume = self._returns(state, both, choice[both, column], self.samples, None).mean(1)
         gain = volume[1::2] - volume[::2]
         return best.index_put((row,), torch.where(gain > 0, best[row], 0))
 
-    def _returns(self, state: State, maps: PlacingMaps, row: Tensor, choice: Tensor, streams: int, horizon) -> Tensor:
+    def _returns(self, state: State, row: Tensor, choice: Tensor, streams: int, horizon) -> Tensor:
         """Return the volume that choices place, and the policy after them, float64 ``[M, streams]``.
 
         Args:
             row, choice: int64 ``[M]``, of which problem, and which footprint.
             streams, horizon: as in :meth:`_play_out`.
         """
-        state, maps = state.rows(row), maps.rows(row)
-        placed = select_item(state.items, choice // self.cell.num_footprints).volume.double()
-        return placed[:, None] + self._play_out(self._place(state, maps, choice), row, streams, horizon)
-
-    def _place(self, state: State, maps: PlacingMaps, choice: Tensor) -> State:
-        """Return the state after the choices ``[N]``, before anything arrives: what is left in the bins.
-
-        Of one item nothing is left; the item stays in the state until the next one takes its place.
-        """
-        surface = put_down(self.cell, state.surface, maps, choice)
-        if state.item.x.dim() == 1:
-            return state._replace(surface=surface)
-        taken = choice // self.cell.num_footprints
-        return State(surface, state.tote_height, remove_item(state.item, taken))
+        state, placed = put_down(self.cell, state.rows(row), choice)
+        return placed.volume.double()[:, None] + self._play_out(state, row, streams, horizon)
 
     def _play_out(self, state: State, problem: Tensor, streams: int, horizon) -> Tensor:
         """Return the volume that the policy goes on to place, float64 ``[M, streams]``.
 
         Args:
-            state: as :meth:`_place` returns it, of ``M`` problems.
+            state: of ``M`` problems, before items arrive.
             problem: int64 ``[M]``; equal ones meet equal items.
             horizon: items after which the critic judges the state; None: played out to the end.
         """
@@ -195,21 +180,20 @@ class Lookahead(MapPlanner):
         seed = problem * 1_000_003 + self._decisions * 7_919 + self.seed
         volume = torch.zeros(len(problem), dtype=torch.float64, device=problem.device)
         arrived = torch.zeros_like(problem)
+        source = _Imagined(self.items, streams)
         row = torch.arange(len(problem), device=problem.device)
         step = 0
         while len(row):
             if step == horizon and not sees_items:
                 volume[row] += self.critic(observe(self.terms, cell, state, critic_keys))[:, 0].double()
                 break
-            item, arrived = self._arrive(state.item, seed[row], stream[row], streams, arrived)
-            state = state._replace(item=item)
-            maps = placing_maps(cell, state)
-            mask = policy.ranked(maps)
+            address = "train", seed[row], stream[row], arrived
+            items, arrived = refill(cell, source, *address, state.items, torch.ones_like(row, dtype=torch.bool))
+            state = state._replace(items=items)
+            mask = policy.ranked(placing_maps(cell, state))
             going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]
             if len(going) < len(row):
-                row, state, mask, maps, arrived = (
-                    row[going], state.rows(going), mask[going], maps.rows(going), arrived[going],
-                )  # fmt: skip
+                row, state, mask, arrived = row[going], state.rows(going), mask[going], arrived[going]
             if len(row) == 0:
                 break
             observation = observe(self.terms, cell, state, keys)
@@ -217,15 +201,25 @@ class Lookahead(MapPlanner):
                 volume[row] += self.critic(observation)[:, 0].double()
                 break
             choice = policy.footprint_logits(observation, mask).argmax(1)
-            volume[row] += select_item(state.items, choice // cell.num_footprints).volume.double()
-            state = self._place(state, maps, choice)
+            state, placed = put_down(cell, state, choice)
+            volume[row] += placed.volume.double()
             step += 1
         return volume.view(-1, streams)
 
-    def _arrive(self, item: Item, seed: Tensor, stream: Tensor, streams: int, arrived: Tensor) -> tuple[Item, Tensor]:
-        """Return what lies in the bins once imagined items have arrived, and how many have, int64 ``[N]``."""
-        if item.x.dim() == 2:
-            return refill(self.cell, self.items, "train", seed, stream, arrived, item)
-        if isinstance(self.items, Kinds) and not arrived.any():
-            return self.items.spread(seed, stream, streams, self.cell.bin_size), arrived + 1
-        return self.items.sample("train", seed, stream, arrived, self.cell.bin_size), arrived + 1
+
+class _Imagined(ItemDistribution):
+    """The items of imagined streams, of which the first ones are spread over the distribution.
+
+    Args:
+        items: the item distribution.
+        count: number of streams.
+    """
+
+    def __init__(self, items: ItemDistribution, count: int):
+        self.items, self.count = items, count
+        self.has_corners = items.has_corners
+
+    def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size) -> Item:
+        item = self.items.sample(stream, seed, episode, step, bin_size)
+        first = self.items.spread(seed, episode, self.count, bin_size)
+        return Item(*(torch.where(step == 0, *parts) for parts in zip(first, item, strict=True)))

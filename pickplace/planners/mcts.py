@@ -11,12 +11,11 @@ from pickplace.common.validate import flag, number, whole_number
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner
-from pickplace.rules.bin import remove_item, select_item
+from pickplace.rules.bin import remove_item
 from pickplace.rules.cell import CellSpec
+from pickplace.rules.item import Item, Observation
 from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, first_action_reaching, placing_maps
-from pickplace.rules.observation import standard_terms
-from pickplace.rules.placing import unchecked_top
-from pickplace.rules.state import Item, Observation, State
+from pickplace.rules.state import State
 from pickplace.rules.step import apply, put_down
 
 MAX_NODES = 1_000_000  # of all trees of a decision
@@ -27,7 +26,7 @@ class _Node:
     """A tote, and what lies in the bin."""
 
     surface: Tensor  # int32 [W_T, D_T], of the tote
-    item: Tensor  # int64 [5], or of several items [M, 5]
+    items: Tensor  # int64 [M, 9], a table
     untried: list[int] | None  # actions in random order, of which the last comes first; None: all N_a flat actions
     edges: dict[int, "_Edge"] = field(default_factory=dict)
 
@@ -42,7 +41,7 @@ class _Edge:
     total: float = 0.0  # of the returns
     volume: int = 0  # that the action places
     surface: Tensor | None = None  # what it leaves; None until it is simulated, and where it fails
-    item: Tensor | None = None  # what it leaves in a bin of several items, as in _Node
+    items: Tensor | None = None  # what it leaves in the bin, as in _Node
     failed: bool = False
     bins: list[_Node] = field(default_factory=list)
 
@@ -95,13 +94,13 @@ class MCTS(MapPlanner):
 
     def decide(self, observation: Observation) -> Tensor:
         """Return flat actions, int64 ``[N]``."""
-        state, maps = _on_cpu(observation, self.cell.bin_items), None
+        state, maps = _on_cpu(observation), None
         if self.mask:
             maps = placing_maps(self.cell, state)
         return self._search(state, self._nodes(state), self.cell, maps).to(observation["tote_depth"].device)
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        seen, maps = _on_cpu(observation, self.cell.bin_items), maps.cpu()
+        seen, maps = _on_cpu(observation), maps.map(Tensor.cpu)
         mask = choice_mask(cell, maps) if self.mask else action_mask(cell, maps)
         roots = self._nodes(seen, mask)
         return self._search(seen, roots, cell, maps).to(observation["tote_depth"].device)
@@ -185,10 +184,8 @@ class MCTS(MapPlanner):
         if going:
             height = tote_height[[walks[number][0] for number in going]]
             surface = torch.stack(list(going.values()))
-            left = None
-            if self.cell.bin_items > 1:
-                left = Item.from_table(torch.stack([cast(Tensor, walks[number][1][-1].item) for number in going]))
-            arrived = State(surface, height, self._arriving(len(going), left))
+            left = torch.stack([cast(Tensor, walks[number][1][-1].items) for number in going])
+            arrived = self._arrive(State(surface, height, Item.from_table(left)))
             nodes = self._nodes(arrived)
             for number, node in zip(going, nodes, strict=True):
                 walks[number][1][-1].bins.append(node)
@@ -202,29 +199,24 @@ class MCTS(MapPlanner):
         """Simulate actions, and keep on their edges what they leave in the tote."""
         if not tried:
             return
-        cell, height = self.cell, tote_height[[problem for problem, _ in tried]]
+        height = tote_height[[problem for problem, _ in tried]]
         surface = torch.stack([edge.node.surface for _, edge in tried])
-        item = Item.from_table(torch.stack([edge.node.item for _, edge in tried]))
-        state = State(surface, height, item)
+        state = State(surface, height, Item.from_table(torch.stack([edge.node.items for _, edge in tried])))
         action = torch.tensor([edge.action for _, edge in tried])
+        after, placed, going = self._move(state, action)
+        parts = zip(after.surface, after.items.table, placed.volume.tolist(), going.tolist(), strict=True)
+        for (_, edge), (left, items, volume, good) in zip(tried, parts, strict=True):
+            edge.failed = not good
+            if good:
+                edge.surface, edge.items, edge.volume = left, items, volume
+
+    def _move(self, state: State, action: Tensor) -> tuple[State, Item, Tensor]:
+        """Return the states after the search's actions, the items placed, and which actions succeed, bool ``[N]``."""
         if self.mask:
-            each = state.each_item()
-            tops = unchecked_top(cell, each)
-            maps = PlacingMaps(tops, tops, each.item, tops, bin_items=state.items.x.shape[1])
-            after, failed = put_down(cell, surface, maps, action), [False] * len(tried)
-            taken = action // cell.num_footprints
-        else:
-            step = apply(cell, state, action)
-            after, failed = step.surface, (step.failure > 0).tolist()
-            taken = action if step.taken is None else step.taken
-        volumes = (item if item.x.dim() == 1 else select_item(item, taken)).volume.tolist()
-        for (_, edge), left, bad, volume in zip(tried, after, failed, volumes, strict=True):
-            edge.failed = bad
-            if not bad:
-                edge.surface, edge.volume = left, volume
-        if item.x.dim() == 2:
-            for (_, edge), table in zip(tried, remove_item(item, taken).table, strict=True):
-                edge.item = table
+            return *put_down(self.cell, state, action), torch.ones_like(action, dtype=torch.bool)
+        step = apply(self.cell, state, action)
+        left = State(step.surface, state.tote_height, remove_item(state.items, step.taken))
+        return left, step.item, step.failure == 0
 
     def _nodes(self, state: State, mask: Tensor | None = None) -> list[_Node]:
         """Return new nodes, with the actions to try: those of a mask, or that the rules allow."""
@@ -233,44 +225,38 @@ class MCTS(MapPlanner):
             mask = choice_mask(self.cell, placing_maps(self.cell, state))
         if mask is not None:
             untried = [self._random.permutation(row.nonzero()[0]).tolist() for row in mask.numpy()]
-        return [_Node(*parts) for parts in zip(state.surface, state.item.table, untried, strict=True)]
+        return [_Node(*parts) for parts in zip(state.surface, state.items.table, untried, strict=True)]
 
-    def _arriving(self, count: int, left: Item | None) -> Item:
-        """Return bins from the item distribution, each drawn once; ``left`` of several items is there already."""
+    def _arrive(self, state: State) -> State:
+        """Return the states with items in the bins that come from the item distribution, each drawn once."""
+        count = len(state.surface)
         number = torch.arange(self._sampled, self._sampled + count)
         self._sampled += count
-        seed = torch.full_like(number, self.seed)
-        if left is not None:
-            return refill(self.cell, self.items, "train", seed, number, torch.zeros_like(number), left)[0]
-        return self.items.sample("train", seed, number, torch.zeros_like(number), self.cell.bin_size)
+        seed, first, rows = torch.full_like(number, self.seed), torch.zeros_like(number), number >= 0
+        return state._replace(items=refill(self.cell, self.items, "train", seed, number, first, state.items, rows)[0])
 
     def _play_out(self, state: State) -> Tensor:
         """Return the volume that uniformly random actions place until the episode ends, float64 ``[M]``."""
         cell, count = self.cell, len(state.surface)
         volume, row = torch.zeros(count, dtype=torch.float64), torch.arange(count)
         while True:
-            surface, tote_height, item = state
             if self.mask:
-                maps = placing_maps(cell, state)
-                mask = choice_mask(cell, maps)
+                mask = choice_mask(cell, placing_maps(cell, state))
                 draw = torch.from_numpy(self._random.random(mask.shape, dtype=np.float32))
-                going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]
-                choice = torch.where(mask, draw, -1.0).argmax(1)
-                surface, taken = put_down(cell, surface, maps, choice), choice // cell.num_footprints
-                placed = select_item(state.items, taken)
+                action = torch.where(mask, draw, -1.0).argmax(1)
+                going = mask.view(torch.uint8).amax(1) > 0
+                state, placed, _ = self._move(state, action)
             else:
-                action = torch.from_numpy(self._random.integers(cell.num_actions, size=len(surface)))
-                step = apply(cell, state, action)
-                surface, going = step.surface, (step.failure == 0).nonzero()[:, 0]
-                placed, taken = step.item, action if step.taken is None else step.taken
+                action = torch.from_numpy(self._random.integers(cell.num_actions, size=len(state.surface)))
+                state, placed, going = self._move(state, action)
             row = row[going]
             volume[row] += placed.volume[going].double()
             if len(row) == 0:
                 return volume
-            left = None if item.x.dim() == 1 else remove_item(item, taken).rows(going)
-            state = State(surface[going], tote_height[going], self._arriving(len(row), left))
+            state = self._arrive(state.rows(going))
 
 
-def _on_cpu(observation: Observation, bin_items: int) -> State:
+def _on_cpu(observation: Observation) -> State:
     """Return the state that an observation shows, on the CPU."""
-    return State.from_observation({key: observation[key].cpu() for key in standard_terms(bin_items)})
+    surface, tote_height, items = State.from_observation(observation)
+    return State(surface.cpu(), tote_height.cpu(), items.map(Tensor.cpu))

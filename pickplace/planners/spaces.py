@@ -132,18 +132,19 @@ class SpacePlanner(MapPlanner):
 
     def _corner_order(self, cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:
         """Return the least order of a space in whose first corner a footprint lies, int64 ``[N * M, Q, W_T, D_T]``."""
-        each = state.each_item()
-        rectangles = Rectangles.of_grid(*cell.tote_size[:2], each.surface.device)
+        surface, tote_height, item = state.each_item()
+        heights = surface >> 1
+        rectangles = Rectangles.of_grid(*cell.tote_size[:2], heights.device)
         wide, deep = (rectangles.x1 - rectangles.x0)[:, None], (rectangles.y1 - rectangles.y0)[:, None]
         corner = (rectangles.x0 * cell.tote_size[1] + rectangles.y0)[:, None]
-        order = torch.full((cell.parities, cell.num_places, len(each.surface)), LAST, device=corner.device)
-        for rows in torch.arange(len(each.surface), device=corner.device).split(max(1, MAX_RECTANGLES // len(corner))):
-            part = each.rows(rows)
-            for floor, space in empty_spaces(part.heights, rectangles, maps.level_step):
+        order = torch.full((cell.parities, cell.num_places, len(heights)), LAST, device=corner.device)
+        for rows in torch.arange(len(heights), device=corner.device).split(max(1, MAX_RECTANGLES // len(corner))):
+            w_and_d, height = (item.w[rows], item.d[rows]), item.h[rows]
+            for floor, space in empty_spaces(heights[rows], rectangles, maps.level_step):
                 for parity in range(cell.parities):
-                    w, d = (part.item.d, part.item.w) if parity else (part.item.w, part.item.d)
+                    w, d = w_and_d[:: 1 - 2 * parity]
                     left_x, left_y = wide - w, deep - d
-                    fits = (left_x >= 0) & (left_y >= 0) & (floor + part.item.h <= part.tote_height)
+                    fits = (left_x >= 0) & (left_y >= 0) & (floor + height <= tote_height[rows])
                     found = torch.where(
                         space & fits if self.holds_item else space, self.space_order(floor, left_x, left_y), LAST
                     )

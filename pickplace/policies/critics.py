@@ -10,7 +10,7 @@ from pickplace.policies.depth import depth_levels, item_code, one_hot
 from pickplace.policies.fcn4d.network import Conv4dCritic
 from pickplace.policies.fcn_grasp.network import DTYPES, MAX_LEVELS, matrix_dtype
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.state import Item, item_from_depth
+from pickplace.rules.item import Item, item_from_depth
 
 
 class PooledCritic(nn.Module):

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pickplace.rules.state import Item
+from pickplace.rules.item import Item
 
 
 class Contents(NamedTuple):

@@ -116,7 +116,7 @@ class FootprintScorer(Policy):
         x, y, w, _ = step.footprint.unbind(-1)
         turned = (w != step.item.w).long()  # a square item is the same either way
         footprint = footprint_index(self.cell.tote_size, turned, x, y)
-        return footprint if step.taken is None else footprint + step.taken * self.cell.num_footprints
+        return footprint + step.taken * self.cell.num_footprints
 
 
 class FootprintPolicy(FootprintScorer):

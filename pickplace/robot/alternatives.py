@@ -76,7 +76,7 @@ def _probable_footprints(
     chosen one, else the first feasible one, else the first one. Of several items in the bin each has its footprints.
     """
     cell = problem.cell
-    footprint = action_footprints(cell, problem.state.item, problem.maps.blocked)[0]  # [N_a]
+    footprint = action_footprints(cell, problem.state.items, problem.maps.blocked)[0]  # [N_a]
     lands = footprint >= 0
     reachable = torch.zeros(cell.num_choices, dtype=torch.bool, device=footprint.device)
     reachable[footprint[lands]] = True

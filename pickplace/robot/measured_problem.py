@@ -29,11 +29,12 @@ from pickplace.robot.scene import BinMap, Scene
 from pickplace.rules.bin import taken_item
 from pickplace.rules.cell import MAX_SIDE, CellSpec, Limits, effector_centre, reference_cell
 from pickplace.rules.grasps import carry, footprint_index
+from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, footprint_mask
 from pickplace.rules.measured import MeasuredMaps, MeasuredTote, bearing_after, failures, floor_height, measured_maps
 from pickplace.rules.placing import is_within_reach
-from pickplace.rules.state import Item, State, surface_from
+from pickplace.rules.state import State, surface_from
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +55,7 @@ class MeasuredProblem(Problem):
     def is_feasible_in_an_empty_tote(self) -> bool:
         flat = torch.zeros_like(self.tote.highest)
         empty = self.tote._replace(highest=flat, lowest=flat, bears=torch.ones_like(self.tote.bears))
-        maps = measured_maps(self.cell, empty, self.state.item, self.sides).maps
+        maps = measured_maps(self.cell, empty, self.maps.item, self.sides).maps
         return bool(footprint_mask(self.cell, maps).any())
 
     def failures(self, actions: Tensor) -> Tensor:
@@ -64,7 +65,7 @@ class MeasuredProblem(Problem):
         if action is None:
             return self.tote.bears
         footprint = self._footprint(action)
-        return bearing_after(self.cell, self.tote, self.state.item, self.sides, self.measured, footprint)
+        return bearing_after(self.cell, self.tote, self.maps.item, self.sides, self.measured, footprint)
 
     def filled(self) -> float:
         return float(self.tote.highest.double().mean()) / self.tote.height
@@ -75,14 +76,14 @@ class MeasuredProblem(Problem):
         return box.w * box.d * box.h / (wide * deep * self.side**2 * self.tote.height * self.unit)
 
     def _suction_face(self, x_bin: int, y_bin: int) -> tuple[float, float, float]:
-        centres = effector_centres(self.cell, self.state.item, self.box, self.side)
+        centres = effector_centres(self.cell, self.maps.item, self.box, self.side)
         return *centres[x_bin * self.cell.bin_size[1] + y_bin], self.grip
 
     def _top(self, action: Tensor) -> int:
-        return int(self.measured.maps.rest.flatten()[self._footprint(action)] + self.state.item.h)
+        return int(self.measured.maps.rest.flatten()[self._footprint(action)] + self.maps.item.h)
 
     def _footprint(self, action: Tensor) -> int:
-        carried = carry(self.cell, self.state.item, action)
+        carried = carry(self.cell, self.maps.item, action)
         return int(footprint_index(self.cell.tote_size, carried.rotation % 2, carried.x, carried.y))
 
 
@@ -102,13 +103,12 @@ class MeasuredBin(Problem):
         top, clearance, rest = (
             torch.cat([getattr(part.maps, key) for part in parts]) for key in ("top", "clearance", "rest")
         )
-        item = Item(*(torch.cat(values) for values in zip(*(part.state.item for part in parts), strict=True)))
+        items = join_items([part.maps.item for part in parts])
+        seen_items = join_items([part.seen.items.rows(0) for part in parts])
         blocked = ~torch.stack([part.cell.limits.pick_ok for part in parts if part.cell.limits is not None])
-        state, seen = (
-            getattr(parts[0], key)._replace(item=join_items([getattr(part, key).item for part in parts]))
-            for key in ("state", "seen")
-        )
-        maps = PlacingMaps(top, clearance, item, rest, blocked, len(parts), parts[0].maps.level_step)
+        state, seen = parts[0].state._replace(items=items), parts[0].seen._replace(items=seen_items)
+        step = parts[0].maps.level_step
+        maps = PlacingMaps(top, clearance, items.rows(0), rest, blocked, len(parts), step)
         return cls(cell=cell, state=state, seen=seen, maps=maps, parts=parts)
 
     def of_item(self, number: int) -> Problem:
@@ -141,7 +141,7 @@ def effector_centres(cell: CellSpec, item: Item, box: Box, side: float) -> np.nd
         box: the same as it was measured.
         side: length of a cell, m.
     """
-    (ee_w, ee_d), (x, y, w, d, _) = cell.effector_size, (int(part) for part in item)
+    (ee_w, ee_d), (x, y, w, d) = cell.effector_size, map(int, item[:4])
     number = np.arange(cell.num_picks)
     x_bin, y_bin = number // cell.bin_size[1], number % cell.bin_size[1]
     along = np.stack([effector_centre(x_bin, ee_w) - (x + w / 2), effector_centre(y_bin, ee_d) - (y + d / 2)], -1)
@@ -183,7 +183,7 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
     # A policy sees heights as in training.
     state, seen_rim = tote.state(free, placed[0].item), max(1, round(tote.height / ratio))
     heights = (state.heights / ratio).round().clamp(max=seen_rim).int()
-    seen = State(surface_from(heights, tote.bears[None]), torch.tensor([seen_rim], device=device), state.item)
+    seen = State(surface_from(heights, tote.bears[None]), torch.tensor([seen_rim], device=device), state.items)
     parts, taken = [], _item_of_each_pick(free, placed)
     for number, (box, item, sides, _) in enumerate(placed):
         h = int(item.h)
@@ -200,9 +200,10 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
             limits = replace(limits, pick_ok=limits.pick_ok & (taken == number))
         limited = replace(free, reach=None, limits=limits)
         measured = measured_maps(limited, tote, item, sides)
-        seen_item = item._replace(h=torch.tensor([max(1, round(h / ratio))], device=device))
+        alone = item.rows((slice(None), None))
+        seen_item = alone._replace(h=torch.tensor([[max(1, round(h / ratio))]], device=device))
         parts.append(MeasuredProblem(
-            cell=limited, state=state._replace(item=item), maps=measured.maps, seen=seen._replace(item=seen_item),
+            cell=limited, state=state._replace(items=alone), maps=measured.maps, seen=seen._replace(items=seen_item),
             yaw=box.yaw, side=cell_size, unit=MILLIMETRE, grip=(h + tote.accuracy) * MILLIMETRE,
             release=2 * tote.accuracy * MILLIMETRE, box=box, measured=measured, tote=tote, sides=sides,
             bin_clear=bin_clear,
@@ -288,7 +289,7 @@ def _item_of_each_pick(cell: CellSpec, placed: Sequence[_PlacedItem]) -> Tensor:
     Each item has a grid of its own. A pick cell that grips several of them stands for the highest, as on the grid.
     """
     pick = torch.arange(cell.num_picks, device=placed[0].item.x.device)
-    items = Item(*(part.expand(len(pick), -1) for part in join_items([one.item for one in placed])))
+    items = join_items([one.item for one in placed]).map(lambda part: part.expand(len(pick), -1))
     return taken_item(cell, items, pick // cell.bin_size[1], pick % cell.bin_size[1])
 
 

@@ -163,7 +163,7 @@ class Planner:
         before, bearing = problem.filled(), item.bearing_after(action)
         return Plan(
             status=status,
-            item={key: int(value) for key, value in item.seen.item._asdict().items()} if is_known else None,
+            item=dict(zip("xywdh", item.seen.items.cuboids[0, 0].tolist(), strict=True)) if is_known else None,
             box=item.box if is_known else None,
             pick=pick,
             place=place,

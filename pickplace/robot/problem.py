@@ -8,12 +8,13 @@ from torch import Tensor
 from pickplace.robot.box import Box, DepthMapError
 from pickplace.robot.measure import flags_of_map, labels_of_map, whole_map
 from pickplace.robot.scene import BinMap, Scene
-from pickplace.rules.bin import select_item, taken_item
+from pickplace.rules.bin import taken_item
 from pickplace.rules.cell import CellSpec, effector_centre
 from pickplace.rules.grasps import split_action
+from pickplace.rules.item import Item, item_from_depth
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, footprint_mask, placing_maps
-from pickplace.rules.state import EMPTY, Item, State, item_from_depth, surface_from
+from pickplace.rules.state import EMPTY, State, surface_from
 from pickplace.rules.step import apply
 
 
@@ -30,7 +31,7 @@ class Pose:
 class Problem:
     """The items in a bin, one tote, and what decides which actions succeed: on the grid, by the rules of training.
 
-    The states have one item ``[1]``, or several ``[1, M]``. What needs one item is asked of :meth:`of_item`.
+    The states have items ``[1, M]``. What needs one item is asked of :meth:`of_item`.
     """
 
     cell: CellSpec
@@ -46,20 +47,18 @@ class Problem:
     @property
     def bin_items(self) -> int:
         """``M``, the number of items in the bin."""
-        return self.state.items.x.shape[1]
+        return self.maps.bin_items
 
     def taken_items(self, actions: Tensor) -> Tensor:
         """Return the number of the item that each flat action takes, int64 ``[A]``; 0 for a pick that grips none."""
-        items = Item(*(part.expand(len(actions), -1) for part in self.state.items))
+        items = self.state.items.map(lambda part: part.expand(len(actions), -1))
         return taken_item(self.cell, items, *split_action(self.cell, actions)[:2])
 
     def of_item(self, number: int) -> "Problem":
         """Return the problem of one item, as if it lay alone."""
-        if self.bin_items == 1:
-            return self
         at = torch.tensor([number], device=self.state.surface.device)
         maps, _ = self.maps.of_choice(self.cell, at * self.cell.num_footprints)
-        state, seen = (each._replace(item=select_item(each.item, at)) for each in (self.state, self.seen))
+        state, seen = (each._replace(items=each.items.rows((slice(None), at))) for each in (self.state, self.seen))
         return replace(self, state=state, seen=seen, maps=maps._replace(blocked=None))
 
     def is_feasible(self) -> bool:
@@ -87,11 +86,11 @@ class Problem:
 
     def item_share(self) -> float:
         """Return the item's share of the tote's volume."""
-        return int(self.state.item.volume) / self.cell.tote_volume(int(self.state.tote_height))
+        return int(self.state.items.volume) / self.cell.tote_volume(int(self.state.tote_height))
 
     def drop_height(self, top: int) -> float:
         """Return the height of the item's underside once it rests with its top at ``top`` height units."""
-        return self._length((top - int(self.state.item.h)) * self.unit)
+        return self._length((top - int(self.state.items.h)) * self.unit)
 
     def poses(self, action: Tensor) -> tuple[Pose, Pose, float, int]:
         """Return the poses at pick and place, the turn in degrees, and the item's top in height units."""
@@ -112,7 +111,7 @@ class Problem:
     def _suction_face(self, x_bin: int, y_bin: int) -> tuple[float, float, float]:
         """Return the centre of the suction face over a pick cell when it grips the item."""
         wide, deep = self.cell.effector_size
-        return effector_centre(x_bin, wide), effector_centre(y_bin, deep), int(self.state.item.h)
+        return effector_centre(x_bin, wide), effector_centre(y_bin, deep), int(self.state.items.h)
 
     def _top(self, action: Tensor) -> int:
         return int(apply(self.cell, self.state, action).top[0])
@@ -141,16 +140,15 @@ def read_grid(cell: CellSpec, scene: Scene, device) -> Problem:
     state = State(
         surface_from(height - tote_map, bearing)[None].to(device),
         torch.tensor([height], device=device),
-        Item(*(part.to(device) for part in join_items(items))),
+        join_items(items).map(lambda part: part.to(device)),
     )
-    if cell.bin_items != len(items):
-        cell = replace(cell, bin_items=len(items))
+    cell = replace(cell, bin_items=len(items))
     return Problem(cell=cell, state=state, maps=placing_maps(cell, state), seen=state)
 
 
 def join_items(items: list[Item]) -> Item:
-    """Return what lies in a bin, of each item's parts ``[1]``: these of one item, ``[1, M]`` of several."""
-    return items[0] if len(items) == 1 else Item(*(torch.cat(parts)[None] for parts in zip(*items, strict=True)))
+    """Return items ``[1]`` as those of one bin, ``[1, M]``."""
+    return Item(*(torch.stack(parts, 1) for parts in zip(*items, strict=True)))
 
 
 def _read_items(bin_map: Tensor, bin_labels, unit_name: str) -> list[Item]:
@@ -166,7 +164,7 @@ def _read_items(bin_map: Tensor, bin_labels, unit_name: str) -> list[Item]:
 
 def _read_cuboid(bin_map: Tensor, segment: Tensor, unit_name: str, name: str, hint: str = "") -> Item:
     """Return the item of a segment of the bin, bool ``[W_B, D_B]``; refuse all but a box filled at one height."""
-    x, y, w, d, _ = (int(value) for value in item_from_depth(segment[None].float()))
+    x, y, w, d, _ = item_from_depth(segment[None].float()).cuboids[0].tolist()
     box = bin_map[x : x + w, y : y + d]
     h = int(bin_map.max())
     if (box != h).any():

@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from pickplace.items.distributions import ItemDistribution
 from pickplace.policies.restore import build_cell
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.state import Item
+from pickplace.rules.item import Item
 
 #: Options of the cell that are no sizes; a policy should meet its own.
 RULES = ("support", "body", "cup", "cup_size", "pick_rule", "min_seal")
@@ -51,7 +51,7 @@ class Training:
         longest = [max(kind[axis] for kind in self.kinds) for axis in range(3)]
         new = {
             f"item of {w}x{d}x{h} cells: the policy met other sizes, up to {_sides(longest)}."
-            for w, d, h in items.table[0, :, 2:].tolist()
+            for w, d, h in items.cuboids[0, :, 2:].tolist()
             if not {(w, d, h), (d, w, h)} & self.kinds
         }
         found = sorted(new)

@@ -1,27 +1,32 @@
 """A bin with several items: which one a pick takes, and what stands in the way.
 
 Each pick takes one item: the highest that the cup grips. The end effector may hang over lower ones; one that is as high
-or higher would be lifted, too, or hit. The tables here have a row for each item, ``[N * M]``, those of a bin one after
-the other (:meth:`~pickplace.rules.state.State.each_item`).
+or higher would be lifted, too, or hit. Nothing is in the way of an item that lies alone: with ``M = 1`` the
+functions take a shorter path to the same result.
 """
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import is_gripped
-from pickplace.rules.state import Item
+from pickplace.rules.item import Item
 
 
-def blocked_picks(cell: CellSpec, items: Item) -> Tensor:
+def blocked_picks(cell: CellSpec, items: Item) -> Tensor | None:
     """Return at which pick cells the end effector would touch another item that is as high or higher.
 
     Args:
         items: ``[N, M]``.
 
     Returns:
-        bool ``[N * M, P]``, for each item the picks that would take it.
+        bool ``[N * M, P]``, for each item, those of a bin one after the other, the picks that would take it; None with
+        ``M = 1``: no pick is blocked.
     """
+    if items.x.shape[1] == 1:
+        return None
     near = [torch.arange(side, device=items.x.device).view(-1, 1, 1) for side in cell.bin_size[:2]]
     shape = cell.effector(0)
     left, front = near[0] - shape.ref_x, near[1] - shape.ref_y  # [W_B, 1, 1], [D_B, 1, 1]
@@ -40,6 +45,24 @@ def blocked_picks(cell: CellSpec, items: Item) -> Tensor:
     return blocked.flatten(2).flatten(0, 1).t()
 
 
+class Taken(NamedTuple):
+    """The item that each of ``N`` picks takes, of the ``M`` in its bin."""
+
+    number: Tensor  # int64 [N], from 0
+    item: Item  # [N]
+    blocked: Tensor | None  # bool [N, P], see `blocked_picks`
+
+
+def take_item(cell: CellSpec, items: Item, x: Tensor, y: Tensor) -> Taken:
+    """Return what picks at cells ``(x, y)`` take out of bins ``[N, M]``; ``x`` and ``y`` are int64 ``[N]``."""
+    number = taken_item(cell, items, x, y)
+    blocked = blocked_picks(cell, items)
+    if blocked is None:
+        return Taken(number, items.map(torch.flatten), None)
+    row = torch.arange(len(number), device=number.device)
+    return Taken(number, select_item(items, number), blocked.unflatten(0, items.x.shape)[row, number])
+
+
 def taken_item(cell: CellSpec, items: Item, x: Tensor, y: Tensor) -> Tensor:
     """Return the number of the item that picks at cells ``(x, y)`` take, int64 ``[N]``: the highest that is gripped.
 
@@ -49,6 +72,8 @@ def taken_item(cell: CellSpec, items: Item, x: Tensor, y: Tensor) -> Tensor:
         items: ``[N, M]``.
         x, y: int64 ``[N]``.
     """
+    if items.x.shape[1] == 1:
+        return torch.zeros_like(x)
     shape = cell.effector(0)
     near_x, near_y = items.x - (x - shape.ref_x)[:, None], items.y - (y - shape.ref_y)[:, None]
     gripped = is_gripped(cell, near_x, near_y, items.w, items.d) & ~items.is_empty
@@ -57,7 +82,7 @@ def taken_item(cell: CellSpec, items: Item, x: Tensor, y: Tensor) -> Tensor:
 
 def select_item(items: Item, number: Tensor) -> Item:
     """Return one item of each bin, ``[N]``; ``number`` is int64 ``[N]``."""
-    return Item(*(part.gather(1, number[:, None])[:, 0] for part in items))
+    return items.map(lambda part: part.gather(1, number[:, None])[:, 0])
 
 
 def remove_item(items: Item, number: Tensor, removed: Tensor | None = None) -> Item:
@@ -67,7 +92,9 @@ def remove_item(items: Item, number: Tensor, removed: Tensor | None = None) -> I
         number: int64 ``[N]``.
         removed: bool ``[N]``, whether that item is removed at all; None: it is.
     """
-    place = torch.arange(items.x.shape[1], device=items.x.device)
+    table = items.table
+    place = torch.arange(table.shape[1], device=table.device)
     later = place >= number[:, None]
-    after = place + (later if removed is None else later & removed[:, None])
-    return Item(*(torch.cat([part, torch.zeros_like(part[:, :1])], 1).gather(1, after) for part in items))
+    after = place + (later if removed is None else later & removed[:, None])  # [N, M]
+    longer = torch.cat([table, torch.zeros_like(table[:, :1])], 1)
+    return Item.from_table(longer.gather(1, after[..., None].expand_as(table)))

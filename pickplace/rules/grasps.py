@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from pickplace.rules.cell import CellSpec, reference_cell
+from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR
 from pickplace.rules.placing import is_within_reach
-from pickplace.rules.state import Item
 
 
 # ---------------------------------------------------------------------- the checks of a pick, one function each

@@ -10,6 +10,7 @@ the tote, is higher than the item's top: one maximum over its cells decides.
 """
 
 import itertools
+from collections.abc import Callable
 from functools import reduce
 from typing import NamedTuple
 
@@ -31,9 +32,10 @@ from pickplace.rules.grasps import (
     split_footprint,
     turned_size,
 )
+from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR, NEVER, surround, windows
 from pickplace.rules.placing import clearance, is_within_reach, resting_top, unchecked_top
-from pickplace.rules.state import Item, State
+from pickplace.rules.state import State
 
 CLASS_BYTES = 2**28  # of the masks of grasp classes that are held at a time
 
@@ -53,18 +55,16 @@ class PlacingMaps(NamedTuple):
     bin_items: int = 1  # M
     level_step: int = 0  # by how much the heights of a level surface may differ, where they are measured
 
+    def map(self, function: Callable[[Tensor], Tensor]) -> "PlacingMaps":
+        """Return the maps with a function applied to each tensor."""
+        top, clearance, rest = map(function, (self.top, self.clearance, self.rest))
+        blocked = None if self.blocked is None else function(self.blocked)
+        return PlacingMaps(top, clearance, self.item.map(function), rest, blocked, self.bin_items, self.level_step)
+
     def rows(self, index: Tensor) -> "PlacingMaps":
         """Return the maps of some bins, by their numbers, which may come up more than once."""
-        if self.bin_items > 1:
-            index = (index[:, None] * self.bin_items + torch.arange(self.bin_items, device=index.device)).flatten()
-        return self._of_rows(index)._replace(bin_items=self.bin_items)
-
-    def cpu(self) -> "PlacingMaps":
-        """Return the maps on the CPU."""
-        blocked = None if self.blocked is None else self.blocked.cpu()
-        item = Item(*(part.cpu() for part in self.item))
-        parts = self.top.cpu(), self.clearance.cpu(), item, self.rest.cpu(), blocked
-        return PlacingMaps(*parts, self.bin_items, self.level_step)
+        row = (index[:, None] * self.bin_items + torch.arange(self.bin_items, device=index.device)).flatten()
+        return self.map(lambda part: part[row])
 
     def of_choice(self, cell: CellSpec, choice: Tensor) -> tuple["PlacingMaps", Tensor]:
         """Return the maps of each choice's item, and its footprint.
@@ -77,16 +77,11 @@ class PlacingMaps(NamedTuple):
             return self, choice
         item = choice // cell.num_footprints
         row = torch.arange(len(choice), device=choice.device) * self.bin_items + item
-        return self._of_rows(row), choice - item * cell.num_footprints
+        return self.map(lambda part: part[row])._replace(bin_items=1), choice - item * cell.num_footprints
 
     def join(self, mask: Tensor) -> Tensor:
         """Return a mask over footprints ``[N * M, Q, W_T, D_T]`` as one over choices, ``[N, M * Q * W_T * D_T]``."""
         return mask.flatten(1).reshape(len(mask) // self.bin_items, -1)
-
-    def _of_rows(self, row: Tensor) -> "PlacingMaps":
-        blocked = None if self.blocked is None else self.blocked[row]
-        parts = self.top[row], self.clearance[row], self.item.rows(row), self.rest[row], blocked
-        return PlacingMaps(*parts, level_step=self.level_step)
 
     def clearance_in(self, rotation: int) -> Tensor:
         """Return the clearance in a rotation or turn, batch last, ``[W_T, D_T, N]``."""
@@ -95,22 +90,21 @@ class PlacingMaps(NamedTuple):
 
 def placing_maps(cell: CellSpec, state: State) -> PlacingMaps:
     """Return everything that decides which actions succeed: see :class:`PlacingMaps`."""
-    return _complete(cell, state, *resting_top(cell, state.each_item()))
+    return _complete(cell, state, *resting_top(cell, *state.each_item()))
 
 
 def unchecked_maps(cell: CellSpec, state: State) -> PlacingMaps:
     """Return the maps of footprints that are known to be stable and below the rim, without a look at either."""
-    each = state.each_item()
-    top = unchecked_top(cell, each)
-    return _complete(cell, state, top, top - each.item.h.to(top.dtype).view(-1, 1, 1, 1))
+    surface, _, item = state.each_item()
+    return _complete(cell, state, *unchecked_top(cell, surface, item))
 
 
 def _complete(cell: CellSpec, state: State, top: Tensor, rest: Tensor) -> PlacingMaps:
     """Return the maps with what the end effector must clear, in the tote and in the bin."""
-    clear, item, count = clearance(cell, state), state.each_item().item, state.items.x.shape[1]
-    if count == 1:
-        return PlacingMaps(top, clear, item, rest)
-    return PlacingMaps(top, clear.repeat_interleave(count, 0), item, rest, blocked_picks(cell, state.item), count)
+    clear, (_, _, item), count = clearance(cell, state), state.each_item(), state.items.x.shape[1]
+    if count > 1:
+        clear = clear.repeat_interleave(count, 0)
+    return PlacingMaps(top, clear, item, rest, blocked_picks(cell, state.items), count)
 
 
 def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
@@ -151,7 +145,7 @@ def num_feasible(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     available, classes = available_offsets(cell, maps.item, maps.blocked)
     places = class_mask(cell, maps).sum(1)  # [T * K, N]
     count = reduce(torch.add, [(places.gather(0, turned) * available).sum(0) for turned in classes])
-    return count if maps.bin_items == 1 else count.view(bins, -1).sum(1)
+    return count.view(bins, -1).sum(1)
 
 
 def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
@@ -311,34 +305,32 @@ def first_action_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) 
     return torch.where(actions >= 0, actions, cell.num_actions - 1).amin(1)
 
 
-def action_footprints(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> Tensor:
+def action_footprints(cell: CellSpec, items: Item, blocked: Tensor | None = None) -> Tensor:
     """Return the footprint that each flat action would leave if nothing collided, int64 ``[N, N_a]``.
 
-    It is an index as in :func:`actions_reaching`, with a square footprint under parity 0; -1 where the pick fails or
-    the footprint leaves the tote.
+    It is ``item * num_footprints`` and an index as in :func:`actions_reaching`, with a square footprint under parity 0;
+    -1 where the pick fails or the footprint leaves the tote.
 
     Args:
         cell: the sizes.
-        item: ``[N]``, or ``[N, M]`` in bins with several items.
-        blocked: as :func:`~pickplace.rules.bin.blocked_picks` has it, which is asked for several items.
+        items: ``[N, M]``.
+        blocked: as of :attr:`PlacingMaps.blocked`; None: by :func:`~pickplace.rules.bin.blocked_picks`.
     """
-    tote_w, tote_d, _ = cell.tote_size
-    if item.x.dim() == 2:
-        blocked = blocked_picks(cell, item) if blocked is None else blocked
-        each = action_footprints(cell, Item(*(part.flatten() for part in item)), blocked).unflatten(0, item.x.shape)
-        number = torch.arange(item.x.shape[1], device=each.device)[:, None] * cell.num_footprints
-        return torch.where(each >= 0, each + number, -1).amax(1)  # a pick lifts one item at most
-    lifted, offset = all_grasps(cell, item, blocked)
+    (tote_w, tote_d, _), count = cell.tote_size, items.x.shape[1]
+    item = items.map(torch.flatten)
+    lifted, offset = all_grasps(cell, item, blocked_picks(cell, items) if blocked is None else blocked)
     device = offset.device
     check_actions(cell, len(lifted), device)
     turned = torch.arange(cell.rotations, device=device) % 2  # [R]
     refs = _reference_cells(cell, device)
-    corner = (offset - refs)[:, :, None, None]  # [N, P, 1, 1, R, 2]
+    corner = (offset - refs)[:, :, None, None]  # [N * M, P, 1, 1, R, 2]
     x = corner[..., 0] + torch.arange(tote_w, device=device)[:, None, None]
     y = corner[..., 1] + torch.arange(tote_d, device=device)[:, None]
-    sizes = turned_size(item.rows((slice(None), None)), turned == 1)  # [N, R] each
+    sizes = turned_size(item.rows((slice(None), None)), turned == 1)  # [N * M, R] each
     w, d = (size[:, None, None, None] for size in sizes)
     inside = ~is_outside(x, w, tote_w) & ~is_outside(y, d, tote_d)
     parity = (turned * (item.w != item.d)[:, None])[:, None, None, None]
-    footprint = footprint_index(cell.tote_size, parity, x, y)
-    return torch.where(inside & lifted[..., None, None, None], footprint, -1).flatten(1)
+    number = (torch.arange(len(lifted), device=device) % count)[:, None, None, None, None]
+    footprint = footprint_index(cell.tote_size, parity, x, y) + number * cell.num_footprints
+    footprint = torch.where(inside & lifted[..., None, None, None], footprint, -1).flatten(1)
+    return footprint if count == 1 else footprint.unflatten(0, (-1, count)).amax(1)  # a pick lifts one item at most

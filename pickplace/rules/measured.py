@@ -14,10 +14,11 @@ from torch import Tensor
 
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import carry, footprint_index, is_clear, is_outside, split_action
+from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR, NEVER
 from pickplace.rules.masks import PlacingMaps
 from pickplace.rules.placing import clearance, footprint_cells, footprint_sizes, is_within_reach, overflows, rest
-from pickplace.rules.state import Failure, Item, State, surface_from
+from pickplace.rules.state import Failure, State, surface_from
 from pickplace.rules.support.contact import Patches
 
 DIRECTIONS = 128  # in which the hull of what supports an item is looked at
@@ -48,7 +49,8 @@ class MeasuredTote(NamedTuple):
         patches = self.highest.shape[0] // cell.tote_size[0]
         heights = self.highest.unflatten(0, (-1, patches)).unflatten(2, (-1, patches)).amax((1, 3))
         height = torch.tensor([self.height - slack], device=heights.device)
-        return State(surface_from((heights - slack).clamp(min=0), self.bears)[None], height, item)
+        items = item.rows((slice(None), None))
+        return State(surface_from((heights - slack).clamp(min=0), self.bears)[None], height, items)
 
 
 class MeasuredMaps(NamedTuple):
@@ -190,7 +192,7 @@ def failures(cell: CellSpec, measured: MeasuredMaps, action: Tensor, bin_clear: 
     """
     (maps, stable, highest, rim), (tote_w, tote_d, _) = measured, cell.tote_size
     x_bin, y_bin, x_tote, y_tote, _ = split_action(cell, action)
-    item = Item(*(part.expand(len(action)) for part in maps.item))
+    item = maps.item.map(lambda part: part.expand(len(action)))
     picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action)
     parity = rotation % 2
     item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)

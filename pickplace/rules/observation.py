@@ -13,7 +13,8 @@ from torch import Tensor
 
 from pickplace.common.validate import excerpt, short_text
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.state import State, bin_depth_from_item, bin_labels_from_items, depth_from_heights
+from pickplace.rules.item import bin_depth_from_items, bin_labels_from_items
+from pickplace.rules.state import State, depth_from_heights
 
 
 class Bounds(NamedTuple):
@@ -49,7 +50,7 @@ class BinDepth(Term):
         return Bounds(0, tallest, cell.bin_size[:2])
 
     def value(self, cell, state):
-        return bin_depth_from_item(state.item, cell.bin_size)
+        return bin_depth_from_items(state.items, cell.bin_size)
 
 
 class BinLabels(Term):
@@ -75,7 +76,7 @@ class Items(Term):
         return Bounds(0, max(tallest, *cell.bin_size[:2]), (cell.bin_items, 5), torch.int64)
 
     def value(self, cell, state):
-        return state.items.table
+        return state.items.cuboids
 
 
 class ToteDepth(Term):

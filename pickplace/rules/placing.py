@@ -11,8 +11,9 @@ from torch import Tensor
 
 from pickplace.rules import large_items
 from pickplace.rules.cell import CellSpec
+from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR, NEVER, is_under, surround, windows
-from pickplace.rules.state import Item, State, surface_from
+from pickplace.rules.state import State, surface_from
 from pickplace.rules.support.contact import Contact
 
 
@@ -43,28 +44,30 @@ def is_within_reach(lowest: Tensor, highest: Tensor, top: Tensor) -> Tensor:
 
 
 # ---------------------------------------------------------------------- maps
-def resting_top(cell: CellSpec, state: State) -> tuple[Tensor, Tensor]:
+def resting_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item) -> tuple[Tensor, Tensor]:
     """Return the height of the item's top for every footprint, and what it rests on; int32 ``[N, Q, W_T, D_T]`` each.
+
+    Arguments as of :meth:`~pickplace.rules.state.State.each_item`.
 
     The top is ``NEVER`` where the item cannot rest: the footprint leaves the tote, the top passes the rim, or the
     support is too small. The height below it is that of :func:`rest`, stable or not; ``FAR`` outside the tote.
     """
-    item, (w, d) = state.item, footprint_sizes(cell, state.item)
+    w, d = footprint_sizes(cell, item)
     if large_items.are_large(cell):
-        z, stable = large_items.resting(cell, state.surface.permute(1, 2, 0), w, d)
+        z, stable = large_items.resting(cell, surface.permute(1, 2, 0), w, d)
     else:
-        cells, under = footprint_cells(cell, state.surface, w, d)
+        cells, under = footprint_cells(cell, surface, w, d)
         z = rest(cells, under)
         stable = cell.support.stable(Contact(cells, under, z, w, d))
     top = z + item.h.to(z.dtype)
-    good = stable & ~overflows(top, state.tote_height) & ~item.is_empty
+    good = stable & ~overflows(top, tote_height) & ~item.is_empty
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
 
-def unchecked_top(cell: CellSpec, state: State) -> Tensor:
-    """Return the height of the item's top for every footprint in the tote, stable or not; as :func:`resting_top`."""
-    z = rest(*footprint_cells(cell, state.surface, *footprint_sizes(cell, state.item)))
-    return (z + state.item.h.to(z.dtype)).permute(3, 0, 1, 2)
+def unchecked_top(cell: CellSpec, surface: Tensor, item: Item) -> tuple[Tensor, Tensor]:
+    """Return the same as :func:`resting_top`, but for every footprint in the tote, stable or not."""
+    z = rest(*footprint_cells(cell, surface, *footprint_sizes(cell, item)))
+    return (z + item.h.to(z.dtype)).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
 
 def footprint_sizes(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:

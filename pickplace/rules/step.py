@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.rules.bin import blocked_picks, select_item, taken_item
+from pickplace.rules.bin import remove_item, select_item, take_item
 from pickplace.rules.cell import CellSpec, EffectorShape
 from pickplace.rules.grasps import (
     carry,
@@ -17,8 +17,7 @@ from pickplace.rules.grasps import (
     split_footprint,
     turned_size,
 )
-from pickplace.rules.maps import is_under, rectangle, square_cells, squares
-from pickplace.rules.masks import PlacingMaps
+from pickplace.rules.maps import NEVER, is_under, rectangle, square_cells, squares
 from pickplace.rules.placing import is_within_reach, overflows, rest
 from pickplace.rules.state import Failure, Item, State, surface_from
 from pickplace.rules.support.contact import Contact
@@ -32,7 +31,7 @@ class Step(NamedTuple):
     top: Tensor  # int64 [N]: height of the item's top, meaningful without failure
     footprint: Tensor  # int64 [N, 4]: x, y, w, d of the footprint in the tote
     item: Item  # the item that is taken, [N]
-    taken: Tensor | None = None  # int64 [N]: its number in the bin; None: it lies alone
+    taken: Tensor  # int64 [N]: its number in the bin
 
     @property
     def heights(self) -> Tensor:
@@ -46,14 +45,8 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     Args:
         action: int64 ``[N]``, the flat index, in ``[0, N_a)``.
     """
-    (surface, tote_height, item), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.effector_size
-    taken = blocked = None
-    if item.x.dim() == 2:
-        taken = taken_item(cell, item, *split_action(cell, action)[:2])
-        blocked = blocked_picks(cell, item).unflatten(0, item.x.shape)[
-            torch.arange(len(taken), device=taken.device), taken
-        ]
-        item = select_item(item, taken)
+    (surface, tote_height, items), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.effector_size
+    taken, item, blocked = take_item(cell, items, *split_action(cell, action)[:2])
     picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
     side, reach = cell.max_side, max(ee_w, ee_d)
@@ -99,19 +92,21 @@ def body_cells(shapes: tuple[EffectorShape, ...], side: int, device: torch.devic
     return covered.flatten(1).t().contiguous().to(device)
 
 
-def put_down(cell: CellSpec, surface: Tensor, maps: PlacingMaps, footprint: Tensor) -> Tensor:
-    """Return the tote after a success that leaves the item in a given footprint, int32 ``[N, W_T, D_T]``.
+def put_down(cell: CellSpec, state: State, choice: Tensor) -> tuple[State, Item]:
+    """Return the state after a successful choice, before other items arrive, and the item that is placed, ``[N]``.
 
     Args:
-        surface: int32 ``[N, W_T, D_T]``, of which ``maps`` were made.
-        footprint: int64 ``[N]``, index ``(parity * W_T + x) * D_T + y``, one that some action reaches; of several
-            items in a bin that of a choice.
+        choice: int64 ``[N]``, ``item * num_footprints + footprint``, with the index of
+            :func:`~pickplace.rules.grasps.footprint_index`; one that some action reaches.
     """
-    maps, footprint = maps.of_choice(cell, footprint)
-    parity, x, y = split_footprint(cell.tote_size, footprint)
-    w, d = turned_size(maps.item, parity == 1)
-    z = maps.top.flatten(1).gather(1, footprint[:, None])[:, 0] - maps.item.h
-    return _add_item(cell, surface, torch.stack([x, y, w, d], -1), z, maps.item.h)
+    taken = choice // cell.num_footprints
+    item = select_item(state.items, taken)
+    parity, x, y = split_footprint(cell.tote_size, choice - taken * cell.num_footprints)
+    w, d = turned_size(item, parity == 1)
+    under = is_under(w, d, cell.max_side)
+    z = torch.where(under, squares(state.surface, x, y, cell.max_side), NEVER).amax(0) >> 1
+    surface = _add_item(cell, state.surface, torch.stack([x, y, w, d], -1), z, item.h)
+    return State(surface, state.tote_height, remove_item(state.items, taken)), item
 
 
 def _add_item(cell: CellSpec, surface: Tensor, footprint: Tensor, z: Tensor, height: Tensor) -> Tensor:

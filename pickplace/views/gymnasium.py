@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDict
 
 from pickplace.envs.gymnasium import PickPlaceGymEnv
-from pickplace.rules.state import Failure, bin_depth_from_item
+from pickplace.rules.item import bin_depth_from_items
+from pickplace.rules.state import Failure
 from pickplace.views.figures import INK
 from pickplace.views.recording import PlacedItem, Recording, items_in_bin, record_moves
 from pickplace.views.scene import draw_scene, item_colours
@@ -54,7 +55,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         if self._recording is not None and (terminated or truncated):
             self._recording.ending = Failure[info["failure"].upper()]
             if self._recording.ending == Failure.STUCK:
-                self._recording.waiting = items_in_bin(self._env.state.items, 0)
+                self._recording.waiting = items_in_bin(self._env.current_items, 0)
         self._update_window()
         return result
 
@@ -69,14 +70,13 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
 
         if self._recording is None:
             raise gymnasium.error.ResetNeeded("render() before reset().")
-        cell, item = self._env.cell, self._env.current_item
+        cell, items = self._env.cell, self._env.current_items
         scene = draw_scene(self._recording, cell, self._colours)
         inset = scene.add_axes((0.01, 0.04, 0.09, 0.18))
-        bin_depth = bin_depth_from_item(item, cell.bin_size)
+        bin_depth = bin_depth_from_items(items, cell.bin_size)
         inset.imshow(bin_depth[0].cpu().numpy().T, origin="lower", cmap="YlOrBr", vmin=0)
-        if cell.bin_items > 1:  # so that items side by side are told apart
-            for x, y, w, d, _ in items_in_bin(self._env.state.items, 0):
-                inset.add_patch(Rectangle((x - 0.5, y - 0.5), w, d, fill=False, edgecolor=INK, linewidth=1))
+        for x, y, w, d, _ in items_in_bin(items, 0):  # so that items side by side are told apart
+            inset.add_patch(Rectangle((x - 0.5, y - 0.5), w, d, fill=False, edgecolor=INK, linewidth=1))
         inset.set_title("bin", fontsize="medium")
         inset.set_xticks([])
         inset.set_yticks([])

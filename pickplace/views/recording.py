@@ -9,7 +9,8 @@ from torch import Tensor
 
 from pickplace.rules.cell import CellSpec, reference_cell
 from pickplace.rules.grasps import split_action
-from pickplace.rules.state import Failure, Item, State
+from pickplace.rules.item import Item
+from pickplace.rules.state import Failure, State
 from pickplace.rules.step import apply
 from pickplace.views.motion import Outcome
 
@@ -88,7 +89,7 @@ class Recording:
 
 def items_in_bin(items: Item, row: int) -> list[InBin]:
     """Return the items in one of the bins ``[N, M]``, in the order of arrival."""
-    return [tuple(item) for item in items.rows(row).table.tolist() if item[4] > 0]
+    return [tuple(item) for item in items.rows(row).cuboids.tolist() if item[4] > 0]
 
 
 def record_moves(cell: CellSpec, planner, observation: TensorDictBase, state: State, action: Tensor) -> list[Move]:
@@ -107,8 +108,7 @@ def record_moves(cell: CellSpec, planner, observation: TensorDictBase, state: St
     if heat is not None:
         heat = (255 * heat / heat.amax((1, 2), keepdim=True).clamp(min=1e-30)).round().byte().cpu().numpy()
     ref_x, ref_y = (reference_cell(side) for side in cell.effector_size)
-    items, contents = step.item.table.tolist(), state.items.table.tolist()
-    taken = [0] * len(action) if step.taken is None else step.taken.tolist()
+    items, contents, taken = (part.tolist() for part in (step.item.cuboids, state.items.cuboids, step.taken))
     moves = []
     for row in range(len(action)):
         shape = cell.effector(rotation[row])

@@ -137,7 +137,7 @@ def test_an_item_depends_on_its_address_alone(settings, first, stride):
         td, episode, step = env.reset(), first + torch.arange(4), torch.zeros(4, dtype=torch.int64)
         for _ in range(20):
             item = env.items.sample(address, torch.tensor(seed), episode, step, env.cell.bin_size)
-            assert torch.equal(env.item, torch.stack(item, 1))
+            assert torch.equal(env.item, item.table[:, None])
             td, following = env.step_and_maybe_reset(td.set("action", actions(td)))
             done = td["next", "done"][:, 0]
             episode, step = episode + stride * done, torch.where(done, 0, step + 1)

@@ -37,7 +37,7 @@ class Fussy(JointDBL):
     def decide(self, observation):
         state = State.from_observation(observation)
         infeasible = action_mask(self.cell, placing_maps(self.cell, state)).int().argmin(1)
-        refused = (state.item.w * state.item.d == 4) & (state.item.x == 0)
+        refused = ((state.items.w * state.items.d == 4) & (state.items.x == 0))[:, 0]
         return torch.where(refused, infeasible, super().decide(observation))
 
 

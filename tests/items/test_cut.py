@@ -10,10 +10,10 @@ import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from pickplace.task import cuts as module
 from scipy.stats import chi2_contingency, chisquare
 
 from pickplace import PickPlaceEnv
+from pickplace.items import cut as module
 from pickplace.items.cut import ORDERS, Cut
 from pickplace.items.distributions import STREAMS, Kinds, search_items
 

@@ -31,8 +31,9 @@ from commands import composed  # noqa: E402
 from pickplace import CellSpec, Planner, Scene, State, cli  # noqa: E402
 from pickplace.evaluation import evaluate  # noqa: E402, F401
 from pickplace.policies.fcn_grasp.policy import FcnGrasp  # noqa: E402
+from pickplace.rules.item import read_items  # noqa: E402
 from pickplace.rules.masks import action_mask, footprint_mask, placing_maps  # noqa: E402
-from pickplace.rules.state import EMPTY, item_from_depth, surface_from  # noqa: E402
+from pickplace.rules.state import EMPTY, surface_from  # noqa: E402
 from pickplace.rules.step import apply  # noqa: E402
 from pickplace.runs import checkpoint  # noqa: E402
 from pickplace.serve import json_lines  # noqa: E402
@@ -244,7 +245,7 @@ def json_line(draw: random.Random, folder: Path) -> None:
     rim = round(request.get("tote_height") or planner.cell.tote_size[2])
     depths = (np.round(np.array(request[key], dtype=float)).astype(int) for key in ("bin_depth", "tote_depth"))
     bin_depth, tote_depth = (torch.from_numpy(values)[None] for values in depths)
-    item = item_from_depth(bin_depth.float())
+    item = read_items(bin_depth.float())
     check_plan(planner.cell, State(surface_from(rim - tote_depth), torch.tensor([rim]), item), reply)
 
 
@@ -261,7 +262,7 @@ def check_plan(cell: CellSpec, state: State, plan: dict) -> None:
         assert feasible[plan["action"]]
         assert int(apply(cell, state, torch.tensor([plan["action"]])).failure) == 0
         gain = (plan["occupancy_after"] - plan["occupancy_before"]) * int(state.tote_height) * cell.num_places
-        assert abs(gain - int(state.item.volume)) < 1e-6
+        assert abs(gain - int(state.items.volume)) < 1e-6
 
 
 def good_request(draw: random.Random, cell: CellSpec) -> dict:

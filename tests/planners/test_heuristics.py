@@ -69,7 +69,7 @@ def test_heightmap_minimisation_raises_the_heights_least(weight, options):
     for env, observation in random_states(**options):
         chosen = HeightmapMinimisation(env.cell, weight).decide(observation)
         for n in range(env.num_envs):
-            items = env.state.items.table[n].tolist()
+            items = env.state.items.cuboids[n].tolist()
             costs = {
                 action: (
                     raised_by(env, n, found) + weight * (found[1] + found[2]),
@@ -95,7 +95,7 @@ def test_the_least_cost_over_all_feasible_actions_is_played(make, cost, options)
         assert torch.equal(make(env.cell).decide(observation.exclude("action_mask")), chosen)
         for n in range(env.num_envs):
             costs = {
-                action: cost(action, choice_by_hand(env.cell, env.state.items.table[n].tolist(), found), found)
+                action: cost(action, choice_by_hand(env.cell, env.state.items.cuboids[n].tolist(), found), found)
                 for action, found in results_by_hand(env, observation, n).items()
             }
             assert int(chosen[n]) == min(costs, key=costs.get)

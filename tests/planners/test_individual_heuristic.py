@@ -39,7 +39,8 @@ def test_corners_of_maximal_rectangles(seed, wide, deep, steps):
     cell = CellSpec(tote_size=(wide, deep, 6))
     heights = torch.randint(steps, (3, wide, deep), generator=generator).int()
     w, d, h = (torch.randint(1, 3, (3,), generator=generator) for _ in range(3))
-    maps = placing_maps(cell, State(surface_from(heights), torch.full((3,), 6), Item(w * 0, w * 0, w, d, h)))
+    items = Item(*(part[:, None] for part in (w * 0, w * 0, w, d, h)))
+    maps = placing_maps(cell, State(surface_from(heights), torch.full((3,), 6), items))
     found = corner_footprints(cell, heights, maps)
     for n in range(3):
         free = {z: list(maximal_rectangles((heights[n] <= z).tolist())) for z in range(steps)}
@@ -72,7 +73,7 @@ def test_the_first_candidate_that_succeeds_is_played(candidates, rotations, tote
     cell, state = env.cell, env.state
     maps = placing_maps(cell, state)
     top, corners, each = maps.top, corner_footprints(cell, state.heights, maps), cell.num_places * rotations
-    first = PICKS[pick](cell, state.item) * each
+    first = PICKS[pick](cell, maps.item) * each
     steps = [apply(cell, state, first + n) for n in range(each)]
     failed, lies = (torch.stack([getattr(step, key) for step in steps], 1) for key in ("failure", "footprint"))
     chosen = IndividualHeuristic(cell, candidates, pick=pick).decide(observation) - first
@@ -101,7 +102,7 @@ def test_of_several_items_it_takes_the_first_that_can_be_picked(rule):
         assert not ((step.failure == Failure.PICK_MISS) | (step.failure == Failure.BIN_COLLISION)).any()
         for n in range(env.num_envs):
             items = env.state.rows([n])
-            table = items.item.table[0].tolist()
+            table = items.items.table[0].tolist()
             order = [k for k in range(4) if table[k][4]]
             if rule == "nearest":
                 order.sort(key=lambda k: (table[k][0] + table[k][2] / 2) ** 2 + (table[k][1] + table[k][3] / 2) ** 2)

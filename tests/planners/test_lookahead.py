@@ -12,8 +12,10 @@ from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.afterstate.policy import Afterstate
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.policies.restore import RestoredCritic, restore_critic, restore_policy
+from pickplace.rules.item import Item
 from pickplace.rules.masks import choice_mask, placing_maps
-from pickplace.rules.state import EMPTY, Item, State
+from pickplace.rules.state import EMPTY, State
+from pickplace.rules.step import put_down
 from pickplace.runs import checkpoint
 
 
@@ -34,7 +36,7 @@ def played_out(search, problem, streams, horizon=None):
     """Return what the search expects of empty totes, ``[problems, streams]``."""
     count = len(problem)
     empty, rims = torch.full((count, 4, 4), EMPTY, dtype=torch.int32), torch.ones(count, dtype=torch.int64)
-    state = State(empty, rims, Item(*torch.zeros(5, count, dtype=torch.int64)))
+    state = State(empty, rims, Item(*torch.zeros(5, count, 1, dtype=torch.int64)))
     return search._play_out(state, torch.tensor(problem), streams, horizon)
 
 
@@ -94,14 +96,15 @@ def test_what_lies_in_the_bin_is_played_before_anything_is_imagined():
     env = make_env(64, (6, 6, 5), **sizes)
     env.reset()
     search = search_of(env, lambda observation: torch.zeros(len(observation["tote_depth"]), 1), horizon=2)
-    state, maps = env.state, placing_maps(env.cell, env.state)
-    choice = choice_mask(env.cell, maps).int().argmax(1)
-    left = state.item.volume.sum(1) - state.item.volume.gather(1, choice[:, None] // env.cell.num_footprints)[:, 0]
-    volume = search._play_out(search._place(state, maps, choice), torch.arange(64), 4, 2)
+    state = env.state
+    choice = choice_mask(env.cell, placing_maps(env.cell, state)).int().argmax(1)
+    after, placed = put_down(env.cell, state, choice)
+    left = state.items.volume.sum(1) - placed.volume
+    volume = search._play_out(after, torch.arange(64), 4, 2)
     assert torch.equal(volume, left.double()[:, None].expand(64, 4))
-    returns = search._returns(state, maps, torch.arange(64), choice, 4, 2)
-    assert torch.equal(returns, state.item.volume.sum(1).double()[:, None].expand(64, 4))  # whichever is first
-    further = search._play_out(search._place(state, maps, choice), torch.arange(64), 4, 3)
+    returns = search._returns(state, torch.arange(64), choice, 4, 2)
+    assert torch.equal(returns, state.items.volume.sum(1).double()[:, None].expand(64, 4))  # whichever is first
+    further = search._play_out(after, torch.arange(64), 4, 3)
     assert further.std(1).max() > 0  # then comes an imagined batch
 
 

@@ -7,8 +7,9 @@ from problems import occupancies
 from pickplace import PickPlaceEnv
 from pickplace.items.distributions import Kinds, Recorded
 from pickplace.planners.mcts import MCTS, _Edge, _Node
+from pickplace.rules.item import Item
 from pickplace.rules.masks import actions_reaching, placing_maps
-from pickplace.rules.state import Item, State
+from pickplace.rules.state import State
 from pickplace.rules.step import apply
 
 OPTIMUM = 0.9456  # 4x4x1, R=4, by tests/dynamic_programming.py
@@ -80,14 +81,14 @@ def test_a_return_is_what_the_walk_places_and_its_rollout(mask):
 def test_what_is_not_taken_stays_in_the_bin(mask):
     env = make_env(tote_size=(4, 4, 2), bin_items=3)
     root, looked = searched(mask, 1500, bin_items=3), set()
-    before = root.item.tolist()
+    before = root.items.tolist()
     for edge in root.edges.values():
         taken = edge.action // env.cell.num_footprints
         if not mask:
-            state = State(root.surface[None], torch.tensor([2]), Item.from_table(root.item[None]))
+            state = State(root.surface[None], torch.tensor([2]), Item.from_table(root.items[None]))
             taken = int(apply(env.cell, state, torch.tensor([edge.action])).taken)
         for node in edge.bins:
-            assert node.item.tolist()[:2] == before[:taken] + before[taken + 1 :]
+            assert node.items.tolist()[:2] == before[:taken] + before[taken + 1 :]
             looked.add(taken)
     assert len(looked) > 1
 
@@ -136,7 +137,7 @@ def test_bad_settings_are_refused(settings, words):
 
 def test_the_next_action_is_chosen_by_ucb1():
     env = make_env()
-    node = _Node(torch.zeros(4, 4), torch.zeros(5), [])
+    node = _Node(torch.zeros(4, 4), torch.zeros(1, 9), [])
     node.edges = {n: _Edge(node, n, visits, visits * mean) for n, (visits, mean) in enumerate([(100, 0.6), (25, 0.45)])}
     # sqrt(ln 125 / n) is 0.220 and 0.439
     for weight, best in ((0, 0), (0.6, 0), (0.75, 1)):

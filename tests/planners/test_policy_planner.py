@@ -95,8 +95,8 @@ def test_a_pick_may_be_chosen_first(rule, make, effector, rotations):
         cell, policy = env.cell, make(env.cell)
         policy.network.compute_dtype = "float32"
         chosen = PolicyPlanner(cell, policy, pick=rule).decide(observation)
-        picks, scores = PICKS[rule](cell, env.state.item).tolist(), policy.unmasked_scores(observation)
-        ranked = policy.ranked(placing_maps(cell, env.state))
+        maps, scores = placing_maps(cell, env.state), policy.unmasked_scores(observation)
+        picks, ranked = PICKS[rule](cell, maps.item).tolist(), policy.ranked(maps)
         for n, pick in enumerate(picks):
             each = cell.num_places * rotations
             actions = torch.arange(pick * each, (pick + 1) * each)

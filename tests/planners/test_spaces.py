@@ -44,7 +44,7 @@ def test_the_first_space_is_filled(planner, options):
         strict = planner(env.cell, dbl_fallback=False).decide(observation)
         for n in range(env.num_envs):
             spaces = list(spaces_by_hand(env.state.heights[n].tolist()))
-            items, in_corner, elsewhere = env.state.items.table[n].tolist(), {}, {}
+            items, in_corner, elsewhere = env.state.items.cuboids[n].tolist(), {}, {}
             results = results_by_hand(env, observation, n)
             for action, found in results.items():
                 top, y, x, w, d, number = found

@@ -33,7 +33,7 @@ def test_totes_after_a_placement_are_those_of_the_oracle(options):
     for env, observation in random_states(4, **options):
         for n in range(0, env.num_envs, 4):
             for top, y, x, w, d, _ in results_by_hand(env, observation, n).values():
-                item, before = env.state.item.rows(n), observation["tote_depth"][n]
+                item, before = env.state.items.rows(n), observation["tote_depth"][n]
                 turned = int((w, d) != (int(item.w), int(item.d)))
                 footprint = footprint_index(env.cell.tote_size, turned, x, y)
                 expected = before.clone()

@@ -216,7 +216,7 @@ def test_the_critic_sees_the_mean_of_several_items():
     for parameter in critic.parameters():
         parameter.normal_()
     bins, totes, bearing = random_maps(3, 2, (4, 6), (5, 5))
-    one = item_from_depth(bins).table[:, None]
+    one = item_from_depth(bins).cuboids[:, None]
     torch.testing.assert_close(critic(bins, totes, bearing, one), critic(bins, totes, bearing))
     both = torch.cat([one, one.flip(0), torch.zeros_like(one)], 1)  # of an empty place it sees nothing
     code = critic._item_code(bins, both)

@@ -77,16 +77,17 @@ def arrivals_by_hand(source, stream, address, contents, cell, arrived):
     while len(found) < cell.bin_items and not (cell.refill == "batch" and contents):
         where = *address, torch.tensor([arrived])
         item = source.sample(stream, *where, cell.bin_size)
-        own_x, own_y, w, d, h = (int(part) for part in item)
+        own_x, own_y, w, d, h = item.cuboids[0].tolist()
         uniform = float(hashed_uniform(stream, *where, 4)[3])
         full = {part for other in found for part in cells(other[:2], other[2:4])}
         places = [
             (x, y) for x, y in product(range(bin_w - w + 1), range(bin_d - d + 1))
             if full.isdisjoint(cells((x, y), (w, d)))
         ]  # fmt: skip
-        if h == 0 or not places or (source.has_corners and (own_x, own_y) not in places):
+        keeps_place = source.has_corners or not found
+        if h == 0 or not places or (keeps_place and (own_x, own_y) not in places):
             break
-        x, y = (own_x, own_y) if source.has_corners else places[int(uniform * len(places))]
+        x, y = (own_x, own_y) if keeps_place else places[int(uniform * len(places))]
         found.append((x, y, w, d, h))
         arrived += 1
     return found, arrived
@@ -103,20 +104,22 @@ def test_items_arrive_in_their_order_where_they_have_room(kind, rule, tmp_path):
     source = Uniform() if kind == "uniform" else Recorded(path)
     cell = CellSpec(bin_size=(5, 6, 1), bin_items=count, refill=rule)
     contents = [random_contents(rng, (5, 6), rng.choice((0, 0, 2, 4))) for _ in range(60)]
-    seed, episode = torch.full((60,), 3), torch.arange(60)
+    seed, episode, rows = torch.full((60,), 3), torch.arange(60), torch.arange(60) % 7 > 0
     arrived = torch.tensor([rng.randint(0, 10) for _ in range(60)])
-    items, after = refill(cell, source, "train", seed, episode, arrived, as_items(contents, count))
+    items, after = refill(cell, source, "train", seed, episode, arrived, as_items(contents, count), rows)
     for n in range(60):
         address = seed[:1], episode[n : n + 1]
-        found, number = arrivals_by_hand(source, "train", address, contents[n], cell, int(arrived[n]))
-        assert [tuple(row) for row in items.table[n].tolist() if row[4]] == found and after[n] == number
+        found, number = contents[n], arrived[n]
+        if rows[n]:
+            found, number = arrivals_by_hand(source, "train", address, contents[n], cell, int(arrived[n]))
+        assert [tuple(row) for row in items.cuboids[n].tolist() if row[4]] == found and after[n] == number
 
 
 def test_places_are_drawn_evenly():
     cell, count = CellSpec(bin_size=(3, 4, 1), bin_items=2), 30_000
     first = as_items([[(0, 0, 1, 2, 1)]] * count, 2)
     zeros = torch.zeros(count, dtype=torch.int64)
-    items, _ = refill(cell, Kinds([(1, 2, 1)]), "train", zeros, torch.arange(count), zeros, first)
+    items, _ = refill(cell, Kinds([(1, 2, 1)]), "train", zeros, torch.arange(count), zeros, first, zeros == 0)
     places = torch.bincount(items.x[:, 1] * 4 + items.y[:, 1])
     free = {(x, y) for x in range(3) for y in range(3)} - {(0, 0), (0, 1)}
     assert set(places.nonzero()[:, 0].tolist()) == {x * 4 + y for x, y in free}

@@ -70,7 +70,7 @@ def test_the_mask_equals_a_plain_search(problem, level_step):
 def test_where_the_gripper_stops_an_item_is_a_corner():
     """A tote whose walls the gripper does not pass: a small item stops short of them."""
     cell = CellSpec(bin_size=(5, 5, 1), tote_size=(7, 7, 5), effector_size=(3, 3), rotations=1)
-    item = Item(*(torch.tensor([value]) for value in (0, 0, 1, 1, 1)))  # gripped at the gripper's corner, or inside
+    item = Item(*(torch.tensor([[value]]) for value in (0, 0, 1, 1, 1)))  # gripped at the gripper's corner, or inside
     state = State(surface_from(torch.zeros(1, 7, 7, dtype=torch.int32)), torch.tensor([5]), item)
     limits = Limits(torch.zeros(25, dtype=torch.bool).index_fill(0, torch.tensor(6), True), *unlimited(cell))
     cell = replace(cell, limits=limits)
@@ -86,7 +86,7 @@ def unlimited(cell):
 
 def test_an_empty_tote_has_its_four_corners_for_each_orientation():
     cell = CellSpec(bin_size=(5, 5, 1), tote_size=(9, 8, 5), effector_size=(3, 3))
-    item = Item(*(torch.tensor([value]) for value in (1, 1, 3, 2, 1)))
+    item = Item(*(torch.tensor([[value]]) for value in (1, 1, 3, 2, 1)))
     state = State(surface_from(torch.zeros(1, 9, 8, dtype=torch.int32)), torch.tensor([5]), item)
     mask = corner_mask(cell, placing_maps(cell, state))
     expected = [[0, 0, x, y] for x in (0, 6) for y in (0, 6)] + [[0, 1, x, y] for x in (0, 7) for y in (0, 5)]

@@ -46,7 +46,7 @@ def test_masks_equal_the_step_and_the_oracle(problem, least_side):
     with patch.object(large_items, "LEAST_SIDE", least_side):
         maps = placing_maps(cell, state)
     masks, reached = action_mask(cell, maps), footprint_mask(cell, maps)
-    footprints = action_footprints(cell, state.item)
+    footprints = action_footprints(cell, state.items)
     assert torch.equal(num_feasible(cell, maps), masks.sum(1))
     for row, case in enumerate(cases):
         plain, mask = oracle_of(cell, case), masks[row]
@@ -73,8 +73,9 @@ def test_masks_equal_the_step_and_the_oracle(problem, least_side):
         assert torch.equal(footprints[row][reaching], each[index])
         first = first_action_reaching(cell, maps.rows(same), each)
         assert torch.equal(first, torch.where(found >= 0, found, cell.num_actions).amin(1))
-        after = put_down(cell, state.surface[same], maps.rows(same), each)
-        assert torch.equal(after, step.surface[first])
+        after, placed = put_down(cell, state.rows(same), each)
+        assert torch.equal(after.surface, step.surface[first]) and after.items.is_empty.all()
+        assert torch.equal(placed.table, step.item.rows(first).table)
 
 
 @pytest.mark.parametrize("seed", range(25))
@@ -93,7 +94,7 @@ def test_bodies_among_towers(seed):
     state, plain = state_of(case), oracle_of(cell, case)
     maps = placing_maps(cell, state)
     mask, actions = action_mask(cell, maps)[0], torch.arange(cell.num_actions)
-    step, footprints = apply(cell, state.repeat(len(actions)), actions), action_footprints(cell, state.item)[0]
+    step, footprints = apply(cell, state.repeat(len(actions)), actions), action_footprints(cell, state.items)[0]
     assert torch.equal(mask, step.failure == 0) and num_feasible(cell, maps).item() == mask.sum()
     reached = footprint_mask(cell, maps)[0].flatten().nonzero()[:, 0]
     assert torch.equal(reached, footprints[mask].unique())
@@ -137,7 +138,7 @@ def test_limits_by_hand():
     """One of each: a pick out of reach, and an item's top too low and too high, in one rotation at one place cell."""
     cell = CellSpec()
     item = (1, 1, 2, 1, 1)
-    state = State(torch.full((1, 6, 6), EMPTY).int(), torch.tensor([5]), Item(*torch.tensor([item]).unbind(1)))
+    state = State(torch.full((1, 6, 6), EMPTY).int(), torch.tensor([5]), Item.from_table(torch.tensor([[item]])))
     actions = torch.arange(cell.num_actions)
     before = apply(cell, state.repeat(len(actions)), actions).failure.view(5, 5, 6, 6, 4)
     limits = open_limits(cell)
@@ -151,16 +152,16 @@ def test_limits_by_hand():
         expected[index] = torch.where(before[index] == 0, int(Failure.OUT_OF_REACH), before[index])
     assert torch.equal(after, expected) and (after != before).sum() == 74
     # The heuristic pick is another one where its first choice is out of reach.
-    pick = heuristic_pick(cell, state.item)
+    pick = heuristic_pick(cell, state.items.rows(0))
     limits.pick_ok[pick] = False
-    assert heuristic_pick(replace(cell, limits=limits), state.item) != pick
+    assert heuristic_pick(replace(cell, limits=limits), state.items.rows(0)) != pick
 
 
 def rest_on(heights, item, support):
     """Return the failure of an item that is set down on the near corner of a tote of these heights."""
     (w, d, h), (wide, deep) = item, heights.shape
     cell = CellSpec((w, d, h), (wide, deep, 9), (w, d), 1, "contain", support)
-    state = State(surface_from(heights)[None], torch.tensor([9]), Item(*torch.tensor([[0, 0, *item]]).unbind(1)))
+    state = State(surface_from(heights)[None], torch.tensor([9]), Item.from_table(torch.tensor([[[0, 0, *item]]])))
     pick = reference_cell(w) * d + reference_cell(d)
     action = torch.tensor([pick * wide * deep + reference_cell(w) * deep + reference_cell(d)])
     failure = apply(cell, state, action).failure.item()
@@ -227,7 +228,7 @@ def test_large_items_rest_as_small_ones_do(support, unit, at_once, monkeypatch):
         each = []
         for least_side in (1, 999):
             monkeypatch.setattr(large_items, "LEAST_SIDE", least_side)
-            each.append(resting_top(env.cell, env.state.each_item()))
+            each.append(resting_top(env.cell, *env.state.each_item()))
         (top, rest), (expected_top, expected_rest) = each
         assert torch.equal(top, expected_top) and torch.equal(rest, expected_rest)
         stable += int((top >= 0).sum())
@@ -292,7 +293,7 @@ def test_an_item_bears_weight_inside_scipys_hull(data):
 def test_a_pile_that_leans_over(support, third):
     """Bricks of three cells, each one cell further. The third one would have the upper two balance on an edge."""
     cell = CellSpec((3, 1, 1), (6, 1, 9), (3, 1), 1, "contain", support)
-    item = Item(*torch.tensor([[0, 0, 3, 1, 1]]).unbind(1))
+    item = Item.from_table(torch.tensor([[[0, 0, 3, 1, 1]]]))
     state, failures = State(torch.full((1, 6, 1), EMPTY, dtype=torch.int32), torch.tensor([9]), item), []
     for middle in (1, 2, 3):
         step = apply(cell, state, torch.tensor([6 + middle]))  # picked in the middle
@@ -308,7 +309,7 @@ def test_a_pile_that_leans_over(support, third):
 def test_picks_that_do_not_look_at_the_tote(problem):
     """Of those that succeed: least ``ox + oy``, then ``oy``; and least from the item's middle to the effector's."""
     cell, cases = problem
-    item, (_, bin_d, _), (ee_w, ee_d) = state_of(*cases).item, cell.bin_size, cell.effector_size
+    item, (_, bin_d, _), (ee_w, ee_d) = state_of(*cases).items.rows((slice(None), 0)), cell.bin_size, cell.effector_size
     picks, central, lifted = (
         heuristic_pick(cell, item).tolist(),
         central_pick(cell, item).tolist(),
@@ -326,7 +327,7 @@ def test_picks_that_do_not_look_at_the_tote(problem):
 
 def test_an_empty_bin_has_no_feasible_action():
     cell, nothing = CellSpec(pick_rule="overlap", support=0.0), torch.zeros(2, dtype=torch.int64)
-    item = Item(nothing, nothing, nothing, nothing, nothing)
+    item = Item(*[nothing[:, None]] * 5)
     maps = placing_maps(cell, State(torch.zeros(2, 6, 6).int(), nothing + 5, item))
     assert not all_grasps(cell, item)[0].any() and not action_mask(cell, maps).any()
     assert not footprint_mask(cell, maps).any() and not num_feasible(cell, maps).any()

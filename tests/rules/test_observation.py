@@ -63,7 +63,7 @@ def test_the_state_can_be_read_from_an_observation(problem):
     cell, cases = problem
     state = state_of(*cases)
     found = State.from_observation(observe(STANDARD_TERMS, cell, state))
-    for ours, expected in zip((*found[:2], *found.item), (*state[:2], *state.item), strict=True):
+    for ours, expected in zip((*found[:2], *found.items), (*state[:2], *state.items), strict=True):
         assert torch.equal(ours, expected)
 
 

@@ -67,7 +67,7 @@ def test_several_items_in_the_bin_are_outlined(scenes):
     _, info = env.reset(seed=0)
     while info["action_mask"].any():
         env.render()
-        lying = [tuple(item) for item in env.unwrapped._env.item[0].tolist() if item[4]]
+        lying = [tuple(item[:5]) for item in env.unwrapped._env.item[0].tolist() if item[4]]
         inset = scenes[-1][-1].axes[-1]
         found = [(p.get_x() + 0.5, p.get_y() + 0.5, p.get_width(), p.get_height()) for p in inset.patches]
         assert len(lying) > 1 and found == [item[:4] for item in lying]

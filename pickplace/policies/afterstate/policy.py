@@ -9,8 +9,8 @@ from pickplace.policies.base import refuse_several_items
 from pickplace.policies.footprints import FootprintPolicy
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_footprint, turned_size
+from pickplace.rules.item import Observation, item_from_depth
 from pickplace.rules.maps import FAR, rectangle
-from pickplace.rules.state import Observation, item_from_depth
 
 
 class Afterstate(FootprintPolicy):

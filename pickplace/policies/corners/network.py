@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from pickplace.common.validate import MAX_WIDTH, check_inputs, excerpt, number, whole_number
 from pickplace.policies.depth import Contents
 from pickplace.rules.grasps import split_footprint
-from pickplace.rules.state import item_from_depth
+from pickplace.rules.item import item_from_depth
 
 PLANES = 6  # of each point, see `CornerNet`
 SIZES = 13  # numbers beside the points

@@ -9,7 +9,7 @@ from pickplace.policies.depth import Contents, clip_depth
 from pickplace.policies.footprints import every_footprint
 from pickplace.rules.cell import reference_cell
 from pickplace.rules.grasps import split_footprint
-from pickplace.rules.state import Item, item_from_depth
+from pickplace.rules.item import Item, item_from_depth
 
 DTYPES = ("auto", "float32", "bfloat16")
 CHUNK_BYTES = 2**29  # inputs of the first layer that are held at a time when gradients are off

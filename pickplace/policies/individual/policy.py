@@ -12,8 +12,8 @@ from pickplace.policies.fcn_grasp.policy import UnmaskedFcnGrasp
 from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintScorer, count_ways
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import heuristic_pick, join_pick, pick_classes, select_pick
+from pickplace.rules.item import Observation, item_from_depth, items_from_observation
 from pickplace.rules.masks import PlacingMaps, action_footprints
-from pickplace.rules.state import Observation, item_from_depth
 
 EXCLUDES = "every pick but the heuristic one"
 
@@ -122,7 +122,7 @@ class IndividualGrasp(FootprintScorer):
         """
         item = item_from_depth(observation["bin_depth"])
         pick = heuristic_pick(self.cell, item)
-        footprint = select_pick(self.cell, action_footprints(self.cell, item), pick)
+        footprint = select_pick(self.cell, action_footprints(self.cell, items_from_observation(observation)), pick)
         if mask is None:
             return pick, footprint, footprint >= 0
         allowed = select_pick(self.cell, mask, pick)

@@ -1,0 +1,142 @@
+"""Items in bins: their columns, and how an observation shows them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TypeAlias
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from pickplace.rules.maps import rectangle
+
+#: An observation ``[N]``: a TensorDict, or a dict of its entries.
+Observation: TypeAlias = TensorDictBase | Mapping[str, Tensor]
+
+ALL_TURNS = 0b1111  # a bit for each quarter turn
+NO_LIMIT = 2**31 - 1  # grams
+DEFAULTS = {"kind": -1, "turns": ALL_TURNS, "grams": 0, "max_load": NO_LIMIT}
+
+
+class _Columns(NamedTuple):
+    """The columns of a table of items."""
+
+    x: Tensor
+    y: Tensor
+    w: Tensor
+    d: Tensor
+    h: Tensor
+    kind: Tensor
+    turns: Tensor
+    grams: Tensor
+    max_load: Tensor
+
+
+class Item(_Columns):
+    """Items, column by column: int64 tensors of one shape.
+
+    The items in the bins of a :class:`~pickplace.rules.state.State` have columns ``[N, M]``: ``M`` places in each bin,
+    filled in the order of arrival. One item for each of ``N`` problems has columns ``[N]``. An item of size
+    ``(0, 0, 0)`` is not there.
+
+    Args:
+        x, y: minimum corner in the bin; cells.
+        w, d, h: width and depth in cells, height in height units.
+        kind: row of the size in :attr:`~pickplace.items.distributions.ItemDistribution.sizes`; -1: not known.
+        turns: quarter turns that are allowed, bit ``r`` for rotation ``r``.
+        grams: mass.
+        max_load: greatest mass that may rest on the item, grams.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, x, y, w, d, h, kind=None, turns=None, grams=None, max_load=None):
+        given = zip((kind, turns, grams, max_load), DEFAULTS.values(), strict=True)
+        rest = (torch.full_like(x, default) if part is None else part for part, default in given)
+        return super().__new__(cls, x, y, w, d, h, *rest)
+
+    @classmethod
+    def from_table(cls, table: Tensor) -> "Item":
+        """Return the items of a table ``[..., 9]``, or ``[..., 5]`` with x, y, w, d and h only."""
+        return cls(*table.unbind(-1))
+
+    @property
+    def table(self) -> Tensor:
+        """All columns, int64 ``[..., 9]``."""
+        return torch.stack(self, -1)
+
+    @property
+    def cuboids(self) -> Tensor:
+        """The columns x, y, w, d and h, int64 ``[..., 5]``."""
+        return torch.stack(self[:5], -1)
+
+    @property
+    def volume(self) -> Tensor:
+        """The volume, in cells times height units, int64."""
+        return self.w * self.d * self.h
+
+    @property
+    def is_empty(self) -> Tensor:
+        """Whether there is no item, bool."""
+        return self.h <= 0
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> "Item":
+        """Return the items with a function applied to each column."""
+        return Item(*map(function, self))
+
+    def rows(self, index) -> "Item":
+        """Return some of the items, by an index into each column."""
+        return self.map(lambda part: part[index])
+
+
+def bin_depth_from_items(items: Item, bin_size: Sequence[int]) -> Tensor:
+    """Return the height above the bin's floor, float32 ``[N, W_B, D_B]``: an item's height under it, else 0."""
+    return _bin_map(items, items.h, bin_size)
+
+
+def bin_labels_from_items(items: Item, bin_size: Sequence[int]) -> Tensor:
+    """Return which item of ``[N, M]`` lies on each cell of the bin, float32 ``[N, W_B, D_B]``, from 1; 0: none."""
+    return _bin_map(items, torch.arange(1, items.x.shape[1] + 1, device=items.x.device).expand_as(items.x), bin_size)
+
+
+def _bin_map(items: Item, value: Tensor, bin_size: Sequence[int]) -> Tensor:
+    """Return a map of a value of each item on its cells, 0 elsewhere, float32 ``[N, W_B, D_B]``."""
+    inside = rectangle(bin_size, *(part.flatten() for part in items[:4]))  # [W_B, D_B, N * M]
+    maps = (inside * value.flatten().float()).unflatten(2, items.x.shape).sum(3)
+    return maps.permute(2, 0, 1).contiguous()
+
+
+def read_items(bin_depth: Tensor, table: Tensor | None = None) -> Item:
+    """Return what lies in the bins, ``[N, M]``: the items of a table, or the one that the depth map shows.
+
+    Args:
+        bin_depth: ``[N, W_B, D_B]``.
+        table: int64 ``[N, M, 5]``, as the observation has it where a bin holds several items.
+    """
+    if table is None:
+        return item_from_depth(bin_depth).rows((slice(None), None))
+    return Item.from_table(table)
+
+
+def listed_items(observation: Observation) -> Item | None:
+    """Return the items that an observation of bins with several items lists, ``[N, M]``; None if it has no list."""
+    table = observation.get("items", None)
+    return None if table is None else Item.from_table(table)
+
+
+def items_from_observation(observation: Observation) -> Item:
+    """Return what lies in the bins, ``[N, M]``; see :func:`read_items`."""
+    return read_items(observation["bin_depth"], observation.get("items", None))
+
+
+def item_from_depth(bin_depth: Tensor) -> Item:
+    """Return the item that a depth map ``[N, W_B, D_B]`` shows, ``[N]``: the bounding box of its non-zero cells."""
+    filled = bin_depth > 0
+    columns, rows = filled.any(2), filled.any(1)  # [N, W_B], [N, D_B]
+    # argmax of a 0/1 map is its first 1: where the item begins.
+    return Item(
+        x=columns.int().argmax(1),
+        y=rows.int().argmax(1),
+        w=columns.sum(1),
+        d=rows.sum(1),
+        h=bin_depth.amax((1, 2)).long(),
+    )
