@@ -78,9 +78,9 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
         for index in sorted(first.tolist()):
             distinct.setdefault(keys[index].tobytes(), int(numbers[index]))
     for chunk in rows[list(distinct.values())].split(max(1, min(1024, 2**24 // cell.num_footprints))):
-        items = Item.from_table(chunk[:, None, :5])
+        lying = Item.from_table(chunk[:, None, :5])
         empty = torch.full((len(chunk), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
-        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), items))
+        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), lying))
         feasible = footprint_mask(cell, maps).flatten(1).any(1)
         if not feasible.all():
             x, y, *_, kind = chunk[~feasible][0].tolist()

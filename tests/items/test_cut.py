@@ -229,9 +229,9 @@ def test_a_perfect_packing_is_feasible_in_the_benchmark_s_environment(order):
     observation, done = env.reset(), torch.zeros(count, dtype=torch.bool)
     for step in range(max(map(len, boxes))):
         here = torch.tensor([each[min(step, len(each) - 1)] for each in boxes])
-        item = env.current_item
+        item = env.current_items.rows((slice(None), 0))
         playing = ~done
-        assert torch.equal(torch.stack(item, 1)[playing, 2:], here[playing, 3:])
+        assert torch.equal(item.cuboids[playing, 2:], here[playing, 3:])
         # The effector's only cell is on the item's first one, and goes to where that one belongs.
         pick = item.x * BIN[1] + item.y
         action = (pick * 10 + here[:, 0]) * 10 + here[:, 1]

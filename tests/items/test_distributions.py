@@ -68,7 +68,7 @@ def test_an_item_is_a_hash_of_its_address():
     for stream in STREAMS:
         for batch in (slice(0, 3), slice(1, 2)):
             item = Kinds(module.PAPER_KINDS).sample(stream, *(part[batch] for part in address), (5, 5, 1))
-            assert torch.stack(item, 1).tolist() == expected[stream][batch]
+            assert item.cuboids.tolist() == expected[stream][batch]
 
 
 def test_positions_are_uniform_and_independent_of_the_kind():

@@ -115,7 +115,7 @@ def test_footprints_without_the_tote(problem):
     x, y, w, d = step.footprint.unbind(-1)
     inside = (x >= 0) & (y >= 0) & (x + w <= cell.tote_size[0]) & (y + d <= cell.tote_size[1])
     lifted = (step.failure != Failure.PICK_MISS) & (step.failure != Failure.BIN_COLLISION)
-    assert torch.equal(action_footprints(cell, flat.item).flatten() >= 0, inside & lifted)
+    assert torch.equal(action_footprints(cell, flat.items).flatten() >= 0, inside & lifted)
 
 
 def open_limits(cell):
@@ -329,5 +329,5 @@ def test_an_empty_bin_has_no_feasible_action():
     cell, nothing = CellSpec(pick_rule="overlap", support=0.0), torch.zeros(2, dtype=torch.int64)
     item = Item(*[nothing[:, None]] * 5)
     maps = placing_maps(cell, State(torch.zeros(2, 6, 6).int(), nothing + 5, item))
-    assert not all_grasps(cell, item)[0].any() and not action_mask(cell, maps).any()
+    assert not all_grasps(cell, maps.item)[0].any() and not action_mask(cell, maps).any()
     assert not footprint_mask(cell, maps).any() and not num_feasible(cell, maps).any()
