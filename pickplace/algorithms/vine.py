@@ -14,9 +14,10 @@ from torchrl.modules import ValueOperator
 
 from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS
 from pickplace.policies.base import Policy
+from pickplace.rules.item import Item
 from pickplace.rules.masks import footprint_mask, placing_maps
 from pickplace.rules.observation import Term, observe
-from pickplace.rules.state import Failure, Item, State
+from pickplace.rules.state import Failure, State
 from pickplace.rules.step import apply
 
 

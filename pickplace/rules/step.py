@@ -17,9 +17,10 @@ from pickplace.rules.grasps import (
     split_footprint,
     turned_size,
 )
+from pickplace.rules.item import Item
 from pickplace.rules.maps import NEVER, is_under, rectangle, square_cells, squares
 from pickplace.rules.placing import is_within_reach, overflows, rest
-from pickplace.rules.state import Failure, Item, State, surface_from
+from pickplace.rules.state import Failure, State, surface_from
 from pickplace.rules.support.contact import Contact
 
 
