@@ -30,7 +30,7 @@ from pickplace import PickPlaceEnv
 from pickplace.config.registry import build
 from pickplace.evaluation.result import confidence95, proportion95
 from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement, read_plans
-from pickplace.rules.state import Item
+from pickplace.rules.item import Item
 
 TABLE, RUNS = ROOT / "docs" / "results" / "physics.csv", ROOT / "outputs" / "physics"
 ITEMS = {"kinds": "6x6x5", "mixed": "8x8x8", "tall": "6x6x5"}

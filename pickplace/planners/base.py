@@ -15,9 +15,10 @@ from pickplace.items.distributions import ItemDistribution
 from pickplace.policies.restore import restore_critic, restore_policy
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, select_pick
+from pickplace.rules.item import Observation
 from pickplace.rules.masks import PlacingMaps, action_footprints, action_mask, placing_maps
 from pickplace.rules.observation import Term
-from pickplace.rules.state import Observation, State
+from pickplace.rules.state import State
 
 
 @runtime_checkable

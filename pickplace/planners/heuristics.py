@@ -9,6 +9,7 @@ from pickplace.common.validate import number
 from pickplace.items.distributions import check_seed
 from pickplace.planners.base import MapPlanner, check_item_rule, restrict_items
 from pickplace.rules.cell import CellSpec
+from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR, rectangle_sums
 from pickplace.rules.masks import (
     PlacingMaps,
@@ -18,7 +19,7 @@ from pickplace.rules.masks import (
     first_action_reaching,
 )
 from pickplace.rules.placing import footprint_sizes
-from pickplace.rules.state import Observation, State
+from pickplace.rules.state import State
 
 
 def dbl_order(cell: CellSpec, top: Tensor, x: Tensor, y: Tensor) -> Tensor:

@@ -8,9 +8,10 @@ from pickplace.planners.base import MapPlanner, pick_first, restrict_items
 from pickplace.planners.heuristics import dbl_order
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, all_grasps, join_pick, split_footprint
+from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps
-from pickplace.rules.state import Observation, State
+from pickplace.rules.state import State
 
 CANDIDATES = ("corners", "cells")
 

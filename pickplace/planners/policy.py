@@ -12,8 +12,9 @@ from pickplace.policies.base import Policy, ScoresFootprints
 from pickplace.policies.footprints import FootprintPolicy, count_ways
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, join_pick, select_pick
+from pickplace.rules.item import Observation
 from pickplace.rules.masks import PlacingMaps, action_mask, first_action_reaching, placing_maps
-from pickplace.rules.state import Observation, State
+from pickplace.rules.state import State
 from pickplace.rules.step import apply
 
 

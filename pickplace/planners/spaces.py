@@ -15,9 +15,10 @@ from pickplace.common.validate import check_bytes, flag
 from pickplace.planners.base import MapPlanner, check_item_rule, restrict_items
 from pickplace.planners.heuristics import dbl_order
 from pickplace.rules.cell import MAX_SIDE, CellSpec
+from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, first_action_reaching
-from pickplace.rules.state import Observation, State
+from pickplace.rules.state import State
 
 LAST = FAR**2  # order of a footprint in no corner
 MAX_RECTANGLES = 2**23  # that are looked at together, over all problems

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from pickplace.policies.base import Policy
 from pickplace.rules.cell import CellSpec
+from pickplace.rules.item import Observation
 from pickplace.rules.masks import PlacingMaps
-from pickplace.rules.state import Observation
 
 
 class ActionPolicy(Policy):

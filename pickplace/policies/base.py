@@ -25,10 +25,11 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ValueOperator
 
 from pickplace.rules.cell import CellSpec
+from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, action_mask, placing_maps
 from pickplace.rules.observation import standard_terms
-from pickplace.rules.state import Observation, State
+from pickplace.rules.state import State
 
 #: The logit of what must not be chosen, far below what a network may score: its probability is exactly 0 in float32.
 #: The rest of float32's range is left for differences from the greatest logit.

@@ -15,6 +15,7 @@ from pickplace.policies.base import MAP_KEYS, MASKED, Policy, pick_one
 from pickplace.policies.depth import Contents
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import footprint_index
+from pickplace.rules.item import Observation, items_from_observation, listed_items
 from pickplace.rules.masks import (
     PlacingMaps,
     action_footprints,
@@ -22,7 +23,7 @@ from pickplace.rules.masks import (
     first_action_reaching,
     unchecked_maps,
 )
-from pickplace.rules.state import Observation, State, items_from_observation, listed_items
+from pickplace.rules.state import State
 from pickplace.rules.step import apply
 
 #: How an index of the scores of all footprints is made.

@@ -20,9 +20,10 @@ from pickplace.config.registry import build
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
 from pickplace.policies.base import EstimatesValue, Policy, as_collection_policy, as_critic
 from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
+from pickplace.rules.item import Observation
 from pickplace.rules.masks import placing_maps
 from pickplace.rules.observation import Term, check_terms
-from pickplace.rules.state import Observation, State
+from pickplace.rules.state import State
 from pickplace.runs import checkpoint
 
 SIZES = ("effector_size", "bin_size", "tote_size", "body", "cup", "cup_size", "pick_rule", "min_seal")

@@ -10,8 +10,9 @@ from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import Policy, ScoresFootprints
 from pickplace.robot.problem import Problem
 from pickplace.rules.grasps import split_action
+from pickplace.rules.item import Observation
 from pickplace.rules.masks import action_footprints, action_mask
-from pickplace.rules.state import Failure, Observation
+from pickplace.rules.state import Failure
 
 MAX_ALTERNATIVES = 100_000  # greatest number of choices that a plan may report
 

@@ -29,8 +29,9 @@ from pickplace.robot.problem import Pose, Problem, read_grid
 from pickplace.robot.scene import Scene
 from pickplace.robot.training import Training
 from pickplace.rules.cell import CellSpec
+from pickplace.rules.item import Observation
 from pickplace.rules.observation import Term, check_terms, observe
-from pickplace.rules.state import Failure, Observation
+from pickplace.rules.state import Failure
 
 CHOOSERS = "expected one item, or a checkpoint of model=fcn_grasp or corners that was trained with a mask"
 

@@ -17,7 +17,7 @@ from pickplace.policies.critics import PooledCritic
 from pickplace.policies.depth import Contents
 from pickplace.policies.fcn_grasp.network import FootprintFcn, matrix_dtype
 from pickplace.policies.fcn_grasp.policy import FcnGrasp, UnmaskedFcnGrasp
-from pickplace.rules.state import item_from_depth
+from pickplace.rules.item import item_from_depth
 from pickplace.runs import checkpoint
 
 FLOAT = {"head_std": 1.0, "compute_dtype": "float32"}

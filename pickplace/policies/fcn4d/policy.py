@@ -10,7 +10,7 @@ from pickplace.policies.base import MASKED
 from pickplace.policies.fcn4d.network import Conv4dNet
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_flat
-from pickplace.rules.state import Observation
+from pickplace.rules.item import Observation
 
 FEW_PLACES = 64  # up to 8x8, single pairs of a pick and a place are faster than all places of a pick
 

@@ -17,7 +17,7 @@ from pickplace.rules.grasps import (
     pick_classes,
     split_flat,
 )
-from pickplace.rules.state import Observation, item_from_depth
+from pickplace.rules.item import Observation, item_from_depth
 
 
 class FcnGrasp(FootprintPolicy):
