@@ -4,7 +4,6 @@ import logging
 import os
 import signal
 import sys
-from functools import partial
 from importlib import import_module
 
 # A thread that waits for others sleeps. If it spun, it would hold up those that share its core. OpenMP reads this when
@@ -62,7 +61,7 @@ def _run(module: str, *needed: str, config_name: str | None = None) -> None:
     signal.signal(signal.SIGINT, on_interrupt)
     help_only = bool(HELP & set(sys.argv[1:]))
     if help_only and config_name:
-        main = partial(import_module("pickplace.runs.hydra_app").command, config_name, None)
+        main = import_module("pickplace.config.hydra_app").Command(config_name)
     else:
         main = import_module(module).main
         for name in () if help_only else needed:

@@ -11,8 +11,8 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
+from pickplace.config.composition import conf_dir
 from pickplace.runs import checkpoint
-from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.loggers import read_csv
 from pickplace.training.trainer import Trainer
 

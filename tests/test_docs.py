@@ -16,10 +16,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import pickplace
 from pickplace import Planner, Scene
+from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
 from pickplace.physics import command as physics
 from pickplace.policies import export
-from pickplace.runs.hydra_app import conf_dir
 from pickplace.serve import json_lines, serve
 
 ROOT = Path(__file__).resolve().parent.parent

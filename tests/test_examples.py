@@ -14,11 +14,11 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from pickplace import Box, PickPlaceEnv, Planner, Scene, load_policy
+from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
 from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.rules.observation import STANDARD_TERMS
 from pickplace.runs import checkpoint
-from pickplace.runs.hydra_app import conf_dir
 from pickplace.serve import json_lines
 
 ROOT = Path(__file__).resolve().parent.parent

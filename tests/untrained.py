@@ -4,11 +4,11 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.fcn_grasp.policy import fcn_grasp
 from pickplace.runs import checkpoint
-from pickplace.runs.hydra_app import conf_dir
 from pickplace.runs.provenance import commit, versions
 
 

@@ -25,8 +25,12 @@ class WorkerDied(Exception):
     """A collector worker process has died. Not an OSError: signal handling code elsewhere catches those."""
 
 
-class UsageError(ValueError):
-    """The command line has arguments that the command does not take."""
+class Parser(argparse.ArgumentParser):
+    """A parser of command lines that raises its errors."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise a ``ValueError``."""
+        raise ValueError(f"{message}; expected the arguments that --help shows.")
 
 
 #: Errors caused by the user or the machine. Any other may be a fault of the program, and its type is printed too.
@@ -45,7 +49,7 @@ def one_sentence():
 
     A command that a signal ended has the exit code 128 + its number: 130 after Ctrl-C, 143 after SIGTERM.
     """
-    usage_error, argparse.ArgumentParser.error = argparse.ArgumentParser.error, _refuse_arguments  # type: ignore
+    shows_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1"
     try:
         yield
         write_output()
@@ -54,20 +58,14 @@ def one_sentence():
     except BrokenPipeError:  # the reader of the output, such as head, has closed it
         sys.exit(141)
     except Exception as error:
-        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+        if shows_traceback:
             raise
         with suppress(OSError):  # a terminal that was closed
             sys.stderr.write(f"error: {sentence(error)}\n")
         sys.exit(2)
     finally:
-        argparse.ArgumentParser.error = usage_error  # type: ignore[method-assign]
         with suppress(OSError):
             write_output()
-
-
-def _refuse_arguments(parser: argparse.ArgumentParser, message: str) -> NoReturn:
-    """Raise an error of the command line, which argparse would print below the usage."""
-    raise UsageError(f"{message}; expected the arguments that --help shows.")
 
 
 def write_output(text: str = "") -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from pickplace.config.composition import PARTS_OF_ENV
+from pickplace.config.hydra_app import Command
 from pickplace.evaluation.artifacts import Artifacts, evaluation_table
 from pickplace.evaluation.parts import prepare
 from pickplace.evaluation.play import carry_out, decision_latency, play
@@ -20,15 +20,15 @@ from pickplace.evaluation.result import (
 from pickplace.physics.engine import build_engine
 from pickplace.physics.plans import CELL_SIZE
 from pickplace.physics.recorded import plan_of
+from pickplace.runs import folder as run_folders
 from pickplace.runs.folder import claim, refuse_occupied
-from pickplace.runs.hydra_app import command
 
 log = logging.getLogger(__name__)
 
 
 def main() -> None:
     """Entry point of ``pickplace-evaluate``."""
-    command("evaluate", run, from_checkpoint=("model", "items", *(f"env.{part}" for part in PARTS_OF_ENV)))
+    Command("evaluate", run, run_folders, from_checkpoint=("env", "items", "model"))()
 
 
 def run(cfg: DictConfig, run_dir: Path) -> float:

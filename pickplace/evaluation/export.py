@@ -3,7 +3,6 @@
 ``python -m pickplace.evaluation.export outputs/cpu pickplace/pretrained/r4 outputs/evaluation/evaluation.json ...``
 """
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.files import read_text
 from pickplace.config.allowlist import trusted_config
-from pickplace.config.errors import one_sentence
+from pickplace.config.errors import Parser, one_sentence
 from pickplace.config.registry import build, find
 from pickplace.policies.base import EstimatesValue
 from pickplace.policies.restore import build_cell
@@ -71,7 +70,7 @@ def critic_serves_any_tote(cfg: DictConfig) -> bool:
 
 def main() -> None:
     """Entry point of ``python -m pickplace.evaluation.export``."""
-    options = argparse.ArgumentParser(
+    options = Parser(
         prog="python -m pickplace.evaluation.export",
         description="Write a training's checkpoint as weights that the package ships, with a card (card.json) that "
         "holds the config of the training and the evaluations. What only training needs is left out.",

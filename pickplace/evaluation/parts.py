@@ -8,19 +8,18 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from pickplace.common.machine import use_machine
 from pickplace.config.allowlist import own_modules, trusted_config
-from pickplace.config.composition import PARTS_OF_ENV, keys_set_in_env, task_overrides
+from pickplace.config.composition import apply_overrides, places_in_other_groups, task_overrides
 from pickplace.config.registry import build
 from pickplace.evaluation.play import MakeEnv, check_episode_settings, check_play
 from pickplace.evaluation.result import YOUNG_SETTINGS, resolved
 from pickplace.planners.base import BatchPlanner, planner_parts
 from pickplace.rules.cell import CellSpec
 from pickplace.runs import checkpoint
-from pickplace.runs.hydra_app import apply_overrides
 from pickplace.runs.provenance import first_weights, imitated_planner
 
 log = logging.getLogger(__name__)
 
-#: Config groups that an evaluation takes from the checkpoint; :data:`PARTS_OF_ENV` are in the first.
+#: Config groups that an evaluation takes from the checkpoint.
 TRAINED = ("env", "items", "model")
 
 
@@ -78,15 +77,15 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
     folder = checkpoint.locate(str(cfg.checkpoint))
     state, saved = checkpoint.read(folder)
     trained = trusted_config(saved["config"], cfg.trust)
-    groups = {key: OmegaConf.create(resolved(cfg[key])) for key in ("env", "items")}
+    groups = OmegaConf.create({key: resolved(cfg[key]) for key in ("env", "items")})
     ours, changed = [], trained.copy()
     for word in task_overrides(HydraConfig.get()):
         key, _, option = word.lstrip("+~").partition("=")
         if key == "benchmark":
             ours += ["env=benchmark", "items=benchmark"] if option not in ("", "null") else []
-        elif key in PARTS_OF_ENV:
-            for name in keys_set_in_env(word):
-                OmegaConf.update(changed, f"env.{name}", groups["env"][name], merge=False, force_add=True)
+        elif places := places_in_other_groups(word):
+            for place in places:  # such as env.reach
+                OmegaConf.update(changed, place, OmegaConf.select(groups, place), merge=False, force_add=True)
         elif key.split(".")[0] in TRAINED:
             ours.append(word)
             name = key.removeprefix("env.")

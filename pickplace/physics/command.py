@@ -3,7 +3,7 @@
 import argparse
 import json
 
-from pickplace.config.errors import one_sentence, write_output
+from pickplace.config.errors import Parser, one_sentence, write_output
 
 
 def main() -> None:
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    options = argparse.ArgumentParser(
+    options = Parser(
         prog="pickplace-physics",
         description="Carry out plans in MuJoCo. Prints a line of JSON for each episode: whether an item was lost, "
         "which one, during which placement, and what was placed before.",

@@ -2,7 +2,7 @@
 
 import argparse
 
-from pickplace.config.errors import one_sentence, write_output
+from pickplace.config.errors import Parser, one_sentence, write_output
 
 
 def main() -> None:
@@ -13,7 +13,7 @@ def main() -> None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    options = argparse.ArgumentParser(
+    options = Parser(
         prog="pickplace-export",
         description="Export the scoring network of a checkpoint to ONNX, for batches, bins and totes of any size, and "
         "check it with onnxruntime at three tote sizes that the export has not seen.",

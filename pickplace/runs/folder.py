@@ -4,16 +4,16 @@ import logging
 import os
 import shutil
 import stat
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import yaml
 from filelock import FileLock, Timeout
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.common.files import read_file
+from pickplace.common.files import read_file, replaced_file
+from pickplace.config.errors import sentence
 from pickplace.config.references import REFERENCE, children
 
 LOCK = ".lock"  # held by the process that trains in the folder
@@ -116,6 +116,27 @@ def refuse_links(run_dir: Path) -> None:
             _refuse_link(Path(entry.path))
 
 
+def refuse_for_run(run_dir: Path, notes: Sequence[str] = ()) -> None:
+    """Refuse a folder in which a new run cannot be written: another run's, one that is in use, or one with links."""
+    refuse_for_job(run_dir)
+    refuse_claimed(run_dir)
+    refuse_occupied(run_dir)
+
+
+def refuse_for_job(run_dir: Path) -> None:
+    """Refuse a part of another run's folder, or a folder with links; a run of a sweep may go on in its own."""
+    refuse_parts(run_dir)
+    refuse_links(run_dir)
+
+
+def refuse_for_sweep(sweep: Path, notes: Sequence[str]) -> None:
+    """Refuse the folder of a sweep if it, or a folder of a run with any of these notes in it, has links."""
+    refuse_links(sweep)
+    for folder in sweep.iterdir() if sweep.is_dir() else ():
+        if any(os.path.lexists(folder / name) for name in notes):
+            refuse_links(folder)
+
+
 def _refuse_link(path: Path) -> None:
     try:
         found = path.lstat()
@@ -130,32 +151,30 @@ def _refuse_link(path: Path) -> None:
         )
 
 
-@contextmanager
-def remove_empty_folders():
-    """If the block fails, remove the folders of this run or sweep that hold nothing but Hydra's notes."""
-    try:
-        yield
-    except BaseException:
-        if HydraConfig.initialized():
-            _remove_empty_folders(HydraConfig.get())
-        raise
+def note_failure(run_dir: Path, error: Exception) -> None:
+    """Write the error of a run of a sweep into its folder, unless another run is there."""
+    if not isinstance(error, OccupiedError):
+        with suppress(OSError), replaced_file(run_dir / FAILURE) as new:  # the disk may be full
+            new.write_text(f"{sentence(error)}\n")
 
 
-def _remove_empty_folders(cfg) -> None:
-    notes = {".hydra", LOCK, FAILURE, f"{cfg.job.name}.log"}
+def remove_empty(folder: Path, notes: Sequence[str], is_sweep: bool) -> None:
+    """Remove the folder of a run in which there is nothing but notes, or that of a sweep of such runs alone.
+
+    Args:
+        folder: the folder.
+        notes: names of Hydra's notes in the folder of a run.
+        is_sweep: whether it is a sweep's.
+    """
     logging.shutdown()
+    names = {LOCK, FAILURE, *notes}
 
-    def is_empty(folder: Path) -> bool:
-        return folder.is_dir() and set(os.listdir(folder)) <= notes and not is_claimed(folder)
+    def is_empty(run_dir: Path) -> bool:
+        return run_dir.is_dir() and set(os.listdir(run_dir)) <= names and not is_claimed(run_dir)
 
-    run_dir = None if OmegaConf.is_missing(cfg.runtime, "output_dir") else cfg.runtime.output_dir
-    if run_dir and is_empty(Path(run_dir)):
-        shutil.rmtree(run_dir, ignore_errors=True)
-    sweep = Path(cfg.sweep.dir) if cfg.mode == RunMode.MULTIRUN else None
-    if not sweep or not sweep.is_dir():
-        return
-    if all(is_empty(entry) for entry in sweep.iterdir() if entry.name != "multirun.yaml"):
-        shutil.rmtree(sweep, ignore_errors=True)
+    runs = [entry for entry in folder.iterdir() if entry.name != "multirun.yaml"] if folder.is_dir() else []
+    if all(map(is_empty, runs)) if is_sweep else is_empty(folder):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def noted_overrides(run_dir: Path) -> list[str]:

@@ -10,19 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from loky import cpu_count
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.validate import excerpt, is_name, is_whole, short_text
 from pickplace.config.allowlist import modules_to_trust, own_modules, trusted_config
-from pickplace.config.composition import PARTS_OF_ENV, compose_plain
+from pickplace.config.composition import apply_overrides, compose_plain, parse, refuse_unknown_keys
 from pickplace.config.errors import WorkerDied, sentence
 from pickplace.config.references import saved_form
 from pickplace.rules.cell import CELL_SETTINGS
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import occupied, refuse_occupied
-from pickplace.runs.hydra_app import apply_overrides, refuse_unknown_keys
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +82,7 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
         ValueError: for a checkpoint that no training wrote, or a change that a resumed run cannot follow.
     """
     _check_counters(place, facts)
-    given = OverridesParser.create().parse_overrides(overrides)
+    given = parse(overrides)
     trust = own_modules(next((word.value() for word in reversed(given) if word.key_or_group == "trust"), None))
     saved = trusted_config(facts["config"], trust, groups=None)
     saved["trust"] = list(trust)  # only the user says what to trust, never the checkpoint
@@ -97,11 +95,6 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     if "threads" not in repeated and is_whole(saved.get("threads")) and saved.threads > cpu_count():
         log.warning("threads=%s of the checkpoint: going on with %d, all of this machine", saved.threads, cpu_count())
         saved["threads"] = cpu_count()
-    for word in given:
-        if word.key_or_group in PARTS_OF_ENV:
-            raise ValueError(
-                f"{word.input_line}: a resumed run keeps the {word.key_or_group} that it began with; start a new one."
-            )
     cfg = apply_overrides(saved, [str(word.input_line) for word in given if word.key_or_group != "trust"])
     for key in FIXED_KEYS:
         before, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)

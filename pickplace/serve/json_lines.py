@@ -12,7 +12,7 @@ import numpy as np
 
 from pickplace.common.files import read_file, read_text
 from pickplace.common.validate import whole_number
-from pickplace.config.errors import one_sentence, sentence, write_output
+from pickplace.config.errors import Parser, one_sentence, sentence, write_output
 from pickplace.robot.box import DepthMapError
 from pickplace.serve.request import MAX_REQUEST, PLAN_OPTIONS, PlanRequest, answer, parse_json
 
@@ -30,7 +30,7 @@ def main() -> None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    options = argparse.ArgumentParser(
+    options = Parser(
         prog="pickplace-plan",
         description="Plan one pick and one place. With --bin and --tote: one plan, as JSON. Without them: read one "
         'request a line from standard input, {"bin_depth": [[...]], "tote_depth": [[...]]}, and answer each with a '

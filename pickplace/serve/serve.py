@@ -6,7 +6,7 @@ import os
 import socket
 
 from pickplace.common.validate import excerpt, number, short_text, whole_number
-from pickplace.config.errors import one_sentence, write_output
+from pickplace.config.errors import Parser, one_sentence, write_output
 from pickplace.serve.json_lines import add_planner_options, load_planner
 
 TOKEN = "PICKPLACE_TOKEN"  # the environment variable; a command line can be read by every user of the machine
@@ -21,7 +21,7 @@ def main() -> None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    options = argparse.ArgumentParser(
+    options = Parser(
         prog="pickplace-serve",
         description="Answer requests over HTTP: POST /plan takes what pickplace-plan reads as a line, and / shows the "
         "last plans in 3D. Without a token it serves this machine only.",

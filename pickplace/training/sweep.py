@@ -15,13 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from omegaconf import DictConfig, read_write
 
 from pickplace.common.files import read_text, replaced_file
 from pickplace.config.errors import one_sentence, sentence
 from pickplace.runs.checkpoint import read_facts
 from pickplace.runs.folder import FAILURE, is_claimed, read_note
-from pickplace.runs.hydra_app import SweepCallback
 from pickplace.runs.loggers import read_csv
 from pickplace.views.figures import figure_of
 
@@ -31,24 +29,6 @@ TABLE, SETTINGS_TABLE, FIGURE = "sweep.csv", "sweep_settings.csv", "sweep.png"
 LARGEST_LEGEND = 40  # settings that the figure and the console name; of more, the best
 RESAMPLES = 9999  # of the bootstrap
 COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c"]  # Okabe and Ito's, no yellow
-
-
-class SweepSummary(SweepCallback):
-    """Write table and figure in the launching process when a sweep of trainings ends, however it ends.
-
-    Training returns an occupancy, so Optuna maximises unless ``hydra.sweeper.direction`` is set.
-    """
-
-    def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
-        super().on_multirun_start(config, **kwargs)
-        logging.getLogger("alembic").setLevel(logging.WARNING)  # Optuna's database tool logs every migration
-        chosen = any(word.startswith("hydra.sweeper.direction=") for word in config.hydra.overrides.hydra)
-        if "direction" in config.hydra.sweeper and not chosen:
-            with read_write(config.hydra):
-                config.hydra.sweeper.direction = "maximize"
-
-    def on_multirun_end(self, config: DictConfig, **kwargs) -> None:
-        summarize(Path(config.hydra.sweep.dir))
 
 
 @dataclass

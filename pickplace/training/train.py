@@ -8,11 +8,13 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from pickplace.config.errors import one_sentence
+from pickplace.config.hydra_app import Command
 from pickplace.runs import checkpoint
+from pickplace.runs import folder as run_folders
 from pickplace.runs.folder import FAILURE, claim, refuse_links
-from pickplace.runs.hydra_app import command
 from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config
 from pickplace.training.metrics import episode_metrics
+from pickplace.training.sweep import summarize
 from pickplace.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -124,7 +126,7 @@ def main() -> None:
                 raise ValueError("resume=...: expected only key=value overrides beside it, no flags such as -m.")
             resume_run(overrides)
     else:
-        command("train", train)
+        Command("train", train, run_folders, after_sweep=summarize)()
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from hydra import compose, initialize_config_dir
 from untrained import write_checkpoint
 
 from pickplace import CellSpec, PickPlaceEnv
+from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
 from pickplace.evaluation.artifacts import evaluation_table
 from pickplace.evaluation.play import play
@@ -17,7 +18,6 @@ from pickplace.evaluation.result import episode_settings, read_comparison
 from pickplace.physics.plans import read_plans
 from pickplace.physics.settle import Settle
 from pickplace.planners.heuristics import JointDBL
-from pickplace.runs.hydra_app import conf_dir
 from pickplace.views.motion import Outcome
 
 

@@ -20,10 +20,10 @@ from torchrl.collectors import RandomPolicy
 from torchrl.envs import TransformedEnv
 
 from pickplace import PickPlaceEnv, Planner
+from pickplace.config.composition import conf_dir
 from pickplace.config.errors import WorkerDied
 from pickplace.evaluation.evaluate import main as evaluate_main
 from pickplace.runs import checkpoint
-from pickplace.runs.hydra_app import conf_dir
 from pickplace.training import collectors
 from pickplace.training.collectors import ignore_signals, watch_workers
 from pickplace.training.train import main as train_main

@@ -10,9 +10,9 @@ from commands import composed
 from omegaconf import OmegaConf
 
 import pickplace
+from pickplace.config.composition import apply_overrides
 from pickplace.config.errors import sentence
 from pickplace.runs.folder import noted_overrides
-from pickplace.runs.hydra_app import apply_overrides
 from pickplace.training import train
 
 CURRICULA = Path(__file__).parents[2] / "docs/examples/own_curriculum"
