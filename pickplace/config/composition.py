@@ -275,7 +275,7 @@ def _has_parts(node: Any) -> bool:
 
 
 # ---------------------------------------------------------------------- saved configs
-def apply_overrides(saved: DictConfig, overrides: list[str], groups: dict[str, DictConfig] | None = None) -> DictConfig:
+def apply_overrides(saved: DictConfig, overrides: list[str], groups: Any = None) -> DictConfig:
     """Return a saved config with command-line overrides on top.
 
     Args:
