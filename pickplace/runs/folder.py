@@ -187,12 +187,9 @@ def noted_config_folders(run_dir: Path) -> list[str]:
     """Return the words of the command that began a run that name folders of config files."""
     notes = read_note(run_dir, "hydra.yaml")
     try:
-        sources = notes["hydra"]["runtime"]["config_sources"]
-        folders = _texts([source["path"] for source in sources if source["provider"] == "command-line"])
-        searchpath = [word for word in _texts(notes["hydra"]["overrides"]["hydra"]) if "hydra.searchpath" in word]
+        return [word for word in _texts(notes["hydra"]["overrides"]["hydra"]) if "hydra.searchpath" in word]
     except (KeyError, TypeError):
         return []
-    return [*(word for folder in folders for word in ("--config-dir", folder)), *searchpath]
 
 
 def _texts(values) -> list[str]:

@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from pickplace.config.composition import constant_keys, folder_name
+from pickplace.config.sweeps import constant_keys, folder_name
 from pickplace.runs import checkpoint
 from pickplace.runs import hydra_app as config
 from pickplace.training.sweep import group_by_setting, label, read_run, summarize
