@@ -8,14 +8,15 @@ import sys
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from pickplace.config.sweeps import constant_keys, folder_name
+from pickplace.config.composition import config_files
+from pickplace.config.sweeps import constant_keys, folder_name, sweep_words
 from pickplace.runs import checkpoint
-from pickplace.runs import hydra_app as config
+from pickplace.runs.folder import FAILURE
 from pickplace.training.sweep import group_by_setting, label, read_run, summarize
 
 SMOKE = ["experiment=smoke", "threads=1"]
@@ -39,7 +40,7 @@ def make_run(folder, name, overrides, occupancies, total=1000, failure=None):
     rows = [f"{100 * (i + 1)},{mean},{mean - 0.01},{mean + 0.01}" for i, mean in enumerate(occupancies)]
     (run_dir / "metrics.csv").write_text("\n".join(["frames,eval/occupancy,eval/ci95_low,eval/ci95_high", *rows, ""]))
     if failure:
-        (run_dir / config.FAILURE).write_text(failure)
+        (run_dir / FAILURE).write_text(failure)
 
 
 def test_the_table_shows_how_every_run_ended(tmp_path):
@@ -172,10 +173,10 @@ def test_names_of_folders():
 def test_a_sweeper_that_draws_values_numbers_its_runs(sweeper, numbered, monkeypatch):
     """It may draw the same values twice."""
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
-    with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
-        cfg = compose("train", [f"hydra.sweeper._target_={sweeper}", "seed=1"], return_hydra_config=True)
-        config.SweepCallback().on_multirun_start(cfg)
-        job = compose("train", [*cfg.hydra.overrides.hydra, "seed=1", "hydra.job.num=3"], return_hydra_config=True)
+    words = [f"hydra.sweeper._target_={sweeper}", "seed=1"]
+    with config_files():
+        settings = sweep_words(compose("train", words, return_hydra_config=True), words)
+        job = compose("train", [*settings, *words, "hydra.job.num=3"], return_hydra_config=True)
     HydraConfig.instance().set_config(job)
     assert job.hydra.sweep.subdir == ("3" if numbered else "seed-1")
 
