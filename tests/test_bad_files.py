@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 import pickplace
 from pickplace.common.files import read_file, replaced_file
 from pickplace.config.errors import one_sentence
-from pickplace.evaluation import evaluate
+from pickplace.evaluation import artifacts, evaluate
 from pickplace.evaluation.result import episode_settings, read_comparison
 from pickplace.items.distributions import Recorded
 from pickplace.rules.observation import ToteDepth
@@ -300,7 +300,7 @@ def full(*_, **__):
 @pytest.mark.parametrize(
     ("command", "owner", "function", "words"),
     [
-        ("evaluate", evaluate, "picture", "run/tote.png: {} The table above and the files that are there are whole."),
+        ("evaluate", artifacts, "picture", "run/tote.png: {} The table above and the files that are there are whole."),
         ("evaluate", "hydra.core.utils", "_save_config", "run: {}"),
         ("train", "hydra.core.utils", "_save_config", "run: {}"),
         ("train", csv.DictWriter, "writeheader", "run/metrics.csv: {} Nothing had been saved before."),
