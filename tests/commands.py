@@ -11,7 +11,10 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
+from pickplace.algorithms.base import Task
 from pickplace.config.composition import conf_dir
+from pickplace.config.registry import build
+from pickplace.rules.observation import STANDARD_TERMS
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
 from pickplace.training.trainer import Trainer
@@ -22,7 +25,8 @@ ITERATION = 8 * 16  # frames: env.num_envs * rollout_length of experiment=smoke
 SETTINGS = [
     "experiment=smoke",
     "env.tote_size=[5,5,3]",
-    "algo.vine_samples=2",
+    "algo=sampled_ppo",
+    "algo.samples=2",
     "curriculum=mixture",  # its sampler draws, so the generators matter
     "curriculum.advance.occupancy=0.3",
     "curriculum.advance.window=10",
@@ -37,6 +41,13 @@ SETTINGS = [
     "threads=1",
 ]
 
+#: A training of one batch with small networks.
+TINY = [
+    "env.num_envs=4", "rollout_length=4", "algo.minibatch_size=8", "algo.epochs=1", "total_frames=16",
+    "evaluation.episodes=2", "evaluation_interval=16", "checkpoint_interval=16", "progress_interval=16",
+    "env.tote_size=[6,6,2]", "model.actor.filters=8", "model.critic.filters=8", "model.critic.hidden=8", "threads=1",
+]  # fmt: skip
+
 #: Processes are forked from one that has imported torch and has not used it, which saves seconds for each.
 FORKSERVER = multiprocessing.get_context("forkserver")
 FORKSERVER.set_forkserver_preload(["pickplace.training.train", "pickplace.training.report"])
@@ -46,6 +57,13 @@ def composed(*overrides, name="train"):
     """Return the config that a command line makes."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return compose(name, list(overrides))
+
+
+def algorithm_of(policy, critic, *overrides):
+    """Return the algorithm of a command line, for batches of 8 slots and 6 steps."""
+    cfg = composed(*overrides)
+    task = Task(STANDARD_TERMS, cfg.reward_scale, num_envs=8, rollout_length=6)
+    return build("algo", cfg.algo, policy=policy, critic=critic, task=task)
 
 
 def options(group):

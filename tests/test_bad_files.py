@@ -17,6 +17,7 @@ from commands import composed
 from omegaconf import OmegaConf
 
 import pickplace
+from pickplace.algorithms.base import load_optimizer
 from pickplace.common.files import read_file, replaced_file
 from pickplace.config.errors import one_sentence
 from pickplace.evaluation import artifacts, evaluate
@@ -25,7 +26,7 @@ from pickplace.items.distributions import Recorded
 from pickplace.rules.observation import ToteDepth
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import changed_values, is_claimed, noted_config_folders, noted_overrides, refuse_links
-from pickplace.runs.resume import StopRequest, load_optimizer
+from pickplace.runs.resume import StopRequest
 from pickplace.serve import json_lines, request
 from pickplace.training import trainer
 from pickplace.training.train import resume_run
@@ -361,6 +362,31 @@ def test_negative_moments_are_refused(key, value):
     load_optimizer(torch.optim.Adam([weight]), {0: moments})
     with pytest.raises(checkpoint.CheckpointError, match=rf"optimizer is of no use: 0\|{key} is negative"):
         load_optimizer(torch.optim.Adam([weight]), {0: {**moments, key: torch.full_like(moments[key], value)}})
+
+
+@pytest.mark.parametrize("kind", [torch.optim.SGD, torch.optim.AdamW, torch.optim.RMSprop])
+def test_any_optimizer_with_several_groups_is_restored(kind):
+    """But for its settings, which are the config's."""
+
+    def make(**settings):
+        torch.manual_seed(0)
+        weights = [torch.nn.Parameter(torch.randn(size)) for size in (2, 3, 4)]
+        return kind([{"params": weights[:1]}, {"params": weights[1:]}], **settings), weights
+
+    trained, weights = make(lr=0.1, **({} if kind is torch.optim.AdamW else {"momentum": 0.9}))
+    sum(weight.square().sum() for weight in weights[:2]).backward()  # the third has no state
+    trained.step()
+    state = trained.state_dict()["state"]
+    restored, own = make(lr=0.2, **({} if kind is torch.optim.AdamW else {"momentum": 0.9}))
+    before = [weight.clone() for weight in own]
+    load_optimizer(restored, state)
+    found = restored.state_dict()["state"]
+    assert found.keys() == state.keys() == {0, 1} and restored.param_groups[0]["lr"] == 0.2
+    assert all(torch.equal(found[n][key], value) for n in state for key, value in state[n].items())
+    assert all(map(torch.equal, before, own))
+    for wrong in ({7: state[0]}, {1: state[0]}, {0: {}}):
+        with pytest.raises(checkpoint.CheckpointError, match="optimizer"):
+            load_optimizer(restored, wrong)
 
 
 @pytest.fixture

@@ -159,9 +159,9 @@ LARGE = [
     (f"{LARGE_FCN4D} env.num_envs=4 algo.minibatch_size=16", "algo.minibatch_size=16: .* GB"),
     (f"{LARGE_FCN4D} algo.minibatch_size=1", "env.num_envs=256: .* GB"),
     ("collector=multi_sync collector.workers=128", "collector.workers=128: .*<= 64"),
-    (f"{LARGE_FCN4D} env.num_envs=4 algo.vine_samples=9999", "algo.minibatch_size=32: .* GB"),
-    ("algo.vine_samples=0", "algo.vine_samples=0"),
-    ("algo.vine_temperature=0", "algo.vine_temperature=0"),
+    (f"{LARGE_FCN4D} env.num_envs=4 algo=sampled_ppo algo.samples=9999", "algo.minibatch_size=32: .* GB"),
+    ("algo=sampled_ppo algo.samples=0", "algo.samples=0"),
+    ("algo=sampled_ppo algo.temperature=0", "algo.temperature=0"),
     ("algo.max_grad_norm=0", "algo.max_grad_norm=0"),
     ("reward_scale=0", "reward_scale=0"),
 ]

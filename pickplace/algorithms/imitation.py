@@ -3,15 +3,16 @@
 import re
 from collections.abc import Mapping
 from contextlib import contextmanager
-from enum import Enum
-from typing import cast
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from pickplace.algorithms.base import Algorithm, At, Imitable
 from pickplace.common.validate import excerpt, whole_number
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import accepted_arguments, build, find
@@ -25,20 +26,8 @@ from pickplace.rules.step import apply
 from pickplace.runs import checkpoint
 
 
-class Phase(Enum):
-    """The phases of a training: what the policy learns from."""
-
-    IMITATION = "imitation"  # the teacher's choices; the critic learns the policy's values meanwhile
-    CRITIC = "critic"  # nothing: only the critic learns, the values of the imitating policy
-    REWARD = "reward"
-
-
 class WarmStart:
-    """Imitation of a planner, then training of the critic alone, then reward.
-
-    The policy itself acts from the first frame on, and the teacher is asked in the states that it reaches (DAgger, Ross
-    et al. 2011). So the policy learns how to continue after its own mistakes, and the critic learns the values of the
-    policy that it will serve.
+    """The teacher of a policy, and the phases of its training (config group ``warm_start``).
 
     Args:
         cfg: the config group ``warm_start``.
@@ -63,19 +52,19 @@ class WarmStart:
         seed: int,
         trust=(),
     ):
-        for key in ("frames", "critic_frames"):
-            whole_number(f"warm_start.{key}", cfg[key], 0)
+        self.frames, self.critic_frames = (
+            whole_number(f"warm_start.{key}", cfg[key], 0) for key in ("frames", "critic_frames")
+        )
         if cfg.frames and cfg.teacher is None:
             raise ValueError(f"warm_start.frames={cfg.frames}: there is no teacher; expected warm_start=imitate.")
         if cfg.teacher is not None and not OmegaConf.is_dict(cfg.teacher):
             given = excerpt(cfg.teacher)
             raise ValueError(f"warm_start.teacher={given}: expected planner@warm_start.teacher=<planner>.")
-        self.policy, self.cell, self.seed = policy, cell, seed
-        self.teacher, self.frames, self.critic_frames = cfg.teacher, cfg.frames, cfg.critic_frames
-        known = accepted_arguments(find("warm_start.teacher", cfg.teacher._target_)) if self.frames else ()
-        self._draws = "seed" in (cfg.teacher if known is None else known)
-        self._parts = self._teacher_parts(cfg, items, terms, trust) if self.frames else {}
+        self.policy, self.cell, self.seed, self.teacher = policy, cell, seed, cfg.teacher
         if self.frames:
+            known = accepted_arguments(find("warm_start.teacher", cfg.teacher._target_))
+            self._draws = "seed" in (cfg.teacher if known is None else known)
+            self._parts = self._teacher_parts(cfg, items, terms, trust)
             self._make_teacher(seed)  # refuses bad settings before the first batch
 
     def _teacher_parts(self, cfg: DictConfig, items: ItemDistribution, terms: Mapping[str, Term], trust) -> dict:
@@ -95,12 +84,6 @@ class WarmStart:
         settings = cast(dict, OmegaConf.to_container(self.teacher, resolve=True))
         with _named_teacher():
             return build("warm_start.teacher", {**settings, **({"seed": seed} if self._draws else {})}, **self._parts)
-
-    def phase(self, frames: int) -> Phase:
-        """Return the phase of the batch that begins after ``frames`` frames of the run."""
-        if frames < self.frames:
-            return Phase.IMITATION
-        return Phase.CRITIC if frames < self.frames + self.critic_frames else Phase.REWARD
 
     @torch.no_grad()
     def ask(self, data: TensorDictBase, iteration: int) -> Tensor:
@@ -132,6 +115,68 @@ def _named_teacher():
         yield
     except ValueError as error:
         raise ValueError(re.sub(r"^planner\b", "warm_start.teacher", str(error))) from error
+
+
+class Imitation(Algorithm):
+    """An algorithm whose policy imitates a teacher first; then the critic learns alone; then it goes on as usual.
+
+    The policy itself acts from the first frame on, and the teacher is asked in the states that it reaches (DAgger, Ross
+    et al. 2011). So the policy learns how to continue after its own mistakes, and the critic learns the values of the
+    policy that it will serve. Optimizer, minibatches and the critic's loss are those of the inner algorithm.
+
+    Args:
+        inner: the algorithm, an :class:`~pickplace.algorithms.base.Imitable`.
+        warm_start: the teacher and the phases.
+    """
+
+    def __init__(self, inner: Any, warm_start: WarmStart):
+        self.inner, self.warm_start = inner, warm_start
+        self.next_keys = inner.next_keys
+
+    def acting_policy(self) -> TensorDictModuleBase:
+        return self.inner.acting_policy()
+
+    def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
+        start = self.warm_start
+        if at.before >= start.frames + start.critic_frames:
+            return self.inner.learn(batch, at)
+        data = self.inner.prepare(batch, at)
+        if at.before < start.frames:
+            data["taught"] = start.ask(batch.reshape(-1), at.iteration)
+        return self.inner.descend(data, at, self.objective)
+
+    def objective(self, data: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        """Return the critic's loss, plus that of imitating ``data["taught"]`` if there is such an entry."""
+        losses = self.inner.losses(data)
+        total = losses["loss_critic"]
+        if "taught" in data:
+            losses["loss_imitation"], losses["agreement"] = imitation_loss(self.warm_start.policy, data)
+            total = total + losses["loss_imitation"]
+        return total, losses
+
+    def state_dict(self) -> dict:
+        return self.inner.state_dict()
+
+    def load_state_dict(self, state: Any) -> None:
+        self.inner.load_state_dict(state)
+
+    def memory(self, frame: int) -> dict[str, int]:
+        memory = self.inner.memory(frame)
+        if self.warm_start.frames:  # imitation needs all logits
+            memory |= self.inner.learning_memory(self.warm_start.policy.learning_bytes())
+        return memory
+
+
+def with_warm_start(algorithm: Algorithm, warm_start: WarmStart) -> Algorithm:
+    """Return an algorithm with a warm start, or itself if the phases of that have no frames.
+
+    Raises:
+        ValueError: for an algorithm whose policy cannot imitate.
+    """
+    for key in ("frames", "critic_frames"):
+        if (frames := getattr(warm_start, key)) and not isinstance(algorithm, Imitable):
+            raise ValueError(f"warm_start.{key}={frames}: expected 0; {type(algorithm).__name__} imitates no teacher.")
+    return Imitation(algorithm, warm_start) if warm_start.frames + warm_start.critic_frames else algorithm
 
 
 def imitation_loss(policy: Policy, data: TensorDictBase) -> tuple[Tensor, Tensor]:

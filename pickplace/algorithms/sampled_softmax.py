@@ -2,10 +2,10 @@
 
 A gradient step through the softmax over all ``N_a`` flat actions computes every logit forward and backward. Here the
 loss computes only those of the *candidates*. The first one is a draw from the policy that collected, ``pi``, and is
-taken; the loss learns from it alone (``algo.advantages=gae``), or from all (:mod:`pickplace.algorithms.vine`). The
-others are drawn without replacement from ``q``, which is ``pi`` at a higher temperature, so that rare choices are tried
-more often: those with the greatest log-probability plus Gumbel noise (Kool, van Hoof and Welling, Stochastic Beams and
-Where to Find Them, 2019).
+taken; the loss learns from it alone (``algo.advantages=gae``), or from all (``vine``). The others are drawn without
+replacement from ``q``, which is ``pi`` at a higher temperature, so that rare choices are tried more often: those with
+the greatest log-probability plus Gumbel noise (Kool, van Hoof and Welling, Stochastic Beams and Where to Find Them,
+2019).
 
 An expectation under the policy is estimated by a weighted mean over the candidates. The weight is the probability
 divided by the chance to be a candidate, with ``k`` the greatest noisy log-probability that is left out::

@@ -35,6 +35,12 @@ PLANNERS = {
 
 #: Place in the config -> short name -> dotted path. ``*`` stands for any one key.
 REGISTRY: dict[str, dict[str, str]] = {
+    "algo": {
+        "ppo": "pickplace.algorithms.ppo.PPO",
+        "a2c": "pickplace.algorithms.a2c.A2C",
+        "sampled_ppo": "pickplace.algorithms.sampled_ppo.SampledPPO",
+        "td": "pickplace.algorithms.td.TD",
+    },
     "env": {"pick_place": "pickplace.envs.torchrl.PickPlaceEnv"},
     "env.observation.*": {
         "bin_depth": "pickplace.rules.observation.BinDepth",
@@ -71,7 +77,6 @@ REGISTRY: dict[str, dict[str, str]] = {
     "model.critic": {
         "pooled": "pickplace.policies.critics.pooled_critic",
         "conv4d": "pickplace.policies.critics.conv4d_critic",
-        "tote_value": "pickplace.policies.afterstate.network.ToteValue",
     },
     "curriculum": {"curriculum": "pickplace.training.curriculum.Curriculum"},
     "curriculum.advance": {

@@ -14,7 +14,6 @@ from pickplace.common.files import read_text
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.errors import Parser, one_sentence
 from pickplace.config.registry import build, find
-from pickplace.policies.base import EstimatesValue
 from pickplace.policies.restore import build_cell
 from pickplace.runs import checkpoint
 
@@ -59,12 +58,11 @@ def critic_serves_any_tote(cfg: DictConfig) -> bool:
     """
     env: Any = OmegaConf.to_container(cfg.env, resolve=True)
     cell = build_cell(env, reach=None)  # a table of reach may be elsewhere
+    if cfg.model.critic is None:
+        return False
     for key in ("actor", "critic"):
         find(f"model.{key}", cfg.model[key]._target_)  # imports it, which the device "meta" does not allow
     with torch.device("meta"):
-        policy = build("model.actor", cfg.model.actor, cell=cell, mask_infeasible=cfg.model.mask_infeasible)
-        if isinstance(policy, EstimatesValue):
-            return False
         return getattr(build("model.critic", cfg.model.critic, cell=cell), "any_size", False)
 
 

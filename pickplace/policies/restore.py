@@ -199,7 +199,7 @@ def restore_critic(cfg: DictConfig, policy: Policy, state: dict, trained_env: di
     if isinstance(policy, EstimatesValue):
         critic = as_critic(policy.value_network())
         return RestoredCritic(critic.module, list(critic.in_keys), cfg.reward_scale)
-    if "critic" not in state:
+    if "critic" not in state or cfg.model.critic is None:
         return None
     cell = policy.cell
 

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
 from loky import cpu_count
 from omegaconf import DictConfig, OmegaConf
 
@@ -185,28 +184,6 @@ def stale_best_frames(run_dir: Path, frames: int, config: dict) -> int | None:
 def has_config(facts: dict, config: dict) -> bool:
     """Return whether a checkpoint is of this config, given in the form that checkpoints hold."""
     return facts["config"] == json.loads(json.dumps(config))
-
-
-def load_optimizer(optimizer: torch.optim.Adam, state: dict) -> None:
-    """Load a checkpoint's moments into Adam; parameters without a gradient so far have none.
-
-    Raises:
-        CheckpointError: if they do not fit the parameters.
-    """
-    if not state or not isinstance(state, dict):
-        raise checkpoint.CheckpointError("The checkpoint has no optimizer; expected one that a training wrote.")
-    parameters = dict(enumerate(optimizer.param_groups[0]["params"]))
-    if unknown := [key for key in state if key not in parameters]:
-        raise checkpoint.CheckpointError(
-            f"The checkpoint's optimizer has {excerpt(unknown[0])}; expected numbers below {len(parameters)}."
-        )
-    own = {n: {"step": torch.tensor(0.0), "exp_avg": p, "exp_avg_sq": p} for n, p in parameters.items() if n in state}
-    moments = checkpoint.matching_state(state, own, "optimizer")
-    for n, moment in moments.items():
-        for key in ("step", "exp_avg_sq"):
-            if (moment[key] < 0).any():
-                raise checkpoint.CheckpointError(f"The checkpoint's optimizer is of no use: {n}|{key} is negative.")
-    optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
 
 
 #: Signals after which a training saves and ends: Ctrl-C, a scheduler's, and that of a closed terminal.

@@ -4,7 +4,7 @@ import signal
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 
@@ -25,7 +25,15 @@ class ResumableCollector(Collector):
 
     Its ``state_dict`` also holds the base environment, the carried TensorDict and the process's random generator;
     TorchRL 0.14.1 saves only the transforms, the policy and the counters.
+
+    Args:
+        next_keys: masks that are stored under ``next``, too.
+        *args, **kwargs: of ``Collector``.
     """
+
+    def __init__(self, *args, next_keys: Collection[str] = (), **kwargs):
+        self.next_keys = next_keys
+        super().__init__(*args, **kwargs)
 
     def start(self, item_seed: int, rng_seed: int | None = None) -> None:
         """Begin the item stream ``item_seed`` with new episodes.
@@ -42,11 +50,11 @@ class ResumableCollector(Collector):
         self.reset()
 
     def _setup_compact_obs(self, compact_obs: bool) -> None:
-        """Store each mask only where it was acted on, not again under ``next``, where nothing reads it."""
+        """Store each mask only where it was acted on, not again under ``next``, but for :attr:`next_keys`."""
         super()._setup_compact_obs(compact_obs)
         if not compact_obs:
-            masks = [key for key in self.env.observation_spec.keys() if key.endswith("_mask")]  # noqa: SIM118
-            self._compact_next_keys = tuple(("next", key) for key in masks)
+            masks = {key for key in self.env.observation_spec.keys() if key.endswith("_mask")}  # noqa: SIM118
+            self._compact_next_keys = tuple(("next", key) for key in sorted(masks.difference(self.next_keys)))
 
     def state_dict(self) -> OrderedDict:
         return OrderedDict(
@@ -190,7 +198,7 @@ def watch_workers(collector):
         signal.signal(signal.SIGCHLD, previous)
 
 
-def single(make_env, policy, num_envs: int, rollout_length: int, seed: int) -> Collector:
+def single(make_env, policy, num_envs: int, rollout_length: int, seed: int, next_keys=()) -> Collector:
     """Make a collector of one batch of environments in this process (config ``collector=single``).
 
     Args:
@@ -199,6 +207,7 @@ def single(make_env, policy, num_envs: int, rollout_length: int, seed: int) -> C
         num_envs: number of environment slots over all processes.
         rollout_length: steps of each slot in a batch.
         seed: seed of the item stream.
+        next_keys: masks that the batch holds under ``next``, too.
     """
     collector = ResumableCollector(
         make_env(0, num_envs),
@@ -208,11 +217,14 @@ def single(make_env, policy, num_envs: int, rollout_length: int, seed: int) -> C
         track_traj_ids=False,  # nothing reads them, and they cost 15%
         trust_policy=True,
         auto_register_policy_transforms=False,  # the policy needs none; the explicit value silences a warning
+        next_keys=next_keys,
     )
     return _started(collector, [(seed,)])
 
 
-def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, workers: int = 2) -> MultiSyncCollector:
+def multi_sync(
+    make_env, policy, num_envs: int, rollout_length: int, seed: int, next_keys=(), workers: int = 2
+) -> MultiSyncCollector:
     """Make a collector of worker processes, each with its share of the slots (config ``collector=multi_sync``).
 
     Args: as :func:`single`, and ``workers``, the number of processes; it must divide ``num_envs``.
@@ -224,7 +236,7 @@ def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, 
         frames_per_batch=num_envs * rollout_length,
         total_frames=-1,
         cat_results=0,
-        collector_class=ResumableCollector,
+        collector_class=partial(ResumableCollector, next_keys=next_keys),
         trust_policy=True,
         use_buffers=True,
         auto_register_policy_transforms=False,
@@ -234,7 +246,14 @@ def multi_sync(make_env, policy, num_envs: int, rollout_length: int, seed: int, 
 
 
 def ray(
-    make_env, policy, num_envs: int, rollout_length: int, seed: int, workers: int = 2, address: str = "local"
+    make_env,
+    policy,
+    num_envs: int,
+    rollout_length: int,
+    seed: int,
+    next_keys=(),
+    workers: int = 2,
+    address: str = "local",
 ) -> ResumableRayCollector:
     """Make a collector of worker processes in a Ray cluster (config ``collector=ray``, extra ``pickplace[ray]``).
 
@@ -261,7 +280,8 @@ def ray(
         sync=True,
         collector_class=ResumableCollector,
         collector_kwargs=[
-            {"track_traj_ids": False, "auto_register_policy_transforms": False} for _ in range(workers)
+            {"track_traj_ids": False, "auto_register_policy_transforms": False, "next_keys": next_keys}
+            for _ in range(workers)
         ],
         trust_policy=True,
         weight_sync_schemes={},

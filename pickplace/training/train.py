@@ -13,7 +13,6 @@ from pickplace.runs import checkpoint
 from pickplace.runs import folder as run_folders
 from pickplace.runs.folder import FAILURE, claim, refuse_links
 from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config
-from pickplace.training.metrics import episode_metrics
 from pickplace.training.sweep import summarize
 from pickplace.training.trainer import Trainer
 
@@ -63,15 +62,9 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             batch = next(batches)
             collected = time.perf_counter()
 
-            # Count; finished episodes move the curriculum.
-            before, phase = trainer.frames, trainer.warm_start.phase(trainer.frames)
-            trainer.frames += batch.numel()
-            trainer.iteration += 1
-            metrics = episode_metrics(batch)
-            metrics |= trainer.advance_curriculum(batch)
-
-            # Learn: advantages once, then epochs of shuffled minibatches.
-            metrics |= trainer.learn(batch, phase)
+            # Finished episodes move the curriculum; the algorithm learns.
+            before = trainer.frames
+            metrics = trainer.learn(batch)
             finished = time.perf_counter()
             metrics["time/collect_ms"] = (collected - started) * 1e3
             metrics["time/update_ms"] = (finished - collected) * 1e3

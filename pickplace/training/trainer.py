@@ -14,17 +14,16 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
-from pickplace.algorithms.imitation import Phase, WarmStart
-from pickplace.algorithms.ppo import add_advantages, afterstates, learning_rate, make_losses, of_taken_choice, update
-from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS, as_sampling_policy
-from pickplace.algorithms.vine import vine_advantages
+from pickplace.algorithms.base import Algorithm, At, Task
+from pickplace.algorithms.imitation import WarmStart, with_warm_start
 from pickplace.common.files import replaced_file
 from pickplace.common.machine import use_machine
+from pickplace.common.validate import excerpt
 from pickplace.config.registry import build
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.evaluation.play import Episodes, play
-from pickplace.policies.base import EstimatesValue, Policy, as_collection_policy, as_critic, refuse_large_network
+from pickplace.policies.base import EstimatesValue, Policy, as_critic, refuse_large_network
 from pickplace.runs import checkpoint
 from pickplace.runs.provenance import commit, versions
 from pickplace.runs.resume import (
@@ -33,15 +32,14 @@ from pickplace.runs.resume import (
     checkpoint_config,
     checkpoint_hint,
     has_config,
-    load_optimizer,
     stale_best_frames,
 )
 from pickplace.training import callbacks
 from pickplace.training.collectors import refuse_other_workers, rng_state, set_rng_state, watch_workers
 from pickplace.training.curriculum import Curriculum, push_level
-from pickplace.training.metrics import has_passed, progress_line, validation_metrics
+from pickplace.training.metrics import episode_metrics, has_passed, progress_line, validation_metrics
 from pickplace.training.report import REPORT, write_report
-from pickplace.training.settings import check_learner, check_memory, check_settings
+from pickplace.training.settings import check_memory, check_settings
 from pickplace.views.figures import learning_curve
 
 log = logging.getLogger(__name__)
@@ -70,7 +68,7 @@ class Trainer:
 
     def __init__(self, cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None = None):
         check_settings(cfg)
-        self.cfg, self.algo, self.run_dir = cfg, cfg.algo, run_dir
+        self.cfg, self.run_dir = cfg, run_dir
         self.saved_config, self.resume_overrides = checkpoint_config(cfg)
         self.device = use_machine(cfg)
         torch.manual_seed(cfg.seed)
@@ -88,34 +86,48 @@ class Trainer:
         self.ended = self.facts.get("ended") is True and has_config(self.facts, self.saved_config)
         self.callbacks = callbacks.make_callbacks(cfg.get("callbacks") or {}, self.facts.get("callbacks") or {})
         # The order of these fixes the random draws of a seed.
-        self._make_models()
+        self._make_networks()
+        self._make_algorithm()
         self._make_curriculum()
-        self._make_learner()
+        self._make_collector()
 
-    def _make_models(self) -> None:
+    def _make_networks(self) -> None:
         """Make the items, the policy, the planner that validates it, the warm start and the critic."""
         cfg = self.cfg
         self.items = build("items", cfg["items"])
         self.env_config = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
         self.build_env = partial(build_env, self.env_config, items=self.items, device=cfg.device)
-        probe = self.build_env(num_envs=1, masks=())
+        self.probe = probe = self.build_env(num_envs=1, masks=())
         self.cell, self.terms, self.min_tote_height = probe.cell, probe.terms, probe.min_tote_height
         make_actor = partial(
             build, "model.actor", cfg.model.actor, cell=self.cell, mask_infeasible=cfg.model.mask_infeasible
         )
         weights = self.state if self.resumed else self._first_weights()
         self.policy: Policy = self._restored("policy", make_actor, weights)
-        check_learner(cfg, self.policy)
         for warning in self.policy.check_sizes():
             log.warning(warning)
         self.planner = build("planner", cfg.planner, cell=self.cell, policy=self.policy)
         self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, self.items, self.terms, cfg.seed, cfg.trust)
+        self.critic = None
         if isinstance(self.policy, EstimatesValue):
+            if cfg.model.critic is not None:
+                raise ValueError(
+                    f"model.critic={excerpt(dict(cfg.model.critic))}: expected null; the actor is the critic."
+                )
             self.critic = as_critic(self.policy.value_network())
-        else:
+        elif cfg.model.critic is not None:
             make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
             self.critic = self._restored("critic", lambda: as_critic(make_critic()), weights)
-        check_memory(cfg, probe, self.policy)
+
+    def _make_algorithm(self) -> None:
+        """Make the algorithm, with its warm start, and check that its batches fit into memory."""
+        cfg = self.cfg
+        task = Task(self.terms, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
+        algorithm = build("algo", cfg.algo, policy=self.policy, critic=self.critic, task=task)
+        if not isinstance(algorithm, Algorithm):
+            raise ValueError(f"algo={excerpt(algorithm)}: expected an algorithm, such as algo=ppo.")
+        self.algorithm = with_warm_start(algorithm, self.warm_start)
+        check_memory(cfg, self.probe, self.policy, self.algorithm)
 
     def _first_weights(self) -> dict:
         """Return the networks with whose weights a new training begins; empty without ``warm_start.weights``."""
@@ -155,27 +167,16 @@ class Trainer:
                     "checkpoints/best is of frame %s and of other settings; the next validation replaces it",
                     f"{stale:,}",
                 )
-        batch_frames = cfg.env.num_envs * cfg.rollout_length
-        if shortage := self.curriculum.check_budget(cfg.total_frames, batch_frames):
+        if shortage := self.curriculum.check_budget(cfg.total_frames, cfg.env.num_envs * cfg.rollout_length):
             log.warning(shortage)
-        if learning_rate(self.algo, batch_frames, cfg.total_frames) == 0 < self.algo.lr:
-            log.warning(
-                "total_frames=%d: the only batch has learning rate 0 (algo.lr_decay_start); nothing is learnt",
-                cfg.total_frames,
-            )
 
-    def _make_learner(self) -> None:
-        """Make TorchRL's parts: advantage, loss, optimizer and collector."""
-        cfg, algo = self.cfg, self.algo
+    def _make_collector(self) -> None:
+        """Make the collector of the algorithm's acting policy."""
+        cfg = self.cfg
         make_env = partial(
             training_env, self.env_config, self.items, cfg.device, self.policy.masks, cfg.env.num_envs, self.curriculum
         )
-        if algo.vine_samples is None:
-            self.acting = as_collection_policy(self.policy)
-        else:
-            self.acting = as_sampling_policy(self.policy, algo.vine_samples, algo.vine_temperature)
-        self.advantage, self.loss = make_losses(algo, self.policy, self.critic)
-        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=algo.lr, eps=1e-5)
+        self.acting = self.algorithm.acting_policy()
         if self.resumed:
             refuse_other_workers(cfg.collector, self.state.get("collector"))
         self.collector = build(
@@ -186,6 +187,7 @@ class Trainer:
             num_envs=cfg.env.num_envs,
             rollout_length=cfg.rollout_length,
             seed=cfg.seed,
+            next_keys=self.algorithm.next_keys,
         )
 
     @property
@@ -239,8 +241,8 @@ class Trainer:
             yield stop
 
     def _restore_state(self) -> None:
-        """Restore optimizer, collector and random generators from the checkpoint."""
-        load_optimizer(self.optimizer, self.state.get("optimizer", {}))
+        """Restore algorithm, collector and random generators from the checkpoint."""
+        self.algorithm.load_state_dict(self.state.get("algorithm"))
         with watch_workers(self.collector):
             own = self.collector.state_dict()
             saved = checkpoint.matching_state(self.state.get("collector"), own, "collector")
@@ -267,30 +269,14 @@ class Trainer:
             callbacks.call(self.callbacks, "on_level_change", self, level, self.curriculum.level)
         return metrics
 
-    def learn(self, batch: TensorDictBase, phase: Phase) -> dict:
-        """Train on a batch ``[N, T]``: advantages and the teacher's choices once, then epochs of minibatches."""
-        rate = learning_rate(self.algo, self.frames, self.cfg.total_frames)
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        if self.algo.loss == "td":
-            data = afterstates(batch, self.advantage, self.cfg.reward_scale)
-            metrics = update(self.loss, self.optimizer, data, self.algo, self.policy, phase)
-            return {**metrics, "train/lr": rate}
-        add_advantages(batch, self.advantage, self.cfg.reward_scale)
-        seen = {*self.policy.in_keys, *self.critic.in_keys}
-        drawn = ("log_prob",) if self.algo.vine_samples is None else CANDIDATE_KEYS
-        data = batch.select(*seen, self.policy.choice_key, *drawn, "advantage", "value_target").reshape(-1)
-        if self.algo.vine_samples is not None:
-            if self.algo.advantages == "vine":
-                parts = (self.policy, self.critic, self.terms, self.algo, self.cfg.reward_scale)
-                data["advantage"] = vine_advantages(batch.reshape(-1), *parts)
-            else:
-                count = data[CANDIDATE_KEYS[0]].shape[1]
-                data["advantage"] = of_taken_choice(data["advantage"], count, self.algo.normalize_advantage)
-        if phase == Phase.IMITATION:
-            data["taught"] = self.warm_start.ask(batch.reshape(-1), self.iteration)
-        metrics = update(self.loss, self.optimizer, data, self.algo, self.policy, phase)
-        return {**metrics, "train/lr": rate}
+    def learn(self, batch: TensorDictBase) -> dict:
+        """Count a batch ``[N, T]``, move the curriculum by it and learn from it; return metrics."""
+        before = self.frames
+        self.frames += batch.numel()
+        self.iteration += 1
+        metrics = episode_metrics(batch) | self.advance_curriculum(batch)
+        at = At(before, self.frames, self.iteration, self.cfg.total_frames)
+        return metrics | self.algorithm.learn(batch, at)
 
     def validate(self, record=()) -> Episodes:
         """Play the validation stream at full height, and record the episodes of these numbers."""
@@ -327,8 +313,8 @@ class Trainer:
         """Write the checkpoint ``checkpoints/<name>``; a ``last`` keeps the one before it as ``previous``."""
         state = {
             "policy": self.policy.state_dict(),
-            "critic": self.critic.state_dict(),
-            "optimizer": self.optimizer.state_dict()["state"],
+            **({} if self.critic is None else {"critic": self.critic.state_dict()}),
+            "algorithm": self.algorithm.state_dict(),
             "collector": self.collector.state_dict(),
             **rng_state(self.device),
         }

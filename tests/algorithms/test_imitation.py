@@ -1,16 +1,19 @@
 """Warm start: what the teacher is asked, what is learnt from it, and when."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from commands import composed
 from omegaconf import OmegaConf
 from problems import late_state
+from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace import PickPlaceEnv
-from pickplace.algorithms.imitation import Phase, WarmStart, imitation_loss
+from pickplace.algorithms.base import At
+from pickplace.algorithms.imitation import Imitation, WarmStart, imitation_loss
 from pickplace.config.registry import PLANNERS
 from pickplace.planners.heuristics import JointDBL
 from pickplace.policies.corners.policy import Corners
@@ -131,10 +134,13 @@ def test_imitation_learns_the_teachers_choices(states):
 
 
 def test_phases_follow_each_other():
-    start, _ = warm_start(config(frames=100, critic_frames=50))
-    phases = [start.phase(frames) for frames in (0, 99, 100, 149, 150)]
-    assert phases == [Phase.IMITATION, Phase.IMITATION, Phase.CRITIC, Phase.CRITIC, Phase.REWARD]
-    assert warm_start(config(None, 0, 0))[0].phase(0) == Phase.REWARD
+    """The teacher is asked, then the critic learns alone, then the algorithm learns as without a teacher."""
+    inner = SimpleNamespace(next_keys=(), learn=lambda batch, at: "reward", prepare=lambda batch, at: batch.clone())
+    inner.descend = lambda data, at, objective: "imitation" if "taught" in data else "critic"
+    imitation = Imitation(inner, warm_start(config(frames=100, critic_frames=50))[0])
+    imitation.warm_start.ask = lambda data, iteration: torch.zeros(len(data))
+    phases = [imitation.learn(TensorDict({}, [2, 3]), At(frames, 0, 1, 0)) for frames in (0, 99, 100, 149, 150)]
+    assert phases == ["imitation", "imitation", "critic", "critic", "reward"]
 
 
 @pytest.mark.parametrize(

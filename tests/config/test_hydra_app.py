@@ -117,7 +117,7 @@ BAD = [
     ("train", "threads=10000000000", ["threads=10000000000", "<= 1"]),
     ("train", "algo.gamma=1.5", ["algo.gamma=1.5", "between 0 and 1"]),
     ("train", "device=tpu", ["device=tpu", "cpu"]),
-    ("train", "algo.loss=dqn", ["algo.loss='dqn'", "'ppo' or 'a2c'"]),
+    ("train", "algo._target_=dqn", ["algo._target_=dqn", "expected one of ppo, a2c, sampled_ppo, td"]),
     ("train", "evaluation.stream=test", ["evaluation.stream='test'", "validation"]),
 ]
 

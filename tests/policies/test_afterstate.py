@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torchrl.objectives.value import GAE
 
 from pickplace import PickPlaceEnv
-from pickplace.algorithms.ppo import afterstates
+from pickplace.algorithms.td import afterstates
 from pickplace.config.registry import build
 from pickplace.evaluation.play import play
 from pickplace.planners.policy import PolicyPlanner
@@ -178,10 +178,10 @@ def shared(state):
 
 
 @pytest.mark.parametrize(("words", "refusal"), [
-    (["model=afterstate"], "algo.loss='ppo': expected 'td' with model=afterstate"),
-    (["algo=td"], "algo.loss='td': expected 'ppo' or 'a2c'"),
+    (["model=afterstate"], "algo: .*expected algo=td"),
+    (["algo=td"], "algo: .*expected model=afterstate"),
     (["model=afterstate", "algo=td", "warm_start=imitate"], "warm_start.frames=200000: expected 0"),
-    (["model=afterstate", "algo=td", "algo.vine_samples=2"], "algo.vine_samples=2: expected null"),
+    (["model=afterstate", "algo=td", "+algo.samples=2"], "algo.samples: there is no key"),
     (["model=afterstate", "algo=td", "rollout_length=1"], "rollout_length=1: expected at least 2"),
     (["model=afterstate", "algo=td", "warm_start.critic_frames=64"], "warm_start.critic_frames=64: expected 0"),
     (["model=afterstate", "algo=td", "model.mask_infeasible=false"], "model.mask_infeasible=False: expected true"),
@@ -189,7 +189,7 @@ def shared(state):
     (["model=afterstate", "algo=td", "model.actor.grid=[10,10]"], r"model.actor.grid=\[10, 10\]: expected 3"),
     (["model=afterstate", "algo=td", "model.actor.grid=[10,1,10]"], r"model.actor.grid=\[10, 1, 10\]: expected at le"),
     (["model=afterstate", "algo=td", "model.actor.reward_scale=1"], "model.actor.reward_scale=1: expected reward_s"),
-    (["model=afterstate", "algo=td", "+model.critic.filters=8"], "model.critic=.*filters.*: expected .*tote_value"),
+    (["model=afterstate", "algo=td", "model.critic={_target_: pooled}"], "model.critic=.*pooled.*: expected null"),
     (["model=afterstate", "algo=td", "model.actor.temperature=0"], "model.actor.temperature=0: expected a number"),
 ])  # fmt: skip
 def test_settings_that_do_not_fit_are_refused(words, refusal, tmp_path):

@@ -235,19 +235,21 @@ def test_a_damaged_checkpoint_is_refused_and_a_whole_one_is_named(smoke_run, tmp
         ("commit", {}, "commit is {}; expected a text or null"), ("versions", None, "versions is None; expected a"),
         *(
             (f"config|{path}", {"x": 1}, f"in the checkpoint's config, {path.replace('|', '.')}: there is no key")
-            for path in ("foo", "algo|foo", "evaluation|foo", "warm_start|foo", "hydra")
+            for path in ("foo", "evaluation|foo", "warm_start|foo", "hydra")
         ),
         *(("curriculum", value, "curriculum is") for value in (None, "x", {}, 10**30)),
         ("curriculum|level", 2.5, "level of the checkpoint=2.5: expected a whole number"),
         ("curriculum|frames", -1, "frames of the checkpoint=-1: expected a whole number"),
         ("curriculum|window", "abc", "window of the checkpoint='abc': expected a list"),
         ("curriculum|window", [0.5, 7], "window of the checkpoint=7: expected a number between 0 and 1"),
+        ("config|algo|foo", 1, "algo.foo: there is no key 'foo' in algo"),
         ("rng", torch.zeros(5056), "rng is float32 of shape (5056,), expected uint8 of shape (5056,)"),
         ("rng", None, "rng is missing, expected uint8"),
         ("rng", torch.zeros(5056, dtype=torch.uint8), "random generator is of no use"),
-        ("optimizer", None, "has no optimizer"),
-        ("optimizer", {"zzz": torch.zeros(1)}, "optimizer has 'zzz'; expected numbers below"),
-        ("optimizer|0|step", torch.tensor(float("inf")), "optimizer is of no use: 0|step holds values"),
+        ("algorithm|optimizer", None, "has no optimizer"),
+        ("algorithm|optimizer", {"zzz": torch.zeros(1)}, "optimizer has 'zzz'; expected numbers below"),
+        ("algorithm", None, "has no optimizer"),
+        ("algorithm|optimizer|0|step", torch.tensor(float("inf")), "optimizer is of no use: 0|step holds values"),
         ("critic", None, "critic does not fit"),
         ("collector", None, "environment|surface is missing"),
         ("collector|carried|footprint_mask", None, "carried|footprint_mask is missing, expected bool"),

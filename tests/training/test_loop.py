@@ -1,17 +1,19 @@
 """Training: advantages by hand, what each loss and step consists of, and the wiring of stream, slots and curriculum."""
 
 from copy import deepcopy
+from types import SimpleNamespace
 
 import pytest
 import torch
-from commands import composed
+from commands import algorithm_of, composed
 from omegaconf import OmegaConf
 from torch import nn
 from torchrl.modules import ValueOperator
 
 from pickplace import PickPlaceEnv
-from pickplace.algorithms.imitation import Phase, imitation_loss
-from pickplace.algorithms.ppo import add_advantages, learning_rate, make_losses, update
+from pickplace.algorithms.actor_critic import ActorCritic
+from pickplace.algorithms.base import At
+from pickplace.algorithms.imitation import Imitation, imitation_loss
 from pickplace.config.registry import build
 from pickplace.evaluation.play import play
 from pickplace.planners.heuristics import JointDBL
@@ -26,6 +28,7 @@ from pickplace.training.metrics import episode_metrics, has_passed
 from pickplace.training.trainer import Trainer, training_env
 
 OBSERVED = ["bin_depth", "tote_depth"]  # by a critic
+AT = At(0, 48, 1, 1000)
 
 
 class MeanDepthCritic(nn.Module):
@@ -54,9 +57,8 @@ def collected():
 
 def test_advantages_by_hand(collected):
     policy, batch = collected[0], collected[1].clone()
-    cfg = composed("algo.gamma=0.9", "algo.lmbda=0.5").algo
-    advantage, _ = make_losses(cfg, policy, ValueOperator(MeanDepthCritic(), OBSERVED))
-    add_advantages(batch, advantage, 0.25)
+    critic = ValueOperator(MeanDepthCritic(), OBSERVED)
+    algorithm_of(policy, critic, "algo.gamma=0.9", "algo.lmbda=0.5", "reward_scale=0.25").prepare(batch, AT)
     value, following = (0.1 * depth.mean((-2, -1)) for depth in (batch["tote_depth"], batch["next", "tote_depth"]))
     reward, goes_on = 0.25 * collected[1]["next", "reward"][..., 0], ~batch["next", "done"][..., 0]
     assert 0 < goes_on.sum() < goes_on.numel()
@@ -72,11 +74,11 @@ def test_advantages_by_hand(collected):
 @pytest.mark.parametrize("algo", ["ppo", "a2c"])
 def test_losses_are_weighted_as_the_config_says(collected, algo):
     policy, data = collected[0], collected[1].reshape(-1)
-    cfg = composed(f"algo={algo}", "algo.entropy_coeff=0.3", "algo.critic_coeff=0.05").algo
-    advantage, loss = make_losses(cfg, policy, ValueOperator(MeanDepthCritic(), OBSERVED))
+    words = [f"algo={algo}", "algo.entropy_coeff=0.3", "algo.critic_coeff=0.05"]
+    made = algorithm_of(policy, ValueOperator(MeanDepthCritic(), OBSERVED), *words)
     with torch.no_grad():
-        advantage(data)
-        losses, value = loss(data), 0.1 * data["tote_depth"].mean((-2, -1))[..., None]
+        made.advantage(data)
+        losses, value = made.losses(data), 0.1 * data["tote_depth"].mean((-2, -1))[..., None]
     torch.testing.assert_close(losses["loss_entropy"], -0.3 * losses["entropy"])
     torch.testing.assert_close(losses["loss_critic"], 0.05 * (value - data["value_target"]).square().mean())
 
@@ -87,53 +89,57 @@ def test_advantages_are_normalised_where_the_config_says_so(collected, algo, wan
     """Then twice the reward has the same gradient for the policy, otherwise twice the gradient."""
     policy, critic, data = collected[0], MeanDepthCritic(), collected[1].clone()
     critic.scale.data.zero_()
-    cfg = composed(f"algo={algo}", f"algo.normalize_advantage={wanted}").algo
-    advantage, loss = make_losses(cfg, policy, ValueOperator(critic, OBSERVED))
+    words = [f"algo={algo}", f"algo.normalize_advantage={wanted}"]
+    made = algorithm_of(policy, ValueOperator(critic, OBSERVED), *words)
     gradients = []
     for _ in range(2):
         with torch.no_grad():
-            advantage(data)
+            made.advantage(data)
         policy.zero_grad()
-        loss(data.reshape(-1))["loss_objective"].backward()
-        gradients.append(torch.cat([part.grad.flatten() for part in loss.parameters() if part.grad is not None]))
+        made.losses(data.reshape(-1))["loss_objective"].backward()
+        gradients.append(torch.cat([part.grad.flatten() for part in made.parameters if part.grad is not None]))
         data["next", "reward"] = 2 * data["next", "reward"]
     torch.testing.assert_close(gradients[1], gradients[0] * (1 if wanted else 2), rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.parametrize("limit", [1e-3, 1e9])
-@pytest.mark.parametrize("phase", Phase)
+@pytest.mark.parametrize("phase", ["reward", "critic", "imitation"])
 def test_a_step_follows_what_its_phase_learns_from(phase, limit, collected):
     """The policy from reward or its teacher, the critic always; no further than the greatest norm of a gradient."""
     policy, data = deepcopy(collected[0]), collected[1].reshape(-1)
     critic = ValueOperator(PooledCritic(filters=8, hidden=8, compute_dtype="float32"), [*PooledCritic.in_keys])
-    settings = ["algo.entropy_coeff=0.3", "algo.epochs=1", "algo.minibatch_size=64"]
-    cfg = composed(*settings, f"algo.max_grad_norm={limit}").algo
-    advantage, loss = make_losses(cfg, policy, critic)
+    words = ["algo.entropy_coeff=0.3", "algo.epochs=1", "algo.minibatch_size=64", "algo.lr_decay_start=null"]
+    made = algorithm_of(policy, critic, *words, f"algo.max_grad_norm={limit}")
     with torch.no_grad():
-        advantage(data)
-    data["taught"] = data["footprint"]
-    losses = loss(data)
-    total = {
-        Phase.REWARD: losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"],
-        Phase.CRITIC: losses["loss_critic"],
-        Phase.IMITATION: losses["loss_critic"] + imitation_loss(policy, data)[0],
-    }[phase]
-    before = [parameter.detach().clone() for parameter in loss.parameters()]
-    gradients = torch.autograd.grad(total, list(loss.parameters()), allow_unused=True)
+        made.advantage(data)
+    if phase == "imitation":
+        data["taught"] = data["footprint"]
+    losses = made.losses(data)
+    total = losses["loss_critic"]
+    if phase == "reward":
+        total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+    elif phase == "imitation":
+        total = total + imitation_loss(policy, data)[0]
+    before = [parameter.detach().clone() for parameter in made.parameters]
+    gradients = torch.autograd.grad(total, made.parameters, allow_unused=True)
     gradients = [torch.zeros_like(b) if g is None else g for b, g in zip(before, gradients, strict=True)]
     norm = torch.cat([g.flatten() for g in gradients]).norm()
-    step = 1 / min(limit, norm.item())  # so that the parameters move by 1, whatever the limit
-    update(loss, torch.optim.SGD(loss.parameters(), lr=step), data, cfg, policy, phase)
-    for parameter, old, gradient in zip(loss.parameters(), before, gradients, strict=True):
+    made.lr = step = 1 / min(limit, norm.item())  # so that the parameters move by 1, whatever the limit
+    made.optimizer = torch.optim.SGD(made.parameters, lr=1.0)
+    objective = made.objective if phase == "reward" else Imitation(made, SimpleNamespace(policy=policy)).objective
+    assert made.descend(data, AT, objective)["train/lr"] == step
+    for parameter, old, gradient in zip(made.parameters, before, gradients, strict=True):
         moved = gradient * step * min(1, limit / norm)
         torch.testing.assert_close(old - parameter.detach(), moved, rtol=1e-2, atol=1e-5)
 
 
-def test_the_learning_rate_falls_linearly_over_the_last_part():
-    algo = composed("algo.lr=0.2", "algo.lr_decay_start=0.75").algo
-    rates = [learning_rate(algo, frames, 1000) for frames in (0, 750, 875, 1000, 1100)]
+def test_the_learning_rate_falls_linearly_over_the_last_part(collected):
+    critic = ValueOperator(MeanDepthCritic(), OBSERVED)
+    falling = algorithm_of(collected[0], critic, "algo.lr=0.2", "algo.lr_decay_start=0.75")
+    rates = [falling.learning_rate(At(0, frames, 1, 1000)) for frames in (0, 750, 875, 1000, 1100)]
     assert rates == pytest.approx([0.2, 0.2, 0.1, 0, 0])
-    assert learning_rate(composed("algo.lr=0.2", "algo.lr_decay_start=null").algo, 1000, 1000) == 0.2
+    constant = algorithm_of(collected[0], critic, "algo.lr=0.2", "algo.lr_decay_start=null")
+    assert constant.learning_rate(At(0, 1000, 1, 1000)) == 0.2
 
 
 # --- the loop
@@ -209,13 +215,14 @@ def test_validation_plays_its_own_stream_at_full_height(tmp_path):
 
 def test_a_learner_expects_nothing_after_the_end_of_a_recording(smoke, tmp_path, monkeypatch):
     """Though it truncates: nothing more comes, and no critic learns the value of an empty bin."""
-    batches = []
+    batches, prepare = [], ActorCritic.prepare
 
-    def recording(*args):
-        advantage, loss = make_losses(*args)
-        return lambda batch: batches.append(advantage(batch).clone()), loss
+    def recording(algorithm, batch, at):
+        data = prepare(algorithm, batch, at)
+        batches.append(batch.clone())
+        return data
 
-    monkeypatch.setattr(trainer, "make_losses", recording)
+    monkeypatch.setattr(ActorCritic, "prepare", recording)
     (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
     quick = ["env.tote_size=[5,5,1]", "total_frames=128", "evaluation.episodes=1", "logger=none"]
     smoke(tmp_path / "run", "items=recorded", f"items.path={tmp_path}/items.csv", *quick)

@@ -4,16 +4,11 @@ import logging
 from itertools import product
 
 import pytest
-from commands import composed, options
+from commands import TINY, composed, options
 
 from pickplace.runs.loggers import read_csv
 from pickplace.training.train import train
 
-TINY = [
-    "env.num_envs=4", "rollout_length=4", "algo.minibatch_size=8", "algo.epochs=1", "total_frames=16",
-    "evaluation.episodes=2", "evaluation_interval=16", "checkpoint_interval=16", "progress_interval=16",
-    "env.tote_size=[6,6,2]", "model.actor.filters=8", "model.critic.filters=8", "model.critic.hidden=8", "threads=1",
-]  # fmt: skip
 ONE_NETWORK = [word for word in TINY if not word.startswith("model.critic.")]  # that of model=afterstate
 
 
@@ -55,8 +50,8 @@ def test_the_paper_s_effector_is_the_default(env):
 ])  # fmt: skip
 def test_every_model_trains_with_and_without_a_mask(model, masked, samples, tmp_path):
     algo = ["algo=td"] if model == "afterstate" else ["algo=a2c"] if model == "fcn_grasp" and masked else []
-    algo += [f"model.mask_infeasible={masked}", f"algo.vine_samples={samples}"]
-    overrides = [f"model={model}", "curriculum=none", "logger=none", *algo]
+    algo = algo if samples == "null" else ["algo=sampled_ppo", f"algo.samples={samples}"]
+    overrides = [f"model={model}", "curriculum=none", "logger=none", *algo, f"model.mask_infeasible={masked}"]
     overrides += ONE_NETWORK if model == "afterstate" else TINY
     if model in ("corners", "afterstate") and not masked:
         with pytest.raises(ValueError, match=f"^model.mask_infeasible=False: with model={model} expected true"):

@@ -2,21 +2,17 @@
 
 import pytest
 import torch
-from commands import composed
+from commands import TINY, algorithm_of, composed
 from problems import late_state
 from tensordict import TensorDict
-from test_presets import TINY
 from torch import nn
 from torchrl.modules import ValueOperator
 
-from pickplace.algorithms.ppo import make_losses, of_taken_choice
+from pickplace.algorithms.sampled_ppo import SampledPPO, of_taken_choice
 from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS, as_sampling_policy, draw_candidates
-from pickplace.algorithms.vine import vine_advantages
 from pickplace.policies.base import Policy
 from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.individual.policy import IndividualRl
-from pickplace.rules.observation import STANDARD_TERMS
-from pickplace.training import trainer
 from pickplace.training.train import train
 
 
@@ -32,7 +28,13 @@ class MeanDepth(nn.Module):
 
 
 CRITIC = ValueOperator(MeanDepth(), ["bin_depth", "tote_depth"])
-SETTINGS = ["algo.gamma=0.9", "reward_scale=0.5", "algo.normalize_advantage=false", "algo.minibatch_size=7"]
+SETTINGS = [
+    "algo=sampled_ppo",
+    "algo.gamma=0.9",
+    "reward_scale=0.5",
+    "algo.normalize_advantage=false",
+    "algo.minibatch_size=7",
+]
 
 
 def drawn(kind, steps):
@@ -55,8 +57,8 @@ def test_advantages_are_those_of_single_steps(kind, monkeypatch):
     arrived = frames["next", "bin_depth"][frames["next", "failure"][:, 0] == 0]
     assert 1 < len(arrived) < 24
     arrived = arrived[torch.arange(24) % len(arrived)]
-    algo = composed(*SETTINGS).algo
-    got = vine_advantages(frames, policy, CRITIC, STANDARD_TERMS, algo)[..., 0]
+    algorithm = algorithm_of(policy, CRITIC, *SETTINGS)
+    got = algorithm.vine_advantages(frames)[..., 0]
     saved, expected = {key: value.clone() for key, value in env.state_dict().items()}, []
     for candidate in frames["candidates"].T:
         after = env.step(frames.clone().set("action", policy.to_action(candidate, frames)))["next"]
@@ -71,8 +73,8 @@ def test_advantages_are_those_of_single_steps(kind, monkeypatch):
         shares = [float(w) * 41 for w in weights]
         shares = [max(w, min(1, w**0.5)) if gain > 0 else w for w, gain in zip(shares, gains, strict=True)]
         torch.testing.assert_close(advantages, gains * torch.tensor(shares))
-    algo.normalize_advantage = True
-    unit = vine_advantages(frames, policy, CRITIC, STANDARD_TERMS, algo)
+    algorithm.normalize_advantage = True
+    unit = algorithm.vine_advantages(frames)
     torch.testing.assert_close(unit[..., 0], got / got.square().mean().sqrt())
 
 
@@ -86,7 +88,7 @@ def test_nothing_follows_where_the_next_item_has_no_place():
     middle, elsewhere = (12 * 25 + 12) * 4, 12 * 25 * 4
     frames["candidates"] = torch.tensor([[middle, elsewhere]]).expand(24, 2).clone()
     frames["candidate_log_weight"] = torch.tensor([0.5, 0.5]).log().expand(24, 2).clone()
-    got = vine_advantages(frames, policy, CRITIC, STANDARD_TERMS, composed(*SETTINGS).algo)
+    got = algorithm_of(policy, CRITIC, *SETTINGS).vine_advantages(frames)
     torch.testing.assert_close(got[..., 0], torch.tensor([[0.25, -0.25]]).expand(24, 2))
 
 
@@ -104,9 +106,8 @@ class Fixed(Policy):
         return self.values.expand(len(observation["bin_depth"]), -1)
 
 
-@pytest.mark.parametrize("loss", ["ppo", "a2c"])
 @pytest.mark.parametrize(("samples", "frames", "error"), [(6, 5, 1e-6), (9, 5, 1e-6), (3, 100_000, 0.02)])
-def test_the_loss_has_the_policy_gradient(loss, samples, frames, error):
+def test_the_loss_has_the_policy_gradient(samples, frames, error):
     """Of 7 choices: exactly once all are candidates, else on average, a little short."""
     torch.manual_seed(samples)
     env, observation = late_state(1)
@@ -117,7 +118,7 @@ def test_the_loss_has_the_policy_gradient(loss, samples, frames, error):
     gain = value[data["candidates"]]
     data["advantage"] = ((gain - (weight * gain).sum(1, keepdim=True)) * weight * weight.shape[1])[..., None]
     data["action"], data["value_target"] = data["candidates"][:, 0], torch.zeros(frames, 1)
-    losses = make_losses(composed(f"algo={loss}", "algo.vine_samples=3").algo, policy, CRITIC)[1](data)
+    losses = algorithm_of(policy, CRITIC, "algo=sampled_ppo", "algo.samples=3").losses(data)
     chance = policy.values.detach().softmax(0)
     wanted = -chance * (value - (chance * value).sum())
     got = torch.autograd.grad(losses["loss_objective"], policy.values, retain_graph=True)[0]
@@ -130,8 +131,7 @@ def test_the_loss_has_the_policy_gradient(loss, samples, frames, error):
     )
 
 
-@pytest.mark.parametrize("loss", ["ppo", "a2c"])
-def test_with_every_choice_a_candidate_and_gae_the_loss_is_the_exact_one(loss):
+def test_with_every_choice_a_candidate_and_gae_the_loss_is_the_exact_one():
     """Gradients equal those of TorchRL's loss over all logits, also where the policy has changed since."""
     torch.manual_seed(0)
     env, observation = late_state(1)
@@ -142,13 +142,10 @@ def test_with_every_choice_a_candidate_and_gae_the_loss_is_the_exact_one(loss):
     data["action"], data["value_target"], data["advantage"] = keys[0][:, 0], torch.zeros(frames, 1), gae
     data["log_prob"] = keys[1][:, 0]
     gradients = []
-    for samples in (None, 6):
-        algo = composed(f"algo={loss}", f"algo.vine_samples={samples or 'null'}").algo
-        if samples:
-            data["advantage"] = of_taken_choice(gae, 1 + samples, algo.normalize_advantage)
-        elif loss == "a2c":  # GAE itself normalises there
-            data["advantage"] = (gae - gae.mean()) / gae.std()
-        losses = make_losses(algo, policy, CRITIC)[1](data)
+    for name in ("ppo", "sampled_ppo"):
+        if name == "sampled_ppo":
+            data["advantage"] = of_taken_choice(gae, 7, normalize=True)
+        losses = algorithm_of(policy, CRITIC, f"algo={name}").losses(data)
         total = losses["loss_objective"] + losses["loss_entropy"]
         gradients += torch.autograd.grad(total, policy.values)
     torch.testing.assert_close(*gradients)
@@ -156,9 +153,9 @@ def test_with_every_choice_a_candidate_and_gae_the_loss_is_the_exact_one(loss):
 
 @pytest.mark.parametrize(("advantages", "counted"), [("vine", 4), ("gae", 1)])
 def test_a_training_learns_from_every_candidate_or_the_taken_one(advantages, counted, monkeypatch, tmp_path):
-    batches, update = [], trainer.update
-    monkeypatch.setattr(trainer, "update", lambda *args: batches.append(args[2]) or update(*args))
-    settings = ["curriculum=none", "logger=none", "algo.vine_samples=3", f"algo.advantages={advantages}"]
+    batches, descend = [], SampledPPO.descend
+    monkeypatch.setattr(SampledPPO, "descend", lambda self, *args: batches.append(args[0]) or descend(self, *args))
+    settings = ["curriculum=none", "logger=none", "algo=sampled_ppo", "algo.samples=3", f"algo.advantages={advantages}"]
     train(composed("model=fcn4d", *settings, *TINY), tmp_path)
     assert [batch["advantage"].shape for batch in batches] == [(16, 4, 1)]
     assert batches[0]["advantage"][:, :counted].all() and not batches[0]["advantage"][:, counted:].any()

@@ -1,0 +1,19 @@
+"""Advantage actor-critic."""
+
+from torchrl.objectives import A2CLoss
+
+from pickplace.algorithms.actor_critic import ActorCritic
+
+
+class A2C(ActorCritic):
+    """A2C (config ``algo=a2c``); its loss does not normalise advantages, so that GAE does, in each batch."""
+
+    averages = True
+
+    def make_loss(self, **common) -> A2CLoss:
+        if self.normalize_advantage and self.task.batch_frames == 1:
+            raise ValueError(
+                "algo.normalize_advantage=True: a batch of one frame (env.num_envs x rollout_length) has no variance; "
+                "expected more frames, or false."
+            )
+        return A2CLoss(self.actor(), self.critic, **common)

@@ -1,0 +1,122 @@
+"""The common part of PPO and A2C: advantages by GAE, and a loss of TorchRL's."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+from torchrl.modules import ValueOperator
+from torchrl.objectives import A2CLoss, ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from pickplace.algorithms.base import At, Task
+from pickplace.algorithms.descent import MAX_WEIGHT, MinibatchDescent
+from pickplace.common.validate import flag, number
+from pickplace.policies.base import EstimatesValue, Policy, as_actor, as_collection_policy
+
+
+class ActorCritic(MinibatchDescent):
+    """Base class of algorithms that learn a policy from advantages over a critic's values.
+
+    Args:
+        policy, task: as of :class:`~pickplace.algorithms.descent.MinibatchDescent`.
+        critic: the value network.
+        gamma: discount per step.
+        lmbda: GAE's lambda.
+        entropy_coeff: weight of the entropy bonus in the loss.
+        critic_coeff: weight of the critic's loss.
+        normalize_advantage: whether advantages have zero mean and unit variance.
+        **descent: settings of the base class.
+    """
+
+    drawn_keys: tuple[str, ...] = ("log_prob",)  # entries that the acting policy writes and the loss reads
+    averages = False  # whether GAE normalises advantages in each batch
+    loss: A2CLoss | ClipPPOLoss
+
+    def __init__(
+        self,
+        policy: Policy,
+        critic: ValueOperator | None,
+        task: Task,
+        gamma: float,
+        lmbda: float,
+        entropy_coeff: float,
+        critic_coeff: float,
+        normalize_advantage: bool,
+        **descent,
+    ):
+        super().__init__(policy, task, **descent)
+        if isinstance(policy, EstimatesValue):
+            raise ValueError("algo: this model follows from the value that it learns; expected algo=td.")
+        if critic is None:
+            raise ValueError("model.critic=None: expected a network, from whose values the advantages follow.")
+        self.critic, self.gamma = critic, number("algo.gamma", gamma, most=1)
+        self.normalize_advantage = flag("algo.normalize_advantage", normalize_advantage)
+        coefficients = {
+            "entropy_coeff": number("algo.entropy_coeff", entropy_coeff, most=MAX_WEIGHT),
+            "critic_coeff": number("algo.critic_coeff", critic_coeff, most=MAX_WEIGHT),
+        }
+        # TorchRL leaves out a part whose coefficient is 0 at first; with 1 it is computed, so that it can be logged.
+        self.loss = self.make_loss(**dict.fromkeys(coefficients, 1.0), loss_critic_type="l2")
+        for key, value in coefficients.items():
+            getattr(self.loss, key).fill_(float(value))
+        self.loss.set_keys(action=policy.choice_key, sample_log_prob=self.log_prob_key)
+        self.advantage = GAE(
+            gamma=self.gamma,
+            lmbda=number("algo.lmbda", lmbda, most=1),
+            value_network=critic,
+            average_gae=self.averages and self.normalize_advantage,
+            deactivate_vmap=True,
+        )
+        self.use_parameters(self.loss.parameters())
+
+    log_prob_key = "log_prob"  # entry with the log-probabilities under the policy that collected
+
+    @abstractmethod
+    def make_loss(self, **common) -> A2CLoss | ClipPPOLoss:
+        """Return TorchRL's loss, with the arguments that all losses have in common."""
+
+    def actor(self) -> ProbabilisticTensorDictSequential:
+        """Return the policy as the loss wants it."""
+        return as_actor(self.policy)
+
+    def acting_policy(self) -> TensorDictModuleBase:
+        return as_collection_policy(self.policy)
+
+    def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
+        return self.descend(self.prepare(batch, at), at, self.objective)
+
+    def prepare(self, batch: TensorDictBase, at: At) -> TensorDictBase:
+        """Return the frames ``[B]`` of a batch ``[N, T]``, with advantages and value targets."""
+        add_advantages(batch, self.advantage, self.task.reward_scale)
+        keys = {*self.policy.in_keys, *self.critic.in_keys, *self.drawn_keys, self.policy.choice_key}
+        return batch.select(*keys, "advantage", "value_target").reshape(-1)
+
+    def losses(self, data: TensorDictBase) -> TensorDictBase:
+        """Return the parts of TorchRL's loss of a minibatch ``[B]``."""
+        return self.loss(data)
+
+    def objective(self, data: TensorDictBase) -> tuple[Tensor, Mapping[str, Any]]:
+        """Return the whole loss of a minibatch, and its parts."""
+        losses = self.losses(data)
+        return losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"], losses
+
+
+@torch.no_grad()
+def add_advantages(batch: TensorDictBase, advantage: GAE, reward_scale: float) -> None:
+    """Scale the rewards of a batch ``[N, T]`` in place and write ``advantage`` and ``value_target`` into it."""
+    batch["next", "reward"] = batch["next", "reward"] * reward_scale
+    batch["next", "terminated"] |= is_bin_empty(batch["next"])
+    advantage(batch)
+
+
+def is_bin_empty(state: TensorDictBase) -> Tensor:
+    """Whether no item has arrived because the item stream has ended, bool ``[..., 1]``.
+
+    The environment reports that as a truncation. But no reward can follow and no action is taken in that state, so the
+    critic would never learn the value with which GAE continues a truncated episode.
+    """
+    return state["bin_depth"].flatten(-2).amax(-1, keepdim=True) == 0

@@ -1,0 +1,159 @@
+"""The interface of algorithms: what a training does with a batch (config group ``algo``)."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from pickplace.common.validate import excerpt
+from pickplace.rules.observation import Term
+from pickplace.runs.checkpoint import CheckpointError, matching_state
+
+
+class At(NamedTuple):
+    """The place of a batch in its run.
+
+    Attributes:
+        before: frames of the run before the batch.
+        frames: frames of the run, the batch included.
+        iteration: number of the batch, from 1.
+        total: the run's budget in frames.
+    """
+
+    before: int
+    frames: int
+    iteration: int
+    total: int
+
+
+@dataclass(frozen=True)
+class Task:
+    """Facts of the training that an algorithm is made for, beside its networks.
+
+    Attributes:
+        terms: of the observation, by key.
+        reward_scale: rewards are to be multiplied by this.
+        num_envs: ``N``, environment slots.
+        rollout_length: ``T``, steps of each slot in a batch.
+    """
+
+    terms: Mapping[str, Term]
+    reward_scale: float
+    num_envs: int
+    rollout_length: int
+
+    @property
+    def batch_frames(self) -> int:
+        """Frames of a batch."""
+        return self.num_envs * self.rollout_length
+
+
+class Algorithm(ABC):
+    """Base class of algorithms, each made as ``Class(policy, critic, task, **settings)``.
+
+    ``policy`` is a :class:`~pickplace.policies.base.Policy`, ``critic`` a TorchRL ``ValueOperator`` or None, ``task`` a
+    :class:`Task`, and the settings are the keys of its config file. The training saves the weights of policy and
+    critic; everything else that a resumed run needs is in :meth:`state_dict`.
+
+    Attributes:
+        next_keys: masks, such as ``"action_mask"``, that the batch must hold under ``next``, too.
+    """
+
+    next_keys: tuple[str, ...] = ()
+
+    @abstractmethod
+    def acting_policy(self) -> TensorDictModuleBase:
+        """Return the module that collects: an observation ``[N]`` in, ``action`` out, and what :meth:`learn` reads.
+
+        It is asked once; its parameters and buffers are sent to the collector before each batch.
+        """
+
+    @abstractmethod
+    def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
+        """Learn from a batch ``[N, T]``; return metrics, named ``train/...``."""
+
+    def state_dict(self) -> dict:
+        """Return what a checkpoint stores for a resume: nested dicts of tensors, numbers and texts."""
+        return {}
+
+    def load_state_dict(self, state: Any) -> None:
+        """Continue from a :meth:`state_dict`, which may come from a stranger's checkpoint.
+
+        Raises:
+            CheckpointError: for one that does not fit.
+        """
+        matching_state(state, self.state_dict(), "algorithm")
+
+    def memory(self, frame: int) -> dict[str, int]:
+        """Return bytes that learning takes at once, by the key and the value that cause them.
+
+        Args:
+            frame: bytes of one collected frame.
+        """
+        return {}
+
+
+#: Computes the loss of a minibatch ``[B]``: what is minimised, and its parts and diagnostics by name.
+Objective = Callable[[TensorDictBase], tuple[Tensor, Mapping[str, Tensor]]]
+
+
+@runtime_checkable
+class Imitable(Protocol):
+    """An algorithm whose policy can imitate a teacher before it learns from reward."""
+
+    def prepare(self, batch: TensorDictBase, at: At) -> TensorDictBase:
+        """Return the frames ``[B]`` of a batch ``[N, T]`` with all that the loss reads; draws everything that is drawn
+        for it."""
+
+    def losses(self, data: TensorDictBase) -> TensorDictBase:
+        """Return the parts of the loss of a minibatch; ``loss_critic`` is the critic's."""
+
+    def descend(self, data: TensorDictBase, at: At, objective: Objective) -> dict[str, float]:
+        """Minimise an objective on frames ``[B]``; return metrics."""
+
+    def learning_memory(self, frame: int) -> dict[str, int]:
+        """Return bytes of a gradient step, by its key, if each frame takes ``frame`` bytes."""
+
+
+#: Entries of an optimizer's state that count or sum squares.
+NOT_NEGATIVE = ("step", "exp_avg_sq", "max_exp_avg_sq", "square_avg", "sum")
+
+
+def load_optimizer(optimizer: torch.optim.Optimizer, state: Any) -> None:
+    """Load ``state_dict()["state"]`` of an optimizer from a checkpoint; its settings stay.
+
+    Parameters that had no gradient so far have no state.
+
+    Raises:
+        CheckpointError: if it does not fit the parameters, or has values that cannot be.
+    """
+    if not isinstance(state, dict):
+        raise CheckpointError("The checkpoint has no optimizer; expected one that a training wrote.")
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    if unknown := [key for key in state if key not in range(len(parameters))]:
+        raise CheckpointError(
+            f"The checkpoint's optimizer has {excerpt(unknown[0])}; expected numbers below {len(parameters)}."
+        )
+    own = _state_after_a_step(optimizer)
+    saved = matching_state(state, {number: own[number] for number in state}, "optimizer")
+    for number, entries in saved.items():
+        for key in NOT_NEGATIVE:
+            if key in entries and (torch.as_tensor(entries[key]) < 0).any():
+                raise CheckpointError(f"The checkpoint's optimizer is of no use: {number}|{key} is negative.")
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": saved})
+
+
+def _state_after_a_step(optimizer: torch.optim.Optimizer) -> dict:
+    """Return the state that an optimizer like this one has after a step, by the number of the parameter."""
+    twin = deepcopy(optimizer)
+    for group in twin.param_groups:
+        for parameter in group["params"]:
+            parameter.grad = torch.zeros_like(parameter)
+    twin.step()
+    return twin.state_dict()["state"]

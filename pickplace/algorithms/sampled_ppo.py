@@ -1,0 +1,145 @@
+"""PPO over a few sampled choices in each state, and their advantages.
+
+A forward pass over all ``N_a`` actions costs far more than a step of the environment. So every choice that was drawn
+may be tried in the simulator, not only the one that is taken, and the loss learns from all of them: the "vine" of TRPO
+(Schulman et al. 2015).
+"""
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.objectives import ClipPPOLoss
+
+from pickplace.algorithms.base import At
+from pickplace.algorithms.ppo import PPO
+from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS, as_sampled_actor, as_sampling_policy
+from pickplace.common.validate import excerpt, number, one_of, whole_number
+from pickplace.rules.item import Item
+from pickplace.rules.masks import footprint_mask, placing_maps
+from pickplace.rules.observation import observe
+from pickplace.rules.state import Failure, State
+from pickplace.rules.step import apply
+
+
+class SampledPPO(PPO):
+    """PPO whose loss is over a few sampled choices (config ``algo=sampled_ppo``).
+
+    Args:
+        samples: choices drawn in each frame beside the one that is taken.
+        temperature: divides the logits from which these are drawn.
+        advantages: ``"vine"``: of each choice, by one step in the simulator; ``"gae"``: of the one that is taken.
+        **settings: of :class:`~pickplace.algorithms.ppo.PPO`; normalised advantages of a vine have a unit mean square.
+    """
+
+    drawn_keys = CANDIDATE_KEYS
+    log_prob_key = CANDIDATE_KEYS[1]
+
+    def __init__(self, *networks, samples: int, temperature: float, advantages: str, **settings):
+        self.samples = whole_number("algo.samples", samples, most=10_000)
+        self.temperature = number("algo.temperature", temperature, 0.01, 100.0)
+        self.advantages = one_of("algo.advantages", advantages, ("vine", "gae"))
+        super().__init__(*networks, **settings)
+        if (several := self.policy.cell.bin_items) != 1 and advantages == "vine":
+            raise ValueError(
+                f"algo.advantages=vine: expected gae with env.bin_items={excerpt(several)}; vine knows one item in the "
+                "bin."
+            )
+
+    def make_loss(self, **common) -> ClipPPOLoss:
+        # Advantages are normalised in prepare(): most of those that the loss sees are 0.
+        return ClipPPOLoss(as_sampled_actor(self.policy), self.critic, clip_epsilon=self.clip_epsilon, **common)
+
+    def acting_policy(self) -> TensorDictModuleBase:
+        return as_sampling_policy(self.policy, self.samples, self.temperature)
+
+    def prepare(self, batch: TensorDictBase, at: At) -> TensorDictBase:
+        """Return the frames ``[B]`` of a batch ``[N, T]``, with advantages ``[B, 1 + samples, 1]``."""
+        data = super().prepare(batch, at)
+        if self.advantages == "vine":
+            data["advantage"] = self.vine_advantages(batch.reshape(-1))
+        else:
+            count = data[CANDIDATE_KEYS[0]].shape[1]
+            data["advantage"] = of_taken_choice(data["advantage"], count, self.normalize_advantage)
+        return data
+
+    def losses(self, data: TensorDictBase) -> TensorDictBase:
+        # TorchRL's means over candidates have no weights, and say nothing about the policy.
+        return super().losses(data).exclude("kl_approx", "clip_fraction")
+
+    def memory(self, frame: int) -> dict[str, int]:
+        candidates = 20 * (1 + self.samples) * self.task.batch_frames
+        learning = self.learning_memory(self.policy.learning_bytes(self.samples))
+        return {f"algo.samples={self.samples}": candidates, **learning}
+
+    @torch.no_grad()
+    def vine_advantages(self, frames: TensorDictBase) -> Tensor:
+        """Return the weighted advantage of each candidate over its state's value, ``[B, 1 + samples, 1]``.
+
+        A state's value is the weighted mean over its candidates. The weights of a state have a mean of 1 here, so that
+        the loss, an unweighted mean over candidates, is an expectation under the policy that drew them. There is one
+        exception: a candidate that is better than expected has the square root of its weight, if that is more. By the
+        expectation alone a rare choice would stay rare for long, however good it is; in a natural gradient (Kakade
+        2002) its step would not depend on its probability at all.
+
+        Args:
+            frames: observations, candidates and, in ``next``, what the taken choices led to, ``[B]``.
+        """
+        items = _arrivals(frames)
+        parts = torch.arange(len(frames), device=items.x.device).split(self.minibatch_size)
+        value = torch.cat([self._values(frames[part], items.rows(part)) for part in parts])
+        weight = frames[CANDIDATE_KEYS[2]].exp()
+        advantage = value - (weight * value).sum(1, keepdim=True)
+        weight *= weight.shape[1]
+        advantage *= torch.where(advantage > 0, weight.maximum(weight.sqrt().clamp(max=1)), weight)
+        if self.normalize_advantage:
+            advantage /= advantage.square().mean().sqrt().clamp(min=1e-6)
+        return advantage[..., None]
+
+    def _values(self, frames: TensorDictBase, items: Item) -> Tensor:
+        """Return the reward of each candidate and the critic's value of what follows, ``[B, 1 + samples]``.
+
+        ``items`` has the item that arrives next, the same for all candidates of a state. A failure is worth nothing,
+        and so is what follows if that item has no feasible action.
+        """
+        cell, candidates = self.policy.cell, frames[CANDIDATE_KEYS[0]]
+        row = torch.arange(len(frames), device=candidates.device).repeat_interleave(candidates.shape[1])
+        state = State.from_observation(frames).rows(row)
+        seen = frames.select(*self.policy.act_keys)[row]
+        step = apply(cell, state, self.policy.to_action(candidates.flatten(), seen))
+        after = State(step.surface, state.tote_height, items.rows(row))
+        placed = step.failure == 0
+        goes_on = placed & footprint_mask(cell, placing_maps(cell, after)).flatten(1).any(1)
+        value = placed * step.item.volume * self.task.reward_scale
+        if goes_on.any():
+            after = after.rows(goes_on.nonzero()[:, 0])
+            seen = observe(self.task.terms, cell, after, self.critic.in_keys)
+            value[goes_on] += self.gamma * self.critic(TensorDict(seen, [len(after.tote_height)]))["state_value"][:, 0]
+        return value.view(candidates.shape)
+
+
+def of_taken_choice(advantage: Tensor, candidates: int, normalize: bool) -> Tensor:
+    """Return advantages ``[B, candidates, 1]`` that are zero except for the taken choice, which is the first.
+
+    They are scaled so that the mean over candidates equals the loss of the taken choice.
+
+    Args:
+        advantage: GAE's, ``[B, 1]``.
+        candidates: ``1 + samples``.
+        normalize: to zero mean and unit variance first.
+    """
+    if normalize:
+        advantage = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
+    return F.pad(candidates * advantage[:, None], (0, 0, 0, candidates - 1))
+
+
+def _arrivals(frames: TensorDictBase) -> Item:
+    """Return an item for each frame, ``[B, 1]``: one that arrived after some success; without any, the frame's own."""
+    after = frames["next"]
+    placed = (after["failure"] == Failure.NONE) | (after["failure"] == Failure.STUCK)
+    rows = (placed & (after["bin_depth"].flatten(1) > 0).any(1, keepdim=True)).nonzero()[:, 0]
+    if not len(rows):
+        return State.from_observation(frames).items
+    draw = torch.randint(len(rows), (len(frames),), device=rows.device)
+    return State.from_observation(after[rows[draw]]).items
