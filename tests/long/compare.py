@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[2]
 #: Words of a command line: pattern of the older form, and today's form.
 RENAMED_WORDS: dict[str, str] = {}
 #: Names of tensors in a checkpoint: pattern of the older form, and today's form.
-RENAMED_TENSORS: dict[str, str] = {}
+RENAMED_TENSORS: dict[str, str] = {r"^optimizer\|": "algorithm|optimizer|"}
 #: Tensors whose form changed: pattern of today's name, and a function that brings a tensor into the older form.
 CHANGED_TENSORS: dict[str, Callable[[Tensor], Tensor]] = {}
 #: Tensors that the older checkout did not have: patterns of today's names.
