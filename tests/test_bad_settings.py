@@ -32,6 +32,7 @@ VALUES = [None, True, "x", -1, 0, 1.5, math.inf, math.nan, 10**20, [], {}, [1, 2
 TRAININGS = {
     "env": [],
     "algo": [],
+    "algo sampled": ["algo=sampled_ppo"],
     "evaluation": [],
     "items": [],
     "items mixed": ["items=mixed", "env.tote_size=[4,4,3]"],
@@ -76,7 +77,7 @@ def check_sentence(error, key):
 
 @pytest.mark.parametrize("name", TRAININGS)
 def test_every_leaf_of_a_training(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(Trainer, "_make_learner", lambda trainer: None)
+    monkeypatch.setattr(Trainer, "_make_collector", lambda trainer: None)
     torch.set_num_threads(1)
     plain = OmegaConf.to_container(composed("experiment=smoke", "threads=1", *TRAININGS[name]), resolve=True)
     for path in leaves({key: plain[key] for key in plain if key in name.split()}):
@@ -188,7 +189,7 @@ def test_a_real_cell_and_a_large_batch_are_accepted(tmp_path, monkeypatch):
     env = PickPlaceEnv(items=Kinds([(4, 3, 2)]), num_envs=2, masks=("footprint",), **sizes)
     assert env.reset()["footprint_mask"].any(1).all()
     large = composed("experiment=quick", "env.num_envs=4096", "rollout_length=32", "threads=1")
-    monkeypatch.setattr(Trainer, "_make_learner", lambda trainer: None)
+    monkeypatch.setattr(Trainer, "_make_collector", lambda trainer: None)
     with pytest.raises(ValueError, match="GB; expected at most 0.8 GB"):
         Trainer(large, tmp_path)
     Trainer(composed("experiment=afterstate", "benchmark=gopt_30", "env.num_envs=128"), tmp_path)
@@ -197,7 +198,7 @@ def test_a_real_cell_and_a_large_batch_are_accepted(tmp_path, monkeypatch):
 
 
 HANDED_OVER = [
-    ("env", "stream", "test"), ("env", "seed", 1), ("env", "first_episode", 5), ("env", "masks", []),
+    ("algo", "policy", None), ("algo", "task", None), ("env", "stream", "test"), ("env", "seed", 1), ("env", "first_episode", 5), ("env", "masks", []),
     ("env", "episode_stride", 3), ("env", "device", "cpu"), ("env", "items", None), ("env", "longest_side", 2),
     ("env", "limits", None), ("model.actor", "cell", None), ("model.actor", "mask_infeasible", True),
     ("model.actor", "out_channels", 2), ("model.critic", "cell", None), ("collector", "seed", 1),
@@ -350,5 +351,5 @@ def test_values_and_sentences_are_short():
     for error in (ValueError("x" * 100_000), RuntimeError("y" * 100_000), OSError(13, "z" * 10**5, "f" * 10**5)):
         assert len(errors.sentence(error)) <= errors.MAX_LENGTH
     with pytest.raises(ValueError) as caught:
-        check_settings(composed("algo.lr=" + "x" * 10_000))
+        check_settings(composed("rollout_length=" + "x" * 10_000))
     assert len(str(caught.value)) < 300

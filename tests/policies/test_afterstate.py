@@ -182,7 +182,7 @@ def shared(state):
     (["algo=td"], "algo: .*expected model=afterstate"),
     (["model=afterstate", "algo=td", "warm_start=imitate"], "warm_start.frames=200000: expected 0"),
     (["model=afterstate", "algo=td", "+algo.samples=2"], "algo.samples: there is no key"),
-    (["model=afterstate", "algo=td", "rollout_length=1"], "rollout_length=1: expected at least 2"),
+    (["model=afterstate", "algo=td", "rollout_length=1"], "rollout_length=1: expected a whole number >= 2"),
     (["model=afterstate", "algo=td", "warm_start.critic_frames=64"], "warm_start.critic_frames=64: expected 0"),
     (["model=afterstate", "algo=td", "model.mask_infeasible=false"], "model.mask_infeasible=False: expected true"),
     (["model=afterstate", "algo=td", "env.bin_items=2"], "env.bin_items=2: expected 1 with Afterstate"),
