@@ -198,7 +198,8 @@ def test_a_real_cell_and_a_large_batch_are_accepted(tmp_path, monkeypatch):
 
 
 HANDED_OVER = [
-    ("algo", "policy", None), ("algo", "task", None), ("env", "stream", "test"), ("env", "seed", 1), ("env", "first_episode", 5), ("env", "masks", []),
+    ("algo", "policy", None), ("algo", "task", None),
+    ("env", "stream", "test"), ("env", "seed", 1), ("env", "first_episode", 5), ("env", "masks", []),
     ("env", "episode_stride", 3), ("env", "device", "cpu"), ("env", "items", None), ("env", "longest_side", 2),
     ("env", "limits", None), ("model.actor", "cell", None), ("model.actor", "mask_infeasible", True),
     ("model.actor", "out_channels", 2), ("model.critic", "cell", None), ("collector", "seed", 1),

@@ -158,7 +158,7 @@ class Policy(TensorDictModuleBase, ABC):
         """Return about how many bytes a frame takes in a gradient step; with ``fcn_grasp`` 90 kB at the paper's cell.
 
         Args:
-            samples: ``algo.vine_samples``.
+            samples: choices in each frame whose logits are computed beside the taken one; None: all.
         """
         return 1_250 * self.cell.num_choices
 
