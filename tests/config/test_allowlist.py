@@ -51,7 +51,7 @@ def mine(tmp_path, monkeypatch):
 
 FOREIGN = [
     "os.system", "pickplace.runs.checkpoint.shutil.rmtree", "builtins.eval", "pickplace", None, 5, "", ["os.system"],
-    "pickplace.evaluation.export.export", "pickplace.items.distributions.Kinds", "joint_dbl", "items/kinds",
+    "pickplace.evaluation.play.play", "pickplace.items.distributions.Kinds", "joint_dbl", "items/kinds",
 ]  # fmt: skip
 
 

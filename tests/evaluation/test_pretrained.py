@@ -4,10 +4,10 @@ import json
 import sys
 
 import pytest
+import ship_weights as export
 from safetensors import safe_open
 
 from pickplace.config.allowlist import trusted_config
-from pickplace.evaluation import export
 from pickplace.runs import checkpoint
 
 CARDS = sorted(checkpoint.PRETRAINED.glob(f"*/{export.CARD}"))

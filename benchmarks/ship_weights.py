@@ -1,6 +1,6 @@
-"""Export of a training's checkpoint as weights that the package ships: ``pretrained/<name>``, with a card.
+"""Write a training's checkpoint as weights that the package ships: ``pretrained/<name>``, with a card.
 
-``python -m pickplace.evaluation.export outputs/cpu pickplace/pretrained/r4 outputs/evaluation/evaluation.json ...``
+python benchmarks/ship_weights.py outputs/cpu pickplace/pretrained/r4 outputs/evaluation/evaluation.json ...
 """
 
 import json
@@ -67,9 +67,7 @@ def critic_serves_any_tote(cfg: DictConfig) -> bool:
 
 
 def main() -> None:
-    """Entry point of ``python -m pickplace.evaluation.export``."""
     options = Parser(
-        prog="python -m pickplace.evaluation.export",
         description="Write a training's checkpoint as weights that the package ships, with a card (card.json) that "
         "holds the config of the training and the evaluations. What only training needs is left out.",
     )
