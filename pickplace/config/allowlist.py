@@ -11,7 +11,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pickplace.common.validate import excerpt
-from pickplace.config.references import children, refusal, refuse_interpolations, select_groups
+from pickplace.config.references import children, refusal, refuse_interpolations, select_groups, walk
 from pickplace.config.registry import names_at, qualified_names
 
 #: Modules that are never a user's own: with their functions a config could do anything.
@@ -151,9 +151,7 @@ def _is_defined_by(target, trust: Collection[str]) -> bool:
     return (inspect.isclass(found) or inspect.isfunction(found)) and f"{home}.".startswith(f"{module}.")
 
 
-def modules_to_trust(node) -> tuple[str, ...]:
+def modules_to_trust(config) -> tuple[str, ...]:
     """Return the modules that a reader of this config, resolved, has to trust."""
-    modules = {module for _, value in children(node) for module in modules_to_trust(value)}
-    if isinstance(node, dict) and _may_be_own(module := _module(node.get("_target_"))):
-        modules.add(module)
-    return tuple(sorted(modules))
+    modules = {_module(node.get("_target_")) for _, node in walk(config) if isinstance(node, dict)}
+    return tuple(sorted(filter(_may_be_own, modules)))

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Collection, Iterator
+from copy import deepcopy
 from functools import reduce
 from operator import getitem
 from typing import Any
@@ -21,18 +22,13 @@ def saved_form(cfg: DictConfig) -> dict:
     """
     raw: Any = OmegaConf.to_container(cfg, resolve=False)
     saved: Any = OmegaConf.to_container(cfg, resolve=True)
-
-    def restore_references(node, path: tuple = ()) -> None:
-        for key, value in children(node):
-            restore_references(value, (*path, key))
-            if key != "_target_" and _is_reference_to_value(value, (*path, key), raw):
-                reduce(getitem, path, saved)[key] = value
-
-    restore_references(raw)
+    for path, value in walk(raw):
+        if _is_reference(value, path, raw):
+            _put(saved, path, value)
     return {**saved, "trust": []}
 
 
-def refuse_interpolations(node, path: tuple = (), root=None) -> None:
+def refuse_interpolations(root: dict) -> None:
     """Refuse all interpolations but references to values in the same config, before anything resolves them.
 
     A resolver reads files and variables, or makes nodes. A reference to a part, or to another reference, could copy
@@ -41,28 +37,19 @@ def refuse_interpolations(node, path: tuple = (), root=None) -> None:
     Raises:
         ValueError: naming the interpolation and its place.
     """
-    root = node if root is None else root
-    if isinstance(node, str) and "${" in node and not _is_reference_to_value(node, path, root):
-        expected = "no interpolation but a reference to a number, a short text or a short list of such"
-        raise refusal(".".join(map(str, path)), node, expected)
-    for key, value in children(node):
-        refuse_interpolations(value, (*path, key), root)
+    for path, value in walk(root):
+        if isinstance(value, str) and "${" in value and not _is_reference(value, path, root):
+            expected = "no interpolation but a reference to a number, a short text or a short list of such"
+            raise refusal(".".join(map(str, path)), value, expected)
 
 
 def select_groups(content: dict, groups: Collection[str]) -> dict:
     """Return some groups of a config, in which references to values in other groups are replaced by the values."""
-
-    def replaced(node, path: tuple):
-        if isinstance(node, dict):
-            return {key: replaced(value, (*path, key)) for key, value in node.items()}
-        if isinstance(node, list):
-            return [replaced(value, (*path, index)) for index, value in enumerate(node)]
-        if path[-1] != "_target_" and _is_reference_to_value(node, path, content):
-            target = _target_path(node, path)
-            return node if target[0] in groups else reduce(getitem, target, content)
-        return node
-
-    return {key: replaced(content[key], (key,)) for key in groups if key in content}
+    selected = deepcopy({key: content[key] for key in groups if key in content})
+    for path, value in list(walk(selected)):
+        if _is_reference(value, path, content) and (target := _target_path(value, path))[0] not in groups:
+            _put(selected, path, reduce(getitem, target, content))
+    return selected
 
 
 def _target_path(text: str, path: tuple) -> tuple:
@@ -73,9 +60,9 @@ def _target_path(text: str, path: tuple) -> tuple:
     return (*(path[:-dots] if dots else ()), *keys.split("."))
 
 
-def _is_reference_to_value(text, path: tuple, root) -> bool:
-    """Return whether a text is a reference to a number, a short text, or a short list of such."""
-    if not isinstance(text, str) or not REFERENCE.fullmatch(text):
+def _is_reference(text, path: tuple, root) -> bool:
+    """Return whether a text at a path is a reference to a number, a short text, or a short list of such."""
+    if not isinstance(text, str) or not REFERENCE.fullmatch(text) or path[-1] == "_target_":
         return False
     try:
         found = reduce(getitem, _target_path(text, path), root)
@@ -84,6 +71,17 @@ def _is_reference_to_value(text, path: tuple, root) -> bool:
     values = found if isinstance(found, list) else [found]
     plain = [not isinstance(value, (dict, list)) and "${" not in str(value) for value in values]
     return all(plain) and len(values) <= 100 and all(len(str(value)) <= 1000 for value in values)
+
+
+def _put(root, path: tuple, value) -> None:
+    reduce(getitem, path[:-1], root)[path[-1]] = value
+
+
+def walk(node, path: tuple = ()) -> Iterator[tuple[tuple, Any]]:
+    """Yield the path and the value of a node and of all nodes within it."""
+    yield path, node
+    for key, value in children(node):
+        yield from walk(value, (*path, key))
 
 
 def children(node) -> Iterator[tuple]:
