@@ -447,7 +447,7 @@ def test_an_endless_line_is_answered_and_skipped(monkeypatch):
 
     lines = list(json_lines.read_lines(Endless()))
     assert lines == [b"x" * 9, b"{}\n", b" " * 8 + b"\n", b"y" * 9]
-    assert "more than 8 bytes" in json_lines.answer_line(None, lines[0], {})["error"]
+    assert "more than 8 bytes" in request.answer(None, lines[0], {})[1]["error"]
 
 
 @pytest.mark.parametrize("name", ["stdin", "stdout"])

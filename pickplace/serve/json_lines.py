@@ -5,16 +5,17 @@ import io
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from pickplace.common.files import read_file, read_text
 from pickplace.common.validate import whole_number
-from pickplace.config.errors import Parser, one_sentence, sentence, write_output
+from pickplace.config.errors import Parser, one_sentence, write_output
 from pickplace.robot.box import DepthMapError
-from pickplace.serve.request import MAX_REQUEST, PLAN_OPTIONS, PlanRequest, answer, parse_json
+from pickplace.serve.request import MAX_REQUEST, PLAN_OPTIONS, PlanRequest, answer
 
 if TYPE_CHECKING:
     from pickplace.robot.planner import Planner
@@ -120,18 +121,19 @@ def run(args: argparse.Namespace) -> None:
         files = {"bin_depth": args.bin, "bin_labels": args.bin_labels, "tote_depth": args.tote}
         files["tote_bearing"] = args.tote_bearing
         maps = {key: read_map(path) for key, path in files.items() if path is not None}
-        plan = timed(PlanRequest.plan) if args.time else PlanRequest.plan
         try:
-            result = plan(PlanRequest.parse(maps, defaults), planner).as_dict()
+            with latency(args.time):
+                result = PlanRequest.parse(maps, defaults).plan(planner).as_dict()
         except DepthMapError as error:
             file = next((path for key, path in files.items() if str(error).startswith(key)), args.bin)
             raise DepthMapError(f"{file}: {error}") from error
         write_output(json.dumps(result, indent=1) + "\n")
         return
-    reply = timed(answer_line) if args.time else answer_line
     for line in read_lines(sys.stdin.buffer):
         if line.strip() or len(line) > MAX_REQUEST:
-            write_output(json.dumps(reply(planner, line, defaults)) + "\n")
+            with latency(args.time):
+                _, reply, _ = answer(planner, line, defaults)
+            write_output(json.dumps(reply) + "\n")
 
 
 def read_lines(stream: BinaryIO) -> Iterator[bytes]:
@@ -142,25 +144,14 @@ def read_lines(stream: BinaryIO) -> Iterator[bytes]:
             line = stream.readline(MAX_REQUEST + 1)
 
 
-def timed(function: Callable) -> Callable:
-    """Return a function that also prints its latency on standard error."""
-
-    def call(*args):
-        start = time.perf_counter()
-        result = function(*args)
+@contextmanager
+def latency(is_printed: bool) -> Iterator[None]:
+    """Print the time that something takes on standard error, if asked for."""
+    start = time.perf_counter()
+    yield
+    if is_printed:
         sys.stderr.write(f"planned in {(time.perf_counter() - start) * 1e3:.1f} ms\n")
         sys.stderr.flush()
-        return result
-
-    return call
-
-
-def answer_line(planner: "Planner", line: bytes, defaults: dict) -> dict:
-    """Return the reply to one line: a plan, or ``{"error": ...}`` in one sentence; with the request's ``id``."""
-    try:
-        return answer(planner, parse_json(line), defaults)
-    except ValueError as error:
-        return {"error": sentence(error)}
 
 
 def read_reach(path: str):
@@ -200,7 +191,3 @@ def read_map(path: str) -> np.ndarray:
     if not isinstance(values, np.ndarray):
         raise ValueError(f"{path}: expected a .npy file with one array, got an archive.")
     return values
-
-
-if __name__ == "__main__":
-    main()

@@ -11,6 +11,7 @@ import numpy as np
 
 from pickplace.common.validate import excerpt
 from pickplace.rules.cell import CellSpec
+from pickplace.serve.request import PlanRequest
 from pickplace.views.replay import effector_parts, filled
 
 MOST_COLUMNS = 60  # greatest number of columns along a side of the tote that the page draws
@@ -39,13 +40,13 @@ def content_policy(html: str) -> str:
     )
 
 
-def entry(cell: CellSpec, number: int, request: dict, reply: dict, seconds: float) -> dict:
+def entry(cell: CellSpec, number: int, request: PlanRequest | None, reply: dict, seconds: float) -> dict:
     """Return what the page shows of an answer, as plain values; lengths are in cells.
 
     Args:
         cell: the sizes.
         number: of the answer, from 1.
-        request: with its defaults, in the keys of a line of ``pickplace-plan``.
+        request: None if it could not be read.
         reply: a plan, or an error.
         seconds: how long it took.
     """
@@ -58,15 +59,14 @@ def entry(cell: CellSpec, number: int, request: dict, reply: dict, seconds: floa
         "error": reply.get("error"),
         "scene": None,
     }
-    return shown if "error" in reply else {**shown, "scene": _scene(cell, request, reply)}
+    return shown if "error" in reply or request is None else {**shown, "scene": _scene(cell, request, reply)}
 
 
-def _scene(cell: CellSpec, request: dict, plan: dict) -> dict:
+def _scene(cell: CellSpec, request: PlanRequest, plan: dict) -> dict:
     """Return the bin, the tote and the move of a plan; lengths in cells, angles in degrees."""
-    side = request.get("cell_size")
+    side = request.cell_size
     along, up = (1.0, cell.height_unit) if side is None else (1 / side, 1 / side)  # cells in a length
-    rim = request.get("tote_height")
-    height = cell.tote_size[2] * cell.height_unit if rim is None else rim * up
+    height = cell.tote_size[2] * cell.height_unit if request.tote_height is None else request.tote_height * up
     box = plan["box"] or (plan["item"] and _box_of_item(plan["item"]))  # None: of several items none is taken
 
     def pose(key: str) -> list[float] | None:
@@ -77,7 +77,7 @@ def _scene(cell: CellSpec, request: dict, plan: dict) -> dict:
 
     return {
         "height": height,
-        "heights": surface(height - np.asarray(request["tote_depth"], float) * up, cell).round(3).tolist(),
+        "heights": surface(height - np.asarray(request.tote_depth, float) * up, cell).round(3).tolist(),
         "item": box and [*(box[key] * along for key in "xywd"), box["h"] * up, box["yaw"]],
         "lengths": box and [box["w"], box["d"], box["h"]],
         "unit": "cells" if side is None else "m",

@@ -1,6 +1,7 @@
 """A request for a plan: a line of ``pickplace-plan``, or the body of an HTTP request. Each key is stated here, once."""
 
 import json
+import math
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Self
 
@@ -13,7 +14,6 @@ if TYPE_CHECKING:
 
 MAX_REQUEST = 2**24  # greatest length of a request, in bytes
 
-BOX_KEYS = "expected the keys x, y, w, d, h and, if it is turned, yaw."
 Map = list[list[float]]
 Labels = list[list[int]]
 
@@ -71,7 +71,7 @@ class PlanRequest:
         """
         from pickplace.robot.scene import Scene  # here, so that --help need not wait for torch
 
-        settings = {key: getattr(self, key) for key in SCENE_SETTINGS}
+        settings = {key.name: getattr(self, key.name) for key in fields(Scene) if key.name not in ("items", "tote")}
         if self.items is None:
             return Scene.from_maps(self.bin_depth, self.tote_depth, self.bin_labels, **settings)
         return Scene(self.items, self.tote_depth, **settings)
@@ -79,10 +79,6 @@ class PlanRequest:
     def plan(self, planner: "Planner") -> "Plan":
         """Return the plan for the request; errors as of :meth:`Planner.plan`."""
         return planner.plan(self.scene(), alternatives=self.alternatives)
-
-
-#: Keys of a request that are fields of the scene as they are.
-SCENE_SETTINGS = ("cell_size", "accuracy", "clearance", "tote_height", "tote_bearing")
 
 
 #: Fields that the command line can set for all requests.
@@ -95,14 +91,13 @@ def read_boxes(items) -> list[Box]:
     Raises:
         ValueError: naming the first one with other keys.
     """
-    if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
-        raise ValueError("items: expected a list of objects with x, y, w, d, h and, if it is turned, yaw.")
     boxes = []
-    for number, item in enumerate(items):
+    for number, item in enumerate(items if isinstance(items, list) else [items]):
         try:
             boxes.append(Box(**item))
         except TypeError as error:
-            raise ValueError(f"items[{number}]: {BOX_KEYS}") from error
+            expected = "expected the keys x, y, w, d, h and, if it is turned, yaw."
+            raise ValueError(f"items[{number}]: {expected}") from error
     return boxes
 
 
@@ -115,7 +110,7 @@ def parse_json(text: bytes) -> dict:
     if len(text) > MAX_REQUEST:
         raise ValueError(f"the request has more than {MAX_REQUEST:,} bytes; expected a shorter one.")
     try:
-        given = json.loads(text.decode(), parse_constant=refuse_constant, parse_float=finite_float)
+        given = json.loads(text.decode(), parse_constant=finite_float, parse_float=finite_float)
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"the request is not JSON: {error}.") from error
     if not isinstance(given, dict):
@@ -124,20 +119,23 @@ def parse_json(text: bytes) -> dict:
 
 
 def finite_float(text: str) -> float:
-    """Return a number of a JSON text; refuse 1e999, which Python reads as infinity and would write as such."""
-    number = float(text)
-    return number if abs(number) < float("inf") else refuse_constant(text)
+    """Return a number of a JSON text; refuse NaN, Infinity and 1e999, which Python reads and JSON does not have."""
+    if math.isfinite(value := float(text)):
+        return value
+    raise ValueError(f"the request is not JSON: got {text[:20]}, expected a finite number.")
 
 
-def refuse_constant(name: str):
-    """Refuse NaN and Infinity, which Python's parser takes and JSON does not have."""
-    raise ValueError(f"the request is not JSON: got {name[:20]}, expected a finite number.")
+def answer(planner: "Planner", text: bytes, defaults: dict) -> tuple[int, dict, PlanRequest | None]:
+    """Return the reply to a request's text: a plan, or ``{"error": ...}`` in one sentence; with the request's ``id``.
 
-
-def answer(planner: "Planner", given: dict, defaults: dict) -> dict:
-    """Return the reply to an object: a plan, or ``{"error": ...}`` in one sentence; with its ``id``."""
-    reply = {key: given[key] for key in ("id",) if key in given}
+    Returns:
+        the status in HTTP, the reply, and the request if it could be read.
+    """
+    status, reply, request = 400, {}, None
     try:
-        return {**reply, **PlanRequest.parse(given, defaults).plan(planner).as_dict()}
+        given = parse_json(text)
+        status, reply = 422, {key: given[key] for key in ("id",) if key in given}
+        request = PlanRequest.parse(given, defaults)
+        return 200, {**reply, **request.plan(planner).as_dict()}, request
     except ValueError as error:
-        return {**reply, "error": sentence(error)}
+        return status, {**reply, "error": sentence(error)}, request

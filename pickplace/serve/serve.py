@@ -138,7 +138,3 @@ def listen(host: str, port: int) -> socket.socket:
         raise ValueError(
             f"--host={excerpt(host)} --port={port}: {reason}; expected an address of this machine and a free port."
         ) from error
-
-
-if __name__ == "__main__":
-    main()

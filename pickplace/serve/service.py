@@ -16,19 +16,16 @@ from fastapi.exceptions import HTTPException, RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import BaseModel, TypeAdapter
-from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.requests import ClientDisconnect
-from starlette.types import ASGIApp, Receive, Scope, Send
 
 import pickplace
 from pickplace.common.validate import excerpt
-from pickplace.config.errors import sentence
 from pickplace.config.registry import names_at
 from pickplace.robot.planner import Plan, Planner
 from pickplace.rules.cell import CELL_SETTINGS, Reach
 from pickplace.serve import live
-from pickplace.serve.request import MAX_REQUEST, PlanRequest, answer, parse_json
+from pickplace.serve.request import MAX_REQUEST, PlanRequest, answer
 
 MAX_WAITING = 16  # requests whose body is read, or that wait for their turn
 BODY_SECONDS = 30  # time that a client has to send its request
@@ -59,27 +56,6 @@ class Health(BaseModel):
     cell: dict
 
 
-class KnownHosts:
-    """Middleware that refuses requests whose ``Host`` is none of the service's names.
-
-    Args:
-        app: what answers the others.
-        names: without a port; ``"*"``: any.
-    """
-
-    def __init__(self, app: ASGIApp, names: Sequence[str]):
-        self.app, self.names = app, [name.lower() for name in names]
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        app = self.app
-        if scope["type"] == "http" and "*" not in self.names:
-            host = Headers(scope=scope).get("host", "")
-            if re.sub(r":\d*$", "", host).lower() not in self.names:
-                expected = "expected a name of this service, see --allow-host"
-                app = JSONResponse({"error": f"Host: got {excerpt(host)}; {expected}."}, 400)
-        await app(scope, receive, send)
-
-
 class Rate:
     """A budget of plans, which fills up evenly.
 
@@ -90,17 +66,16 @@ class Rate:
     """
 
     def __init__(self, per_minute: float):
-        self.per_minute = self.left = per_minute
-        self.at = time.monotonic()
+        self.seconds = 60 / per_minute  # of a plan
+        self.full_at = 0.0  # the time at which the budget is full again
 
     def take(self) -> float:
         """Take one plan and return 0, or the seconds after which there is one."""
         now = time.monotonic()
-        self.left = min(self.per_minute, self.left + (now - self.at) * self.per_minute / 60)
-        self.at = now
-        if self.left < 1:
-            return (1 - self.left) * 60 / self.per_minute
-        self.left -= 1
+        full_at = max(now, self.full_at) + self.seconds
+        if (wait := full_at - now - 60) > 1e-6:
+            return wait
+        self.full_at = full_at
         return 0.0
 
 
@@ -123,16 +98,9 @@ class Service:
         return await asyncio.get_running_loop().run_in_executor(self.worker, self._answer, body)
 
     def _answer(self, body: bytes) -> tuple[int, str]:
-        start, request = time.perf_counter(), {}
-        try:
-            request = parse_json(body)
-            reply = answer(self.planner, request, self.defaults)
-            status = 422 if "error" in reply else 200
-        except ValueError as error:
-            status, reply = 400, {"error": sentence(error)}
-        spent = time.perf_counter() - start
-        number = self.count + 1
-        self.history.append(live.entry(self.planner.cell, number, {**self.defaults, **request}, reply, spent))
+        start, number = time.perf_counter(), self.count + 1
+        status, reply, request = answer(self.planner, body, self.defaults)
+        self.history.append(live.entry(self.planner.cell, number, request, reply, time.perf_counter() - start))
         self.count = number  # now: who knows of a number finds its answer
         return status, json.dumps(reply)
 
@@ -194,11 +162,17 @@ def make_app(
         yield
         service.worker.shutdown(wait=False, cancel_futures=True)
 
+    def check_host(request: Request) -> None:
+        # Not Starlette's TrustedHostMiddleware, whose answer is plain text.
+        host = request.headers.get("host", "")
+        if "*" not in hosts and re.sub(r":\d*$", "", host).lower() not in map(str.lower, hosts):
+            raise HTTPException(400, f"Host: got {excerpt(host)}; expected a name of this service, see --allow-host.")
+
     app = FastAPI(
         title="pickplace", version=pickplace.__version__, lifespan=lifespan, docs_url=None, redoc_url=None,
+        dependencies=[Depends(check_host)],
         description="Where a suction robot picks an item in a bin, and where and how it places it in a tote.",
     )  # fmt: skip
-    app.add_middleware(KnownHosts, names=hosts)
 
     @app.exception_handler(Exception)
     async def report_fault(_, error):

@@ -36,7 +36,7 @@ from pickplace.rules.masks import action_mask, footprint_mask, placing_maps  # n
 from pickplace.rules.state import EMPTY, surface_from  # noqa: E402
 from pickplace.rules.step import apply  # noqa: E402
 from pickplace.runs import checkpoint  # noqa: E402
-from pickplace.serve import json_lines  # noqa: E402
+from pickplace.serve.request import answer  # noqa: E402
 from pickplace.training import train  # noqa: E402
 
 SECONDS, BYTES = 20, 1.5e9
@@ -233,7 +233,7 @@ def json_line(draw: random.Random, folder: Path) -> None:
     planner = Planner(policy.cell, policy, draw.choice(("all", 5)))
     line = line_of(draw, damage(draw, good_request(draw, cell)))
     report([cell.describe(), repr(line[:300])])
-    reply = json_lines.answer_line(planner, line, DEFAULTS)
+    _, reply, _ = answer(planner, line, DEFAULTS)
     text = json.dumps(reply, allow_nan=False)
     assert "\n" not in text and json.loads(text).keys() == reply.keys()
     if "error" in reply:

@@ -22,7 +22,7 @@ from pickplace.robot.measure import Box, HiddenBox, touches
 from pickplace.robot.measured_problem import read_metric
 from pickplace.rules.grasps import all_grasps
 from pickplace.rules.reach import Annulus
-from pickplace.serve.json_lines import answer_line
+from pickplace.serve.request import answer
 
 CELL, TOTE, NOISE = 0.05, (0.3, 0.3, 0.25), 0.002
 FLAT = {"tote_depth": np.full((30, 30), 0.25), "cell_size": CELL}
@@ -382,9 +382,9 @@ def test_items_of_a_fine_map_and_of_a_line():
     assert plan.status == "ok" and plan.item_number in (1, 2)  # the first one is lower than its neighbour
     assert plan.box.h == (0.05, 0.08)[plan.item_number == 2] and plan.alternatives[0].item_number == plan.item_number
     line = {"bin_depth": heights.tolist(), "bin_labels": labels.tolist(), **tote, "alternatives": 3}
-    assert json.dumps(answer_line(planner, json.dumps(line).encode(), {})) == json.dumps(plan.as_dict())
+    assert json.dumps(answer(planner, json.dumps(line).encode(), {})[1]) == json.dumps(plan.as_dict())
     boxes = [vars(box) for box in BOXES]
-    reply = answer_line(planner, json.dumps({"items": boxes, **tote}).encode(), {})
+    _, reply, _ = answer(planner, json.dumps({"items": boxes, **tote}).encode(), {})
     assert reply["status"] == "ok" and reply["box"] == boxes[reply["item_number"]]
-    bad = answer_line(planner, json.dumps({"items": [*boxes, {"x": 1}], **tote}).encode(), {})
+    _, bad, _ = answer(planner, json.dumps({"items": [*boxes, {"x": 1}], **tote}).encode(), {})
     assert bad == {"error": "items[3]: expected the keys x, y, w, d, h and, if it is turned, yaw."}
