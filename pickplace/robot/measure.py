@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from pickplace.robot.box import MILLIMETRE, Box, DepthMapError, HiddenBox
@@ -26,6 +27,19 @@ class ToteMap(NamedTuple):
 
     highest: np.ndarray
     lowest: np.ndarray
+
+
+def refuse(name: str, bad: np.ndarray, values: np.ndarray, unit: str, expected: str) -> None:
+    """Raise a :class:`DepthMapError` that names the first cell of a map that is bad, if one is.
+
+    Args:
+        bad: bool, in the shape of the map's values.
+        unit: of a value, for the message, with what else is to be said of it.
+        expected: what a good cell has.
+    """
+    if bad.any():
+        x, y = np.argwhere(bad)[0].tolist()
+        raise DepthMapError(f"{name}[{x}, {y}]: got {values[x, y]:g}{unit}, expected {expected}.")
 
 
 def as_array(name: str, values, grid: Sequence[int], kinds: str = "iuf") -> np.ndarray:
@@ -49,39 +63,36 @@ def as_array(name: str, values, grid: Sequence[int], kinds: str = "iuf") -> np.n
         )
     if array.dtype.kind not in kinds:
         raise DepthMapError(f"{name}: got values of type {array.dtype}, expected numbers.")
-    if isinstance(values, np.ma.MaskedArray) and np.ma.getmaskarray(values).any():
-        x, y = np.argwhere(np.ma.getmaskarray(values))[0].tolist()
-        raise DepthMapError(f"{name}[{x}, {y}]: got a masked value, expected a measured one.")
+    if isinstance(values, np.ma.MaskedArray):
+        refuse(name, np.ma.getmaskarray(values), array, ", which is masked", "a measured value")
     return array
 
 
-def whole_map(name: str, values, grid: Sequence[int], highest: int, unit_name: str) -> Tensor:
-    """Return a map of whole height units, int64 ``grid``.
+def whole_map(name: str, values, grid: Sequence[int], most: int, unit: str = "", kinds: str = "iuf") -> np.ndarray:
+    """Return a map of whole numbers from 0 to ``most``, int64 ``grid``.
 
     Args:
         name: the argument's name, for messages.
         values: numpy, torch or lists.
         grid: the expected shape.
-        highest: the greatest value.
+        unit: of the numbers, for messages.
+        kinds: as of :func:`as_array`.
 
     Raises:
         DepthMapError: naming the first cell that is out of range, or no whole number.
     """
-    array = as_array(name, values, grid)
+    array = as_array(name, values, grid, kinds)
     if array.shape != tuple(grid):
-        expected = f"{list(grid)}; finer maps are in metres, with cell_size"
-        raise DepthMapError(f"{name}: got shape {list(array.shape)}, expected {expected}.")
+        hint = "; finer maps are in metres, with cell_size" * bool(unit)
+        raise DepthMapError(f"{name}: got shape {list(array.shape)}, expected {list(grid)}{hint}.")
+    units = array.astype(np.float64)
     with np.errstate(all="ignore"):
-        units = array.astype(np.float64)
         whole = np.round(units)
         near = np.abs(units - whole) <= ROUNDING * np.maximum(1, np.abs(units))  # False for NaN
-        inside = (whole >= 0) & (whole <= highest)
-    if not (near & inside).all():
-        x, y = np.argwhere(~(near & inside))[0].tolist()
-        wanted = f"0 to {highest} {unit_name}" if near[x, y] else f"a whole number of {unit_name}"
-        hint = "" if near[x, y] else "; measured heights are in metres, with cell_size"
-        raise DepthMapError(f"{name}[{x}, {y}]: got {units[x, y]:g} {unit_name}, expected {wanted}{hint}.")
-    return torch.from_numpy(whole.astype(np.int64))
+    hint = "; measured heights are in metres, with cell_size" * bool(unit)
+    refuse(name, ~near, units, unit, f"a whole number{unit and f' of{unit}'}{hint}")
+    refuse(name, (whole < 0) | (whole > most), units, unit, f"0 to {most:,}{unit}")
+    return whole.astype(np.int64)
 
 
 def metric_map(name: str, values, grid: Sequence[int], least: float, most: float) -> np.ndarray:
@@ -94,10 +105,8 @@ def metric_map(name: str, values, grid: Sequence[int], least: float, most: float
         DepthMapError: naming the first value that is out of range.
     """
     array = as_array(name, values, grid).astype(np.float64)
-    bad = ~((array >= least - ROUNDING) & (array <= most + ROUNDING))  # True for NaN
-    if bad.any():
-        x, y = np.argwhere(bad)[0].tolist()
-        raise DepthMapError(f"{name}[{x}, {y}]: got {array[x, y]:g} m, expected {least:g} to {most:g} m.")
+    inside = (array >= least - ROUNDING) & (array <= most + ROUNDING)  # False for NaN
+    refuse(name, ~inside, array, " m", f"{least:g} to {most:g} m")
     return array
 
 
@@ -121,16 +130,6 @@ def whole_units(lengths, unit: float, up: bool) -> Tensor:
     return torch.from_numpy(np.asarray(np.ceil(units - ROUNDING) if up else np.floor(units + ROUNDING))).int()
 
 
-def flags_of_map(name: str, values, grid: Sequence[int]) -> Tensor:
-    """Return a map of 0 and 1, int64 ``grid``; errors as of :func:`whole_map`."""
-    array = as_array(name, values, grid, "biuf")
-    if (bad := (array != 0) & (array != 1)).any() or array.shape != tuple(grid):
-        x, y = np.argwhere(bad)[0].tolist() if bad.any() else (0, 0)
-        found = f"[{x}, {y}]: got {array[x, y]:g}" if bad.any() else f": got shape {list(array.shape)}"
-        raise DepthMapError(f"{name}{found}, expected {'0 or 1' if bad.any() else list(grid)}.")
-    return torch.from_numpy(array.astype(np.int64))
-
-
 def labels_of_map(values, heights: np.ndarray, least: float) -> dict[int, np.ndarray]:
     """Return where each label of ``bin_labels`` stands, bool in the shape of ``heights``; by ascending labels.
 
@@ -142,29 +141,13 @@ def labels_of_map(values, heights: np.ndarray, least: float) -> dict[int, np.nda
     Raises:
         DepthMapError: naming the first value that is no such number, or does not fit the heights.
     """
-    array = as_array("bin_labels", values, heights.shape)
-    if array.shape != heights.shape:
-        raise DepthMapError(
-            f"bin_labels: got shape {list(array.shape)}, expected {list(heights.shape)}, that of bin_depth."
-        )
-
-    def refuse(bad: np.ndarray, expected: str) -> None:
-        if bad.any():
-            x, y = np.argwhere(bad)[0].tolist()
-            raise DepthMapError(
-                f"bin_labels[{x}, {y}]: got {array[x, y]:g} where bin_depth is {heights[x, y]:g}, expected {expected}."
-            )
-
-    refuse(~((array >= 0) & (array <= MAX_LABEL) & (array == np.floor(array))), f"a whole number, 0 to {MAX_LABEL:,}")
-    refuse((heights > least) & (array == 0), "a label for each item")
-    labels = [int(label) for label in np.unique(array) if label]
+    array, is_item = whole_map("bin_labels", values, heights.shape, MAX_LABEL), heights > least
+    refuse("bin_labels", is_item & (array == 0), array, "", "a label, as bin_depth shows an item")
+    refuse("bin_labels", (array > 0) & ~np.isin(array, array[is_item]), array, "", "0, as bin_depth shows no item")
+    labels = np.unique(array[is_item]).tolist()
     if not 1 <= len(labels) <= MAX_BIN_ITEMS:
         raise DepthMapError(f"bin_labels: got {len(labels)} labels, expected 1 to {MAX_BIN_ITEMS}, one for each item.")
-    segments = {label: array == label for label in labels}
-    for segment in segments.values():
-        if not (heights[segment] > least).any():
-            refuse(segment, "0, as no item is seen")
-    return segments
+    return {label: array == label for label in labels}
 
 
 def is_inside(points: np.ndarray, centre: Sequence[float], sides: Sequence[float], yaw: float) -> np.ndarray:
@@ -216,18 +199,20 @@ def refuse_stacked(boxes: list[Box], tolerance: float) -> None:
 
 
 def boxes_of_map(heights: np.ndarray, labels, side: float, accuracy: float, is_cell_map: bool = False) -> list[Box]:
-    """Return the cuboid of each label in a bin's map, by ascending labels.
+    """Return the cuboid of each label in a bin's map, by ascending labels; without labels the one that lies there.
 
     Args:
-        labels: ``bin_labels``, see :func:`labels_of_map`; the others as of :func:`box_of_map`.
+        labels: ``bin_labels``, see :func:`labels_of_map`, or None; the others as of :func:`box_of_map`.
 
     Raises:
         DepthMapError: for labels that do not fit the map, or a label of something else than one cuboid.
     """
-    boxes = []
-    for label, segment in labels_of_map(labels, heights, least_height(accuracy)).items():
-        boxes.append(box_of_map(np.where(segment, heights, 0.0), side, accuracy, is_cell_map, f" with label {label}"))
-    return boxes
+    if labels is None:
+        return [box_of_map(heights, side, accuracy, is_cell_map)]
+    return [
+        box_of_map(np.where(segment, heights, 0.0), side, accuracy, is_cell_map, f" with label {label}")
+        for label, segment in labels_of_map(labels, heights, least_height(accuracy)).items()
+    ]
 
 
 def least_height(accuracy: float) -> float:
@@ -259,12 +244,9 @@ def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: b
     centres = (np.indices(heights.shape).transpose(1, 2, 0) + 0.5) * side
     border = 0.0 if is_cell_map else side + SNAPPED * max(w, d) * (yaw == 0)
     inside = is_inside(centres, (x, y), (w - 2 * border, d - 2 * border), yaw)
-    if (bad := inside & (heights < box.h - 2 * accuracy - ROUNDING)).any():
-        i, j = np.argwhere(bad)[0].tolist()
-        raise DepthMapError(
-            f"bin_depth[{i}, {j}]: got {heights[i, j]:g} m{name}, expected {box.h:g} m: one cuboid, {w:g} x {d:g} m "
-            f"with its centre at [{x:g}, {y:g}]{'' if name else '; of several items give bin_labels, too'}."
-        )
+    hint = "" if name else "; of several items give bin_labels, too"
+    expected = f"{box.h:g} m: one cuboid, {w:g} x {d:g} m with its centre at [{x:g}, {y:g}]{hint}"
+    refuse("bin_depth", inside & (heights < box.h - 2 * accuracy - ROUNDING), heights, f" m{name}", expected)
     return box.upright()
 
 
@@ -273,7 +255,11 @@ def smallest_rectangle(points: np.ndarray) -> tuple[float, float, float, float, 
 
     One along the axes is returned if it is hardly larger, as it is for a turn of a degree.
     """
-    hull = _convex_hull(points)
+    try:
+        hull = points[ConvexHull(points).vertices]
+    except QhullError:  # all lie on a line
+        hull = points
+    hull = np.roll(hull, -np.lexsort(hull.T[::-1])[0], 0)  # of equally good rectangles the same is taken each time
     edges = np.roll(hull, -1, 0) - hull
     best = None
     for angle in [0.0, *(np.arctan2(edges[:, 1], edges[:, 0]) % (math.pi / 2)).tolist()]:
@@ -287,20 +273,3 @@ def smallest_rectangle(points: np.ndarray) -> tuple[float, float, float, float, 
     assert best is not None
     _, x, y, (w, d), angle = best
     return x, y, w, d, math.degrees(angle)
-
-
-def _convex_hull(points: np.ndarray) -> np.ndarray:
-    """Return the corners of the convex hull, counter-clockwise (monotone chain)."""
-    ordered = sorted(map(tuple, points.tolist()))
-    hull: list = []
-    for sequence in (ordered, ordered[::-1]):
-        part: list = []
-        for x, y in sequence:
-            while len(part) > 1:
-                (ax, ay), (bx, by) = part[-2:]
-                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 1e-15:
-                    break
-                part.pop()
-            part.append((x, y))
-        hull += part[:-1]
-    return np.array(hull)

@@ -16,7 +16,6 @@ from pickplace.robot.measure import (
     ROUNDING,
     ToteMap,
     as_array,
-    box_of_map,
     boxes_of_map,
     metric_map,
     patches,
@@ -219,10 +218,7 @@ def _read_boxes(cell: CellSpec, scene: Scene) -> tuple[list[Box], float]:
         heights = metric_map("bin_depth", scene.items.depth, cell.bin_size[:2], least, MAX_SIDE * MILLIMETRE)
         is_cell_map, square = len(heights) == cell.bin_size[0], side * cell.bin_size[0] / len(heights)
         clearance = 0.0 if is_cell_map else clearance
-        if scene.items.labels is None:
-            boxes = [box_of_map(heights, square, accuracy, is_cell_map)]
-        else:
-            boxes = boxes_of_map(heights, scene.items.labels, square, accuracy, is_cell_map)
+        boxes = boxes_of_map(heights, scene.items.labels, square, accuracy, is_cell_map)
     else:
         boxes = [box.upright() for box in scene.items]
         for number, box in enumerate(boxes):

@@ -2,16 +2,17 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from pickplace.robot.box import Box, DepthMapError
-from pickplace.robot.measure import flags_of_map, labels_of_map, whole_map
+from pickplace.robot.measure import labels_of_map, refuse, whole_map
 from pickplace.robot.scene import BinMap, Scene
 from pickplace.rules.bin import taken_item
 from pickplace.rules.cell import CellSpec, effector_centre
 from pickplace.rules.grasps import split_action
-from pickplace.rules.item import Item, item_from_depth
+from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, footprint_mask, placing_maps
 from pickplace.rules.state import EMPTY, State, surface_from
@@ -121,19 +122,14 @@ class Problem:
         return round(float(value), 9)  # without the tail of binary fractions
 
 
-def unit_of(cell: CellSpec) -> str:
-    """Return the name of a cell's height units, for messages."""
-    return "cells" if cell.height_unit == 1 else "height units"
-
-
 def read_grid(cell: CellSpec, scene: Scene, device) -> Problem:
     """Return the problem of a scene in whole cells; errors as of :meth:`Planner.plan`."""
     assert isinstance(scene.items, BinMap)
-    unit_name = unit_of(cell)
+    unit = " cells" if cell.height_unit == 1 else " height units"
     height = cell.tote_size[2] if scene.tote_height is None else round(scene.tote_height)
-    bin_map = whole_map("bin_depth", scene.items.depth, cell.bin_size[:2], FAR, unit_name)
-    tote_map = whole_map("tote_depth", scene.tote, cell.tote_size[:2], height, unit_name)
-    items = _read_items(bin_map, scene.items.labels, unit_name)
+    bin_map = whole_map("bin_depth", scene.items.depth, cell.bin_size[:2], FAR, unit)
+    tote_map = torch.from_numpy(whole_map("tote_depth", scene.tote, cell.tote_size[:2], height, unit))
+    items = _read_items(bin_map, scene.items.labels, unit)
     for item in items:
         check_longest(cell, item, "bin_depth")
     bearing = read_bearing(cell, scene.tote_bearing, tote_map == height)
@@ -151,29 +147,25 @@ def join_items(items: list[Item]) -> Item:
     return Item(*(torch.stack(parts, 1) for parts in zip(*items, strict=True)))
 
 
-def _read_items(bin_map: Tensor, bin_labels, unit_name: str) -> list[Item]:
+def _read_items(bin_map: np.ndarray, bin_labels, unit: str) -> list[Item]:
     """Return the items in a bin ``[W_B, D_B]``, each with parts ``[1]``; in the order of their labels, if any."""
     if bin_labels is None:
-        if not (bin_map > 0).any():
+        if not bin_map.any():
             raise DepthMapError("bin_depth: got no cell above 0, expected one item.")
-        return [_read_cuboid(bin_map, bin_map > 0, unit_name, "", "; of several items give bin_labels, too")]
-    segments = labels_of_map(bin_labels, bin_map.numpy(), 0)
-    parts = ((torch.from_numpy(segment), f" with label {label}") for label, segment in segments.items())
-    return [_read_cuboid(torch.where(segment, bin_map, 0), segment, unit_name, name) for segment, name in parts]
+        return [_read_cuboid(bin_map, bin_map > 0, unit, "; of several items give bin_labels, too")]
+    segments = labels_of_map(bin_labels, bin_map, 0)
+    return [_read_cuboid(bin_map, segment, f"{unit} with label {label}") for label, segment in segments.items()]
 
 
-def _read_cuboid(bin_map: Tensor, segment: Tensor, unit_name: str, name: str, hint: str = "") -> Item:
+def _read_cuboid(bin_map: np.ndarray, segment: np.ndarray, unit: str, hint: str = "") -> Item:
     """Return the item of a segment of the bin, bool ``[W_B, D_B]``; refuse all but a box filled at one height."""
-    x, y, w, d, _ = item_from_depth(segment[None].float()).cuboids[0].tolist()
-    box = bin_map[x : x + w, y : y + d]
-    h = int(bin_map.max())
-    if (box != h).any():
-        i, j = (box != h).nonzero()[0].tolist()
-        raise DepthMapError(
-            f"bin_depth[{x + i}, {y + j}]: got {int(box[i, j])} {unit_name}{name}, expected {h}: one cuboid that fills "
-            f"its bounding box, {w}x{d} cells from [{x}, {y}]{hint}."
-        )
-    return Item(*(torch.tensor([value]) for value in (x, y, w, d, h)))
+    heights, filled = np.where(segment, bin_map, 0), np.argwhere(segment)
+    (x, y), (w, d), h = filled.min(0), np.ptp(filled, 0) + 1, heights.max()
+    bad = np.zeros_like(segment)
+    bad[x : x + w, y : y + d] = heights[x : x + w, y : y + d] != h
+    expected = f"{h}: one cuboid that fills its bounding box, {w}x{d} cells from [{x}, {y}]{hint}"
+    refuse("bin_depth", bad, heights, unit, expected)
+    return Item(*(torch.tensor([int(value)]) for value in (x, y, w, d, h)))
 
 
 def check_longest(cell: CellSpec, item: Item, key: str) -> None:
@@ -189,7 +181,7 @@ def read_bearing(cell: CellSpec, tote_bearing, on_floor: Tensor) -> Tensor:
     """Return where the tote bears weight, int64 ``[W_T, D_T]``: as plans before say, and on the floor."""
     if tote_bearing is None:
         return torch.ones_like(on_floor, dtype=torch.int64)
-    bearing = flags_of_map("tote_bearing", tote_bearing, cell.tote_size[:2])
+    bearing = torch.from_numpy(whole_map("tote_bearing", tote_bearing, cell.tote_size[:2], 1, kinds="biuf"))
     bearing = torch.where(on_floor, 1, bearing)  # this may be another tote
     if not cell.support.marks_bearing and not bearing.all():
         raise DepthMapError(f"tote_bearing: got a 0 with support={cell.support}, expected support=bearing.")

@@ -161,7 +161,7 @@ BAD = [
     ({"bin_depth": changed(ITEM, (0, 0), np.nan)}, "bin_depth[0, 0]: got nan cells"),
     ({"bin_depth": changed(ITEM, (4, 0), -1)}, "bin_depth[4, 0]: got -1 cells, expected 0 to"),
     ({"bin_depth": changed(ITEM, (1, 2), 1.3)}, "bin_depth[1, 2]: got 1.3 cells, expected a whole number of cells"),
-    ({"bin_depth": np.ma.masked_equal(ITEM, 1)}, "bin_depth[1, 2]: got a masked value, expected a measured one."),
+    ({"bin_depth": np.ma.masked_equal(ITEM, 1)}, "bin_depth[1, 2]: got 1, which is masked, expected a measured value."),
     ({"tote_depth": EMPTY.T[:, :5]}, "tote_depth: got shape [6, 5], expected [6, 6]"),
     ({"tote_depth": changed(EMPTY, (3, 1), 6)}, "tote_depth[3, 1]: got 6 cells, expected 0 to 5 cells"),
     ({"tote_depth": EMPTY * 0.05 + 0.04, "bin_depth": ITEM * 0.05, "cell_size": 0.05},

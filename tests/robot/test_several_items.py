@@ -152,13 +152,13 @@ def changed(array, cell, value):
 
 
 @pytest.mark.parametrize(("given", "message"), [
-    ({"bin_labels": None}, "bin_depth[0, 0]: got 1 cells, expected 2: one cuboid that fills its bounding box, 4x3 "
+    ({"bin_labels": None}, "bin_depth[0, 0]: got 1 cells, expected 2: one cuboid that fills its bounding box, 5x5 "
      "cells from [0, 0]; of several items give bin_labels, too."),
     ({"bin_labels": LABELS[1][:4]}, "bin_labels: got shape [4, 5], expected [5, 5]"),
-    ({"bin_labels": changed(LABELS[1], (0, 0), -1)}, "bin_labels[0, 0]: got -1 where bin_depth is 1, expected a whole"),
-    ({"bin_labels": LABELS[1] * 0.5}, "bin_labels[0, 0]: got 0.5 where bin_depth is 1, expected a whole number, 0 to"),
-    ({"bin_labels": changed(LABELS[1], (3, 4), 0)}, "bin_labels[3, 4]: got 0 where bin_depth is 2, expected a label"),
-    ({"bin_labels": changed(LABELS[1], (0, 4), 7)}, "bin_labels[0, 4]: got 7 where bin_depth is 0, expected 0, as no"),
+    ({"bin_labels": changed(LABELS[1], (0, 0), -1)}, "bin_labels[0, 0]: got -1, expected 0 to 2,147,483,647"),
+    ({"bin_labels": LABELS[1] * 0.5}, "bin_labels[0, 0]: got 0.5, expected a whole number"),
+    ({"bin_labels": changed(LABELS[1], (3, 4), 0)}, "bin_labels[3, 4]: got 0, expected a label"),
+    ({"bin_labels": changed(LABELS[1], (0, 4), 7)}, "bin_labels[0, 4]: got 7, expected 0, as bin_depth"),
     ({"bin_labels": changed(LABELS[1], (0, 4), 1)}, "bin_depth[0, 1]: got 0 cells with label 1, expected 1: one cub"),
     ({"bin_depth": changed(LABELS[0], (3, 4), 1)}, "bin_depth[3, 4]: got 1 cells with label 4, expected 2: one cuboid"),
     ({"bin_depth": LABELS[0] * 0, "bin_labels": LABELS[1] * 0}, "bin_labels: got 0 labels, expected 1 to 100"),
