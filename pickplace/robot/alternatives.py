@@ -49,6 +49,8 @@ def list_alternatives(
         if chosen is not None and not (actions == chosen).any():
             actions = torch.cat([actions, chosen])
         probability = log_probs[actions].exp()
+    if not len(actions):
+        return []
     failure, item = problem.failures(actions), problem.taken_items(actions)
     columns = [column.tolist() for column in split_action(cell, actions)]
     return [

@@ -8,7 +8,7 @@ cell ``(0, 0)`` on the inner floor; x runs along the first axis of the depth map
 seen from above.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
@@ -27,7 +27,7 @@ from pickplace.robot.box import Box, DepthMapError
 from pickplace.robot.measured_problem import read_metric
 from pickplace.robot.problem import Pose, Problem, read_grid
 from pickplace.robot.scene import Scene
-from pickplace.robot.training import Training
+from pickplace.robot.training_envelope import TrainingEnvelope
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
 from pickplace.rules.observation import Term, check_terms, observe
@@ -98,21 +98,20 @@ class Planner:
         terms: Mapping[str, Term] | None = None,
         planner: str | MapPlanner | None = None,
         items: ItemDistribution | None = None,
-        training: Training | None = None,
+        training: TrainingEnvelope | None = None,
         critic=None,
     ):
         self.cell, self.policy, self.training = cell, policy, training
         self.terms = check_terms(terms, cell.bin_items)
-        self._make = None  # a function of cell, policy and terms; None: the planner was made
+        self._name, self._parts = None, {"items": items, "critic": critic, "candidates": candidates}
         if planner is None or isinstance(planner, str):
-            self._make = _maker(planner or "policy", candidates, policy=policy, items=items, critic=critic)
+            self._name = planner or "policy"
             planner = self._make(cell, policy, self.terms)
         if not isinstance(planner, MapPlanner):
             raise ValueError(
                 f"planner={excerpt(planner)}: it does not choose among feasible actions; expected another."
             )
-        self._planner: MapPlanner = planner
-        self._others: dict[int, MapPlanner] = {}  # for another number of items in the bin
+        self._planners: dict[int, MapPlanner] = {cell.bin_items: planner}  # by the number of items in the bin
 
     @classmethod
     def load(
@@ -129,7 +128,7 @@ class Planner:
         trained = load_policy(path, device, trust, **sizes)
         items = build("items", trained.config["items"])
         critic = load_critic(path, trained) if planner == "lookahead" else None
-        training = Training.of(trained.config, items)
+        training = TrainingEnvelope.of(trained.config, items)
         return cls(trained.cell, trained.policy, candidates, trained.terms, planner, items, training, critic)
 
     @torch.inference_mode()
@@ -186,44 +185,30 @@ class Planner:
         Raises:
             DepthMapError: for a planner that cannot.
         """
-        planner, terms = self._planner, self.terms
-        if count != self.cell.bin_items:
-            planner = self._others.get(count, planner)
-            terms = check_terms(terms, max(count, self.cell.bin_items))
-            if self._make is not None and count not in self._others:
-                cell, policy = replace(self.cell, bin_items=count), self.policy
-                try:
-                    policy = policy and policy.with_cell(cell)
-                except ValueError as error:
-                    raise _several_items(policy, count) from error
-                planner = self._others[count] = self._make(cell, policy, terms)
+        terms = check_terms(self.terms, max(count, self.cell.bin_items))
+        if self._name is not None and count not in self._planners:
+            cell, policy = replace(self.cell, bin_items=count), self.policy
+            try:
+                policy = policy and policy.with_cell(cell)
+            except ValueError as error:
+                raise _several_items(policy, count) from error
+            self._planners[count] = self._make(cell, policy, terms)
+        planner = self._planners.get(count, self._planners[self.cell.bin_items])
         if count > 1:
             _check_choice(planner, count, is_metric)
         return planner, terms
 
-
-def _maker(name: str, candidates: int | Literal["all"], **given) -> Callable[..., MapPlanner]:
-    """Return a function of a cell, a policy for it and the terms of the observation: it makes the planner of a name.
-
-    Args:
-        given: policy, items and critic, or None.
-    """
-    if name == "policy":
-        if given["policy"] is None:
-            raise ValueError("policy=None: expected a policy, or planner='joint_dbl' or another that needs none.")
-        return lambda cell, policy, terms: PolicyPlanner(cell, policy, candidates)
-    maker = find("planner", name)
-    needs = getattr(maker, "needs", ())
-    for key in ("policy", "items"):
-        if key in needs and given[key] is None:
-            raise ValueError(f"{key}=None: planner={name!r} needs it; Planner.load has it from a checkpoint.")
-
-    def make(cell, policy, terms):
-        critic = given["critic"] and given["critic"].with_bin_items(cell.bin_items)
-        parts = {**given, "policy": policy, "terms": terms, "critic": critic}
-        return maker(cell=cell, **{key: parts[key] for key in parts if key in needs})
-
-    return make
+    def _make(self, cell: CellSpec, policy: Policy | None, terms: Mapping[str, Term]) -> MapPlanner:
+        """Return the planner of the name, for a cell, a policy made for it and the terms of the observation."""
+        maker = find("planner", self._name)
+        parts, needs = {**self._parts, "policy": policy, "terms": terms}, getattr(maker, "needs", ())
+        for key in ("policy", "items"):
+            if key in needs and parts[key] is None:
+                raise ValueError(f"{key}=None: planner={self._name!r} needs it; Planner.load has it from a checkpoint.")
+        if "critic" in needs:
+            parts["critic"] = parts["critic"].with_bin_items(cell.bin_items)
+        given = (*needs, "candidates") if maker is PolicyPlanner else needs
+        return maker(cell=cell, **{key: parts[key] for key in given})
 
 
 def _check_choice(planner: MapPlanner, count: int, is_metric: bool) -> None:

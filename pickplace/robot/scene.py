@@ -50,13 +50,16 @@ class Scene:
     tote_bearing: Any = None
 
     def __post_init__(self):
-        check_settings(self.tote_height, self.cell_size, self.accuracy, self.clearance)
-        for key, is_metric in (
-            ("items", not isinstance(self.items, BinMap)),
-            ("tote", isinstance(self.tote, ToteMap)),
-        ):
-            if is_metric and self.cell_size is None:
-                raise ValueError(f"cell_size=None: expected the side of a cell in metres, as {key} are measured.")
+        number("accuracy", self.accuracy, 0, 0.1, "metres")
+        number("clearance", self.clearance, 0, 0.1, "metres")
+        if self.cell_size is not None:
+            number("cell_size", self.cell_size, 1e-3, 10, "metres")
+        elif not isinstance(self.items, BinMap) or isinstance(self.tote, ToteMap):
+            raise ValueError("cell_size=None: expected the side of a cell in metres, as items or tote are measured.")
+        if self.tote_height is not None and self.cell_size is not None:
+            number("tote_height", self.tote_height, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
+        elif self.tote_height is not None:
+            integral_number("tote_height", self.tote_height, 1, FAR - 1)
         if not isinstance(self.items, BinMap):
             check_boxes(self.items)
 
@@ -88,22 +91,6 @@ class Scene:
         items = over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes)
         tote = over_tote.tote_map(tote_image, cell, cell_size, tote_height)
         return cls(items, tote, cell_size, accuracy, tote_height=tote_height, **settings)
-
-
-def check_settings(tote_height, cell_size, accuracy, clearance) -> None:
-    """Check the settings of a scene.
-
-    Raises:
-        ValueError: naming the one that is out of range.
-    """
-    if cell_size is not None:
-        number("cell_size", cell_size, 1e-3, 10, "metres")
-    number("accuracy", accuracy, 0, 0.1, "metres")
-    number("clearance", clearance, 0, 0.1, "metres")
-    if tote_height is not None and cell_size is None:
-        integral_number("tote_height", tote_height, 1, FAR - 1)
-    elif tote_height is not None:
-        number("tote_height", tote_height, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
 
 
 def check_boxes(items) -> None:

@@ -190,7 +190,7 @@ def test_what_is_no_image_of_the_tote_is_refused():
     with pytest.raises(DepthMapError, match="labels: got shape"):
         camera(BIN).items(image(camera(BIN), [], BIN), CELL, SIZE, labels=np.zeros((3, 3)))
     found = eye.tote_map(shown, CELL, SIZE)
-    with pytest.raises(ValueError, match="cell_size=None: .* as tote are measured"):
+    with pytest.raises(ValueError, match="cell_size=None: .* as items or tote are measured"):
         Scene.from_maps(np.zeros((5, 5)), found)
 
 

@@ -271,7 +271,7 @@ def test_warnings_name_what_lies_outside_the_training():
     with pytest.raises(DepthMapError, match=r"items\[0\]: the item is 3 cells long, longer .*; expected at most 2"):
         overlap = Planner(CellSpec(pick_rule="overlap", longest_side=2), planner="joint_dbl")
         plan_for(overlap, items=[Box(0.1, 0.1, 0.1, 0.04, 0.05)], tote_depth=np.full((6, 6), 0.25), **flat)
-    with pytest.raises(ValueError, match="policy=None: expected a policy"):
+    with pytest.raises(ValueError, match="policy=None: planner='policy' needs it"):
         Planner(CellSpec())
     with pytest.raises(ValueError, match="items=None: planner='mcts' needs it"):
         Planner(CellSpec(), planner="mcts")

@@ -170,7 +170,7 @@ BAD = [
     ({"tote_depth": np.full((12, 12), 5)}, "expected [6, 6]; finer maps are in metres, with cell_size"),
     ({"bin_depth": None}, "bin_depth: got shape [], expected [5, 5]"),
     ({"tote_depth": None}, "tote_depth: got shape [], expected [6, 6]"),
-    ({"bin_depth": None, "items": [BOX]}, "cell_size=None: expected the side of a cell in metres, as items are"),
+    ({"bin_depth": None, "items": [BOX]}, "cell_size=None: expected the side of a cell in metres, as items or"),
     (boxes(), "items: got 0 boxes, expected 1 to 100: an empty bin"),
     (boxes(*[BOX] * 101), "items: got 101 boxes, expected 1 to 100: too many"),
     (boxes(1), "items=[1]: expected a list of Box"),

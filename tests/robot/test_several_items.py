@@ -360,9 +360,9 @@ def test_the_critic_of_a_search_sees_each_item():
     depth, labels = np.zeros((5, 5)), np.zeros((5, 5), dtype=int)
     for label, (corner, height) in enumerate(((slice(0, 1), 1), (slice(3, 5), 2)), 1):
         depth[corner, corner], labels[corner, corner] = height, label
-    critics = [planner._planner.critic]
+    critics = [planner._planners[1].critic]
     assert plan_for(planner, depth, np.full((6, 6), 5), bin_labels=labels).status == "ok"
-    critics.append(planner._others[2].critic)
+    critics.append(planner._planners[2].critic)
     assert [critic.in_keys[3:] for critic in critics] == [[], ["items"]]
     assert critics[0].network is critics[1].network
 
@@ -388,3 +388,9 @@ def test_items_of_a_fine_map_and_of_a_line():
     assert reply["status"] == "ok" and reply["box"] == boxes[reply["item_number"]]
     _, bad, _ = answer(planner, json.dumps({"items": [*boxes, {"x": 1}], **tote}).encode(), {})
     assert bad == {"error": "items[3]: expected the keys x, y, w, d, h and, if it is turned, yaw."}
+
+
+def test_no_alternatives_where_no_item_is_gripped():
+    depth, labels = bin_maps({1: (0, 0, 4, 4, 1), 2: (4, 4, 4, 4, 2)}, (8, 8))
+    plan = plan_for(Planner.load("pretrained/mixed", **MIXED), depth, np.full((6, 6), 5), bin_labels=labels)
+    assert plan.status == "impossible" and plan.alternatives == []

@@ -1,4 +1,4 @@
-"""The items and sizes of a policy's training, and warnings about what lies outside of them."""
+"""The items, sizes and rules of a policy's training, and warnings about what lies outside of them."""
 
 from dataclasses import dataclass
 from typing import Any, cast
@@ -15,7 +15,7 @@ RULES = ("support", "body", "cup", "cup_size", "pick_rule", "min_seal")
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainingEnvelope:
     """The items and the sizes of a policy's training.
 
     Attributes:
@@ -33,7 +33,7 @@ class Training:
     rules: dict[str, Any]
 
     @classmethod
-    def of(cls, config: DictConfig, items: ItemDistribution) -> "Training":
+    def of(cls, config: DictConfig, items: ItemDistribution) -> "TrainingEnvelope":
         """Return what a checkpoint's config says."""
         kinds = frozenset((int(w), int(d), int(h)) for w, d, h in items.sizes.tolist())
         env = cast(dict, OmegaConf.to_container(config.env, resolve=True))
