@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+from examples.simulated_cell import SimulatedCell
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from pickplace import Planner
-from pickplace.robot.simulated import SimulatedCell
 
 INK, ITEM, GRIPPER = "#263238", "#e69f00", "#c2410c"
 SIDE, STEPS = 0.05, 9  # m; items in the tote when the picture is taken

@@ -1,11 +1,17 @@
 """A cell in MuJoCo, end to end: depth images with noise, the camera code, the planner, the gantry."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from pickplace import CellSpec, Planner
 
 pytest.importorskip("mujoco")
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs" / "examples"))
+
+from simulated_cell import SimulatedCell  # noqa: E402
 
 SIZES = {"tote_size": (6, 6, 5)}
 
@@ -28,8 +34,6 @@ ANY = [(0.04, 0.04, 0.06), (0.135, 0.135, 0.1)]
 
 def fill(planner: Planner, seed: int, sizes) -> float:
     """The filled share of a tote that is filled until an item finds no place."""
-    from pickplace.robot.simulated import SimulatedCell
-
     filled = SimulatedCell(planner, seed=seed).fill(draw_items(seed, sizes))
     assert filled.loss is None and filled.last.status == "stuck", (seed, filled)
     return filled.volume / np.prod((0.3, 0.3, 0.25))
@@ -52,8 +56,6 @@ def test_a_gantry_fills_20_totes(name, sizes):
 
 def test_an_item_that_the_gripper_does_not_reach_is_lost():
     """The test above can fail: a camera that sees items 2 cm too high."""
-    from pickplace.robot.simulated import SimulatedCell
-
     cell = SimulatedCell(Planner(CellSpec(**SIZES), planner="joint_dbl"))
     measure = cell.depth_image
     cell.depth_image = lambda name: (depth := measure(name)) - 0.02 * (name == "bin") * (depth < 1.17)
