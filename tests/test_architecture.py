@@ -59,3 +59,8 @@ def test_the_rules_need_torch_alone():
             names |= {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
             roots = {name.split(".")[0] for name in names}
             assert not roots & {"torchrl", "hydra", "omegaconf", "gymnasium", "numpy", "scipy", "matplotlib"}, module
+
+
+def test_the_protocol_of_planners_knows_the_rules_only():
+    assert {name.split(".")[1] for name in imports("pickplace.planners.base")} == {"rules", "common"}
+    assert "omegaconf" not in MODULES["pickplace.planners.base"].read_text()

@@ -17,7 +17,8 @@ from pickplace.common.validate import excerpt, whole_number
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import accepted_arguments, build, find
 from pickplace.items.distributions import ItemDistribution
-from pickplace.planners.base import BatchPlanner, decide, planner_parts
+from pickplace.planners.base import BatchPlanner
+from pickplace.planners.use import decide, planner_parts
 from pickplace.policies.base import MASKED, Policy
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.observation import Term

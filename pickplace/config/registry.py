@@ -75,8 +75,8 @@ REGISTRY: dict[str, dict[str, str]] = {
         "individual_grasp": "pickplace.policies.individual.policy.individual_grasp",
     },
     "model.critic": {
-        "pooled": "pickplace.policies.critics.pooled_critic",
-        "conv4d": "pickplace.policies.critics.conv4d_critic",
+        "pooled": "pickplace.policies.critics.Pooled",
+        "conv4d": "pickplace.policies.critics.Conv4d",
     },
     "curriculum": {"curriculum": "pickplace.training.curriculum.Curriculum"},
     "curriculum.advance": {

@@ -12,7 +12,8 @@ from pickplace.config.composition import apply_overrides, places_in_other_groups
 from pickplace.config.registry import build
 from pickplace.evaluation.play import MakeEnv, check_episode_settings, check_play
 from pickplace.evaluation.result import YOUNG_SETTINGS, resolved
-from pickplace.planners.base import BatchPlanner, planner_parts
+from pickplace.planners.base import BatchPlanner
+from pickplace.planners.use import planner_parts
 from pickplace.rules.cell import CellSpec
 from pickplace.runs import checkpoint
 from pickplace.runs.provenance import first_weights, imitated_planner

@@ -16,7 +16,8 @@ from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.distributions import check_seed
 from pickplace.physics.engine import Engine
 from pickplace.physics.plans import EpisodePlan
-from pickplace.planners.base import BatchPlanner, decide
+from pickplace.planners.base import BatchPlanner
+from pickplace.planners.use import decide
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.masks import num_feasible, placing_maps
 from pickplace.rules.state import Failure

@@ -1,19 +1,22 @@
 """Value networks. They share nothing with the policies; acting needs none, but ``planner=lookahead`` asks one."""
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.common.validate import MAX_WIDTH, check_inputs, odd_number, one_of, whole_number
+from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_number
 from pickplace.policies.base import MAP_KEYS
-from pickplace.policies.depth import depth_levels, item_code, one_hot
-from pickplace.policies.fcn4d.network import Conv4dCritic
+from pickplace.policies.depth import clip_depth, item_code
+from pickplace.policies.fcn4d.network import BIN_PADDING, TOTE_PADDING, check_clips, clip_and_pad
+from pickplace.policies.fcn4d.network import DTYPES as CONV4D_DTYPES
 from pickplace.policies.fcn_grasp.network import DTYPES, MAX_LEVELS, matrix_dtype
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, item_from_depth
 
 
-class PooledCritic(nn.Module):
+class Pooled(nn.Module):
     """The critic beside ``fcn_grasp``: the volume that each column of the tote will still take, summed.
 
     A convolution over the one-hot clipped tote (a cell outside it is in no plane), the item's size added, then ``1x1``
@@ -21,6 +24,7 @@ class PooledCritic(nn.Module):
     the cells is the value, so that one set of weights serves any tote.
 
     Args:
+        cell: the sizes.
         filters: width of the convolution.
         receptive_field: side of the square that is seen around a cell, odd; cells.
         hidden: width of the 1x1 layer before the output.
@@ -34,10 +38,10 @@ class PooledCritic(nn.Module):
     """
 
     any_size = True
-    in_keys: tuple[str, ...] = MAP_KEYS
 
     def __init__(
         self,
+        cell: CellSpec,
         filters: int = 32,
         receptive_field: int = 5,
         hidden: int = 32,
@@ -52,6 +56,7 @@ class PooledCritic(nn.Module):
         odd_number("model.critic.receptive_field", receptive_field)
         for key, value in {"filters": filters, "hidden": hidden, "level": level, "stride": stride}.items():
             whole_number(f"model.critic.{key}", value, most=MAX_WIDTH)
+        self.in_keys = self.keys_for(cell.bin_items)
         self.level, self.stride = level, stride
         for key, value in {"tote_clip": tote_clip, "depth_range": depth_range, "item_range": item_range}.items():
             whole_number(f"model.critic.{key}", value, most=MAX_LEVELS)
@@ -73,8 +78,8 @@ class PooledCritic(nn.Module):
         batch = tote_depth.shape[:-2]
         bin_depth, tote_depth, bearing = (maps.flatten(0, -3) for maps in (bin_depth, tote_depth, tote_bearing))
         tote_depth = tote_depth / self.level
-        levels = depth_levels(tote_depth, self.tote_clip, self.depth_range)
-        planes = one_hot(levels.flatten(1), self.depth_range).view(-1, self.depth_range, *levels.shape[1:])
+        levels = (self.tote_clip - clip_depth(tote_depth, self.tote_clip)).clamp(0, self.depth_range - 1)
+        planes = torch.arange(self.depth_range, device=levels.device)[:, None, None] == levels.to(torch.uint8)[:, None]
         room = tote_depth[:, :: self.stride, :: self.stride, None] / 5
         dtype = matrix_dtype(self.compute_dtype, tote_depth.device.type)
         with torch.autocast(tote_depth.device.type, dtype, enabled=dtype != torch.float32):
@@ -103,13 +108,69 @@ class PooledCritic(nn.Module):
         return code.sum(1) / (~several.is_empty).sum(1, keepdim=True).clamp(min=1)
 
 
-def pooled_critic(cell: CellSpec, **network) -> PooledCritic:
-    """Return the critic beside ``fcn_grasp``, for any sizes (config ``model=fcn_grasp``)."""
-    critic = PooledCritic(**network)
-    critic.in_keys = critic.keys_for(cell.bin_items)
-    return critic
+class Conv4d(nn.Module):
+    """The value of a state, by a network that shares nothing with the policy.
 
+    The paper only says that the value function has its own network with a fully connected end; everything
+    else here is a choice. Running the policy's 4D layers once more would double the cost of an update, so
+    each map, clipped and padded as for the policy, passes two 2D convolutions of ``filters`` ``3x3``, each
+    with a ReLU; all of it, with the mean and the greatest *unclipped* remaining depth of the tote (the
+    clipped map hides how much is left, and the return depends on it), passes a hidden layer with a ReLU and a
+    linear output. The fully connected end ties it to one bin and tote size; acting needs no value.
 
-def conv4d_critic(cell: CellSpec, **network) -> Conv4dCritic:
-    """Return the critic beside ``fcn4d``, for these sizes (config ``model=fcn4d``)."""
-    return Conv4dCritic(cell.bin_size, cell.tote_size, **network)
+    Args:
+        cell: the sizes.
+        filters: channels of the 2D convolutions.
+        hidden: width of the fully connected layer.
+        bin_clip, tote_clip, floor: as in :class:`~pickplace.policies.fcn4d.network.Conv4dNet`.
+        depth_scale: the two unclipped figures are divided by it.
+        compute_dtype: of all but the last layer, ``float32`` or ``bfloat16``; parameters and values stay float32.
+    """
+
+    def __init__(
+        self,
+        cell: CellSpec,
+        filters: int = 64,
+        hidden: int = 256,
+        bin_clip: float | None = 1.0,
+        tote_clip: float | None = 5.0,
+        floor: float | None = None,
+        depth_scale: float = 5.0,
+        compute_dtype: str = "float32",
+    ):
+        super().__init__()
+        whole_number("model.critic.filters", filters, most=MAX_WIDTH)
+        whole_number("model.critic.hidden", hidden, most=MAX_WIDTH)
+        one_of("model.critic.compute_dtype", compute_dtype, CONV4D_DTYPES)
+        check_clips("model.critic", bin_clip, tote_clip, floor)
+        number("model.critic.depth_scale", depth_scale, 1e-3, 1e6)
+        self.bin_size, self.tote_size = cell.bin_size[:2], cell.tote_size[:2]
+        self.bin_clip, self.tote_clip, self.floor = bin_clip, tote_clip, floor
+        self.depth_scale, self.compute_dtype = depth_scale, compute_dtype
+        self.bin_layers = self._map_layers(filters)
+        self.tote_layers = self._map_layers(filters)
+        cells = math.prod(self.bin_size) + math.prod(self.tote_size)
+        self.value = nn.Sequential(nn.Linear(filters * cells + 2, hidden), nn.ReLU(), nn.Linear(hidden, 1))
+
+    @staticmethod
+    def _map_layers(filters: int) -> nn.Sequential:
+        first, second = nn.Conv2d(1, filters, 3), nn.Conv2d(filters, filters, 3)
+        return nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), nn.Flatten())
+
+    def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
+        """Return values ``[..., 1]`` of bin depth ``[..., W_B, D_B]`` and tote depth ``[..., W_T, D_T]``."""
+        for name, depth, size in (("bin", bin_depth, self.bin_size), ("tote", tote_depth, self.tote_size)):
+            got = tuple(depth.shape[-2:])
+            if got != size:
+                raise ValueError(
+                    f"{name}_depth: got {list(got)}, expected {list(size)}, for which the critic was made."
+                )
+        batch, dtype = tote_depth.shape[:-2], next(self.parameters()).dtype
+        bins = bin_depth.to(dtype).reshape(-1, 1, *self.bin_size)
+        totes = tote_depth.to(dtype).reshape(-1, 1, *self.tote_size)
+        left = torch.stack((totes.mean((1, 2, 3)), totes.amax((1, 2, 3))), dim=-1) / self.depth_scale
+        bins = clip_and_pad(bins, self.bin_clip, self.floor, BIN_PADDING)
+        totes = clip_and_pad(totes, self.tote_clip, self.floor, TOTE_PADDING)
+        with torch.autocast(bins.device.type, torch.bfloat16, enabled=self.compute_dtype == "bfloat16"):
+            hidden = self.value[:-1](torch.cat((self.bin_layers(bins), self.tote_layers(totes), left), dim=-1))
+        return self.value[-1](hidden.to(dtype)).reshape(*batch, 1)

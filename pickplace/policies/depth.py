@@ -1,9 +1,8 @@
-"""Preparation of depth maps for the networks: clipping, then padding (fcn4d) or one-hot codes (fcn_grasp)."""
+"""Preparation of depth maps and items for the networks: clipping, and one-hot codes."""
 
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from pickplace.rules.item import Item
@@ -50,25 +49,6 @@ def clip_depth(depth: Tensor, limit: float | None, floor: float | None = None) -
     if limit is not None:
         depth = depth - (depth.amax((-2, -1), keepdim=True) - limit).clamp_min(0)
     return depth if floor is None else depth.clamp_min(floor)
-
-
-def pad_depth(depth: Tensor, cells: int, value: float) -> Tensor:
-    """Surround each map ``[..., W, D]`` by ``cells`` cells of ``value``: ``[..., W + 2 cells, D + 2 cells]``.
-
-    The paper pads the bin with -1 and the tote with 0, after clipping and before broadcasting the maps to 4D.
-    """
-    return F.pad(depth, (cells,) * 4, value=value)
-
-
-def depth_levels(tote_depth: Tensor, tote_clip: int, depth_range: int) -> Tensor:
-    """Return clipped depths (eq. 4) counted from ``tote_clip`` downwards, uint8 in ``[0, depth_range)``, same shape."""
-    return (tote_clip - clip_depth(tote_depth, tote_clip)).clamp(0, depth_range - 1).to(torch.uint8)
-
-
-def one_hot(levels: Tensor, count: int) -> Tensor:
-    """Return planes of uint8 levels: ``[N, M]`` to bool ``[N, count * M]``; a greater level is in no plane."""
-    plane = torch.arange(count, dtype=torch.uint8, device=levels.device)
-    return (levels[:, None] == plane[:, None]).flatten(1)
 
 
 def item_code(item: Item, item_range: int, level: int = 1) -> Tensor:

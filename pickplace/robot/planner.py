@@ -18,8 +18,9 @@ from torch import Tensor
 from pickplace.common.validate import excerpt, whole_number
 from pickplace.config.registry import build, find
 from pickplace.items.distributions import ItemDistribution
-from pickplace.planners.base import MapPlanner, decide
+from pickplace.planners.base import MapPlanner
 from pickplace.planners.policy import PolicyPlanner
+from pickplace.planners.use import decide
 from pickplace.policies.base import Policy, ScoresActions, ScoresFootprints
 from pickplace.policies.restore import load_critic, load_policy
 from pickplace.robot.alternatives import MAX_ALTERNATIVES, Alternative, list_alternatives

@@ -6,8 +6,8 @@ from untrained import untrained_policy
 
 from pickplace import CellSpec, PickPlaceEnv, Planner, Scene
 from pickplace.evaluation.play import decision_latency, play
-from pickplace.planners.base import decide
 from pickplace.planners.heuristics import JointDBL
+from pickplace.planners.use import decide
 
 
 class Wrong:

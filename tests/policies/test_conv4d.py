@@ -8,9 +8,10 @@ import torch
 
 from pickplace import CellSpec
 from pickplace.policies.base import MASKED
-from pickplace.policies.depth import clip_depth, pad_depth
+from pickplace.policies.critics import Conv4d
+from pickplace.policies.depth import clip_depth
 from pickplace.policies.fcn4d import policy as fcn4d
-from pickplace.policies.fcn4d.network import Conv4dCritic, Conv4dNet
+from pickplace.policies.fcn4d.network import Conv4dNet, clip_and_pad
 from pickplace.policies.fcn4d.policy import Fcn4d, Typical
 
 SIZES = [  # bin, tote, R, clips, floor
@@ -61,14 +62,14 @@ def naive_map(depth, limit, floor, padding):
 
 
 def naive(model, bins, totes):
-    """Return logits and features by the paper's description, on an explicit two-channel 4D tensor."""
+    """Return logits by the paper's description, on an explicit two-channel 4D tensor."""
     bins = naive_map(bins, model.bin_clip, model.floor, -1.0)[:, :, :, None, None]
     totes = naive_map(totes, model.tote_clip, model.floor, 0.0)[:, None, None]
     x = torch.stack(torch.broadcast_tensors(bins, totes), dim=1)
     x = convolve4d(x, model.first.weight, model.first.bias).relu()
     x = convolve4d(x, model.second.weight, model.second.bias).relu()
     logits = convolve4d(x, model.head.weight, model.head.bias).movedim(1, -1)
-    return logits.flatten(1), x.movedim(1, -1).flatten(3, 4).flatten(1, 2)
+    return logits.flatten(1)
 
 
 @pytest.mark.parametrize(("bin_size", "tote_size", "rotations", "clips", "floor"), SIZES)
@@ -76,10 +77,9 @@ def test_equals_the_naive_4d_convolution(bin_size, tote_size, rotations, clips, 
     """And the same weights serve other sizes."""
     model = network(rotations, bin_clip=clips[0], tote_clip=clips[1], floor=floor)
     for maps in (depths(bin_size, tote_size), depths((4, 7), (3, 8), batch=1)):
-        logits, features = naive(model, *maps)
+        logits = naive(model, *maps)
         assert logits.shape[1] == maps[0][0].numel() * maps[1][0].numel() * rotations
         assert_close(model(*maps), logits)
-        assert_close(model.features(*maps), features)
 
 
 def test_gradients_equal_the_naive_ones():
@@ -87,7 +87,7 @@ def test_gradients_equal_the_naive_ones():
     maps = [m.requires_grad_() for m in depths((3, 4), (5, 3), dtype=torch.float64)]
     inputs, output = [*maps, *model.parameters()], model(*maps)
     direction = torch.randn(output.shape, generator=torch.Generator().manual_seed(1), dtype=output.dtype)
-    expected = torch.autograd.grad(naive(model, *maps)[0], inputs, direction)
+    expected = torch.autograd.grad(naive(model, *maps), inputs, direction)
     for ours, wanted in zip(torch.autograd.grad(output, inputs, direction), expected, strict=True):
         assert_close(ours, wanted, 1e-9)
 
@@ -96,7 +96,7 @@ def test_bfloat16_is_close_and_keeps_float32_outside():
     exact, rough = network(4, 16), network(4, 16, compute_dtype="bfloat16")
     maps = depths((5, 5), (6, 6))
     want, got = exact(*maps), rough(*maps)
-    assert got.dtype == rough.features(*maps).dtype == torch.float32
+    assert got.dtype == torch.float32
     assert (got - want).abs().max() < 0.02 * want.abs().max()
     for output in (want, got):
         output.square().sum().backward()
@@ -110,18 +110,16 @@ def test_chunks_change_nothing(chunk_bytes):
     maps = depths((4, 3), (5, 6), batch=7)
     with torch.no_grad():
         assert_close(pieces(*maps), whole(*maps))
-        assert_close(pieces.features(*maps), whole.features(*maps))
 
 
 def test_given_pick_cells_select_their_part():
     model, maps = network(3), depths((4, 5), (3, 6), batch=4)
     pick, each = torch.tensor([0, 7, 19, 11]), torch.arange(4)
     assert_close(model(*maps, pick), model(*maps).unflatten(1, (20, -1))[each, pick])
-    assert_close(model.features(*maps, pick), model.features(*maps)[each, pick])
 
 
 def test_any_leading_dimensions_and_integer_depths():
-    model, critic = network(), Conv4dCritic((4, 3, 1), (5, 6, 5), filters=4, hidden=8)
+    model, critic = network(), Conv4d(CellSpec(bin_size=(4, 3, 1), tote_size=(5, 6, 5)), filters=4, hidden=8)
     bins, totes = depths((4, 3), (5, 6), batch=6, dtype=torch.int64)
     flat, values = model(bins, totes), critic(bins, totes)
     two = [m.unflatten(0, (2, 3)) for m in (bins, totes)]
@@ -137,7 +135,7 @@ def test_depth_clipping():
     """It makes the tote's height irrelevant to the policy, but not to the critic."""
     bins, totes = depths((5, 5), (6, 6))
     totes[:, 0, 0] = 10.0  # an empty column
-    clipped, raw, critic = network(), network(tote_clip=None), Conv4dCritic((5, 5, 1), (6, 6, 5), filters=4, hidden=16)
+    clipped, raw, critic = network(), network(tote_clip=None), Conv4d(CellSpec(), filters=4, hidden=16)
     assert_close(clipped(bins, totes + 20), clipped(bins, totes))
     for sees in (raw, critic):
         assert not torch.allclose(sees(bins, totes + 20), sees(bins, totes))
@@ -146,7 +144,7 @@ def test_depth_clipping():
     assert clip_depth(depth, 5.0, floor=-1.0).min() == -1
     assert_close(clip_depth(depth, None), depth)
     assert clip_depth(depth, None, floor=2.0).min() == 2
-    assert pad_depth(depth, 2, -1.0).shape == (2, 6, 6)
+    assert clip_and_pad(depth, None, None, -1.0).shape == (2, 6, 6)
 
 
 def test_initialisation():
@@ -163,9 +161,9 @@ def test_initialisation():
     [
         (lambda: network(compute_dtype="float16"), "model.actor.compute_dtype='float16': expected 'float32' or"),
         (lambda: network(filters=0), "model.actor.filters=0"),
-        (lambda: Conv4dCritic((5, 5), (6, 6), filters=0), "model.critic.filters=0"),
-        (lambda: Conv4dCritic((5, 5), (6, 6), hidden=1.5), "model.critic.hidden=1.5"),
-        (lambda: Conv4dCritic((5, 5), (6, 6))(*depths((5, 5), (7, 6))), r"tote_depth: got \[7, 6\], expected \[6, 6\]"),
+        (lambda: Conv4d(CellSpec(), filters=0), "model.critic.filters=0"),
+        (lambda: Conv4d(CellSpec(), hidden=1.5), "model.critic.hidden=1.5"),
+        (lambda: Conv4d(CellSpec())(*depths((5, 5), (7, 6))), r"tote_depth: got \[7, 6\], expected \[6, 6\]"),
     ],
 )
 def test_bad_settings_are_refused(make, message):

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from problems import late_state
 from pickplace import CellSpec, Item
 from pickplace.items.distributions import Kinds, Uniform
 from pickplace.policies.base import MAP_KEYS, MASKED, as_collection_policy
-from pickplace.policies.critics import PooledCritic
+from pickplace.policies.critics import Pooled
 from pickplace.policies.depth import Contents
 from pickplace.policies.fcn_grasp.network import FootprintFcn, matrix_dtype
 from pickplace.policies.fcn_grasp.policy import FcnGrasp, UnmaskedFcnGrasp
@@ -184,8 +185,8 @@ def test_the_fastest_type_of_matrix_products(able, expected, monkeypatch):
 )
 def test_the_critic_adds_up_what_each_column_will_hold(seed, field, tote, level, stride):
     generator = torch.Generator().manual_seed(seed)
-    coarse = {"level": level, "stride": stride}
-    critic = PooledCritic(4, field, 6, tote_clip=2, depth_range=4, item_range=3, compute_dtype="float32", **coarse)
+    coarse = {"level": level, "stride": stride, "compute_dtype": "float32"}
+    critic = Pooled(CellSpec(), 4, field, 6, tote_clip=2, depth_range=4, item_range=3, **coarse)
     for parameter in critic.parameters():
         parameter.requires_grad_(False).normal_(generator=generator)
     bins, totes, bearing = random_maps(seed, 2, (4, 6), tote)
@@ -212,7 +213,7 @@ def test_the_critic_adds_up_what_each_column_will_hold(seed, field, tote, level,
 
 
 def test_the_critic_sees_the_mean_of_several_items():
-    critic = PooledCritic(4, 3, 6, compute_dtype="float32").requires_grad_(False)
+    critic = Pooled(CellSpec(), 4, 3, 6, compute_dtype="float32").requires_grad_(False)
     for parameter in critic.parameters():
         parameter.normal_()
     bins, totes, bearing = random_maps(3, 2, (4, 6), (5, 5))
@@ -268,7 +269,7 @@ def test_weights_that_are_older_than_the_marks_serve():
         checkpoint.restore(lambda: FcnGrasp(env.cell, **FLOAT), older, "policy")
 
 
-@pytest.mark.parametrize("make", [FootprintFcn, PooledCritic])
+@pytest.mark.parametrize("make", [FootprintFcn, partial(Pooled, CellSpec())])
 @pytest.mark.parametrize(
     ("key", "values", "expected"),
     [

@@ -17,8 +17,8 @@ from scipy.spatial import ConvexHull, QhullError
 
 from pickplace import CellSpec, Failure, Item, PickPlaceEnv, State
 from pickplace.items.distributions import Uniform
-from pickplace.planners.base import decide
 from pickplace.planners.heuristics import JointDBL
+from pickplace.planners.use import decide
 from pickplace.rules import large_items
 from pickplace.rules.cell import Limits, reference_cell
 from pickplace.rules.grasps import all_grasps, central_pick, heuristic_pick

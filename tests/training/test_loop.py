@@ -10,15 +10,15 @@ from omegaconf import OmegaConf
 from torch import nn
 from torchrl.modules import ValueOperator
 
-from pickplace import PickPlaceEnv
+from pickplace import CellSpec, PickPlaceEnv
 from pickplace.algorithms.actor_critic import ActorCritic
 from pickplace.algorithms.base import At
 from pickplace.algorithms.imitation import Imitation, imitation_loss
 from pickplace.config.registry import build
 from pickplace.evaluation.play import play
 from pickplace.planners.heuristics import JointDBL
-from pickplace.policies.base import as_collection_policy
-from pickplace.policies.critics import PooledCritic
+from pickplace.policies.base import as_collection_policy, as_critic
+from pickplace.policies.critics import Pooled
 from pickplace.policies.fcn_grasp.policy import fcn_grasp
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
@@ -107,7 +107,7 @@ def test_advantages_are_normalised_where_the_config_says_so(collected, algo, wan
 def test_a_step_follows_what_its_phase_learns_from(phase, limit, collected):
     """The policy from reward or its teacher, the critic always; no further than the greatest norm of a gradient."""
     policy, data = deepcopy(collected[0]), collected[1].reshape(-1)
-    critic = ValueOperator(PooledCritic(filters=8, hidden=8, compute_dtype="float32"), [*PooledCritic.in_keys])
+    critic = as_critic(Pooled(CellSpec(), filters=8, hidden=8, compute_dtype="float32"))
     words = ["algo.entropy_coeff=0.3", "algo.epochs=1", "algo.minibatch_size=64", "algo.lr_decay_start=null"]
     made = algorithm_of(policy, critic, *words, f"algo.max_grad_norm={limit}")
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The paper's policy, 4D convolutions over (pick x, pick y, place x, place y), and a value network.
+"""The paper's policy network: 4D convolutions over (pick x, pick y, place x, place y).
 
 How the 4D convolutions are computed, exactly and without a 4D kernel:
 
@@ -18,20 +18,19 @@ optimizer moves the sum nine times as far. Keeping the full kernel keeps the pap
 """
 
 import math
-from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.common.validate import MAX_WIDTH, number, number_or_null, one_of, whole_number
-from pickplace.policies.depth import clip_depth, pad_depth
+from pickplace.common.validate import MAX_WIDTH, number_or_null, one_of, whole_number
+from pickplace.policies.depth import clip_depth
 
 BIN_PADDING, TOTE_PADDING = -1.0, 0.0
 DTYPES = ("float32", "bfloat16")
 MAX_DEPTH = 10_000  # height units; deeper than any tote
 PAIRS_AT_ONCE = {"cpu": 512, "cuda": 65_536}  # a CPU's caches hold the hidden activations of so many
-PADDED_PAIRS = 64  # their number is rounded up to a multiple; see PADDED_ROWS in footprint_fcn.py
+PADDED_PAIRS = 64  # their number is rounded up to a multiple; see PADDED_ROWS in fcn_grasp/network.py
 
 
 def check_clips(place: str, bin_clip: float | None, tote_clip: float | None, floor: float | None) -> None:
@@ -39,6 +38,11 @@ def check_clips(place: str, bin_clip: float | None, tote_clip: float | None, flo
     number_or_null(f"{place}.bin_clip", bin_clip, 0, MAX_DEPTH)
     number_or_null(f"{place}.tote_clip", tote_clip, 0, MAX_DEPTH)
     number_or_null(f"{place}.floor", floor, -MAX_DEPTH, MAX_DEPTH)
+
+
+def clip_and_pad(depth: Tensor, limit: float | None, floor: float | None, padding: float) -> Tensor:
+    """Return maps ``[..., W, D]`` clipped, see :func:`clip_depth`, and surrounded by two cells of ``padding``."""
+    return F.pad(clip_depth(depth, limit, floor), (2,) * 4, value=padding)
 
 
 class Conv4dParameters(nn.Module):
@@ -99,13 +103,9 @@ class Conv4dNet(nn.Module):
         check_clips("model.actor", bin_clip, tote_clip, floor)
         number_or_null("model.actor.head_std", head_std, 0, 1e3)
         whole_number("model.actor.chunk_bytes", chunk_bytes, most=2**30)
-        self.rotations = rotations
-        self.filters = filters
-        self.bin_clip = bin_clip
-        self.tote_clip = tote_clip
-        self.floor = floor
-        self.compute_dtype = compute_dtype
-        self.chunk_bytes = chunk_bytes
+        self.rotations, self.filters = rotations, filters
+        self.bin_clip, self.tote_clip, self.floor = bin_clip, tote_clip, floor
+        self.compute_dtype, self.chunk_bytes = compute_dtype, chunk_bytes
         self.first = Conv4dParameters(2, filters, 3)
         self.second = Conv4dParameters(filters, filters, 3)
         self.head = Conv4dParameters(filters, rotations, 1)
@@ -125,7 +125,24 @@ class Conv4dNet(nn.Module):
         Returns:
             ``[..., W_B * D_B * W_T * D_T * R]``, or ``[..., W_T * D_T * R]`` for given pick cells.
         """
-        return self._compute(bin_depth, tote_depth, pick, self._logits).flatten(tote_depth.dim() - 2)
+        batch = tote_depth.shape[:-2]
+        bins = self._prepare(bin_depth, self.bin_clip, BIN_PADDING).flatten(0, -3)
+        totes = self._prepare(tote_depth, self.tote_clip, TOTE_PADDING).flatten(0, -3)
+        if pick is not None:
+            bins = self._windows(bins, torch.arange(len(bins), device=bins.device), pick.flatten())
+        if torch.compiler.is_exporting():  # at once: the number of pieces depends on the sizes
+            parts = [self._logits(bins, totes)]
+        else:
+            rows = bins.shape[1] - 4
+            states_at_once, rows_at_once = self._chunk_sizes(bins, totes)
+            parts = [
+                torch.cat(
+                    [self._logits(b[:, row : row + rows_at_once + 4], t) for row in range(0, rows, rows_at_once)], dim=1
+                )
+                for b, t in zip(bins.split(states_at_once), totes.split(states_at_once), strict=True)
+            ]
+        out = torch.cat(parts).flatten(1)
+        return out.reshape(*batch, out.shape[1])
 
     def pair_logits(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, pick: Tensor, place: Tensor) -> Tensor:
         """Return the logits of single pairs of a pick and a place, each from its 5x5 windows of the maps.
@@ -159,45 +176,10 @@ class Conv4dNet(nn.Module):
         features = torch.cat(parts).to(self.head.weight.dtype)
         return F.linear(features, self.head.weight.flatten(1), self.head.bias)[:count]
 
-    def features(self, bin_depth: Tensor, tote_depth: Tensor, pick: Tensor | None = None) -> Tensor:
-        """Return activations after the last ``3x3x3x3`` convolution's ReLU, float32. Arguments as in `forward`.
-
-        Returns:
-            ``[..., W_B * D_B, W_T * D_T, filters]``, or ``[..., W_T * D_T, filters]`` for given pick cells.
-        """
-        out = self._compute(bin_depth, tote_depth, pick, self._features)  # [..., W_B, D_B, W_T, D_T, filters]
-        out = out.flatten(-5, -4).flatten(-3, -2)
-        return out if pick is None else out.squeeze(-3)
-
-    def extra_repr(self) -> str:
-        names = ("rotations", "filters", "bin_clip", "tote_clip", "floor", "compute_dtype")
-        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
-
-    def _compute(self, bin_depth: Tensor, tote_depth: Tensor, pick: Tensor | None, layers) -> Tensor:
-        """Prepare the maps, call ``layers`` on pieces that fit, and join ``[..., W_B, D_B, W_T, D_T, C]``."""
-        batch = tote_depth.shape[:-2]
-        bins = self._prepare(bin_depth, self.bin_clip, BIN_PADDING).flatten(0, -3)
-        totes = self._prepare(tote_depth, self.tote_clip, TOTE_PADDING).flatten(0, -3)
-        if pick is not None:
-            bins = self._windows(bins, torch.arange(len(bins), device=bins.device), pick.flatten())
-        if torch.compiler.is_exporting():  # at once: the number of pieces depends on the sizes
-            parts = [layers(bins, totes)]
-        else:
-            rows = bins.shape[1] - 4
-            states_at_once, rows_at_once = self._chunk_sizes(bins, totes)
-            parts = [
-                torch.cat(
-                    [layers(b[:, row : row + rows_at_once + 4], t) for row in range(0, rows, rows_at_once)], dim=1
-                )
-                for b, t in zip(bins.split(states_at_once), totes.split(states_at_once), strict=True)
-            ]
-        out = torch.cat(parts)
-        return out.reshape(*batch, *out.shape[1:])
-
     def _prepare(self, depth: Tensor, limit: float | None, padding: float) -> Tensor:
         depth = depth.to(self.first.weight.dtype)
         depth = depth if depth.dim() > 2 else depth[None]
-        return pad_depth(clip_depth(depth, limit, self.floor), 2, padding)
+        return clip_and_pad(depth, limit, self.floor, padding)
 
     def _windows(self, maps: Tensor, row: Tensor, cell: Tensor) -> Tensor:
         """Return the windows ``[M, 5, 5]`` of padded maps ``[N, W + 4, D + 4]`` around flat cells of rows, ``[M]``."""
@@ -263,10 +245,8 @@ class Conv4dNet(nn.Module):
         out = F.conv2d(hidden.permute(0, 3, 1, 2), kernel, self.second.bias.to(hidden.dtype))
         return out.relu_().permute(0, 2, 3, 1)[None, :, None]
 
-    def _features(self, bins: Tensor, totes: Tensor) -> Tensor:
-        return self._hidden(bins, totes).transpose(0, 1).to(bins.dtype)
-
     def _logits(self, bins: Tensor, totes: Tensor) -> Tensor:
+        """Return ``[N, W_B, D_B, W_T, D_T, rotations]`` of padded maps."""
         hidden = self._hidden(bins, totes).to(bins.dtype)
         return F.linear(hidden, self.head.weight.flatten(1), self.head.bias).transpose(0, 1)
 
@@ -283,80 +263,5 @@ def _patches(maps: Tensor, row: Tensor, cell: Tensor) -> Tensor:
     """
     wide, long = maps.shape[-2] + 2, maps.shape[-1] + 2
     tap = torch.arange(3, device=row.device)
-    corner = (row * wide + cell // (long - 2)) * long + cell % (long - 2)
-    return corner[:, None] + (tap[:, None] * long + tap).flatten()
-
-
-class Conv4dCritic(nn.Module):
-    """The value of a state, by a network that shares nothing with the policy.
-
-    The paper only says that the value function has its own network with a fully connected end; everything
-    else here is a choice. Running the policy's 4D layers once more would double the cost of an update, so
-    each map, clipped and padded as for the policy, passes two 2D convolutions of ``filters`` ``3x3``, each
-    with a ReLU; all of it, with the mean and the greatest *unclipped* remaining depth of the tote (the
-    clipped map hides how much is left, and the return depends on it), passes a hidden layer with a ReLU and a
-    linear output. The fully connected end ties it to one bin and tote size; acting needs no value.
-
-    Args:
-        bin_size: ``(W_B, D_B, ...)``; what follows the first two is ignored.
-        tote_size: ``(W_T, D_T, ...)``; likewise.
-        filters: channels of the 2D convolutions.
-        hidden: width of the fully connected layer.
-        bin_clip, tote_clip, floor: as in `Conv4dNet`.
-        depth_scale: the two unclipped figures are divided by it.
-        compute_dtype: of all but the last layer, ``float32`` or ``bfloat16``; parameters and values stay float32.
-    """
-
-    def __init__(
-        self,
-        bin_size: Sequence[int],
-        tote_size: Sequence[int],
-        /,
-        filters: int = 64,
-        hidden: int = 256,
-        bin_clip: float | None = 1.0,
-        tote_clip: float | None = 5.0,
-        floor: float | None = None,
-        depth_scale: float = 5.0,
-        compute_dtype: str = "float32",
-    ):
-        super().__init__()
-        whole_number("model.critic.filters", filters, most=MAX_WIDTH)
-        whole_number("model.critic.hidden", hidden, most=MAX_WIDTH)
-        one_of("model.critic.compute_dtype", compute_dtype, DTYPES)
-        check_clips("model.critic", bin_clip, tote_clip, floor)
-        number("model.critic.depth_scale", depth_scale, 1e-3, 1e6)
-        self.bin_size = tuple(bin_size)[:2]
-        self.tote_size = tuple(tote_size)[:2]
-        self.bin_clip = bin_clip
-        self.tote_clip = tote_clip
-        self.floor = floor
-        self.depth_scale = depth_scale
-        self.compute_dtype = compute_dtype
-        self.bin_layers = self._map_layers(filters)
-        self.tote_layers = self._map_layers(filters)
-        cells = math.prod(self.bin_size) + math.prod(self.tote_size)
-        self.value = nn.Sequential(nn.Linear(filters * cells + 2, hidden), nn.ReLU(), nn.Linear(hidden, 1))
-
-    @staticmethod
-    def _map_layers(filters: int) -> nn.Sequential:
-        first, second = nn.Conv2d(1, filters, 3), nn.Conv2d(filters, filters, 3)
-        return nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), nn.Flatten())
-
-    def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
-        """Return values ``[..., 1]`` of bin depth ``[..., W_B, D_B]`` and tote depth ``[..., W_T, D_T]``."""
-        for name, depth, size in (("bin", bin_depth, self.bin_size), ("tote", tote_depth, self.tote_size)):
-            got = tuple(depth.shape[-2:])
-            if got != size:
-                raise ValueError(
-                    f"{name}_depth: got {list(got)}, expected {list(size)}, for which the critic was made."
-                )
-        batch, dtype = tote_depth.shape[:-2], next(self.parameters()).dtype
-        bins = bin_depth.to(dtype).reshape(-1, 1, *self.bin_size)
-        totes = tote_depth.to(dtype).reshape(-1, 1, *self.tote_size)
-        left = torch.stack((totes.mean((1, 2, 3)), totes.amax((1, 2, 3))), dim=-1) / self.depth_scale
-        bins = pad_depth(clip_depth(bins, self.bin_clip, self.floor), 2, BIN_PADDING)
-        totes = pad_depth(clip_depth(totes, self.tote_clip, self.floor), 2, TOTE_PADDING)
-        with torch.autocast(bins.device.type, torch.bfloat16, enabled=self.compute_dtype == "bfloat16"):
-            hidden = self.value[:-1](torch.cat((self.bin_layers(bins), self.tote_layers(totes), left), dim=-1))
-        return self.value[-1](hidden.to(dtype)).reshape(*batch, 1)
+    first = (row * wide + cell // (long - 2)) * long + cell % (long - 2)
+    return first[:, None] + (tap[:, None] * long + tap).flatten()
