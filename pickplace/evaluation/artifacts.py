@@ -82,60 +82,48 @@ def to_json(value: Any) -> Any:
 
 def evaluation_table(result: dict) -> str:
     """Return the figures of an ``evaluation.json`` as a Markdown table."""
-    env, occupancy, latency = result["env"], result["occupancy"], result["latency_ms"]
-    low, high = occupancy["ci95"]
-    failures = ", ".join(f"{name} {count}" for name, count in result["failures"].items())
+    env, failures = result["env"], ", ".join(f"{name} {count}" for name, count in result["failures"].items())
+    rows = {"planner": result["planner"]}
+    rows["tote, rotations"] = f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}"
+    if (count := env.get("bin_items", 1)) > 1:
+        rows["items in the bin"] = f"up to {count}, refill: {env.get('refill', 'each')}"
     same = ", all of the same items" if result.get("same_items") else ""
-    rows = [
-        ("planner", result["planner"]),
-        ("tote, rotations", f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}"),
-        *(
-            [("items in the bin", f"up to {count}, refill: {env.get('refill', 'each')}")]
-            if (count := env.get("bin_items", 1)) > 1
-            else []
-        ),
-        ("episodes", f"{result['episodes']} of the {result['stream']} stream, seed {result['seed']}{same}"),
-        ("occupancy", f"{occupancy['mean']:.4f} (95% interval {low:.4f} to {high:.4f}), least {occupancy['min']:.4f}"),
-        ("items placed", f"{result['items_placed']:.1f} an episode"),
-        ("episodes ended by", failures),
-        ("feasible actions", f"{result['feasible_action_share']:.2%} of all, mean over decisions"),
-    ]
+    rows |= {
+        "episodes": f"{result['episodes']} of the {result['stream']} stream, seed {result['seed']}{same}",
+        "occupancy": f"{_interval(result['occupancy'], '.4f')}, least {result['occupancy']['min']:.4f}",
+        "items placed": f"{result['items_placed']:.1f} an episode",
+        "episodes ended by": failures,
+        "feasible actions": f"{result['feasible_action_share']:.2%} of all, mean over decisions",
+    }
     if physics := result.get("physics"):
-        share, carried = physics["carried_out"], physics["occupancy"]
-        low, high = share["ci95"]
-        text = f"{share['mean']:.1%} of the episodes to their end (95% interval {low:.1%} to {high:.1%})"
-        rows.append((f"physics, {physics['method']}", text))
-        low, high = carried["ci95"]
-        rows.append(("occupancy carried out", f"{carried['mean']:.4f} (95% interval {low:.4f} to {high:.4f})"))
+        rows[f"physics, {physics['method']}"] = _interval(
+            physics["carried_out"], ".1%", " of the episodes to their end"
+        )
+        rows["occupancy carried out"] = _interval(physics["occupancy"], ".4f")
     if paired := result.get("paired_difference"):
-        low, high = paired["ci95"]
-        text = f"{paired['mean']:+.4f} (95% interval of the paired difference {low:+.4f} to {high:+.4f})"
-        rows.append((f"minus {paired['against']}", text))
-    if latency:
-        rows.append(("one decision", f"{latency['p50']:.1f} ms (median), {latency['p95']:.1f} ms (95th percentile)"))
+        rows[f"minus {paired['against']}"] = _interval(paired, "+.4f", of=" of the paired difference")
+    if latency := result["latency_ms"]:
+        rows["one decision"] = f"{latency['p50']:.1f} ms (median), {latency['p95']:.1f} ms (95th percentile)"
     if result.get("checkpoint"):
         trained = result["trained"]
-        rows.append(("checkpoint", f"{result['checkpoint']} ({trained['frames']:,} frames, seed {trained['seed']})"))
-        if result.get("warm_start"):
-            rows.append(("warm start", f"imitated {result['warm_start']}"))
-        if result.get("first_weights"):
-            rows.append(("began with weights", result["first_weights"]))
+        rows["checkpoint"] = f"{result['checkpoint']} ({trained['frames']:,} frames, seed {trained['seed']})"
+    if result.get("warm_start"):
+        rows["warm start"] = f"imitated {result['warm_start']}"
+    if result.get("first_weights"):
+        rows["began with weights"] = result["first_weights"]
     if "candidates" in result:
-        rows.append(("mask; candidates K", f"{_describe_masks(result)}; {result['candidates']}"))
-    rows = [(_escape(name), _escape(value)) for name, value in rows]
-    width = max(len(name) for name, _ in rows)
-    values = max(len(value) for _, value in rows)
-    lines = [f"| {name:<{width}} | {value:<{values}} |" for name, value in rows]
-    return "\n".join([lines[0], f"|{'-' * (width + 2)}|{'-' * (values + 2)}|", *lines[1:]]) + "\n"
+        words = {True: "yes", False: "no", None: "unknown"}
+        masks = (result.get(key) for key in ("mask_in_training", "mask_at_decision"))
+        training, decision = (words.get(mask, mask) for mask in masks)
+        rows["mask; candidates K"] = f"in training {training}, at decision {decision}; {result['candidates']}"
+    # Names may have letters that end the cell or begin a tag.
+    cells = [[re.sub(r"([|<])", r"\\\1", text) for text in row] for row in rows.items()]
+    name, value = (max(map(len, column)) for column in zip(*cells, strict=True))
+    head, *lines = [f"| {row[0]:<{name}} | {row[1]:<{value}} |" for row in cells]
+    return "\n".join([head, f"|{'-' * (name + 2)}|{'-' * (value + 2)}|", *lines]) + "\n"
 
 
-def _escape(text: str) -> str:
-    """Return the text of a cell in Markdown: names may have letters that end the cell or begin a tag."""
-    return re.sub(r"([|<])", r"\\\1", text)
-
-
-def _describe_masks(result: dict) -> str:
-    """Return whether there was a mask in training, and in decisions."""
-    words = {True: "yes", False: "no", None: "unknown"}
-    training, decision = (result.get(key) for key in ("mask_in_training", "mask_at_decision"))
-    return f"in training {words.get(training, training)}, at decision {words.get(decision, decision)}"
+def _interval(entry: dict, form: str, after: str = "", of: str = "") -> str:
+    """Return a mean and its interval, in a format, with words after the mean and after the interval's name."""
+    low, high = entry["ci95"]
+    return f"{entry['mean']:{form}}{after} (95% interval{of} {low:{form}} to {high:{form}})"

@@ -61,14 +61,10 @@ class _Batch:
     """
 
     def __init__(self, env: PickPlaceEnv, first: int, record: Collection[int], heat_maps: Collection[int]):
-        count, device = env.num_envs, env.device
         self.env, self.heat_maps = env, heat_maps
-        self.running = torch.ones(count, dtype=torch.bool, device=device)
-        self.occupancy = torch.zeros(count, dtype=torch.float64, device=device)
-        self.items_placed = torch.zeros(count, dtype=torch.int64, device=device)
-        self.failure = torch.zeros(count, dtype=torch.int64, device=device)
+        self.running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
         self.observation = env.reset()
-        self.final_heights, self.tote_height = env.state.heights, env.tote_height.clone()
+        self.results = {"tote_height": env.tote_height.clone()}  # entries of Episodes, of the slots that have ended
         heights = enumerate(env.tote_height.tolist())
         self.recordings = {slot: Recording(first + slot, high) for slot, high in heights if first + slot in record}
 
@@ -105,14 +101,15 @@ class _Batch:
 
     def _keep_results(self, ended: Tensor, after: TensorDictBase) -> None:
         """Keep the results of the slots in ``ended``, bool ``[N]``, from the observation after their last step."""
-        env, occupancy = self.env, self.env.exact_occupancy
-        self.occupancy = torch.where(ended, occupancy, self.occupancy)
-        self.items_placed = torch.where(ended, env.steps, self.items_placed)
-        self.failure = torch.where(ended, after["failure"][:, 0], self.failure)
-        self.final_heights = torch.where(ended[:, None, None], env.state.heights, self.final_heights)
+        env, failure = self.env, after["failure"][:, 0]
+        now = {"occupancy": env.exact_occupancy, "items_placed": env.steps, "failure": failure}
+        now["final_heights"] = env.state.heights
+        for name, values in now.items():
+            where = ended.view(-1, *[1] * (values.ndim - 1))
+            self.results[name] = torch.where(where, values, self.results.get(name, values))
         for slot, recording in self.recordings.items():
             if ended[slot]:
-                recording.ending, recording.occupancy = Failure(int(self.failure[slot])), float(occupancy[slot])
+                recording.ending, recording.occupancy = Failure(int(failure[slot])), float(now["occupancy"][slot])
                 if recording.ending == Failure.STUCK:
                     recording.waiting = items_in_bin(env.state.items, slot)
 
@@ -170,7 +167,7 @@ def play(
             seconds += time.perf_counter() - start
             batch.record(planner, action)
             batch.step(action)
-        parts.append({name: getattr(batch, name) for name in RESULTS})
+        parts.append(batch.results)
         recordings += batch.recordings.values()
     results = {name: torch.cat([part[name] for part in parts]).cpu() for name in RESULTS}
     return Episodes(

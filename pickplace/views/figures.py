@@ -88,7 +88,11 @@ def _draw_occupancy(axes, rows: list[dict]) -> None:
     if axes.get_legend_handles_labels()[0]:
         axes.legend(loc="best")
     else:
-        axes.text(0.5, 0.5, "no episode has ended yet", transform=axes.transAxes, ha="center", color=INK)
+        _say_empty(axes)
+
+
+def _say_empty(axes) -> None:
+    axes.text(0.5, 0.5, "no episode has ended yet", transform=axes.transAxes, ha="center", color=INK)
 
 
 def _draw_level(axes, frames: np.ndarray, level: np.ndarray) -> None:
@@ -135,7 +139,7 @@ def failure_mix(metrics: Path, path) -> None:
         axes.set_xlim(0, 1.02 * frames[-1])
         axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
     else:
-        axes.text(0.5, 0.5, "no episode has ended yet", transform=axes.transAxes, ha="center", color=INK)
+        _say_empty(axes)
     axes.set_ylim(0, 1)
     axes.yaxis.set_major_formatter(PercentFormatter(1))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))

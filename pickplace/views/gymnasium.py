@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from tensordict import TensorDict
 
 from pickplace.envs.gymnasium import PickPlaceGymEnv
 from pickplace.rules.item import bin_depth_from_items
@@ -48,16 +47,14 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
     def step(self, action):
         if self._recording is not None and self.action_space.contains(action):
             env, actions = self._env, torch.as_tensor([int(action)], device=self._env.device)
-            observation = TensorDict({"tote_height": env.tote_height[:, None].clone()}, [1], device=env.device)
-            self._recording.moves += record_moves(env.cell, None, observation, env.state, actions)
-        result = super().step(action)
-        _, _, terminated, truncated, info = result
+            self._recording.moves += record_moves(env.cell, None, None, env.state, actions)
+        *result, terminated, truncated, info = super().step(action)
         if self._recording is not None and (terminated or truncated):
             self._recording.ending = Failure[info["failure"].upper()]
             if self._recording.ending == Failure.STUCK:
                 self._recording.waiting = items_in_bin(self._env.current_items, 0)
         self._update_window()
-        return result
+        return *result, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         if self.render_mode == "rgb_array":

@@ -92,13 +92,15 @@ def items_in_bin(items: Item, row: int) -> list[InBin]:
     return [tuple(item) for item in items.rows(row).cuboids.tolist() if item[4] > 0]
 
 
-def record_moves(cell: CellSpec, planner, observation: TensorDictBase, state: State, action: Tensor) -> list[Move]:
+def record_moves(
+    cell: CellSpec, planner, observation: TensorDictBase | None, state: State, action: Tensor
+) -> list[Move]:
     """Return the moves that actions make, one for each row.
 
     Args:
         cell: the sizes.
         planner: the planner that decided; its ``heat_map`` is recorded if it has one.
-        observation: what the planner saw, ``[N]``.
+        observation: what the planner saw, ``[N]``; it is needed for heat maps alone.
         state: the states before the moves.
         action: int64 ``[N]``.
     """
