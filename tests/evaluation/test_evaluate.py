@@ -160,7 +160,7 @@ def test_physics_and_plans(evaluation, tmp_path):
     assert found["occupancy"]["mean"] == pytest.approx(mean) and f"{mean:.4f}" in result["out"]
     assert len(found["occupancy"]["per_episode"]) == 4 and found["drift"] == max(one["drift"] for one in outcomes)
     assert "physics" not in evaluation(*settings) and not list(tmp_path.glob("MUJOCO*"))
-    evaluation(*settings, "physics=settle", "physics.gap=1", refused="physics.gap=1: expected a number between 0 and")
+    evaluation(*settings, "physics=settle", "physics.gap=1", refused="physics.gap=1: ")
 
 
 def test_items_of_a_checkpoint_and_other_ones(evaluation):
@@ -193,7 +193,7 @@ def test_only_the_same_episodes_are_compared(word, tmp_path):
     path.write_text(json.dumps({**ours, "planner": "a", "occupancy": {"per_episode": [0.5] * 100}}))
     read_comparison(path, ours)
     key = word.partition("=")[0].removeprefix("evaluation.")
-    with pytest.raises(ValueError, match=key if "." in key else f"its {key} is"):
+    with pytest.raises(ValueError, match=key if "." in key else f"its {key} is "):
         read_comparison(path, theirs)
 
 
@@ -261,5 +261,5 @@ def test_a_physics_engine_of_ones_own(evaluation):
     assert "clumsy" in (result["path"].parent / "replay.html").read_text()
     own = "+physics._target_=test_evaluate."
     evaluation(*words, f"{own}Clumsy", "+physics.skip=true", refused="physics=clumsy: outcomes of the episodes [1, 2]")
-    evaluation(*words, f"{own}Clumsy", "+physics.speed=1", refused="physics.speed: there is no key")
+    evaluation(*words, f"{own}Clumsy", "+physics.speed=1", refused="physics.speed: ")
     evaluation(*words, f"{own}Counting", refused="physics._target_=test_evaluate.Counting: ")

@@ -76,9 +76,9 @@ def test_a_round_plate_is_narrower_than_its_cells(ahead, diameter, ending):
 
 
 def test_a_round_plate_must_fit_its_cells():
-    with pytest.raises(ValueError, match="physics.plate_diameter=0.2: expected at most 0.15, its cells"):
+    with pytest.raises(ValueError, match="physics.plate_diameter=0.2: .* 0.15"):
         carry(placed(*LOW), plate_diameter=0.2)
-    with pytest.raises(ValueError, match="physics.plate_diameter='x': expected a number"):
+    with pytest.raises(ValueError, match="physics.plate_diameter='x': "):
         Execute(plate_diameter="x")
 
 
@@ -102,7 +102,7 @@ def test_a_light_contact_does_not_count():
 
 
 def test_plans_without_a_bin_are_refused():
-    with pytest.raises(ValueError, match="episode 3 has no bin; expected plans with all keys"):
+    with pytest.raises(ValueError, match="episode 3 has no bin"):
         Execute().carry_out_one(EpisodePlan(3, (0.3, 0.3, 0.3), placements=[Placement((0, 0, 0), (0.1, 0.1, 0.1))]))
 
 
@@ -192,7 +192,7 @@ def test_an_item_waits_in_the_bin_until_it_is_taken():
 
 def test_a_neighbour_hardly_wider_than_the_gap_is_refused():
     plan = EpisodePlan(4, (0.3, 0.3, 0.25), (0.3, 0.3, 0.05), EFFECTOR, [beside(0.2, 0.05, 0.0015)])
-    with pytest.raises(ValueError, match="episode 4, a neighbour of item 1: 0.0015 m wide; expected sides of at least"):
+    with pytest.raises(ValueError, match="episode 4, a neighbour of item 1: 0.0015 m wide"):
         Execute().carry_out_one(plan)
 
 

@@ -50,27 +50,27 @@ def test_a_recorded_episode_in_metres(tmp_path):
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    ({"corner": [0.25, 0, 0]}, "the item leaves the tote: along x from 0.25 to 0.35 m, expected 0 to 0.3 m"),
-    ({"corner": [0, 0, 0.16]}, "the item leaves the tote: along z"),
-    ({"corner": [0.05, 0.02, 0.03]}, "the item overlaps item 1 of its episode by 20.0 mm"),
-    ({"corner": [0.05, 0.02, 0.06]}, "the item floats 10.0 mm above what lies below it"),
+    ({"corner": [0.25, 0, 0]}, "the item .* x .* 0.25 to 0.35 m"),
+    ({"corner": [0, 0, 0.16]}, "the item .* z .* 0.16 to 0.21 m"),
+    ({"corner": [0.05, 0.02, 0.03]}, "the item .* item 1 .* 20.0 mm"),
+    ({"corner": [0.05, 0.02, 0.06]}, "the item floats 10.0 mm"),
     ({"corner": [0.1, 0.0, 0.05]}, "the item floats 50.0 mm"),
-    ({"corner": [0, 0, math.nan]}, r"corner=\[0, 0, nan\]: expected 3 coordinates, in metres"),
-    ({"corner": [0, 0]}, "corner=.*expected 3 coordinates"),
-    ({"size": [0.1, 0, 0.1]}, "size=.*expected 3 lengths above 0, in metres"),
-    ({"size": "large"}, "size='large': expected 3 lengths"),
-    *(({"episode": value}, f"episode={value}: expected a whole number >= 0") for value in (0.5, -1)),
-    ({"tote": [0.3, 0.3, 0.3]}, "tote: expected the same in all lines of episode 0"),
-    ({"volume": 1}, "'volume': there is no such key; expected episode, tote, corner, size, bin"),
-    ({"pick": [0, 0]}, "bin: missing; expected episode, tote, corner, size, bin"),
-    ({**ROBOT, "rotation": 45}, "rotation=45: expected 0, 90, 180 or 270"),
+    ({"corner": [0, 0, math.nan]}, r"corner=\[0, 0, nan\]: "),
+    ({"corner": [0, 0]}, r"corner=\[0, 0\]: "),
+    ({"size": [0.1, 0, 0.1]}, r"size=\[0.1, 0, 0.1\]: "),
+    ({"size": "large"}, "size='large': "),
+    *(({"episode": value}, f"episode={value}: ") for value in (0.5, -1)),
+    ({"tote": [0.3, 0.3, 0.3]}, "tote: .* episode 0"),
+    ({"volume": 1}, "'volume': "),
+    ({"pick": [0, 0]}, "bin: missing"),
+    ({**ROBOT, "rotation": 45}, "rotation=45: "),
     *(
-        ({**ROBOT, "body": body}, "body=.*: expected up to 2,048 rectangles x, y, w, d inside the effector")
+        ({**ROBOT, "body": body}, "body=.*: ")
         for body in ([], "L", [[0, 0, 0.1]], [[0, 0, 0.2, 0.1]], [[-0.1, 0, 0.1, 0.1]], [[0, 0, 0.1, 0]])
     ),
     ({"body": [[0, 0, 0.1, 0.1]]}, "bin: missing"),
     *(
-        ({**ROBOT, "neighbours": value}, "neighbours=.*: expected up to 100 boxes x, y, w, d, h with sides above 0")
+        ({**ROBOT, "neighbours": value}, "neighbours=.*: ")
         for value in (
             "one", {}, None, [0.1], [[0.1, 0.1, 0.1, 0.1]], [[0.1, 0.1, 0.1, 0.1, 0]], [[1e3, 0, 0.1, 0.1, 0.1]],
             [[0.1, 0.1, 0.1, 0.1, None]], [[n, 1, 0.5, 0.5, 0.5] for n in range(101)],
@@ -115,9 +115,9 @@ def test_neighbours_in_metres(tmp_path):
 
 
 @pytest.mark.parametrize(("text", "words"), [
-    ("corner\n", r"line 1: expected an object in JSON \("),
-    ("[1]\n", "line 1: got list, expected an object with episode, tote, corner, size"),
-    (json.dumps({"episode": 1}) + "\n", "line 1: tote: missing; expected episode, tote, corner, size"),
+    ("corner\n", r"line 1: .*JSON \("),
+    ("[1]\n", "line 1: got list, "),
+    (json.dumps({"episode": 1}) + "\n", "line 1: tote: missing"),
 ])  # fmt: skip
 def test_another_file_is_refused(text, words, tmp_path):
     (tmp_path / "plans.jsonl").write_text(text)
@@ -132,7 +132,7 @@ def test_an_episode_without_placements_has_no_line(tmp_path):
 
 def test_the_lines_of_an_episode_follow_one_another(tmp_path):
     path = written(tmp_path / "plans.jsonl", LINE, LINE | {"episode": 1}, LINE | {"corner": [0.1, 0, 0]})
-    with pytest.raises(ValueError, match="line 3: episode=0: expected its lines to follow one another"):
+    with pytest.raises(ValueError, match="line 3: episode=0: "):
         read_plans(path)
 
 
@@ -163,13 +163,13 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert (done["episode"], done["ending"], done["placed"]) == (3, "done", 1)
     assert call(path, "friction=0.5", "sleep=false")[1]["placed"] == 1
     for words, expected in (
-        ((path, "friction=-1"), "physics.friction=-1: expected a number between 0 and 10"),
-        ((path, "fricton=1"), "physics.fricton: there is no key 'fricton' in physics; did you mean 'friction'?"),
-        *(((path, word), f"{word}: expected <key>=<value>") for word in ("friction", "friction=[1", "_target_=x")),
+        ((path, "friction=-1"), "physics.friction=-1: "),
+        ((path, "fricton=1"), "physics.fricton: "),
+        *(((path, word), f"{word}: ") for word in ("friction", "friction=[1", "_target_=x")),
         ((path, "--method", "execute", "friction=0.3"), "physics=execute: episode 0 has no bin"),
         ((path, "--method", "setle"), "physics._target_=setle: "),
         ((path, "gap=0.02", "cell_size=1"), None),
-        ((path, "gap=0.06", "cell_size=1"), "episode 0, item 1: 0.1 m wide; expected sides of at least twice physics"),
+        ((path, "gap=0.06", "cell_size=1"), "episode 0, item 1: 0.1 m wide"),
         ((tmp_path / "none.jsonl",), "none.jsonl: No such file"),
     ):
         if expected is None:

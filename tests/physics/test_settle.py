@@ -118,7 +118,7 @@ def test_a_simulation_that_diverges_is_told():
 
 def test_without_mujoco(monkeypatch):
     monkeypatch.setattr(simulation, "mujoco", None)
-    with pytest.raises(ValueError, match="physics=settle: MuJoCo is missing; pip install"):
+    with pytest.raises(ValueError, match="physics=settle: MuJoCo is missing"):
         Settle()
 
 
