@@ -27,12 +27,12 @@ from pickplace.robot.problem import Problem, check_longest, join_items, read_bea
 from pickplace.robot.scene import BinMap, Scene
 from pickplace.rules.bin import taken_item
 from pickplace.rules.cell import MAX_SIDE, CellSpec, Limits, effector_centre, reference_cell
+from pickplace.rules.checks import is_within_reach
 from pickplace.rules.grasps import carry, footprint_index
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, footprint_mask
 from pickplace.rules.measured import MeasuredMaps, MeasuredTote, bearing_after, failures, floor_height, measured_maps
-from pickplace.rules.placing import is_within_reach
 from pickplace.rules.state import State, surface_from
 
 
@@ -99,15 +99,14 @@ class MeasuredBin(Problem):
         assert limits is not None
         everywhere = replace(limits, pick_ok=torch.ones_like(limits.pick_ok))  # each item has its own picks
         cell = replace(parts[0].cell, limits=everywhere, bin_items=len(parts))
-        top, clearance, rest = (
-            torch.cat([getattr(part.maps, key) for part in parts]) for key in ("top", "clearance", "rest")
-        )
+        keys = ("top", "clearance", "rest", "greatest_top")
+        maps = {key: torch.cat([getattr(part.maps, key) for part in parts]) for key in keys}
+        step = parts[0].maps.level_step
         items = join_items([part.maps.item for part in parts])
         seen_items = join_items([part.seen.items.rows(0) for part in parts])
         blocked = ~torch.stack([part.cell.limits.pick_ok for part in parts if part.cell.limits is not None])
         state, seen = parts[0].state._replace(items=items), parts[0].seen._replace(items=seen_items)
-        step = parts[0].maps.level_step
-        maps = PlacingMaps(top, clearance, items.rows(0), rest, blocked, len(parts), step)
+        maps = PlacingMaps(**maps, item=items.rows(0), blocked=blocked, bin_items=len(parts), level_step=step)
         return cls(cell=cell, state=state, seen=seen, maps=maps, parts=parts)
 
     def of_item(self, number: int) -> Problem:

@@ -14,12 +14,11 @@ import torch
 from torch import Tensor
 
 from pickplace.rules.cell import CellSpec, reference_cell
+from pickplace.rules.checks import PICK, combine, is_within_reach
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR
-from pickplace.rules.placing import is_within_reach
 
 
-# ---------------------------------------------------------------------- the checks of a pick, one function each
 def is_gripped(cell: CellSpec, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor) -> Tensor:
     """Return whether the end effector grips the item: whether enough cells of the cup lie on it.
 
@@ -49,16 +48,6 @@ def is_outside(corner: Tensor, side: Tensor | int, grid: int) -> Tensor:
     return (corner < 0) | (corner > grid - side)
 
 
-def is_clear(face: Tensor, obstacle: Tensor | int, out: Tensor | None = None) -> Tensor:
-    """Return whether the end effector passes an obstacle: one that is exactly level does not collide.
-
-    Args:
-        face: height of the suction face, which is the height of the item's top.
-        obstacle: height of a wall, or of what lies under the end effector.
-    """
-    return torch.ge(face, obstacle, out=out)
-
-
 def turn(near_x: Tensor, near_y: Tensor, back_x: Tensor, back_y: Tensor) -> tuple[tuple[Tensor, Tensor], ...]:
     """Return the item's offset ``(x, y)`` under the end effector for each rotation ``0..3``.
 
@@ -81,7 +70,7 @@ class Grasp(NamedTuple):
 
     grips: Tensor
     collides: Tensor
-    unreachable: Tensor | None  # None: the robot has no limits
+    reachable: Tensor | None  # None: the robot has no limits
     near_x: Tensor
     near_y: Tensor
     back_x: Tensor
@@ -90,8 +79,7 @@ class Grasp(NamedTuple):
     @property
     def succeeds(self) -> Tensor:
         """Whether the pick lifts the item."""
-        good = self.grips & ~self.collides
-        return good if self.unreachable is None else good & ~self.unreachable
+        return combine(PICK, self)
 
 
 def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | None = None) -> Grasp:
@@ -110,18 +98,18 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | No
     # Every edge of the rectangle has a cell of the body.
     leaves_bin = is_outside(left, ee_w, bin_w) | is_outside(front, ee_d, bin_d)
     # An item is never higher than its own top: just the walls and other items can be hit.
-    collides = leaves_bin & ~is_clear(item.h, wall)
-    unreachable = None
+    collides = leaves_bin & (item.h < wall)
+    reachable = None
     if blocked is not None or cell.limits is not None:
         pick = (x.clamp(0, bin_w - 1) * bin_d + y.clamp(0, bin_d - 1)).expand_as(gripped)
     if blocked is not None:
         collides = collides | blocked.t().gather(0, pick.reshape(-1, pick.shape[-1])).view_as(pick)
     if cell.limits is not None:
         limits = cell.limits.on(pick.device)
-        unreachable = ~limits.pick_ok[pick]
+        reachable = limits.pick_ok[pick]
         if limits.lowest_pick is not None and limits.highest_pick is not None:
-            unreachable |= ~is_within_reach(limits.lowest_pick[pick], limits.highest_pick[pick], item.h)
-    return Grasp(gripped & ~item.is_empty, collides, unreachable, near_x, near_y, back_x, back_y)
+            reachable = reachable & is_within_reach(limits.lowest_pick[pick], limits.highest_pick[pick], item.h)
+    return Grasp(gripped & ~item.is_empty, collides, reachable, near_x, near_y, back_x, back_y)
 
 
 class Carried(NamedTuple):

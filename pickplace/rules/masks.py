@@ -19,12 +19,12 @@ from torch import Tensor
 
 from pickplace.common.validate import check_bytes
 from pickplace.rules.bin import blocked_picks
-from pickplace.rules.cell import CellSpec, Limits
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.checks import GREATEST_TOP, LEAST_TOP, Over, combine
 from pickplace.rules.grasps import (
     all_grasps,
     available_offsets,
     footprint_index,
-    is_clear,
     is_outside,
     join_action,
     num_turns,
@@ -34,7 +34,7 @@ from pickplace.rules.grasps import (
 )
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR, NEVER, surround, windows
-from pickplace.rules.placing import clearance, is_within_reach, resting_top, unchecked_top
+from pickplace.rules.placing import over_tote, resting_top, unchecked_top
 from pickplace.rules.state import State
 
 CLASS_BYTES = 2**28  # of the masks of grasp classes that are held at a time
@@ -48,18 +48,29 @@ class PlacingMaps(NamedTuple):
     """
 
     top: Tensor  # int32 [N, Q, W_T, D_T]: height of the item's top with its footprint's min corner there, or NEVER
-    clearance: Tensor  # int32 [N, B, W_T, D_T]: highest thing under the end effector with its reference cell there
+    clearance: Tensor  # int32 [N, B or R, W_T, D_T]: least top with the end effector's reference cell there
     item: Item  # what is picked
     rest: Tensor  # int32 [N, Q, W_T, D_T]: height on which the item would lie, stable or not; FAR outside the tote
     blocked: Tensor | None = None  # bool [N, P]: see `blocked_picks`; None: the items lie alone
     bin_items: int = 1  # M
+    greatest_top: Tensor | None = None  # int [N, R, W_T, D_T]: greatest top there; None: any
     level_step: int = 0  # by how much the heights of a level surface may differ, where they are measured
+
+    @classmethod
+    def of(cls, top: Tensor, rest: Tensor, over: Over, item: Item, blocked: Tensor | None) -> "PlacingMaps":
+        """Return the maps of items, with the end effector over every place cell of a tote for each bin."""
+        bins, count = over.obstacle.shape[-1], len(top) // over.obstacle.shape[-1]
+        bounds = []
+        for scope in (LEAST_TOP, GREATEST_TOP):
+            if (bound := combine(scope, over)) is not None:
+                bound = bound.permute(3, 0, 1, 2).expand(bins, -1, -1, -1)
+            bounds.append(bound if count == 1 or bound is None else bound.repeat_interleave(count, 0))
+        return cls(top, bounds[0], item, rest, blocked, count, bounds[1])
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "PlacingMaps":
         """Return the maps with a function applied to each tensor."""
-        top, clearance, rest = map(function, (self.top, self.clearance, self.rest))
-        blocked = None if self.blocked is None else function(self.blocked)
-        return PlacingMaps(top, clearance, self.item.map(function), rest, blocked, self.bin_items, self.level_step)
+        changed = {key: function(part) for key, part in self._asdict().items() if isinstance(part, Tensor)}
+        return self._replace(item=self.item.map(function), **changed)
 
     def rows(self, index: Tensor) -> "PlacingMaps":
         """Return the maps of some bins, by their numbers, which may come up more than once."""
@@ -101,17 +112,14 @@ def unchecked_maps(cell: CellSpec, state: State) -> PlacingMaps:
 
 def _complete(cell: CellSpec, state: State, top: Tensor, rest: Tensor) -> PlacingMaps:
     """Return the maps with what the end effector must clear, in the tote and in the bin."""
-    clear, (_, _, item), count = clearance(cell, state), state.each_item(), state.items.x.shape[1]
-    if count > 1:
-        clear = clear.repeat_interleave(count, 0)
-    return PlacingMaps(top, clear, item, rest, blocked_picks(cell, state.items), count)
+    over = over_tote(cell, state.surface, state.tote_height)
+    return PlacingMaps.of(top, rest, over, state.each_item()[2], blocked_picks(cell, state.items))
 
 
 def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     """Return whether placing succeeds, per grasp class and place cell, bool ``[T * K, W_T * D_T, N]``, batch last."""
     low, count = cell.min_offset, cell.num_offsets
     tote_w, tote_d, _ = cell.tote_size
-    limits = None if cell.limits is None else cell.limits.on(maps.top.device)
     mask = maps.top.new_empty(num_turns(cell), count, count, tote_w, tote_d, len(maps.top), dtype=torch.bool)
     for number in range(num_turns(cell)):
         parity = number % cell.parities
@@ -119,10 +127,9 @@ def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
         # With the reference cell at p and the item at offset o, the footprint begins at p - ref + o.
         pad = (ref_x - low, low + count - 1 - ref_x, ref_y - low, low + count - 1 - ref_y)
         top = windows(surround(maps.top[:, parity].permute(1, 2, 0), pad, NEVER), count)
-        is_clear(top, maps.clearance_in(number), out=mask[number])
-        if limits is not None:
-            lowest, highest = limits.lowest_top[number, ..., None], limits.highest_top[number, ..., None]
-            mask[number] &= is_within_reach(lowest, highest, top)
+        torch.ge(top, maps.clearance_in(number), out=mask[number])
+        if maps.greatest_top is not None:
+            mask[number] &= top <= maps.greatest_top[:, number].permute(1, 2, 0)
     return mask.flatten(3, 4).flatten(0, 2)
 
 
@@ -192,12 +199,11 @@ def footprint_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     grasped = grasped[:-1].view(turns, count, count, 1, 1, batch)
     reached = available.new_empty(cell.parities, *cell.tote_size[:2], batch)
     for parity in range(cell.parities):
-        if cell.limits is None:
-            is_clear(
-                maps.top[:, parity].permute(1, 2, 0), _least_clearance(cell, maps, parity, grasped), out=reached[parity]
-            )
+        if maps.greatest_top is None:
+            top = maps.top[:, parity].permute(1, 2, 0)
+            torch.ge(top, _least_clearance(cell, maps, parity, grasped), out=reached[parity])
         else:
-            reached[parity] = _reached_within_limits(cell, cell.limits.on(maps.top.device), maps, parity, grasped)
+            reached[parity] = _reached_within_limits(cell, maps, parity, grasped)
     if cell.parities == 2:
         square = maps.item.w == maps.item.d
         reached[0] |= square & reached[1]
@@ -245,19 +251,18 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Te
     return reduce(torch.minimum, least)
 
 
-def _reached_within_limits(cell: CellSpec, limits: Limits, maps: PlacingMaps, parity: int, grasped: Tensor) -> Tensor:
+def _reached_within_limits(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Tensor) -> Tensor:
     """Return the footprints that some grasp of this parity reaches, bool ``[W_T, D_T, N]``, under the limits."""
     (tote_w, tote_d, _), count, margins = cell.tote_size, cell.num_offsets, _footprint_margins(cell, parity)
     top = maps.top[:, parity].permute(1, 2, 0)
     reached = torch.zeros_like(top, dtype=torch.bool)
     for rotation in range(parity, cell.rotations, 2):
         clear = surround(maps.clearance_in(rotation), margins, FAR)
-        lowest = surround(limits.lowest_top[rotation, ..., None], margins, FAR)
-        highest = surround(limits.highest_top[rotation, ..., None], margins, NEVER)
+        highest = surround(maps.greatest_top[:, rotation].permute(1, 2, 0), margins, NEVER)
         for i in range(count):
             for j in range(count):
                 here = slice(i, i + tote_w), slice(j, j + tote_d)
-                good = is_clear(top, clear[here]) & is_within_reach(lowest[here], highest[here], top)
+                good = (top >= clear[here]) & (top <= highest[here])
                 reached |= good & grasped[rotation, count - 1 - i, count - 1 - j]
     return reached
 
@@ -283,14 +288,13 @@ def actions_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Te
     place_x, place_y = (torch.stack([x, y], -1)[:, None, None] + refs - offset).unbind(-1)  # [N, P, R]
     in_tote = ~is_outside(place_x, 1, tote_w) & ~is_outside(place_y, 1, tote_d)
     place_x, place_y = place_x.clamp(0, tote_w - 1), place_y.clamp(0, tote_d - 1)
-    index = footprint_index(cell.tote_size, rotation % len(cell.effectors), place_x, place_y)
+    index = footprint_index(cell.tote_size, rotation % maps.clearance.shape[1], place_x, place_y)
     clear = maps.clearance.flatten(1).gather(1, index.flatten(1)).view_as(index)
     top = maps.top.flatten(1).gather(1, footprint[:, None])[..., None]
     same = (maps.item.w == maps.item.d)[:, None, None] | (parity == turned[:, None, None])
-    good = in_tote & same & is_clear(top, clear) & lifted[..., None]
-    if cell.limits is not None:
-        limits, number = cell.limits.on(device), footprint_index(cell.tote_size, rotation, place_x, place_y)
-        good &= is_within_reach(limits.lowest_top.flatten()[number], limits.highest_top.flatten()[number], top)
+    good = in_tote & same & (top >= clear) & lifted[..., None]
+    if maps.greatest_top is not None:
+        good &= top <= maps.greatest_top.flatten(1).gather(1, index.flatten(1)).view_as(index)
     pick = torch.arange(cell.num_picks, device=device)[:, None]
     action = join_action(cell, pick, place_x * tote_d + place_y, rotation)
     return torch.where(good, action, -1).flatten(1)

@@ -13,12 +13,13 @@ import torch
 from torch import Tensor
 
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.grasps import carry, footprint_index, is_clear, is_outside, split_action
+from pickplace.rules.checks import FOOTPRINT, Over, Resting, combine, first_failure
+from pickplace.rules.grasps import carry, footprint_index, is_outside, split_action
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR, NEVER
 from pickplace.rules.masks import PlacingMaps
-from pickplace.rules.placing import clearance, footprint_cells, footprint_sizes, is_within_reach, overflows, rest
-from pickplace.rules.state import Failure, State, surface_from
+from pickplace.rules.placing import OnFootprints, footprint_sizes, over_tote
+from pickplace.rules.state import State, surface_from
 from pickplace.rules.support.contact import Patches
 
 DIRECTIONS = 128  # in which the hull of what supports an item is looked at
@@ -59,7 +60,7 @@ class MeasuredMaps(NamedTuple):
     maps: PlacingMaps
     stable: Tensor  # bool [Q, W_T, D_T]
     highest_top: int  # greatest top that does not pass the rim
-    rim: int  # least top at which the end effector passes the rim
+    over: Over  # the end effector over every place cell
 
 
 def measured_maps(cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[float, float]) -> MeasuredMaps:
@@ -76,19 +77,16 @@ def measured_maps(cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[f
     slack = tote.accuracy
     state = tote.state(cell, item)
     w, d = footprint_sizes(cell, item)
-    z = rest(*footprint_cells(cell, state.surface, w, d))[..., 0]  # [Q, W_T, D_T]
+    z = OnFootprints(cell, state.surface, w, d).z[..., 0]  # [Q, W_T, D_T]
     stable = torch.stack([_is_stable(cell, tote, item, sides, parity, z[parity]) for parity in range(cell.parities)])
     if int(item.w) == int(item.d):  # one footprint to the masks, whichever way the item lies in it
         stable = stable.all(0).expand_as(stable)
     top = z + item.h.to(z.dtype)
     highest = tote.height - 2 * slack
-    good = stable & ~overflows(top, torch.tensor(highest)) & (z < FAR)
-    over_rim = tote.rim - 2 * slack
-    free = clearance(
-        cell, tote.state(cell, item, slack)._replace(tote_height=torch.tensor([over_rim], device=z.device))
-    )
-    maps = PlacingMaps(torch.where(good, top, NEVER)[None], free, item, z[None], level_step=level_step(slack))
-    return MeasuredMaps(maps, stable, highest, over_rim)
+    good = combine(FOOTPRINT, Resting(z < FAR, top, highest, stable))
+    over = over_tote(cell, tote.state(cell, item, slack).surface, torch.tensor([tote.rim - 2 * slack], device=z.device))
+    maps = PlacingMaps.of(torch.where(good, top, NEVER)[None], z[None], over, item, None)
+    return MeasuredMaps(maps._replace(level_step=level_step(slack)), stable, highest, over)
 
 
 def _contact(
@@ -190,30 +188,14 @@ def failures(cell: CellSpec, measured: MeasuredMaps, action: Tensor, bin_clear: 
         action: int64 ``[A]``.
         bin_clear: bool ``[P]``, whether the end effector hits no wall of the bin at each pick cell.
     """
-    (maps, stable, highest, rim), (tote_w, tote_d, _) = measured, cell.tote_size
+    (maps, stable, highest, over), (tote_w, tote_d, _) = measured, cell.tote_size
     x_bin, y_bin, x_tote, y_tote, _ = split_action(cell, action)
     item = maps.item.map(lambda part: part.expand(len(action)))
-    picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action)
+    picked, rotation, *_, x, y, w, d = carry(cell, item, action)
     parity = rotation % 2
     item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)
-    effector_leaves = is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d)
     footprint = footprint_index(cell.tote_size, parity, x.clamp(0, tote_w - 1), y.clamp(0, tote_d - 1))
-    place = footprint_index(cell.tote_size, rotation % len(cell.effectors), x_tote, y_tote)
+    place = footprint_index(cell.tote_size, rotation % len(over.leaves), x_tote, y_tote)
     top = maps.rest.flatten()[footprint] + item.h
-    pick = x_bin * cell.bin_size[1] + y_bin
-    checks = [  # from the last to the first, so that the first failure has the last word
-        (Failure.UNSTABLE, ~stable.flatten()[footprint]),
-        (Failure.ITEM_COLLISION, ~is_clear(top, maps.clearance.flatten()[place])),
-        (Failure.OVERFLOW, overflows(top, torch.tensor(highest))),
-        (Failure.TOTE_COLLISION, item_leaves | (effector_leaves & ~is_clear(top, rim))),
-        (Failure.BIN_COLLISION, ~bin_clear[pick]),
-        (Failure.PICK_MISS, ~picked.grips),
-    ]
-    if cell.limits is not None:
-        limits, number = cell.limits.on(action.device), footprint_index(cell.tote_size, rotation, x_tote, y_tote)
-        reached = is_within_reach(limits.lowest_top.flatten()[number], limits.highest_top.flatten()[number], top)
-        checks.insert(0, (Failure.OUT_OF_REACH, ~limits.pick_ok[pick] & bin_clear[pick] | ~reached))
-    failure = torch.zeros_like(action)
-    for kind, failed in checks:
-        failure = torch.where(failed, int(kind), failure)
-    return failure
+    picked = picked._replace(collides=~bin_clear[x_bin * cell.bin_size[1] + y_bin])
+    return first_failure(picked, Resting(~item_leaves, top, highest, stable.flatten()[footprint]), over.at(place))

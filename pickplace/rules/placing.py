@@ -3,70 +3,49 @@
 Surfaces, see :func:`~pickplace.rules.state.surface_from`, are halved where heights are needed.
 """
 
-from collections.abc import Sequence
-from functools import reduce
+from collections.abc import Iterator
+from functools import cached_property, reduce
 
 import torch
 from torch import Tensor
 
-from pickplace.rules import large_items
 from pickplace.rules.cell import CellSpec
+from pickplace.rules.checks import FOOTPRINT, Over, Resting, combine
+from pickplace.rules.grasps import is_outside
 from pickplace.rules.item import Item
-from pickplace.rules.maps import FAR, NEVER, is_under, surround, windows
-from pickplace.rules.state import State, surface_from
+from pickplace.rules.maps import FAR, NEVER, is_under, rectangle_sums, surround, windows
+from pickplace.rules.state import surface_from
 from pickplace.rules.support.contact import Contact
 
-
-# ---------------------------------------------------------------------- the checks of a placement, one function each
-def rest(cells: Sequence[Tensor], under: Sequence[Tensor]) -> Tensor:
-    """Return the height on which an item comes to rest.
-
-    Loops over cells, so that the inner loops run over whole maps, which is fast.
-
-    Args:
-        cells: for each cell of a square at the footprint's minimum corner its surface, int32, all of one shape.
-        under: whether the item covers that cell, bool, broadcastable.
-    """
-    highest = torch.full((), NEVER, dtype=cells[0].dtype, device=cells[0].device)
-    for surface, used in zip(cells, under, strict=True):
-        highest = torch.maximum(highest, torch.where(used, surface, NEVER))
-    return highest >> 1
+LEAST_SIDE = 8  # of the square under an item; from there on :class:`LargeItems` is faster
+MAX_ENTRIES = 2**22  # of its tables; more problems are looked at in turn
 
 
-def overflows(top: Tensor, tote_height: Tensor) -> Tensor:
-    """Return whether an item's top passes the rim."""
-    return top > tote_height
-
-
-def is_within_reach(lowest: Tensor, highest: Tensor, top: Tensor) -> Tensor:
-    """Return whether the robot may bring an item's top to that height, see :class:`~pickplace.rules.cell.Limits`."""
-    return (lowest <= top) & (top <= highest)
-
-
-# ---------------------------------------------------------------------- maps
 def resting_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item) -> tuple[Tensor, Tensor]:
     """Return the height of the item's top for every footprint, and what it rests on; int32 ``[N, Q, W_T, D_T]`` each.
 
     Arguments as of :meth:`~pickplace.rules.state.State.each_item`.
 
     The top is ``NEVER`` where the item cannot rest: the footprint leaves the tote, the top passes the rim, or the
-    support is too small. The height below it is that of :func:`rest`, stable or not; ``FAR`` outside the tote.
+    support is too small. The height below it is that on which it would lie, stable or not; ``FAR`` outside the tote.
     """
     w, d = footprint_sizes(cell, item)
-    if large_items.are_large(cell):
-        z, stable = large_items.resting(cell, surface.permute(1, 2, 0), w, d)
-    else:
-        cells, under = footprint_cells(cell, surface, w, d)
-        z = rest(cells, under)
-        stable = cell.support.stable(Contact(cells, under, z, w, d))
+    count, at_once, kind = len(surface), max(1, len(surface)), OnFootprints
+    if cell.max_side >= LEAST_SIDE:
+        kind, at_once = LargeItems, max(1, MAX_ENTRIES // (len(surface.unique()) * cell.num_places))
+    parts = (slice(start, start + at_once) for start in range(0, max(1, count), at_once))
+    contacts = (kind(cell, surface[part], w[..., part], d[..., part]) for part in parts)
+    z, stable = (
+        torch.cat(each, -1) for each in zip(*((on.z, cell.support.stable(on)) for on in contacts), strict=True)
+    )
     top = z + item.h.to(z.dtype)
-    good = stable & ~overflows(top, tote_height) & ~item.is_empty
+    good = combine(FOOTPRINT, Resting(None, top, tote_height, stable)) & ~item.is_empty
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
 
 def unchecked_top(cell: CellSpec, surface: Tensor, item: Item) -> tuple[Tensor, Tensor]:
     """Return the same as :func:`resting_top`, but for every footprint in the tote, stable or not."""
-    z = rest(*footprint_cells(cell, surface, *footprint_sizes(cell, item)))
+    z = OnFootprints(cell, surface, *footprint_sizes(cell, item)).z
     return (z + item.h.to(z.dtype)).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
 
@@ -76,36 +55,90 @@ def footprint_sizes(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:
     return w, d
 
 
-def footprint_cells(
-    cell: CellSpec, surface: Tensor, w: Tensor, d: Tensor
-) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Return the cells of a square at every footprint's minimum corner, and whether the item covers them.
+class OnFootprints(Contact):
+    """The supporting cells under an item at rest on every footprint; quantities are ``[Q, W_T, D_T, N]``.
+
+    Footprints that leave the tote rest higher than any rim.
 
     Args:
         surface: int32 ``[N, W_T, D_T]``.
         w, d: as of :func:`footprint_sizes`.
-
-    Returns:
-        for each cell of the square its surface, int32 ``[W_T, D_T, N]``, beyond any height outside the tote; and bool
-        ``[Q, 1, 1, N]``.
     """
-    side = cell.max_side
-    padded = surround(surface.permute(1, 2, 0), (0, side - 1, 0, side - 1), 2 * FAR)
-    return windows(padded, side).flatten(0, 1).unbind(0), is_under(w, d, side).unbind(0)
+
+    def __init__(self, cell: CellSpec, surface: Tensor, w: Tensor, d: Tensor):
+        self.surface, self.side, self.w, self.d = surface.permute(1, 2, 0), cell.max_side, w, d
+        self.padded = surround(self.surface, (0, self.side - 1, 0, self.side - 1), 2 * FAR)
+        highest = self.padded[None]
+        # The maximum over a rectangle is a maximum along one axis, then along the other.
+        for axis, size, grid in ((1, w, cell.tote_size[0]), (2, d, cell.tote_size[1])):
+            parts = (torch.where(step < size, highest.narrow(axis, step, grid), NEVER) for step in range(self.side))
+            highest = reduce(torch.maximum, parts)
+        self.z = highest >> 1
+        self.supporting = surface_from(self.z)
+
+    @property
+    def surfaces(self):
+        return windows(self.padded, self.side).flatten(0, 1).unbind(0)
+
+    @property
+    def under(self):
+        return is_under(self.w, self.d, self.side).unbind(0)
 
 
-def clearance(cell: CellSpec, state: State) -> Tensor:
-    """Return the least top at which the end effector hits nothing, per shape and place cell.
+class LargeItems(OnFootprints):
+    """The same for large items on fine grids, where the work must not grow with the area of an item.
 
-    That is the highest tote cell under the end effector; where it leaves the tote, the rim. The result is int32
-    ``[N, B, W_T, D_T]``, for each of :attr:`~pickplace.rules.cell.CellSpec.effectors`.
+    For each height in a tote tables are made of the cells that have it, in which a row of any footprint is looked up.
     """
-    (tote_w, tote_d, _), surface = cell.tote_size, state.surface
-    maps = surface.new_empty(len(cell.effectors), tote_w, tote_d, len(surface))
-    rim = surface_from(state.tote_height)
+
+    @cached_property
+    def _levels(self) -> tuple[Tensor, Tensor]:
+        """Whether a cell has a height, bool ``[levels, W_T, D_T, N]``, and the index of the supporting cells' height.
+
+        Where no cell bears weight it is the index of a greater height, which no cell under the item has.
+        """
+        levels = torch.cat([self.surface.unique(), self.surface.new_tensor([4 * FAR])])
+        return self.surface == levels.view(-1, 1, 1, 1), torch.searchsorted(levels, self.supporting)
+
+    @property
+    def count(self) -> Tensor:
+        has_level, level = self._levels
+        return rectangle_sums(has_level, self.w, self.d, level)
+
+    def rows(self) -> Iterator[tuple[Tensor, Tensor]]:
+        (has_level, level), side = self._levels, self.side
+        _, wide, deep, count = has_level.shape
+        x_at, y_at, number = (torch.arange(size, device=level.device) for size in (wide, deep, count))
+        start = ((level * wide + x_at.view(-1, 1, 1)) * deep + y_at.view(-1, 1)) * count + number
+        y = y_at.view(-1, 1).short()
+        after = torch.where(has_level, y, deep).flip(2).cummin(2).values.flip(2)  # first of the level from y on
+        before = torch.where(has_level, y, -1).cummax(2).values
+        end = start + (self.d - 1) * count
+        for x in range(side):
+            row, most = x * deep * count, after.numel() - 1
+            first, last = after.take((start + row).clamp_(max=most)) - y, before.take((end + row).clamp_(max=most)) - y
+            held = (x < self.w) & (first < self.d)
+            yield torch.where(held, first, side), torch.where(held, last, -1)
+
+
+def over_tote(cell: CellSpec, surface: Tensor, rim: Tensor) -> Over:
+    """Return the facts of the end effector over every place cell; each ``[T, W_T, D_T, N]``, or broadcasts to that.
+
+    ``T`` counts :attr:`~pickplace.rules.cell.CellSpec.effectors`; with limits of the robot, rotations.
+
+    Args:
+        surface: int32 ``[N, W_T, D_T]``.
+        rim: height of the tote, ``[N]``.
+    """
+    (tote_w, tote_d, _), device = cell.tote_size, surface.device
+    x, y = torch.arange(tote_w, device=device)[:, None], torch.arange(tote_d, device=device)
+    leaves, obstacle = [], surface.new_empty(len(cell.effectors), tote_w, tote_d, len(surface))
     for number, shape in enumerate(cell.effectors):
+        leaves.append(
+            is_outside(x - shape.ref_x, shape.width, tote_w) | is_outside(y - shape.ref_y, shape.depth, tote_d)
+        )
         after_x, after_y = shape.width - 1 - shape.ref_x, shape.depth - 1 - shape.ref_y
-        walled = surround(surface.permute(1, 2, 0), (shape.ref_x, after_x, shape.ref_y, after_y), rim)
+        walled = surround(surface.permute(1, 2, 0), (shape.ref_x, after_x, shape.ref_y, after_y), 0)
         highest = []
         for box in shape.body:
             under = walled
@@ -113,5 +146,10 @@ def clearance(cell: CellSpec, state: State) -> Tensor:
             for axis, begin, size, grid in ((0, box.x, box.width, tote_w), (1, box.y, box.depth, tote_d)):
                 under = reduce(torch.maximum, [under.narrow(axis, begin + i, grid) for i in range(size)])
             highest.append(under)
-        maps[number] = reduce(torch.maximum, highest) >> 1
-    return maps.permute(3, 0, 1, 2)
+        obstacle[number] = reduce(torch.maximum, highest) >> 1
+    over = Over(torch.stack(leaves)[..., None], rim.int(), obstacle)
+    if cell.limits is None:
+        return over
+    turns, limits = [turn % len(cell.effectors) for turn in range(cell.rotations)], cell.limits.on(device)
+    lowest, highest = limits.lowest_top[..., None], limits.highest_top[..., None]
+    return Over(over.leaves[turns], over.rim, obstacle[turns], lowest, highest)

@@ -8,10 +8,9 @@ from torch import Tensor
 
 from pickplace.rules.bin import remove_item, select_item, take_item
 from pickplace.rules.cell import CellSpec, EffectorShape
+from pickplace.rules.checks import Over, Resting, first_failure
 from pickplace.rules.grasps import (
     carry,
-    footprint_index,
-    is_clear,
     is_outside,
     split_action,
     split_footprint,
@@ -19,8 +18,7 @@ from pickplace.rules.grasps import (
 )
 from pickplace.rules.item import Item
 from pickplace.rules.maps import NEVER, is_under, rectangle, square_cells, squares
-from pickplace.rules.placing import is_within_reach, overflows, rest
-from pickplace.rules.state import Failure, State, surface_from
+from pickplace.rules.state import State, surface_from
 from pickplace.rules.support.contact import Contact
 
 
@@ -51,9 +49,8 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
     side, reach = cell.max_side, max(ee_w, ee_d)
-    cells, under = squares(surface, x, y, side).unbind(0), is_under(w, d, side).unbind(0)
-    z = rest(cells, under)
-    contact = Contact(cells, under, z, w, d)
+    cells, under = squares(surface, x, y, side), is_under(w, d, side)
+    z = torch.where(under, cells, NEVER).amax(0) >> 1
     top = z.long() + item.h
     covered = body_cells(cell.effectors, reach, action.device)  # [side * side, B]
     if len(cell.effectors) > 1:
@@ -62,22 +59,12 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)
     effector_leaves = is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d)
 
-    checks = [  # from the last to the first, so that the first failure has the last word
-        (Failure.UNSTABLE, ~cell.support.stable(contact)),
-        (Failure.ITEM_COLLISION, ~is_clear(top, highest)),
-        (Failure.OVERFLOW, overflows(top, tote_height)),
-        (Failure.TOTE_COLLISION, item_leaves | (effector_leaves & ~is_clear(top, tote_height))),
-        (Failure.BIN_COLLISION, picked.collides),
-        (Failure.PICK_MISS, ~picked.grips),
-    ]
-    if cell.limits is not None and picked.unreachable is not None:
-        _, _, x_tote, y_tote, _ = split_action(cell, action)
-        limits, number = cell.limits.on(action.device), footprint_index(cell.tote_size, rotation, x_tote, y_tote)
-        lowest, highest_top = limits.lowest_top.flatten()[number], limits.highest_top.flatten()[number]
-        checks.insert(0, (Failure.OUT_OF_REACH, picked.unreachable | ~is_within_reach(lowest, highest_top, top)))
-    failure = torch.zeros_like(action)
-    for kind, failed in checks:
-        failure = torch.where(failed, int(kind), failure)
+    over = Over(effector_leaves, tote_height, highest)
+    if cell.limits is not None:
+        limits, place = cell.limits.on(action.device), (rotation, *split_action(cell, action)[2:4])
+        over = over._replace(lowest=limits.lowest_top[place], highest=limits.highest_top[place])
+    resting = Resting(~item_leaves, top, tote_height, cell.support.stable(Contact(cells, under, z, w, d)))
+    failure = first_failure(picked, resting, over)
     footprint = torch.stack([x, y, w, d], -1)
     after = _add_item(cell, surface, footprint, z, torch.where(failure == 0, item.h, 0))
     return Step(after, failure, top, footprint, item, taken)

@@ -19,7 +19,7 @@ from pickplace import CellSpec, Failure, Item, PickPlaceEnv, State
 from pickplace.items.distributions import Uniform
 from pickplace.planners.heuristics import JointDBL
 from pickplace.planners.use import decide
-from pickplace.rules import large_items
+from pickplace.rules import placing
 from pickplace.rules.cell import Limits, reference_cell
 from pickplace.rules.grasps import all_grasps, central_pick, heuristic_pick
 from pickplace.rules.masks import (
@@ -39,11 +39,11 @@ from pickplace.rules.support.contact import Contact
 
 
 @settings(max_examples=150)
-@given(problems(limited=st.booleans(), count=2, shaped=st.booleans()), st.sampled_from([1, large_items.LEAST_SIDE]))
+@given(problems(limited=st.booleans(), count=2, shaped=st.booleans()), st.sampled_from([1, placing.LEAST_SIDE]))
 def test_masks_equal_the_step_and_the_oracle(problem, least_side):
     cell, cases = problem
     state, actions = state_of(*cases), torch.arange(cell.num_actions)
-    with patch.object(large_items, "LEAST_SIDE", least_side):
+    with patch.object(placing, "LEAST_SIDE", least_side):
         maps = placing_maps(cell, state)
     masks, reached = action_mask(cell, maps), footprint_mask(cell, maps)
     footprints = action_footprints(cell, state.items)
@@ -216,18 +216,18 @@ def test_half_or_hull_equals_scipys_hull(data):
     assert rest_on(heights, (w, d, 1), "half_or_hull") == (SUCCESS if 2 * len(held) > w * d or inside else UNSTABLE)
 
 
-@pytest.mark.parametrize("at_once", [1, large_items.MAX_ENTRIES])
+@pytest.mark.parametrize("at_once", [1, placing.MAX_ENTRIES])
 @pytest.mark.parametrize(("support", "unit"), [("half_or_hull", 3), ("half_or_hull", 10), ("corners", 4), (0.7, 5)])
 def test_large_items_rest_as_small_ones_do(support, unit, at_once, monkeypatch):
     sizes = {"bin_size": (5 * unit, 5 * unit, 1), "tote_size": (7 * unit, 6 * unit, 8 * unit), "support": support}
     items, effector = Uniform((1, 5), (1, 5), (1, 5), unit=unit), {"effector_size": (1, 1), "pick_rule": "overlap"}
     env = PickPlaceEnv(items, num_envs=2, masks=(), rotations=2, **sizes, **effector)
     planner, seen, stable = JointDBL(env.cell), env.reset(), 0
-    monkeypatch.setattr(large_items, "MAX_ENTRIES", at_once)
+    monkeypatch.setattr(placing, "MAX_ENTRIES", at_once)
     for _ in range(2 if unit > 5 else 12):
         each = []
         for least_side in (1, 999):
-            monkeypatch.setattr(large_items, "LEAST_SIDE", least_side)
+            monkeypatch.setattr(placing, "LEAST_SIDE", least_side)
             each.append(resting_top(env.cell, *env.state.each_item()))
         (top, rest), (expected_top, expected_rest) = each
         assert torch.equal(top, expected_top) and torch.equal(rest, expected_rest)

@@ -85,7 +85,7 @@ class Contact:
     def in_hull(self) -> Tensor:
         """Return which cells under the items lie inside the hull of the supporting cells, bool ``[S * S, N]``."""
         under = torch.stack([*self.under])
-        return hull.cells_inside((torch.stack([*self.surfaces]) == self.supporting) & under, under)
+        return hull.cells_inside(torch.stack([*self.cells()]), under)
 
 
 class Patches:

@@ -1,6 +1,7 @@
 """The stability rules that have a short name."""
 
 from dataclasses import dataclass, field
+from math import nextafter
 
 from torch import Tensor
 
@@ -22,15 +23,11 @@ class Share(Support):
     def __post_init__(self):
         number("support.least", self.least, 0, 1)
 
-    def is_enough(self, share: Tensor) -> Tensor:
-        """Return whether a supported share of the footprint, float64, suffices alone."""
-        return share >= self.least
-
     def stable(self, contact: Contact) -> Tensor:
-        return self.is_enough(contact.share)
+        return contact.share >= self.least
 
     def measured(self, patches: Patches) -> Tensor:
-        return self.is_enough(patches.share)
+        return patches.share >= self.least
 
 
 @dataclass(frozen=True)
@@ -41,11 +38,10 @@ class Half(Share):
 
 
 @dataclass(frozen=True)
-class MoreThanHalf(Half):
+class MoreThanHalf(Share):
     """More than half of the footprint is supported."""
 
-    def is_enough(self, share: Tensor) -> Tensor:
-        return share > self.least
+    least: float = field(default=nextafter(0.5, 1), init=False)  # the next number after a half
 
 
 @dataclass(frozen=True)

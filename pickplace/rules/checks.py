@@ -1,0 +1,84 @@
+"""The checks of an action, in the order of the rules: one list, which the single step, masks and measured totes read.
+
+A check looks at the facts of a scope: of a pick (a :class:`~pickplace.rules.grasps.Grasp`), of an item at rest on a
+footprint, or of the end effector over the tote. The single step looks at all facts of one action. Masks combine the
+checks of each scope for all picks, all footprints, and all places of the end effector.
+"""
+
+from collections.abc import Callable
+from functools import reduce
+from operator import and_
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from pickplace.rules.maps import NEVER
+from pickplace.rules.state import Failure
+
+#: The scopes. A check of a pick or a footprint is passed or not. One of a place of the end effector says which height
+#: its suction face, which is that of the item's top, must have at least, or at most.
+PICK, FOOTPRINT, LEAST_TOP, GREATEST_TOP = range(4)
+_COMPARE = {LEAST_TOP: torch.ge, GREATEST_TOP: torch.le}
+_COMBINE = {PICK: and_, FOOTPRINT: and_, LEAST_TOP: torch.maximum, GREATEST_TOP: torch.minimum}
+
+
+class Resting(NamedTuple):
+    """Items at rest on footprints."""
+
+    inside: Tensor | None  # whether the footprint is in the tote; None: outside of it the top is above any rim
+    top: Tensor  # height of the item's top
+    rim: Tensor | int  # height of the tote
+    stable: Tensor
+
+
+class Over(NamedTuple):
+    """The end effector over places in the tote."""
+
+    leaves: Tensor  # whether it leaves the tote
+    rim: Tensor | int  # height of the tote
+    obstacle: Tensor  # greatest height under it in the tote
+    lowest: Tensor | None = None  # limits of the robot on the height of the suction face; None: it has none
+    highest: Tensor | None = None
+
+    def at(self, index: Tensor) -> "Over":
+        """Return the facts at flat indices of the places."""
+        return Over(*(part if part is None or part.dim() == 1 else part.flatten()[index] for part in self))
+
+
+#: Why an action may fail, the scope, and a function that returns of the scope's facts whether the check is passed, or
+#: the height; None: there is nothing to check.
+CHECKS: tuple[tuple[Failure, int, Callable[[Any], Tensor | None]], ...] = (
+    (Failure.PICK_MISS, PICK, lambda pick: pick.grips),
+    (Failure.BIN_COLLISION, PICK, lambda pick: ~pick.collides),
+    (Failure.TOTE_COLLISION, FOOTPRINT, lambda resting: resting.inside),
+    (Failure.TOTE_COLLISION, LEAST_TOP, lambda over: torch.where(over.leaves, over.rim, NEVER)),
+    (Failure.OVERFLOW, FOOTPRINT, lambda resting: resting.top <= resting.rim),
+    (Failure.ITEM_COLLISION, LEAST_TOP, lambda over: over.obstacle),
+    (Failure.UNSTABLE, FOOTPRINT, lambda resting: resting.stable),
+    (Failure.OUT_OF_REACH, PICK, lambda pick: pick.reachable),
+    (Failure.OUT_OF_REACH, LEAST_TOP, lambda over: over.lowest),
+    (Failure.OUT_OF_REACH, GREATEST_TOP, lambda over: over.highest),
+)
+
+
+def combine(scope: int, facts: Any) -> Any:
+    """Return whether all checks of a scope are passed, bool; of a height the one that passes all; None: any does."""
+    values = [value for _, where, find in CHECKS if where == scope and (value := find(facts)) is not None]
+    return reduce(_COMBINE[scope], values) if values else None
+
+
+def first_failure(pick: Any, resting: Resting, over: Over) -> Tensor:
+    """Return the failure code of each action by the first check that is not passed, int64; 0 if all are."""
+    failure = torch.zeros_like(resting.top)
+    facts = {PICK: pick, FOOTPRINT: resting, LEAST_TOP: over, GREATEST_TOP: over}
+    for kind, scope, find in reversed(CHECKS):  # the first has the last word
+        if (value := find(facts[scope])) is not None:
+            passed = _COMPARE[scope](resting.top, value) if scope in _COMPARE else value
+            failure = torch.where(passed, failure, int(kind))
+    return failure
+
+
+def is_within_reach(lowest: Tensor, highest: Tensor, face: Tensor) -> Tensor:
+    """Return whether the robot may bring the suction face to that height, see the limits of a cell."""
+    return (lowest <= face) & (face <= highest)
