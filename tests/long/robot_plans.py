@@ -44,7 +44,7 @@ CELLS = [
     ("joint_dbl", {}, DISC, 0.02),
     ("pretrained/r4", {}, {}, 0.05),
     ("joint_dbl", {}, ARRAY, 0.05),
-    ("pretrained/mixed", {"planner": "corner"}, MIXED | {"support": "hull", "support_margin": 0.25}, 0.05),
+    ("pretrained/mixed", {"planner": "corner"}, MIXED | {"support": "hull"}, 0.05),
     ("joint_dbl", {}, MASKS, 0.05),
     ("pretrained/unmasked", {"candidates": 5}, {}, 0.05),
     ("pretrained/fcn4d", {}, {}, 0.05),
