@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from problems import problems, state_of
 
 from pickplace import CellSpec, Failure
+from pickplace.rules.checks import is_within_reach
 from pickplace.rules.grasps import split_action
 from pickplace.rules.masks import action_mask, footprint_mask, num_feasible, placing_maps
-from pickplace.rules.placing import is_within_reach
 from pickplace.rules.reach import Annulus, ReachTable
 from pickplace.rules.step import apply
 
