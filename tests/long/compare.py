@@ -31,9 +31,11 @@ RENAMED_WORDS: dict[str, str] = {}
 #: Names of tensors in a checkpoint: pattern of the older form, and today's form.
 RENAMED_TENSORS: dict[str, str] = {r"^optimizer\|": "algorithm|optimizer|"}
 #: Tensors whose form changed: pattern of today's name, and a function that brings a tensor into the older form.
-CHANGED_TENSORS: dict[str, Callable[[Tensor], Tensor]] = {}
+CHANGED_TENSORS: dict[str, Callable[[Tensor], Tensor]] = {
+    r"collector\|(worker\d+\|)?environment\|item": lambda item: item[:, 0, :5],  # [N, M, columns] was [N, 5]
+}
 #: Tensors that the older checkout did not have: patterns of today's names.
-NEW_TENSORS: tuple[str, ...] = ()
+NEW_TENSORS = (r"collector\|(worker\d+\|)?environment\|arrived",)
 
 TRAINING = ["threads=1", "evaluation.episodes=16", "evaluation.batch_size=16"]
 #: A few batches each, through all phases, with a validation and a checkpoint within.
