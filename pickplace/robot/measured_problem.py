@@ -266,11 +266,11 @@ def _place(cell: CellSpec, box: Box, cell_size: float, clearance: float, name: s
                 f"{most_cells}, those of the bin."
             )
     h = int(whole_units(box.h, MILLIMETRE, up=True))
-    corner = [
+    least = [
         min(max(0, round(at / cell_size - size / 2)), most_cells - size)
         for at, size, most_cells in zip((box.x, box.y), whole, cell.bin_size[:2], strict=True)
     ]
-    item = Item(*(torch.tensor([part], device=device) for part in (*corner, *whole, h)))
+    item = Item(*(torch.tensor([part], device=device) for part in (*least, *whole, h)))
     check_longest(cell, item, name)
     inset = [
         math.ceil((size - side) / 2 + clearance / cell_size - ROUNDING) for size, side in zip(whole, sides, strict=True)
@@ -304,20 +304,20 @@ def _hits_others(
 ) -> np.ndarray:
     """Return at which of its centres ``[P, 2]`` the end effector touches another box that may be as high, ``[P]``.
 
-    The rectangle around it decides, which is turned with the item; other boxes are wider by the clearance. One that is
-    surely lower is in nobody's way.
+    The rectangle around it decides, which is turned with the item; other boxes are wider by the clearance. Boxes that
+    are clearly lower are ignored.
 
     Args:
         number: of the item that is picked, among the boxes.
     """
     box = boxes[number]
     sides = cell.effector_size[0] * side, cell.effector_size[1] * side
-    hit = np.zeros(len(centres), dtype=bool)
-    for other in boxes[:number] + boxes[number + 1 :]:
-        if other.h + accuracy >= box.h - accuracy - ROUNDING:
-            wide = replace(other, w=other.w + 2 * clearance, d=other.d + 2 * clearance)
-            hit |= touches(centres, sides, box.yaw, wide)
-    return hit
+    wide = [
+        replace(other, w=other.w + 2 * clearance, d=other.d + 2 * clearance)
+        for other in boxes[:number] + boxes[number + 1 :]
+        if other.h + accuracy >= box.h - accuracy - ROUNDING
+    ]
+    return np.any([np.zeros(len(centres)), *(touches(centres, sides, box.yaw, other) for other in wide)], 0)
 
 
 def _limits(cell: CellSpec, free: CellSpec, bin_clear: Tensor, centres: np.ndarray, grip: int, release: int) -> Limits:

@@ -162,7 +162,7 @@ def make_app(
         yield
         service.worker.shutdown(wait=False, cancel_futures=True)
 
-    def check_host(request: Request) -> None:
+    async def check_host(request: Request) -> None:
         # Not Starlette's TrustedHostMiddleware, whose answer is plain text.
         host = request.headers.get("host", "")
         if "*" not in hosts and re.sub(r":\d*$", "", host).lower() not in map(str.lower, hosts):
