@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from tensordict import TensorDict
 
 from pickplace.algorithms.base import Task
 from pickplace.config.composition import conf_dir
@@ -62,7 +63,7 @@ def composed(*overrides, name="train"):
 def algorithm_of(policy, critic, *overrides):
     """Return the algorithm of a command line, for batches of 8 slots and 6 steps."""
     cfg = composed(*overrides)
-    task = Task(STANDARD_TERMS, cfg.reward_scale, num_envs=8, rollout_length=6)
+    task = Task(STANDARD_TERMS, TensorDict({}, [1]), cfg.reward_scale, num_envs=8, rollout_length=6)
     return build("algo", cfg.algo, policy=policy, critic=critic, task=task)
 
 

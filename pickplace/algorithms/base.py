@@ -38,12 +38,14 @@ class Task:
 
     Attributes:
         terms: of the observation, by key.
+        observation: an observation of zeros, ``[1]``, with the masks of the policy.
         reward_scale: rewards are to be multiplied by this.
         num_envs: ``N``, environment slots.
         rollout_length: ``T``, steps of each slot in a batch.
     """
 
     terms: Mapping[str, Term]
+    observation: TensorDictBase
     reward_scale: float
     num_envs: int
     rollout_length: int

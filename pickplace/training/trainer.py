@@ -122,7 +122,8 @@ class Trainer:
     def _make_algorithm(self) -> None:
         """Make the algorithm, with its warm start, and check that its batches fit into memory."""
         cfg = self.cfg
-        task = Task(self.terms, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
+        observation = self.build_env(num_envs=1, masks=self.policy.masks).observation_spec.zero()
+        task = Task(self.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
         algorithm = build("algo", cfg.algo, policy=self.policy, critic=self.critic, task=task)
         if not isinstance(algorithm, Algorithm):
             raise ValueError(f"algo={excerpt(algorithm)}: expected an algorithm, such as algo=ppo.")
