@@ -135,7 +135,8 @@ class Simulation(ABC):
             loss = self.find_loss(scene)
         kept = [number for number in range(placed) if loss is None or number != loss.item]
         ending = loss.reason if loss else "done"
-        sentence, label = (text.format(loss.item + 1 if loss else "") for text in self.endings[ending])
+        words = self.endings.get(ending, (f"Item {{}}: {ending}.", ending))
+        sentence, label = (text.format(loss.item + 1 if loss else "") for text in words)
         outcome = Outcome(
             episode=plan.episode,
             ending=ending,

@@ -1,6 +1,7 @@
 """Boxes under gravity: cases whose outcome is known, and what ends an episode."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from pickplace.physics.execute import Execute
 from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.physics.scene import Scene
 from pickplace.physics.settle import Settle
-from pickplace.physics.simulation import FINAL_WAIT, wait
+from pickplace.physics.simulation import FINAL_WAIT, Loss, wait
 
 pytest.importorskip("mujoco")
 EXACT = Settle(gap=0.0)
@@ -139,3 +140,21 @@ def test_a_gap_and_an_error_move_the_boxes():
 def test_impossible_settings_are_refused(key, value):
     with pytest.raises(ValueError, match=f"physics.{key}=.*expected"):
         Settle(**{key: value})
+
+
+@dataclass(frozen=True)
+class Weary(Settle):
+    """Drops the second item."""
+
+    name: ClassVar[str] = "weary"
+
+    def place(self, scene, placement, error):
+        return Loss("tired", 1) if len(scene.boxes) else super().place(scene, placement, error)
+
+
+def test_another_scene_is_a_subclass_and_has_losses_of_its_own():
+    outcome = Weary().carry_out_one(bricks(0.0), record=True)
+    assert (outcome.ending, outcome.lost, outcome.placed, outcome.label) == ("tired", 1, 1, "tired")
+    assert outcome.sentence == "Item 2: tired." and len(outcome.motion.boxes) == 1
+    done = Settle().carry_out_one(bricks(0.0))
+    assert done.sentence.startswith("Carried out") and "motion" not in done.facts() and "sentence" not in done.facts()
