@@ -25,6 +25,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
+from typing import NamedTuple
 
 from pickplace.common.files import read_text
 from pickplace.common.validate import excerpt, is_number, is_whole
@@ -36,11 +37,28 @@ TOLERANCE = 1e-4  # distance by which boxes may overlap or float, for rounding; 
 MAX_LENGTH = 100.0  # greatest length or coordinate, m
 MAX_FILE = 2**28  # greatest size of a file, bytes
 
-#: Keys of every line, and further ones for a robot, with the number of their values; 0: one number.
-KEYS = {"episode": 0, "tote": 3, "corner": 3, "size": 3}
-ROBOT_KEYS = {"bin": 3, "item": 2, "effector": 2, "pick": 2, "place": 2, "rotation": 0}
-OPTIONAL_KEYS = ("body", "neighbours")  # which a robot may do without
 MAX_BODY = 2_048  # rectangles of a body
+
+
+class Value(NamedTuple):
+    """What a key of a line holds: a whole number, or ``count`` lengths and coordinates."""
+
+    expected: str
+    count: int = 0  # 0: one whole number
+    sides: int = 0  # how many of the lengths, the last ones, are sides above 0
+    most: int = 0  # greatest number of boxes of a list; 0: no list
+
+
+SIDES, CORNER = (Value("3 lengths above 0, in metres", 3, 3), Value("3 coordinates, in metres", 3))
+POINT = Value("2 coordinates, in metres", 2)
+#: Keys of every line, further ones for a robot, and those that a robot may do without.
+KEYS = {"episode": Value("a whole number >= 0"), "tote": SIDES, "corner": CORNER, "size": SIDES}
+ROBOT_KEYS = {"bin": SIDES, "item": POINT, "effector": Value("2 lengths above 0, in metres", 2, 2), "pick": POINT}
+ROBOT_KEYS |= {"place": POINT, "rotation": Value("0, 90, 180 or 270")}
+OPTIONAL_KEYS = {
+    "body": Value(f"up to {MAX_BODY:,} rectangles x, y, w, d, in metres", 4, 2, MAX_BODY),
+    "neighbours": Value(f"up to {MAX_BIN_ITEMS} boxes x, y, w, d, h, in metres", 5, 3, MAX_BIN_ITEMS),
+}
 
 Point = tuple[float, ...]
 
@@ -127,74 +145,48 @@ def _read_line(where: str, line: str) -> dict:
     if not isinstance(values, dict):
         raise ValueError(f"{where}: got {type(values).__name__}, expected an object with {', '.join(KEYS)}.")
     known = {**KEYS, **ROBOT_KEYS}
-    if unknown := [key for key in values if key not in known and key not in OPTIONAL_KEYS]:
+    kinds = {**known, **OPTIONAL_KEYS}
+    if unknown := [key for key in values if key not in kinds]:
         raise ValueError(f"{where}: {excerpt(unknown[0])}: there is no such key; expected {', '.join(known)}.")
-    needed = known if (ROBOT_KEYS.keys() | {*OPTIONAL_KEYS}) & values.keys() else KEYS
+    needed = known if values.keys() - KEYS.keys() else KEYS
     if missing := [key for key in needed if key not in values]:
         raise ValueError(f"{where}: {missing[0]}: missing; expected {', '.join(needed)}.")
-    for key in needed:
-        value = values[key]
-        if not known[key]:
-            if not is_whole(value) or value < 0 or (key == "rotation" and value not in (0, 90, 180, 270)):
-                expected = "0, 90, 180 or 270" if key == "rotation" else "a whole number >= 0"
-                raise ValueError(f"{where}: {key}={excerpt(value)}: expected {expected}.")
-            continue
-        is_side = key in ("tote", "size", "bin", "effector")
-        good = isinstance(value, list) and len(value) == known[key] and all(map(is_number, value))
-        if not good or not all((1e-6 if is_side else -MAX_LENGTH) <= part <= MAX_LENGTH for part in value):
-            kind = "lengths above 0" if is_side else "coordinates"
-            raise ValueError(f"{where}: {key}={excerpt(value)}: expected {known[key]} {kind}, in metres.")
-        values[key] = tuple(map(float, value))
-    if "body" in values:
-        values["body"] = _read_body(where, values["body"], values["effector"])
-    if "neighbours" in values:
-        values["neighbours"] = _read_neighbours(where, values)
-    return values
+    found = {key: _read_value(f"{where}: {key}", value, kinds[key]) for key, value in values.items()}
+    if found.get("rotation", 0) not in (0, 90, 180, 270):
+        raise ValueError(f"{where}: rotation={found['rotation']}: expected {ROBOT_KEYS['rotation'].expected}.")
+    for key, outer in (("body", "effector"), ("neighbours", "bin")):
+        for x, y, w, d, *_ in found.get(key, ()):
+            wide, deep, *_ = found[outer]
+            if min(x, y) < -TOLERANCE or x + w > wide + TOLERANCE or y + d > deep + TOLERANCE:
+                raise ValueError(f"{where}: {key}: {[x, y, w, d]} leaves the {outer} of {wide:g} x {deep:g} m.")
+    if "neighbours" in found:
+        w, d, _ = found["size"]
+        item = *found["item"], *((d, w) if found["rotation"] % 180 else (w, d))
+        for one, other in combinations([item, *found["neighbours"]], 2):
+            shared = [min(one[i] + one[i + 2], other[i] + other[i + 2]) - max(one[i], other[i]) for i in (0, 1)]
+            if min(shared) > TOLERANCE:
+                raise ValueError(f"{where}: neighbours: {excerpt([*other])} overlaps {excerpt([*one])} in the bin.")
+    return found
 
 
-def _read_body(where: str, value, effector) -> tuple[Point, ...]:
-    """Return the rectangles of an end effector."""
+def _read_value(where: str, value, kind: Value):
+    """Return the value of a key: a whole number, a tuple of numbers, or a tuple of such tuples."""
 
-    def is_good(box) -> bool:
-        if not isinstance(box, list) or len(box) != 4 or not all(map(is_number, box)):
+    def is_good(point) -> bool:
+        if not isinstance(point, list) or len(point) != kind.count or not all(map(is_number, point)):
             return False
-        (x, y, w, d), (wide, deep) = box, effector
-        inside = min(x, y) >= 0 and x + w <= wide + TOLERANCE and y + d <= deep + TOLERANCE
-        return inside and min(w, d) >= 1e-6
+        return max(map(abs, point)) <= MAX_LENGTH and all(side >= 1e-6 for side in point[kind.count - kind.sides :])
 
-    if not isinstance(value, list) or not 1 <= len(value) <= MAX_BODY or not all(map(is_good, value)):
-        raise ValueError(
-            f"{where}: body={excerpt(value)}: expected up to {MAX_BODY:,} rectangles x, y, w, d inside the effector, "
-            "in metres."
-        )
-    return tuple(tuple(map(float, box)) for box in value)
-
-
-def _read_neighbours(where: str, values: dict) -> tuple[Point, ...]:
-    """Return what else lies in the bin of a line whose other values have been read."""
-    value, (w, d, _) = values["neighbours"], values["size"]
-
-    def is_good(box) -> bool:
-        if not isinstance(box, list) or len(box) != 5 or not all(map(is_number, box)):
-            return False
-        return min(box[2:]) >= 1e-6 and max(map(abs, box)) <= MAX_LENGTH
-
-    if not isinstance(value, list) or len(value) > MAX_BIN_ITEMS or not all(map(is_good, value)):
-        raise ValueError(
-            f"{where}: neighbours={excerpt(value)}: expected up to {MAX_BIN_ITEMS} boxes x, y, w, d, h with sides "
-            "above 0, in metres."
-        )
-    wide, deep, _ = values["bin"]
-    for box in value:
-        x, y, far_x, far_y = box[0], box[1], box[0] + box[2], box[1] + box[3]
-        if min(x, y) < -TOLERANCE or far_x > wide + TOLERANCE or far_y > deep + TOLERANCE:
-            raise ValueError(f"{where}: neighbours: {excerpt(box)} leaves the bin of {wide:g} x {deep:g} m.")
-    item = *values["item"], *((d, w) if values["rotation"] % 180 else (w, d))
-    for one, other in combinations([item, *value], 2):
-        shared = [min(one[i] + one[i + 2], other[i] + other[i + 2]) - max(one[i], other[i]) for i in (0, 1)]
-        if min(shared) > TOLERANCE:
-            raise ValueError(f"{where}: neighbours: {excerpt([*other])} overlaps {excerpt([*one])} in the bin.")
-    return tuple(tuple(map(float, box)) for box in value)
+    if kind.count == 0:
+        points = []
+        good = is_whole(value) and value >= 0
+    else:
+        points = value if kind.most else [value]
+        good = isinstance(points, list) and len(points) <= max(kind.most, 1) and all(map(is_good, points))
+    if not good:
+        raise ValueError(f"{where}={excerpt(value)}: expected {kind.expected}.")
+    boxes = tuple(tuple(map(float, point)) for point in points)
+    return boxes if kind.most else boxes[0] if kind.count else value
 
 
 def _fault(placement: Placement, plan: EpisodePlan) -> str:

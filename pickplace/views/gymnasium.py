@@ -15,6 +15,8 @@ from pickplace.views.figures import INK
 from pickplace.views.recording import PlacedItem, Recording, items_in_bin, record_moves
 from pickplace.views.scene import draw_scene, item_colours
 
+WINDOW = "pickplace"  # title of the window of mode human
+
 
 class RenderedPickPlaceEnv(PickPlaceGymEnv):
     """:class:`~pickplace.envs.gymnasium.PickPlaceGymEnv` with rendering.
@@ -33,7 +35,6 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         super().__init__(items, **settings)
         self.render_mode = render_mode
         self._recording: Recording | None = None  # of the running episode
-        self._window: tuple | None = None  # the figure and the image in it
         sizes = self._env.items.sizes.tolist()
         self._colours = item_colours([PlacedItem(0, 0, 0, *size) for size in sizes]) if render_mode else {}
 
@@ -91,17 +92,11 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
             return
         from matplotlib import pyplot
 
-        if self._window is None:
-            figure = pyplot.figure("pickplace", figsize=(12, 6))
-            axes = figure.add_axes((0, 0, 1, 1))
-            axes.set_axis_off()
-            self._window = figure, axes.imshow(self._picture())
-        self._window[1].set_data(self._picture())
+        pyplot.figure(WINDOW, figsize=(12, 6), dpi=100, clear=True).figimage(self._picture())
         pyplot.pause(1 / self.metadata["render_fps"])
 
     def close(self) -> None:
-        if self._window is not None:
+        if self.render_mode == "human":
             from matplotlib import pyplot
 
-            pyplot.close(self._window[0])
-            self._window = None
+            pyplot.close(WINDOW)
