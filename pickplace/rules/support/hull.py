@@ -75,8 +75,8 @@ def cells_inside(supporting: Tensor, under: Tensor) -> Tensor:
 def _extents(side: int, device: torch.device) -> list[Tensor]:
     """Return how far the cells of a square reach along normals, from its corner: int32 ``[BITS, side * side]`` each."""
     near = torch.arange(side)
-    ends = torch.stack([near, near + 1])[..., None]
-    furthest = _greater_products(_normals(side), ends)[..., 0]  # [normals, axis, cell]
+    ends = torch.stack([near, near + 1])
+    furthest = (_normals(side)[:, :, None, None] * ends).amax(2)  # [normals, axis, cell]
     along = furthest[:, 0, :, None] + furthest[:, 1, None, :]
     return [part.int().to(device) for part in along.flatten(1).split(BITS)]
 
@@ -86,11 +86,6 @@ def _normals(side: int) -> Tensor:
     furthest = max(side - 1, 1)
     steps = range(-furthest, furthest + 1)
     return torch.tensor([(x, y) for x in steps for y in steps if gcd(x, y) == 1])
-
-
-def _greater_products(normals: Tensor, ends: Tensor) -> Tensor:
-    """Return the greatest product of each normal's parts ``[normals, axis]`` with the ends ``[1 or 2, ...]``."""
-    return (normals[:, :, None, None, None] * ends).amax(2)
 
 
 @lru_cache(maxsize=64)
@@ -120,7 +115,7 @@ def hull_patterns(side: int, margin: float, device: torch.device) -> list[tuple[
     inside = inside[:, None, :, None] & inside[None, :, None, :]  # [x, y, w, d]
     words, normals = [], _normals(side)
     for chunk in normals.split(BITS):
-        furthest = _greater_products(chunk, ends)  # [normals, axis, cell, size]
+        furthest = (chunk[:, :, None, None, None] * ends).amax(2)  # [normals, axis, cell, size]
         along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
         distance = 2 * margin * chunk.double().norm(dim=1).view(-1, 1, 1, 1, 1)
         beyond = along > distance
