@@ -36,14 +36,15 @@ class Over(NamedTuple):
     """The end effector over places in the tote."""
 
     leaves: Tensor  # whether it leaves the tote
-    rim: Tensor | int  # height of the tote
+    rim: Tensor  # height of the tote
     obstacle: Tensor  # greatest height under it in the tote
     lowest: Tensor | None = None  # limits of the robot on the height of the suction face; None: it has none
     highest: Tensor | None = None
 
     def at(self, index: Tensor) -> "Over":
         """Return the facts at flat indices of the places."""
-        return Over(*(part if part is None or part.dim() == 1 else part.flatten()[index] for part in self))
+        limits = [part.flatten()[index] for part in (self.lowest, self.highest) if part is not None]
+        return Over(self.leaves.flatten()[index], self.rim, self.obstacle.flatten()[index], *limits)
 
 
 #: Why an action may fail, the scope, and a function that returns of the scope's facts whether the check is passed, or
