@@ -220,8 +220,9 @@ def places_in_other_groups(word: str) -> list[str]:
 def _is_choice(override: Override) -> bool:
     """Return whether an override chooses the option of a group, rather than a value."""
     group = override.key_or_group
-    is_known = group in HydraConfig.get().runtime.choices or (conf_dir() / group).is_dir()  # not if it is removed
-    return bool(override.package or is_known or "/" in group) and not isinstance(override.value(), dict)
+    is_removed = override.is_delete() and (conf_dir() / group).is_dir()
+    is_listed = group in HydraConfig.get().runtime.choices and not isinstance(override.value(), dict)
+    return bool(override.package or "/" in group or is_listed or is_removed)
 
 
 def _group(choice: Override) -> str:

@@ -15,7 +15,8 @@ from pickplace.config.errors import sentence
 from pickplace.runs.folder import noted_overrides
 from pickplace.training import train
 
-CURRICULA = Path(__file__).parents[2] / "docs/examples/own_curriculum"
+EXAMPLES = Path(__file__).parents[2] / "docs/examples"
+CURRICULA = EXAMPLES / "own_curriculum"
 PLATEAU = {"_target_": "plateau", "window": 400, "patience": 3, "min_improvement": 0.01}
 MINE = """\
 # @package _global_
@@ -256,6 +257,32 @@ def test_full_error_shows_the_traceback(run, monkeypatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(ValueError, match="rotations=5"):
         run("train", "env.rotations=5")
+
+
+@pytest.mark.parametrize("name", ["train", "evaluate"])
+@pytest.mark.parametrize("words", ["--cfg job", "--cfg all", "--help", "--cfg job -p env --resolve", "--version"])
+def test_hydra_s_flags_with_its_debugging_output(run, tmp_path, name, words):
+    code, out, err = run(name, "hydra.verbose=true", *words.split())
+    assert code == 0, err
+    assert "1.3" in out if words == "--version" else "tote_size:" in out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_hydra_s_debugging_output_of_a_run(run, monkeypatch):
+    given = []
+    monkeypatch.setattr(train, "train", lambda cfg, run_dir: given.append((cfg.seed, run_dir.name)))
+    code, _, err = run("train", "hydra.verbose=true", "seed=3", "hydra.run.dir='${seed} and it\\'s'")
+    assert code == 0 and given == [(3, "3 and it's")], err
+    assert run("train", "seed=4,5", "hydra.mode=MULTIRUN", "hydra.sweep.dir=sweep")[0] == 0
+    assert given[1:] == [(4, "seed-4"), (5, "seed-5")]
+
+
+def test_several_folders_of_config_files(run, monkeypatch):
+    given = []
+    monkeypatch.setattr(train, "train", lambda cfg, run_dir: given.append(cfg))
+    folders = [word for name in ("own_model", "own_curriculum") for word in ("--config-dir", str(EXAMPLES / name))]
+    code, _, err = run("train", *folders, "model=mlp", "curriculum=careful")
+    assert code == 0 and given[0].curriculum.advance.window == 200 and given[0].model.actor.hidden, err
 
 
 @pytest.mark.parametrize("name", ["train", "evaluate"])
