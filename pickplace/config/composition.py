@@ -295,9 +295,10 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: Any = None)
         if groups and key in groups:
             cfg[key] = groups[key]
         elif (conf_dir() / key).is_dir() or (OmegaConf.is_dict(OmegaConf.select(cfg, key)) and not is_part):
+            new_run = "" if groups else ", or a new run with warm_start.weights=<run folder>"
             raise ValueError(
                 f"{line!r}: the checkpoint's config group {key!r} cannot be exchanged; expected overrides of its "
-                f"values, such as {key.replace('/', '.')}.<key>=<value>."
+                f"values, such as {key.replace('/', '.')}.<key>=<value>{new_run}."
             )
         elif override.is_delete() or override.is_sweep_override():
             raise ValueError(f"{line!r}: expected <key>=<value> with one value, on top of the checkpoint's config.")

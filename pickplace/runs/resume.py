@@ -99,7 +99,8 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
         before, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
         if before != now:
             raise ValueError(
-                f"{key}={now}: the run began with {before}, and a resumed run cannot change it; start a new one."
+                f"{key}={now}: the run began with {before}, and a resumed run cannot change it; expected a new run with "
+                f"warm_start.weights={place}."
             )
     if type(cfg.total_frames) is not int:
         raise ValueError(f"total_frames={cfg.total_frames}: expected a whole number >= 1 and < 2**63.")
