@@ -12,7 +12,7 @@ from typing import Any
 from loky import cpu_count
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.common.validate import excerpt, is_name, is_whole, short_text
+from pickplace.common.validate import MAX_COUNT, excerpt, is_name, is_whole, number, whole_number
 from pickplace.config.allowlist import modules_to_trust, own_modules, trusted_config
 from pickplace.config.composition import apply_overrides, compose_plain, parse, refuse_unknown_keys
 from pickplace.config.errors import WorkerDied, sentence
@@ -27,16 +27,11 @@ log = logging.getLogger(__name__)
 #: the latest validation.
 COUNTERS: dict[str, Any] = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
 
-#: Least and greatest value of each counter; other numbers need only be finite.
-RANGES = {"best": (-1, 1), "occupancy": (0, 1), "ci95_low": (0, 1), "ci95_high": (0, 1)}
-
-#: Types of further facts in a checkpoint, and their names.
-FACT_TYPES: dict[str, tuple] = {
-    "callbacks": (dict, "a dict"),
-    "ended": (bool, "true or false"),
-    "commit": (str | None, "a text or null"),
-    "versions": (dict, "a dict"),
-}
+#: Types of the facts in the checkpoint of a training, beside the config and the frames.
+FACT_TYPES = {
+    "iteration": int, "best": int | float, "latest": dict, "curriculum": dict, "callbacks": dict, "ended": bool,
+    "commit": str | None, "versions": dict,
+}  # fmt: skip
 
 #: Settings that may leave the run folder or the machine, and their values that do not. The user must repeat others on
 #: resume.
@@ -80,7 +75,7 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     Raises:
         ValueError: for a checkpoint that no training wrote, or a change that a resumed run cannot follow.
     """
-    _check_counters(place, facts)
+    _check_facts(place, facts)
     given = parse(overrides)
     trust = own_modules(next((word.value() for word in reversed(given) if word.key_or_group == "trust"), None))
     saved = trusted_config(facts["config"], trust, groups=None)
@@ -99,8 +94,8 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
         before, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
         if before != now:
             raise ValueError(
-                f"{key}={now}: the run began with {before}, and a resumed run cannot change it; expected a new run with "
-                f"warm_start.weights={place}."
+                f"{key}={now}: the run began with {before}, and a resumed run cannot change it; expected a new run, "
+                f"such as one with warm_start.weights={place}."
             )
     if type(cfg.total_frames) is not int:
         raise ValueError(f"total_frames={cfg.total_frames}: expected a whole number >= 1 and < 2**63.")
@@ -111,27 +106,22 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     return cfg
 
 
-def _check_counters(place: str, facts: dict) -> None:
-    if missing := [key for key in ("curriculum", *COUNTERS) if key not in facts]:
-        raise ValueError(f"resume={place}: the checkpoint has no {missing[0]!r}; expected one that a training wrote.")
-
-    def error(key: str, value, expected: str) -> ValueError:
-        words = f"the checkpoint's {short_text(key)} is {excerpt(value)}"
-        return ValueError(f"resume={place}: {words}; expected {expected} that a training wrote.")
-
-    for key, (kind, name) in FACT_TYPES.items():
-        if key in facts and not isinstance(facts[key], kind):
-            raise error(key, facts[key], name)
-    if not isinstance(facts["latest"], dict) or len(facts["latest"]) > 100 or not all(map(is_name, facts["latest"])):
-        raise error("latest", facts["latest"], "a validation")
-    for key, value in {"iteration": facts["iteration"], "best": facts["best"], **facts["latest"]}.items():
-        kind = int if key == "iteration" else (int, float)
-        least, most = (0, facts["frames"]) if key == "iteration" else RANGES.get(key, (1 - 2**63, 2**63 - 1))
-        if isinstance(value, bool) or not isinstance(value, kind) or not least <= value <= most:
-            raise error(key, value, f"a number from {least:,} to {most:,}")
-    frames = facts["curriculum"].get("frames") if isinstance(facts["curriculum"], dict) else None
-    if isinstance(frames, int) and frames > facts["frames"]:
-        raise error("curriculum|frames", frames, f"at most the {facts['frames']:,} frames")
+def _check_facts(place: str, facts: dict) -> None:
+    """Refuse facts that no training wrote."""
+    saved = f"resume={place}: the checkpoint's "
+    for key, kind in FACT_TYPES.items():
+        if key not in facts or not isinstance(facts[key], kind):
+            found = f"is {excerpt(facts[key])}" if key in facts else "is missing"
+            raise ValueError(f"{saved}{key} {found}; expected what a training wrote.")
+    latest, frames = facts["latest"], facts["frames"]
+    whole_number(f"{saved}iteration", facts["iteration"], 0, frames)
+    number(f"{saved}best", facts["best"], -1, 1)
+    if len(latest) > 100 or not all(map(is_name, latest)):
+        raise ValueError(f"{saved}latest is {excerpt(latest)}; expected a validation that a training wrote.")
+    for key, value in latest.items():
+        shares = key in ("occupancy", "ci95_low", "ci95_high")
+        number(f"{saved}{key}", value, 0 if shares else -MAX_COUNT, 1 if shares else MAX_COUNT)
+    whole_number(f"{saved}curriculum|frames", facts["curriculum"].get("frames", 0), 0, frames)
 
 
 def _refuse_remote_values(saved: DictConfig, repeated: set[str]) -> None:
@@ -221,8 +211,8 @@ class StopRequest:
 
     def restore(self) -> None:
         """Restore the earlier signal handlers."""
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
+        for each, handler in self._previous.items():
+            signal.signal(each, handler)
 
 
 @contextmanager
