@@ -174,7 +174,7 @@ def pack_without_gripper(cell: Cell, totes: int) -> tuple[list[float], list[Epis
     for episode in range(totes):
         size = [int(side) for side in cell.tote.split("x")]
         env = PickPlaceEnv(tote_size=size, rotations=cell.R, num_envs=1, stream="test", first_episode=episode, masks=())
-        metres = [[side * CELL_SIZE for side in sides] for sides in (size, env.cell.bin_size, env.cell.effector_size)]
+        metres = [[side * CELL_SIZE for side in sides] for sides in (size, env.cell.bin_size, env.cell.gripper.size)]
         placements, volume = [], 0
         for item, x, y, z, wide, deep in planned_placements(env):
             corner = tuple(at * CELL_SIZE for at in (x, y, z))

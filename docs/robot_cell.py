@@ -52,7 +52,7 @@ picture = image_axes.imshow(1e3 * images["tote"], cmap="viridis_r")
 figure.colorbar(picture, ax=image_axes, label="distance, mm", shrink=0.85)
 image_axes.set(xlabel="column", ylabel="row")
 
-box, effector = plan.box, np.array(planner.cell.effector_size) * SIDE
+box, effector = plan.box, np.array(planner.cell.gripper.size) * SIDE
 heights = cell.cameras["bin"].points(images["bin"])
 bin_axes.set_title("the item that was found, and the pick", color=INK)
 inside = (heights[..., :2] > 0).all(-1) & (heights[..., :2] < 0.25).all(-1)

@@ -14,7 +14,8 @@ from torchrl.envs.utils import step_mdp
 from pickplace import CellSpec, Item, PickPlaceEnv, State
 from pickplace.items.distributions import Uniform
 from pickplace.planners.heuristics import RandomFeasible
-from pickplace.rules.cell import CELL_SETTINGS, Limits
+from pickplace.rules.cell import CELL_SETTINGS
+from pickplace.rules.reach.base import Limits
 from pickplace.rules.state import surface_from
 from pickplace.rules.support import RULES, Support, read_support
 
@@ -65,10 +66,12 @@ def state_of(*cases: Case) -> State:
 def oracle_of(cell: CellSpec, case: Case) -> Oracle:
     """Return a case as the oracle sees it."""
     tables = {} if cell.limits is None else {k: v.tolist() for k, v in vars(cell.limits).items() if v is not None}
-    names = (name for name in CELL_SETTINGS if name not in ("height_unit", "reach", "support"))
+    names = (name for name in CELL_SETTINGS if name not in ("height_unit", "reach", "gripper", "support"))
     rule, margin = next(entry for entry in SUPPORTS if support_of(*entry) == cell.support)
-    settings = {name: getattr(cell, name) for name in names}
-    rules = Rules(**settings, support=rule, support_margin=margin, **tables)
+    settings = {name: getattr(cell, name) for name in names} | {"support": rule, "support_margin": margin}
+    gripper = {"effector_size" if name == "size" else name: value for name, value in vars(cell.gripper).items()}
+    gripper = {key: gripper[key] for key in ("effector_size", "body", "cup", "cup_size", "min_seal") if key in gripper}
+    rules = Rules(**settings, **gripper, pick_rule=type(cell.gripper).__name__.lower(), **tables)
     others = [(item[2:], item[:2]) for item in case.others]
     heights, bearing = case.heights.tolist(), case.bearing.tolist()
     return Oracle(rules, case.rim, case.item[2:], case.item[:2], heights, bearing=bearing, others=others)
@@ -125,11 +128,11 @@ def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=NEVER, 
     rule = draw(st.sampled_from(["contain", "overlap", "seal"] if shape else ["contain", "overlap"]))
     support = support_of(*draw(st.sampled_from(SUPPORTS)))
     cell = CellSpec(
-        (bin_w, bin_d, draw(st.sampled_from([1, 2, 1, 3]))), (tote_w, tote_d, 6), effector,
-        draw(st.sampled_from(rotations)), rule, support, **shape,
+        (bin_w, bin_d, draw(st.sampled_from([1, 2, 1, 3]))), (tote_w, tote_d, 6), effector_size=effector,
+        rotations=draw(st.sampled_from(rotations)), pick_rule=rule, support=support, **shape,
     )  # fmt: skip
     if draw(limited):
-        cell = replace(cell, limits=random_limits(cell, draw(st.integers(0, 999))))
+        cell = replace(cell, reach=random_limits(cell, draw(st.integers(0, 999))))
     most = [min(pair) if rule == "contain" else pair[0] for pair in zip((bin_w, bin_d), effector, strict=True)]
     cases = []
     for _ in range(count):

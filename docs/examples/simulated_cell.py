@@ -64,7 +64,7 @@ class SimulatedCell:
         cell = planner.cell
         scale = (cell_size, cell_size, cell_size * cell.height_unit)
         self.bin, self.tote = (tuple(np.multiply(size, scale)) for size in (cell.bin_size, cell.tote_size))
-        effector = tuple(np.multiply(cell.effector_size, cell_size))
+        effector = tuple(np.multiply(cell.gripper.size, cell_size))
         plan = EpisodePlan(0, self.tote, self.bin, effector, body=body_of(cell, cell_size))
         self.gantry: Gantry = self.simulation.make_scene(plan)
         focal = 0.8 * IMAGE[0] * CAMERA_HEIGHT / (max(*self.bin[:2], *self.tote[:2]) + 0.1)

@@ -11,8 +11,10 @@ To add an option, write one line into :data:`REGISTRY` and one file into ``conf/
 import inspect
 import re
 from collections.abc import Callable
+from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from importlib import import_module
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -48,16 +50,24 @@ REGISTRY: dict[str, dict[str, str]] = {
         "tote_bearing": "pickplace.rules.observation.ToteBearing",
         "tote_height": "pickplace.rules.observation.ToteHeight",
     },
-    "env.reach": {"annulus": "pickplace.rules.reach.Annulus", "table": "pickplace.rules.reach.ReachTable"},
+    "env.gripper": {
+        "contain": "pickplace.rules.gripper.rules.Contain",
+        "overlap": "pickplace.rules.gripper.rules.Overlap",
+        "seal": "pickplace.rules.gripper.rules.Seal",
+    },
+    "env.reach": {
+        "annulus": "pickplace.rules.reach.annulus.Annulus",
+        "table": "pickplace.rules.reach.table.ReachTable",
+    },
     "env.support": {
-        "half": "pickplace.rules.support.Half",
-        "more_than_half": "pickplace.rules.support.MoreThanHalf",
-        "hull": "pickplace.rules.support.Hull",
-        "bearing": "pickplace.rules.support.Bearing",
-        "half_or_hull": "pickplace.rules.support.HalfOrHull",
-        "corners": "pickplace.rules.support.Corners",
-        "full": "pickplace.rules.support.Full",
-        "share": "pickplace.rules.support.Share",
+        "half": "pickplace.rules.support.rules.Half",
+        "more_than_half": "pickplace.rules.support.rules.MoreThanHalf",
+        "hull": "pickplace.rules.support.rules.Hull",
+        "bearing": "pickplace.rules.support.rules.Bearing",
+        "half_or_hull": "pickplace.rules.support.rules.HalfOrHull",
+        "corners": "pickplace.rules.support.rules.Corners",
+        "full": "pickplace.rules.support.rules.Full",
+        "share": "pickplace.rules.support.rules.Share",
     },
     "items": {
         "kinds": "pickplace.items.distributions.Kinds",
@@ -146,6 +156,20 @@ def _make(place: str, node, given: dict):
             others = {key: value for key, value in settings.items() if key != unknown[1]}
             raise ValueError(unknown_key(f"{place}.{unknown[1]}", others, f"{place}.")) from error
         raise ValueError(f"{place}._target_={short_text(node['_target_'])}: {error}.") from error
+
+
+def node_of(place: str, part: Any) -> Any:
+    """Return the config of a part that :func:`build` makes of it: of a dataclass its name and its settings."""
+    if isinstance(part, (tuple, list)):
+        return [node_of(place, value) for value in part]
+    if not is_dataclass(part):
+        return part
+    path = f"{type(part).__module__}.{type(part).__qualname__}"
+    names = {path: name for name, path in names_at(place).items()}
+    settings = {
+        item.name: node_of(f"{place}.{item.name}", getattr(part, item.name)) for item in fields(part) if item.init
+    }
+    return {"_target_": names.get(path, path), **settings}
 
 
 def names_at(place: str) -> dict[str, str]:

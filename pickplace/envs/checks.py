@@ -37,9 +37,8 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
     # (x, y, w, d, h) -> the first kind like it: the rows of a long recording repeat themselves
     problems: dict[tuple[int, ...], int] = {}
     widest: dict[str, tuple[int, ...]] = {"bin_size": (w_b, d_b)}
-    if cell.pick_rule == "contain":
-        cup = tuple(end - begin for begin, end in cell.cup_bounds)
-        widest["effector_size" if cup == cell.effector_size else "the cup"] = cup
+    if largest := cell.gripper.largest_item:
+        widest["gripper.size" if largest == cell.gripper.size else "the cup"] = largest
     for kind, (w, d, h) in enumerate(items.sizes.tolist()):
         for what, (grid_w, grid_d) in widest.items():
             if w > grid_w or d > grid_d:
@@ -56,8 +55,6 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
                 "bin; expected a smaller bin, or fewer kinds."
             )
     description = f"{cell.describe()}, support={cell.support}"
-    if cell.pick_rule != "contain":
-        description += f", pick_rule={cell.pick_rule}"
     if cell.reach is not None:
         description += f", reach={cell.reach}"
     cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
@@ -65,7 +62,7 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
     if cell.limits is None:
         # The lower an item, the harder to clear the rim; and what is far from all walls of the tote is alike.
         rows = rows[rows[:, 4].argsort(stable=True)]
-        enough = 2 * (max(cell.effector_size) + cell.max_side)
+        enough = 2 * (max(cell.gripper.size) + cell.max_side)
         cell = replace(cell, tote_size=(min(cell.tote_size[0], enough), min(cell.tote_size[1], enough), height))
     # Positions in which the end effector can hold an item in the same ways have the same feasible footprints.
     distinct: dict[bytes, int] = {}

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from pickplace.config.allowlist import own_modules
 from pickplace.config.hydra_app import Command
 from pickplace.evaluation.artifacts import Artifacts, evaluation_table
 from pickplace.evaluation.parts import prepare
@@ -50,7 +51,7 @@ def _evaluate(cfg: DictConfig, run_dir: Path) -> float:
     engine = build_engine(cfg.physics) if cfg.physics else None
     make_env, planner, facts = prepare(cfg)
     cell, settings = make_env(0, 1).cell, episode_settings(cfg)
-    other = None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), settings)
+    other = None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), settings, own_modules(cfg.trust))
 
     log.info("%s episodes to play with %s", f"{ev.episodes:,}", planner.name)
     recorded = ev.episodes if artifacts.plans or engine else max(artifacts.replay, 1)

@@ -11,10 +11,10 @@ from pickplace.config.allowlist import own_modules, trusted_config
 from pickplace.config.composition import apply_overrides, places_in_other_groups, task_overrides
 from pickplace.config.registry import build
 from pickplace.evaluation.play import MakeEnv, check_episode_settings, check_play
-from pickplace.evaluation.result import YOUNG_SETTINGS, resolved
+from pickplace.evaluation.result import resolved
 from pickplace.planners.base import BatchPlanner
 from pickplace.planners.use import planner_parts
-from pickplace.rules.cell import CellSpec
+from pickplace.rules.cell import CELL_SETTINGS, SHORT_FORMS, CellSpec
 from pickplace.runs import checkpoint
 from pickplace.runs.provenance import first_weights, imitated_planner
 
@@ -90,7 +90,9 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
         elif key.split(".")[0] in TRAINED:
             ours.append(word)
             name = key.removeprefix("env.")
-            if name in YOUNG_SETTINGS and name not in changed.env:  # older checkpoints lack what is to be overridden
+            if (
+                name in (*CELL_SETTINGS, *SHORT_FORMS) and name not in changed.env
+            ):  # older checkpoints lack what is to be overridden
                 OmegaConf.update(changed, key, getattr(CellSpec, name), force_add=True)
     merged = apply_overrides(changed, ours, groups)
     with open_dict(cfg):

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +13,16 @@ from torch import Tensor
 
 from pickplace.common.files import read_file
 from pickplace.common.validate import excerpt, is_name, is_number
-from pickplace.config.registry import build
+from pickplace.config.allowlist import refuse_foreign_targets
 from pickplace.evaluation.play import Episodes
 from pickplace.physics.engine import Engine
 from pickplace.planners.base import BatchPlanner
-from pickplace.rules.cell import CELL_SETTINGS, CellSpec
+from pickplace.policies.restore import build_cell, cell_settings, differences
 from pickplace.rules.state import Failure
-from pickplace.rules.support import read_support, support_setting
 from pickplace.runs.provenance import commit, versions
 from pickplace.views.motion import Outcome
 
 MAX_EVALUATION = 2**26  # greatest size of an evaluation.json that is read, in bytes
-
-#: Settings of the cell that older files lack; they were played with the default.
-YOUNG_SETTINGS = ("body", "cup", "cup_size", "min_seal", "reach", "bin_items", "refill")
 
 
 def confidence95(values: Tensor, least: float = 0.0, most: float = 1.0) -> tuple[float, float]:
@@ -135,10 +131,8 @@ def paired_difference(result: dict, other: dict) -> dict:
 
 def episode_settings(cfg: DictConfig) -> dict:
     """Return the settings that determine which episodes an evaluation plays."""
-    env = {key: with_hash(value) for key, value in resolved(cfg.env).items()}
-    env["support"] = support_setting(read_support(build("env.support", env["support"])))  # the same for a short form
     return {
-        "env": env,
+        "env": {key: with_hash(value) for key, value in resolved(cfg.env).items()},
         "items": with_hash(resolved(cfg["items"])),
         "stream": cfg.evaluation.stream,
         "episodes": cfg.evaluation.episodes,
@@ -162,12 +156,13 @@ def is_same(ours: Any, theirs: Any) -> bool:
     return ours == theirs
 
 
-def read_comparison(path: Path, expected: dict) -> dict:
+def read_comparison(path: Path, expected: dict, trust: Collection[str] = ()) -> dict:
     """Return another ``evaluation.json`` of the same episodes, for :func:`paired_difference`.
 
     Args:
         path: the file.
         expected: :func:`episode_settings` of the evaluation at hand.
+        trust: modules whose classes its ``env`` may name.
 
     Raises:
         ValueError: for a file that cannot be read, or that is about other episodes.
@@ -175,23 +170,22 @@ def read_comparison(path: Path, expected: dict) -> dict:
     refused = f"compare={excerpt(str(path))}: expected an evaluation.json"
     try:
         other = json.loads(read_file(path, MAX_EVALUATION, empty=False))
-        cell, values, name = dict(other["env"]), other["occupancy"]["per_episode"], other.get("planner")
+        env, values, name = dict(other["env"]), other["occupancy"]["per_episode"], other.get("planner")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{refused} ({error}).") from error
     for key in ("stream", "seed", "episodes", "items"):
         if not is_same(expected[key], other.get(key)):
             found = excerpt(other.get(key))
             raise ValueError(f"compare={excerpt(str(path))}: its {key} is {found}, expected {excerpt(expected[key])}.")
-    unused = {
-        "min_seal": cell.get("pick_rule") != "seal",
-        "refill": cell.get("bin_items", 1) == 1,
-    }
-    for key in CELL_SETTINGS:
-        # A setting that is younger than the file, or the checkpoint, has its default.
-        default = getattr(CellSpec, key) if key in YOUNG_SETTINGS else None
-        ours, theirs = (env.get(key, default) for env in (expected["env"], cell))
-        if not is_same(ours, theirs) and not unused.get(key):
-            raise ValueError(f"compare={excerpt(str(path))}: env.{key}={excerpt(theirs)}, expected {ours}.")
+    refuse_foreign_targets(env, trust, "env")
+    cells = [build_cell(one, reach=None) for one in (expected["env"], env)]  # a missing setting has its default
+    found = [*differences(*map(cell_settings, cells), "env")]
+    reaches = [one.get("reach") for one in (expected["env"], env)]
+    if not is_same(*reaches):
+        found.append(("env.reach", *reaches))
+    for key, ours, theirs in found:
+        if key != "env.refill" or cells[0].bin_items > 1:
+            raise ValueError(f"compare={excerpt(str(path))}: {key}={excerpt(theirs)}, expected {ours}.")
     count = expected["episodes"]
     if not isinstance(values, list) or len(values) != count or not all(is_number(v) and 0 <= v <= 1 for v in values):
         raise ValueError(f"{refused} whose occupancy.per_episode is a list of {count} numbers between 0 and 1.")

@@ -18,7 +18,7 @@ def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePl
         return metres(*(at + side / 2 for at, side in zip(corner, sides, strict=True)))
 
     tote = metres(*cell.tote_size[:2], recording.tote_height)
-    sizes = tote, metres(*cell.bin_size), metres(*cell.effector_size)
+    sizes = tote, metres(*cell.bin_size), metres(*cell.gripper.size)
     plan = EpisodePlan(recording.episode, *sizes, body=body_of(cell, cell_size))
     for move in recording.moves:
         if not move.failure:
@@ -26,7 +26,7 @@ def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePl
             shape = cell.effector(move.rotation)
             placement = Placement(
                 metres(x, y, move.z), metres(w, d, move.item[4]), metres(*move.item[:2]),
-                middle(move.pick, cell.effector_size), middle(move.place, shape[:2]), 90 * move.rotation,
+                middle(move.pick, cell.gripper.size), middle(move.place, shape[:2]), 90 * move.rotation,
                 tuple((*metres(*other[:2]), *metres(*other[2:])) for other in move.others),
             )  # fmt: skip
             plan.placements.append(placement)

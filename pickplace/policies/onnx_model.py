@@ -14,9 +14,7 @@ import pickplace
 from pickplace.common.files import replaced_file
 from pickplace.common.validate import short_text
 from pickplace.policies.base import ScoresAnySize
-from pickplace.policies.restore import TrainedPolicy, load_policy
-from pickplace.rules.cell import CELL_SETTINGS
-from pickplace.rules.support import support_setting
+from pickplace.policies.restore import TrainedPolicy, cell_settings, load_policy
 
 TOLERANCE = 1e-5  # greatest difference between onnxruntime and torch, as a share of the greatest score
 #: Cells by which the totes, and the bins, of the check are larger than those of the training.
@@ -84,13 +82,13 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
         )
     keys = [key for key in policy.in_keys if not key.endswith("_mask")]
     seen = _observations(trained, keys, 1)
-    facts = {key: getattr(cell, key) for key in CELL_SETTINGS if key != "reach"}  # scores do not depend on it
+    facts = cell_settings(cell) | {"reach": None}  # scores do not depend on it
     model = _convert(Scores(policy, keys).eval(), keys, seen)
     model.model.metadata_props.update({
         "pickplace": pickplace.__version__,
         "checkpoint": str(checkpoint),
         "policy": type(policy).__name__,
-        "cell": json.dumps(facts, default=support_setting),
+        "cell": json.dumps(facts),
         "index": policy.score_index,
     })  # fmt: skip
     differences: dict[tuple[int, ...], float] = {}

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, cast
@@ -16,17 +16,17 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from pickplace.common.machine import usable_device
 from pickplace.config.allowlist import trusted_config
-from pickplace.config.registry import build
+from pickplace.config.registry import build, node_of
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
 from pickplace.policies.base import EstimatesValue, Policy, as_collection_policy, as_critic
-from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
+from pickplace.rules.cell import CELL_SETTINGS, SHORT_FORMS, CellSpec, cell_from_settings
 from pickplace.rules.item import Observation
 from pickplace.rules.masks import placing_maps
 from pickplace.rules.observation import Term, check_terms
 from pickplace.rules.state import State
 from pickplace.runs import checkpoint
 
-SIZES = ("effector_size", "bin_size", "tote_size", "body", "cup", "cup_size", "pick_rule", "min_seal")
+SIZES = ("gripper", "bin_size", "tote_size")
 
 
 def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: dict) -> Policy:
@@ -55,14 +55,14 @@ def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: di
         return restored(cell)
     except checkpoint.CheckpointError as error:
         trained = build_cell(trained_env, reach=None)  # a table of reach may be elsewhere
-        sizes: dict[str, Any] = {
-            key: getattr(trained, key) for key in SIZES if getattr(trained, key) != getattr(cell, key)
-        }
-        if not sizes:
+        ours, theirs = (cell_settings(one, SIZES) for one in (cell, trained))
+        different = [*differences(ours, theirs, "env")]
+        if not different:
             raise
-        restored(replace(cell, reach=None, limits=None, **sizes))  # if that fails too, the sizes are not the reason
-        ours = ", ".join(f"env.{key}={json.dumps(getattr(cell, key))}" for key in sizes)
-        theirs = ", ".join(map(json.dumps, sizes.values()))
+        sizes: dict[str, Any] = {key: getattr(trained, key) for key in SIZES}
+        restored(replace(cell, reach=None, **sizes))  # if that fails too, the sizes are not the reason
+        ours = ", ".join(f"{key}={json.dumps(value)}" for key, value, _ in different)
+        theirs = ", ".join(json.dumps(value) for _, _, value in different)
         raise checkpoint.CheckpointError(
             f"{ours}: the checkpoint was trained with {theirs}, and its policy does not serve every other cell."
         ) from error
@@ -127,8 +127,22 @@ def build_cell(env: dict, **given) -> CellSpec:
     Raises:
         ValueError: as of :func:`~pickplace.config.registry.build` and of the cell.
     """
-    own = {key: env[key] for key in CELL_SETTINGS if key in env and key not in given}
+    own = {key: env[key] for key in (*CELL_SETTINGS, *SHORT_FORMS) if key in env and key not in given}
     return cell_from_settings({**build("env", own), **given})
+
+
+def cell_settings(cell: CellSpec, keys: Collection[str] = CELL_SETTINGS) -> dict[str, Any]:
+    """Return settings of a cell as a config's group ``env`` has them."""
+    return {key: node_of(f"env.{key}", getattr(cell, key)) for key in keys}
+
+
+def differences(ours: Any, theirs: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield the keys in which two parts of configs differ, with both values."""
+    if isinstance(ours, dict) and isinstance(theirs, dict) and ours.get("_target_") == theirs.get("_target_"):
+        for key in {**ours, **theirs}:
+            yield from differences(ours.get(key), theirs.get(key), f"{place}.{key}".lstrip("."))
+    elif ours != theirs:
+        yield place, ours, theirs
 
 
 def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -> TrainedPolicy:

@@ -26,13 +26,15 @@ from pickplace.robot.measure import (
 from pickplace.robot.problem import Problem, check_longest, join_items, read_bearing
 from pickplace.robot.scene import BinMap, Scene
 from pickplace.rules.bin import taken_item
-from pickplace.rules.cell import MAX_SIDE, CellSpec, Limits, effector_centre, reference_cell
+from pickplace.rules.cell import MAX_SIDE, CellSpec
 from pickplace.rules.checks import is_within_reach
 from pickplace.rules.grasps import carry, footprint_index
+from pickplace.rules.gripper.base import effector_centre, reference_cell
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, footprint_mask
 from pickplace.rules.measured import MeasuredMaps, MeasuredTote, bearing_after, failures, floor_height, measured_maps
+from pickplace.rules.reach.base import Limits
 from pickplace.rules.state import State, surface_from
 
 
@@ -98,7 +100,7 @@ class MeasuredBin(Problem):
         limits = parts[0].cell.limits
         assert limits is not None
         everywhere = replace(limits, pick_ok=torch.ones_like(limits.pick_ok))  # each item has its own picks
-        cell = replace(parts[0].cell, limits=everywhere, bin_items=len(parts))
+        cell = replace(parts[0].cell, reach=everywhere, bin_items=len(parts))
         keys = ("top", "clearance", "rest", "greatest_top")
         maps = {key: torch.cat([getattr(part.maps, key) for part in parts]) for key in keys}
         step = parts[0].maps.level_step
@@ -139,7 +141,7 @@ def effector_centres(cell: CellSpec, item: Item, box: Box, side: float) -> np.nd
         box: the same as it was measured.
         side: length of a cell, m.
     """
-    (ee_w, ee_d), (x, y, w, d) = cell.effector_size, map(int, item[:4])
+    (ee_w, ee_d), (x, y, w, d) = cell.gripper.size, map(int, item[:4])
     number = np.arange(cell.num_picks)
     x_bin, y_bin = number // cell.bin_size[1], number % cell.bin_size[1]
     along = np.stack([effector_centre(x_bin, ee_w) - (x + w / 2), effector_centre(y_bin, ee_d) - (y + d / 2)], -1)
@@ -173,7 +175,6 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
         bin_size=(*cell.bin_size[:2], 1),
         tote_size=(*cell.tote_size[:2], tote.height),
         height_unit=MILLIMETRE / cell_size,
-        limits=None,
         bin_items=1,
         item_inset=(max(one.inset[0] for one in placed), max(one.inset[1] for one in placed)),
         longest_side=cell.longest_side or (None if cell.has_known_offsets else longest),
@@ -196,7 +197,7 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
         limits = _limits(cell, free, bin_clear, centres / cell_size, h + tote.accuracy, 2 * tote.accuracy)
         if len(boxes) > 1:
             limits = replace(limits, pick_ok=limits.pick_ok & (taken == number))
-        limited = replace(free, reach=None, limits=limits)
+        limited = replace(free, reach=limits)
         measured = measured_maps(limited, tote, item, sides)
         alone = item.rows((slice(None), None))
         seen_item = alone._replace(h=torch.tensor([[max(1, round(h / ratio))]], device=device))
@@ -293,7 +294,7 @@ def _misses_walls(centres: np.ndarray, cell: CellSpec, yaw: float, side: float) 
 
     The rectangle around it decides.
     """
-    turn, (wide, deep) = math.radians(yaw), (size * side / 2 for size in cell.effector_size)
+    turn, (wide, deep) = math.radians(yaw), (size * side / 2 for size in cell.gripper.size)
     cos, sin = abs(math.cos(turn)), abs(math.sin(turn))
     reach, far = np.array([wide * cos + deep * sin, wide * sin + deep * cos]), np.array(cell.bin_size[:2]) * side
     return ((centres >= reach - ROUNDING) & (centres <= far - reach + ROUNDING)).all(1)
@@ -311,7 +312,7 @@ def _hits_others(
         number: of the item that is picked, among the boxes.
     """
     box = boxes[number]
-    sides = cell.effector_size[0] * side, cell.effector_size[1] * side
+    sides = cell.gripper.size[0] * side, cell.gripper.size[1] * side
     wide = [
         replace(other, w=other.w + 2 * clearance, d=other.d + 2 * clearance)
         for other in boxes[:number] + boxes[number + 1 :]
@@ -332,8 +333,8 @@ def _limits(cell: CellSpec, free: CellSpec, bin_clear: Tensor, centres: np.ndarr
         release: height of the suction face above the item's planned top when it lets go, mm.
     """
     device, limits, ratio = bin_clear.device, free.limits, 1.0
-    if cell.reach is None:
-        limits, ratio = cell.limits, cell.height_unit / free.height_unit
+    if isinstance(cell.reach, Limits):  # tables in the height units of the cell
+        ratio = cell.height_unit / free.height_unit
     if limits is None:
         places = torch.zeros(cell.rotations, *cell.tote_size[:2], dtype=torch.int64, device=device)
         return Limits(bin_clear, places, places + FAR)
@@ -361,7 +362,7 @@ def _reached_picks(
     if limits.lowest_pick is not None and limits.highest_pick is not None:
         reached = reached & is_within_reach(limits.lowest_pick * ratio, limits.highest_pick * ratio, face)
     allowed = F.pad(reached.view(bin_w, bin_d), (1, 1, 1, 1), value=False).cpu().numpy()
-    at = [centres[:, axis] - side / 2 + reference_cell(side) for axis, side in enumerate(cell.effector_size)]
+    at = [centres[:, axis] - side / 2 + reference_cell(side) for axis, side in enumerate(cell.gripper.size)]
     good = np.ones(len(centres), dtype=bool)
     for round_x in (np.floor, np.ceil):
         for round_y in (np.floor, np.ceil):

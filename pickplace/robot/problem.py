@@ -10,8 +10,9 @@ from pickplace.robot.box import Box, DepthMapError
 from pickplace.robot.measure import labels_of_map, refuse, whole_map
 from pickplace.robot.scene import BinMap, Scene
 from pickplace.rules.bin import taken_item
-from pickplace.rules.cell import CellSpec, effector_centre
+from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_action
+from pickplace.rules.gripper.base import effector_centre
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, footprint_mask, placing_maps
@@ -111,7 +112,7 @@ class Problem:
 
     def _suction_face(self, x_bin: int, y_bin: int) -> tuple[float, float, float]:
         """Return the centre of the suction face over a pick cell when it grips the item."""
-        wide, deep = self.cell.effector_size
+        wide, deep = self.cell.gripper.size
         return effector_centre(x_bin, wide), effector_centre(y_bin, deep), int(self.state.items.h)
 
     def _top(self, action: Tensor) -> int:
@@ -171,7 +172,7 @@ def _read_cuboid(bin_map: np.ndarray, segment: np.ndarray, unit: str, hint: str 
 def check_longest(cell: CellSpec, item: Item, key: str) -> None:
     """Refuse an item that is longer than the tables of grasps hold."""
     longest = max(int(item.w), int(item.d))
-    if cell.pick_rule != "contain" and longest > cell.max_side:
+    if cell.gripper.largest_item is None and longest > cell.max_side:
         raise DepthMapError(
             f"{key}: the item is {longest} cells long, longer than any in training; expected at most {cell.max_side}."
         )

@@ -6,12 +6,12 @@ from typing import Any, cast
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.items.distributions import ItemDistribution
-from pickplace.policies.restore import build_cell
+from pickplace.policies.restore import build_cell, cell_settings, differences
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item
 
 #: Options of the cell that are no sizes; a policy should meet its own.
-RULES = ("support", "body", "cup", "cup_size", "pick_rule", "min_seal")
+RULES = ("support", "gripper")
 
 
 @dataclass(frozen=True)
@@ -21,14 +21,12 @@ class TrainingEnvelope:
     Attributes:
         kinds: every size ``(w, d, h)`` of its items, in cells and height units.
         tote_size: greatest tote, ``(W_T, D_T, H_T)``.
-        effector_size: ``(W_E, D_E)``.
         bin_items: number of items that the bin holds.
         rules: its options that are no sizes, such as ``support``, by name.
     """
 
     kinds: frozenset[tuple[int, int, int]]
     tote_size: tuple[int, ...]
-    effector_size: tuple[int, ...]
     bin_items: int
     rules: dict[str, Any]
 
@@ -38,8 +36,7 @@ class TrainingEnvelope:
         kinds = frozenset((int(w), int(d), int(h)) for w, d, h in items.sizes.tolist())
         env = cast(dict, OmegaConf.to_container(config.env, resolve=True))
         cell = build_cell(env, reach=None)  # a table of reach may be elsewhere
-        rules = {key: getattr(cell, key) for key in RULES}
-        return cls(kinds, tuple(env["tote_size"]), tuple(env["effector_size"]), cell.bin_items, rules)
+        return cls(kinds, cell.tote_size, cell.bin_items, cell_settings(cell, RULES))
 
     def warnings(self, cell: CellSpec, items: Item) -> list[str]:
         """Return a sentence for each thing that the policy never met: an item, the tote, the effector, the rule.
@@ -59,12 +56,9 @@ class TrainingEnvelope:
             found.append(f"{count} items in the bin: the policy met at most {self.bin_items}.")
         if self.tote_size[:2] != cell.tote_size[:2] or cell.tote_size[2] > self.tote_size[2]:
             found.append(f"tote of {_sides(cell.tote_size)} cells: the policy met {_sides(self.tote_size)}.")
-        if sorted(self.effector_size) != sorted(cell.effector_size):
-            sizes = _sides(cell.effector_size), _sides(self.effector_size)
-            found.append(f"end effector of {sizes[0]} cells: the policy met {sizes[1]}.")
-        for key, value in self.rules.items():
-            if value != getattr(cell, key):
-                found.append(f"{key}={getattr(cell, key)}: the policy met {key}={value}.")
+        for key, ours, theirs in differences(cell_settings(cell, RULES), self.rules):
+            if key != "gripper.size" or sorted(ours) != sorted(theirs):
+                found.append(f"{key}={ours}: the policy met {theirs}.")
         return found
 
 

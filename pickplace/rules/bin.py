@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.grasps import is_gripped
 from pickplace.rules.item import Item
 
 
@@ -76,7 +75,7 @@ def taken_item(cell: CellSpec, items: Item, x: Tensor, y: Tensor) -> Tensor:
         return torch.zeros_like(x)
     shape = cell.effector(0)
     near_x, near_y = items.x - (x - shape.ref_x)[:, None], items.y - (y - shape.ref_y)[:, None]
-    gripped = is_gripped(cell, near_x, near_y, items.w, items.d) & ~items.is_empty
+    gripped = cell.gripper.is_gripped(near_x, near_y, items.w, items.d, cell.item_inset) & ~items.is_empty
     return torch.where(gripped, items.h, 0).argmax(1)
 
 

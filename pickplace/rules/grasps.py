@@ -7,40 +7,16 @@ that differ by 180 degrees; else it is a rotation.
 """
 
 from collections.abc import Sequence
-from functools import reduce
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from pickplace.rules.cell import CellSpec, reference_cell
-from pickplace.rules.checks import PICK, combine, is_within_reach
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.checks import PICK, combine
+from pickplace.rules.gripper.base import reference_cell
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR
-
-
-def is_gripped(cell: CellSpec, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor) -> Tensor:
-    """Return whether the end effector grips the item: whether enough cells of the cup lie on it.
-
-    Args:
-        near_x, near_y: from the end effector's minimum corner to the item's, before turning, in cells; negative if the
-            item begins before it. They broadcast.
-        w, d: sides of the item.
-    """
-    contain = cell.pick_rule == "contain"
-    if not contain and any(cell.item_inset):
-        x, y = cell.item_inset
-        near_x, near_y, w, d = near_x + x, near_y + y, w - 2 * x, d - 2 * y
-    shared = [(_shared(near_x, w, box.x, box.width), _shared(near_y, d, box.y, box.depth)) for box in cell.cup_boxes]
-    if contain and len(shared) == 1:  # the same along each axis, which is faster
-        return (shared[0][0] == w) & (shared[0][1] == d)
-    count = reduce(torch.add, [x.clamp(min=0) * y.clamp(min=0) for x, y in shared])
-    return count >= (w * d if contain else cell.least_sealed)
-
-
-def _shared(near: Tensor, side: Tensor, begin: int, length: int) -> Tensor:
-    """Return how many cells an item and a part of the cup share along an axis; negative if there are cells between."""
-    return (near + side).clamp_(max=begin + length) - near.clamp(min=begin)
 
 
 def is_outside(corner: Tensor, side: Tensor | int, grid: int) -> Tensor:
@@ -90,11 +66,11 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | No
         x, y: tensors that broadcast with ``[..., N]``.
         blocked: bool ``[N, P]``, see :func:`~pickplace.rules.bin.blocked_picks`; None: the item lies alone.
     """
-    (bin_w, bin_d, wall), (ee_w, ee_d) = cell.bin_size, cell.effector_size
+    (bin_w, bin_d, wall), (ee_w, ee_d) = cell.bin_size, cell.gripper.size
     left, front = x - reference_cell(ee_w), y - reference_cell(ee_d)  # the end effector's minimum corner
     near_x, near_y = item.x - left, item.y - front
     back_x, back_y = ee_w - item.w - near_x, ee_d - item.d - near_y
-    gripped = is_gripped(cell, near_x, near_y, item.w, item.d)
+    gripped = cell.gripper.is_gripped(near_x, near_y, item.w, item.d, cell.item_inset)
     # Every edge of the rectangle has a cell of the body.
     leaves_bin = is_outside(left, ee_w, bin_w) | is_outside(front, ee_d, bin_d)
     # An item is never higher than its own top: just the walls and other items can be hit.
@@ -105,10 +81,7 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | No
     if blocked is not None:
         collides = collides | blocked.t().gather(0, pick.reshape(-1, pick.shape[-1])).view_as(pick)
     if cell.limits is not None:
-        limits = cell.limits.on(pick.device)
-        reachable = limits.pick_ok[pick]
-        if limits.lowest_pick is not None and limits.highest_pick is not None:
-            reachable = reachable & is_within_reach(limits.lowest_pick[pick], limits.highest_pick[pick], item.h)
+        reachable = cell.limits.on(pick.device).allow_pick(pick, item.h)
     return Grasp(gripped & ~item.is_empty, collides, reachable, near_x, near_y, back_x, back_y)
 
 
@@ -129,7 +102,7 @@ class Carried(NamedTuple):
 
 def carry(cell: CellSpec, item: Item, action: Tensor, blocked: Tensor | None = None) -> Carried:
     """Return where flat actions ``[A]`` bring items, of which there are ``[A]``; ``blocked`` as of :func:`grasp`."""
-    (ee_w, ee_d), (x_bin, y_bin, x_tote, y_tote, rotation) = cell.effector_size, split_action(cell, action)
+    (ee_w, ee_d), (x_bin, y_bin, x_tote, y_tote, rotation) = cell.gripper.size, split_action(cell, action)
     odd = rotation % 2 == 1
     picked = grasp(cell, item, x_bin, y_bin, blocked)
     turned = zip(*turn(picked.near_x, picked.near_y, picked.back_x, picked.back_y)[: cell.rotations], strict=True)
@@ -216,7 +189,7 @@ def central_pick(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> T
     """
     succeeds, offset = all_grasps(cell, item, blocked)
     ox, oy = offset[:, :, 0].unbind(-1)  # before turning, [N, P]
-    ee_w, ee_d = cell.effector_size
+    ee_w, ee_d = cell.gripper.size
     away = (2 * ox + item.w[:, None] - ee_w).abs() + (2 * oy + item.d[:, None] - ee_d).abs()
     return torch.where(succeeds, away, FAR).argmin(1)
 
@@ -269,7 +242,7 @@ def available_offsets(cell: CellSpec, item: Item, blocked: Tensor | None = None)
         bool ``[K, N]``: some pick cell, the only one, lifts the item with this offset under the end effector before
         turning; int64 ``[R, K, N]``: the class that this offset becomes by each rotation, clamped into range.
     """
-    (bin_w, bin_d, _), (ee_w, ee_d), count = cell.bin_size, cell.effector_size, cell.num_offsets
+    (bin_w, bin_d, _), (ee_w, ee_d), count = cell.bin_size, cell.gripper.size, cell.num_offsets
     here = torch.arange(count, device=item.x.device)[:, None]
     step = here + cell.min_offset  # [O, 1]
     x, y = item.x - step + reference_cell(ee_w), item.y - step + reference_cell(ee_d)  # the pick cell, [O, N]
@@ -288,7 +261,7 @@ def available_offsets(cell: CellSpec, item: Item, blocked: Tensor | None = None)
 
 def pick_blocks(cell: CellSpec, item: Item) -> Tensor:
     """Return the number of each pick cell's offset, int64 ``[N, P]``; ``K`` where the item is not under it at all."""
-    (_, bin_d, _), (ee_w, ee_d), count = cell.bin_size, cell.effector_size, cell.num_offsets
+    (_, bin_d, _), (ee_w, ee_d), count = cell.bin_size, cell.gripper.size, cell.num_offsets
     number = torch.arange(cell.num_picks, device=item.x.device)
     x = item.x[:, None] - (number // bin_d - reference_cell(ee_w)) - cell.min_offset
     y = item.y[:, None] - (number % bin_d - reference_cell(ee_d)) - cell.min_offset

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from pickplace.rules.bin import remove_item, select_item, take_item
-from pickplace.rules.cell import CellSpec, EffectorShape
+from pickplace.rules.cell import CellSpec
 from pickplace.rules.checks import Over, Resting, first_failure
 from pickplace.rules.grasps import (
     carry,
@@ -16,6 +16,7 @@ from pickplace.rules.grasps import (
     split_footprint,
     turned_size,
 )
+from pickplace.rules.gripper.base import EffectorShape
 from pickplace.rules.item import Item
 from pickplace.rules.maps import NEVER, is_under, rectangle, square_cells, squares
 from pickplace.rules.state import State, surface_from
@@ -44,7 +45,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     Args:
         action: int64 ``[N]``, the flat index, in ``[0, N_a)``.
     """
-    (surface, tote_height, items), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.effector_size
+    (surface, tote_height, items), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.gripper.size
     taken, item, blocked = take_item(cell, items, *split_action(cell, action)[:2])
     picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.

@@ -17,7 +17,6 @@ from pickplace.config.allowlist import modules_to_trust, own_modules, trusted_co
 from pickplace.config.composition import apply_overrides, compose_plain, parse, refuse_unknown_keys
 from pickplace.config.errors import WorkerDied, sentence
 from pickplace.config.references import saved_form
-from pickplace.rules.cell import CELL_SETTINGS
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import occupied, refuse_occupied
 
@@ -41,10 +40,9 @@ LOCAL_VALUES = {
     "logger.offline": ("true", True, None),
 }
 
-#: Settings that a resumed run cannot change, since the state of its episodes depends on them.
+#: Settings that a resumed run cannot change, as all of ``env``, since the state of its episodes depends on them.
 FIXED_KEYS = (
-    "seed", *(f"env.{key}" for key in CELL_SETTINGS), "env.num_envs", "env.observation", "items",
-    "model.mask_infeasible", "collector.workers", "warm_start.weights",
+    "seed", "items", "model.mask_infeasible", "collector.workers", "warm_start.weights",
 )  # fmt: skip
 
 
@@ -90,7 +88,7 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
         log.warning("threads=%s of the checkpoint: going on with %d, all of this machine", saved.threads, cpu_count())
         saved["threads"] = cpu_count()
     cfg = apply_overrides(saved, [str(word.input_line) for word in given if word.key_or_group != "trust"])
-    for key in FIXED_KEYS:
+    for key in (*FIXED_KEYS, *(f"env.{key}" for key in saved.env)):
         before, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
         if before != now:
             raise ValueError(

@@ -21,9 +21,9 @@ from starlette.requests import ClientDisconnect
 
 import pickplace
 from pickplace.common.validate import excerpt
-from pickplace.config.registry import names_at
+from pickplace.config.registry import node_of
+from pickplace.policies.restore import cell_settings
 from pickplace.robot.planner import Plan, Planner
-from pickplace.rules.cell import CELL_SETTINGS, Reach
 from pickplace.serve import live
 from pickplace.serve.request import MAX_REQUEST, PlanRequest, answer
 
@@ -147,9 +147,10 @@ def make_app(
         hosts: names by which clients may call it, ``"*"``: any.
     """
     service, budget = Service(planner, defaults, history), Rate(rate)
+    reach = node_of("env.reach", planner.cell.reach)
     health = Health(
         status="ok", version=pickplace.__version__, planner=name, checkpoint=checkpoint,
-        cell={key: getattr(planner.cell, key) for key in CELL_SETTINGS} | {"reach": kind_of_reach(planner.cell.reach)},
+        cell=cell_settings(planner.cell) | {"reach": "everywhere" if reach is None else reach["_target_"]},
     )  # fmt: skip
     page = live.page(planner.cell)
     page_headers = {
@@ -241,13 +242,6 @@ def make_app(
 
     _describe_requests(app)
     return app
-
-
-def kind_of_reach(reach: Reach | None) -> str:
-    """Return the name of a reach: the option of the config group, or the class if it is of the user's own."""
-    path = f"{type(reach).__module__}.{type(reach).__qualname__}"
-    options = {path: name for name, path in names_at("env.reach").items()}
-    return "everywhere" if reach is None else options.get(path, path)
 
 
 def _describe_requests(app: FastAPI) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pickplace.rules.cell import CellSpec, reference_cell
+from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_action
 from pickplace.rules.item import Item
 from pickplace.rules.state import Failure, State
@@ -109,7 +109,7 @@ def record_moves(
     heat = planner.heat_map(observation) if hasattr(planner, "heat_map") else None
     if heat is not None:
         heat = (255 * heat / heat.amax((1, 2), keepdim=True).clamp(min=1e-30)).round().byte().cpu().numpy()
-    ref_x, ref_y = (reference_cell(side) for side in cell.effector_size)
+    _, _, ref_x, ref_y, _ = cell.effector(0)
     items, contents, taken = (part.tolist() for part in (step.item.cuboids, state.items.cuboids, step.taken))
     moves = []
     for row in range(len(action)):

@@ -47,8 +47,8 @@ def page(recordings: list[Recording], cell: CellSpec, title: str) -> str:
 
 def effector_parts(cell: CellSpec) -> dict:
     """Return what the scene draws of the end effector: its sides, the rectangles of its body, the cells of its cup."""
-    cups = [[x, y] for x, column in enumerate(cell.cup_mask) for y, is_cup in enumerate(column) if is_cup]
-    return {"effector": cell.effector_size, "body": cell.effector(0).body, "cups": cups}
+    cups = [[x, y] for x, column in enumerate(cell.gripper.cup_mask) for y, is_cup in enumerate(column) if is_cup]
+    return {"effector": cell.gripper.size, "body": cell.effector(0).body, "cups": cups}
 
 
 @cache

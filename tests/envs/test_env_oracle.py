@@ -13,7 +13,7 @@ from tensordict import TensorDict
 
 from pickplace import PickPlaceEnv
 from pickplace.items.distributions import Kinds
-from pickplace.rules.cell import Limits
+from pickplace.rules.reach.base import Limits
 
 NUM_ENVS, STEPS = (1, 6, 12, 24), 25  # per configuration: 25 to 600 transitions
 
@@ -56,7 +56,7 @@ def make_env(rules, kinds, **settings):
     tables = {name: torch.tensor(table) for name, table in tables.items() if table is not None}
     limits = Limits(**tables) if tables else None
     given["support"] = support_of(given.pop("support"), given.pop("support_margin"))
-    return PickPlaceEnv(**given, limits=limits, items=Kinds(kinds), **settings)
+    return PickPlaceEnv(**given, reach=limits, items=Kinds(kinds), **settings)
 
 
 def read_items(observation, row):

@@ -15,8 +15,8 @@ from tensordict import TensorDict
 from pickplace import Failure, PickPlaceEnv
 from pickplace.config.registry import build
 from pickplace.items.distributions import Kinds, Recorded
-from pickplace.rules.cell import CELL_SETTINGS
-from pickplace.rules.reach import Annulus
+from pickplace.rules.cell import CELL_SETTINGS, SHORT_FORMS
+from pickplace.rules.reach.annulus import Annulus
 
 ID = "pickplace/PickPlace-v0"
 SMALL = {"tote_size": (4, 5, 2), "items": [(1, 1, 1), (2, 1, 1), (2, 2, 1)]}
@@ -89,7 +89,7 @@ def test_a_cup_and_a_reach_against_the_batched_environment_of_the_config():
     words += ["env.reach.radii=[8.5,15.5]", "env.reach.bin=[-16,-4,0]", "env.reach.tote=[4,-5,0]"]
     cfg, items = OmegaConf.to_container(composed(*words).env), Kinds([(5, 4, 2), (4, 4, 3), (6, 5, 2)])
     below = build("env", {**cfg, "num_envs": 1}, items=items, seed=6)
-    settings = {key: cfg[key] for key in CELL_SETTINGS if key != "reach"}
+    settings = {key: cfg[key] for key in (*CELL_SETTINGS, *SHORT_FORMS) if key not in ("gripper", "reach")}
     reach = Annulus((8.5, 15.5), (0, 10), (-16, -4, 0), (4, -5, 0))
     env, free = (gymnasium.make(ID, items=items, **settings, reach=given) for given in (reach, None))
     generator, forbidden, steps = np.random.default_rng(0), 0, 0

@@ -46,7 +46,7 @@ def same(left, right):
         {"num_envs": 1, "rotations": 3, "masks": ()},
         {"pick_rule": "overlap", "support": Hull(0.1), "masks": ("footprint", "action")},
         {"kinds": [(2, 3, 2), (1, 1, 1)], "bin_size": (4, 6, 2), "tote_size": (5, 7, 6), "effector_size": (2, 4)},
-        {"limits": random_limits(CellSpec(rotations=2), 1), "rotations": 2, "kinds": [(1, 1, 1)]},
+        {"reach": random_limits(CellSpec(rotations=2), 1), "rotations": 2, "kinds": [(1, 1, 1)]},
         {"bin_items": 3, "masks": ("footprint", "action")},
         {"bin_items": 4, "refill": "batch", "kinds": [(2, 3, 2), (1, 1, 1)], "bin_size": (4, 6, 1)},
     ],
@@ -164,10 +164,10 @@ NO_TOP.highest_top.fill_(0)
         ({"rotations": 5}, "rotations=5: expected 1, 2, 3 or 4"),
         ({"size": 3}, "size=3: expected one of bin_size"),
         ({"kinds": [(6, 1, 1)]}, "item 6x1x1 does not fit bin_size: expected at most 5x5"),
-        ({"kinds": [(4, 1, 1)]}, "item 4x1x1 does not fit effector_size: expected at most 3x3"),
+        ({"kinds": [(4, 1, 1)]}, "item 4x1x1 does not fit gripper.size: expected at most 3x3"),
         ({"kinds": [(1, 1, 6)]}, r"item 1x1x6 is higher than the tote: expected at most tote_size\[2\]=5"),
         ({"support": Hull(0.5)}, r"item 1x1x1 .* has no feasible action"),
-        ({"limits": NO_TOP}, "item 1x1x1 .* has no feasible action"),
+        ({"reach": NO_TOP}, "item 1x1x1 .* has no feasible action"),
         # Deep bin walls: the effector cannot reach an item in the corner of a bin smaller than itself.
         ({"kinds": [(1, 1, 1)], "bin_size": (2, 2, 2)}, "1x1x1 at x=0, y=0 in the bin has no feasible action"),
         # A tote smaller than the effector: only an item level with its rim can be placed.

@@ -8,7 +8,9 @@ from commands import composed
 from untrained import write_checkpoint
 
 from pickplace import CellSpec, Planner, load_policy
-from pickplace.rules.reach import Annulus, ReachTable
+from pickplace.rules.gripper.rules import Seal
+from pickplace.rules.reach.annulus import Annulus
+from pickplace.rules.reach.table import ReachTable
 from pickplace.runs import checkpoint
 from pickplace.runs.resume import resumed_config
 from pickplace.training.train import resume_run
@@ -117,7 +119,7 @@ def test_a_resumed_run_keeps_its_cell(trained, smoke, tmp_path):
     run_dir = tmp_path / "run"
     smoke(run_dir, *TINY, "effector=cup_round", "env.effector_size=[3,3]", "items.kinds=[[3,3,1],[4,3,1]]", *WIDE)
     begun = load_policy(run_dir).cell
-    assert begun.body == begun.cup == "disc" and begun.pick_rule == "seal" and begun.reach == Annulus(*WIDE_REACH)
+    assert begun.gripper == Seal((3, 3), "disc", "disc", (3, 3)) and begun.reach == Annulus(*WIDE_REACH)
     before = checkpoint.read(checkpoint.locate(run_dir, prefer="last"))[1]
     resume_run([f"resume={run_dir}", "total_frames=256"])
     after = checkpoint.read(checkpoint.locate(run_dir, prefer="last"))[1]

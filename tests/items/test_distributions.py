@@ -223,7 +223,7 @@ def test_ways_to_write_the_same_file(recorded, text):
         ("w,d,h,x,y\n1,1,1,-1,0\n", "line 2"),
         # Rows that do not fit the cell.
         ("w,d,h\n1,1,1\n\n6,1,1\n", "line 4: item 6x1x1 does not fit bin_size"),
-        ("w,d,h\n4,1,1\n", "line 2: item 4x1x1 does not fit effector_size"),
+        ("w,d,h\n4,1,1\n", "line 2: item 4x1x1 does not fit gripper.size"),
         ("w,d,h\n1,1,6\n", "line 2: item 1x1x6 is higher than the tote"),
         ("w,d,h,x,y\n1,1,1,0,0\n2,2,1,4,0\n", "line 3: item 2x2x1 at x=4, y=0 leaves the bin"),
     ],

@@ -32,7 +32,7 @@ def written(path, *lines):
 
 def test_a_recorded_episode_in_metres(tmp_path):
     """Cells of 4 cm, heights of 1 cm; by hand."""
-    cell = CellSpec((5, 5, 3), (6, 6, 20), (3, 2), height_unit=0.25)
+    cell = CellSpec((5, 5, 3), (6, 6, 20), effector_size=(3, 2), height_unit=0.25)
     moves = [
         Move((2, 1, 2, 1, 5), (1, 0), (0, 1), 1, (0, 2, 1, 2), 0, Failure.NONE),
         Move((0, 0, 1, 1, 4), (0, 0), (0, 0), 0, (0, 2, 1, 1), 5, Failure.NONE),
@@ -101,7 +101,7 @@ def test_a_body_in_metres(tmp_path):
 
 def test_neighbours_in_metres(tmp_path):
     """Cells of 4 cm, heights of 1 cm; by hand. Only the move that has neighbours names them."""
-    cell = CellSpec((5, 5, 3), (6, 6, 20), (3, 2), height_unit=0.25, bin_items=2)
+    cell = CellSpec((5, 5, 3), (6, 6, 20), effector_size=(3, 2), height_unit=0.25, bin_items=2)
     moves = [
         Move((2, 1, 2, 1, 5), (1, 0), (0, 1), 0, (0, 1, 2, 1), 0, Failure.NONE, others=[(0, 3, 1, 2, 6)]),
         Move((0, 3, 1, 2, 6), (0, 2), (3, 3), 0, (3, 3, 1, 2), 0, Failure.NONE),

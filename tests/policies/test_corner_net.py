@@ -80,7 +80,7 @@ def test_a_turned_problem_is_the_same_problem(problem):
     """Turning the tote by exchanging x and y, and the item with it, changes no score."""
     cell, cases = problem
     tote_w, tote_d, _ = cell.tote_size
-    turned = CellSpec(cell.bin_size, (tote_d, tote_w, cell.tote_size[2]), cell.effector_size)
+    turned = CellSpec(cell.bin_size, (tote_d, tote_w, cell.tote_size[2]), cell.gripper)
     flipped = [case._replace(heights=case.heights.T.copy(), bearing=case.bearing.T.copy()) for case in cases]
     for row, case in enumerate(cases):
         w, d = case.item[2:4]

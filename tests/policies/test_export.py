@@ -18,7 +18,7 @@ from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.policies.onnx_model import SHAPES, Scores
 from pickplace.rules.item import item_from_depth
 from pickplace.rules.masks import footprint_mask
-from pickplace.rules.reach import Annulus
+from pickplace.rules.reach.annulus import Annulus
 
 MAKERS = {
     "fcn_grasp": lambda: FcnGrasp(CellSpec(), head_std=1.0, compute_dtype="float32"),

@@ -11,7 +11,7 @@ from scenes import Gripper, World, disc, fault, plan_for, random_scene, rectangl
 from pickplace import CellSpec, DepthMapError, Planner
 from pickplace.robot.measure import box_of_map
 from pickplace.robot.planner import Box
-from pickplace.rules.cell import Limits
+from pickplace.rules.reach.base import Limits
 from pickplace.rules.support import Hull
 
 CELL, TOTE = 0.05, (0.3, 0.3, 0.25)
@@ -86,7 +86,7 @@ def scenes_of(name: str, scenes: int, seed: int, **options) -> Counter:
     bin_cells, cells = round(0.25 / side - 0.4), round(0.3 / side)
     sizes = {"bin_size": (bin_cells, bin_cells, round(0.05 / side)), "tote_size": (cells, cells, round(0.25 / side))}
     planner = Planner(CellSpec(**sizes, **settings, **options), planner="joint_dbl")
-    effector = tuple(np.multiply(planner.cell.effector_size, side))
+    effector = tuple(np.multiply(planner.cell.gripper.size, side))
     for _ in range(scenes):
         scene = random_scene(
             draw, TOTE, most, bin=tuple(np.multiply(planner.cell.bin_size, side)), effector=effector, gripper=gripper
@@ -167,15 +167,15 @@ def test_limits_of_the_robot_hold_for_the_pose_and_the_release():
     boxes = [Box(0.11, 0.125, 0.06, 0.06, 0.06, yaw) for yaw in (0, 20, 40)]
     flat = {"tote_depth": np.full((30, 30), 0.25), "cell_size": CELL, "accuracy": 0.005}
     for box in boxes:
-        assert plan_for(Planner(CellSpec(limits=open_limits), planner="joint_dbl"), items=[box], **flat).status == "ok"
+        assert plan_for(Planner(CellSpec(reach=open_limits), planner="joint_dbl"), items=[box], **flat).status == "ok"
         column = torch.zeros(5, 5, dtype=torch.bool)
         column[2] = True  # reference cells at x of 100 to 150 mm
-        planner = Planner(CellSpec(limits=replace(open_limits, pick_ok=column.flatten())), planner="joint_dbl")
+        planner = Planner(CellSpec(reach=replace(open_limits, pick_ok=column.flatten())), planner="joint_dbl")
         plan = plan_for(planner, items=[box], **flat)
         assert plan.status != "ok" or plan.pick.center[0] == pytest.approx(0.125)
     for top, status in ((0.07, "ok"), (0.069, "impossible")):
         low = replace(open_limits, highest_top=torch.full((4, 6, 6), 7))
-        cell = CellSpec(limits=low, height_unit=top / 7 / CELL)
+        cell = CellSpec(reach=low, height_unit=top / 7 / CELL)
         plan = plan_for(Planner(cell, planner="joint_dbl"), items=boxes[:1], tote_height=0.25, **flat)
         assert plan.status == status  # the suction face lets go at 60 mm and twice the accuracy
 
@@ -260,7 +260,7 @@ def test_warnings_name_what_lies_outside_the_training():
     planner = Planner.load("pretrained/r4", tote_size=(7, 6, 5), effector_size=(4, 4))
     plan = plan_for(planner, items=[Box(0.1, 0.1, 0.12, 0.08, 0.06)], tote_depth=np.full((7, 6), 0.25), **flat)
     assert [warning.partition(" cells")[0] for warning in plan.warnings] == [
-        "item of 3x2x1", "tote of 7x6x5", "end effector of 4x4",
+        "item of 3x2x1", "tote of 7x6x5", "gripper.size=[4, 4]: the policy met [3, 3].",
     ]  # fmt: skip
     known = plan_for(
         Planner.load("pretrained/r4"), items=[Box(0.1, 0.1, 0.09, 0.04, 0.05)], tote_depth=np.full((6, 6), 0.25), **flat

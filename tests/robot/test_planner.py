@@ -233,12 +233,12 @@ def test_load():
 @pytest.mark.parametrize(("path", "sizes", "message"), [
     ("pretrained/r4", {"tote_sizes": 1}, "tote_sizes=1: expected one of bin_size"),
     ("pretrained/r4", {"rotations": 5}, "rotations=5"),
-    ("pretrained/r4", {"effector_size": (0, 3)}, "effector_size"),
+    ("pretrained/r4", {"effector_size": (0, 3)}, r"gripper.size=\(0, 3\)"),
     ("pretrained/r4", {"candidates": 0}, "candidates=0"),
     ("pretrained/r9", {}, "pretrained/r9.*expected .*pretrained/r4"),
     (None, {}, "path=None: expected a run folder"),
     ("pretrained/unmasked", {"effector_size": (4, 4)},
-     r"env.effector_size=\[4, 4\]: the checkpoint was trained with \[3, 3\], and"),
+     r"env.gripper.size=\[4, 4\]: the checkpoint was trained with \[3, 3\], and"),
 ])  # fmt: skip
 def test_load_refuses(path, sizes, message):
     with pytest.raises(ValueError, match=message):

@@ -8,7 +8,8 @@ import pytest
 from scenes import fault, plan_for, random_scene
 
 from pickplace import Box, CellSpec, Planner
-from pickplace.rules.reach import Annulus, ReachTable
+from pickplace.rules.reach.annulus import Annulus
+from pickplace.rules.reach.table import ReachTable
 
 CELL, TOTE, ACCURACY = 0.05, (0.3, 0.3, 0.25), 0.002  # metres
 ANNULUS_OF_ALL = Annulus((2, 20), (0, 10), (-9, -2.5, 0), (4, -3, 0))

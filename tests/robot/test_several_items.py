@@ -21,7 +21,7 @@ from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.robot.measure import Box, HiddenBox, touches
 from pickplace.robot.measured_problem import read_metric
 from pickplace.rules.grasps import all_grasps
-from pickplace.rules.reach import Annulus
+from pickplace.rules.reach.annulus import Annulus
 from pickplace.serve.request import answer
 
 CELL, TOTE, NOISE = 0.05, (0.3, 0.3, 0.25), 0.002

@@ -12,7 +12,7 @@ from pickplace import CellSpec, Item, PickPlaceEnv
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import Kinds, Recorded, Uniform, hashed_uniform
 from pickplace.rules.bin import blocked_picks, remove_item, select_item, taken_item
-from pickplace.rules.cell import reference_cell
+from pickplace.rules.gripper.base import reference_cell
 
 
 def random_contents(rng: Random, size, count, most=3):
@@ -44,8 +44,8 @@ def test_what_a_pick_takes_and_what_stands_in_its_way(seed):
     contents = [random_contents(rng, bin_size, 4) for _ in range(8)]
     items = as_items(contents, 4)
     blocked = blocked_picks(cell, items).view(8, 4, *bin_size[:2])
-    body = shape_cells(cell.body if isinstance(cell.body, str) else [*map(list, cell.body)], effector, effector)
-    cup = [(x, y) for x in range(effector[0]) for y in range(effector[1]) if cell.cup_mask[x][y]]
+    body = shape_cells(shape.get("body", "rectangle"), effector, effector)
+    cup = [(x, y) for x in range(effector[0]) for y in range(effector[1]) if cell.gripper.cup_mask[x][y]]
     for n, x, y in product(range(8), range(bin_size[0]), range(bin_size[1])):
         corner = x - reference_cell(effector[0]), y - reference_cell(effector[1])
         below, held = ({(corner[0] + a, corner[1] + b) for a, b in part} for part in (body, cup))
@@ -53,7 +53,7 @@ def test_what_a_pick_takes_and_what_stands_in_its_way(seed):
         for number, (i, j, w, d, h) in enumerate(contents[n]):
             under = set(cells((i, j), (w, d)))
             shared = len(under & held)
-            enough = {"contain": under <= held, "overlap": shared > 0, "seal": shared >= cell.least_sealed}[rule]
+            enough = {"contain": under <= held, "overlap": shared > 0, "seal": shared >= cell.gripper.least_cells}[rule]
             gripped += [(-h, number)] * enough
             in_the_way = [
                 other for k, other in enumerate(contents[n])

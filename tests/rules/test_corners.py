@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from problems import problems, state_of
 
 from pickplace import CellSpec, Item, State
-from pickplace.rules.cell import Limits
 from pickplace.rules.corners import corner_mask
 from pickplace.rules.masks import footprint_mask, placing_maps
+from pickplace.rules.reach.base import Limits
 from pickplace.rules.state import surface_from
 
 
@@ -73,7 +73,7 @@ def test_where_the_gripper_stops_an_item_is_a_corner():
     item = Item(*(torch.tensor([[value]]) for value in (0, 0, 1, 1, 1)))  # gripped at the gripper's corner, or inside
     state = State(surface_from(torch.zeros(1, 7, 7, dtype=torch.int32)), torch.tensor([5]), item)
     limits = Limits(torch.zeros(25, dtype=torch.bool).index_fill(0, torch.tensor(6), True), *unlimited(cell))
-    cell = replace(cell, limits=limits)
+    cell = replace(cell, reach=limits)
     # Pick cell (1, 1) has the item at offset (0, 0) under the gripper: it cannot come nearer to the far walls than 2.
     mask = corner_mask(cell, placing_maps(cell, state))
     assert sorted(mask.nonzero().tolist()) == [[0, 0, x, y] for x in (0, 4) for y in (0, 4)]

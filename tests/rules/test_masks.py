@@ -20,8 +20,9 @@ from pickplace.items.distributions import Uniform
 from pickplace.planners.heuristics import JointDBL
 from pickplace.planners.use import decide
 from pickplace.rules import placing
-from pickplace.rules.cell import Limits, reference_cell
 from pickplace.rules.grasps import all_grasps, central_pick, heuristic_pick
+from pickplace.rules.gripper.base import reference_cell
+from pickplace.rules.gripper.rules import Contain
 from pickplace.rules.masks import (
     action_footprints,
     action_mask,
@@ -32,6 +33,7 @@ from pickplace.rules.masks import (
     placing_maps,
 )
 from pickplace.rules.placing import resting_top
+from pickplace.rules.reach.base import Limits
 from pickplace.rules.state import EMPTY, surface_from
 from pickplace.rules.step import apply, put_down
 from pickplace.rules.support import Hull
@@ -86,7 +88,8 @@ def test_bodies_among_towers(seed):
     body = random_effector(random, size, kind="mask")["body"]
     shape = {"body": body, "cup": body, "min_seal": random.choice((0.1, 0.4))}
     rotations, rule = random.choice((1, 2, 3, 4)), random.choice(("overlap", "seal", "seal"))
-    cell = CellSpec((5, 4, 1), (8, 7, 9), size, rotations, rule, 0.0, longest_side=3, **shape)
+    sizes = {"bin_size": (5, 4, 1), "tote_size": (8, 7, 9), "effector_size": size, "longest_side": 3}
+    cell = CellSpec(**sizes, rotations=rotations, pick_rule=rule, support=0.0, **shape)
     towers = np.array(random.choices((0, 0, 0, 0, 0, 3, 5), k=56)).reshape(8, 7)
     w, d = random.randint(1, 3), random.randint(1, 3)
     item = (random.randint(0, 5 - w), random.randint(0, 4 - d), w, d, random.randint(1, 3))
@@ -128,7 +131,7 @@ def open_limits(cell):
 @given(problems(count=3, shaped=st.booleans()))
 def test_tables_that_allow_everything_change_nothing(problem):
     cell, cases = problem
-    free = replace(cell, limits=open_limits(cell))
+    free = replace(cell, reach=open_limits(cell))
     maps = placing_maps(cell, state_of(*cases))
     for function in (action_mask, footprint_mask, num_feasible):
         assert torch.equal(function(cell, maps), function(free, maps))
@@ -145,7 +148,7 @@ def test_limits_by_hand():
     limits.pick_ok[2 * 5 + 1] = False
     limits.lowest_top[1, 2, 3], limits.highest_top[3, 4, 1] = 2, 0  # the top is 1
     limits.lowest_top[0, 1, 1] = limits.highest_top[0, 1, 1] = 1  # allowed exactly
-    after = apply(replace(cell, limits=limits), state.repeat(len(actions)), actions).failure.view(5, 5, 6, 6, 4)
+    after = apply(replace(cell, reach=limits), state.repeat(len(actions)), actions).failure.view(5, 5, 6, 6, 4)
     expected = before.clone()
     for index in ((2, 1), (slice(None), slice(None), 2, 3, 1), (slice(None), slice(None), 4, 1, 3)):
         # Reach is judged last: what failed before fails for the same reason.
@@ -154,13 +157,13 @@ def test_limits_by_hand():
     # The heuristic pick is another one where its first choice is out of reach.
     pick = heuristic_pick(cell, state.items.rows(0))
     limits.pick_ok[pick] = False
-    assert heuristic_pick(replace(cell, limits=limits), state.items.rows(0)) != pick
+    assert heuristic_pick(replace(cell, reach=limits), state.items.rows(0)) != pick
 
 
 def rest_on(heights, item, support):
     """Return the failure of an item that is set down on the near corner of a tote of these heights."""
     (w, d, h), (wide, deep) = item, heights.shape
-    cell = CellSpec((w, d, h), (wide, deep, 9), (w, d), 1, "contain", support)
+    cell = CellSpec((w, d, h), (wide, deep, 9), Contain((w, d)), 1, support)
     state = State(surface_from(heights)[None], torch.tensor([9]), Item.from_table(torch.tensor([[[0, 0, *item]]])))
     pick = reference_cell(w) * d + reference_cell(d)
     action = torch.tensor([pick * wide * deep + reference_cell(w) * deep + reference_cell(d)])
@@ -292,7 +295,7 @@ def test_an_item_bears_weight_inside_scipys_hull(data):
 @pytest.mark.parametrize(("support", "third"), [("hull", SUCCESS), ("bearing", UNSTABLE)])
 def test_a_pile_that_leans_over(support, third):
     """Bricks of three cells, each one cell further. The third one would have the upper two balance on an edge."""
-    cell = CellSpec((3, 1, 1), (6, 1, 9), (3, 1), 1, "contain", support)
+    cell = CellSpec((3, 1, 1), (6, 1, 9), Contain((3, 1)), 1, support)
     item = Item.from_table(torch.tensor([[[0, 0, 3, 1, 1]]]))
     state, failures = State(torch.full((1, 6, 1), EMPTY, dtype=torch.int32), torch.tensor([9]), item), []
     for middle in (1, 2, 3):
@@ -309,7 +312,7 @@ def test_a_pile_that_leans_over(support, third):
 def test_picks_that_do_not_look_at_the_tote(problem):
     """Of those that succeed: least ``ox + oy``, then ``oy``; and least from the item's middle to the effector's."""
     cell, cases = problem
-    item, (_, bin_d, _), (ee_w, ee_d) = state_of(*cases).items.rows((slice(None), 0)), cell.bin_size, cell.effector_size
+    item, (_, bin_d, _), (ee_w, ee_d) = state_of(*cases).items.rows((slice(None), 0)), cell.bin_size, cell.gripper.size
     picks, central, lifted = (
         heuristic_pick(cell, item).tolist(),
         central_pick(cell, item).tolist(),

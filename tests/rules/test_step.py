@@ -1,5 +1,7 @@
 """Symmetries that any packing problem has, whatever its sizes; and the oracle itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from hypothesis import given, settings
@@ -46,10 +48,10 @@ def test_a_mirrored_problem_has_the_mirrored_results(problem):
 
 def quarter(cell, case):
     """Return the whole cell as seen from the side: bin, tote, end effector and item turned counter-clockwise."""
-    (bin_w, bin_d, wall), (tote_w, tote_d, top), (ee_w, ee_d) = cell.bin_size, cell.tote_size, cell.effector_size
+    (bin_w, bin_d, wall), (tote_w, tote_d, top), (ee_w, ee_d) = cell.bin_size, cell.tote_size, cell.gripper.size
     turned = CellSpec(
-        (bin_d, bin_w, wall), (tote_d, tote_w, top), (ee_d, ee_w),
-        cell.rotations, cell.pick_rule, cell.support,
+        (bin_d, bin_w, wall), (tote_d, tote_w, top), replace(cell.gripper, size=(ee_d, ee_w)),
+        cell.rotations, cell.support,
     )  # fmt: skip
     x, y, w, d, h = case.item
     return turned, Case(case.rim, np.rot90(case.heights), np.rot90(case.bearing), (bin_d - y - d, x, d, w, h))

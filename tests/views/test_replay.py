@@ -56,7 +56,7 @@ def test_recordings_are_what_happened(cell, planner):
             odd = move.rotation % 2
             assert not move.failure and (w, d) == ((idp, iw) if odd else (iw, idp))
             # The end effector covers the item in the bin, and after the turn in the tote.
-            ee = cell.effector_size
+            ee = cell.gripper.size
             for corner, size, at, reach in (
                 ((ix, iy), (iw, idp), move.pick, ee), ((x, y), (w, d), move.place, ee[::-1] if odd else ee)
             ):  # fmt: skip

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_number
 from pickplace.policies.depth import Contents, clip_depth
 from pickplace.policies.footprints import every_footprint
-from pickplace.rules.cell import reference_cell
 from pickplace.rules.grasps import split_footprint
+from pickplace.rules.gripper.base import reference_cell
 from pickplace.rules.item import Item, item_from_depth
 
 DTYPES = ("auto", "float32", "bfloat16")

@@ -29,9 +29,3 @@ def read_support(value: Any) -> Support:
     if is_number(value) and 0 <= value <= 1:
         return Share(value)
     return RULES[one_of("support", value, RULES, "a number between 0 and 1, or an object of a rule's class")]()
-
-
-def support_setting(rule: Support) -> dict[str, Any]:
-    """Return the setting of a config that makes a rule, with all of the rule's own settings."""
-    names = {kind: name for name, kind in {**RULES, "share": Share}.items()}
-    return {"_target_": names.get(type(rule), f"{type(rule).__module__}.{type(rule).__qualname__}"), **vars(rule)}

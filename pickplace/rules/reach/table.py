@@ -1,7 +1,4 @@
-"""The robot's reach as a setting of the cell: where the centre of the suction face may be.
-
-All lengths are in sides of a cell, heights too, whatever the cell's height unit is.
-"""
+"""A robot that reaches the poses of a file, such as one that its inverse kinematics made."""
 
 import csv
 import io
@@ -9,93 +6,14 @@ import math
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor
 
 from pickplace.common.files import read_text
-from pickplace.common.validate import excerpt, is_number
-from pickplace.rules.cell import CellSpec, Limits, Reach, effector_centre
-from pickplace.rules.maps import FAR, NEVER
+from pickplace.common.validate import excerpt
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.maps import NEVER
+from pickplace.rules.reach.base import MAX_COORDINATE, Limits, Reach, whole_heights
 
-#: Greatest coordinate, in sides of a cell, and greatest size of a table, in bytes.
-MAX_COORDINATE, MAX_TEXT = 1e5, 100_000_000
-#: By how much rounded numbers may pass a limit: three times 0.1 is not exactly 0.3 in binary fractions.
-ROUNDING = 1e-6
-
-
-def _whole_heights(cell: CellSpec, lowest: Tensor, highest: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the ranges of whole height units inside ranges in sides of a cell, int32; from 0 to beyond any height."""
-    low = (lowest / cell.height_unit - ROUNDING).clamp(0, FAR).ceil()
-    high = (highest / cell.height_unit + ROUNDING).clamp(NEVER, FAR).floor()
-    return low.int(), high.int()
-
-
-def _numbers(key: str, value, count: int, expected: str) -> tuple[float, ...]:
-    """Return a list of numbers as a tuple."""
-    good = isinstance(value, (list, tuple)) and len(value) == count and all(map(is_number, value))
-    if not good or max(map(abs, value)) > MAX_COORDINATE:
-        raise ValueError(f"{key}={excerpt(value)}: expected {expected}, up to {MAX_COORDINATE:,.0f} sides of a cell.")
-    return tuple(map(float, value))
-
-
-@dataclass(frozen=True)
-class Annulus(Reach):
-    """An upright hollow cylinder about the axis of the robot's base.
-
-    The base's frame has its origin on that axis. Its x and y are parallel to those of bin and tote, z points upwards.
-
-    Args:
-        radii: least and greatest distance of the suction face's centre from the axis.
-        heights: lowest and highest suction face.
-        bin: near corner of the bin's floor, ``(x, y, z)`` in the base's frame.
-        tote: the same of the tote.
-
-    Raises:
-        ValueError: naming the argument, the value received and what was expected.
-    """
-
-    radii: tuple[float, float]
-    heights: tuple[float, float]
-    bin: tuple[float, float, float]
-    tote: tuple[float, float, float]
-
-    def __post_init__(self):
-        for key, count, expected in (
-            ("radii", 2, "[least, greatest] with 0 <= least <= greatest"),
-            ("heights", 2, "[lowest, highest] with lowest <= highest"),
-            ("bin", 3, "[x, y, z]"),
-            ("tote", 3, "[x, y, z]"),
-        ):
-            value = _numbers(f"reach.{key}", getattr(self, key), count, expected)
-            if count == 2 and (value[0] > value[1] or (key == "radii" and value[0] < 0)):
-                raise ValueError(f"reach.{key}={[*value]}: expected {expected}.")
-            object.__setattr__(self, key, value)
-
-    def limits(self, cell: CellSpec) -> Limits:
-        def centres(grid, sides) -> tuple[Tensor, Tensor]:
-            """Return the effector's centres for all cells of a grid: x as a column, y as a row."""
-            x, y = (effector_centre(torch.arange(count), side) for count, side in zip(grid, sides, strict=False))
-            return x.double()[:, None], y.double()
-
-        lowest_pick, highest_pick = (
-            part.flatten() for part in self.picks(cell, *centres(cell.bin_size, cell.effector_size))
-        )
-        turned = [cell.effector_size[:: -1 if rotation % 2 else 1] for rotation in range(cell.rotations)]
-        places = [self._range(cell, self.tote, *centres(cell.tote_size, sides)) for sides in turned]
-        lowest, highest = (torch.stack(parts) for parts in zip(*places, strict=True))
-        return Limits(lowest_pick <= highest_pick, lowest, highest, lowest_pick, highest_pick)
-
-    def picks(self, cell: CellSpec, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        return self._range(cell, self.bin, x, y)
-
-    def _range(self, cell: CellSpec, corner: tuple[float, ...], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return lowest and highest suction face at points of a grid with that corner, int32, in height units."""
-        distance = torch.hypot(x + corner[0], y + corner[1])
-        inside = (distance >= self.radii[0] - ROUNDING) & (distance <= self.radii[1] + ROUNDING)
-        heights = torch.tensor(self.heights, dtype=torch.float64) - corner[2]
-        lowest, highest = _whole_heights(cell, *heights)
-        return lowest.expand(inside.shape), torch.where(inside, highest, NEVER)
-
-
+MAX_TEXT = 100_000_000  # greatest size of a table, in bytes
 COLUMNS = ["where", "x", "y", "rotation", "lowest", "highest"]
 
 
@@ -163,7 +81,7 @@ class ReachTable(Reach):
             heights = torch.tensor([row[4:] for row in rows], dtype=torch.float64).view(-1, 2).unbind(1)
             lowest = torch.zeros(turns, wide, deep, dtype=torch.int32)
             highest = torch.full_like(lowest, NEVER)
-            lowest[index], highest[index] = _whole_heights(cell, *heights)
+            lowest[index], highest[index] = whole_heights(cell, *heights)
             tables[where] = lowest, highest
         lowest_pick, highest_pick = (part.flatten() for part in tables["bin"])
         lowest, highest = (part[: cell.rotations] for part in tables["tote"])

@@ -13,7 +13,8 @@ from pickplace import CellSpec, Failure
 from pickplace.rules.checks import is_within_reach
 from pickplace.rules.grasps import split_action
 from pickplace.rules.masks import action_mask, footprint_mask, num_feasible, placing_maps
-from pickplace.rules.reach import Annulus, ReachTable
+from pickplace.rules.reach.annulus import Annulus
+from pickplace.rules.reach.table import ReachTable
 from pickplace.rules.step import apply
 
 HEADER = "where,x,y,rotation,lowest,highest\n"
@@ -64,7 +65,7 @@ def test_an_annulus_is_the_geometry_in_step_and_masks(problem, reach, unit):
         *(part.tolist() for part in split_action(cell, actions)), strict=True,
     ):  # fmt: skip
         pick, place, rotation = action[:2], action[2:4], action[4]
-        w, d = cell.effector_size
+        w, d = cell.gripper.size
         sides = (d, w) if rotation in (1, 3) else (w, d)
         good = is_reached(reach, reach.bin, unit, pick, (w, d), cases[0].item[4])
         good = good and is_reached(reach, reach.tote, unit, place, sides, top)
@@ -81,7 +82,7 @@ def test_an_annulus_is_the_geometry_in_step_and_masks(problem, reach, unit):
 def test_the_tables_of_an_annulus(problem, reach, unit):
     """Every pick cell, place cell, rotation and height: also the boundaries, on which decimal fractions often lie."""
     cell = replace(problem[0], height_unit=unit, reach=reach)
-    limits, (w, d) = cell.limits, cell.effector_size
+    limits, (w, d) = cell.limits, cell.gripper.size
     tops = sorted({0, 1, 2, 3, *(round(h / unit) + at for h in reach.heights for at in range(-3, 3))} - {-3, -2, -1})
     for face in (top for top in tops if top >= 0):
         picks = limits.pick_ok & is_within_reach(limits.lowest_pick, limits.highest_pick, torch.tensor(face))
@@ -105,7 +106,7 @@ def test_a_distance_that_is_exactly_a_radius_is_reached():
                     (c * scale + off, 99), (0, c * scale - off), (c * scale + off, c * scale + off)
                 )]  # fmt: skip
                 for one in reach:
-                    limits = CellSpec((1, 1, 1), (1, 1, 5), (1, 1), 1, reach=one).limits
+                    limits = CellSpec((1, 1, 1), (1, 1, 5), effector_size=(1, 1), rotations=1, reach=one).limits
                     assert bool(limits.pick_ok) == (int(limits.highest_top) >= 0) == reached
 
 

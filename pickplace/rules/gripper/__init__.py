@@ -1,0 +1,1 @@
+"""Grippers: the shapes of body and cup, and one class for each grip rule."""

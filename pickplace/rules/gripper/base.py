@@ -1,0 +1,185 @@
+"""The gripper: a body that must hit nothing, a cup that grips, and a rule for when it grips an item."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pickplace.common.validate import excerpt, size_tuple
+from pickplace.rules.gripper.shapes import Box, Mask, boxes, centred, read_shape, turned
+
+MAX_GRIPPER = 64  # greatest side of a gripper, in cells
+
+
+def reference_cell(side):
+    """Return the gripper's reference cell along a side, counted from its minimum corner; an int or a tensor."""
+    return (side - 1) // 2
+
+
+def effector_centre(at, side):
+    """Return the gripper's centre along a side, with its reference cell at ``at``; in cells, numbers or tensors.
+
+    It comes from the rectangle: on even sides the reference cell is half a cell off.
+    """
+    return at - reference_cell(side) + side / 2
+
+
+class EffectorShape(NamedTuple):
+    """The gripper as it is turned: its sides, its reference cell and the rectangles of its body, in cells."""
+
+    width: int
+    depth: int
+    ref_x: int
+    ref_y: int
+    body: tuple[Box, ...]
+
+
+@dataclass(frozen=True)
+class Gripper(ABC):
+    """A gripper: body and cup, in a rectangle of cells, and a grip rule.
+
+    A grip rule of your own is a subclass with :attr:`least_cells`, and a config file: ``gripper: {_target_:
+    my_module.MyRule, size: [3, 3]}``, for which the command needs ``trust=my_module``. Where the number of the cup's
+    cells on the item does not decide alone, override :meth:`is_gripped`, too. Further fields of the dataclass are
+    settings; they must be numbers, texts or tuples.
+
+    Args:
+        size: ``(W_E, D_E)`` of the rectangle around the gripper.
+        body: the cells of ``size`` that must not hit anything: ``"rectangle"``, all; ``"disc"``, those that the ellipse
+            inscribed in it touches; or a mask, ``W_E`` lists of ``D_E`` times 0 or 1, with a 1 on each edge.
+        cup: the cells that grip the item: ``"rectangle"`` or ``"disc"`` of ``cup_size``, or a mask as ``body``'s. They
+            must be cells of the body.
+        cup_size: ``(w, d)`` of the cup, in the middle of the body; None: ``size``. None with a mask.
+
+    Raises:
+        ValueError: naming the argument, the value received and what was expected.
+    """
+
+    size: tuple[int, int] = (3, 3)
+    body: str | Mask = "rectangle"
+    cup: str | Mask = "rectangle"
+    cup_size: tuple[int, int] | None = None
+
+    def __post_init__(self):
+        object.__setattr__(self, "size", size_tuple("gripper.size", self.size, 2, MAX_GRIPPER))
+        for key in ("body", "cup"):
+            object.__setattr__(self, key, read_shape(f"gripper.{key}", getattr(self, key), self.size))
+        lines_of_body = self.body_mask, tuple(zip(*self.body_mask, strict=True))
+        if not all(any(line) for lines in lines_of_body for line in (lines[0], lines[-1])):
+            raise ValueError(
+                f"gripper.body={excerpt(self.body)}: expected a 1 in its first and last list, and first and last in "
+                "some list; a smaller body needs a smaller size."
+            )
+        if self.cup_size is not None:
+            self._check_cup_size()
+        for x, (body, cup) in enumerate(zip(self.body_mask, self.cup_mask, strict=True)):
+            for y in range(len(body)):
+                if cup[y] > body[y]:
+                    raise ValueError(
+                        f"gripper.cup={excerpt(self.cup)}, cup_size={excerpt(self.cup_size)}: cell ({x}, {y}) of the "
+                        f"cup is not in body={excerpt(self.body)}; expected a cup that is part of the body."
+                    )
+
+    def _check_cup_size(self) -> None:
+        """Refuse sides of a cup that cannot lie in the middle of the body."""
+        sides = size_tuple("gripper.cup_size", self.cup_size, 2, MAX_GRIPPER)
+        object.__setattr__(self, "cup_size", sides)
+        if not isinstance(self.cup, str):
+            raise ValueError(f"gripper.cup_size={[*sides]}: expected null, as cup is a mask.")
+        if any(cup > body or (body - cup) % 2 for cup, body in zip(sides, self.size, strict=True)):
+            raise ValueError(
+                f"gripper.cup_size={[*sides]}: expected sides that differ from size={[*self.size]} by an even number "
+                "of cells, so that the cup is centred in the body."
+            )
+
+    # ------------------------------------------------------------------ the grip rule
+    @property
+    @abstractmethod
+    def least_cells(self) -> int:
+        """The least number of the cup's cells on an item, whatever its size, with which it may be gripped."""
+
+    @property
+    def largest_item(self) -> tuple[int, int] | None:
+        """Greatest sides of an item that may be gripped, along x and y, before turning; None: there is no limit."""
+        return None
+
+    def is_gripped(self, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor, inset: tuple[int, int]) -> Tensor:
+        """Return whether the gripper grips the item: by default whether enough cells of the cup lie on it.
+
+        Args:
+            near_x, near_y: from the gripper's minimum corner to the item's, before turning, in cells; negative if the
+                item begins before it. They broadcast.
+            w, d: sides of the item.
+            inset: cells at each edge of the item, along x and y, that a measured item may cover in part only.
+        """
+        if any(inset):
+            x, y = inset
+            near_x, near_y, w, d = near_x + x, near_y + y, w - 2 * x, d - 2 * y
+        return self.count_cells(self.shared_sides(near_x, near_y, w, d)) >= self.least_cells
+
+    def shared_sides(self, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return how many cells an item shares with each rectangle of the cup along x and y; negative beside it."""
+        return [(_shared(near_x, w, box.x, box.width), _shared(near_y, d, box.y, box.depth)) for box in self.cup_boxes]
+
+    @staticmethod
+    def count_cells(shared: list[tuple[Tensor, Tensor]]) -> Tensor:
+        """Return how many of the cup's cells lie on an item, from :meth:`shared_sides`."""
+        return reduce(torch.add, [x.clamp(min=0) * y.clamp(min=0) for x, y in shared])
+
+    def offsets(self, longest: int, rotations: int) -> range:
+        """Return the offsets of an item under the gripper with which it may be gripped, along either axis, at any turn.
+
+        An item covers lines of cells in which there are at least :attr:`least_cells` of the cup.
+
+        Args:
+            longest: longest side of any item.
+            rotations: number of quarter turns to choose from.
+        """
+        found = []
+        for lines in self.cup_lines:
+            counts = [sum(line) for line in lines]
+            for part in (counts, counts[::-1]) if rotations > 1 else (counts,):
+                held = range(1 - longest, len(part))
+                found += [at for at in held if sum(part[max(at, 0) : at + longest]) >= self.least_cells]
+        return range(min(found), max(found) + 1) if found else range(1)
+
+    # ------------------------------------------------------------------ body and cup
+    @cached_property
+    def body_mask(self) -> Mask:
+        """The cells of the body, before turning."""
+        return centred(self.body, self.size, self.size)
+
+    @cached_property
+    def cup_mask(self) -> Mask:
+        """The cells of the cup, before turning."""
+        return centred(self.cup, self.cup_size or self.size, self.size)
+
+    @property
+    def cup_lines(self) -> tuple[Mask, Mask]:
+        """The cup's lines across x, and across y."""
+        return self.cup_mask, tuple(zip(*self.cup_mask, strict=True))
+
+    @cached_property
+    def cup_boxes(self) -> tuple[Box, ...]:
+        """Rectangles that do not overlap and make up the cup, before turning."""
+        return boxes(self.cup_mask)
+
+    def shapes(self, rotations: int) -> tuple[EffectorShape, ...]:
+        """Return the distinct shapes of the turned body: 1, 2 or ``rotations`` of them."""
+        masks = [self.body_mask]
+        for _ in range(rotations - 1):
+            masks.append(turned(masks[-1]))
+        count = next(n for n in (1, 2, len(masks)) if masks == [masks[r % n] for r in range(len(masks))])
+        sizes = (self.size, self.size[::-1])
+        return tuple(
+            EffectorShape(*sizes[turn % 2], *map(reference_cell, sizes[turn % 2]), boxes(mask))
+            for turn, mask in enumerate(masks[:count])
+        )
+
+
+def _shared(near: Tensor, side: Tensor, begin: int, length: int) -> Tensor:
+    """Return how many cells an item and a part of the cup share along an axis; negative if there are cells between."""
+    return (near + side).clamp_(max=begin + length) - near.clamp(min=begin)

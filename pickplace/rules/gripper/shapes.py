@@ -1,0 +1,91 @@
+"""Shapes of the gripper: which cells of its rectangle are body, and which are cup.
+
+A mask is a tuple of columns, ``mask[x][y]``, of 0 and 1. Plain integers: no tensor is needed before masks are used.
+"""
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import Any, NamedTuple
+
+from pickplace.common.validate import excerpt
+
+Mask = tuple[tuple[int, ...], ...]
+
+SHAPES = ("rectangle", "disc")
+
+
+class Box(NamedTuple):
+    """A rectangle of cells of a mask: minimum corner and sides."""
+
+    x: int
+    y: int
+    width: int
+    depth: int
+
+
+def is_in_disc(x: int, y: int, width: int, depth: int) -> bool:
+    """Return whether the inside of a cell meets the ellipse inscribed in a rectangle: a circle if its sides are equal.
+
+    Distances from the middle of each side to the cell are doubled, so that they are whole.
+    """
+    away_x, away_y = (max(0, 2 * at - side, side - 2 * (at + 1)) for at, side in ((x, width), (y, depth)))
+    return (away_x * depth) ** 2 + (away_y * width) ** 2 < (width * depth) ** 2
+
+
+def read_shape(key: str, value: Any, size: tuple[int, int]) -> str | Mask:
+    """Return a shape as it was given, with a mask as tuples; ``ValueError`` if it is neither a name nor a mask."""
+    if isinstance(value, str) and value in SHAPES:
+        return value
+    try:
+        columns = [] if isinstance(value, str) else [list(column) for column in value]
+    except TypeError:
+        columns = []
+    if [len(column) for column in columns] != [size[1]] * size[0] or any(
+        isinstance(cell, bool) or cell not in (0, 1) for column in columns for cell in column
+    ):
+        raise ValueError(
+            f"{key}={excerpt(value)}: expected 'rectangle', 'disc', or a mask of size={[*size]}: {size[0]} lists of "
+            f"{size[1]} times 0 or 1."
+        )
+    if not any(map(any, columns)):
+        raise ValueError(f"{key}={excerpt(value)}: expected a mask with a 1.")
+    return tuple(tuple(map(int, column)) for column in columns)
+
+
+def centred(shape: str | Mask, inner: tuple[int, int], size: tuple[int, int]) -> Mask:
+    """Return a rectangle or disc of ``inner`` cells in the middle of a mask of ``size``; a mask as it is."""
+    if not isinstance(shape, str):
+        return shape
+    x0, y0 = ((outer - side) // 2 for outer, side in zip(size, inner, strict=True))
+
+    def is_covered(x: int, y: int) -> bool:
+        is_inside = 0 <= x < inner[0] and 0 <= y < inner[1]
+        return is_inside and (shape == "rectangle" or is_in_disc(x, y, *inner))
+
+    return tuple(tuple(int(is_covered(x - x0, y - y0)) for y in range(size[1])) for x in range(size[0]))
+
+
+def turned(mask: Mask) -> Mask:
+    """Return a mask turned by a quarter turn: cell ``(x, y)`` goes where rotation 1 puts an item of one cell."""
+    depth = len(mask[0])
+    return tuple(tuple(column[depth - 1 - x] for column in mask) for x in range(depth))
+
+
+def boxes(mask: Mask) -> tuple[Box, ...]:
+    """Return rectangles that do not overlap and cover the ones of a mask; a rectangle is one."""
+    found: list[Box] = []
+    open_runs: dict[tuple[int, int], int] = {}  # (y, depth) of the runs of the column before -> where they began
+    for x, column in enumerate((*mask, ())):
+        runs = _runs(column)
+        for run in [run for run in open_runs if run not in runs]:
+            begin = open_runs.pop(run)
+            found.append(Box(begin, run[0], x - begin, run[1]))
+        for run in runs:
+            open_runs.setdefault(run, x)
+    return tuple(sorted(found))
+
+
+def _runs(column: Sequence[int]) -> list[tuple[int, int]]:
+    """Return where the runs of ones begin, and their lengths."""
+    groups = (list(group) for _, group in groupby(enumerate(column), key=lambda entry: entry[1]))
+    return [(group[0][0], len(group)) for group in groups if group[0][1]]

@@ -1,0 +1,89 @@
+"""The robot's reach, a setting of the cell, and the tables that the rules read of it."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pickplace.rules.checks import is_within_reach
+from pickplace.rules.maps import FAR, NEVER
+
+#: Greatest coordinate, in sides of a cell.
+MAX_COORDINATE = 1e5
+#: By how much rounded numbers may pass a limit: three times 0.1 is not exactly 0.3 in binary fractions.
+ROUNDING = 1e-6
+
+
+class Reach(ABC):
+    """The robot's reach, a setting of the cell; two of the same reach are equal."""
+
+    @abstractmethod
+    def limits(self, cell: Any) -> "Limits":
+        """Return what a robot of this reach may do in a :class:`~pickplace.rules.cell.CellSpec`."""
+
+    def picks(self, cell: Any, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Return the range of heights of the suction face for centres of the gripper anywhere in the bin.
+
+        Args:
+            cell: the sizes.
+            x, y: from the bin's corner, in cells; float64 of one shape.
+
+        Returns:
+            Lowest and highest, in height units, integers of that shape, an empty range where the robot cannot go;
+            None: only what lies between pick cells that are all reached is known to be reached.
+        """
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class Limits(Reach):
+    """Limits of the robot, as tables that masks and the single step read; for cells of one size and height unit.
+
+    Attributes:
+        pick_ok: bool ``[P]``, whether the robot reaches each pick cell.
+        lowest_top, highest_top: int ``[R, W_T, D_T]``, the range in which the item's top, where the suction face is,
+            must be for each rotation and place cell; in height units. An empty range forbids the place cell.
+        lowest_pick, highest_pick: int ``[P]``, the same range for each pick cell; None: any height.
+    """
+
+    pick_ok: Tensor
+    lowest_top: Tensor
+    highest_top: Tensor
+    lowest_pick: Tensor | None = None
+    highest_pick: Tensor | None = None
+
+    def limits(self, cell: Any) -> "Limits":
+        return self
+
+    def check(self, cell: Any) -> None:
+        """Refuse tables of another shape or type than the cell needs, with a ``ValueError`` that names the table."""
+        picks, places = [cell.num_picks], [cell.rotations, *cell.tote_size[:2]]
+        shapes = {"pick_ok": picks, "lowest_top": places, "highest_top": places}
+        if self.lowest_pick is not None or self.highest_pick is not None:
+            shapes |= {"lowest_pick": picks, "highest_pick": picks}
+        for name, shape in shapes.items():
+            table, is_flag = getattr(self, name), name == "pick_ok"
+            found = "None" if table is None else f"{table.dtype} of shape {[*table.shape]}"
+            fits = table is not None and [*table.shape] == shape and not table.dtype.is_floating_point
+            if not fits or (table.dtype == torch.bool) != is_flag:
+                kind = "bool" if is_flag else "integers"
+                raise ValueError(f"limits.{name}: got {found}, expected {kind} of shape {shape}.")
+
+    def on(self, device) -> "Limits":
+        """Return the tables on a device."""
+        return replace(self, **{name: table.to(device) for name, table in vars(self).items() if table is not None})
+
+    def allow_pick(self, pick: Tensor, face: Tensor) -> Tensor:
+        """Return whether the suction face may be at a height over pick cells; flat indices and heights broadcast."""
+        if self.lowest_pick is None or self.highest_pick is None:
+            return self.pick_ok[pick]
+        return self.pick_ok[pick] & is_within_reach(self.lowest_pick[pick], self.highest_pick[pick], face)
+
+
+def whole_heights(cell: Any, lowest: Tensor, highest: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the ranges of whole height units inside ranges in sides of a cell, int32; from 0 to beyond any height."""
+    low = (lowest / cell.height_unit - ROUNDING).clamp(0, FAR).ceil()
+    high = (highest / cell.height_unit + ROUNDING).clamp(NEVER, FAR).floor()
+    return low.int(), high.int()
