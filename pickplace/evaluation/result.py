@@ -177,14 +177,18 @@ def read_comparison(path: Path, expected: dict, trust: Collection[str] = ()) -> 
         if not is_same(expected[key], other.get(key)):
             found = excerpt(other.get(key))
             raise ValueError(f"compare={excerpt(str(path))}: its {key} is {found}, expected {excerpt(expected[key])}.")
-    refuse_foreign_targets(env, trust, "env")
-    cells = [build_cell(one, reach=None) for one in (expected["env"], env)]  # a missing setting has its default
-    found = [*differences(*map(cell_settings, cells), "env")]
-    reaches = [one.get("reach") for one in (expected["env"], env)]
-    if not is_same(*reaches):
-        found.append(("env.reach", *reaches))
-    for key, ours, theirs in found:
-        if key != "env.refill" or cells[0].bin_items > 1:
+    cell = build_cell(expected["env"], reach=None)
+    try:
+        refuse_foreign_targets(env, trust, "env")
+        other_cell = build_cell(env, reach=None)  # what is missing has its default
+    except ValueError as error:
+        raise ValueError(f"{refused} ({error})") from error
+    different = [*differences(cell_settings(cell), cell_settings(other_cell), "env")]
+    reach, other_reach = expected["env"].get("reach"), env.get("reach")
+    if not is_same(reach, other_reach):
+        different.append(("env.reach", reach, other_reach))
+    for key, ours, theirs in different:
+        if key != "env.refill" or cell.bin_items > 1:
             raise ValueError(f"compare={excerpt(str(path))}: {key}={excerpt(theirs)}, expected {ours}.")
     count = expected["episodes"]
     if not isinstance(values, list) or len(values) != count or not all(is_number(v) and 0 <= v <= 1 for v in values):

@@ -61,10 +61,10 @@ def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: di
             raise
         sizes: dict[str, Any] = {key: getattr(trained, key) for key in SIZES}
         restored(replace(cell, reach=None, **sizes))  # if that fails too, the sizes are not the reason
-        ours = ", ".join(f"{key}={json.dumps(value)}" for key, value, _ in different)
-        theirs = ", ".join(json.dumps(value) for _, _, value in different)
+        new = ", ".join(f"{key}={json.dumps(value)}" for key, value, _ in different)
+        old = ", ".join(json.dumps(value) for _, _, value in different)
         raise checkpoint.CheckpointError(
-            f"{ours}: the checkpoint was trained with {theirs}, and its policy does not serve every other cell."
+            f"{new}: the checkpoint was trained with {old}, and its policy does not serve every other cell."
         ) from error
 
 

@@ -62,7 +62,7 @@ def test_another_stability_rule_than_that_of_the_training(tmp_path):
     other = Planner.load(run, support="bearing")
     assert other.cell.support == Bearing(0.25)
     (warning,) = other.plan(scene).warnings
-    assert all(words in warning for words in ("support=Bearing(margin=0.25)", "support=Half(")), warning
+    assert all(words in warning for words in ("support=", "'bearing'", "0.25", "'half'")), warning
 
 
 @pytest.mark.parametrize(
