@@ -14,11 +14,13 @@ from torch import Tensor
 from pickplace.common.files import read_file
 from pickplace.common.validate import excerpt, is_name, is_number
 from pickplace.config.allowlist import refuse_foreign_targets
+from pickplace.config.registry import build, node_of
 from pickplace.evaluation.play import Episodes
 from pickplace.physics.engine import Engine
 from pickplace.planners.base import BatchPlanner
 from pickplace.policies.restore import build_cell, cell_settings, differences
 from pickplace.rules.state import Failure
+from pickplace.rules.support import read_support
 from pickplace.runs.provenance import commit, versions
 from pickplace.views.motion import Outcome
 
@@ -131,8 +133,10 @@ def paired_difference(result: dict, other: dict) -> dict:
 
 def episode_settings(cfg: DictConfig) -> dict:
     """Return the settings that determine which episodes an evaluation plays."""
+    env = {key: with_hash(value) for key, value in resolved(cfg.env).items()}
+    env["support"] = node_of("env.support", read_support(build("env.support", env["support"])))  # a short form in full
     return {
-        "env": {key: with_hash(value) for key, value in resolved(cfg.env).items()},
+        "env": env,
         "items": with_hash(resolved(cfg["items"])),
         "stream": cfg.evaluation.stream,
         "episodes": cfg.evaluation.episodes,
