@@ -13,7 +13,7 @@ from pickplace.config.registry import REGISTRY, build
 from pickplace.rules.maps import FAR
 from pickplace.rules.placing import LargeItems, OnFootprints
 from pickplace.rules.state import surface_from
-from pickplace.rules.support import RULES, Bearing, Hull, Share, Support, read_support, support_setting
+from pickplace.rules.support import RULES, Bearing, Hull, Share, Support, read_support
 
 
 def test_the_registry_has_every_rule():
@@ -23,7 +23,7 @@ def test_the_registry_has_every_rule():
 @pytest.mark.parametrize(("name", "margin"), SUPPORTS)
 def test_a_rule_is_made_again_of_its_setting(name, margin):
     rule = support_of(name, margin)
-    assert build("env.support", support_setting(rule)) == rule == read_support(rule)
+    assert build("env.support", node_of("env.support", rule)) == rule == read_support(rule)
     assert CellSpec(support=rule) == CellSpec(support=support_of(name, margin)) and hash(rule) == hash(rule)
 
 
