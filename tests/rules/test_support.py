@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from problems import SUPPORTS, support_of
 
 from pickplace import Box, CellSpec, Planner, Scene
-from pickplace.config.registry import REGISTRY, build
+from pickplace.config.registry import REGISTRY, build, node_of
 from pickplace.rules.maps import FAR
 from pickplace.rules.placing import LargeItems, OnFootprints
 from pickplace.rules.state import surface_from
