@@ -10,6 +10,7 @@ from problems import SUPPORTS, support_of
 
 from pickplace import Box, CellSpec, Planner, Scene
 from pickplace.config.registry import REGISTRY, build, node_of
+from pickplace.rules.gripper.rules import Contain
 from pickplace.rules.maps import FAR
 from pickplace.rules.placing import LargeItems, OnFootprints
 from pickplace.rules.state import surface_from
@@ -52,7 +53,7 @@ def test_bad_settings_are_refused(node, message):
 def test_large_items_touch_what_small_ones_do(side, seed):
     """Every quantity of a contact, with cells that bear no weight."""
     random = torch.Generator().manual_seed(seed)
-    cell = CellSpec((side, side, 1), (7, 6, 9), (side, side), rotations=2, longest_side=side)
+    cell = CellSpec((side, side, 1), (7, 6, 9), Contain((side, side)), rotations=2, longest_side=side)
     heights, bearing = (torch.randint(0, 2, (5, 7, 6), generator=random) for _ in range(2))
     if seed % 2:
         bearing[heights == 1] = 0  # nothing carries an item there
@@ -87,7 +88,7 @@ class GridOnly(Anything):
 ])  # fmt: skip
 def test_no_rule_lets_an_item_lean_in_a_measured_tote(rule, wall, status):
     """The only place is partly on a wall in a tote that is as large as the item."""
-    cell = CellSpec((3, 3, 1), (3, 3, 6), (3, 3), 1, support=rule)
+    cell = CellSpec((3, 3, 1), (3, 3, 6), rotations=1, support=rule)
     remaining = torch.full((30, 30), 0.3)
     remaining[: round(wall * 200)] -= 0.1
     scene = Scene([Box(0.075, 0.075, 0.14, 0.14, 0.05)], remaining, cell_size=0.05, accuracy=0.001, clearance=0.0)
