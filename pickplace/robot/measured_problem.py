@@ -102,13 +102,13 @@ class MeasuredBin(Problem):
         everywhere = replace(limits, pick_ok=torch.ones_like(limits.pick_ok))  # each item has its own picks
         cell = replace(parts[0].cell, reach=everywhere, bin_items=len(parts))
         keys = ("top", "clearance", "rest", "greatest_top")
-        maps = {key: torch.cat([getattr(part.maps, key) for part in parts]) for key in keys}
+        joined = {key: torch.cat([getattr(part.maps, key) for part in parts]) for key in keys}
         step = parts[0].maps.level_step
         items = join_items([part.maps.item for part in parts])
         seen_items = join_items([part.seen.items.rows(0) for part in parts])
         blocked = ~torch.stack([part.cell.limits.pick_ok for part in parts if part.cell.limits is not None])
         state, seen = parts[0].state._replace(items=items), parts[0].seen._replace(items=seen_items)
-        maps = PlacingMaps(**maps, item=items.rows(0), blocked=blocked, bin_items=len(parts), level_step=step)
+        maps = PlacingMaps(**joined, item=items.rows(0), blocked=blocked, bin_items=len(parts), level_step=step)
         return cls(cell=cell, state=state, seen=seen, maps=maps, parts=parts)
 
     def of_item(self, number: int) -> Problem:

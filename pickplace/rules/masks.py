@@ -12,7 +12,7 @@ the tote, is higher than the item's top: one maximum over its cells decides.
 import itertools
 from collections.abc import Callable
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -69,7 +69,9 @@ class PlacingMaps(NamedTuple):
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "PlacingMaps":
         """Return the maps with a function applied to each tensor."""
-        changed = {key: function(part) for key, part in self._asdict().items() if isinstance(part, Tensor)}
+        changed: dict[str, Any] = {
+            key: function(part) for key, part in self._asdict().items() if isinstance(part, Tensor)
+        }
         return self._replace(item=self.item.map(function), **changed)
 
     def rows(self, index: Tensor) -> "PlacingMaps":
@@ -203,7 +205,7 @@ def footprint_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
             top = maps.top[:, parity].permute(1, 2, 0)
             torch.ge(top, _least_clearance(cell, maps, parity, grasped), out=reached[parity])
         else:
-            reached[parity] = _reached_within_limits(cell, maps, parity, grasped)
+            reached[parity] = _reached_within_limits(cell, maps, maps.greatest_top, parity, grasped)
     if cell.parities == 2:
         square = maps.item.w == maps.item.d
         reached[0] |= square & reached[1]
@@ -251,14 +253,16 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Te
     return reduce(torch.minimum, least)
 
 
-def _reached_within_limits(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Tensor) -> Tensor:
+def _reached_within_limits(
+    cell: CellSpec, maps: PlacingMaps, greatest_top: Tensor, parity: int, grasped: Tensor
+) -> Tensor:
     """Return the footprints that some grasp of this parity reaches, bool ``[W_T, D_T, N]``, under the limits."""
     (tote_w, tote_d, _), count, margins = cell.tote_size, cell.num_offsets, _footprint_margins(cell, parity)
     top = maps.top[:, parity].permute(1, 2, 0)
     reached = torch.zeros_like(top, dtype=torch.bool)
     for rotation in range(parity, cell.rotations, 2):
         clear = surround(maps.clearance_in(rotation), margins, FAR)
-        highest = surround(maps.greatest_top[:, rotation].permute(1, 2, 0), margins, NEVER)
+        highest = surround(greatest_top[:, rotation].permute(1, 2, 0), margins, NEVER)
         for i in range(count):
             for j in range(count):
                 here = slice(i, i + tote_w), slice(j, j + tote_d)

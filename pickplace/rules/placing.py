@@ -76,12 +76,12 @@ class OnFootprints(Contact):
         self.z = highest >> 1
         self.supporting = surface_from(self.z)
 
-    @property
-    def surfaces(self):
+    @cached_property
+    def surfaces(self):  # type: ignore[override]
         return windows(self.padded, self.side).flatten(0, 1).unbind(0)
 
-    @property
-    def under(self):
+    @cached_property
+    def under(self):  # type: ignore[override]
         return is_under(self.w, self.d, self.side).unbind(0)
 
 
@@ -151,5 +151,5 @@ def over_tote(cell: CellSpec, surface: Tensor, rim: Tensor) -> Over:
     if cell.limits is None:
         return over
     turns, limits = [turn % len(cell.effectors) for turn in range(cell.rotations)], cell.limits.on(device)
-    lowest, highest = limits.lowest_top[..., None], limits.highest_top[..., None]
-    return Over(over.leaves[turns], over.rim, obstacle[turns], lowest, highest)
+    bounds = limits.lowest_top[..., None], limits.highest_top[..., None]
+    return Over(over.leaves[turns], over.rim, obstacle[turns], *bounds)

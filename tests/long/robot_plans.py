@@ -58,6 +58,11 @@ CELLS = [
 ]
 
 
+def marks_bearing(cell) -> bool:
+    """Return whether plans say where the tote bears weight; in older versions the rule is a name."""
+    return getattr(cell.support, "marks_bearing", cell.support == "bearing")
+
+
 def annulus(*args):
     """Return a reach."""
     from importlib import import_module
@@ -144,7 +149,7 @@ def as_cells(draw: np.random.Generator, world: scenes.World, cell, side: float) 
             depth[x : x + w, y : y + d], labels[x : x + w, y : y + d] = draw.integers(1, 4), label
     rim = cell.tote_size[2]
     heights = np.minimum(np.round(tote_heights(world, cell, side, 1) / (side * cell.height_unit)), rim).astype(int)
-    bearing = draw.integers(0, 2, heights.shape) if cell.support == "bearing" and draw.random() < 0.5 else None
+    bearing = draw.integers(0, 2, heights.shape) if marks_bearing(cell) and draw.random() < 0.5 else None
     seen = {"bin_depth": depth, "tote_depth": rim - heights, "tote_bearing": bearing}
     return seen | ({"bin_labels": labels} if world.others else {})
 
@@ -184,7 +189,7 @@ def tote_heights(world: scenes.World, cell, side: float, along: int) -> np.ndarr
 def metres(draw: np.random.Generator, world: scenes.World, cell, side: float) -> dict:
     """Return the settings of a scene in metres."""
     shape = cell.tote_size[:2]
-    bearing = draw.integers(0, 4, shape) > 0 if cell.support == "bearing" and draw.random() < 0.5 else None
+    bearing = draw.integers(0, 4, shape) > 0 if marks_bearing(cell) and draw.random() < 0.5 else None
     return {
         "cell_size": side, "tote_height": float(world.tote[2]), "accuracy": ACCURACY,
         "clearance": float(draw.choice((0.0, 0.003, 0.005))), "tote_bearing": None if bearing is None else bearing * 1,

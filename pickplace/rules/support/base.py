@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 
+import torch
 from torch import Tensor
 
 from pickplace.rules.support.contact import Contact, Patches
@@ -17,12 +18,12 @@ class Support(ABC):
     def stable(self, contact: Contact) -> Tensor:
         """Return whether items on the grid are stable where they come to rest, bool of the shape of ``contact.z``."""
 
-    def bearing(self, contact: Contact) -> Tensor | None:
-        """Return which cells under an item bear weight once it lies there, bool ``[S * S, N]``; None: all of them.
+    def bearing(self, contact: Contact) -> Tensor:
+        """Return which cells under an item bear weight once it lies there, bool ``[S * S, N]``; by default all of them.
 
         ``S`` is the side of the square of cells at each footprint's minimum corner.
         """
-        return None
+        return torch.stack([*contact.under])
 
     def measured(self, patches: Patches) -> Tensor:
         """Return whether an item is stable on a surface that was measured, bool of the shape of ``patches.share``.

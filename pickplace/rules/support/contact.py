@@ -5,12 +5,15 @@ The *supporting cells* are the cells under the footprint that are as high as the
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
 from pickplace.rules.state import surface_from
 from pickplace.rules.support import hull
+
+Cells: TypeAlias = Sequence[Tensor] | Tensor  # a tensor for each cell of a square, row by row
 
 
 class Contact:
@@ -27,7 +30,7 @@ class Contact:
         side: ``S``, of the square.
     """
 
-    def __init__(self, surfaces: Sequence[Tensor], under: Sequence[Tensor], z: Tensor, w: Tensor, d: Tensor):
+    def __init__(self, surfaces: Cells, under: Cells, z: Tensor, w: Tensor, d: Tensor):
         self.surfaces, self.under, self.z, self.w, self.d = surfaces, under, z, w, d
         self.supporting, self.side = surface_from(z), round(len(under) ** 0.5)
 

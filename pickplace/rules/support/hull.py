@@ -40,7 +40,9 @@ def is_centre_in_hull_of_middles(rows: Iterable[tuple[Tensor, Tensor]], w: Tenso
     return (left + right >= 0) & (near_left + near_right >= 0)
 
 
-def is_centre_inside(cells: Sequence[Tensor], supporting: Tensor, w: Tensor, d: Tensor, margin: float) -> Tensor:
+def is_centre_inside(
+    cells: Sequence[Tensor] | Tensor, supporting: Tensor, w: Tensor, d: Tensor, margin: float
+) -> Tensor:
     """Return whether the item's centre lies inside the hull, further than ``margin`` from its edge."""
     side = round(len(cells) ** 0.5)
     sizes = w.clamp(1, side) - 1, d.clamp(1, side) - 1
