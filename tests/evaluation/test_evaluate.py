@@ -1,6 +1,9 @@
 """``pickplace-evaluate``: what it writes, what it compares, and planners of the user's own."""
 
+import base64
 import json
+import re
+import zlib
 from itertools import product
 
 import numpy
@@ -259,7 +262,10 @@ def test_a_physics_engine_of_ones_own(evaluation):
     assert plans[0].tote == (0.8, 0.8, 0.4) and found["carried_out"]["mean"] == 0
     volumes = [plan.placements[0].volume / 0.256 for plan in plans]
     assert found["occupancy"]["per_episode"] == pytest.approx(volumes)
-    assert "clumsy" in (result["path"].parent / "replay.html").read_text()
+    html = (result["path"].parent / "replay.html").read_text()
+    shown = json.loads(zlib.decompress(base64.b64decode(re.search(r'id="data">([^<]*)<', html)[1])))["episodes"]
+    assert "clumsy" in html and [episode["label"] for episode in shown] == ["slipped", "slipped"]
+    assert [episode["occupancy"] for episode in shown] == found["occupancy"]["per_episode"][:2]
     own = "+physics._target_=test_evaluate."
     evaluation(*words, f"{own}Clumsy", "+physics.skip=true", refused="physics=clumsy: outcomes of the episodes [1, 2]")
     evaluation(*words, f"{own}Clumsy", "+physics.speed=1", refused="physics.speed: ")
