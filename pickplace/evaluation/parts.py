@@ -98,6 +98,7 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
     with open_dict(cfg):
         for group in TRAINED:  # resolved where they come from: here a reference could lead elsewhere
             cfg[group] = resolved(merged[group])
+        cfg.reward_scale = merged.reward_scale  # the scale of the critic's values
     facts = {
         "checkpoint": str(folder),
         "trained": {"frames": saved["frames"], "seed": merged.seed, "commit": saved["commit"]},

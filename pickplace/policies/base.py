@@ -28,7 +28,7 @@ from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, action_mask, placing_maps
-from pickplace.rules.observation import standard_terms
+from pickplace.rules.observation import item_keys, standard_terms
 from pickplace.rules.state import State
 
 #: The logit of what must not be chosen, far below what a network may score: its probability is exactly 0 in float32.
@@ -141,8 +141,7 @@ class Policy(TensorDictModuleBase, ABC):
         self.check_cell(cell)
         other = copy(self)
         other.cell = cell
-        if cell.bin_items > 1:
-            other.in_keys = [*dict.fromkeys([*self.in_keys, "items"])]
+        other.in_keys = [*dict.fromkeys([*self.in_keys, *item_keys(cell.bin_items)])]
         return other
 
     def act(self, choice: Tensor, *values: Tensor) -> Tensor:

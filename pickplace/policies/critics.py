@@ -13,7 +13,8 @@ from pickplace.policies.fcn4d.network import BIN_PADDING, TOTE_PADDING, check_cl
 from pickplace.policies.fcn4d.network import DTYPES as CONV4D_DTYPES
 from pickplace.policies.fcn_grasp.network import DTYPES, MAX_LEVELS, matrix_dtype
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.item import Item, item_from_depth
+from pickplace.rules.item import Item, read_items
+from pickplace.rules.observation import item_keys
 
 
 class Pooled(nn.Module):
@@ -86,7 +87,7 @@ class Pooled(nn.Module):
             x = self.around(planes.to(dtype, memory_format=torch.channels_last))
             x = x + F.conv2d(1 - bearing[:, None].to(dtype), self.weak, None, self.stride, len(self.weak[0, 0]) // 2)
             x = x.permute(0, 2, 3, 1)
-            code = self._item_code(bin_depth, None if items is None else items.flatten(0, -3))
+            code = self._item_code(read_items(bin_depth, None if items is None else items.flatten(0, -3)))
             x = x + self.item(code.to(dtype))[:, None, None]
             x = x + room.to(dtype) * self.room.to(dtype)
             x = F.relu(self.hidden(F.relu(x)))
@@ -97,15 +98,12 @@ class Pooled(nn.Module):
     @staticmethod
     def keys_for(bin_items: int) -> tuple[str, ...]:
         """Return the entries of the observation to read where a bin holds so many items."""
-        return (*MAP_KEYS, "items") if bin_items > 1 else MAP_KEYS
+        return (*MAP_KEYS, *item_keys(bin_items))
 
-    def _item_code(self, bin_depth: Tensor, items: Tensor | None) -> Tensor:
-        """Return the code of what lies in the bin, ``[N, 3 * item_range]``; of several items the mean."""
-        if items is None:
-            return item_code(item_from_depth(bin_depth), self.item_range, self.level)
-        several = Item.from_table(items)
-        code = item_code(several, self.item_range, self.level) * ~several.is_empty[..., None]
-        return code.sum(1) / (~several.is_empty).sum(1, keepdim=True).clamp(min=1)
+    def _item_code(self, items: Item) -> Tensor:
+        """Return the mean code of the items ``[N, M]`` in each bin, ``[N, 3 * item_range]``."""
+        code = item_code(items, self.item_range, self.level) * ~items.is_empty[..., None]
+        return code.sum(1) / (~items.is_empty).sum(1, keepdim=True).clamp(min=1)
 
 
 class Conv4d(nn.Module):

@@ -1,5 +1,6 @@
 """Preparation of depth maps and items for the networks: clipping, and one-hot codes."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -9,7 +10,7 @@ from pickplace.rules.item import Item
 
 
 class Contents(NamedTuple):
-    """The items in bins with several of them, and the number of the one that is scored."""
+    """The items in the bins, and for each footprint that is scored the number of its item."""
 
     items: Item  # [N, M]
     number: Tensor  # int64, one for each footprint that is scored
@@ -18,16 +19,21 @@ class Contents(NamedTuple):
         """Return the same for some of the footprints."""
         return Contents(self.items, self.number[index])
 
-    def scored_items(self, row: Tensor) -> Item:
-        """Return the item of each footprint; ``row`` is the bin of each."""
-        return self.items.rows((row, self.number))
+    def sizes(self, row: Tensor) -> list[Tensor]:
+        """Return width, depth and height of each footprint's item; ``row`` is the bin of each."""
+        at = row * self.items.x.shape[1] + self.number
+        return [part.flatten()[at] for part in (self.items.w, self.items.d, self.items.h)]
 
-    def rest_code(self, row: Tensor, item_range: int) -> Tensor:
-        """Return the mean code of the other items in the bin, float32 ``[rows, 3 * item_range]``; 0 without any."""
+    def other_codes(self, row: Tensor, item_range: int) -> Iterator[Tensor]:
+        """Yield a code of each of the ``M - 1`` other items in the bin, float32 ``[rows, 3 * item_range]``.
+
+        Their sum is the mean of the codes of those that are there.
+        """
         there = ~self.items.is_empty
-        code = item_code(self.items, item_range) & there[..., None]
-        rest = code.sum(1)[row] - code[row, self.number].int()
-        return rest / (there.sum(1, keepdim=True) - 1).clamp(min=1)[row]
+        others = (there.sum(1, keepdim=True) - 1).clamp(min=1)
+        code = item_code(self.items, item_range) * there[..., None] / others[..., None]
+        for step in range(1, code.shape[1]):
+            yield code[row, (self.number + step) % code.shape[1]]
 
 
 def clip_depth(depth: Tensor, limit: float | None, floor: float | None = None) -> Tensor:

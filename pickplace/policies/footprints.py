@@ -15,7 +15,7 @@ from pickplace.policies.base import MAP_KEYS, MASKED, Policy, pick_one
 from pickplace.policies.depth import Contents
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import footprint_index
-from pickplace.rules.item import Observation, items_from_observation, listed_items
+from pickplace.rules.item import Observation, items_from_observation
 from pickplace.rules.masks import (
     PlacingMaps,
     action_footprints,
@@ -23,6 +23,7 @@ from pickplace.rules.masks import (
     first_action_reaching,
     unchecked_maps,
 )
+from pickplace.rules.observation import item_keys
 from pickplace.rules.state import State
 from pickplace.rules.step import apply
 
@@ -76,8 +77,7 @@ class FootprintScorer(Policy):
                 f"model.mask_infeasible=False: expected true with {type(self).__name__}; its choices are feasible ones."
             )
         super().__init__(cell, masks=(self.mask,))
-        if cell.bin_items > 1:
-            self.in_keys.append("items")
+        self.in_keys += item_keys(cell.bin_items)
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
         """Return the scores of some footprints, float32 ``[M]``; a subclass may add what further terms tell.
@@ -87,13 +87,10 @@ class FootprintScorer(Policy):
             footprint: int64 ``[M]``, index ``(parity * W_T + x) * D_T + y``; of several items that of a choice.
         """
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
-        contents = None
-        if (items := listed_items(observation)) is not None:
-            places = self.cell.parities * totes.shape[1] * totes.shape[2]
-            number = footprint // places
-            contents = Contents(items, number)
-            footprint = footprint - number * places
-        return self.network.at(bins, totes, bearing, row, footprint, contents)[:, 0]
+        places = self.cell.parities * totes.shape[1] * totes.shape[2]
+        number = footprint // places
+        contents = Contents(items_from_observation(observation), number)
+        return self.network.at(bins, totes, bearing, row, footprint - number * places, contents)[:, 0]
 
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
         """Return logits of the footprints that a mask ``[N, M * Q * W_T * D_T]`` allows; the others are not
@@ -104,8 +101,8 @@ class FootprintScorer(Policy):
 
     def unmasked_scores(self, observation: Observation) -> Tensor:
         """Return the scores of all footprints, float32 ``[N, scores]``; bins and totes may have any size."""
-        totes, items = observation["tote_depth"], listed_items(observation)
-        parities = self.cell.parities * (1 if items is None else items.x.shape[1])  # of each item
+        totes, items = observation["tote_depth"], items_from_observation(observation)
+        parities = self.cell.parities * items.x.shape[1]  # of each item
         return self.scores(observation, *every_footprint(totes, parities)).view(totes.shape[0], -1)
 
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:

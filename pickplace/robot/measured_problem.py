@@ -191,12 +191,10 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
         clear = above_walls | _misses_walls(centres, cell, box.yaw, cell_size)
         if isinstance(box, HiddenBox):
             clear = np.zeros_like(clear)
-        if len(boxes) > 1:  # one that lies alone may be picked anywhere
-            clear &= ~_hits_others(centres, cell, number, boxes, cell_size, accuracy, clearance)
+        clear &= ~_hits_others(centres, cell, number, boxes, cell_size, accuracy, clearance)
         bin_clear = torch.from_numpy(clear).to(device)
         limits = _limits(cell, free, bin_clear, centres / cell_size, h + tote.accuracy, 2 * tote.accuracy)
-        if len(boxes) > 1:
-            limits = replace(limits, pick_ok=limits.pick_ok & (taken == number))
+        limits = replace(limits, pick_ok=limits.pick_ok & (taken == number))
         limited = replace(free, reach=limits)
         measured = measured_maps(limited, tote, item, sides)
         alone = item.rows((slice(None), None))

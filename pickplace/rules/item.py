@@ -117,12 +117,6 @@ def read_items(bin_depth: Tensor, table: Tensor | None = None) -> Item:
     return Item.from_table(table)
 
 
-def listed_items(observation: Observation) -> Item | None:
-    """Return the items that an observation of bins with several items lists, ``[N, M]``; None if it has no list."""
-    table = observation.get("items", None)
-    return None if table is None else Item.from_table(table)
-
-
 def items_from_observation(observation: Observation) -> Item:
     """Return what lies in the bins, ``[N, M]``; see :func:`read_items`."""
     return read_items(observation["bin_depth"], observation.get("items", None))

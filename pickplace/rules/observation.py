@@ -154,6 +154,11 @@ def standard_terms(bin_items: int) -> dict[str, Term]:
     return {**STANDARD_TERMS, **(SEVERAL_ITEMS if bin_items > 1 else {})}
 
 
+def item_keys(bin_items: int) -> tuple[str, ...]:
+    """Return the entries of such an observation that list the items; one item is in the depth map."""
+    return ("items",) if bin_items > 1 else ()
+
+
 def check_terms(terms: Mapping[str, Term] | None, bin_items: int = 1) -> dict[str, Term]:
     """Return the terms of an observation, the standard ones first; None gives those alone.
 

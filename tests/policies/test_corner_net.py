@@ -8,6 +8,7 @@ from problems import problems, state_of
 
 from pickplace import CellSpec
 from pickplace.policies.corners.network import PLANES, CornerNet
+from pickplace.policies.depth import Contents
 from pickplace.rules.observation import STANDARD_TERMS, observe
 
 INSIDE, NEAR = 3, 2
@@ -16,6 +17,11 @@ INSIDE, NEAR = 3, 2
 def network(seed=0, **sizes):
     torch.manual_seed(seed)
     return CornerNet(8, 8, INSIDE, NEAR, (4, 3), head_std=1.0, **sizes)
+
+
+def contents(row, *cases):
+    """Return the items, one in each bin."""
+    return Contents(state_of(*cases).items, torch.zeros_like(row))
 
 
 def observed(cell, *cases):
@@ -67,7 +73,7 @@ def test_the_points_show_the_tote_around_the_item(problem, data):
     if not places:
         return
     row, parity, x, y = torch.tensor(places).unbind(1)
-    found = net.inputs(*observed(cell, *cases), row, (parity * tote_w + x) * tote_d + y)
+    found = net.inputs(*observed(cell, *cases), row, (parity * tote_w + x) * tote_d + y, contents(row, *cases))
     for one, (number, *place) in zip(found, places, strict=True):
         planes = one[: PLANES * net.points**2].view(PLANES, net.points, net.points)
         torch.testing.assert_close(planes, plain_planes(cases[number], *place))
@@ -88,8 +94,10 @@ def test_a_turned_problem_is_the_same_problem(problem):
         if w > tote_w or d > tote_d:
             continue
         net, one = network(), torch.tensor([row])
-        here = net.at(*observed(cell, *cases), one, torch.tensor([x * tote_d + y]))
-        there = net.at(*observed(turned, *flipped), one, torch.tensor([(tote_d + y) * tote_w + x]))
+        here = net.at(*observed(cell, *cases), one, torch.tensor([x * tote_d + y]), contents(one, *cases))
+        there = net.at(
+            *observed(turned, *flipped), one, torch.tensor([(tote_d + y) * tote_w + x]), contents(one, *cases)
+        )
         torch.testing.assert_close(here, there)
 
 

@@ -220,8 +220,8 @@ def test_the_critic_sees_the_mean_of_several_items():
     one = item_from_depth(bins).cuboids[:, None]
     torch.testing.assert_close(critic(bins, totes, bearing, one), critic(bins, totes, bearing))
     both = torch.cat([one, one.flip(0), torch.zeros_like(one)], 1)  # of an empty place it sees nothing
-    code = critic._item_code(bins, both)
-    each = [critic._item_code(bins, part[:, None]) for part in both.unbind(1)[:2]]
+    code = critic._item_code(Item.from_table(both))
+    each = [critic._item_code(Item.from_table(part[:, None])) for part in both.unbind(1)[:2]]
     torch.testing.assert_close(code, (each[0] + each[1]) / 2)
     several = critic(bins, totes, bearing, both)
     assert not torch.allclose(several, critic(bins, totes, bearing))
@@ -245,7 +245,8 @@ def test_the_policy_sees_the_mean_of_the_other_items():
     swapped = state.clone().set("items", state["items"][:, [0, 2, 1]])  # the order of the others is nothing to it
     swapped["footprint_mask"] = state["footprint_mask"].unflatten(1, (3, -1))[:, [0, 2, 1]].flatten(1)
     torch.testing.assert_close(policy.logits(swapped)[:, :places], changed[:, :places])
-    code = Contents(Item.from_table(state["items"]), torch.zeros(1, dtype=torch.int64)).rest_code(torch.tensor([0]), 3)
+    contents = Contents(Item.from_table(state["items"]), torch.zeros(1, dtype=torch.int64))
+    code = sum(contents.other_codes(torch.tensor([0]), 3))
     by_hand = torch.zeros(9)
     others = [item for item in state["items"][0, 1:].tolist() if item[4]]
     for item in others:

@@ -7,7 +7,6 @@ from torch import Tensor, nn
 from pickplace.common.validate import MAX_WIDTH, check_inputs, excerpt, number, whole_number
 from pickplace.policies.depth import Contents
 from pickplace.rules.grasps import split_footprint
-from pickplace.rules.item import item_from_depth
 
 PLANES = 6  # of each point, see `CornerNet`
 SIZES = 13  # numbers beside the points
@@ -61,7 +60,7 @@ class CornerNet(nn.Module):
 
     def at(
         self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor,
-        contents: Contents | None = None,
+        contents: Contents,
     ) -> Tensor:  # fmt: skip
         """Return the scores of some footprints, float32 ``[M, 1]``.
 
@@ -70,21 +69,21 @@ class CornerNet(nn.Module):
             bearing: 1 where a cell of the tote bears weight, else 0, ``[N, W_T, D_T]``.
             row: int64 ``[M]``, which problem.
             footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
-            contents: of bins with several items; None: there is one, which the depth map shows.
+            contents: the items in the bins, and which one each footprint is of.
         """
         return self.head(self.body(self.inputs(bin_depth, tote_depth, bearing, row, footprint, contents)))
 
     @torch.no_grad()
     def inputs(
         self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor,
-        contents: Contents | None = None,
+        contents: Contents,
     ) -> Tensor:  # fmt: skip
         """Return what the first layer sees, float32 ``[M, inputs]``; arguments as of :meth:`at`."""
         _, wide, deep = tote_depth.shape
-        item = item_from_depth(bin_depth).rows(row) if contents is None else contents.scored_items(row)
         parity, x, y = split_footprint((wide, deep), footprint)
         turned = (parity == 1)[:, None]
-        w, d, h = (part[:, None] for part in (item.w, item.d, item.h.float()))
+        w, d, h = (part[:, None] for part in contents.sizes(row))
+        h = h.float()
 
         # The points along the item's width and depth, as cells of the tote: outside it, a cell of the margin.
         along, across = self._points(w), self._points(d)  # [M, points]

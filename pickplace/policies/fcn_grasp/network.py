@@ -1,5 +1,7 @@
 """The fully convolutional network behind ``fcn_grasp``: the tote around a footprint, seen from what would lie there."""
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -9,7 +11,7 @@ from pickplace.policies.depth import Contents, clip_depth
 from pickplace.policies.footprints import every_footprint
 from pickplace.rules.grasps import split_footprint
 from pickplace.rules.gripper.base import reference_cell
-from pickplace.rules.item import Item, item_from_depth
+from pickplace.rules.item import read_items
 
 DTYPES = ("auto", "float32", "bfloat16")
 CHUNK_BYTES = 2**29  # inputs of the first layer that are held at a time when gradients are off
@@ -50,7 +52,6 @@ class FootprintFcn(nn.Module):
         head_std: standard deviation of the last layer's initial weights.
         compute_dtype: ``"float32"``, ``"bfloat16"`` (autocast of the matrix products), or ``"auto"``: bfloat16 where
             the processor has units for it.
-        several_items: whether it looks at the other items in the bin.
     """
 
     def __init__(
@@ -67,7 +68,6 @@ class FootprintFcn(nn.Module):
         head_std: float = 0.01,
         compute_dtype: str = "auto",
         headroom_bins: int | None = None,
-        several_items: bool = False,
     ):
         super().__init__()
         odd_number("model.actor.receptive_field", receptive_field, least=3)
@@ -87,7 +87,7 @@ class FootprintFcn(nn.Module):
         check_inputs(f"model.actor.receptive_field={receptive_field}, {self.planes} planes", inputs)
         self.patch = nn.Linear(inputs, filters)
         self.weak = nn.Parameter(torch.zeros(filters, receptive_field**2))
-        self.rest_of_bin = nn.Parameter(torch.zeros(filters, 3 * item_range)) if several_items else None
+        self.rest_of_bin = nn.Parameter(torch.zeros(filters, 3 * item_range))
         self.hidden = nn.Linear(filters, hidden)
         self.head = nn.Linear(hidden, out_channels)
         nn.init.normal_(self.head.weight, std=head_std)
@@ -102,12 +102,14 @@ class FootprintFcn(nn.Module):
             parities: 1, or 2 to turn the footprints too.
         """
         batch, wide, long = tote_depth.shape
-        out = self.at(bin_depth, tote_depth, bearing, *every_footprint(tote_depth, parities))
+        row, footprint = every_footprint(tote_depth, parities)
+        contents = Contents(read_items(bin_depth), torch.zeros_like(row))
+        out = self.at(bin_depth, tote_depth, bearing, row, footprint, contents)
         return out.view(batch, parities, wide, long, -1)
 
     def at(
         self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor,
-        contents: Contents | None = None,
+        contents: Contents,
     ) -> Tensor:  # fmt: skip
         """Return the scores of some footprints only, float32 ``[M, out_channels]``.
 
@@ -115,7 +117,7 @@ class FootprintFcn(nn.Module):
             bin_depth, tote_depth, bearing: as in :meth:`forward`.
             row: int64 ``[M]``, which problem.
             footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
-            contents: of bins with several items; None: there is one, which the depth map shows.
+            contents: the items in the bins, and which one each footprint is of.
         """
         at_once = CHUNK_BYTES // (4 * self.patch.in_features)
         if not torch.is_grad_enabled() and len(row) > at_once:  # of large totes: a part at a time, to save memory
@@ -127,7 +129,7 @@ class FootprintFcn(nn.Module):
                         bearing,
                         row[part],
                         footprint[part],
-                        None if contents is None else contents.part(part),
+                        contents.part(part),
                     )
                     for part in torch.arange(len(row), device=row.device).split(at_once)
                 ]
@@ -137,27 +139,34 @@ class FootprintFcn(nn.Module):
         if lower:
             padding = next((-count % step for beyond, step in PADDED_ROWS if count > beyond), 0)
             row, footprint = (F.pad(index, (0, padding)) for index in (row, footprint))
-            contents = contents and contents._replace(number=F.pad(contents.number, (0, padding)))
-        item = item_from_depth(bin_depth).rows(row) if contents is None else contents.scored_items(row)
-        x, weak = self._inputs(bin_depth, tote_depth, bearing, row, footprint, item, dtype)
+            contents = contents._replace(number=F.pad(contents.number, (0, padding)))
+        sizes = contents.sizes(row)
+        x, weak = self._inputs(bin_depth, tote_depth, bearing, row, footprint, sizes, dtype)
         with torch.autocast(tote_depth.device.type, dtype, enabled=lower):
             x = self.patch(x) + F.linear(weak, self.weak)
-            if contents is not None and self.rest_of_bin is not None:
-                x = x + F.linear(contents.rest_code(row, self.item_range).to(dtype), self.rest_of_bin)
+            for code in contents.other_codes(row, self.item_range):
+                x = x + F.linear(code.to(dtype), self.rest_of_bin)
             x = F.relu(self.hidden(F.relu(x)))
         return self.head(x.float())[:count]  # in full: scores that differ a little must not be rounded to a tie
 
     def _inputs(
-        self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor, item: Item, dtype
+        self,
+        bin_depth: Tensor,
+        tote_depth: Tensor,
+        bearing: Tensor,
+        row: Tensor,
+        footprint: Tensor,
+        sizes: Sequence[Tensor],
+        dtype,
     ) -> tuple[Tensor, Tensor]:
         """Return the inputs of the first layer: ``[M, inputs]``, one-hot, cell by cell, then the five codes; and marks,
         ``[M, side * side]``."""
-        side, reach = self.receptive_field, self.reach
+        side, reach, (w, d, h) = self.receptive_field, self.reach, sizes
         _, wide, long = tote_depth.shape
         parity, x, y = split_footprint((wide, long), footprint)
         turned = parity == 1
         # Patches begin some cells before their footprint along the item's own axes, to have it in their middle.
-        before_w, before_d = (reference_cell(side) - reference_cell(size) for size in (item.w, item.d))
+        before_w, before_d = (reference_cell(side) - reference_cell(size) for size in (w, d))
         margin = side + max(bin_depth.shape[1:])
         stride = long + 2 * margin
         x = x + margin - torch.where(turned, before_d, before_w)
@@ -173,16 +182,15 @@ class FootprintFcn(nn.Module):
         cells = steps[turned.long()] + corner[:, None]  # [M, side * side]
         seen = depth.flatten()[cells]
         weak = F.pad(1 - bearing, (margin,) * 4).flatten()[cells].to(dtype)
-        under = self._under(bin_depth.shape[1:], row.device)[item.w, item.d]
+        under = self._under(bin_depth.shape[1:], row.device)[w, d]
         rest = torch.where(under, seen, FAR_DOWN).amin(1)  # depth of what the item rests on
-        headroom = rest - item.h.to(small)  # above its top
+        headroom = rest - h.to(small)  # above its top
         around = (headroom[:, None] - seen).clamp_(-reach, reach).add_(reach)
         hole = (seen - rest[:, None]).clamp_(0, reach).add_(2 * reach + 1)
         level = torch.where(under, hole, around).masked_fill_(seen == OUTSIDE, self.planes)
 
-        sizes = [(size - 1).clamp(0, self.item_range - 1).to(small) for size in (item.w, item.d, item.h)]
         codes = [
-            *sizes,
+            *((size - 1).clamp(0, self.item_range - 1).to(small) for size in sizes),
             (headroom + 1).clamp(0, self.headroom_bins - 1),
             (deepest - rest).clamp(0, self.depth_range - 1),
         ]

@@ -34,7 +34,7 @@ class FcnGrasp(FootprintPolicy):
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = True, **network):
         super().__init__(cell, mask_infeasible)
-        self.network = FootprintFcn(several_items=cell.bin_items > 1, **network)
+        self.network = FootprintFcn(**network)
 
 
 class UnmaskedFcnGrasp(Policy):
