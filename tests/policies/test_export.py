@@ -111,7 +111,7 @@ def test_any_size_is_what_a_person_would_read_off_the_maps(exported, seed, batch
     assert logits.shape == (batch, 2 * tote[0] * tote[1])
     network, item = load_policy("pretrained/mixed").policy.network, item_from_depth(maps[0])
     row, parity = batch - 1, seed % 2
-    w, d, h = (int(part[row]) for part in item[2:])
+    w, d, h = (int(part[row]) for part in item[2:5])
     wide, deep = (d, w) if parity else (w, d)
     if wide <= tote[0] and deep <= tote[1]:
         x, y = (tote[0] - wide) // 2, tote[1] - deep
