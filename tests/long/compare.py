@@ -35,7 +35,7 @@ CHANGED_TENSORS: dict[str, Callable[[Tensor], Tensor]] = {
     r"collector\|(worker\d+\|)?environment\|item": lambda item: item[:, 0, :5],  # [N, M, columns] was [N, 5]
 }
 #: Tensors that the older checkout did not have: patterns of today's names.
-NEW_TENSORS = (r"collector\|(worker\d+\|)?environment\|arrived",)
+NEW_TENSORS = (r"collector\|(worker\d+\|)?environment\|arrived", r"policy\|network\.rest_of_bin")
 
 TRAINING = ["threads=1", "evaluation.episodes=16", "evaluation.batch_size=16"]
 #: A few batches each, through all phases, with a validation and a checkpoint within.
@@ -160,8 +160,8 @@ def play(case: Case, checkout: Path, words: list[str], folder: Path) -> None:
 
 def tensor_differences(old: dict[str, Tensor], new: dict[str, Tensor]) -> list[str]:
     """Return a line for each tensor of two checkpoints that differs or has no counterpart."""
-    found, left = [], dict(new)
-    for name, tensor in old.items():
+    found, left = [], by_rank(new)
+    for name, tensor in by_rank(old).items():
         today = name
         for pattern, form in RENAMED_TENSORS.items():
             today = re.sub(pattern, form, today)
@@ -174,6 +174,14 @@ def tensor_differences(old: dict[str, Tensor], new: dict[str, Tensor]) -> list[s
         if tensor.shape != other.shape or tensor.dtype != other.dtype or not torch.equal(tensor, other):
             found.append(f"{name}: differs")
     return found + [f"{name}: new" for name in left if not any(re.fullmatch(each, name) for each in NEW_TENSORS)]
+
+
+def by_rank(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return tensors with the parameters of the optimizer counted without those that had no gradient."""
+    pattern = re.compile(r"optimizer\|(\d+)\|")
+    numbers = sorted({int(found[1]) for name in tensors if (found := pattern.search(name))})
+    rank = {str(number): f"optimizer|{rank}|" for rank, number in enumerate(numbers)}
+    return {pattern.sub(lambda found: rank[found[1]], name): tensor for name, tensor in tensors.items()}
 
 
 def metric_differences(old: Path, new: Path) -> list[str]:
