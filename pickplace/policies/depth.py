@@ -1,6 +1,5 @@
 """Preparation of depth maps and items for the networks: clipping, and one-hot codes."""
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -24,16 +23,12 @@ class Contents(NamedTuple):
         at = row * self.items.x.shape[1] + self.number
         return [part.flatten()[at] for part in (self.items.w, self.items.d, self.items.h)]
 
-    def other_codes(self, row: Tensor, item_range: int) -> Iterator[Tensor]:
-        """Yield a code of each of the ``M - 1`` other items in the bin, float32 ``[rows, 3 * item_range]``.
-
-        Their sum is the mean of the codes of those that are there.
-        """
+    def rest_code(self, row: Tensor, item_range: int) -> Tensor:
+        """Return the mean code of the other items in the bin, float32 ``[rows, 3 * item_range]``; 0 without any."""
         there = ~self.items.is_empty
-        others = (there.sum(1, keepdim=True) - 1).clamp(min=1)
-        code = item_code(self.items, item_range) * there[..., None] / others[..., None]
-        for step in range(1, code.shape[1]):
-            yield code[row, (self.number + step) % code.shape[1]]
+        code = item_code(self.items, item_range) & there[..., None]
+        rest = code.sum(1)[row] - code[row, self.number].int()
+        return rest / (there.sum(1, keepdim=True) - 1).clamp(min=1)[row]
 
 
 def clip_depth(depth: Tensor, limit: float | None, floor: float | None = None) -> Tensor:

@@ -247,7 +247,7 @@ def test_the_policy_sees_the_mean_of_the_other_items():
     swapped["footprint_mask"] = state["footprint_mask"].unflatten(1, (3, -1))[:, [0, 2, 1]].flatten(1)
     torch.testing.assert_close(policy.logits(swapped)[:, :places], changed[:, :places])
     contents = Contents(Item.from_table(state["items"]), torch.zeros(1, dtype=torch.int64))
-    code = sum(contents.other_codes(torch.tensor([0]), 3))
+    code = contents.rest_code(torch.tensor([0]), 3)
     by_hand = torch.zeros(9)
     others = [item for item in state["items"][0, 1:].tolist() if item[4]]
     for item in others:

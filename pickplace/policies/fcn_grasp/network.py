@@ -144,8 +144,8 @@ class FootprintFcn(nn.Module):
         x, weak = self._inputs(bin_depth, tote_depth, bearing, row, footprint, sizes, dtype)
         with torch.autocast(tote_depth.device.type, dtype, enabled=lower):
             x = self.patch(x) + F.linear(weak, self.weak)
-            for code in contents.other_codes(row, self.item_range):
-                x = x + F.linear(code.to(dtype), self.rest_of_bin)
+            if contents.items.x.shape[1] > 1:  # else a gradient of zeros would change the norm that clipping sees
+                x = x + F.linear(contents.rest_code(row, self.item_range).to(dtype), self.rest_of_bin)
             x = F.relu(self.hidden(F.relu(x)))
         return self.head(x.float())[:count]  # in full: scores that differ a little must not be rounded to a tie
 
