@@ -21,6 +21,8 @@ from pickplace.items.distributions import Kinds, Uniform
 from pickplace.planners.mcts import MCTS
 from pickplace.policies.fcn_grasp import network as footprint_fcn
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
+from pickplace.rules.masks import placing_maps
+from pickplace.rules.state import State
 from pickplace.runs import checkpoint
 from pickplace.training.collectors import refuse_other_workers
 from pickplace.training.settings import check_settings
@@ -339,10 +341,11 @@ def test_a_search_that_would_fill_the_memory_is_refused():
 def test_scores_of_many_footprints_are_computed_in_parts(monkeypatch):
     policy, state = FcnGrasp(CellSpec(), filters=8, hidden=8, compute_dtype="float32"), PickPlaceEnv(num_envs=9)
     seen = state.reset()
+    maps = placing_maps(policy.cell, State.from_observation(seen))
     with torch.no_grad():
-        whole = policy.best_feasible(seen), policy.action_log_probs(seen)
+        whole = policy.best_feasible(seen, maps), policy.action_log_probs(seen)
         monkeypatch.setattr(footprint_fcn, "CHUNK_BYTES", 4 * policy.network.patch.in_features * 7)
-        assert policy.best_feasible(seen).equal(whole[0])
+        assert policy.best_feasible(seen, maps).equal(whole[0])
         torch.testing.assert_close(policy.action_log_probs(seen), whole[1])
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pickplace.common.validate import check_bytes, excerpt, is_whole, one_of
+from pickplace.common.validate import excerpt, is_whole, one_of
 from pickplace.planners.base import MapPlanner, check_item_rule, pick_first, restrict_items
 from pickplace.policies.base import Policy, ScoresFootprints
 from pickplace.policies.footprints import FootprintPolicy, count_ways
@@ -15,7 +15,6 @@ from pickplace.rules.grasps import PICKS, join_pick, select_pick
 from pickplace.rules.item import Observation
 from pickplace.rules.masks import PlacingMaps, action_mask, first_action_reaching, placing_maps
 from pickplace.rules.state import State
-from pickplace.rules.step import apply
 
 
 class PolicyPlanner(MapPlanner):
@@ -56,19 +55,6 @@ class PolicyPlanner(MapPlanner):
                 )
         if pick != "any" and cell.bin_items > 1:
             raise ValueError(f"planner.pick={pick!r}: expected 'any' with env.bin_items={cell.bin_items}.")
-
-    @torch.no_grad()
-    def decide(self, observation: Observation) -> Tensor:
-        """Return flat actions, int64 ``[N]``."""
-        if self.candidates == "all":
-            return super().decide(observation)
-        count = min(self.candidates, self.cell.num_actions)
-        score, tried = self.policy.action_log_probs(observation).topk(count, dim=1)  # [N, K]
-        check_bytes(f"planner.candidates={count}", 32 * tried.numel() * self.cell.num_places, tried.device)
-        step = apply(self.cell, State.from_observation(observation).repeat(count), tried.flatten())
-        succeeds = (step.failure.view_as(tried) == 0) & (score > -torch.inf)
-        first = succeeds.int().argmax(1, keepdim=True)  # 0, the most probable, if none
-        return tried.gather(1, first)[:, 0]
 
     @torch.no_grad()
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:

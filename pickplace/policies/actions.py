@@ -7,7 +7,7 @@ from torch import Tensor
 from pickplace.policies.base import Policy
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
-from pickplace.rules.masks import PlacingMaps
+from pickplace.rules.masks import PlacingMaps, action_mask
 
 
 class ActionPolicy(Policy):
@@ -40,5 +40,5 @@ class ActionPolicy(Policy):
     def action_log_probs(self, observation: Observation) -> Tensor:
         return self.action_scores(observation).log_softmax(-1)
 
-    def best_feasible(self, observation: Observation, maps: PlacingMaps | None = None) -> Tensor:
-        return self.action_scores(observation, self.feasible(observation, maps)).argmax(1)
+    def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
+        return self.action_scores(observation, action_mask(self.cell, maps)).argmax(1)

@@ -27,9 +27,8 @@ from torchrl.modules import ValueOperator
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
-from pickplace.rules.masks import PlacingMaps, action_mask, placing_maps
+from pickplace.rules.masks import PlacingMaps, action_mask
 from pickplace.rules.observation import item_keys, standard_terms
-from pickplace.rules.state import State
 
 #: The logit of what must not be chosen, far below what a network may score: its probability is exactly 0 in float32.
 #: The rest of float32's range is left for differences from the greatest logit.
@@ -112,25 +111,17 @@ class Policy(TensorDictModuleBase, ABC):
         """Write ``logits`` into the observation."""
         return observation.set("logits", self.logits(observation))
 
-    def best_feasible(self, observation: Observation, maps: PlacingMaps | None = None) -> Tensor:
+    def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
         """Return the most probable feasible action, int64 ``[N]``.
 
         If a policy has probability for none of the feasible ones, its most probable action is returned, and fails.
 
         Args:
             observation: what the networks see.
-            maps: what decides which actions are feasible; None: that of the state that the observation shows.
+            maps: what decides which actions are feasible.
         """
         score = self.action_log_probs(observation)
-        return torch.where(self.feasible(observation, maps), score, score - FAR).argmax(1)
-
-    def feasible(self, observation: Observation, maps: PlacingMaps | None) -> Tensor:
-        """Return the mask over flat actions, bool ``[N, N_a]``; arguments as of :meth:`best_feasible`."""
-        return action_mask(self.cell, self.maps_of(observation) if maps is None else maps)
-
-    def maps_of(self, observation: Observation) -> PlacingMaps:
-        """Return what decides which actions succeed in the state that an observation shows."""
-        return placing_maps(self.cell, State.from_observation(observation))
+        return torch.where(action_mask(self.cell, maps), score, score - FAR).argmax(1)
 
     def with_cell(self, cell: CellSpec) -> Self:
         """Return this policy, with the same networks, for a cell that differs in its limits or in the number of items.

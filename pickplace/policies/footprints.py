@@ -146,7 +146,6 @@ class FootprintPolicy(FootprintScorer):
         share = logits.log_softmax(-1) - ways.clamp(min=1).log()
         return torch.where(footprint >= 0, share.gather(1, footprint.clamp(min=0)), MASKED)
 
-    def best_feasible(self, observation: Observation, maps: PlacingMaps | None = None) -> Tensor:
-        maps = self.maps_of(observation) if maps is None else maps
+    def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
         choice = self.footprint_logits(observation, self.ranked(maps)).argmax(1)
         return first_action_reaching(self.cell, maps, choice)

@@ -94,13 +94,13 @@ class TrainedPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` into the observation."""
         seen = tensordict.select(*self.in_keys).reshape(-1)
+        maps = placing_maps(self.cell, State.from_observation(seen))
         if exploration_type() == ExplorationType.RANDOM:
-            maps = placing_maps(self.cell, State.from_observation(seen))
             for name in self.policy.masks:
                 seen[f"{name}_mask"] = MASKS[name].make(self.cell, maps)
             action = self._draw(seen)["action"]
         else:
-            action = self.policy.best_feasible(seen)
+            action = self.policy.best_feasible(seen, maps)
         return tensordict.set("action", action.reshape(tensordict.batch_size))
 
     def make_env(self, num_envs: int = 1, **options) -> PickPlaceEnv:

@@ -23,6 +23,8 @@ from pickplace.policies.base import as_critic
 from pickplace.policies.restore import restore_critic, restore_policy
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import footprint_index
+from pickplace.rules.masks import placing_maps
+from pickplace.rules.state import State
 from pickplace.runs import checkpoint
 from pickplace.training.train import train
 
@@ -201,7 +203,8 @@ def test_it_serves_other_totes():
     policy = Afterstate(CellSpec(tote_size=(9, 7, 6)), grid=(6, 5, 4), filters=4, hidden=8)
     env = PickPlaceEnv(num_envs=3, tote_size=(9, 7, 6), masks=())
     seen = env.reset()
-    assert (env.step(seen.set("action", policy.best_feasible(seen)))["next", "failure"] == 0).all()
+    maps = placing_maps(policy.cell, State.from_observation(seen))
+    assert (env.step(seen.set("action", policy.best_feasible(seen, maps)))["next", "failure"] == 0).all()
 
 
 def test_shipped_weights_judge_for_a_search_and_begin_a_training(tmp_path):

@@ -17,8 +17,9 @@ from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.policies.onnx_model import SHAPES, Scores
 from pickplace.rules.item import item_from_depth
-from pickplace.rules.masks import footprint_mask
+from pickplace.rules.masks import footprint_mask, placing_maps
 from pickplace.rules.reach.annulus import Annulus
+from pickplace.rules.state import State
 
 MAKERS = {
     "fcn_grasp": lambda: FcnGrasp(CellSpec(), head_std=1.0, compute_dtype="float32"),
@@ -125,9 +126,10 @@ def test_its_best_feasible_footprint_is_the_planners(exported):
     seen = trained.make_env(num_envs=8).rollout(10, trained, break_when_any_done=False).reshape(-1)
     keys = [entry.name for entry in exported[0].get_inputs()]
     logits = torch.from_numpy(exported[0].run(None, {key: seen[key].numpy() for key in keys})[0])
-    mask = footprint_mask(trained.cell, trained.policy.maps_of(seen)).flatten(1)
+    maps = placing_maps(trained.cell, State.from_observation(seen))
+    mask = footprint_mask(trained.cell, maps).flatten(1)
     best = torch.where(mask, logits, MASKED).argmax(1)
-    assert torch.equal(best, trained.policy.to_choice(trained.policy.best_feasible(seen), seen))
+    assert torch.equal(best, trained.policy.to_choice(trained.policy.best_feasible(seen, maps), seen))
 
 
 @pytest.fixture

@@ -13,7 +13,8 @@ from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintScorer, coun
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import heuristic_pick, join_pick, pick_classes, select_pick
 from pickplace.rules.item import Observation, item_from_depth, items_from_observation
-from pickplace.rules.masks import PlacingMaps, action_footprints
+from pickplace.rules.masks import PlacingMaps, action_footprints, action_mask, placing_maps
+from pickplace.rules.state import State
 
 EXCLUDES = "every pick but the heuristic one"
 
@@ -142,10 +143,11 @@ class IndividualGrasp(FootprintScorer):
         return join_pick(self.cell, pick, place_rotation.clamp(min=0))
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        return self._action(choice, observation, self.feasible(observation, None))
+        maps = placing_maps(self.cell, State.from_observation(observation))
+        return self._action(choice, observation, action_mask(self.cell, maps))
 
-    def best_feasible(self, observation: Observation, maps: PlacingMaps | None = None) -> Tensor:
-        mask = self.feasible(observation, maps)
+    def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
+        mask = action_mask(self.cell, maps)
         return self._action(self._masked_logits(observation, mask).argmax(1), observation, mask)
 
     def action_log_probs(self, observation: Observation) -> Tensor:
