@@ -104,12 +104,12 @@ class JointDBL(MapPlanner):
         y = torch.arange(tote_d, device=feasible.device)
         # Items and parities that share the least order are tied.
         order = torch.where(feasible, maps.join(dbl_order(cell, maps.top.long(), x, y)), FAR**2)
-        best, corner = order.unflatten(1, (-1, cell.num_places)).min(2)  # [N, M * Q]
+        best, place = order.unflatten(1, (-1, cell.num_places)).min(2)  # [N, M * Q]
         least = best.amin(1, keepdim=True)
         highest = cell.num_actions
         action = torch.full_like(least, highest)
         for index in range(best.shape[1]):
-            choice = index * cell.num_places + corner[:, index]
+            choice = index * cell.num_places + place[:, index]
             reaching = actions_reaching(cell, maps, choice)
             reaching = torch.where((reaching >= 0) & (best[:, index, None] == least), reaching, highest)
             action = torch.minimum(action, reaching.amin(1, keepdim=True))
@@ -126,7 +126,7 @@ class _Cheapest(MapPlanner):
         """Return the cost of each footprint, ``[N, Q, W_T, D_T]``.
 
         Args:
-            distance: from the tote's first corner, ``x + y``, int64 ``[W_T, D_T]``.
+            distance: from the tote's origin, ``x + y``, int64 ``[W_T, D_T]``.
         """
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
@@ -138,7 +138,7 @@ class _Cheapest(MapPlanner):
 
 
 class Corner(_Cheapest):
-    """Keeps the item's top low and its footprint near the tote's first corner; not in the paper.
+    """Keeps the item's top low and its footprint near the tote's origin; not in the paper.
 
     Minimises ``height_weight * top + x + y`` of the footprint over everything that is feasible; ties go to the lowest
     footprint index, then to the lowest flat index.
@@ -169,7 +169,7 @@ class HeightmapMinimisation(_Cheapest):
 
     Args:
         cell: the sizes.
-        distance_weight: cost of one cell of distance from the tote's first corner, in cells times height units.
+        distance_weight: cost of one cell of distance from the tote's origin, in cells times height units.
         item: which of several items in the bin are considered, see
             :func:`~pickplace.planners.base.restrict_items`.
     """

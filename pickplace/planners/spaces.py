@@ -1,7 +1,8 @@
-"""Planners that set items down in corners of maximal empty spaces, as the packing heuristics of the literature do.
+"""Planners that set items down at the origins of maximal empty spaces, as the packing heuristics of the literature do.
 
-A *maximal empty space* is a box above the items, open to the top, that cannot grow: a rectangle of cells no higher than
-its floor, one of which is as high, with something higher, or a wall, along each side.
+A *maximal empty space* is a space above the items, open to the top, that cannot grow: a rectangle of cells no higher
+than its floor, one of which is as high, with something higher, or a wall, along each side. Its origin is its cell with
+the least x and y.
 """
 
 from abc import abstractmethod
@@ -20,7 +21,7 @@ from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, first_action_reaching
 from pickplace.rules.state import State
 
-LAST = FAR**2  # order of a footprint in no corner
+LAST = FAR**2  # order of a footprint at the origin of no space
 MAX_RECTANGLES = 2**23  # that are looked at together, over all problems
 
 
@@ -78,20 +79,20 @@ def _counter(cells: Tensor, outside: int = 1):
     def at(x: Tensor, y: Tensor) -> Tensor:
         return table.index_select(0, (x + 1) * deep + y + 1)
 
-    return lambda box: at(box.x1, box.y1) - at(box.x0, box.y1) - at(box.x1, box.y0) + at(box.x0, box.y0)
+    return lambda r: at(r.x1, r.y1) - at(r.x0, r.y1) - at(r.x1, r.y0) + at(r.x0, r.y0)
 
 
 class SpacePlanner(MapPlanner):
-    """Sets the item down in the first corner of the empty space that comes first in an order of the planner's own.
+    """Sets the item down at the origin of the empty space that comes first in an order of the planner's own.
 
     Minimises (:meth:`space_order`, footprint y, footprint x, parity) over all feasible footprints that begin in the
-    first corner of a maximal empty space; then the lowest flat index.
+    origin of a maximal empty space; then the lowest flat index.
 
     Args:
         cell: the sizes.
         item: which of several items in the bin are considered, see
             :func:`~pickplace.planners.base.restrict_items`.
-        dbl_fallback: where no item fits a corner of a space: whether deepest-bottom-left decides over all feasible
+        dbl_fallback: where no item fits at the origin of a space: whether deepest-bottom-left decides over all feasible
             footprints. Else an action is played that fails, and ends the episode, as in the literature.
 
     Raises:
@@ -121,25 +122,25 @@ class SpacePlanner(MapPlanner):
         x, y = (torch.arange(side, device=feasible.device) for side in cell.tote_size[:2])
         parity = torch.arange(cell.parities, device=feasible.device)[:, None, None]
         orders, last = [], LAST * cell.num_footprints
-        for order in (self._corner_order(cell, state, maps), maps.top.long()):
+        for order in (self._least_order(cell, state, maps), maps.top.long()):
             order = dbl_order(cell, order, x[:, None], y) * cell.parities + parity
             orders.append(torch.where(feasible, maps.join(order), last))
-        in_corner, elsewhere = orders
-        has_corner = (in_corner < last).any(1, keepdim=True)
-        action = first_action_reaching(cell, maps, torch.where(has_corner, in_corner, elsewhere).argmin(1))
-        if self.dbl_fallback or has_corner.all():
+        at_origin, elsewhere = orders
+        has_origin = (at_origin < last).any(1, keepdim=True)
+        action = first_action_reaching(cell, maps, torch.where(has_origin, at_origin, elsewhere).argmin(1))
+        if self.dbl_fallback or has_origin.all():
             return action
-        return torch.where(has_corner[:, 0], action, action_mask(cell, maps).int().argmin(1))
+        return torch.where(has_origin[:, 0], action, action_mask(cell, maps).int().argmin(1))
 
-    def _corner_order(self, cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:
-        """Return the least order of a space in whose first corner a footprint lies, int64 ``[N * M, Q, W_T, D_T]``."""
+    def _least_order(self, cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:
+        """Return the least order of a space at whose origin a footprint lies, int64 ``[N * M, Q, W_T, D_T]``."""
         surface, tote_height, item = state.each_item()
         heights = surface >> 1
         rectangles = Rectangles.of_grid(*cell.tote_size[:2], heights.device)
         wide, deep = (rectangles.x1 - rectangles.x0)[:, None], (rectangles.y1 - rectangles.y0)[:, None]
-        corner = (rectangles.x0 * cell.tote_size[1] + rectangles.y0)[:, None]
-        order = torch.full((cell.parities, cell.num_places, len(heights)), LAST, device=corner.device)
-        for rows in torch.arange(len(heights), device=corner.device).split(max(1, MAX_RECTANGLES // len(corner))):
+        origin = (rectangles.x0 * cell.tote_size[1] + rectangles.y0)[:, None]
+        order = torch.full((cell.parities, cell.num_places, len(heights)), LAST, device=origin.device)
+        for rows in torch.arange(len(heights), device=origin.device).split(max(1, MAX_RECTANGLES // len(origin))):
             w_and_d, height = (item.w[rows], item.d[rows]), item.h[rows]
             for floor, space in empty_spaces(heights[rows], rectangles, maps.level_step):
                 for parity in range(cell.parities):
@@ -149,7 +150,7 @@ class SpacePlanner(MapPlanner):
                     found = torch.where(
                         space & fits if self.holds_item else space, self.space_order(floor, left_x, left_y), LAST
                     )
-                    least = order[parity][:, rows].scatter_reduce(0, corner.expand_as(found), found, "amin")
+                    least = order[parity][:, rows].scatter_reduce(0, origin.expand_as(found), found, "amin")
                     order[parity, :, rows] = least
         return order.permute(2, 0, 1).unflatten(2, cell.tote_size[:2])
 

@@ -29,7 +29,7 @@ from pickplace.rules.step import apply
 
 #: How an index of the scores of all footprints is made.
 FOOTPRINT_INDEX = (
-    "(parity * W_T + x) * D_T + y: minimum corner of the item in the tote; parity 1: turned by 90 degrees; of several "
+    "(parity * W_T + x) * D_T + y: first cell of the item in the tote; parity 1: turned by 90 degrees; of several "
     "items one after the other"
 )
 

@@ -87,8 +87,8 @@ class CornerNet(nn.Module):
 
         # The points along the item's width and depth, as cells of the tote: outside it, a cell of the margin.
         along, across = self._points(w), self._points(d)  # [M, points]
-        corner_x, corner_y = x[:, None], y[:, None]
-        begin_w, begin_d = torch.where(turned, corner_y, corner_x), torch.where(turned, corner_x, corner_y)
+        begin_x, begin_y = x[:, None], y[:, None]
+        begin_w, begin_d = torch.where(turned, begin_y, begin_x), torch.where(turned, begin_x, begin_y)
         size_w, size_d = torch.where(turned, deep, wide), torch.where(turned, wide, deep)
         along = torch.minimum((begin_w + along).clamp(min=-1), size_w) + 1
         across = torch.minimum((begin_d + across).clamp(min=-1), size_d) + 1

@@ -178,8 +178,8 @@ class FootprintFcn(nn.Module):
         depth = clip_depth(tote_depth, 8_000, floor=-900).to(small)
         deepest = depth.amax((1, 2)).clamp(min=self.tote_clip)[row]
         depth = F.pad(depth, (margin,) * 4, value=OUTSIDE)
-        corner = (row * (wide + 2 * margin) + x) * stride + y
-        cells = steps[turned.long()] + corner[:, None]  # [M, side * side]
+        first = (row * (wide + 2 * margin) + x) * stride + y
+        cells = steps[turned.long()] + first[:, None]  # [M, side * side]
         seen = depth.flatten()[cells]
         weak = F.pad(1 - bearing, (margin,) * 4).flatten()[cells].to(dtype)
         under = self._under(bin_depth.shape[1:], row.device)[w, d]

@@ -65,7 +65,7 @@ class UnmaskedFcnGrasp(Policy):
     def _scored(self) -> Tensor:
         """Return where among the network's scores each (grasp class, place cell) is found, int64 ``[C, W_T * D_T]``.
 
-        The last score is that of every footprint whose corner is not in the tote.
+        The last score is that of every footprint that does not begin in the tote.
         """
         (tote_w, tote_d, _), offsets, low = self.cell.tote_size, self.cell.num_offsets, self.cell.min_offset
         step, x, y = torch.arange(offsets), torch.arange(tote_w), torch.arange(tote_d)
