@@ -58,11 +58,11 @@ class Row(NamedTuple):
         """Return overrides of pickplace-evaluate."""
         weights = self.benchmark if self.benchmark in ("cdrl_rs", "cut1", "cut2") else "gopt_rs"
         learned = self.planner.startswith("learned")
-        words = [f"benchmark={self.benchmark}", f"effector={self.effector}", f"env.rotations={self.rotations}"]
+        words = [f"benchmark={self.benchmark}", f"gripper={self.effector}", f"env.rotations={self.rotations}"]
         words += [f"checkpoint=pretrained/{weights}" if learned else "evaluation.episodes=300"]
         if self.benchmark in SCALED and self.effector in PLATES:  # the plate grows with the tote
             scale, side = SCALED[self.benchmark], PLATES[self.effector] * SCALED[self.benchmark]
-            words += [f"env.effector_size=[{side},{side}]", f"env.cup_size=[{scale},{scale}]"]
+            words += [f"env.gripper.size=[{side},{side}]", f"env.gripper.cup_size=[{scale},{scale}]"]
         return [*words, *PLANNERS[self.planner], "physics=settle"]
 
 

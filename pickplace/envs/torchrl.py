@@ -16,7 +16,7 @@ from pickplace.envs.checks import check_items, problem_bytes
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.rules.bin import remove_item
-from pickplace.rules.cell import CELL_SETTINGS, SHORT_FORMS, CellSpec, cell_from_settings
+from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.rules.corners import corner_mask
 from pickplace.rules.item import Item
 from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, placing_maps
@@ -94,7 +94,7 @@ class PickPlaceEnv(EnvBase):
     """
 
     #: Arguments that a config may give. The others decide which episodes are played, and where.
-    settings = (*CELL_SETTINGS, *SHORT_FORMS, "num_envs", "observation")
+    settings = (*CELL_SETTINGS, "num_envs", "observation")
 
     def __init__(
         self,

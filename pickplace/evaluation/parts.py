@@ -14,7 +14,6 @@ from pickplace.evaluation.play import MakeEnv, check_episode_settings, check_pla
 from pickplace.evaluation.result import resolved
 from pickplace.planners.base import BatchPlanner
 from pickplace.planners.use import planner_parts
-from pickplace.rules.cell import CELL_SETTINGS, SHORT_FORMS, CellSpec
 from pickplace.runs import checkpoint
 from pickplace.runs.provenance import first_weights, imitated_planner
 
@@ -89,11 +88,6 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
                 OmegaConf.update(changed, place, OmegaConf.select(groups, place), merge=False, force_add=True)
         elif key.split(".")[0] in TRAINED:
             ours.append(word)
-            name = key.removeprefix("env.")
-            if (
-                name in (*CELL_SETTINGS, *SHORT_FORMS) and name not in changed.env
-            ):  # older checkpoints lack what is to be overridden
-                OmegaConf.update(changed, key, getattr(CellSpec, name), force_add=True)
     merged = apply_overrides(changed, ours, groups)
     with open_dict(cfg):
         for group in TRAINED:  # resolved where they come from: here a reference could lead elsewhere

@@ -19,7 +19,7 @@ from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import build, node_of
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
 from pickplace.policies.base import EstimatesValue, Policy, as_collection_policy, as_critic
-from pickplace.rules.cell import CELL_SETTINGS, SHORT_FORMS, CellSpec, cell_from_settings
+from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.rules.item import Observation
 from pickplace.rules.masks import placing_maps
 from pickplace.rules.observation import Term, check_terms
@@ -127,7 +127,7 @@ def build_cell(env: dict, **given) -> CellSpec:
     Raises:
         ValueError: as of :func:`~pickplace.config.registry.build` and of the cell.
     """
-    own = {key: env[key] for key in (*CELL_SETTINGS, *SHORT_FORMS) if key in env and key not in given}
+    own = {key: env[key] for key in CELL_SETTINGS if key in env and key not in given}
     return cell_from_settings({**build("env", own), **given})
 
 

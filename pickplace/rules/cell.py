@@ -191,7 +191,6 @@ class CellSpec:
 
 #: The settings of a cell, by the names that configs, checkpoints and evaluations use.
 CELL_SETTINGS = tuple(item.name for item in fields(CellSpec) if not item.metadata.get("derived"))
-SHORT_FORMS = ("effector_size", "body", "cup", "cup_size", "pick_rule", "min_seal")
 
 
 def cell_from_settings(settings: dict) -> CellSpec:

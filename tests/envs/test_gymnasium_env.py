@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from pickplace import Failure, PickPlaceEnv
 from pickplace.config.registry import build
 from pickplace.items.distributions import Kinds, Recorded
-from pickplace.rules.cell import CELL_SETTINGS, SHORT_FORMS
+from pickplace.rules.cell import CELL_SETTINGS
 from pickplace.rules.reach.annulus import Annulus
 
 ID = "pickplace/PickPlace-v0"
@@ -85,12 +85,13 @@ def test_a_single_environment_against_the_batched_one(seed, height):
 
 def test_a_cup_and_a_reach_against_the_batched_environment_of_the_config():
     """And against distances computed here: centres of cells, as the end effector's sides are odd."""
-    words = ["effector=cup_round", "reach=annulus", "env.bin_size=[9,8,2]", "env.tote_size=[14,12,8]"]
+    words = ["gripper=cup_round", "reach=annulus", "env.bin_size=[9,8,2]", "env.tote_size=[14,12,8]"]
     words += ["env.reach.radii=[8.5,15.5]", "env.reach.bin=[-16,-4,0]", "env.reach.tote=[4,-5,0]"]
     cfg, items = OmegaConf.to_container(composed(*words).env), Kinds([(5, 4, 2), (4, 4, 3), (6, 5, 2)])
     below = build("env", {**cfg, "num_envs": 1}, items=items, seed=6)
-    settings = {key: cfg[key] for key in (*CELL_SETTINGS, *SHORT_FORMS) if key not in ("gripper", "reach")}
+    settings = {key: cfg[key] for key in CELL_SETTINGS if key not in ("gripper", "reach")}
     reach = Annulus((8.5, 15.5), (0, 10), (-16, -4, 0), (4, -5, 0))
+    settings |= {"effector_size": (7, 7), "body": "disc", "cup": "disc", "cup_size": (3, 3), "pick_rule": "seal"}
     env, free = (gymnasium.make(ID, items=items, **settings, reach=given) for given in (reach, None))
     generator, forbidden, steps = np.random.default_rng(0), 0, 0
     for episode in range(10):

@@ -48,13 +48,12 @@ def evaluation(run, tmp_path):
     return call
 
 
-def test_weights_of_before_play_with_several_items(evaluation):
-    """Their config lacks the keys; one is given, the other has its default."""
+def test_shipped_weights_play_with_several_items(evaluation):
     few = [*SMALL[1:], "env.tote_size=[5,5,4]", "evaluation.episodes=3", "threads=1"]
     one = evaluation("checkpoint=pretrained/mixed", *few)
     several = evaluation("checkpoint=pretrained/mixed", "env.bin_items=2", "env.bin_size=[6,6,1]", *few)
     assert "| items in the bin " in several["out"] and "up to 2, refill: each" in several["out"]
-    assert "items in the bin" not in one["out"] and "bin_items" not in one["env"]
+    assert "items in the bin" not in one["out"] and one["env"]["bin_items"] == 1
     path = one["path"]
     evaluation(
         "checkpoint=pretrained/mixed", "env.bin_items=2", *few, f"compare={path}",
@@ -89,7 +88,7 @@ def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, 
     assert cfg["items"].get("container", cfg.env.tote_size) == cfg.env.tote_size
     assert cfg.evaluation.episodes == episodes
     assert (cfg.env.tote_size, cfg.env.rotations) == ([10, 10, 10], rotations)
-    assert (cfg.env.effector_size, cfg.env.pick_rule, cfg.env.bin_size) == ([1, 1], "overlap", [5, 5, 1])
+    assert (cfg.env.gripper.size, cfg.env.gripper._target_, cfg.env.bin_size) == ([1, 1], "overlap", [5, 5, 1])
     short = [f"benchmark={name}", "evaluation.episodes=2", *SMALL[1:]]
     first = evaluation("planner=joint_dbl", *short)
     assert first["failures"] == {"stuck": 2} and first["env"]["support"]["_target_"] == support
@@ -185,8 +184,8 @@ def test_paired_difference(evaluation):
 
 
 @pytest.mark.parametrize("word", [
-    "env.rotations=2", "env.effector_size=[2,3]", "env.bin_size=[5,4,1]", "env.tote_size=[4,5,1]",
-    "env.pick_rule=overlap", "env.support=hull", "env.support={_target_: bearing, margin: 0.1}",
+    "env.rotations=2", "env.gripper.size=[2,3]", "env.bin_size=[5,4,1]", "env.tote_size=[4,5,1]",
+    "env.gripper._target_=overlap", "env.support=hull", "env.support={_target_: bearing, margin: 0.1}",
     "evaluation.seed=1", "evaluation.episodes=3", "evaluation.stream=validation", "items=mixed",
 ])  # fmt: skip
 def test_only_the_same_episodes_are_compared(word, tmp_path):
@@ -196,7 +195,7 @@ def test_only_the_same_episodes_are_compared(word, tmp_path):
     path.write_text(json.dumps({**ours, "planner": "a", "occupancy": {"per_episode": [0.5] * 100}}))
     read_comparison(path, ours)
     key = word.partition("=")[0].removeprefix("evaluation.")
-    key = {"env.effector_size": "env.gripper.size", "env.pick_rule": "env.gripper"}.get(key, key)
+    key = key.removesuffix("._target_")
     with pytest.raises(ValueError, match=key if "." in key else f"its {key} is "):
         read_comparison(path, theirs)
 

@@ -62,18 +62,18 @@ def test_a_checkpoint_brings_its_reach(trained, evaluation):
     assert everywhere["env"]["reach"] is None
     error = evaluation(f"checkpoint={trained}", "reach=everywhere", f"compare={plain['folder']}/evaluation.json")
     assert "env.reach={" in error and "expected None" in error
-    for word, expected in (("~reach", "reach="), ("~effector", "effector="), ("~reach=null", "reach=")):
+    for word, expected in (("~reach", "reach="), ("~gripper", "gripper="), ("~reach=null", "reach=")):
         error = evaluation(f"checkpoint={trained}", word)
         assert f"error: {word}: " in error and f"expected {expected}" in error and error.count("\n") == 1
     assert "env.reach.radi:" in evaluation(f"checkpoint={trained}", "env.reach.radi=[1,2]")
 
 
-def test_weights_of_before_are_evaluated_with_a_reach(evaluation):
-    """Their config has no such key."""
-    assert "reach" not in checkpoint.read(checkpoint.locate("pretrained/r4"))[1]["config"]["env"]
+def test_shipped_weights_are_evaluated_with_a_reach_and_another_gripper(evaluation):
     words = ["checkpoint=pretrained/r4", "env.tote_size=[6,6,1]"]
     plain = evaluation(*words)
-    assert "reach" not in plain["env"]
+    assert plain["env"]["reach"] is None
+    cup = evaluation(*words, "gripper=point")["env"]["gripper"]
+    assert (cup["_target_"], cup["size"]) == ("overlap", [1, 1])
     compare = f"compare={plain['folder']}/evaluation.json"
     assert evaluation(*words, compare)["paired_difference"]["mean"] == 0
     everywhere = evaluation(*words, "reach=everywhere", compare)
@@ -101,7 +101,7 @@ def test_tables_are_compared_by_content(evaluation, tmp_path):
 def test_physics_carries_out_poses_in_reach(evaluation):
     """Each pick and place, with the turned end effector's centre, from the rules to a gantry in metres."""
     pytest.importorskip("mujoco")
-    words = ["planner=joint_dbl", "env.tote_size=[6,6,3]", "env.effector_size=[4,3]", "items=mixed", "reach=annulus"]
+    words = ["planner=joint_dbl", "env.tote_size=[6,6,3]", "env.gripper.size=[4,3]", "items=mixed", "reach=annulus"]
     words += ["env.reach.heights=[0.5,2.5]", "env.reach.tote=[4,-3,0.5]", "env.reach.radii=[5.2,9.6]"]
     result = evaluation(*words, "physics=execute", "evaluation.plans=true", "items.height=[1,2]")
     assert set(result["physics"]["endings"]) == {"done"}
@@ -115,17 +115,17 @@ def test_physics_carries_out_poses_in_reach(evaluation):
 
 
 def test_a_resumed_run_keeps_its_cell(trained, smoke, tmp_path):
-    """Options of ``reach`` and ``effector`` are refused, as other settings of the cell are."""
+    """Options of ``reach`` and ``gripper`` are refused, as other settings of the cell are."""
     run_dir = tmp_path / "run"
-    smoke(run_dir, *TINY, "effector=cup_round", "env.effector_size=[3,3]", "items.kinds=[[3,3,1],[4,3,1]]", *WIDE)
+    smoke(run_dir, *TINY, "gripper=cup_round", "env.gripper.size=[3,3]", "items.kinds=[[3,3,1],[4,3,1]]", *WIDE)
     begun = load_policy(run_dir).cell
     assert begun.gripper == Seal((3, 3), "disc", "disc", (3, 3)) and begun.reach == Annulus(*WIDE_REACH)
     before = checkpoint.read(checkpoint.locate(run_dir, prefer="last"))[1]
     resume_run([f"resume={run_dir}", "total_frames=256"])
     after = checkpoint.read(checkpoint.locate(run_dir, prefer="last"))[1]
     assert (before["frames"], after["frames"]) == (128, 256) and after["config"]["env"] == before["config"]["env"]
-    for word in ("reach=everywhere", "reach=annulus", "effector=paper", "~reach"):
-        with pytest.raises(ValueError, match=f"'{word}': .*'(reach|effector)' cannot be exchanged"):
+    for word in ("reach=everywhere", "reach=annulus", "gripper=paper", "~reach"):
+        with pytest.raises(ValueError, match=f"'{word}': .*'(reach|gripper)' cannot be exchanged"):
             resume_run([f"resume={run_dir}", word, "total_frames=384"])
 
     _, facts = checkpoint.read(checkpoint.locate(trained, prefer="last"))

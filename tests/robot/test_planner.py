@@ -248,7 +248,7 @@ def test_load_refuses(path, sizes, message):
 def test_load_of_a_policy_whose_grasps_depend_on_the_items(tmp_path):
     """With ``pick_rule=overlap`` and no mask the number of grasp classes follows from the longest item in training."""
     cell = CellSpec(tote_size=(5, 5, 2), pick_rule="overlap", longest_side=2)
-    overrides = ["env.pick_rule=overlap", "model.mask_infeasible=false", "env.tote_size=[5,5,2]"]
+    overrides = ["env.gripper._target_=overlap", "model.mask_infeasible=false", "env.tote_size=[5,5,2]"]
     loaded = Planner.load(write_checkpoint(tmp_path / "it", cell, *overrides))
     assert plan_for(loaded, ITEM, np.full((5, 5), 2)).status == "ok"
     with pytest.raises(DepthMapError, match="the item is 3 cells long, longer than .*; expected at most 2"):

@@ -36,13 +36,13 @@ def test_a_benchmark_is_trained_on(name, tmp_path):
 @pytest.mark.parametrize("name", options("effector"))
 def test_every_effector_trains(name, masked, tmp_path):
     kinds = ["items.kinds=[[5,4,1],[4,4,2]]", "env.bin_size=[9,9,1]", "env.tote_size=[11,10,2]"]
-    words = [f"effector={name}", f"model.mask_infeasible={masked}", "curriculum=none", "logger=none", *TINY]
+    words = [f"gripper={name}", f"model.mask_infeasible={masked}", "curriculum=none", "logger=none", *TINY]
     assert 0 <= train(composed(*words, *(kinds if name == "cup_round" else [])), tmp_path) <= 1
 
 
 @pytest.mark.parametrize("env", options("env"))
 def test_the_paper_s_effector_is_the_default(env):
-    assert composed(f"env={env}").env == composed(f"env={env}", "effector=paper").env
+    assert composed(f"env={env}").env == composed(f"env={env}", "gripper=paper").env
 
 
 @pytest.mark.parametrize(("model", "masked", "samples"), [
