@@ -151,7 +151,7 @@ def own_values(cfg: DictConfig) -> DictConfig:
     running = HydraConfig.get()
     search, given = _search_words(running.overrides.hydra), parse(task_overrides(running))
     choices = [override for override in given if _is_choice(override)]
-    pairs = [(place, choice) for choice in choices for place in _places(choice, search)]
+    pairs = [(place, choice) for choice in choices if not choice.is_delete() for place in _places(choice, search)]
     for place, choice in sorted(pairs, key=lambda pair: pair[0].count(".")):  # an outer part before its own parts
         if place == "env" or OmegaConf.select(cfg, place) is None:
             continue
