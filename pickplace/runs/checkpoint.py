@@ -25,7 +25,6 @@ from pickplace.common.validate import excerpt
 SCHEMA = 1
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"  # weights that the package ships
 TENSORS, FACTS = "state.safetensors", "state.json"
-ZERO_SUFFIX = (".weak", ".rest_of_bin")  # of parameters that begin at zero, and that older weights lack
 PREVIOUS = "previous"  # the checkpoint before checkpoints/last, beside it
 MAX_BYTES = {FACTS: 2**25, TENSORS: 2**32}  # greatest size of each file
 
@@ -252,14 +251,11 @@ def restore(make: Callable[[], Module], state: dict, what: str) -> Module:
     """
     with torch.device("meta"):
         own = make().state_dict()
-    lacking = {key for key in own if key.endswith(ZERO_SUFFIX) and key not in state}
-    weights = matching_state(state, {key: value for key, value in own.items() if key not in lacking}, what)
+    weights = matching_state(state, own, what)
     if unknown := sorted(map(str, set(state) - set(own))):
         raise CheckpointError(f"The checkpoint's {what} does not fit these settings: {unknown[0]} is not expected.")
     module = make()
-    if nonzero := [key for key in sorted(lacking) if module.state_dict()[key].any()]:
-        raise CheckpointError(f"The checkpoint's {what} does not fit these settings: {nonzero[0]} is missing.")
-    module.load_state_dict(weights, strict=not lacking)
+    module.load_state_dict(weights)
     return module
 
 

@@ -25,6 +25,10 @@ from pickplace.runs.resume import checkpoint_config, resumed_config
 from pickplace.training.train import resume_run, train
 from pickplace.training.trainer import Trainer
 
+#: Facts of a checkpoint, beside its config.
+SAVED = {"curriculum": {}, "frames": 5, "iteration": 1, "best": 0.5, "latest": {}}
+SAVED |= {"callbacks": {}, "ended": False, "commit": None, "versions": {}}
+
 
 def saved_frames(run_dir):
     return json.loads((checkpoint.locate(run_dir, "last") / checkpoint.FACTS).read_text())["frames"]
@@ -307,7 +311,7 @@ def test_a_bin_that_no_episode_leads_to_is_refused(change, words):
 )  # fmt: skip
 def test_the_user_repeats_settings_that_leave_the_machine(key, value, local):
     config = saved_form(composed("experiment=quick", f"++{key}={value}"))
-    facts = {"config": config, "curriculum": {}, "frames": 5, "iteration": 1, "best": 0.5, "latest": {}}
+    facts = {"config": config, **SAVED}
     with pytest.raises(ValueError, match=f"{key}={value}: the checkpoint would write outside .* or {key}={local}"):
         resumed_config("run", facts, [])
     assert OmegaConf.select(resumed_config("run", facts, [f"{key}={local}"]), key) != value
@@ -318,13 +322,13 @@ def test_the_user_repeats_settings_that_leave_the_machine(key, value, local):
 def test_a_checkpoint_asks_for_no_more_threads_than_there_are(caplog):
     """A user may."""
     config = saved_form(composed("experiment=quick", "threads=1024"))
-    facts = {"config": config, "curriculum": {}, "frames": 5, "iteration": 1, "best": 0.5, "latest": {}}
+    facts = {"config": config, **SAVED}
     assert resumed_config("run", facts, []).threads == cpu_count() and "threads=1024" in caplog.text
     assert resumed_config("run", facts, ["threads=1024"]).threads == 1024
 
 
 def test_only_the_user_says_what_to_trust():
     config = {**saved_form(composed("experiment=quick")), "trust": ["evil"]}
-    facts = {"config": config, "curriculum": {}, "frames": 5, "iteration": 1, "best": 0.5, "latest": {}}
+    facts = {"config": config, **SAVED}
     assert resumed_config("run", facts, []).trust == []
     assert resumed_config("run", facts, ["trust=[mine]"]).trust == ["mine"]
