@@ -68,9 +68,11 @@ class Artifacts:
             for name, text in texts.items():
                 with replaced_file(run_dir / name) as new:
                     new.write_text(text, encoding="utf-8")
-            for name, draw in {"tote.png": picture, **({"replay.gif": animation} if self.gif else {})}.items():
-                with replaced_file(run_dir / name) as new:
-                    draw(recordings[0], cell, new)
+            with replaced_file(run_dir / "tote.png") as new:
+                picture(recordings[0], cell, new)
+            if self.gif:
+                with replaced_file(run_dir / "replay.gif") as new:
+                    animation(recordings[0], cell, new)
         except OSError as error:
             raise ValueError(f"{sentence(error)} The table above and the files that are there are whole.") from error
 

@@ -41,10 +41,10 @@ MAX_BODY = 2_048  # rectangles of a body
 
 
 class Value(NamedTuple):
-    """What a key of a line holds: a whole number, or ``count`` lengths and coordinates."""
+    """What a key of a line holds: a whole number, or ``parts`` lengths and coordinates."""
 
     expected: str
-    count: int = 0  # 0: one whole number
+    parts: int = 0  # numbers of a point or size; 0: one whole number
     sides: int = 0  # how many of the lengths, the last ones, are sides above 0
     most: int = 0  # greatest number of boxes of a list; 0: no list
 
@@ -173,12 +173,12 @@ def _read_value(where: str, value, kind: Value):
     """Return the value of a key: a whole number, a tuple of numbers, or a tuple of such tuples."""
 
     def is_good(point) -> bool:
-        if not isinstance(point, list) or len(point) != kind.count or not all(map(is_number, point)):
+        if not isinstance(point, list) or len(point) != kind.parts or not all(map(is_number, point)):
             return False
-        return max(map(abs, point)) <= MAX_LENGTH and all(side >= 1e-6 for side in point[kind.count - kind.sides :])
+        return max(map(abs, point)) <= MAX_LENGTH and all(side >= 1e-6 for side in point[kind.parts - kind.sides :])
 
-    if kind.count == 0:
-        points = []
+    if kind.parts == 0:
+        points: list = []
         good = is_whole(value) and value >= 0
     else:
         points = value if kind.most else [value]
@@ -186,7 +186,7 @@ def _read_value(where: str, value, kind: Value):
     if not good:
         raise ValueError(f"{where}={excerpt(value)}: expected {kind.expected}.")
     boxes = tuple(tuple(map(float, point)) for point in points)
-    return boxes if kind.most else boxes[0] if kind.count else value
+    return boxes if kind.most else boxes[0] if kind.parts else value
 
 
 def _fault(placement: Placement, plan: EpisodePlan) -> str:

@@ -164,8 +164,8 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
     cell_size, accuracy = scene.cell_size, scene.accuracy
     assert cell_size is not None
     unit = cell_size * cell.height_unit
-    boxes, clearance = _read_boxes(cell, scene)
-    tote = _read_tote(cell, scene, device)
+    boxes, clearance = _read_boxes(cell, scene, cell_size)
+    tote = _read_tote(cell, scene, unit, device)
     placed = [_place(cell, box, cell_size, clearance, f"items[{number}]", device) for number, box in enumerate(boxes)]
 
     ratio = unit / MILLIMETRE
@@ -208,9 +208,9 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
     return parts[0] if len(parts) == 1 else MeasuredBin.of(parts)
 
 
-def _read_boxes(cell: CellSpec, scene: Scene) -> tuple[list[Box], float]:
+def _read_boxes(cell: CellSpec, scene: Scene, side: float) -> tuple[list[Box], float]:
     """Return the items, and the clearance that they need: none if a map with one value a cell shows them."""
-    side, accuracy, clearance = scene.cell_size, scene.accuracy, scene.clearance
+    accuracy, clearance = scene.accuracy, scene.clearance
     if isinstance(scene.items, BinMap):
         least = -max(4 * accuracy, 0.01)
         heights = metric_map("bin_depth", scene.items.depth, cell.bin_size[:2], least, MAX_SIDE * MILLIMETRE)
@@ -232,11 +232,10 @@ def _read_boxes(cell: CellSpec, scene: Scene) -> tuple[list[Box], float]:
     return boxes, clearance
 
 
-def _read_tote(cell: CellSpec, scene: Scene, device) -> MeasuredTote:
-    """Return the tote, in millimetres."""
+def _read_tote(cell: CellSpec, scene: Scene, unit: float, device) -> MeasuredTote:
+    """Return the tote, in millimetres; ``unit`` is the length of a height unit, in metres."""
     grid, slack, height = cell.tote_size[:2], math.ceil(scene.accuracy / MILLIMETRE - ROUNDING), scene.tote_height
     if height is None:
-        unit = scene.cell_size * cell.height_unit
         height = checked_number("tote_height", cell.tote_size[2] * unit, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
     rim, over_rim = (int(whole_units(height, MILLIMETRE, up)) for up in (False, True))
     if isinstance(scene.tote, ToteMap):

@@ -139,8 +139,9 @@ def draw_items(axes, items: list[PlacedItem], colours: dict[Kind, str], size: tu
                     fills.append((0.0, 0.0, 0.0, 0.0))
                     lines.append((*to_rgb(INK), 1.0))
                     widths.append(width)
-    look = {"facecolors": fills, "edgecolors": lines, "linewidths": widths, "capstyle": "round"}
-    axes.add_collection(PolyCollection(polygons, zorder=2, **look))
+    axes.add_collection(
+        PolyCollection(polygons, facecolors=fills, edgecolors=lines, linewidths=widths, capstyle="round", zorder=2)
+    )
 
 
 def _is_edge(place, start, end, item: PlacedItem) -> bool:

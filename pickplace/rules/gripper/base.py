@@ -173,10 +173,10 @@ class Gripper(ABC):
         for _ in range(rotations - 1):
             masks.append(turned(masks[-1]))
         count = next(n for n in (1, 2, len(masks)) if masks == [masks[r % n] for r in range(len(masks))])
-        sizes = (self.size, self.size[::-1])
+        sides = [self.size[:: -1 if turn % 2 else 1] for turn in range(count)]
         return tuple(
-            EffectorShape(*sizes[turn % 2], *map(reference_cell, sizes[turn % 2]), boxes(mask))
-            for turn, mask in enumerate(masks[:count])
+            EffectorShape(width, depth, reference_cell(width), reference_cell(depth), boxes(mask))
+            for (width, depth), mask in zip(sides, masks, strict=False)
         )
 
 
