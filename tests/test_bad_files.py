@@ -116,7 +116,7 @@ def test_a_report_does_without_notes_that_cannot_be_read(smoke_run, tmp_path):
         ({"occupancy": None}, "expected an evaluation.json"),
         ({"planner": "a\x1b[31m"}, "a name to print, got 'a\\x1b[31m'"), ({"planner": "a" * 101}, "a name to print"),
         ({"planner": 3}, "a name to print, got 3"), ({"stream": "x" * 10**6}, "its stream is 'xxx"),
-        ({"env": {}}, "env.bin_size=None"), ({"env": {"support": None}}, "env.support=None"),
+        ({"env": {}}, "env.tote_size=[6, 6, 5]"), ({"env": {"tote_size": None}}, "env.tote_size=[6, 6, 5]"),
         ({"env": 3}, "expected an evaluation.json"),
     ],
 )  # fmt: skip
@@ -126,6 +126,8 @@ def test_a_comparison_is_checked_before_playing(run, tmp_path, monkeypatch, chan
     path = tmp_path / "evaluation.json"
     path.write_text(json.dumps(content))
     read_comparison(path, ours)
+    path.write_text(json.dumps({**content, "env": {k: v for k, v in ours["env"].items() if k != "height_unit"}}))
+    read_comparison(path, ours)  # a default is a default
     if isinstance(change.get("env"), dict) and change["env"]:  # a key that an older file lacks
         change = {"env": {key: value for key, value in ours["env"].items() if key not in change["env"]}}
     path.write_text(json.dumps({**content, **change}))
@@ -325,7 +327,7 @@ def test_a_full_disk_is_named(run, tmp_path, monkeypatch, command, owner, functi
         ("surface", 0, 0, "surface: expected cells that bear weight"),
         ("tote_height", 0, 0, "tote_height: expected"), ("volume", 0, -1, "volume"), ("volume", 0, 10**9, "volume"),
         ("steps", 0, -1, "steps"), ("steps", 0, 10**9, "steps"), ("episode", 0, -1, "episode"),
-        ("item", (0, 0), 99, "item: expected"), ("item", (0, 4), -1, "item: expected"),
+        ("item", (0, 0, 0), 99, "item: expected"), ("item", (0, 0, 4), -1, "item: expected"),
         ("item_seed", (), -1, "item_seed: expected"),
         ("occupancy", 0, 7.0, "the carried occupancy: expected what the state shows"),
     ],
