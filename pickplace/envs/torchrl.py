@@ -235,7 +235,7 @@ class PickPlaceEnv(EnvBase):
         self.episode.add_(rows * self.episode_stride)
         self.item.masked_fill_(rows[:, None, None], 0)
         self.arrived.masked_fill_(rows, 0)
-        self._refill(rows)
+        self._refill(rows, self.current_items)
         self._update_masks(rows, empty=True)
         if (jammed := rows & ~self.feasible).any():  # the first one alone always has a feasible action
             self.item[:, 1:] *= ~jammed[:, None, None]
@@ -258,8 +258,7 @@ class PickPlaceEnv(EnvBase):
         self.surface.copy_(step.surface)
         self.volume.add_(gained)
         self.steps.add_(placed)
-        self.item.copy_(remove_item(state.items, step.taken, placed).table)
-        self._refill(placed)
+        self._refill(placed, remove_item(state.items, step.taken, placed))
         self._update_masks(placed)
         ended = placed & self.current_items.is_empty.all(1)  # the stream has no further item
         stuck = placed & ~self.feasible & ~ended
@@ -295,10 +294,10 @@ class PickPlaceEnv(EnvBase):
         """The volume placed / the volume of the tote, float64 ``[N]``."""
         return self.volume.double() / self.cell.tote_volume(self.tote_height)
 
-    def _refill(self, rows: Tensor) -> None:
-        """Let items arrive in the bins in ``rows``, bool ``[N]``."""
+    def _refill(self, rows: Tensor, left: Item) -> None:
+        """Let items arrive in the bins in ``rows``, bool ``[N]``, which hold what is ``left``, ``[N, M]``."""
         address = self.item_seed.expand_as(self.episode), self.episode, self.arrived
-        items, arrived = refill(self.cell, self.items, self.stream, *address, self.current_items, rows)
+        items, arrived = refill(self.cell, self.items, self.stream, *address, left, rows)
         self.item.copy_(items.table)
         self.arrived.copy_(arrived)
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from pickplace.items.distributions import ItemDistribution, hashed_uniform
+from pickplace.rules.bin import add_item, must_share
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item
 
@@ -28,23 +29,20 @@ def refill(
         items: ``[N, M]``, the first ones filled.
         rows: bool ``[N]``, the bins in which items may arrive.
     """
-    table, count = items.table, (~items.is_empty).sum(1)
-    place = torch.arange(table.shape[1], device=table.device)
+    count, most = (items.h > 0).sum(1), items.x.shape[1]
     open_ = rows & (count == 0) if cell.refill == "batch" else rows
-    for _ in place:
-        open_ = open_ & (count < len(place))
+    for _ in range(most):
+        open_ = open_ & (count < most)
         if not open_.any():
             break
         item = source.sample(stream, seed, episode, arrived, cell.bin_size)
-        keeps_place = (count == 0) | source.has_corners
-        if (open_ & (count > 0)).any():
+        if must_share(items, open_):
             uniform = hashed_uniform(stream, seed, episode, arrived, 4)[3]
-            item = _find_room(cell, item, Item.from_table(table), keeps_place, uniform)
-        found = open_ & ~item.is_empty
-        filled = found[:, None] & (place == count[:, None])  # [N, M]
-        table = torch.where(filled[..., None], item.table[:, None], table)
-        arrived, count, open_ = arrived + found, count + found, found
-    return Item.from_table(table), arrived
+            item = _find_room(cell, item, items, (count == 0) | source.has_corners, uniform)
+        open_ = open_ & (item.h > 0)
+        items = add_item(items, item, open_)
+        arrived, count = arrived + open_, count + open_
+    return items, arrived
 
 
 def _find_room(cell: CellSpec, item: Item, others: Item, keeps_place: Tensor, uniform: Tensor) -> Item:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from pickplace.rules.cell import CellSpec
+from pickplace.rules.grasps import split_action
 from pickplace.rules.item import Item
 
 
@@ -52,12 +53,12 @@ class Taken(NamedTuple):
     blocked: Tensor | None  # bool [N, P], see `blocked_picks`
 
 
-def take_item(cell: CellSpec, items: Item, x: Tensor, y: Tensor) -> Taken:
-    """Return what picks at cells ``(x, y)`` take out of bins ``[N, M]``; ``x`` and ``y`` are int64 ``[N]``."""
-    number = taken_item(cell, items, x, y)
+def take_item(cell: CellSpec, items: Item, action: Tensor) -> Taken:
+    """Return what flat actions, int64 ``[N]``, take out of bins ``[N, M]``."""
     blocked = blocked_picks(cell, items)
     if blocked is None:
-        return Taken(number, items.map(torch.flatten), None)
+        return Taken(torch.zeros_like(action), items.flatten(), None)
+    number = taken_item(cell, items, *split_action(cell, action)[:2])
     row = torch.arange(len(number), device=number.device)
     return Taken(number, select_item(items, number), blocked.unflatten(0, items.x.shape)[row, number])
 
@@ -81,7 +82,9 @@ def taken_item(cell: CellSpec, items: Item, x: Tensor, y: Tensor) -> Tensor:
 
 def select_item(items: Item, number: Tensor) -> Item:
     """Return one item of each bin, ``[N]``; ``number`` is int64 ``[N]``."""
-    return items.map(lambda part: part.gather(1, number[:, None])[:, 0])
+    if items.x.shape[1] == 1:
+        return items.flatten()
+    return items.rows((torch.arange(len(number), device=number.device), number))
 
 
 def remove_item(items: Item, number: Tensor, removed: Tensor | None = None) -> Item:
@@ -92,8 +95,29 @@ def remove_item(items: Item, number: Tensor, removed: Tensor | None = None) -> I
         removed: bool ``[N]``, whether that item is removed at all; None: it is.
     """
     table = items.table
+    if table.shape[1] == 1:
+        return Item.from_table(torch.zeros_like(table) if removed is None else table * ~removed[:, None, None])
     place = torch.arange(table.shape[1], device=table.device)
     later = place >= number[:, None]
     after = place + (later if removed is None else later & removed[:, None])  # [N, M]
     longer = torch.cat([table, torch.zeros_like(table[:, :1])], 1)
     return Item.from_table(longer.gather(1, after[..., None].expand_as(table)))
+
+
+def must_share(items: Item, rows: Tensor) -> bool:
+    """Return whether any of the bins in ``rows``, bool ``[N]``, holds an item already; all of them have room."""
+    return items.x.shape[1] > 1 and bool((rows & ~items.is_empty[:, 0]).any())
+
+
+def add_item(items: Item, item: Item, rows: Tensor) -> Item:
+    """Return the bins ``[N, M]`` after an item is added behind the others.
+
+    Args:
+        items: ``[N, M]``.
+        item: ``[N]``.
+        rows: bool ``[N]``, the bins to which one is added; they have room.
+    """
+    added, count = rows[:, None], items.x.shape[1]
+    if count > 1:
+        added = added & (torch.arange(count, device=rows.device) == (~items.is_empty).sum(1, keepdim=True))
+    return Item.from_table(torch.where(added[..., None], item.table[:, None], items.table))

@@ -47,7 +47,7 @@ class Item(_Columns):
         max_load: greatest mass that may rest on the item, grams.
     """
 
-    __slots__ = ()
+    _table: Tensor | None = None  # of which the columns are views
 
     def __new__(cls, x, y, w, d, h, kind=None, turns=None, grams=None, max_load=None):
         given = zip((kind, turns, grams, max_load), DEFAULTS.values(), strict=True)
@@ -56,13 +56,16 @@ class Item(_Columns):
 
     @classmethod
     def from_table(cls, table: Tensor) -> "Item":
-        """Return the items of a table ``[..., 9]``, or ``[..., 5]`` with x, y, w, d and h only."""
-        return cls(*table.unbind(-1))
+        """Return the items of a table ``[..., 9]``, of which they are views, or ``[..., 5]``: x, y, w, d and h only."""
+        items = cls(*table.unbind(-1))
+        if table.shape[-1] == len(cls._fields):
+            items._table = table
+        return items
 
     @property
     def table(self) -> Tensor:
-        """All columns, int64 ``[..., 9]``."""
-        return torch.stack(self, -1)
+        """All columns, int64 ``[..., 9]``: the table of which the items were made, if there is one."""
+        return torch.stack(self, -1) if self._table is None else self._table
 
     @property
     def cuboids(self) -> Tensor:
@@ -85,7 +88,11 @@ class Item(_Columns):
 
     def rows(self, index) -> "Item":
         """Return some of the items, by an index into each column."""
-        return self.map(lambda part: part[index])
+        return Item.from_table(self.table[index])
+
+    def flatten(self) -> "Item":
+        """Return the items of bins ``[N, M]`` one after the other, ``[N * M]``."""
+        return Item.from_table(self.table.flatten(0, 1))
 
 
 def bin_depth_from_items(items: Item, bin_size: Sequence[int]) -> Tensor:
@@ -101,7 +108,9 @@ def bin_labels_from_items(items: Item, bin_size: Sequence[int]) -> Tensor:
 def _bin_map(items: Item, value: Tensor, bin_size: Sequence[int]) -> Tensor:
     """Return a map of a value of each item on its cells, 0 elsewhere, float32 ``[N, W_B, D_B]``."""
     inside = rectangle(bin_size, *(part.flatten() for part in items[:4]))  # [W_B, D_B, N * M]
-    maps = (inside * value.flatten().float()).unflatten(2, items.x.shape).sum(3)
+    maps = inside * value.flatten().float()
+    if items.x.shape[1] > 1:
+        maps = maps.unflatten(2, items.x.shape).sum(3)
     return maps.permute(2, 0, 1).contiguous()
 
 

@@ -103,19 +103,20 @@ class PlacingMaps(NamedTuple):
 
 def placing_maps(cell: CellSpec, state: State) -> PlacingMaps:
     """Return everything that decides which actions succeed: see :class:`PlacingMaps`."""
-    return _complete(cell, state, *resting_top(cell, *state.each_item()))
+    surface, tote_height, item = state.each_item()
+    return _complete(cell, state, item, *resting_top(cell, surface, tote_height, item))
 
 
 def unchecked_maps(cell: CellSpec, state: State) -> PlacingMaps:
     """Return the maps of footprints that are known to be stable and below the rim, without a look at either."""
     surface, _, item = state.each_item()
-    return _complete(cell, state, *unchecked_top(cell, surface, item))
+    return _complete(cell, state, item, *unchecked_top(cell, surface, item))
 
 
-def _complete(cell: CellSpec, state: State, top: Tensor, rest: Tensor) -> PlacingMaps:
+def _complete(cell: CellSpec, state: State, item: Item, top: Tensor, rest: Tensor) -> PlacingMaps:
     """Return the maps with what the end effector must clear, in the tote and in the bin."""
     over = over_tote(cell, state.surface, state.tote_height)
-    return PlacingMaps.of(top, rest, over, state.each_item()[2], blocked_picks(cell, state.items))
+    return PlacingMaps.of(top, rest, over, item, blocked_picks(cell, state.items))
 
 
 def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
@@ -325,7 +326,7 @@ def action_footprints(cell: CellSpec, items: Item, blocked: Tensor | None = None
         blocked: as of :attr:`PlacingMaps.blocked`; None: by :func:`~pickplace.rules.bin.blocked_picks`.
     """
     (tote_w, tote_d, _), count = cell.tote_size, items.x.shape[1]
-    item = items.map(torch.flatten)
+    item = items.flatten()
     lifted, offset = all_grasps(cell, item, blocked_picks(cell, items) if blocked is None else blocked)
     device = offset.device
     check_actions(cell, len(lifted), device)

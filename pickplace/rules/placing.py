@@ -4,7 +4,7 @@ Surfaces, see :func:`~pickplace.rules.state.surface_from`, are halved where heig
 """
 
 from collections.abc import Iterator
-from functools import cached_property, reduce
+from functools import cached_property, lru_cache, reduce
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torch import Tensor
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.checks import FOOTPRINT, Over, Resting, combine
 from pickplace.rules.grasps import is_outside
+from pickplace.rules.gripper.base import EffectorShape
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR, NEVER, is_under, rectangle_sums, surround, windows
 from pickplace.rules.state import surface_from
@@ -35,9 +36,8 @@ def resting_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item
         kind, at_once = LargeItems, max(1, MAX_ENTRIES // (len(surface.unique()) * cell.num_places))
     parts = (slice(start, start + at_once) for start in range(0, max(1, count), at_once))
     contacts = (kind(cell, surface[part], w[..., part], d[..., part]) for part in parts)
-    z, stable = (
-        torch.cat(each, -1) for each in zip(*((on.z, cell.support.stable(on)) for on in contacts), strict=True)
-    )
+    found = [(on.z, cell.support.stable(on)) for on in contacts]
+    z, stable = found[0] if len(found) == 1 else (torch.cat(each, -1) for each in zip(*found, strict=True))
     top = z + item.h.to(z.dtype)
     good = combine(FOOTPRINT, Resting(None, top, tote_height, stable)) & ~item.is_empty
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
@@ -121,6 +121,17 @@ class LargeItems(OnFootprints):
             yield torch.where(held, first, side), torch.where(held, last, -1)
 
 
+@lru_cache(maxsize=64)
+def leaving_places(shapes: tuple[EffectorShape, ...], grid: tuple[int, int], device: torch.device) -> Tensor:
+    """Return the place cells at which the end effector leaves the tote, bool ``[B, W_T, D_T, 1]``, for each shape."""
+    x, y = torch.arange(grid[0], device=device)[:, None], torch.arange(grid[1], device=device)
+    leaves = [
+        is_outside(x - shape.ref_x, shape.width, grid[0]) | is_outside(y - shape.ref_y, shape.depth, grid[1])
+        for shape in shapes
+    ]
+    return torch.stack(leaves)[..., None]
+
+
 def over_tote(cell: CellSpec, surface: Tensor, rim: Tensor) -> Over:
     """Return the facts of the end effector over every place cell; each ``[T, W_T, D_T, N]``, or broadcasts to that.
 
@@ -131,12 +142,8 @@ def over_tote(cell: CellSpec, surface: Tensor, rim: Tensor) -> Over:
         rim: height of the tote, ``[N]``.
     """
     (tote_w, tote_d, _), device = cell.tote_size, surface.device
-    x, y = torch.arange(tote_w, device=device)[:, None], torch.arange(tote_d, device=device)
-    leaves, obstacle = [], surface.new_empty(len(cell.effectors), tote_w, tote_d, len(surface))
+    obstacle = surface.new_empty(len(cell.effectors), tote_w, tote_d, len(surface))
     for number, shape in enumerate(cell.effectors):
-        leaves.append(
-            is_outside(x - shape.ref_x, shape.width, tote_w) | is_outside(y - shape.ref_y, shape.depth, tote_d)
-        )
         after_x, after_y = shape.width - 1 - shape.ref_x, shape.depth - 1 - shape.ref_y
         walled = surround(surface.permute(1, 2, 0), (shape.ref_x, after_x, shape.ref_y, after_y), 0)
         highest = []
@@ -147,7 +154,7 @@ def over_tote(cell: CellSpec, surface: Tensor, rim: Tensor) -> Over:
                 under = reduce(torch.maximum, [under.narrow(axis, begin + i, grid) for i in range(size)])
             highest.append(under)
         obstacle[number] = reduce(torch.maximum, highest) >> 1
-    over = Over(torch.stack(leaves)[..., None], rim.int(), obstacle)
+    over = Over(leaving_places(cell.effectors, (tote_w, tote_d), device), rim.int(), obstacle)
     if cell.limits is None:
         return over
     turns, limits = [turn % len(cell.effectors) for turn in range(cell.rotations)], cell.limits.on(device)

@@ -86,7 +86,7 @@ class State(NamedTuple):
         """
         count = self.items.x.shape[1]
         each = self if count == 1 else self.repeat(count)
-        return each.surface, each.tote_height, self.items.map(torch.flatten)
+        return each.surface, each.tote_height, self.items.flatten()
 
     def repeat(self, count: int) -> "State":
         """Return each problem ``count`` times, one copy after the other."""

@@ -46,7 +46,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
         action: int64 ``[N]``, the flat index, in ``[0, N_a)``.
     """
     (surface, tote_height, items), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.gripper.size
-    taken, item, blocked = take_item(cell, items, *split_action(cell, action)[:2])
+    taken, item, blocked = take_item(cell, items, action)
     picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
     side, reach = cell.max_side, max(ee_w, ee_d)

@@ -1,5 +1,6 @@
 """Bins with several items: what is taken, what stands in the way, how items arrive; against plain Python."""
 
+from dataclasses import replace
 from itertools import product
 from random import Random
 
@@ -11,8 +12,20 @@ from problems import random_effector
 from pickplace import CellSpec, Item, PickPlaceEnv
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import Kinds, Recorded, Uniform, hashed_uniform
-from pickplace.rules.bin import blocked_picks, remove_item, select_item, taken_item
+from pickplace.rules.bin import (
+    add_item,
+    blocked_picks,
+    must_share,
+    remove_item,
+    select_item,
+    take_item,
+    taken_item,
+)
 from pickplace.rules.gripper.base import reference_cell
+from pickplace.rules.item import bin_depth_from_items, bin_labels_from_items
+from pickplace.rules.masks import action_footprints, action_mask, choice_mask, placing_maps
+from pickplace.rules.state import State, surface_from
+from pickplace.rules.step import apply, put_down
 
 
 def random_contents(rng: Random, size, count, most=3):
@@ -133,3 +146,63 @@ def test_a_bin_that_is_jammed_begins_with_one_item():
     observation = env.reset()
     assert observation["action_mask"].any(1).all()
     assert ((observation["items"][..., 4] > 0).sum(1) == 1).all() and (env.arrived == 1).all()
+
+
+def same(one, other):
+    """Return whether two results are equal: tensors, None, or tuples of results."""
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    return torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
+
+
+@pytest.mark.parametrize("support", ["half", "bearing"])
+def test_a_bin_for_one_item_takes_a_shorter_path_to_the_same_result(support):
+    """The general path: a bin for two items, of which the second place is empty."""
+    count, draw = 200, torch.Generator().manual_seed(0)
+    numbers = torch.arange(count)
+    lone, two = (CellSpec(bin_size=(5, 4, 1), support=support, bin_items=places) for places in (1, 2))
+    lone, two = (replace(cell, longest_side=3) for cell in (lone, two))
+    sizes = Uniform((1, 3), (1, 3), (1, 2))
+    item, other = (sizes.sample("train", torch.full_like(numbers, s), numbers, numbers, lone.bin_size) for s in (0, 1))
+    there, rows = (torch.rand(2, count, generator=draw) < 0.8).unbind(0)
+    items = item.map(lambda part: torch.where(there, part, 0)).rows((slice(None), None))
+    assert items.x.shape == (count, 1) and 0 < there.sum() < count
+    padded = Item.from_table(torch.cat([items.table, torch.zeros_like(items.table)], 1))
+    first = (slice(None), slice(0, 1))
+    surface = surface_from(torch.randint(0, 3, (count, *lone.tote_size[:2]), generator=draw))
+    height = torch.full((count,), lone.tote_size[2])
+    state, general = (State(surface, height, each) for each in (items, padded))
+    action = torch.randint(0, lone.num_actions, (count,), generator=draw)
+    zero = torch.zeros_like(action)
+
+    assert blocked_picks(lone, items) is None and not blocked_picks(two, padded)[::2].any()
+    assert same(take_item(lone, items, action)[:2], take_item(two, padded, action)[:2])
+    assert same(taken_item(lone, items, zero, zero), taken_item(two, padded, zero, zero))
+    assert same(select_item(items, zero), select_item(padded, zero))
+    for removed in (None, rows):
+        left = remove_item(items, zero, removed)
+        assert same(left, remove_item(padded, zero, removed).rows(first))
+        assert same(left.table, torch.stack(left, -1))
+    open_ = rows & ~there
+    assert not must_share(items, open_) and not must_share(padded, open_) and must_share(padded, there)
+    assert same(add_item(items, other, open_), add_item(padded, other, open_).rows(first))
+    for shown in (bin_depth_from_items, bin_labels_from_items):
+        assert same(shown(items, lone.bin_size), shown(padded, lone.bin_size))
+    at = 2 * numbers
+    assert same(state.each_item()[2], general.each_item()[2].rows(at))
+    maps, wide = placing_maps(lone, state), placing_maps(two, general)
+    for one, both in zip(maps[:4], wide[:4], strict=True):
+        assert same(one, both.rows(at) if isinstance(both, Item) else both[at])
+    assert same(action_mask(lone, maps), action_mask(two, wide))
+    mask, choices = choice_mask(lone, maps), choice_mask(two, wide)
+    assert mask.any() and same(mask, choices[:, : lone.num_footprints]) and not choices[:, lone.num_footprints :].any()
+    assert same(action_footprints(lone, items), action_footprints(two, padded))
+    step, step_of_two = apply(lone, state, action), apply(two, general, action)
+    assert same(tuple(step), tuple(step_of_two))
+    good = mask.any(1)
+    choice = mask[good].int().argmax(1)
+    (after, placed), (after_two, placed_two) = (
+        put_down(cell, each.rows(good), choice) for cell, each in ((lone, state), (two, general))
+    )
+    assert same(placed, placed_two) and same(after[:2], after_two[:2]) and after_two.items.is_empty.all()
+    assert same(after.items, after_two.items.rows(first))
