@@ -258,9 +258,9 @@ class PickPlaceEnv(EnvBase):
         self.surface.copy_(step.surface)
         self.volume.add_(gained)
         self.steps.add_(placed)
-        self._refill(placed, remove_item(state.items, step.taken, placed))
+        items = self._refill(placed, remove_item(state.items, step.taken, placed))
         self._update_masks(placed)
-        ended = placed & self.current_items.is_empty.all(1)  # the stream has no further item
+        ended = placed & items.is_empty.all(1)  # the stream has no further item
         stuck = placed & ~self.feasible & ~ended
         failure = torch.where(stuck, int(Failure.STUCK), step.failure)
         result = {
@@ -294,12 +294,13 @@ class PickPlaceEnv(EnvBase):
         """The volume placed / the volume of the tote, float64 ``[N]``."""
         return self.volume.double() / self.cell.tote_volume(self.tote_height)
 
-    def _refill(self, rows: Tensor, left: Item) -> None:
-        """Let items arrive in the bins in ``rows``, bool ``[N]``, which hold what is ``left``, ``[N, M]``."""
+    def _refill(self, rows: Tensor, left: Item) -> Item:
+        """Let items arrive in the bins in ``rows``, bool ``[N]``; ``left`` and the result are all items, ``[N, M]``."""
         address = self.item_seed.expand_as(self.episode), self.episode, self.arrived
         items, arrived = refill(self.cell, self.items, self.stream, *address, left, rows)
         self.item.copy_(items.table)
         self.arrived.copy_(arrived)
+        return items
 
     def _update_masks(self, rows: Tensor, empty: bool = False):
         """Recompute the masks of the problems in ``rows``, bool ``[N]``; the others' states did not change.

@@ -57,9 +57,11 @@ class Item(_Columns):
     @classmethod
     def from_table(cls, table: Tensor) -> "Item":
         """Return the items of a table ``[..., 9]``, of which they are views, or ``[..., 5]``: x, y, w, d and h only."""
-        items = cls(*table.unbind(-1))
-        if table.shape[-1] == len(cls._fields):
-            items._table = table
+        columns = table.unbind(-1)
+        if len(columns) < len(cls._fields):
+            return cls(*columns)
+        items = cls._make(columns)
+        items._table = table
         return items
 
     @property

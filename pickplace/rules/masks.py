@@ -9,7 +9,6 @@ grasp class. And the end effector collides if and only if the highest thing unde
 the tote, is higher than the item's top: one maximum over its cells decides.
 """
 
-import itertools
 from collections.abc import Callable
 from functools import reduce
 from typing import Any, NamedTuple
@@ -235,6 +234,16 @@ def _footprint_margins(cell: CellSpec, parity: int) -> tuple[int, int, int, int]
     return high - ref_x, ref_x - low, high - ref_y, ref_y - low
 
 
+def _sides(kinds: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return the offsets along x and along y, bool ``[O, 1, 1, N]`` each, if grasps are all pairs of these; else None.
+
+    Args:
+        kinds: whether there is a grasp with an offset, bool ``[O, O, 1, 1, N]``.
+    """
+    in_x, in_y = kinds.any(1), kinds.any(0)
+    return (in_x, in_y) if torch.equal(kinds, in_x[:, None] & in_y) else None
+
+
 def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Tensor) -> Tensor:
     """Return the least clearance with which any grasp reaches each footprint, ``[W_T, D_T, N]``; FAR if none does."""
     (tote_w, tote_d, _), count = cell.tote_size, cell.num_offsets
@@ -242,14 +251,15 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Te
     least = []
     for turn in range(parity, len(grasped), 2):
         clear, kinds = surround(maps.clearance_in(turn), margins, FAR), grasped[turn].flip(0, 1)  # as the windows are
-        in_x, in_y = kinds.any(1), kinds.any(0)  # [count, 1, 1, N]
-        if count > 3 and torch.equal(kinds, in_x[:, None] & in_y):
+        if sides := _sides(kinds) if count > 3 else None:
             # Mostly so. The least in a rectangle is the least along x, then along y.
+            in_x, in_y = sides
             along = reduce(torch.minimum, (torch.where(in_x[i], clear[i : i + tote_w], FAR) for i in range(count)))
             usable = (torch.where(in_y[j], along[:, j : j + tote_d], FAR) for j in range(count))
         else:
-            each = itertools.product(range(count), repeat=2)
-            usable = (torch.where(kinds[i, j], clear[i : i + tote_w, j : j + tote_d], FAR) for i, j in each)
+            rows = zip(kinds.unbind(0), windows(clear, count).unbind(0), strict=True)
+            each = (pair for row in rows for pair in zip(*(part.unbind(0) for part in row), strict=True))
+            usable = (torch.where(used, part, FAR) for used, part in each)
         least.append(reduce(torch.minimum, usable))
     return reduce(torch.minimum, least)
 
