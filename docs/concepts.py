@@ -27,7 +27,7 @@ GRIPS = {1: ((2, 2), (2, ROW), BAD), 2: ((1, 2), (1, ROW), GOOD)}  # pick cell, 
 def try_grip(cell: CellSpec, pick, place):
     """Return the effect of one action without rotation: its failure, the item's top, and the footprint's corner."""
     heights = torch.tensor(PROFILE, dtype=torch.int32)[None, :, None].expand(1, 6, 6).contiguous()
-    item = Item(*(torch.tensor([value]) for value in (*ITEM_AT, *ITEM_SIZE)))
+    item = Item(*(torch.tensor([[value]]) for value in (*ITEM_AT, *ITEM_SIZE)))
     numbers = (x * side + y for (x, y), side in ((pick, cell.bin_size[1]), (place, cell.tote_size[1])))
     action = join_action(cell, *(torch.tensor([number]) for number in (*numbers, 0)))
     step = apply(cell, State(surface_from(heights), torch.tensor([HEIGHT]), item), action)
