@@ -207,6 +207,12 @@ def find(place: str, target) -> Callable:
     raise ValueError(f"{place}._target_={short_text(target)}: there is no such class or function{reason}; {hint}")
 
 
+def with_defaults(place: str, node: dict) -> dict:
+    """Return a config node with the defaults of the arguments that it leaves out."""
+    parameters = inspect.signature(find(place, node["_target_"])).parameters.values()
+    return {each.name: each.default for each in parameters if each.default is not each.empty} | node
+
+
 def accepted_arguments(function: Callable) -> list[str] | None:
     """Return the keywords that a config may give to a class or function, or None if any.
 

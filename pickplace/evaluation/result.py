@@ -14,7 +14,7 @@ from torch import Tensor
 from pickplace.common.files import read_file
 from pickplace.common.validate import excerpt, is_name, is_number
 from pickplace.config.allowlist import refuse_foreign_targets
-from pickplace.config.registry import build, node_of
+from pickplace.config.registry import build, node_of, with_defaults
 from pickplace.evaluation.play import Episodes
 from pickplace.physics.engine import Engine
 from pickplace.planners.base import BatchPlanner
@@ -177,6 +177,9 @@ def read_comparison(path: Path, expected: dict, trust: Collection[str] = ()) -> 
         env, values, name = dict(other["env"]), other["occupancy"]["per_episode"], other.get("planner")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{refused} ({error}).") from error
+    items = other.get("items")
+    if isinstance(items, dict) and items.get("_target_") == expected["items"]["_target_"]:
+        expected, other = ({**each, "items": with_defaults("items", each["items"])} for each in (expected, other))
     for key in ("stream", "seed", "episodes", "items"):
         if not is_same(expected[key], other.get(key)):
             found = excerpt(other.get(key))

@@ -11,7 +11,7 @@ from pickplace.policies.base import MASKED, EstimatesValue, Policy, ScoresFootpr
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, Observation
 from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
-from pickplace.rules.observation import STANDARD_TERMS, observe
+from pickplace.rules.observation import check_terms, observe
 from pickplace.rules.state import State
 from pickplace.rules.step import put_down
 
@@ -35,7 +35,7 @@ class Lookahead(MapPlanner):
         items: the item distribution; of a sequence, recorded or cut, its sizes, equally likely.
         candidates: how many of the policy's most probable choices are played out.
         critic: the value of a state, a function from observations to ``[N, 1]``, in volume; None: there is none.
-        terms: of the observation, by key.
+        terms: of the observation, by key; None: the standard ones.
         horizon: items after which the critic judges the state; None, or without a critic: played out to the end.
         samples: imagined streams in the first round, each later round doubles them; and of what is played to the end.
         rounds: the greatest number of rounds.
@@ -52,7 +52,7 @@ class Lookahead(MapPlanner):
         policy: Policy,
         items: ItemDistribution,
         critic=None,
-        terms=STANDARD_TERMS,
+        terms=None,
         horizon: int | None = 2,
         candidates: int = 4,
         samples: int = 32,
@@ -73,7 +73,7 @@ class Lookahead(MapPlanner):
             raise ValueError(
                 "planner=lookahead: expected a checkpoint of model=fcn_grasp, corners or afterstate, with a mask."
             )
-        self.cell, self.policy, self.critic, self.terms = cell, policy, critic, terms
+        self.cell, self.policy, self.critic, self.terms = cell, policy, critic, check_terms(terms, cell.bin_items)
         self.horizon = horizon if critic is not None else None
         self.items = search_items(items)
         self.candidates, self.samples, self.rounds, self.confidence = candidates, samples, rounds, confidence
