@@ -1,5 +1,6 @@
 """Untrained policies, which prefer some actions clearly, and checkpoints of them."""
 
+import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
@@ -7,9 +8,38 @@ from omegaconf import OmegaConf
 from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.fcn_grasp.policy import fcn_grasp
+from pickplace.policies.corners.policy import Corners
+from pickplace.policies.fcn4d.policy import Fcn4d, Typical
+from pickplace.policies.fcn_grasp.policy import FcnGrasp, UnmaskedFcnGrasp, fcn_grasp
+from pickplace.policies.individual.policy import IndividualGrasp, IndividualRl, UnmaskedIndividualGrasp
 from pickplace.runs import checkpoint
 from pickplace.runs.provenance import commit, versions
+
+GRASP, CONV4D = {"filters": 8, "hidden": 8, "head_std": 1.0}, {"filters": 4, "head_std": 1.0}
+POLICIES = {
+    FcnGrasp: GRASP, UnmaskedFcnGrasp: GRASP, UnmaskedIndividualGrasp: GRASP, IndividualGrasp: GRASP,
+    Corners: GRASP, Fcn4d: CONV4D, Typical: CONV4D, IndividualRl: CONV4D,
+}  # fmt: skip
+CELLS = [
+    {"tote_size": (4, 4, 2), "bin_size": (4, 4, 1), "num_envs": 4},
+    {"tote_size": (4, 5, 3), "bin_size": (4, 3, 1), "effector_size": (3, 2), "rotations": 3, "num_envs": 4},
+    {"tote_size": (4, 4, 2), "bin_size": (3, 3, 1), "rotations": 1, "pick_rule": "overlap", "num_envs": 4},
+    {
+        "tote_size": (4, 5, 2),
+        "effector_size": (2, 2),
+        "cup": [[1, 0], [1, 0]],
+        "pick_rule": "seal",
+        "min_seal": 0.5,
+        "num_envs": 4,
+    },
+]
+every_policy = pytest.mark.parametrize("kind", POLICIES)
+
+
+def small(kind, cell, **settings):
+    """Return a small policy with random weights, of which the distribution is far from even."""
+    torch.manual_seed(0)
+    return kind(cell, **POLICIES[kind], **settings)
 
 
 def untrained_policy(cell, mask=True, seed=0):

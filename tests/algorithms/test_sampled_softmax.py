@@ -4,8 +4,8 @@ import pytest
 import torch
 from problems import random_states
 from tensordict import TensorDict
-from test_policies import CELLS, POLICIES, every_policy, small
 from torch.distributions import Categorical
+from untrained import CELLS, POLICIES, every_policy, small
 
 from pickplace.algorithms.sampled_softmax import (
     CANDIDATE_KEYS,

@@ -7,6 +7,7 @@ import torch
 from problems import SETTINGS, late_state, random_states
 from scipy.stats import chisquare
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from untrained import CELLS, POLICIES, every_policy, small
 
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.planners.policy import PolicyPlanner
@@ -27,38 +28,13 @@ from pickplace.policies.individual.policy import IndividualGrasp, IndividualRl, 
 from pickplace.rules.grasps import all_grasps, heuristic_pick, split_action
 from pickplace.rules.masks import action_footprints
 
-GRASP, CONV4D = {"filters": 8, "hidden": 8, "head_std": 1.0}, {"filters": 4, "head_std": 1.0}
-POLICIES = {
-    FcnGrasp: GRASP, UnmaskedFcnGrasp: GRASP, UnmaskedIndividualGrasp: GRASP, IndividualGrasp: GRASP,
-    Corners: GRASP, Fcn4d: CONV4D, Typical: CONV4D, IndividualRl: CONV4D,
-}  # fmt: skip
 INDIVIDUAL = (IndividualGrasp, UnmaskedIndividualGrasp, IndividualRl)
-CELLS = [
-    {"tote_size": (4, 4, 2), "bin_size": (4, 4, 1), "num_envs": 4},
-    {"tote_size": (4, 5, 3), "bin_size": (4, 3, 1), "effector_size": (3, 2), "rotations": 3, "num_envs": 4},
-    {"tote_size": (4, 4, 2), "bin_size": (3, 3, 1), "rotations": 1, "pick_rule": "overlap", "num_envs": 4},
-    {
-        "tote_size": (4, 5, 2),
-        "effector_size": (2, 2),
-        "cup": [[1, 0], [1, 0]],
-        "pick_rule": "seal",
-        "min_seal": 0.5,
-        "num_envs": 4,
-    },
-]
 SEVERAL = {
     "tote_size": (4, 5, 3), "bin_size": (5, 6, 1), "bin_items": 3, "refill": "batch", "num_envs": 4, "rotations": 2,
 }  # fmt: skip
 #: The policies that choose among several items.
 CHOOSERS = (FcnGrasp, Corners, Fcn4d, Typical)
-every_policy = pytest.mark.parametrize("kind", POLICIES)
 MASKS = {"masks": ("action", "footprint", "corner")}
-
-
-def small(kind, cell, **settings):
-    """Return a small policy with random weights, of which the distribution is far from even."""
-    torch.manual_seed(0)
-    return kind(cell, **POLICIES[kind], **settings)
 
 
 def at_pick(kind, env, mask):
