@@ -166,6 +166,19 @@ def test_own_support(example):
     assert plan.status == "ok"
 
 
+def test_own_gripper(example):
+    """A grip rule: trained, evaluated with other settings, and planned with in metres."""
+    folder = example("train", "own_gripper", "gripper=two_cells", *TRAINING, "model.actor.filters=8", "curriculum=none")
+    given = [f"checkpoint={folder}", *EVALUATION]
+    example("evaluate", "own_gripper", *given, refused="if own_gripper is yours, say trust=own_gripper")
+    ours = example("evaluate", "own_gripper", *given, "trust=own_gripper", "env.gripper.cells=1")
+    assert ours["env"]["gripper"]["_target_"] == "own_gripper.TwoCells" and ours["env"]["gripper"]["cells"] == 1
+    planner = Planner.load(folder, trust=["own_gripper"])
+    assert type(planner.cell.gripper).__name__ == "TwoCells"
+    plan = planner.plan(Scene([Box(0.1, 0.1, 0.09, 0.09, 0.05)], np.full((6, 6), 0.25), cell_size=0.05))
+    assert plan.status == "ok"
+
+
 ALGORITHMS = {
     "own_algorithm_reinforce": ["algo=reinforce"],
     "own_algorithm_dqn": ["algo=dqn", "model.critic=null", "algo.capacity=100", "algo.minibatch_size=16"],
