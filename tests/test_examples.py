@@ -175,7 +175,8 @@ def test_own_gripper(example):
     assert ours["env"]["gripper"]["_target_"] == "own_gripper.TwoCells" and ours["env"]["gripper"]["cells"] == 1
     planner = Planner.load(folder, trust=["own_gripper"])
     assert type(planner.cell.gripper).__name__ == "TwoCells"
-    plan = planner.plan(Scene([Box(0.1, 0.1, 0.09, 0.09, 0.05)], np.full((6, 6), 0.25), cell_size=0.05))
+    wide = Box(0.12, 0.12, 0.14, 0.14, 0.05)  # of three cells along each side one is covered for sure
+    plan = planner.plan(Scene([wide], np.full((6, 6), 0.25), cell_size=0.05))
     assert plan.status == "ok"
 
 
