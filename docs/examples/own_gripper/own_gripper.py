@@ -17,7 +17,7 @@ class TwoCells(Gripper):
 
     @property
     def least_cells(self):
-        """The least number of cells with which any item may be gripped, for the table of offsets."""
+        """The least number of the cup's cells that can grip any item."""
         return 1
 
     def is_gripped(self, near_x, near_y, w, d, inset):
