@@ -24,9 +24,7 @@ def figure_of(width: float, height: float):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return FigureCanvasAgg(Figure(figsize=(width, height), layout="constrained")).figure
 
 
 def learning_curve(metrics: Path, path: Path) -> None:
@@ -38,22 +36,22 @@ def learning_curve(metrics: Path, path: Path) -> None:
         metrics: a ``metrics.csv``, see :class:`pickplace.runs.loggers.CsvLogger`.
         path: the PNG or SVG to write.
     """
-    from matplotlib.ticker import EngFormatter
+    from matplotlib.ticker import MaxNLocator
 
     rows = read_csv(metrics)
     frames, level = _columns(rows, "curriculum/level")
-    figure = figure_of(8, 5 if len(frames) else 4)
-    if len(frames):
-        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[4, 1])
+    ratios = [4, 1] if len(frames) else [4]
+    figure = figure_of(8, sum(ratios))
+    upper, *lower = figure.subplots(len(ratios), squeeze=False, sharex=True, height_ratios=ratios)[:, 0]
+    for axes in lower:
         for frame in frames[1:][np.diff(level) != 0]:
             upper.axvline(frame, color=WALL, lw=0.8, ls=":", zorder=0)
-        _draw_level(lower, frames, level)
-    else:
-        upper = lower = figure.subplots()
+        axes.step(frames, level, _line(frames), where="post", color=INK)
+        axes.set(ylabel="tote height\n(cells)", ylim=(0, level.max() + 0.5))
+        axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+        axes.grid(alpha=0.3)
     _draw_occupancy(upper, rows)
-    lower.set_xlabel("frames (environment steps)")
-    lower.set_xlim(0, 1.02 * max([row["frames"] for row in rows], default=100))
-    lower.xaxis.set_major_formatter(EngFormatter(sep=""))
+    _show_frames(figure.axes[-1], rows)
     figure.savefig(path, dpi=120)
 
 
@@ -63,14 +61,34 @@ def _columns(rows: list[dict], *keys: str) -> np.ndarray:
     return np.array(table, dtype=float).reshape(-1, 1 + len(keys)).T
 
 
+def _line(values: np.ndarray) -> str:
+    """Return the format of a line, with dots where there are few of them."""
+    return ".-" if len(values) < 20 else "-"
+
+
+def _running_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the weighted mean over the latest 1% of the batches, for each batch that has as many before it."""
+    window = np.ones(max(1, len(values) // 100))
+    total = np.maximum(np.convolve(weights, window, mode="valid"), 1e-9)
+    return np.convolve(values * weights, window, mode="valid") / total
+
+
+def _show_frames(axes, rows: list[dict]) -> None:
+    """Label the axis of the frames, which begins with 0."""
+    from matplotlib.ticker import EngFormatter
+
+    most = max([row["frames"] for row in rows], default=100)
+    axes.set(xlabel="frames (environment steps)", xlim=(0, 1.02 * most))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+
+
 def _draw_occupancy(axes, rows: list[dict]) -> None:
     """Draw the occupancy of training and validation episodes."""
     frames, occupancy = _columns(rows, "train/occupancy")
     if len(frames):
-        window = max(1, len(frames) // 100)  # a running mean over the latest 1% of the batches
-        smooth = np.convolve(occupancy, np.ones(window) / window, mode="valid")
+        smooth = _running_mean(occupancy, np.ones(len(frames)))
         axes.plot(
-            frames[window - 1 :], smooth, ".-" if len(smooth) < 20 else "-", color=LINE,
+            frames[-len(smooth) :], smooth, _line(smooth), color=LINE,
             label="training episodes, at the curriculum's height, actions sampled",
         )  # fmt: skip
     frames, mean = _columns(rows, "eval/occupancy")
@@ -79,31 +97,20 @@ def _draw_occupancy(axes, rows: list[dict]) -> None:
     frames, mean, low, high = _columns(rows, "eval/occupancy", "eval/ci95_low", "eval/ci95_high")
     if len(frames):
         # The mean of few episodes may lie outside its interval by rounding; a bar has no negative length.
-        bars = [np.maximum(mean - low, 0), np.maximum(high - mean, 0)]
+        bars = np.maximum([mean - low, high - mean], 0)
         axes.errorbar(frames, mean, yerr=bars, fmt="none", ecolor=POINT, capsize=3)
     axes.set_title("Learning curve: share of the tote's volume filled when an episode ends")
-    axes.set_ylabel("occupancy (0 to 1)")
-    axes.set_ylim(0, 1.02)
+    axes.set(ylabel="occupancy (0 to 1)", ylim=(0, 1.02))
     axes.grid(alpha=0.3)
+    _draw_legend(axes, loc="best")
+
+
+def _draw_legend(axes, **place) -> None:
+    """Draw a legend; or say that there is nothing to see."""
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="best")
+        axes.legend(**place)
     else:
-        _say_empty(axes)
-
-
-def _say_empty(axes) -> None:
-    axes.text(0.5, 0.5, "no episode has ended yet", transform=axes.transAxes, ha="center", color=INK)
-
-
-def _draw_level(axes, frames: np.ndarray, level: np.ndarray) -> None:
-    """Draw the curriculum's tote height."""
-    from matplotlib.ticker import MaxNLocator
-
-    axes.step(frames, level, ".-" if len(frames) < 20 else "-", where="post", color=INK)
-    axes.set_ylabel("tote height\n(cells)")
-    axes.set_ylim(0, level.max() + 0.5)
-    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-    axes.grid(alpha=0.3)
+        axes.text(0.5, 0.5, "no episode has ended yet", transform=axes.transAxes, ha="center", color=INK)
 
 
 def failure_mix(metrics: Path, path) -> None:
@@ -113,36 +120,23 @@ def failure_mix(metrics: Path, path) -> None:
         metrics: a ``metrics.csv``.
         path: the PNG or SVG to write, or a file object.
     """
-    from matplotlib.ticker import EngFormatter, PercentFormatter
+    from matplotlib.ticker import PercentFormatter
 
     prefix = "train/failure_"
     rows = [row for row in read_csv(metrics) if any(key.startswith(prefix) for key in row)]
     names = [name for name in FAILURES if any(row.get(prefix + name, 0) > 0 for row in rows)]
     figure = figure_of(8, 3.2)
     axes = figure.subplots()
-    if rows:
-        frames = np.array([row["frames"] for row in rows])
-        shares = np.array([[row.get(prefix + name, 0.0) for row in rows] for name in names]).reshape(len(names), -1)
+    if names:
         weights = np.array([row.get("train/episodes", 1.0) for row in rows])
-        window = max(1, len(rows) // 100)  # as in the learning curve: a running mean over the latest 1%
-
-        def smooth(values):
-            """Return sums over the window."""
-            return np.convolve(values, np.ones(window), mode="valid")
-
-        total = np.maximum(smooth(weights), 1e-9)
-        stack = [smooth(share * weights) / total for share in shares]
+        shares = (np.array([row.get(prefix + name, 0.0) for row in rows]) for name in names)
+        stack = [_running_mean(share, weights) for share in shares]
         axes.stackplot(
-            frames[window - 1 :], stack, labels=[name.replace("_", " ") for name in names],
-            colors=[FAILURES[name] for name in names],
+            [row["frames"] for row in rows[-len(stack[0]):]], stack,
+            labels=[name.replace("_", " ") for name in names], colors=[FAILURES[name] for name in names],
         )  # fmt: skip
-        axes.set_xlim(0, 1.02 * frames[-1])
-        axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
-    else:
-        _say_empty(axes)
-    axes.set_ylim(0, 1)
+    _draw_legend(axes, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+    axes.set(ylim=(0, 1), ylabel="training episodes")
     axes.yaxis.set_major_formatter(PercentFormatter(1))
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.set_xlabel("frames (environment steps)")
-    axes.set_ylabel("training episodes")
-    figure.savefig(path, dpi=120, format=None if isinstance(path, Path) else "png")
+    _show_frames(axes, rows)
+    figure.savefig(path, dpi=120)

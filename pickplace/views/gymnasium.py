@@ -12,7 +12,7 @@ from pickplace.envs.gymnasium import PickPlaceGymEnv
 from pickplace.rules.item import bin_depth_from_items
 from pickplace.rules.state import Failure
 from pickplace.views.figures import INK
-from pickplace.views.recording import PlacedItem, Recording, items_in_bin, record_moves
+from pickplace.views.recording import Recording, items_in_bin, record_moves
 from pickplace.views.scene import draw_scene, item_colours
 
 WINDOW = "pickplace"  # title of the window of mode human
@@ -35,8 +35,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         super().__init__(items, **settings)
         self.render_mode = render_mode
         self._recording: Recording | None = None  # of the running episode
-        sizes = self._env.items.sizes.tolist()
-        self._colours = item_colours([PlacedItem(0, 0, 0, *size) for size in sizes]) if render_mode else {}
+        self._colours = item_colours(self._env.items.sizes.tolist()) if render_mode else {}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         result = super().reset(seed=seed, options=options)
@@ -58,9 +57,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         return *result, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        if self.render_mode == "rgb_array":
-            return self._picture()
-        return None  # the window is kept up to date
+        return self._picture() if self.render_mode == "rgb_array" else None  # the window is kept up to date
 
     def _picture(self) -> np.ndarray:
         """Return a picture of the tote in 3D, its height map and the bin, uint8 ``[600, 1200, 3]``."""
@@ -76,8 +73,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         for x, y, w, d, _ in items_in_bin(items, 0):  # so that items side by side are told apart
             inset.add_patch(Rectangle((x - 0.5, y - 0.5), w, d, fill=False, edgecolor=INK, linewidth=1))
         inset.set_title("bin", fontsize="medium")
-        inset.set_xticks([])
-        inset.set_yticks([])
+        inset.set(xticks=[], yticks=[])
         scene.set_dpi(100)
         scene.canvas.draw()
         return np.asarray(scene.canvas.buffer_rgba())[..., :3].copy()
@@ -86,14 +82,13 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         """Bring the window up to date, in mode ``human``."""
         if self.render_mode != "human":
             return
-        display = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-        if not display:
-            gymnasium.logger.warn("render_mode='human': there is no display, so no window is shown; try 'rgb_array'.")
-            return
-        from matplotlib import pyplot
+        if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+            from matplotlib import pyplot
 
-        pyplot.figure(WINDOW, figsize=(12, 6), dpi=100, clear=True).figimage(self._picture())
-        pyplot.pause(1 / self.metadata["render_fps"])
+            pyplot.figure(WINDOW, figsize=(12, 6), dpi=100, clear=True).figimage(self._picture())
+            pyplot.pause(1 / self.metadata["render_fps"])
+        else:
+            gymnasium.logger.warn("render_mode='human': there is no display, so no window is shown; try 'rgb_array'.")
 
     def close(self) -> None:
         if self.render_mode == "human":

@@ -1,6 +1,6 @@
 """An episode that a physics engine carried out: its end, and the poses of the bodies, picture by picture."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -67,5 +67,4 @@ class Outcome:
 
     def facts(self) -> dict[str, Any]:
         """Return the figures, as ``pickplace-physics`` prints them."""
-        hidden = ("sentence", "label", "motion")
-        return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name not in hidden}
+        return {key: value for key, value in vars(self).items() if key not in ("sentence", "label", "motion")}

@@ -7,6 +7,7 @@ import numpy as np
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from pickplace.rules.bin import remove_item
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_action
 from pickplace.rules.item import Item
@@ -67,24 +68,17 @@ class Recording:
     @property
     def boxes(self) -> list[PlacedItem]:
         """The items placed, in order."""
-        boxes = []
-        for move in self.moves:
-            if not move.failure:
-                x, y, w, d = move.footprint
-                boxes.append(PlacedItem(x, y, move.z, w, d, move.item[4]))
-        return boxes
+        placed = [(*move.footprint, move) for move in self.moves if not move.failure]
+        return [PlacedItem(x, y, move.z, w, d, move.item[4]) for x, y, w, d, move in placed]
 
     def describe_ending(self, num_places: int) -> str:
         """Return why the episode ended, in a sentence; empty while it goes on."""
-        if self.ending is None:
-            return ""
-        volume = sum(box.volume for box in self.boxes)
         if self.ending == Failure.STUCK:
-            if volume == num_places * self.tote_height:
+            if sum(box.volume for box in self.boxes) == num_places * self.tote_height:
                 return FULL
             if len(self.waiting) > 1:
                 return NONE_FITS
-        return self.ending.sentence
+        return "" if self.ending is None else self.ending.sentence
 
 
 def items_in_bin(items: Item, row: int) -> list[InBin]:
@@ -109,24 +103,19 @@ def record_moves(
     heat = planner.heat_map(observation) if hasattr(planner, "heat_map") else None
     if heat is not None:
         heat = (255 * heat / heat.amax((1, 2), keepdim=True).clamp(min=1e-30)).round().byte().cpu().numpy()
-    _, _, ref_x, ref_y, _ = cell.effector(0)
-    items, contents, taken = (part.tolist() for part in (step.item.cuboids, state.items.cuboids, step.taken))
-    moves = []
-    for row in range(len(action)):
-        shape = cell.effector(rotation[row])
-        moves.append(
-            Move(
-                item=tuple(items[row]),
-                pick=(x_bin[row] - ref_x, y_bin[row] - ref_y),
-                place=(x_tote[row] - shape.ref_x, y_tote[row] - shape.ref_y),
-                rotation=rotation[row],
-                footprint=tuple(step.footprint[row].tolist()),
-                z=int(step.top[row]) - items[row][4],
-                failure=Failure(int(step.failure[row])),
-                heat=None if heat is None else heat[row],
-                others=[
-                    tuple(item) for number, item in enumerate(contents[row]) if number != taken[row] and item[4] > 0
-                ],
-            )
+    items, others = step.item.cuboids.tolist(), remove_item(state.items, step.taken)
+    shape, turned = cell.effector(0), [cell.effector(turns) for turns in rotation]
+    return [
+        Move(
+            item=tuple(items[row]),
+            pick=(x_bin[row] - shape.ref_x, y_bin[row] - shape.ref_y),
+            place=(x_tote[row] - turned[row].ref_x, y_tote[row] - turned[row].ref_y),
+            rotation=rotation[row],
+            footprint=tuple(step.footprint[row].tolist()),
+            z=int(step.top[row]) - items[row][4],
+            failure=Failure(int(step.failure[row])),
+            heat=None if heat is None else heat[row],
+            others=items_in_bin(others, row),
         )
-    return moves
+        for row in range(len(action))
+    ]

@@ -13,8 +13,8 @@ import numpy as np
 
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.state import Failure
-from pickplace.views.motion import Motion, Outcome
-from pickplace.views.recording import FULL, InBin, PlacedItem, Recording
+from pickplace.views.motion import Outcome
+from pickplace.views.recording import FULL, InBin, Recording
 from pickplace.views.scene import draw_scene, item_colours
 
 ASSETS = Path(__file__).resolve().parent / "assets"
@@ -29,16 +29,17 @@ def page(recordings: list[Recording], cell: CellSpec, title: str) -> str:
         cell: the sizes.
         title: a short line, such as the planner's name and the stream.
     """
-    colours = item_colours([box for recording in recordings for box in recording.boxes + _items_not_placed(recording)])
-    kinds = {f"{w},{d},{_cells(h, cell)}": colour for (w, d, h), colour in colours.items()}
-    motions = [one.carried_out.motion for one in recordings if one.carried_out and one.carried_out.motion]
+    items = [item for one in recordings for move in one.moves for item in (move.item, *move.others)]
+    colours = item_colours(items + [item for one in recordings for item in one.waiting])
+    motion = next((one.carried_out.motion for one in recordings if one.carried_out and one.carried_out.motion), None)
     data = {
         "title": title,
-        "binAt": _bin_corner(motions[0]) if motions else None,
+        # In cells, from the tote's corner.
+        "binAt": [round(at / motion.cell_size, 6) for at in motion.bin] if motion and motion.bin else None,
         "bin": [*cell.bin_size[:2], _cells(cell.bin_size[2], cell)],
         "tote": cell.tote_size[:2],
         **effector_parts(cell),
-        "colours": kinds,
+        "colours": {f"{w},{d},{_cells(h, cell)}": colour for (w, d, h), colour in colours.items()},
         "episodes": [_episode(recording, cell) for recording in recordings],
     }
     packed = base64.b64encode(zlib.compress(json.dumps(data, separators=(",", ":")).encode(), 9)).decode()
@@ -70,23 +71,11 @@ def _cells(height: int, cell: CellSpec) -> int | float:
     return int(cells) if cells.is_integer() else cells
 
 
-def _items_not_placed(recording: Recording) -> list[PlacedItem]:
-    """Return the items that are seen but not placed, as boxes at the origin."""
-    items = [item for move in recording.moves for item in ([move.item] if move.failure else []) + move.others]
-    return [PlacedItem(0, 0, 0, w, d, h) for _, _, w, d, h in items + recording.waiting]
-
-
-def _label(recording: Recording, ending: str) -> str:
-    """Return why an episode ended, in a word or two, for a list of episodes."""
-    if recording.ending is None:
-        return "goes on"
-    return "full" if ending == FULL else recording.ending.label
-
-
 def _episode(recording: Recording, cell: CellSpec) -> dict:
     """Return an episode for the page; all lengths are in cells."""
     heat = [move.heat for move in recording.moves if move.heat is not None]
     ending = recording.describe_ending(cell.num_places)
+    label = "goes on" if recording.ending is None else "full" if ending == FULL else recording.ending.label
     # One flat list a move: 5 of the item, 2 pick, 2 place, rotation, 4 of the footprint, z, failure code.
     moves = [
         [*_item(move.item, cell), *move.pick, *move.place, move.rotation, *move.footprint, _cells(move.z, cell),
@@ -98,7 +87,7 @@ def _episode(recording: Recording, cell: CellSpec) -> dict:
         "height": _cells(recording.tote_height, cell),
         "occupancy": recording.occupancy,
         "ending": ending,
-        "label": _label(recording, ending),
+        "label": label,
         "failed": recording.ending not in (None, Failure.NONE, Failure.STUCK),
         "stuck": recording.ending == Failure.STUCK and ending != FULL,
         "waiting": [_item(item, cell) for item in recording.waiting],
@@ -138,11 +127,6 @@ def _poses(poses: list[tuple[float, ...]], cell_size: float) -> list[int]:
     return np.rint(np.array(poses).reshape(-1, 8) * scale).astype(int).ravel().tolist()
 
 
-def _bin_corner(motion: Motion) -> list[float] | None:
-    """Return where the bin stands, in cells from the tote's corner, if there is one."""
-    return None if motion.bin is None else [round(at / motion.cell_size, 6) for at in motion.bin]
-
-
 def _item(item: InBin, cell: CellSpec) -> list[int | float]:
     """Return an item ``(x, y, w, d, h)`` with its height in cells."""
     return [*item[:4], _cells(item[4], cell)]
@@ -157,8 +141,7 @@ def picture(recording: Recording, cell: CellSpec, path: Path, moves: int | None 
         path: the file to write.
         moves: how many moves have been made; None: all.
     """
-    colours = item_colours(recording.boxes)
-    draw_scene(recording, cell, colours, moves).savefig(path, dpi=120)
+    draw_scene(recording, cell, item_colours(recording.boxes), moves).savefig(path, dpi=120)
 
 
 def animation(
@@ -183,6 +166,6 @@ def animation(
         buffer = io.BytesIO()
         draw_scene(recording, cell, colours, moves).savefig(buffer, format="png", dpi=dpi)
         images.append(Image.open(buffer).convert("RGB").quantize(128, dither=Image.Dither.NONE))
-    each = max(20, round(1000 * seconds / len(images)))
-    durations = [each] * (len(images) - 1) + [each + 2000]
+    durations = [max(20, round(1000 * seconds / len(images)))] * len(images)
+    durations[-1] += 2000
     images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)

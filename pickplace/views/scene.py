@@ -1,5 +1,7 @@
 """Drawing of a packed tote: boxes in isometric projection, and the height map from above."""
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 
 from pickplace.rules.cell import CellSpec
@@ -19,7 +21,9 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
         colours: of the kinds of items, see :func:`item_colours`.
         moves: how many moves have been made; None: all, and the caption says how the episode ended.
     """
-    done = recording.moves if moves is None else recording.moves[:moves]
+    from matplotlib.patches import Patch
+
+    done = recording.moves[:moves]
     boxes = recording.boxes[: sum(not move.failure for move in done)]
     heights = np.zeros(cell.tote_size[:2], dtype=int)
     for x, y, z, w, d, h in boxes:
@@ -28,12 +32,13 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
     figure = figure_of(12, 6)
     solid, plan = figure.subplots(1, 2, width_ratios=[1.2, 1])
     draw_tote(solid, (*size[:2], size[2] * cell.height_unit))
-    draw_items(solid, boxes, colours, size, cell.height_unit)
+    if boxes:
+        draw_items(solid, boxes, colours, size, cell.height_unit)
     if 0 < len(colours) <= 20:
-        _draw_legend(figure, colours, cell)
+        patches = [Patch(facecolor=c, edgecolor=INK, label=_sides(kind, cell)) for kind, c in colours.items()]
+        figure.legend(handles=patches, title="items (cells)", loc="outside left upper", frameon=False, alignment="left")
     _draw_plan(plan, heights, recording.tote_height, cell)
-    share = 100 * sum(box.volume for box in boxes) / np.prod(size)
-    share = np.floor(10 * share + 1e-9) / 10  # never rounded up: 100% is full
+    share = np.floor(1000 * sum(box.volume for box in boxes) / np.prod(size) + 1e-9) / 10  # not rounded: 100% is full
     caption = f"{_sides(size, cell)} tote, {share:.1f}% full, {len(boxes)} items placed"
     if len(done) == len(recording.moves) and recording.ending is not None:
         caption += f". {recording.describe_ending(cell.num_places)}"
@@ -41,18 +46,18 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
     return figure
 
 
-def kind_of(box: PlacedItem) -> Kind:
-    """Return the size of a box, whichever way it is turned."""
-    *_, w, d, h = box
+def kind_of(item: Sequence[int]) -> Kind:
+    """Return the size of an item ``(..., w, d, h)``, whichever way it is turned."""
+    *_, w, d, h = item
     return min(w, d), max(w, d), h
 
 
-def item_colours(boxes: list[PlacedItem]) -> dict[Kind, str]:
-    """Return a colour for each kind of item, the small ones first; many kinds share a spectrum."""
+def item_colours(items: Iterable[Sequence[int]]) -> dict[Kind, str]:
+    """Return a colour for each kind of items ``(..., w, d, h)``, the small ones first; many kinds share a spectrum."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    kinds = sorted({kind_of(box) for box in boxes}, key=lambda kind: (np.prod(kind), kind))
+    kinds = sorted(set(map(kind_of, items)), key=lambda kind: (np.prod(kind), kind))
     few = len(kinds) <= len(COLOURS)
     colours = COLOURS if few else [to_hex(c) for c in colormaps["Spectral"](np.linspace(0, 1, len(kinds)))]
     return dict(zip(kinds, colours, strict=False))
@@ -80,14 +85,12 @@ def draw_tote(axes, size: tuple[float, float, float]) -> None:
     def corner(x, y, z):
         return _to_paper(x - z, deep - y - z)  # y turned around, so that the viewer is at (1, 1, 1)
 
-    floor = [corner(x, y, 0) for x, y in ((0, 0), (wide, 0), (wide, deep), (0, deep))]
-    near_to_far = [((x, y), (0, deep)) for x, y in ((0, 0), (wide, deep))]
-    far_walls = [[corner(*a, 0), corner(*b, 0), corner(*b, high), corner(*a, high)] for a, b in near_to_far]
+    floor, rim = ([corner(x, y, z) for x, y in ((0, 0), (wide, 0), (wide, deep), (0, deep))] for z in (0, high))
+    far_walls = [[floor[near], floor[3], rim[3], rim[near]] for near in (0, 2)]
     tints = ["#e4e8eb", "#f4f6f7", "#eceff1"]
     axes.add_collection(PolyCollection([floor, *far_walls], facecolors=tints, edgecolors=WALL, zorder=1))
-    rim = [corner(x, y, high) for x, y in ((0, 0), (wide, 0), (wide, deep), (0, deep), (0, 0))]
-    near_edges = [[corner(x, y, 0), corner(x, y, high)] for x, y in ((0, 0), (wide, 0), (wide, deep))]
-    axes.add_collection(LineCollection([rim, *near_edges], colors=WALL, linewidths=1.2, zorder=4))
+    near_edges = zip(floor[:3], rim, strict=False)
+    axes.add_collection(LineCollection([[*rim, rim[0]], *near_edges], colors=WALL, linewidths=1.2, zorder=4))
     gap = 0.05 * (wide + deep)
     for label, (x, y) in (("x", corner(wide / 2, 0, 0)), ("y", corner(wide, deep / 2, 0))):
         axes.text(x + (gap if label == "y" else -gap) / 2, y - gap / 2, label, ha="center", va="top", color=INK)
@@ -106,7 +109,7 @@ def draw_items(axes, items: list[PlacedItem], colours: dict[Kind, str], size: tu
     from matplotlib.colors import to_rgb
 
     wide, deep, _ = size
-    width = float(np.clip(10 / (wide + deep), 0.35, 1.1))
+    pen = (*to_rgb(INK), 1.0), float(np.clip(10 / (wide + deep), 0.35, 1.1))  # colour and width
     spans: dict[tuple[int, int], list[tuple[int, int]]] = {}  # cell -> heights that are filled; y is turned around
     columns = []
     for item in items:
@@ -118,7 +121,7 @@ def draw_items(axes, items: list[PlacedItem], colours: dict[Kind, str], size: tu
     def is_covered(x: int, y: int, low: int, high: int) -> bool:
         return sum(max(0, min(high, top) - max(low, z)) for z, top in spans.get((x, y), ())) == high - low
 
-    polygons, fills, lines, widths = [], [], [], []
+    drawn: list[tuple] = []  # polygon, fill, colour and width of its line
     for _, low, cell, place, item in sorted(columns):
         top = low + item.h
         for (i, j, k), light, corners in FACES:
@@ -129,16 +132,11 @@ def draw_items(axes, items: list[PlacedItem], colours: dict[Kind, str], size: tu
                 _to_paper(cell[0] + a - z, cell[1] + b - z) for (a, b, _), z in zip(corners, heights, strict=True)
             ]
             fill = (*np.multiply(to_rgb(colours[kind_of(item)]), light), 1.0)
-            polygons.append(points)
-            fills.append(fill)
-            lines.append(fill)  # closes the seam between columns
-            widths.append(0.6)
+            drawn.append((points, fill, fill, 0.6))  # the line closes the seam between columns
             for start, end in ((0, 1), (1, 2), (2, 3), (3, 0)):
                 if _is_edge(place, corners[start], corners[end], item):
-                    polygons.append([points[start], points[end]])
-                    fills.append((0.0, 0.0, 0.0, 0.0))
-                    lines.append((*to_rgb(INK), 1.0))
-                    widths.append(width)
+                    drawn.append(([points[start], points[end]], (0.0, 0.0, 0.0, 0.0), *pen))
+    polygons, fills, lines, widths = zip(*drawn, strict=True)
     axes.add_collection(
         PolyCollection(polygons, facecolors=fills, edgecolors=lines, linewidths=widths, capstyle="round", zorder=2)
     )
@@ -156,16 +154,7 @@ def _is_edge(place, start, end, item: PlacedItem) -> bool:
 
 def _sides(size: tuple[int, ...], cell: CellSpec) -> str:
     """Return a size ``(w, d, h)`` in cells, as ``WxDxH``."""
-    w, d, h = size
-    return f"{w}x{d}x{h * cell.height_unit:g}"
-
-
-def _draw_legend(figure, colours: dict[Kind, str], cell: CellSpec) -> None:
-    """Draw which colour stands for which kind of item."""
-    from matplotlib.patches import Patch
-
-    patches = [Patch(facecolor=c, edgecolor=INK, label=_sides(kind, cell)) for kind, c in colours.items()]
-    figure.legend(handles=patches, title="items (cells)", loc="outside left upper", frameon=False, alignment="left")
+    return f"{size[0]}x{size[1]}x{size[2] * cell.height_unit:g}"
 
 
 def _draw_plan(axes, heights: np.ndarray, limit: int, cell: CellSpec) -> None:
@@ -186,11 +175,9 @@ def _draw_plan(axes, heights: np.ndarray, limit: int, cell: CellSpec) -> None:
         axes.set_yticks(np.arange(heights.shape[1] + 1) - 0.5, minor=True)
         axes.grid(which="minor", color="white", lw=1)
         axes.tick_params(which="minor", length=0)
-    axes.set_xlabel("x (cells)")
-    axes.set_ylabel("y (cells)")
+    axes.set(title="height map from above", xlabel="x (cells)", ylabel="y (cells)")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(12, integer=True, min_n_ticks=1))
-    axes.set_title("height map from above")
     every = limit // 12 + 1
     unit = "cells" if cell.height_unit == 1 else f"units of {cell.height_unit:g} cells"
     axes.figure.colorbar(image, ax=axes, label=f"height ({unit})", shrink=0.8, ticks=range(0, limit + 1, every))
