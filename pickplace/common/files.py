@@ -1,11 +1,17 @@
 """Files that a user or a stranger's run folder names: how they are read, and how they are replaced as a whole."""
 
+import csv
+import io
 import stat
 from contextlib import contextmanager
 from pathlib import Path
 
+from pickplace.common.validate import at_most, excerpt
+
 #: Greatest size of a file that is read, in bytes, unless a reader sets its own: more would fill the memory.
 MAX_BYTES = 2**30
+#: Greatest size of a table of settings: its rows take more memory than the file.
+MAX_TABLE_BYTES = 100_000_000
 
 
 def read_file(path, most: int = MAX_BYTES, links: bool = True, empty: bool = True) -> bytes:
@@ -27,8 +33,7 @@ def read_file(path, most: int = MAX_BYTES, links: bool = True, empty: bool = Tru
     found = path.stat(follow_symlinks=links)
     if not stat.S_ISREG(found.st_mode):
         raise ValueError(f"{path}: a folder, link, pipe or device; expected a regular file.")
-    if found.st_size > most:
-        raise ValueError(f"{path}: {found.st_size:,} bytes; expected at most {most:,}.")
+    at_most(f"{path}:", found.st_size, "bytes", most)
     if not (found.st_size or empty):
         raise ValueError(f"{path}: 0 bytes; expected a file with content.")
     with path.open("rb") as file:
@@ -41,6 +46,34 @@ def read_text(path, most: int = MAX_BYTES, encoding: str = "utf-8", empty: bool 
         return read_file(path, most, empty=empty).decode(encoding)
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: {error}; expected a text in UTF-8.") from error
+
+
+def read_table(key: str, path, *headers: str) -> tuple[str, list[tuple[int, list[str]]]]:
+    """Return the header of a CSV file, and the other rows: the number of the line and the fields, without white space.
+
+    Args:
+        key: the setting that names the file.
+        path: the file.
+        headers: the headers that it may have, with commas.
+
+    Raises:
+        ValueError: naming the file, for one that is not there, has another header, or no row below it.
+    """
+    if not Path(path).exists():
+        raise ValueError(f"{key}={str(path)!r}: no such file; expected a CSV with columns {' or '.join(headers)}.")
+    try:
+        reader = csv.reader(io.StringIO(read_text(path, MAX_TABLE_BYTES, "utf-8-sig", empty=False), newline=""))
+        table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
+    except csv.Error as error:
+        raise ValueError(f"{path}: {error}; expected a CSV in UTF-8.") from error
+    (_, names), *rows = [*table, (0, [])]
+    header, rows = ",".join(names), [(line, fields) for line, fields in rows if any(fields)]
+    if header not in headers:
+        expected = " or ".join(map(repr, headers))
+        raise ValueError(f"{path}: the header is {excerpt(header)}, expected {expected}.")
+    if not rows:
+        raise ValueError(f"{path}: no rows, expected at least one below the header.")
+    return header, rows
 
 
 @contextmanager

@@ -39,6 +39,18 @@ def short_text(name) -> str:
     return excerpt(str(name))[1:-1]
 
 
+def expect(good: Any, key: str, value: Any, expected: str) -> None:
+    """Refuse a value that is not good; the message says what was expected."""
+    if not good:
+        raise ValueError(f"{key}={excerpt(value)}: expected {expected}.")
+
+
+def at_most(words: str, count: int, what: str, most: int) -> None:
+    """Refuse a count that is too great; the message begins with ``words``."""
+    if count > most:
+        raise ValueError(f"{words} {count:,} {what}; expected at most {most:,}.")
+
+
 def is_whole(value) -> bool:
     """Return whether a value is an integer of Python's or numpy's, and not a bool."""
     return isinstance(value, Integral) and not isinstance(value, bool)
@@ -52,9 +64,8 @@ def is_number(value: Any) -> bool:
 
 def whole_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:
     """Return ``value`` if it is a whole number in ``[least, most]``."""
-    if not is_whole(value) or not least <= value <= most:
-        limit = "< 2**63" if most == MAX_COUNT else f"<= {most:,}"
-        raise ValueError(f"{key}={excerpt(value)}: expected a whole number >= {least} and {limit}.")
+    limit = "< 2**63" if most == MAX_COUNT else f"<= {most:,}"
+    expect(is_whole(value) and least <= value <= most, key, value, f"a whole number >= {least} and {limit}")
     return int(value)
 
 
@@ -70,9 +81,8 @@ def number(key: str, value, least: float = 0.0, most: float | None = None, what:
     Args:
         what: for the message: a number, or its unit.
     """
-    if not is_number(value) or value < least or (most is not None and value > most):
-        limits = f">= {least:g}" if most is None else f"between {least:g} and {most:g}"
-        raise ValueError(f"{key}={excerpt(value)}: expected {what} {limits}.")
+    limits = f">= {least:g}" if most is None else f"between {least:g} and {most:g}"
+    expect(is_number(value) and least <= value and (most is None or value <= most), key, value, f"{what} {limits}")
     return value
 
 
@@ -83,16 +93,14 @@ def is_name(value: Any) -> bool:
 
 def flag(key: str, value) -> bool:
     """Return ``value`` if it is true or false."""
-    if not isinstance(value, bool):
-        raise ValueError(f"{key}={excerpt(value)}: expected true or false.")
+    expect(isinstance(value, bool), key, value, "true or false")
     return value
 
 
 def one_of(key: str, value, choices, alternative: str | None = None) -> str:
     """Return ``value`` if it is a text among the choices; the message names an alternative, if there is one."""
-    if not isinstance(value, str) or value not in choices:
-        expected = [*map(repr, choices), *([alternative] if alternative else [])]
-        raise ValueError(f"{key}={excerpt(value)}: expected {' or '.join(expected)}.")
+    expected = [*map(repr, choices), *([alternative] if alternative else [])]
+    expect(isinstance(value, str) and value in choices, key, value, " or ".join(expected))
     return value
 
 
@@ -103,29 +111,28 @@ def size_tuple(name: str, value, count: int, most: int) -> tuple[int, ...]:
         exact = all(int(v) == v and not isinstance(v, bool) for v in value)
     except (TypeError, ValueError, OverflowError):
         sizes, exact = (), False
-    if not exact or len(sizes) != count or min(sizes) < 1 or max(sizes) > most:
-        raise ValueError(f"{name}={excerpt(value)}: expected {count} whole numbers >= 1 and <= {most:,}.")
+    good = exact and len(sizes) == count and min(sizes) >= 1 and max(sizes) <= most
+    expect(good, name, value, f"{count} whole numbers >= 1 and <= {most:,}")
     return sizes
 
 
 def odd_number(key: str, value, least: int = 1, most: int = 99) -> int:
     """Return ``value`` if it is an odd whole number in ``[least, most]``."""
-    if not is_whole(value) or not least <= value <= most or value % 2 == 0:
-        raise ValueError(f"{key}={excerpt(value)}: expected an odd number >= {least} and <= {most}.")
+    good = is_whole(value) and least <= value <= most and value % 2
+    expect(good, key, value, f"an odd number >= {least} and <= {most}")
     return int(value)
 
 
 def number_or_null(key: str, value, least: float, most: float) -> float | None:
     """Return ``value`` if it is None or a finite number in ``[least, most]``."""
-    if value is not None and (not is_number(value) or not least <= value <= most):
-        raise ValueError(f"{key}={excerpt(value)}: expected a number between {least:g} and {most:g}, or null.")
+    good = value is None or (is_number(value) and least <= value <= most)
+    expect(good, key, value, f"a number between {least:g} and {most:g}, or null")
     return value
 
 
 def check_inputs(key: str, count: int) -> None:
     """Refuse a layer with more inputs than :data:`MAX_INPUTS`."""
-    if count > MAX_INPUTS:
-        raise ValueError(f"{key}: a neuron would have {count:,} inputs; expected at most {MAX_INPUTS:,}.")
+    at_most(f"{key}: a neuron would have", count, "inputs", MAX_INPUTS)
 
 
 def check_bytes(setting: str, needed: int, device="cpu") -> None:

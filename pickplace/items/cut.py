@@ -6,8 +6,8 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import one_of, size_tuple
-from pickplace.items.distributions import ItemDistribution, check_count, check_range, hashed_uniform, place_at_random
+from pickplace.common.validate import at_most, one_of, size_tuple
+from pickplace.items.distributions import MAX_KINDS, ItemDistribution, check_range, hashed_uniform, place_at_random
 
 #: Orders of arrival: CUT-1 and CUT-2.
 ORDERS = ("z", "stacking")
@@ -61,8 +61,7 @@ class Cut(ItemDistribution):
         if bad := [side for side in self.container if not fits[side]]:
             raise ValueError(f"{key}: sides of {least} to {greatest} do not add up to {bad[0]}; expected some that do.")
         count = math.prod(side // least for side in self.container)
-        if count > MAX_ITEMS:
-            raise ValueError(f"{key}: an episode has up to {count:,} items; expected at most {MAX_ITEMS:,}.")
+        at_most(f"{key}: an episode has up to", count, "items", MAX_ITEMS)
         cuts = [
             [at for at in range(least, length - least + 1) if length > greatest and fits[at] and fits[length - at]]
             for length in range(longest + 1)
@@ -71,7 +70,7 @@ class Cut(ItemDistribution):
         for length, places in enumerate(cuts):
             arising.append({length} if length <= greatest else set().union(*(arising[at] for at in places)))
         sides_of_items = [sorted(arising[side]) for side in self.container]
-        check_count(f"{key}: the container gives", math.prod(map(len, sides_of_items)))
+        at_most(f"{key}: the container gives", math.prod(map(len, sides_of_items)), "kinds of items", MAX_KINDS)
         self.sizes = torch.tensor(list(product(*sides_of_items)))
         self._num_cuts = torch.tensor([len(places) for places in cuts])
         self._cuts = torch.tensor([places + [0] * (longest - len(places)) for places in cuts])

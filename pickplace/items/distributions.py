@@ -4,22 +4,22 @@ An item is a counter-based hash of (stream, seed, episode, step), so there is no
 depend on the batch size, and every method that plays an episode meets the same ones.
 """
 
-import csv
-import io
 import math
 from itertools import product
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from pickplace.common.files import read_text
-from pickplace.common.validate import excerpt, flag, is_number, is_whole
+from pickplace.common.files import read_table
+from pickplace.common.validate import at_most, excerpt, expect, flag, is_number, is_whole, whole_number
 from pickplace.rules.item import Item
 
 #: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
 STREAMS = ("train", "validation", "test")
 MAX_SEED = 2**62  # beyond it, seeds of two families could meet
+
+MAX_LENGTH = 2**31 - 1  # of a side, in cells or height units
+MAX_KINDS = 100_000  # of items: more would fill the memory
 
 #: The kinds of items in the paper, (w, d, h).
 PAPER_KINDS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1))
@@ -27,8 +27,7 @@ PAPER_KINDS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1))
 
 def check_seed(seed, key: str = "seed") -> int:
     """Return the seed, or raise a ``ValueError`` that names the ``key`` if it is none."""
-    if not is_whole(seed) or not 0 <= seed < MAX_SEED:
-        raise ValueError(f"{key}={excerpt(seed)}: expected a whole number >= 0 and < 2**62.")
+    expect(is_whole(seed) and 0 <= seed < MAX_SEED, key, seed, "a whole number >= 0 and < 2**62")
     return int(seed)
 
 
@@ -53,29 +52,21 @@ def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, cou
 def place_at_random(size: Tensor, across: Tensor, along: Tensor, bin_size, kind: Tensor | None = None) -> Item:
     """Return items of given sizes, int64 ``[N, 3]``, in the bin, at places that two uniform numbers decide, ``[N]``."""
     w, d, h = size.unbind(-1)
-    x = (across * (bin_size[0] - w + 1)).long()
-    y = (along * (bin_size[1] - d + 1)).long()
+    x, y = (across * (bin_size[0] - w + 1)).long(), (along * (bin_size[1] - d + 1)).long()
     return Item(x, y, w, d, h, kind)
 
 
-def _is_length(value) -> bool:
-    """Return whether a value is a positive whole number that fits the tensors."""
-    return is_whole(value) and 1 <= int(value) < 2**31
+def _are_lengths(values, count: int) -> bool:
+    """Return whether there are so many positive whole numbers that fit the tensors."""
+    is_list = isinstance(values, (list, tuple)) and len(values) == count
+    return is_list and all(is_whole(value) and 1 <= value <= MAX_LENGTH for value in values)
 
 
 def check_range(key: str, limits) -> tuple[int, int]:
     """Return ``(least, greatest)``, or raise a ``ValueError`` that names the ``key``."""
-    pair = isinstance(limits, (list, tuple)) and len(limits) == 2 and all(map(_is_length, limits))
-    if not pair or limits[0] > limits[1]:
-        expected = "[least, greatest], whole cells with 1 <= least <= greatest"
-        raise ValueError(f"{key}={excerpt(limits)}: expected {expected}.")
+    good = _are_lengths(limits, 2) and limits[0] <= limits[1]
+    expect(good, key, limits, "[least, greatest], whole cells with 1 <= least <= greatest")
     return int(limits[0]), int(limits[1])
-
-
-def check_count(words: str, count: int) -> None:
-    """Refuse more than :data:`MAX_KINDS` kinds; the message begins with ``words``."""
-    if count > MAX_KINDS:
-        raise ValueError(f"{words} {count:,} kinds of items; expected at most {MAX_KINDS:,}.")
 
 
 class ItemDistribution:
@@ -83,14 +74,12 @@ class ItemDistribution:
 
     Attributes:
         sizes: int64 ``[K, 3]``, every size ``(w, d, h)`` that may arrive, in cells and height units.
-        length: number of items in each episode, or None if they never end, or if it differs between episodes.
         varies: whether episodes differ at all.
         sequential: whether an episode is a sequence whose order a search must not know: it samples from ``sizes``.
         has_corners: whether each item has one place in the bin, so that of several items one waits for its place.
     """
 
     sizes: Tensor
-    length: int | None = None
     varies: bool = True
     sequential: bool = False
     has_corners: bool = False
@@ -131,18 +120,16 @@ class Kinds(ItemDistribution):
     """
 
     def __init__(self, kinds, weights=None):
-        if not isinstance(kinds, (list, tuple)) or not kinds:
-            raise ValueError(f"items.kinds={excerpt(kinds)}: expected a list of at least one (w, d, h).")
-        check_count("items.kinds: the list has", len(kinds))
-        for kind in kinds:
-            if not isinstance(kind, (list, tuple)) or len(kind) != 3 or not all(map(_is_length, kind)):
-                raise ValueError(f"items.kinds: got {excerpt(kind)}, expected (w, d, h) in positive whole cells.")
-        if weights is None:
-            weights = [1.0] * len(kinds)
-        if not isinstance(weights, (list, tuple)) or len(weights) != len(kinds):
-            raise ValueError(f"items.weights={excerpt(weights)}: expected {len(kinds)} numbers, one for each kind.")
-        if not all(is_number(v) and v >= 0 for v in weights) or not is_number(total := sum(weights)) or total <= 0:
-            raise ValueError(f"items.weights={excerpt(weights)}: expected finite numbers >= 0 that are not all 0.")
+        is_list = isinstance(kinds, (list, tuple)) and kinds
+        expect(is_list, "items.kinds", kinds, "a list of at least one (w, d, h)")
+        at_most("items.kinds: the list has", len(kinds), "kinds of items", MAX_KINDS)
+        if bad := [kind for kind in kinds if not _are_lengths(kind, 3)]:
+            raise ValueError(f"items.kinds: got {excerpt(bad[0])}, expected (w, d, h) in positive whole cells.")
+        weights = [1.0] * len(kinds) if weights is None else weights
+        fits = isinstance(weights, (list, tuple)) and len(weights) == len(kinds)
+        expect(fits, "items.weights", weights, f"{len(kinds)} numbers, one for each kind")
+        good = all(is_number(v) and v >= 0 for v in weights) and is_number(total := sum(weights)) and total > 0
+        expect(good, "items.weights", weights, "finite numbers >= 0 that are not all 0")
         used = [i for i, v in enumerate(weights) if v > 0]
         self.sizes = torch.tensor([list(kinds[i]) for i in used], dtype=torch.int64)
         share = torch.tensor([weights[i] for i in used], dtype=torch.float64)
@@ -164,10 +151,6 @@ class Kinds(ItemDistribution):
         return place_at_random(self.sizes.to(rank.device)[kind], across, along, bin_size, kind)
 
 
-#: Greatest size of a recorded file, in bytes, and number of kinds: more would fill the memory.
-MAX_TEXT, MAX_KINDS = 100_000_000, 100_000
-
-
 class Uniform(Kinds):
     """Cuboids whose sides and heights are drawn uniformly and independently from closed ranges.
 
@@ -181,9 +164,9 @@ class Uniform(Kinds):
         for name, limits in ranges.items():
             check_range(f"items.{name}", limits)
         words = ", ".join(f"items.{name}={[*limits]}" for name, limits in ranges.items())
-        check_count(f"{words}: the ranges have", math.prod(high - low + 1 for low, high in ranges.values()))
-        if not _is_length(unit):
-            raise ValueError(f"items.unit={excerpt(unit)}: expected a whole number >= 1.")
+        count = math.prod(high - low + 1 for low, high in ranges.values())
+        at_most(f"{words}: the ranges have", count, "kinds of items", MAX_KINDS)
+        whole_number("items.unit", unit, most=MAX_LENGTH)
         sides = ([unit * length for length in range(low, high + 1)] for low, high in ranges.values())
         super().__init__(list(product(*sides)))
 
@@ -204,56 +187,33 @@ class Recorded(ItemDistribution):
 
     def __init__(self, path, loop=False):
         flag("items.loop", loop)
-        self.path = Path(str(path))
-        if not self.path.exists():
-            raise ValueError(f"items.path={str(path)!r}: no such file; expected a CSV with columns w,d,h (and x,y).")
-        try:
-            reader = csv.reader(io.StringIO(read_text(path, MAX_TEXT, "utf-8-sig", empty=False), newline=""))
-            table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
-        except csv.Error as error:
-            raise ValueError(f"{path}: {error}; expected a CSV in UTF-8.") from error
-        header = table[0][1] if table else []
-        if header not in (["w", "d", "h"], ["w", "d", "h", "x", "y"]):
-            raise ValueError(f"{path}: the header is {excerpt(','.join(header))}, expected 'w,d,h' or 'w,d,h,x,y'.")
-        rows = [self._row(line, row, header) for line, row in table[1:] if any(row)]
-        if not rows:
-            raise ValueError(f"{path}: no items, expected at least one row below the header.")
-        numbers = torch.tensor(rows, dtype=torch.int64)
-        self.sizes = numbers[:, :3]
-        self._corner = numbers[:, 3:] if len(header) == 5 else None
-        self.has_corners = self._corner is not None
+        self.path, self._loop = str(path), loop
+        header, table = read_table("items.path", self.path, "w,d,h", "w,d,h,x,y")
+        for line, row in table:
+            whole = all(field.isdecimal() and len(field) < 10 for field in row)
+            if len(row) != len(header.split(",")) or not whole or min(map(int, row[:3])) < 1:
+                raise ValueError(
+                    f"{path}, line {line}: got {excerpt(','.join(row))}, expected {header} as whole numbers with "
+                    "w, d, h >= 1 and x, y >= 0."
+                )
+        self._lines = [line for line, _ in table]
+        numbers = torch.tensor([[int(field) for field in row] for _, row in table])
+        self.sizes, self._corner = numbers[:, :3], numbers[:, 3:]
+        self.has_corners = self._corner.numel() > 0
         self.varies = not self.has_corners  # else not even where the items lie
-        self._lines = [line for line, row in table[1:] if any(row)]
-        self._loop = loop
-        self.length = None if loop else len(rows)
-
-    def _row(self, line, row, header):
-        whole = all(field.isdecimal() and len(field) < 10 for field in row)
-        values = [int(field) for field in row] if whole else []
-        if len(values) != len(header) or min(values[:3]) < 1:
-            raise ValueError(
-                f"{self.path}, line {line}: got {excerpt(','.join(row))}, expected {','.join(header)} as whole numbers "
-                "with w, d, h >= 1 and x, y >= 0."
-            )
-        return values
 
     def sample(self, stream, seed, episode, step, bin_size):
         item = super().sample(stream, seed, episode, step, bin_size)
-        if self._corner is not None:
+        if self.has_corners:
             x, y = self._corner.to(step.device)[item.kind].unbind(-1)
             item = item._replace(x=x, y=y)
-        if self.length is None:
-            return item
-        left = step < self.length
-        return item.map(lambda part: torch.where(left, part, 0))
+        return item if self._loop else item.map(lambda part: torch.where(step < len(self.sizes), part, 0))
 
     def _index(self, uniform, step):
-        return step % len(self.sizes) if self._loop else step.clamp(max=len(self.sizes) - 1)
+        return step % len(self.sizes)
 
     def corners(self, kind, bin_size):
-        if self._corner is None:
-            return super().corners(kind, bin_size)
-        return [tuple(self._corner[kind].tolist())]
+        return [tuple(self._corner[kind].tolist())] if self.has_corners else super().corners(kind, bin_size)
 
     def label(self, kind):
         return f"{self.path}, line {self._lines[kind]}: " + super().label(kind)

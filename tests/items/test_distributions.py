@@ -179,9 +179,9 @@ def test_a_recorded_stream_ends_each_episode_at_its_own_time(recorded):
 
 def test_a_recorded_stream_may_loop_and_a_search_knows_its_sizes_only(recorded):
     items = recorded("w,d,h\n1,1,1\n2,1,1\n", loop=True)
-    assert drawn(items, 6).w.tolist() == [1, 2, 1, 2, 1, 2] and items.length is None
+    assert drawn(items, 6).w.tolist() == [1, 2, 1, 2, 1, 2]
     imagined = module.search_items(recorded("w,d,h,x,y\n1,1,1,0,0\n2,1,1,0,0\n"))
-    assert isinstance(imagined, Kinds) and imagined.length is None and imagined.sizes.tolist() == items.sizes.tolist()
+    assert isinstance(imagined, Kinds) and imagined.sizes.tolist() == items.sizes.tolist()
     # Positions are random unless given.
     item = drawn(recorded("w,d,h\n2,1,1\n", loop=True), 20_000)
     assert is_even(item.x * 5 + item.y, 20)
@@ -210,7 +210,7 @@ def test_ways_to_write_the_same_file(recorded, text):
         ("W;D;H\n1;1;1\n", "the header is 'W;D;H', expected 'w,d,h' or 'w,d,h,x,y'"),
         ("w,d,h,x\n1,1,1,1\n", "the header is 'w,d,h,x'"),
         ("1,1,1\n", "the header is '1,1,1'"),
-        ("w,d,h\n", "no items"),
+        ("w,d,h\n", "no rows"),
         (b"w,d,h\n1,1,\xff\n", "expected a text in UTF-8"),
         ("w,d,h\n1,1,1\n1,x,1\n", "line 3: got '1,x,1'"),
         ("w,d,h\n1,1\n", "line 2: got '1,1', expected w,d,h as whole numbers"),

@@ -112,7 +112,7 @@ def test_a_recorded_stream_is_not_looked_up_and_a_full_tote_has_nothing_to_searc
     (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
     env = make_env(items=Recorded(tmp_path / "items.csv"))
     search, observation = search_of(env, 20), env.reset()
-    assert isinstance(search.items, Kinds) and search.items.length is None
+    assert isinstance(search.items, Kinds)
     for depth in (1.0, 0.0):
         observation["tote_depth"] = torch.full_like(observation["tote_depth"], depth)
         assert search.decide(observation).item() in range(env.cell.num_actions)

@@ -1,20 +1,17 @@
 """A robot that reaches the poses of a file, such as one that its inverse kinematics made."""
 
-import csv
-import io
 import math
 from dataclasses import dataclass, field
 
 import torch
 
-from pickplace.common.files import read_text
-from pickplace.common.validate import excerpt
+from pickplace.common.files import read_table
+from pickplace.common.validate import excerpt, expect
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.maps import NEVER
 from pickplace.rules.reach.base import MAX_COORDINATE, Limits, Reach, whole_heights
 
-MAX_TEXT = 100_000_000  # greatest size of a table, in bytes
-COLUMNS = ["where", "x", "y", "rotation", "lowest", "highest"]
+HEADER = "where,x,y,rotation,lowest,highest"
 
 
 @dataclass(frozen=True)
@@ -36,33 +33,15 @@ class ReachTable(Reach):
     lines: dict[tuple, int] = field(init=False, repr=False, compare=False)  # of each pose
 
     def __post_init__(self):
-        path = str(self.path)
-        try:
-            reader = csv.reader(io.StringIO(read_text(path, MAX_TEXT, "utf-8-sig", empty=False), newline=""))
-            lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-        except FileNotFoundError as error:
-            expected = f"a CSV with columns {','.join(COLUMNS)}"
-            raise ValueError(f"reach.path={path!r}: no such file; expected {expected}.") from error
-        except csv.Error as error:
-            raise ValueError(f"{path}: {error}; expected a CSV in UTF-8.") from error
-        header = lines[0][1] if lines else []
-        if header != COLUMNS:
-            raise ValueError(f"{path}: the header is {excerpt(','.join(header))}, expected {','.join(COLUMNS)!r}.")
-        found: dict[tuple, int] = {}
-        rows = []
-        for line, texts in lines[1:]:
-            if not any(texts):
-                continue
+        path, found, rows = str(self.path), {}, []
+        for line, texts in read_table("reach.path", path, HEADER)[1]:
             row = _row(f"{path}, line {line}", texts)
-            if row[:4] in found:
+            if (first := found.setdefault(row[:4], line)) != line:
                 raise ValueError(
-                    f"{path}, line {line}: got {excerpt(','.join(texts))}, the same pose as in line {found[row[:4]]}; "
+                    f"{path}, line {line}: got {excerpt(','.join(texts))}, the same pose as in line {first}; "
                     "expected one row for each."
                 )
-            found[row[:4]] = line
             rows.append(row)
-        if not rows:
-            raise ValueError(f"{path}: no poses, expected at least one row below the header.")
         object.__setattr__(self, "path", path)
         object.__setattr__(self, "rows", tuple(sorted(rows)))
         object.__setattr__(self, "lines", found)
@@ -90,28 +69,27 @@ class ReachTable(Reach):
 
 def _row(place: str, texts: list[str]) -> tuple[str, int, int, int, float, float]:
     """Return the values of a row."""
+    columns = HEADER.split(",")
+    if len(texts) != len(columns):
+        raise ValueError(f"{place}: got {excerpt(','.join(texts))}, expected {HEADER}.")
+    row = dict(zip(columns, texts, strict=True))
 
-    def refuse(column: str, expected: str) -> ValueError:
-        return ValueError(f"{place}: {column}={excerpt(row[column])}: expected {expected}.")
+    def check(column: str, good: bool, expected: str) -> None:
+        expect(good, f"{place}: {column}", row[column], expected)
 
-    if len(texts) != len(COLUMNS):
-        raise ValueError(f"{place}: got {excerpt(','.join(texts))}, expected {','.join(COLUMNS)}.")
-    row = dict(zip(COLUMNS, texts, strict=True))
-    if row["where"] not in ("bin", "tote"):
-        raise refuse("where", "bin or tote")
+    check("where", row["where"] in ("bin", "tote"), "bin or tote")
     for column in ("x", "y"):
-        if not row[column].isdecimal() or len(row[column]) > 6:
-            raise refuse(column, "a cell, a whole number >= 0")
-    if row["rotation"] not in ([""] if row["where"] == "bin" else ["0", "1", "2", "3"]):
-        raise refuse("rotation", "nothing in the bin" if row["where"] == "bin" else "0, 1, 2 or 3 quarter turns")
+        check(column, row[column].isdecimal() and len(row[column]) <= 6, "a cell, a whole number >= 0")
+    in_tote = ["0", "1", "2", "3"], "0, 1, 2 or 3 quarter turns"
+    turns, expected = in_tote if row["where"] == "tote" else ([""], "nothing in the bin")
+    check("rotation", row["rotation"] in turns, expected)
     heights = []
     for column, unlimited in (("lowest", 0.0), ("highest", math.inf)):
         try:
             heights.append(float(row[column]) if row[column] else unlimited)
         except ValueError:
             heights.append(math.nan)
-        if row[column] and not abs(heights[-1]) <= MAX_COORDINATE:
-            raise refuse(column, "a height in sides of a cell, or nothing")
-    if heights[0] > heights[1]:
-        raise refuse("highest", f"at least lowest={row['lowest'] or 0}")
+        good = not row[column] or abs(heights[-1]) <= MAX_COORDINATE
+        check(column, good, "a height in sides of a cell, or nothing")
+    check("highest", heights[0] <= heights[1], f"at least lowest={row['lowest'] or 0}")
     return row["where"], int(row["x"]), int(row["y"]), int(row["rotation"] or 0), heights[0], heights[1]

@@ -167,7 +167,7 @@ def test_tables_are_compared_by_content(table):
     ("text", "message"),
     [
         ("", "reach.csv: 0 bytes"),
-        (HEADER, "reach.csv: no poses"),
+        (HEADER, "reach.csv: no rows"),
         ("where,x,y\n", "reach.csv: the header is 'where,x,y', expected 'where,x,y,rotation,lowest,highest'"),
         (HEADER.replace("lowest", "low"), "the header is 'where,x,y,rotation,low,highest'"),
         (b"\xff\xfe", "expected a text in UTF-8"),
