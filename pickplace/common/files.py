@@ -66,8 +66,8 @@ def read_table(key: str, path, *headers: str) -> tuple[str, list[tuple[int, list
         table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
     except csv.Error as error:
         raise ValueError(f"{path}: {error}; expected a CSV in UTF-8.") from error
-    (_, names), *rows = [*table, (0, [])]
-    header, rows = ",".join(names), [(line, fields) for line, fields in rows if any(fields)]
+    header = ",".join(table[0][1]) if table else ""
+    rows = [(line, fields) for line, fields in table[1:] if any(fields)]
     if header not in headers:
         expected = " or ".join(map(repr, headers))
         raise ValueError(f"{path}: the header is {excerpt(header)}, expected {expected}.")

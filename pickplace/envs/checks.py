@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from pickplace.common.validate import at_most
 from pickplace.items.distributions import ItemDistribution
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import available_offsets
@@ -32,8 +33,7 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
     Raises:
         ValueError: naming the kind, the position and the tote height.
     """
-    w_b, d_b, _ = cell.bin_size
-    height = cell.tote_size[2]
+    (w_b, d_b, _), height = cell.bin_size, cell.tote_size[2]
     # (x, y, w, d, h) -> the first kind like it: the rows of a long recording repeat themselves
     problems: dict[tuple[int, ...], int] = {}
     widest: dict[str, tuple[int, ...]] = {"bin_size": (w_b, d_b)}
@@ -49,14 +49,9 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
             if x + w > w_b or y + d > d_b:
                 raise ValueError(f"{items.label(kind)} at x={x}, y={y} leaves the bin: expected it inside {w_b}x{d_b}.")
             problems.setdefault((x, y, w, d, h), kind)
-        if len(problems) > MAX_POSITIONS:
-            raise ValueError(
-                f"bin_size={[*cell.bin_size]}: the kinds of items have more than {MAX_POSITIONS:,} positions in the "
-                "bin; expected a smaller bin, or fewer kinds."
-            )
-    description = f"{cell.describe()}, support={cell.support}"
-    if cell.reach is not None:
-        description += f", reach={cell.reach}"
+        words = f"bin_size={[*cell.bin_size]}: the kinds of items have at least"
+        at_most(words, len(problems), "positions in the bin", MAX_POSITIONS)
+    description = f"{cell.describe()}, support={cell.support}" + (f", reach={cell.reach}" if cell.reach else "")
     cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
     rows = torch.tensor([(*item, kind) for item, kind in problems.items()])
     if cell.limits is None:

@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from tensordict import TensorDict
 
+from pickplace.common.validate import expect
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.distributions import Kinds, check_seed
 from pickplace.rules.state import Failure
@@ -18,18 +19,18 @@ from pickplace.rules.state import Failure
 def _make_env(num_envs: int, items, settings: dict) -> PickPlaceEnv:
     """Return the batched environment below; a list of ``(w, d, h)`` is short for ``Kinds``."""
     for key, why in (("masks", "the action mask always comes along"), ("seed", "reset(seed=...) begins a stream")):
-        if key in settings:
-            raise ValueError(f"{key}={settings[key]!r}: expected no such argument; {why}.")
+        expect(key not in settings, key, settings.get(key), f"no such argument; {why}")
     items = Kinds(items) if isinstance(items, (list, tuple)) else items
     return PickPlaceEnv(items=items, num_envs=num_envs, **settings)
 
 
 def _spaces(env: PickPlaceEnv) -> tuple[spaces.Dict, spaces.Discrete]:
     """Return observation and action space of one problem."""
-    boxes: dict[str, spaces.Space] = {}
-    for key, term in env.terms.items():
-        low, high, shape, dtype = term.bounds(env.cell, env.min_tote_height)
-        boxes[key] = spaces.Box(low, high, shape, torch.empty(0, dtype=dtype).numpy().dtype.type)
+    bounds = {key: term.bounds(env.cell, env.min_tote_height) for key, term in env.terms.items()}
+    boxes: dict[str, spaces.Space] = {
+        key: spaces.Box(low, high, shape, torch.empty(0, dtype=dtype).numpy().dtype.type)
+        for key, (low, high, shape, dtype) in bounds.items()
+    }
     return spaces.Dict(boxes), spaces.Discrete(env.cell.num_actions)
 
 
@@ -44,13 +45,11 @@ def _tote_heights(given, env: PickPlaceEnv) -> torch.Tensor:
     """Return ``options["tote_height"]``, a whole number or one per problem, as int64 ``[N, 1]``; None: full height."""
     low, high, count = env.min_tote_height, env.cell.tote_size[2], env.num_envs
     heights = np.asarray(high if given is None else given)
-    wanted = f"a whole number between {low} (the tallest item) and {high} (tote_size[2])"
-    if heights.dtype.kind not in "iu" or heights.shape not in ((), (count,)):
-        raise ValueError(
-            f"options['tote_height']={given!r}: expected {wanted}" + f", or {count} of them." * (count > 1)
-        )
-    if (heights < low).any() or (heights > high).any():
-        raise ValueError(f"options['tote_height']={given!r}: expected {wanted}.")
+    good = (
+        heights.dtype.kind in "iu" and heights.shape in ((), (count,)) and low <= heights.min() <= heights.max() <= high
+    )
+    expected = f"a whole number between {low} (the tallest item) and {high} (tote_size[2])"
+    expect(good, "options['tote_height']", given, expected + f", or {count} of them" * (count > 1))
     return torch.as_tensor(np.broadcast_to(heights, count).astype(np.int64))[:, None].to(env.device)
 
 
@@ -131,9 +130,9 @@ class PickPlaceGymEnv(gymnasium.Env):
     def step(self, action):
         if not self._started:
             raise gymnasium.error.ResetNeeded("step() before reset().")
-        if not self.action_space.contains(action):
-            raise ValueError(f"action={action!r}: expected a whole number in [0, {self.action_space.n}).")
-        actions = torch.as_tensor([int(action)], device=self._env.device)
+        good = self.action_space.contains(action)
+        expect(good, "action", action, f"a whole number in [0, {self.action_space.n})")
+        actions = torch.tensor([int(action)], device=self._env.device)
         state = self._env.step(TensorDict({"action": actions}, [1], device=self._env.device))["next"]
         flags = bool(state["terminated"]), bool(state["truncated"])
         return self._observation(state), float(state["reward"]), *flags, self._info(state)
@@ -174,13 +173,11 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         render_mode: str | None = None,
         **settings,
     ):
-        if render_mode is not None:
-            raise ValueError(f"render_mode={render_mode!r}: expected None; render a single environment.")
-        try:
-            self.autoreset_mode = AutoresetMode(autoreset_mode)
-        except ValueError as error:
-            modes = ", ".join(repr(mode.value) for mode in AutoresetMode)
-            raise ValueError(f"autoreset_mode={autoreset_mode!r}: expected one of {modes}.") from error
+        expect(render_mode is None, "render_mode", render_mode, "None; render a single environment")
+        modes = {mode.value: mode for mode in AutoresetMode}
+        known = isinstance(autoreset_mode, AutoresetMode) or autoreset_mode in modes
+        expect(known, "autoreset_mode", autoreset_mode, f"one of {', '.join(map(repr, modes))}")
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self._env, self.num_envs = _make_env(num_envs, items, settings), num_envs
         self.metadata = {**PickPlaceGymEnv.metadata, "render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.single_observation_space, self.single_action_space = _spaces(self._env)
@@ -190,26 +187,22 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         self._started = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        if isinstance(seed, (list, tuple, np.ndarray)):
-            raise ValueError(f"seed={seed!r}: expected one whole number; its stream gives each slot its own episodes.")
+        is_one = not isinstance(seed, (list, tuple, np.ndarray))
+        expect(is_one, "seed", seed, "one whole number; its stream gives each slot its own episodes")
         seed = None if seed is None else check_seed(seed)
         super().reset(seed=seed)
         options = _options(options, ("tote_height", "reset_mask"))
         heights = _tote_heights(options.get("tote_height"), self._env)
-        rows = np.ones(self.num_envs, dtype=bool)
-        if "reset_mask" in options:
-            rows = np.asarray(options["reset_mask"])
-            if rows.shape != (self.num_envs,) or rows.dtype != bool or not rows.any():
-                wanted = f"bool of shape ({self.num_envs},), at least one True"
-                raise ValueError(f"options['reset_mask']={options['reset_mask']!r}: expected {wanted}.")
+        rows = np.asarray(options.get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        good = rows.shape == (self.num_envs,) and rows.dtype == bool and rows.any()
+        expect(good, "options['reset_mask']", rows, f"bool of shape ({self.num_envs},), at least one True")
         if seed is not None or not self._started:
-            if not rows.all():
-                when = "in the first reset" if seed is None else f"with seed={seed!r}"
-                raise ValueError(f"options['reset_mask'] {when}: expected none; a stream begins for all slots.")
+            expected = "none in the first reset, or with a seed; a stream begins for all slots"
+            expect(rows.all(), "options['reset_mask']", rows, expected)
             self._env.set_seed(int(self.np_random.integers(2**31)) if seed is None else seed)
             self._started = True
         self._reset_rows(rows, heights)
-        self._ended &= ~rows
+        self._ended = self._ended & ~rows
         state = self._env._observation()
         return self._observations(state), self._infos(state, rows)
 
@@ -217,15 +210,13 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         if not self._started:
             raise gymnasium.error.ResetNeeded("step() before reset().")
         actions = np.asarray(actions)
-        if actions.dtype.kind not in "iu" or not self.action_space.contains(actions.astype(np.int64, copy=False)):
-            wanted = f"{self.num_envs} whole numbers in [0, {self.single_action_space.n})"
-            raise ValueError(f"actions={actions!r}: expected {wanted}.")
-        waiting = self._ended.copy()
+        good = actions.dtype.kind in "iu" and self.action_space.contains(actions.astype(np.int64, copy=False))
+        expect(good, "actions", actions, f"{self.num_envs} whole numbers in [0, {self.single_action_space.n})")
+        waiting = self._ended
         if waiting.any() and self.autoreset_mode == AutoresetMode.DISABLED:
             raise gymnasium.error.ResetNeeded(f"slots {np.flatnonzero(waiting).tolist()} have ended: reset them first.")
-        chosen = torch.as_tensor(np.where(waiting, 0, actions), dtype=torch.int64, device=self._env.device)
-        step = TensorDict({"action": chosen}, [self.num_envs], device=self._env.device)
-        state = self._env.step(step)["next"]
+        chosen = torch.as_tensor(np.where(waiting, 0, actions), dtype=torch.int64)
+        state = self._env.step(TensorDict({"action": chosen}, [self.num_envs], device=self._env.device))["next"]
         reward, terminated, truncated = (
             state[key][:, 0].cpu().numpy().copy() for key in ("reward", "terminated", "truncated")
         )
@@ -233,22 +224,19 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         infos: dict[str, Any] = {}
         if waiting.any():  # their action did not count: this step is their reset
             self._reset_rows(waiting)
-            reward[waiting], terminated[waiting], truncated[waiting] = 0, False, False
-            fresh = self._env._observation()
-            rows = torch.as_tensor(waiting, device=self._env.device)
-            for key in (*self._env.terms, "occupancy", "failure", "action_mask"):
-                state[key] = torch.where(rows.view(-1, *[1] * (state[key].ndim - 1)), fresh[key], state[key])
+            reward[waiting] = terminated[waiting] = truncated[waiting] = 0
+            failure = state["failure"].masked_fill(torch.as_tensor(waiting, device=self._env.device)[:, None], 0)
+            state = self._env._observation().set("failure", failure)
         self._ended = terminated | truncated
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
             final = self._observations(state)
-            infos["final_obs"] = np.full(self.num_envs, None, dtype=object)
-            for slot in np.flatnonzero(self._ended):
-                infos["final_obs"][slot] = {key: value[slot] for key, value in final.items()}
+            slots = enumerate(self._ended)
+            each = [{key: value[slot] for key, value in final.items()} if over else None for slot, over in slots]
+            infos["final_obs"] = np.array(each, dtype=object)
             infos["final_info"] = self._infos(state, self._ended)
             infos["_final_obs"] = infos["_final_info"] = self._ended.copy()
             self._reset_rows(self._ended)
-            state = self._env._observation()
-            self._ended = np.zeros(self.num_envs, dtype=bool)
+            state, self._ended = self._env._observation(), np.zeros(self.num_envs, dtype=bool)
         infos |= self._infos(state, np.ones(self.num_envs, dtype=bool))
         return self._observations(state), reward, terminated, truncated, infos
 
@@ -258,9 +246,8 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
 
     def _reset_rows(self, rows: np.ndarray, heights: torch.Tensor | None = None) -> None:
         heights = _tote_heights(None, self._env) if heights is None else heights
-        mask = torch.as_tensor(rows.copy(), device=self._env.device)[:, None]
-        td = TensorDict({"_reset": mask, "tote_height": heights}, [self.num_envs], device=self._env.device)
-        self._env.reset(td)
+        entries = {"_reset": torch.as_tensor(rows.copy())[:, None], "tote_height": heights}
+        self._env.reset(TensorDict(entries, [self.num_envs], device=self._env.device))
 
     def _observations(self, state) -> dict[str, np.ndarray]:
         return {key: state[key].cpu().numpy().copy() for key in self._env.terms}
@@ -273,8 +260,6 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
             "failure": names[state["failure"][:, 0].cpu().numpy()],
             "action_mask": state["action_mask"].cpu().numpy().copy(),
         }
-        for key in list(infos):
-            empty = None if infos[key].dtype == object else 0
-            infos[key][~rows] = empty
-            infos[f"_{key}"] = rows.copy()
-        return infos
+        for value in infos.values():
+            value[~rows] = None if value.dtype == object else 0
+        return infos | {f"_{key}": rows.copy() for key in infos}

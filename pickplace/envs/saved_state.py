@@ -43,15 +43,14 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
             raise CheckpointError(f"The checkpoint's environment is of no use: {key}: expected {expected}.")
 
     cell = env.cell
-    surface, tote_height, volume, steps = (saved[key] for key in ("surface", "tote_height", "volume", "steps"))
-    episode, seed = saved["episode"], saved["item_seed"]
+    keys = ("surface", "tote_height", "volume", "steps", "episode", "item_seed")
+    surface, tote_height, volume, steps, episode, seed = (saved[key] for key in keys)
     low, high = env.min_tote_height, cell.tote_size[2]
     check("tote_height", (tote_height >= low) & (tote_height <= high), f"{low} to {high}")
     state = State(surface, tote_height, Item.from_table(saved["item"]))
     heights = state.heights
     check("surface", (heights >= 0) & (heights <= tote_height[:, None, None]), "heights of 0 to tote_height")
-    bearing = state.bearing | ((heights > 0) & cell.support.marks_bearing)
-    check("surface", bearing, "cells that bear weight")
+    check("surface", state.bearing | ((heights > 0) & cell.support.marks_bearing), "cells that bear weight")
     check("volume", (volume >= 0) & (volume <= heights.sum((1, 2))), "at most the volume below the surface")
     check("steps", (steps >= 0) & (steps <= volume), "at most one for each unit of volume")
     check("episode", episode >= 0, "at least 0")

@@ -52,10 +52,9 @@ class Cut(ItemDistribution):
     def __init__(self, container=(10, 10, 10), sides=(2, 5), order="z"):
         self.order = one_of("items.order", order, ORDERS)
         self.container = size_tuple("items.container", container, 3, MAX_SIDE)
-        self._greatest = check_range("items.sides", sides)[1]
-        least, greatest = sides
+        least, greatest = check_range("items.sides", sides)
         key = f"items.container={[*self.container]}, items.sides={[least, greatest]}"
-        longest = max(self.container)
+        self._greatest, longest = greatest, max(self.container)
         # A length can be cut into allowed sides if some number of them may be as short and as long in all.
         fits = [-(-length // greatest) * least <= length for length in range(longest + 1)]
         if bad := [side for side in self.container if not fits[side]]:
@@ -84,13 +83,10 @@ class Cut(ItemDistribution):
         keys = [(stream, *key) for key in zip(*rows[:2], strict=True)]
         if unseen := list(dict.fromkeys(key for key in keys if key not in self._kept)):
             self._keep(stream, unseen)
-        sequences = map(self._kept.__getitem__, keys)
-        size = [
-            each[number] if number < len(each) else [0, 0, 0] for each, number in zip(sequences, rows[2], strict=True)
-        ]
-        item = place_at_random(
-            torch.tensor(size, dtype=torch.int64, device=step.device).view(-1, 3), across, along, bin_size
-        )
+        # With a slice, since the item after the last one is none.
+        size = [[*self._kept[key][at : at + 1], [0, 0, 0]][0] for key, at in zip(keys, rows[2], strict=True)]
+        sizes = torch.tensor(size, dtype=torch.int64, device=step.device).view(-1, 3)
+        item = place_at_random(sizes, across, along, bin_size)
         if len(self._kept) > max(KEPT_EPISODES, 2 * len(keys)):
             self._kept = {key: self._kept[key] for key in keys}
         return item.map(lambda part: torch.where(item.is_empty, 0, part))
@@ -99,8 +95,7 @@ class Cut(ItemDistribution):
         """Cut the episodes of these keys, ``(stream, seed, episode)``, and keep the sizes of their items."""
         for start in range(0, len(keys), self._at_once):
             some = keys[start : start + self._at_once]
-            _, seed, episode = zip(*some, strict=True)
-            boxes = self.boxes(stream, torch.tensor(seed), torch.tensor(episode))
+            boxes = self.boxes(stream, *torch.tensor([key[1:] for key in some]).unbind(1))
             self._kept.update(zip(some, (each[:, 3:].tolist() for each in boxes), strict=True))
 
     def boxes(self, stream: str, seed: Tensor, episode: Tensor) -> list[Tensor]:
@@ -113,18 +108,17 @@ class Cut(ItemDistribution):
         Returns:
             For each episode int64 ``[n, 6]``, the ``x, y, z, w, d, h`` of its items in their order of arrival.
         """
-        row, low, high, uniform = self._cut(stream, seed, episode)
+        cut = self._cut(stream, seed, episode)
         # Row by row; within a row the lower come first, so that a stable sort keeps an item after its supporters.
-        index = torch.argsort(row * self.container[2] + low[:, 2], stable=True)
-        row, low, high, uniform = row[index], low[index], high[index], uniform[index]
+        index = torch.argsort(cut[0] * self.container[2] + cut[1][:, 2], stable=True)
+        row, low, high, uniform = (part[index] for part in cut)
         counts = torch.bincount(row, minlength=len(episode))
         place = torch.arange(len(row)) - (counts.cumsum(0) - counts)[row]
         shape = len(episode), int(counts.max())
 
-        def padded(part: Tensor) -> Tensor:
-            return part.new_zeros(*shape, *part.shape[1:]).index_put((row, place), part)
-
-        low, high, uniform = padded(low), padded(high), padded(uniform)
+        low, high, uniform = (
+            part.new_zeros(*shape, *part.shape[1:]).index_put((row, place), part) for part in (low, high, uniform)
+        )
         time = low[..., 2] + uniform if self.order == "z" else self._arrival(low, high, uniform)
         time = time.masked_fill(torch.arange(shape[1]) >= counts[:, None], torch.inf)
         order = time.argsort(stable=True)[..., None].expand_as(low)
@@ -137,8 +131,7 @@ class Cut(ItemDistribution):
         All pieces are cut at once, round by round. A piece has the numbers of its own place in the container, so that
         the order of the cuts does not matter.
         """
-        _, depth, height = self.container
-        volume = math.prod(self.container)
+        (_, depth, height), volume = self.container, math.prod(self.container)
         row, low = torch.arange(len(episode)), torch.zeros(len(episode), 3, dtype=torch.int64)
         high = low + torch.tensor(self.container)
         done = []
@@ -170,8 +163,7 @@ class Cut(ItemDistribution):
         """
         overlap = (low[:, :, None, :2] < high[:, None, :, :2]) & (low[:, None, :, :2] < high[:, :, None, :2])
         below = overlap.all(-1) & (high[:, :, None, 2] == low[:, None, :, 2])  # [E, below, above]
-        wait = -torch.log1p(-uniform)
-        time = wait
+        time = wait = -torch.log1p(-uniform)
         for _ in range(self._layers - 1):
             time = wait + torch.where(below, time[:, :, None], 0).amax(1)
         return time

@@ -4,14 +4,22 @@ from dataclasses import InitVar, dataclass, field, fields
 from functools import cached_property
 from inspect import signature
 
-from pickplace.common.validate import excerpt, is_whole, number, one_of, short_text, size_tuple, whole_number
+from pickplace.common.validate import (
+    at_most,
+    expect,
+    is_whole,
+    number,
+    one_of,
+    short_text,
+    size_tuple,
+    whole_number,
+)
 from pickplace.rules.gripper.base import EffectorShape, Gripper
 from pickplace.rules.gripper.rules import Contain, changed_gripper
 from pickplace.rules.gripper.shapes import Mask
 from pickplace.rules.reach.base import Limits, Reach
 from pickplace.rules.support import Bearing, Support, read_support
 
-REFILLS = ("each", "batch")
 MAX_BIN_ITEMS = 100
 
 MAX_SIDE = 2_000  # greatest side of a grid or height, in cells or height units
@@ -69,43 +77,35 @@ class CellSpec:
     min_seal: InitVar[float | None] = None
 
     def __post_init__(self, effector_size, body, cup, cup_size, pick_rule, min_seal):
-        object.__setattr__(self, "bin_size", size_tuple("bin_size", self.bin_size, 3, MAX_SIDE))
-        object.__setattr__(self, "tote_size", size_tuple("tote_size", self.tote_size, 3, MAX_SIDE))
-        if not isinstance(self.gripper, Gripper):
-            raise ValueError(f"gripper={excerpt(self.gripper)}: expected a Gripper, such as Contain(size=(3, 3)).")
+        expect(isinstance(self.gripper, Gripper), "gripper", self.gripper, "a Gripper, such as Contain(size=(3, 3))")
         short = {"size": effector_size, "body": body, "cup": cup, "cup_size": cup_size, "min_seal": min_seal}
-        object.__setattr__(self, "gripper", changed_gripper(self.gripper, pick_rule, **short))
-        if not is_whole(self.rotations) or not 1 <= self.rotations <= 4:
-            raise ValueError(
-                f"rotations={excerpt(self.rotations)}: expected 1, 2, 3 or 4 (quarter turns to choose from)."
-            )
-        object.__setattr__(self, "support", read_support(self.support))
-        object.__setattr__(self, "height_unit", float(number("height_unit", self.height_unit, 1e-3, 1e3)))
+        read = {
+            "bin_size": size_tuple("bin_size", self.bin_size, 3, MAX_SIDE),
+            "tote_size": size_tuple("tote_size", self.tote_size, 3, MAX_SIDE),
+            "gripper": changed_gripper(self.gripper, pick_rule, **short),
+            "support": read_support(self.support),
+            "height_unit": float(number("height_unit", self.height_unit, 1e-3, 1e3)),
+        }
+        for key, value in read.items():
+            object.__setattr__(self, key, value)
+        good = is_whole(self.rotations) and 1 <= self.rotations <= 4
+        expect(good, "rotations", self.rotations, "1, 2, 3 or 4 (quarter turns to choose from)")
         whole_number("bin_items", self.bin_items, most=MAX_BIN_ITEMS)
-        one_of("refill", self.refill, REFILLS)
+        one_of("refill", self.refill, ("each", "batch"))
         if self.longest_side is not None:
             whole_number("longest_side", self.longest_side)
-        if self.reach is not None and not isinstance(self.reach, Reach):
-            raise ValueError(f"reach={excerpt(self.reach)}: expected a Reach, such as an Annulus, or None.")
-        self._check_products()
-        if self.limits is not None:
-            self.limits.check(self)
-
-    def _check_products(self) -> None:
-        """Refuse sizes each of which is possible, but whose products would fill the memory."""
+        expect(isinstance(self.reach, Reach | None), "reach", self.reach, "a Reach, such as an Annulus, or None")
+        # Sizes each of which is possible, but whose products would fill the memory.
         bin_size, tote_size = f"bin_size={[*self.bin_size]}", f"tote_size={[*self.tote_size]}"
-        products = [
-            (f"{bin_size}: the bin has", self.num_picks, "cells", MAX_CELLS),
-            (f"{tote_size}: the tote has", self.num_places, "cells", MAX_CELLS),
-            (f"{bin_size}, {tote_size}: the cell has", self.num_actions, "actions", MAX_ACTIONS),
-        ]
+        at_most(f"{bin_size}: the bin has", self.num_picks, "cells", MAX_CELLS)
+        at_most(f"{tote_size}: the tote has", self.num_places, "cells", MAX_CELLS)
+        at_most(f"{bin_size}, {tote_size}: the cell has", self.num_actions, "actions", MAX_ACTIONS)
         if self.has_known_offsets:  # else the items will say how many
             table = self.rotations * self.num_offsets**2 * self.num_places
-            key = f"gripper.size={[*self.gripper.size]}, {tote_size}: the table of offsets has"
-            products.append((key, table, "entries", MAX_TABLE))
-        for words, count, what, most in products:
-            if count > most:
-                raise ValueError(f"{words} {count:,} {what}; expected at most {most:,}.")
+            words = f"gripper.size={[*self.gripper.size]}, {tote_size}: the table of offsets has"
+            at_most(words, table, "entries", MAX_TABLE)
+        if self.limits is not None:
+            self.limits.check(self)
 
     @property
     def num_picks(self) -> int:
@@ -185,8 +185,7 @@ class CellSpec:
         """Return the sizes in one short line, for messages."""
         sizes = self.bin_size, self.tote_size, self.gripper.size
         bin_size, tote_size, size = ("x".join(map(str, sides)) for sides in sizes)
-        gripper = f"{type(self.gripper).__name__} {size}"
-        return f"bin {bin_size}, tote {tote_size}, gripper {gripper}, R={self.rotations}"
+        return f"bin {bin_size}, tote {tote_size}, gripper {type(self.gripper).__name__} {size}, R={self.rotations}"
 
 
 #: The settings of a cell, by the names that configs, checkpoints and evaluations use.
@@ -195,7 +194,7 @@ CELL_SETTINGS = tuple(item.name for item in fields(CellSpec) if not item.metadat
 
 def cell_from_settings(settings: dict) -> CellSpec:
     """Return the cell of settings by name, such as a config's; raises ``ValueError`` for a name that there is not."""
-    if unknown := [name for name in settings if name not in signature(CellSpec).parameters]:
-        value = excerpt(settings[unknown[0]])
-        raise ValueError(f"{short_text(unknown[0])}={value}: expected one of {', '.join(CELL_SETTINGS)}.")
+    for name, value in settings.items():
+        known = name in signature(CellSpec).parameters
+        expect(known, short_text(name), value, f"one of {', '.join(CELL_SETTINGS)}")
     return CellSpec(**settings)

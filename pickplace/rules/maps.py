@@ -42,10 +42,8 @@ def windows(maps: Tensor, count: int) -> Tensor:
 
 def rectangle(grid: Sequence[int], x: Tensor, y: Tensor, w: Tensor, d: Tensor) -> Tensor:
     """Return the cells of a grid inside the rectangle of size ``(w, d)`` at ``(x, y)``, bool ``[*grid, N]``."""
-    column = torch.arange(grid[0], device=x.device)[:, None]
-    row = torch.arange(grid[1], device=x.device)[:, None]
-    in_x = (column >= x) & (column < x + w)
-    in_y = (row >= y) & (row < y + d)
+    column, row = (torch.arange(side, device=x.device)[:, None] for side in grid[:2])
+    in_x, in_y = (column >= x) & (column < x + w), (row >= y) & (row < y + d)
     return in_x[:, None] & in_y
 
 

@@ -75,14 +75,11 @@ def measured_maps(cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[f
         sides: its width and depth, in cells, as measured.
     """
     slack = tote.accuracy
-    state = tote.state(cell, item)
-    w, d = footprint_sizes(cell, item)
-    z = OnFootprints(cell, state.surface, w, d).z[..., 0]  # [Q, W_T, D_T]
+    z = OnFootprints(cell, tote.state(cell, item).surface, *footprint_sizes(cell, item)).z[..., 0]  # [Q, W_T, D_T]
     stable = torch.stack([_is_stable(cell, tote, item, sides, parity, z[parity]) for parity in range(cell.parities)])
     if int(item.w) == int(item.d):  # one footprint to the masks, whichever way the item lies in it
         stable = stable.all(0).expand_as(stable)
-    top = z + item.h.to(z.dtype)
-    highest = tote.height - 2 * slack
+    top, highest = z + item.h.to(z.dtype), tote.height - 2 * slack
     good = combine(FOOTPRINT, Resting(z < FAR, top, highest, stable))
     over = over_tote(cell, tote.state(cell, item, slack).surface, torch.tensor([tote.rim - 2 * slack], device=z.device))
     maps = PlacingMaps.of(torch.where(good, top, NEVER)[None], z[None], over, item, None)
@@ -93,13 +90,12 @@ def _contact(
     cell: CellSpec, tote: MeasuredTote, footprint: tuple[int, int], sides: tuple[float, float], z: Tensor
 ) -> Patches:
     """Return what supports an item of ``sides`` in the middle of footprints ``[W, D]`` that rest on heights ``z``."""
-    count = tote.highest.shape[0] // cell.tote_size[0]
-    spans = []
-    for size, side in zip(footprint, sides, strict=True):
-        low, high = (size - side) / 2 * count, (size + side) / 2 * count
-        spans.append((math.ceil(low - 1e-6), math.floor(high + 1e-6)))
+    count, shape, device = tote.highest.shape[0] // cell.tote_size[0], tuple(z.shape), z.device
+    spans = [
+        (math.ceil((size - side) / 2 * count - 1e-6), math.floor((size + side) / 2 * count + 1e-6))
+        for size, side in zip(footprint, sides, strict=True)
+    ]
     (x0, x1), (y0, y1) = spans
-    shape, device = tuple(z.shape), z.device
     if x1 <= x0 or y1 <= y0:  # an item that is narrower than a patch
         none = torch.zeros(0, dtype=torch.int64, device=device)
         along = torch.zeros(DIRECTIONS, 0, dtype=torch.float64, device=device)
@@ -113,11 +109,12 @@ def _contact(
     bears = tote.bears[x[:, None, :, None], y[None, :, None, :]].flatten(2)
     supports = (under.flatten(2) >= (z - level_step(tote.accuracy))[..., None]) & bears
     angle = torch.arange(DIRECTIONS, dtype=torch.float64, device=device) * (2 * math.pi / DIRECTIONS)
-    reach = []
-    for part, size, direction in zip(near, footprint, (angle.cos(), angle.sin()), strict=True):
-        begin = part - size * count / 2
-        reach.append(torch.maximum(begin * direction[:, None], (begin + 1) * direction[:, None]))
-    along = (reach[0][:, :, None] + reach[1][:, None, :]).flatten(1)
+    begins = (part - size * count / 2 for part, size in zip(near, footprint, strict=True))
+    along_x, along_y = (
+        torch.maximum(begin * direction[:, None], (begin + 1) * direction[:, None])
+        for begin, direction in zip(begins, (angle.cos(), angle.sin()), strict=True)
+    )
+    along = (along_x[:, :, None] + along_y[:, None, :]).flatten(1)
     slack = math.hypot(*sides) * count / 2 * math.sin(math.pi / DIRECTIONS)
     touched = math.prod(side * count for side in sides)
     return Patches(supports, along, cells, count, slack, touched, min(x1 - x0, y1 - y0))
@@ -142,8 +139,7 @@ def _is_stable(
     contact = _contact(cell, tote, footprint, sides, z)
     on_floor = z <= floor_height(tote.accuracy)  # the one surface that has no gaps
     # By every rule the centre must be above what carries the item.
-    enough = contact.is_centre_in_hull() & cell.support.measured(contact)
-    stable[inside] = on_floor | contact.full | enough
+    stable[inside] = on_floor | contact.full | (contact.is_centre_in_hull() & cell.support.measured(contact))
     return stable
 
 
@@ -168,15 +164,10 @@ def bearing_after(
         reached = torch.where(flags, contact.along, -FAR).amax(1, keepdim=True)
         held = (contact.along <= reached + 1e-9).all(0)
     # A cell bears weight if all patches of it that are under the item do; one value a cell must cover it.
-    weak = (
-        torch.zeros(size[0] * size[1], dtype=torch.int64, device=flags.device).index_add_(
-            0, contact.cells, (~held).long()
-        )
-        > 0
-    )
-    covered = torch.zeros_like(weak).index_fill_(0, contact.cells, True)
+    bears = torch.zeros(size, dtype=torch.bool, device=flags.device)
+    bears.view(-1).index_fill_(0, contact.cells, True).index_fill_(0, contact.cells[~held], False)
     after = tote.bears.clone()
-    after[x : x + size[0], y : y + size[1]] = (covered & ~weak).view(size)
+    after[x : x + size[0], y : y + size[1]] = bears
     return after
 
 
@@ -192,10 +183,9 @@ def failures(cell: CellSpec, measured: MeasuredMaps, action: Tensor, bin_clear: 
     x_bin, y_bin, x_tote, y_tote, _ = split_action(cell, action)
     item = maps.item.map(lambda part: part.expand(len(action)))
     picked, rotation, *_, x, y, w, d = carry(cell, item, action)
-    parity = rotation % 2
-    item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)
-    footprint = footprint_index(cell.tote_size, parity, x.clamp(0, tote_w - 1), y.clamp(0, tote_d - 1))
+    inside = ~is_outside(x, w, tote_w) & ~is_outside(y, d, tote_d)
+    footprint = footprint_index(cell.tote_size, rotation % 2, x.clamp(0, tote_w - 1), y.clamp(0, tote_d - 1))
     place = footprint_index(cell.tote_size, rotation % len(over.leaves), x_tote, y_tote)
-    top = maps.rest.flatten()[footprint] + item.h
+    resting = Resting(inside, maps.rest.flatten()[footprint] + item.h, highest, stable.flatten()[footprint])
     picked = picked._replace(collides=~bin_clear[x_bin * cell.bin_size[1] + y_bin])
-    return first_failure(picked, Resting(~item_leaves, top, highest, stable.flatten()[footprint]), over.at(place))
+    return first_failure(picked, resting, over.at(place))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import excerpt, short_text
+from pickplace.common.validate import expect, short_text
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import bin_depth_from_items, bin_labels_from_items
 from pickplace.rules.state import State, depth_from_heights
@@ -170,24 +170,18 @@ def check_terms(terms: Mapping[str, Term] | None, bin_items: int = 1) -> dict[st
         ValueError: naming the key, for something else than a term, a key that is taken, or another term for a standard
             one.
     """
-    standard = standard_terms(bin_items)
-    if terms is None:
-        return standard
-    if not isinstance(terms, Mapping):
-        raise ValueError(f"observation={excerpt(terms)}: expected terms by their keys.")
-    for key, term in terms.items():
+    standard, given = standard_terms(bin_items), {} if terms is None else terms
+    expect(isinstance(given, Mapping), "observation", terms, "terms by their keys")
+    for key, term in given.items():
         place = f"observation.{short_text(key)}"
-        if not isinstance(term, Term):
-            raise ValueError(
-                f"{place}={excerpt(term)}: expected a Term, such as pickplace.rules.observation.ToteDepth."
-            )
+        expect(isinstance(term, Term), place, term, "a Term, such as pickplace.rules.observation.ToteDepth")
         if not isinstance(key, str) or key in RESERVED or not key.isidentifier():
             raise ValueError(f"{place}: expected another name; taken are {', '.join(RESERVED)}.")
+    found = {**standard, **given}
     for key, term in standard.items():
-        if type(found := terms.get(key, term)) is not type(term):
-            expected = f"{type(term).__name__}, which is always there"
-            raise ValueError(f"observation.{key}={excerpt(found)}: expected {expected}.")
-    return {**standard, **terms}
+        expected = f"{type(term).__name__}, which is always there"
+        expect(type(found[key]) is type(term), f"observation.{key}", found[key], expected)
+    return found
 
 
 def observe(

@@ -62,7 +62,6 @@ def _columns(rows: list[dict], *keys: str) -> np.ndarray:
 
 
 def _line(values: np.ndarray) -> str:
-    """Return the format of a line, with dots where there are few of them."""
     return ".-" if len(values) < 20 else "-"
 
 
@@ -74,7 +73,6 @@ def _running_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _show_frames(axes, rows: list[dict]) -> None:
-    """Label the axis of the frames, which begins with 0."""
     from matplotlib.ticker import EngFormatter
 
     most = max([row["frames"] for row in rows], default=100)
@@ -83,7 +81,6 @@ def _show_frames(axes, rows: list[dict]) -> None:
 
 
 def _draw_occupancy(axes, rows: list[dict]) -> None:
-    """Draw the occupancy of training and validation episodes."""
     frames, occupancy = _columns(rows, "train/occupancy")
     if len(frames):
         smooth = _running_mean(occupancy, np.ones(len(frames)))

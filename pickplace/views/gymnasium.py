@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import torch
 
+from pickplace.common.validate import expect
 from pickplace.envs.gymnasium import PickPlaceGymEnv
 from pickplace.rules.item import bin_depth_from_items
 from pickplace.rules.state import Failure
@@ -30,8 +31,8 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 4}
 
     def __init__(self, items=None, render_mode: str | None = None, **settings):
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode={render_mode!r}: expected 'rgb_array', 'human' or None.")
+        known = render_mode in (None, *self.metadata["render_modes"])
+        expect(known, "render_mode", render_mode, "'rgb_array', 'human' or None")
         super().__init__(items, **settings)
         self.render_mode = render_mode
         self._recording: Recording | None = None  # of the running episode
@@ -79,7 +80,6 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         return np.asarray(scene.canvas.buffer_rgba())[..., :3].copy()
 
     def _update_window(self) -> None:
-        """Bring the window up to date, in mode ``human``."""
         if self.render_mode != "human":
             return
         if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):

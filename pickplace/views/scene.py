@@ -54,12 +54,11 @@ def kind_of(item: Sequence[int]) -> Kind:
 
 def item_colours(items: Iterable[Sequence[int]]) -> dict[Kind, str]:
     """Return a colour for each kind of items ``(..., w, d, h)``, the small ones first; many kinds share a spectrum."""
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
+    from matplotlib import colormaps, colors
 
     kinds = sorted(set(map(kind_of, items)), key=lambda kind: (np.prod(kind), kind))
     few = len(kinds) <= len(COLOURS)
-    colours = COLOURS if few else [to_hex(c) for c in colormaps["Spectral"](np.linspace(0, 1, len(kinds)))]
+    colours = COLOURS if few else [colors.to_hex(c) for c in colormaps["Spectral"](np.linspace(0, 1, len(kinds)))]
     return dict(zip(kinds, colours, strict=False))
 
 
@@ -105,11 +104,10 @@ def draw_items(axes, items: list[PlacedItem], colours: dict[Kind, str], size: tu
     They are drawn in columns of one cell by one cell. From the direction (1, 1, 1) a column can hide only those that
     are farther along x + y, and lower parts of its own cell. So there is an order in which all of them are drawn right.
     """
-    from matplotlib.collections import PolyCollection
-    from matplotlib.colors import to_rgb
+    from matplotlib import collections, colors
 
     wide, deep, _ = size
-    pen = (*to_rgb(INK), 1.0), float(np.clip(10 / (wide + deep), 0.35, 1.1))  # colour and width
+    pen = (*colors.to_rgb(INK), 1.0), float(np.clip(10 / (wide + deep), 0.35, 1.1))  # colour and width
     spans: dict[tuple[int, int], list[tuple[int, int]]] = {}  # cell -> heights that are filled; y is turned around
     columns = []
     for item in items:
@@ -131,14 +129,16 @@ def draw_items(axes, items: list[PlacedItem], colours: dict[Kind, str], size: tu
             points = [
                 _to_paper(cell[0] + a - z, cell[1] + b - z) for (a, b, _), z in zip(corners, heights, strict=True)
             ]
-            fill = (*np.multiply(to_rgb(colours[kind_of(item)]), light), 1.0)
+            fill = (*np.multiply(colors.to_rgb(colours[kind_of(item)]), light), 1.0)
             drawn.append((points, fill, fill, 0.6))  # the line closes the seam between columns
             for start, end in ((0, 1), (1, 2), (2, 3), (3, 0)):
                 if _is_edge(place, corners[start], corners[end], item):
                     drawn.append(([points[start], points[end]], (0.0, 0.0, 0.0, 0.0), *pen))
     polygons, fills, lines, widths = zip(*drawn, strict=True)
     axes.add_collection(
-        PolyCollection(polygons, facecolors=fills, edgecolors=lines, linewidths=widths, capstyle="round", zorder=2)
+        collections.PolyCollection(
+            polygons, facecolors=fills, edgecolors=lines, linewidths=widths, capstyle="round", zorder=2
+        )
     )
 
 
@@ -153,18 +153,15 @@ def _is_edge(place, start, end, item: PlacedItem) -> bool:
 
 
 def _sides(size: tuple[int, ...], cell: CellSpec) -> str:
-    """Return a size ``(w, d, h)`` in cells, as ``WxDxH``."""
     return f"{size[0]}x{size[1]}x{size[2] * cell.height_unit:g}"
 
 
 def _draw_plan(axes, heights: np.ndarray, limit: int, cell: CellSpec) -> None:
     """Draw a height map ``[W_T, D_T]`` from above, in one colour for each whole height up to ``limit``."""
-    from matplotlib import colormaps
-    from matplotlib.colors import BoundaryNorm, ListedColormap
-    from matplotlib.ticker import MaxNLocator
+    from matplotlib import colormaps, colors, ticker
 
-    colours = ListedColormap(colormaps["YlGnBu"](np.linspace(0, 0.75, limit + 1)))
-    norm = BoundaryNorm(np.arange(limit + 2) - 0.5, colours.N)
+    colours = colors.ListedColormap(colormaps["YlGnBu"](np.linspace(0, 0.75, limit + 1)))
+    norm = colors.BoundaryNorm(np.arange(limit + 2) - 0.5, colours.N)
     image = axes.imshow(heights.T, origin="lower", cmap=colours, norm=norm)
     if max(heights.shape) <= 12:
         for (x, y), height in np.ndenumerate(heights):
@@ -177,7 +174,7 @@ def _draw_plan(axes, heights: np.ndarray, limit: int, cell: CellSpec) -> None:
         axes.tick_params(which="minor", length=0)
     axes.set(title="height map from above", xlabel="x (cells)", ylabel="y (cells)")
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(12, integer=True, min_n_ticks=1))
+        axis.set_major_locator(ticker.MaxNLocator(12, integer=True, min_n_ticks=1))
     every = limit // 12 + 1
     unit = "cells" if cell.height_unit == 1 else f"units of {cell.height_unit:g} cells"
     axes.figure.colorbar(image, ax=axes, label=f"height ({unit})", shrink=0.8, ticks=range(0, limit + 1, every))

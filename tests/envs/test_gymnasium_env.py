@@ -235,7 +235,7 @@ def step(env, action):
         (lambda: vector().reset(options={"reset_mask": [True]}), "reset_mask"),
         (
             lambda: vector().reset(options={"reset_mask": np.array([True, False])}),
-            "reset_mask.* in the first reset: expected none",
+            "reset_mask.*: expected none in the first reset",
         ),
         (lambda: make().unwrapped.step(0), "before reset"),
         (lambda: vector().step(np.zeros(2, dtype=np.int64)), "before reset"),

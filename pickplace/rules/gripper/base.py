@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import excerpt, size_tuple
+from pickplace.common.validate import excerpt, expect, size_tuple
 from pickplace.rules.gripper.shapes import Box, Mask, boxes, centred, read_shape, turned
 
 MAX_GRIPPER = 64  # greatest side of a gripper, in cells
@@ -68,31 +68,22 @@ class Gripper(ABC):
         for key in ("body", "cup"):
             object.__setattr__(self, key, read_shape(f"gripper.{key}", getattr(self, key), self.size))
         lines_of_body = self.body_mask, tuple(zip(*self.body_mask, strict=True))
-        if not all(any(line) for lines in lines_of_body for line in (lines[0], lines[-1])):
-            raise ValueError(
-                f"gripper.body={excerpt(self.body)}: expected a 1 in its first and last list, and first and last in "
-                "some list; a smaller body needs a smaller size."
-            )
+        touches = all(any(line) for lines in lines_of_body for line in (lines[0], lines[-1]))
+        lists = "a 1 in its first and last list, and first and last in some list"
+        expect(touches, "gripper.body", self.body, f"{lists}; a smaller body needs a smaller size")
         if self.cup_size is not None:
-            self._check_cup_size()
-        for x, (body, cup) in enumerate(zip(self.body_mask, self.cup_mask, strict=True)):
-            for y in range(len(body)):
-                if cup[y] > body[y]:
-                    raise ValueError(
-                        f"gripper.cup={excerpt(self.cup)}, cup_size={excerpt(self.cup_size)}: cell ({x}, {y}) of the "
-                        f"cup is not in body={excerpt(self.body)}; expected a cup that is part of the body."
-                    )
-
-    def _check_cup_size(self) -> None:
-        """Refuse sides of a cup that cannot lie in the middle of the body."""
-        sides = size_tuple("gripper.cup_size", self.cup_size, 2, MAX_GRIPPER)
-        object.__setattr__(self, "cup_size", sides)
-        if not isinstance(self.cup, str):
-            raise ValueError(f"gripper.cup_size={[*sides]}: expected null, as cup is a mask.")
-        if any(cup > body or (body - cup) % 2 for cup, body in zip(sides, self.size, strict=True)):
+            sides = [*size_tuple("gripper.cup_size", self.cup_size, 2, MAX_GRIPPER)]
+            object.__setattr__(self, "cup_size", tuple(sides))
+            expect(isinstance(self.cup, str), "gripper.cup_size", sides, "null, as cup is a mask")
+            centred = all(cup <= body and (body - cup) % 2 == 0 for cup, body in zip(sides, self.size, strict=True))
+            even = f"sides that differ from size={[*self.size]} by an even number of cells"
+            expect(centred, "gripper.cup_size", sides, f"{even}, so that the cup is centred in the body")
+        columns = enumerate(zip(self.body_mask, self.cup_mask, strict=True))
+        outside = [(x, y) for x, (body, cup) in columns for y in range(len(body)) if cup[y] > body[y]]
+        if outside:
             raise ValueError(
-                f"gripper.cup_size={[*sides]}: expected sides that differ from size={[*self.size]} by an even number "
-                "of cells, so that the cup is centred in the body."
+                f"gripper.cup={excerpt(self.cup)}, cup_size={excerpt(self.cup_size)}: cell {outside[0]} of the cup is "
+                f"not in body={excerpt(self.body)}; expected a cup that is part of the body."
             )
 
     # ------------------------------------------------------------------ the grip rule

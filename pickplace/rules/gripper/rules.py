@@ -5,7 +5,7 @@ from functools import cached_property
 
 from torch import Tensor
 
-from pickplace.common.validate import excerpt, is_number, one_of
+from pickplace.common.validate import expect, is_number, one_of
 from pickplace.rules.gripper.base import Gripper
 
 
@@ -50,8 +50,8 @@ class Seal(Gripper):
 
     def __post_init__(self):
         super().__post_init__()
-        if not is_number(self.min_seal) or not 0 < self.min_seal <= 1:
-            raise ValueError(f"gripper.min_seal={excerpt(self.min_seal)}: expected a number > 0 and <= 1.")
+        good = is_number(self.min_seal) and 0 < self.min_seal <= 1
+        expect(good, "gripper.min_seal", self.min_seal, "a number > 0 and <= 1")
 
     @cached_property
     def least_cells(self) -> int:

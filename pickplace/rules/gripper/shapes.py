@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from itertools import groupby
 from typing import Any, NamedTuple
 
-from pickplace.common.validate import excerpt
+from pickplace.common.validate import expect
 
 Mask = tuple[tuple[int, ...], ...]
-
-SHAPES = ("rectangle", "disc")
 
 
 class Box(NamedTuple):
@@ -34,21 +32,17 @@ def is_in_disc(x: int, y: int, width: int, depth: int) -> bool:
 
 def read_shape(key: str, value: Any, size: tuple[int, int]) -> str | Mask:
     """Return a shape as it was given, with a mask as tuples; ``ValueError`` if it is neither a name nor a mask."""
-    if isinstance(value, str) and value in SHAPES:
+    if isinstance(value, str) and value in ("rectangle", "disc"):
         return value
     try:
         columns = [] if isinstance(value, str) else [list(column) for column in value]
     except TypeError:
         columns = []
-    if [len(column) for column in columns] != [size[1]] * size[0] or any(
-        isinstance(cell, bool) or cell not in (0, 1) for column in columns for cell in column
-    ):
-        raise ValueError(
-            f"{key}={excerpt(value)}: expected 'rectangle', 'disc', or a mask of size={[*size]}: {size[0]} lists of "
-            f"{size[1]} times 0 or 1."
-        )
-    if not any(map(any, columns)):
-        raise ValueError(f"{key}={excerpt(value)}: expected a mask with a 1.")
+    fits = [len(column) for column in columns] == [size[1]] * size[0]
+    good = fits and not any(isinstance(cell, bool) or cell not in (0, 1) for column in columns for cell in column)
+    mask = f"a mask of size={[*size]}: {size[0]} lists of {size[1]} times 0 or 1"
+    expect(good, key, value, f"'rectangle', 'disc', or {mask}")
+    expect(any(map(any, columns)), key, value, "a mask with a 1")
     return tuple(tuple(map(int, column)) for column in columns)
 
 

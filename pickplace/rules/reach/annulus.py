@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import excerpt, is_number
+from pickplace.common.validate import expect, is_number
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.gripper.base import effector_centre
 from pickplace.rules.maps import NEVER
@@ -45,13 +45,12 @@ class Annulus(Reach):
         ):
             value = getattr(self, key)
             good = isinstance(value, (list, tuple)) and len(value) == count and all(map(is_number, value))
-            if not good or max(map(abs, value)) > MAX_COORDINATE:
-                limit = f"up to {MAX_COORDINATE:,.0f} sides of a cell"
-                raise ValueError(f"reach.{key}={excerpt(value)}: expected {expected}, {limit}.")
-            value = tuple(map(float, value))
-            if count == 2 and (value[0] > value[1] or (key == "radii" and value[0] < 0)):
-                raise ValueError(f"reach.{key}={[*value]}: expected {expected}.")
-            object.__setattr__(self, key, value)
+            good = good and max(map(abs, value)) <= MAX_COORDINATE
+            expect(good, f"reach.{key}", value, f"{expected}, up to {MAX_COORDINATE:,.0f} sides of a cell")
+            value = [*map(float, value)]
+            ordered = count == 3 or (value[0] <= value[1] and (key != "radii" or value[0] >= 0))
+            expect(ordered, f"reach.{key}", value, expected)
+            object.__setattr__(self, key, tuple(value))
 
     def limits(self, cell: CellSpec) -> Limits:
         def centres(grid, sides) -> tuple[Tensor, Tensor]:
@@ -59,9 +58,8 @@ class Annulus(Reach):
             x, y = (effector_centre(torch.arange(count), side) for count, side in zip(grid, sides, strict=False))
             return x.double()[:, None], y.double()
 
-        lowest_pick, highest_pick = (
-            part.flatten() for part in self.picks(cell, *centres(cell.bin_size, cell.gripper.size))
-        )
+        picks = self.picks(cell, *centres(cell.bin_size, cell.gripper.size))
+        lowest_pick, highest_pick = (part.flatten() for part in picks)
         turned = [cell.gripper.size[:: -1 if rotation % 2 else 1] for rotation in range(cell.rotations)]
         places = [self._range(cell, self.tote, *centres(cell.tote_size, sides)) for sides in turned]
         lowest, highest = (torch.stack(parts) for parts in zip(*places, strict=True))
@@ -74,6 +72,5 @@ class Annulus(Reach):
         """Return lowest and highest suction face at points of a grid with that corner, int32, in height units."""
         distance = torch.hypot(x + corner[0], y + corner[1])
         inside = (distance >= self.radii[0] - ROUNDING) & (distance <= self.radii[1] + ROUNDING)
-        heights = torch.tensor(self.heights, dtype=torch.float64) - corner[2]
-        lowest, highest = whole_heights(cell, *heights)
+        lowest, highest = whole_heights(cell, *torch.tensor(self.heights, dtype=torch.float64) - corner[2])
         return lowest.expand(inside.shape), torch.where(inside, highest, NEVER)

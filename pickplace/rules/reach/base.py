@@ -64,11 +64,10 @@ class Limits(Reach):
         if self.lowest_pick is not None or self.highest_pick is not None:
             shapes |= {"lowest_pick": picks, "highest_pick": picks}
         for name, shape in shapes.items():
-            table, is_flag = getattr(self, name), name == "pick_ok"
-            found = "None" if table is None else f"{table.dtype} of shape {[*table.shape]}"
+            table, kind = getattr(self, name), "bool" if name == "pick_ok" else "integers"
             fits = table is not None and [*table.shape] == shape and not table.dtype.is_floating_point
-            if not fits or (table.dtype == torch.bool) != is_flag:
-                kind = "bool" if is_flag else "integers"
+            if not fits or (table.dtype == torch.bool) != (kind == "bool"):
+                found = "None" if table is None else f"{table.dtype} of shape {[*table.shape]}"
                 raise ValueError(f"limits.{name}: got {found}, expected {kind} of shape {shape}.")
 
     def on(self, device) -> "Limits":

@@ -33,7 +33,8 @@ class ReachTable(Reach):
     lines: dict[tuple, int] = field(init=False, repr=False, compare=False)  # of each pose
 
     def __post_init__(self):
-        path, found, rows = str(self.path), {}, []
+        path, rows = str(self.path), []
+        found: dict[tuple, int] = {}
         for line, texts in read_table("reach.path", path, HEADER)[1]:
             row = _row(f"{path}, line {line}", texts)
             if (first := found.setdefault(row[:4], line)) != line:
@@ -68,7 +69,6 @@ class ReachTable(Reach):
 
 
 def _row(place: str, texts: list[str]) -> tuple[str, int, int, int, float, float]:
-    """Return the values of a row."""
     columns = HEADER.split(",")
     if len(texts) != len(columns):
         raise ValueError(f"{place}: got {excerpt(','.join(texts))}, expected {HEADER}.")

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pickplace.rules.state import surface_from
-from pickplace.rules.support import hull
+from pickplace.rules.support.hull import extents, hull_patterns
 
 Cells: TypeAlias = Sequence[Tensor] | Tensor  # a tensor for each cell of a square, row by row
 
@@ -79,16 +79,50 @@ class Contact:
         Args:
             margin: distance from the hull's edge that the centre must exceed, in cells.
         """
-        return hull.is_centre_inside(self.surfaces, self.supporting, self.w, self.d, margin)
+        sizes = self.w.clamp(1, self.side) - 1, self.d.clamp(1, self.side) - 1
+        tables = hull_patterns(self.side, margin, self.supporting.device)
+        words = [(patterns[:, *sizes], whole[sizes]) for patterns, whole in tables]
+        reached = [torch.zeros_like(self.supporting, dtype=patterns.dtype) for patterns, _ in words]
+        for number, surface in enumerate(self.surfaces):
+            supports = surface == self.supporting
+            if len(words) == 1:
+                reached[0] |= supports * words[0][0][number]
+                continue
+            # With many words: all bits of a cell that supports, or none, are combined faster than numbers multiplied.
+            supports = supports.int().neg_()
+            for bits, (patterns, _) in zip(reached, words, strict=True):
+                bits |= supports & patterns[number]
+        return torch.stack([bits == whole for bits, (_, whole) in zip(reached, words, strict=True)]).all(0)
 
     def is_centre_in_hull_of_middles(self) -> Tensor:
-        """Return whether the item's centre lies in the hull of the middles of the supporting cells, or on its edge."""
-        return hull.is_centre_in_hull_of_middles(self.rows(), self.w, self.d, self.side)
+        """Return whether the item's centre lies in the hull of the middles of the supporting cells, or on its edge.
+
+        It does if some line between two of these middles passes the centre on its far side along y, and some on its
+        near side. Such a line goes from one at ``(-a, b)`` to one at ``(a', b')``, as seen from the centre, and passes
+        at a height of the sign of ``b / a + b' / a'``: so the steepest on each side decide, and no pairs are compared.
+        """
+        exact = torch.float32 if self.side <= 64 else torch.float64  # tells apart all ratios of whole numbers up to it
+        w, d = self.w.short(), self.d.short()
+        lowest = torch.tensor(-torch.inf, dtype=exact, device=w.device)
+        steepest = [[lowest, lowest], [lowest, lowest]]  # to the far side, left and right of the centre; to the near
+        for x, (first, last) in enumerate(self.rows()):
+            offset = (2 * x + 1 - w).to(exact)
+            gap = torch.where(last >= 0, 0.0, torch.inf).to(exact)
+            for parts, beyond in zip(steepest, (2 * last + 1 - d, d - 2 * first - 1), strict=True):
+                slope = (beyond - gap) / offset.abs()  # on the line through the centre +-inf, and nan for 0 / 0
+                slope = torch.where(slope.isnan(), torch.inf, slope)
+                parts[0] = torch.maximum(parts[0], torch.where(offset <= 0, slope, -torch.inf))
+                parts[1] = torch.maximum(parts[1], torch.where(offset >= 0, slope, -torch.inf))
+        (left, right), (near_left, near_right) = steepest
+        return (left + right >= 0) & (near_left + near_right >= 0)
 
     def in_hull(self) -> Tensor:
         """Return which cells under the items lie inside the hull of the supporting cells, bool ``[S * S, N]``."""
-        under = torch.stack([*self.under])
-        return hull.cells_inside(torch.stack([*self.cells()]), under)
+        inside, supporting = torch.stack([*self.under]), torch.stack([*self.cells()])
+        for along in extents(self.side, inside.device):
+            reached = torch.where(supporting, along[:, :, None], along.min() - 1).amax(1, keepdim=True)
+            inside &= (along[:, :, None] <= reached).all(0)  # [normals, S * S, N], of which the first is combined
+        return inside
 
 
 class Patches:
