@@ -1,5 +1,6 @@
 """Gymnasium environments over :class:`~pickplace.envs.torchrl.PickPlaceEnv`: one problem, or many side by side."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import gymnasium
@@ -15,42 +16,7 @@ from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.distributions import Kinds, check_seed
 from pickplace.rules.state import Failure
 
-
-def _make_env(num_envs: int, items, settings: dict) -> PickPlaceEnv:
-    """Return the batched environment below; a list of ``(w, d, h)`` is short for ``Kinds``."""
-    for key, why in (("masks", "the action mask always comes along"), ("seed", "reset(seed=...) begins a stream")):
-        expect(key not in settings, key, settings.get(key), f"no such argument; {why}")
-    items = Kinds(items) if isinstance(items, (list, tuple)) else items
-    return PickPlaceEnv(items=items, num_envs=num_envs, **settings)
-
-
-def _spaces(env: PickPlaceEnv) -> tuple[spaces.Dict, spaces.Discrete]:
-    """Return observation and action space of one problem."""
-    bounds = {key: term.bounds(env.cell, env.min_tote_height) for key, term in env.terms.items()}
-    boxes: dict[str, spaces.Space] = {
-        key: spaces.Box(low, high, shape, torch.empty(0, dtype=dtype).numpy().dtype.type)
-        for key, (low, high, shape, dtype) in bounds.items()
-    }
-    return spaces.Dict(boxes), spaces.Discrete(env.cell.num_actions)
-
-
-def _options(options: dict | None, known: tuple[str, ...]) -> dict:
-    options = dict(options or {})
-    if unknown := sorted(set(options) - set(known)):
-        raise ValueError(f"options[{unknown[0]!r}]: there is no such option; expected {', '.join(known)}.")
-    return options
-
-
-def _tote_heights(given, env: PickPlaceEnv) -> torch.Tensor:
-    """Return ``options["tote_height"]``, a whole number or one per problem, as int64 ``[N, 1]``; None: full height."""
-    low, high, count = env.min_tote_height, env.cell.tote_size[2], env.num_envs
-    heights = np.asarray(high if given is None else given)
-    good = (
-        heights.dtype.kind in "iu" and heights.shape in ((), (count,)) and low <= heights.min() <= heights.max() <= high
-    )
-    expected = f"a whole number between {low} (the tallest item) and {high} (tote_size[2])"
-    expect(good, "options['tote_height']", given, expected + f", or {count} of them" * (count > 1))
-    return torch.as_tensor(np.broadcast_to(heights, count).astype(np.int64))[:, None].to(env.device)
+INFO = ("occupancy", "failure", "action_mask")
 
 
 class PickPlaceGymEnv(gymnasium.Env):
@@ -113,40 +79,29 @@ class PickPlaceGymEnv(gymnasium.Env):
     action_space: spaces.Discrete
 
     def __init__(self, items=None, **settings):
-        self._env = _make_env(1, items, settings)
-        self.observation_space, self.action_space = _spaces(self._env)
-        self._started = False
+        self._vector = PickPlaceVectorEnv(1, items, AutoresetMode.DISABLED, **settings)
+        self._env, self.action_space = self._vector._env, self._vector.single_action_space
+        self.observation_space = self._vector.single_observation_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        seed = None if seed is None else check_seed(seed)
+        observations, infos = self._vector.reset(seed=seed, options=options)
         super().reset(seed=seed)
-        heights = _tote_heights(_options(options, ("tote_height",)).get("tote_height"), self._env)
-        if seed is not None or not self._started:
-            self._env.set_seed(int(self.np_random.integers(2**31)) if seed is None else seed)
-            self._started = True
-        state = self._env.reset(TensorDict({"tote_height": heights}, [1], device=self._env.device))
-        return self._observation(state), self._info(state)
+        return _first(observations, self._env.terms), _first(infos, INFO)
 
     def step(self, action):
-        if not self._started:
-            raise gymnasium.error.ResetNeeded("step() before reset().")
         good = self.action_space.contains(action)
         expect(good, "action", action, f"a whole number in [0, {self.action_space.n})")
-        actions = torch.tensor([int(action)], device=self._env.device)
-        state = self._env.step(TensorDict({"action": actions}, [1], device=self._env.device))["next"]
-        flags = bool(state["terminated"]), bool(state["truncated"])
-        return self._observation(state), float(state["reward"]), *flags, self._info(state)
+        observations, *results, infos = self._vector.step(np.array([action]))
+        return _first(observations, self._env.terms), *(part[0].item() for part in results), _first(infos, INFO)
 
     def action_masks(self) -> np.ndarray:
         """Return which actions would succeed, bool ``[N_a]``; sb3-contrib's MaskablePPO looks for this name."""
-        return self._env.action_mask[0].cpu().numpy().copy()
+        return self._vector.action_masks()[0]
 
-    def _observation(self, state) -> dict[str, np.ndarray]:
-        return {key: state[key][0].cpu().numpy().copy() for key in self._env.terms}
 
-    def _info(self, state) -> dict[str, Any]:
-        failure = Failure(int(state["failure"])).name.lower()
-        return {"occupancy": float(state["occupancy"]), "failure": failure, "action_mask": self.action_masks()}
+def _first(arrays: dict[str, np.ndarray], keys: Iterable[str]) -> dict[str, Any]:
+    """Return the entries of the first problem."""
+    return {key: arrays[key][0] for key in keys}
 
 
 class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
@@ -178,9 +133,19 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         known = isinstance(autoreset_mode, AutoresetMode) or autoreset_mode in modes
         expect(known, "autoreset_mode", autoreset_mode, f"one of {', '.join(map(repr, modes))}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self._env, self.num_envs = _make_env(num_envs, items, settings), num_envs
-        self.metadata = {**PickPlaceGymEnv.metadata, "render_modes": [], "autoreset_mode": self.autoreset_mode}
-        self.single_observation_space, self.single_action_space = _spaces(self._env)
+        for key, why in (("masks", "the action mask always comes along"), ("seed", "reset(seed=...) begins a stream")):
+            expect(key not in settings, key, settings.get(key), f"no such argument; {why}")
+        items = Kinds(items) if isinstance(items, (list, tuple)) else items
+        self._env = env = PickPlaceEnv(items=items, num_envs=num_envs, **settings)
+        self.num_envs = num_envs
+        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
+        bounds = {key: term.bounds(env.cell, env.min_tote_height) for key, term in env.terms.items()}
+        boxes: dict[str, spaces.Space] = {
+            key: spaces.Box(low, high, shape, torch.empty(0, dtype=dtype).numpy().dtype.type)
+            for key, (low, high, shape, dtype) in bounds.items()
+        }
+        self.single_observation_space = spaces.Dict(boxes)
+        self.single_action_space = spaces.Discrete(env.cell.num_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended = np.zeros(num_envs, dtype=bool)  # slots that wait for their reset
@@ -191,8 +156,10 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         expect(is_one, "seed", seed, "one whole number; its stream gives each slot its own episodes")
         seed = None if seed is None else check_seed(seed)
         super().reset(seed=seed)
-        options = _options(options, ("tote_height", "reset_mask"))
-        heights = _tote_heights(options.get("tote_height"), self._env)
+        options = dict(options or {})
+        if unknown := sorted(set(options) - {"tote_height", "reset_mask"}):
+            raise ValueError(f"options[{unknown[0]!r}]: there is no such option; expected tote_height or reset_mask.")
+        heights = self._tote_heights(options.get("tote_height"))
         rows = np.asarray(options.get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         good = rows.shape == (self.num_envs,) and rows.dtype == bool and rows.any()
         expect(good, "options['reset_mask']", rows, f"bool of shape ({self.num_envs},), at least one True")
@@ -223,7 +190,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         reward = reward.astype(np.float64)
         infos: dict[str, Any] = {}
         if waiting.any():  # their action did not count: this step is their reset
-            self._reset_rows(waiting)
+            self._reset_rows(waiting, self._tote_heights())
             reward[waiting] = terminated[waiting] = truncated[waiting] = 0
             failure = state["failure"].masked_fill(torch.as_tensor(waiting, device=self._env.device)[:, None], 0)
             state = self._env._observation().set("failure", failure)
@@ -235,7 +202,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
             infos["final_obs"] = np.array(each, dtype=object)
             infos["final_info"] = self._infos(state, self._ended)
             infos["_final_obs"] = infos["_final_info"] = self._ended.copy()
-            self._reset_rows(self._ended)
+            self._reset_rows(self._ended, self._tote_heights())
             state, self._ended = self._env._observation(), np.zeros(self.num_envs, dtype=bool)
         infos |= self._infos(state, np.ones(self.num_envs, dtype=bool))
         return self._observations(state), reward, terminated, truncated, infos
@@ -244,8 +211,17 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         """Return which actions would succeed, bool ``[N, N_a]``."""
         return self._env.action_mask.cpu().numpy().copy()
 
-    def _reset_rows(self, rows: np.ndarray, heights: torch.Tensor | None = None) -> None:
-        heights = _tote_heights(None, self._env) if heights is None else heights
+    def _tote_heights(self, given=None) -> torch.Tensor:
+        """Return ``options["tote_height"]``, a number or one per problem, as int64 ``[N, 1]``; None: full height."""
+        low, high, count = self._env.min_tote_height, self._env.cell.tote_size[2], self.num_envs
+        heights = np.asarray(high if given is None else given)
+        fits = heights.dtype.kind in "iu" and heights.shape in ((), (count,))
+        expected = f"a whole number between {low} (the tallest item) and {high} (tote_size[2])"
+        good = fits and low <= heights.min() <= heights.max() <= high
+        expect(good, "options['tote_height']", given, expected + f", or {count} of them" * (count > 1))
+        return torch.as_tensor(np.broadcast_to(heights, count).astype(np.int64))[:, None]
+
+    def _reset_rows(self, rows: np.ndarray, heights: torch.Tensor) -> None:
         entries = {"_reset": torch.as_tensor(rows.copy())[:, None], "tote_height": heights}
         self._env.reset(TensorDict(entries, [self.num_envs], device=self._env.device))
 
