@@ -129,12 +129,10 @@ class Gripper(ABC):
             longest: longest side of any item.
             rotations: number of quarter turns to choose from.
         """
-        found = []
-        for lines in self.cup_lines:
-            counts = [sum(line) for line in lines]
-            for part in (counts, counts[::-1]) if rotations > 1 else (counts,):
-                held = range(1 - longest, len(part))
-                found += [at for at in held if sum(part[max(at, 0) : at + longest]) >= self.least_cells]
+        counts = [[*map(sum, lines)] for lines in self.cup_lines]
+        counts += [line[::-1] for line in counts] if rotations > 1 else []
+        places = ((at, line[max(at, 0) : at + longest]) for line in counts for at in range(1 - longest, len(line)))
+        found = [at for at, covered in places if sum(covered) >= self.least_cells]
         return range(min(found), max(found) + 1) if found else range(1)
 
     # ------------------------------------------------------------------ body and cup
