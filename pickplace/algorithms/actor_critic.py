@@ -33,6 +33,7 @@ class ActorCritic(MinibatchDescent):
     """
 
     drawn_keys: tuple[str, ...] = ("log_prob",)  # entries that the acting policy writes and the loss reads
+    log_prob_key = "log_prob"  # the one with the log-probabilities under the policy that collected
     averages = False  # whether GAE normalises advantages in each batch
     loss: A2CLoss | ClipPPOLoss
 
@@ -73,8 +74,6 @@ class ActorCritic(MinibatchDescent):
         )
         self.use_parameters(self.loss.parameters())
 
-    log_prob_key = "log_prob"  # entry with the log-probabilities under the policy that collected
-
     @abstractmethod
     def make_loss(self, **common) -> A2CLoss | ClipPPOLoss:
         """Return TorchRL's loss, with the arguments that all losses have in common."""
@@ -89,9 +88,15 @@ class ActorCritic(MinibatchDescent):
     def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
         return self.descend(self.prepare(batch, at), at, self.objective)
 
+    @torch.no_grad()
     def prepare(self, batch: TensorDictBase, at: At) -> TensorDictBase:
         """Return the frames ``[B]`` of a batch ``[N, T]``, with advantages and value targets."""
-        add_advantages(batch, self.advantage, self.task.reward_scale)
+        following = batch["next"]
+        following["reward"] = following["reward"] * self.task.reward_scale
+        # The environment reports the end of the item stream, an empty bin, as a truncation. But no reward can follow
+        # and no action is taken in that state, so the critic would never learn the value with which GAE continues.
+        following["terminated"] |= following["bin_depth"].flatten(-2).amax(-1, keepdim=True) == 0
+        self.advantage(batch)
         keys = {*self.policy.in_keys, *self.critic.in_keys, *self.drawn_keys, self.policy.choice_key}
         return batch.select(*keys, "advantage", "value_target").reshape(-1)
 
@@ -103,20 +108,3 @@ class ActorCritic(MinibatchDescent):
         """Return the whole loss of a minibatch, and its parts."""
         losses = self.losses(data)
         return losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"], losses
-
-
-@torch.no_grad()
-def add_advantages(batch: TensorDictBase, advantage: GAE, reward_scale: float) -> None:
-    """Scale the rewards of a batch ``[N, T]`` in place and write ``advantage`` and ``value_target`` into it."""
-    batch["next", "reward"] = batch["next", "reward"] * reward_scale
-    batch["next", "terminated"] |= is_bin_empty(batch["next"])
-    advantage(batch)
-
-
-def is_bin_empty(state: TensorDictBase) -> Tensor:
-    """Whether no item has arrived because the item stream has ended, bool ``[..., 1]``.
-
-    The environment reports that as a truncation. But no reward can follow and no action is taken in that state, so the
-    critic would never learn the value with which GAE continues a truncated episode.
-    """
-    return state["bin_depth"].flatten(-2).amax(-1, keepdim=True) == 0

@@ -137,25 +137,18 @@ def load_optimizer(optimizer: torch.optim.Optimizer, state: Any) -> None:
     """
     if not isinstance(state, dict):
         raise CheckpointError("The checkpoint has no optimizer; expected one that a training wrote.")
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    if unknown := [key for key in state if key not in range(len(parameters))]:
-        raise CheckpointError(
-            f"The checkpoint's optimizer has {excerpt(unknown[0])}; expected numbers below {len(parameters)}."
-        )
-    own = _state_after_a_step(optimizer)
-    saved = matching_state(state, {number: own[number] for number in state}, "optimizer")
-    for number, entries in saved.items():
-        for key in NOT_NEGATIVE:
-            if key in entries and (torch.as_tensor(entries[key]) < 0).any():
-                raise CheckpointError(f"The checkpoint's optimizer is of no use: {number}|{key} is negative.")
-    optimizer.load_state_dict({**optimizer.state_dict(), "state": saved})
-
-
-def _state_after_a_step(optimizer: torch.optim.Optimizer) -> dict:
-    """Return the state that an optimizer like this one has after a step, by the number of the parameter."""
-    twin = deepcopy(optimizer)
+    twin = deepcopy(optimizer)  # after a step it has a state for each parameter
     for group in twin.param_groups:
         for parameter in group["params"]:
             parameter.grad = torch.zeros_like(parameter)
     twin.step()
-    return twin.state_dict()["state"]
+    own = twin.state_dict()["state"]
+    if unknown := [key for key in state if key not in own]:
+        raise CheckpointError(
+            f"The checkpoint's optimizer has {excerpt(unknown[0])}; expected numbers below {len(own)}."
+        )
+    saved = matching_state(state, {number: own[number] for number in state}, "optimizer")
+    for number, entries in saved.items():
+        if bad := [key for key in NOT_NEGATIVE if key in entries and (torch.as_tensor(entries[key]) < 0).any()]:
+            raise CheckpointError(f"The checkpoint's optimizer is of no use: {number}|{bad[0]} is negative.")
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": saved})

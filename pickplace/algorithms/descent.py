@@ -1,7 +1,7 @@
 """Epochs of shuffled minibatches over a batch: the gradient steps of most algorithms."""
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from pickplace.algorithms.base import Algorithm, At, Objective, Task, load_optimizer
-from pickplace.common.validate import number, whole_number
+from pickplace.common.validate import number, or_null, whole_number
 from pickplace.policies.base import Policy
 
 log = logging.getLogger(__name__)
@@ -58,9 +58,7 @@ class MinibatchDescent(Algorithm):
         self.epochs = whole_number("algo.epochs", epochs, most=1_000)
         self.minibatch_size = whole_number("algo.minibatch_size", minibatch_size)
         self.lr = number("algo.lr", lr, most=MAX_WEIGHT)
-        self.lr_decay_start = lr_decay_start
-        if lr_decay_start is not None:
-            number("algo.lr_decay_start", lr_decay_start, most=1)
+        self.lr_decay_start = or_null(number, "algo.lr_decay_start", lr_decay_start, 0, 1)
         self.max_grad_norm = number("algo.max_grad_norm", max_grad_norm, 1e-9, MAX_WEIGHT)
 
     def use_parameters(self, parameters: Iterable[torch.nn.Parameter]) -> None:
@@ -82,8 +80,7 @@ class MinibatchDescent(Algorithm):
             log.warning("total_frames=%d: the only batch has learning rate 0; nothing is learnt", at.total)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        totals: dict[str, Tensor | float] = {}
-        steps = 0
+        history: list[dict[str, Tensor]] = []  # diagnostics of each step
         for _ in range(self.epochs):
             for index in torch.randperm(len(data), device=data.device).split(self.minibatch_size):
                 part = data[index]
@@ -93,14 +90,14 @@ class MinibatchDescent(Algorithm):
                 norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
                 if not torch.isfinite(norm + total.detach()):
                     parts = {key: value.detach() for key, value in losses.items() if key.startswith("loss_")}
-                    ranges = value_ranges({**parts, **part})
+                    floats = {key: value for key, value in {**parts, **part}.items() if value.is_floating_point()}
+                    ranges = "; ".join(f"{key} {value_range(value)}" for key, value in floats.items())
                     raise FloatingPointError(f"the loss or its gradient is not finite: {ranges}.")
                 self.optimizer.step()
-                steps += 1
                 diagnostics = {name: losses[key].detach() for key, name in DIAGNOSTICS.items() if key in losses}
-                for name, value in {**diagnostics, "grad_norm": norm}.items():
-                    totals[name] = totals.get(name, 0.0) + value
-        return {f"train/{name}": float(value) / steps for name, value in totals.items()} | {"train/lr": rate}
+                history.append({**diagnostics, "grad_norm": norm})
+        means = {f"train/{name}": float(sum(each[name] for each in history)) / len(history) for name in history[0]}
+        return {**means, "train/lr": rate}
 
     def learning_rate(self, at: At) -> float:
         """Return the learning rate of a batch; if it falls, it is 0 in the last one."""
@@ -124,13 +121,9 @@ class MinibatchDescent(Algorithm):
         return {f"algo.minibatch_size={size}": size * frame}
 
 
-def value_ranges(values: Mapping[str, Tensor]) -> str:
-    """Least and greatest value of each floating-point tensor and its number of non-finite values, as one line."""
-    words = []
-    for name, value in values.items():
-        if value.is_floating_point():
-            finite = value[value.isfinite()]
-            text = f"{finite.min():.3g} to {finite.max():.3g}" if len(finite) else "no number"
-            bad = value.numel() - len(finite)
-            words.append(f"{name} {text}" + f" ({bad} of {value.numel()} not finite)" * bool(bad))
-    return "; ".join(words)
+def value_range(value: Tensor) -> str:
+    """Return the least and the greatest number in a tensor, and how many of its values are not finite."""
+    finite = value[value.isfinite()]
+    text = f"{finite.min():.3g} to {finite.max():.3g}" if len(finite) else "no number"
+    bad = value.numel() - len(finite)
+    return text + f" ({bad} of {value.numel()} not finite)" * bool(bad)

@@ -13,7 +13,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from pickplace.algorithms.base import Algorithm, At, Imitable
-from pickplace.common.validate import excerpt, whole_number
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import accepted_arguments, build, find
 from pickplace.items.distributions import ItemDistribution
@@ -25,6 +24,16 @@ from pickplace.rules.observation import Term
 from pickplace.rules.state import State
 from pickplace.rules.step import apply
 from pickplace.runs import checkpoint
+
+
+@contextmanager
+def _named_keys():
+    """Name a teacher's settings in the errors of planners, which call them ``planner`` and ``checkpoint``."""
+    try:
+        yield
+    except ValueError as error:
+        words = re.sub(r"^checkpoint\b", "warm_start.checkpoint", str(error))
+        raise ValueError(re.sub(r"^planner\b", "warm_start.teacher", words)) from error
 
 
 class WarmStart:
@@ -40,9 +49,10 @@ class WarmStart:
         trust: modules of the user whose classes the config of the teacher's checkpoint may name.
 
     Raises:
-        ValueError: naming the key, for a bad number or a teacher without its checkpoint.
+        ValueError: naming the key, for a teacher that is missing or cannot be made.
     """
 
+    @_named_keys()
     def __init__(
         self,
         cfg: DictConfig,
@@ -53,40 +63,30 @@ class WarmStart:
         seed: int,
         trust=(),
     ):
-        self.frames, self.critic_frames = (
-            whole_number(f"warm_start.{key}", cfg[key], 0) for key in ("frames", "critic_frames")
-        )
-        if cfg.frames and cfg.teacher is None:
+        self.frames, self.critic_frames = cfg.frames, cfg.critic_frames
+        self.policy, self.cell, self.seed = policy, cell, seed
+        if not cfg.frames:
+            return
+        if cfg.teacher is None:
             raise ValueError(f"warm_start.frames={cfg.frames}: there is no teacher; expected warm_start=imitate.")
-        if cfg.teacher is not None and not OmegaConf.is_dict(cfg.teacher):
-            given = excerpt(cfg.teacher)
-            raise ValueError(f"warm_start.teacher={given}: expected planner@warm_start.teacher=<planner>.")
-        self.policy, self.cell, self.seed, self.teacher = policy, cell, seed, cfg.teacher
-        if self.frames:
-            known = accepted_arguments(find("warm_start.teacher", cfg.teacher._target_))
-            self._draws = "seed" in (cfg.teacher if known is None else known)
-            self._parts = self._teacher_parts(cfg, items, terms, trust)
-            self._make_teacher(seed)  # refuses bad settings before the first batch
-
-    def _teacher_parts(self, cfg: DictConfig, items: ItemDistribution, terms: Mapping[str, Term], trust) -> dict:
-        """Return the teacher's arguments beside its settings, such as the policy of its checkpoint."""
         trained = None
         if cfg.checkpoint is not None:
-            state, facts = checkpoint.read(checkpoint.locate(str(cfg.checkpoint)))
+            state, facts = checkpoint.read(checkpoint.locate(cfg.checkpoint))
             trained_cfg = trusted_config(facts["config"], trust)
             trained = (trained_cfg, state, cast(dict, OmegaConf.to_container(trained_cfg.env, resolve=True)))
-        try:
-            return planner_parts(cfg.teacher, self.cell, items, terms, trained)
-        except ValueError as error:
-            raise ValueError(f"warm_start.{error}") from error
+        known = accepted_arguments(find("warm_start.teacher", cfg.teacher._target_))
+        self._draws = "seed" in (cfg.teacher if known is None else known)
+        self._settings = cast(dict, OmegaConf.to_container(cfg.teacher, resolve=True))
+        self._parts = planner_parts(cfg.teacher, cell, items, terms, trained)
+        self._make_teacher(0)  # refuses bad settings before the first batch
 
-    def _make_teacher(self, seed: int) -> BatchPlanner:
-        """Make the teacher anew; one that draws gets the seed."""
-        settings = cast(dict, OmegaConf.to_container(self.teacher, resolve=True))
-        with _named_teacher():
-            return build("warm_start.teacher", {**settings, **({"seed": seed} if self._draws else {})}, **self._parts)
+    def _make_teacher(self, iteration: int) -> BatchPlanner:
+        """Make the teacher anew; one that draws gets a seed of its own in each iteration."""
+        seed = {"seed": self.seed + iteration} if self._draws else {}
+        return build("warm_start.teacher", {**self._settings, **seed}, **self._parts)
 
     @torch.no_grad()
+    @_named_keys()
     def ask(self, data: TensorDictBase, iteration: int) -> Tensor:
         """Return the teacher's choices, int64 ``[B]``; -1 where its action fails or this policy cannot choose it.
 
@@ -94,28 +94,14 @@ class WarmStart:
             data: observations ``[B]``.
             iteration: the run's batch number; it seeds a teacher that draws, so that a resumed run is the same.
         """
-        teacher = self._make_teacher(self.seed + iteration)
-        with _named_teacher():
-            action = decide(teacher, self.cell, data)
+        action = decide(self._make_teacher(iteration), self.cell, data)
         state = State.from_observation(data)
         wanted = apply(self.cell, state, action)
-        choice = self.policy.to_choice(action, data)
-        choice = torch.where(wanted.failure == 0, choice, 0)  # any choice will do
+        choice = torch.where(wanted.failure == 0, self.policy.to_choice(action, data), 0)  # any choice will do
         # A policy with a pick of its own may not reach the same footprint.
-        action = self.policy.to_action(choice, data).clamp(min=0)
-        reached = apply(self.cell, state, action)
+        reached = apply(self.cell, state, self.policy.to_action(choice, data).clamp(min=0))
         same = (reached.footprint == wanted.footprint).all(1) & (reached.taken == wanted.taken)
-        same &= (reached.failure == 0) & (wanted.failure == 0)
-        return torch.where(same, choice, -1)
-
-
-@contextmanager
-def _named_teacher():
-    """Name a teacher's settings in the errors of planners, which call them ``planner``."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(re.sub(r"^planner\b", "warm_start.teacher", str(error))) from error
+        return torch.where(same & (reached.failure == 0) & (wanted.failure == 0), choice, -1)
 
 
 class Imitation(Algorithm):

@@ -20,5 +20,10 @@ class PPO(ActorCritic):
         super().__init__(*networks, **settings)
 
     def make_loss(self, **common) -> ClipPPOLoss:
-        clip = {"clip_epsilon": self.clip_epsilon, "normalize_advantage": self.normalize_advantage}
-        return ClipPPOLoss(self.actor(), self.critic, **clip, **common)
+        return ClipPPOLoss(
+            self.actor(),
+            self.critic,
+            clip_epsilon=self.clip_epsilon,
+            normalize_advantage=self.normalize_advantage,
+            **common,
+        )

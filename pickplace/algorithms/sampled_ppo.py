@@ -58,11 +58,9 @@ class SampledPPO(PPO):
         """Return the frames ``[B]`` of a batch ``[N, T]``, with advantages ``[B, 1 + samples, 1]``."""
         data = super().prepare(batch, at)
         if self.advantages == "vine":
-            data["advantage"] = self.vine_advantages(batch.reshape(-1))
-        else:
-            count = data[CANDIDATE_KEYS[0]].shape[1]
-            data["advantage"] = of_taken_choice(data["advantage"], count, self.normalize_advantage)
-        return data
+            return data.set("advantage", self.vine_advantages(batch.reshape(-1)))
+        count = data[CANDIDATE_KEYS[0]].shape[1]
+        return data.set("advantage", of_taken_choice(data["advantage"], count, self.normalize_advantage))
 
     def losses(self, data: TensorDictBase) -> TensorDictBase:
         # TorchRL's means over candidates have no weights, and say nothing about the policy.

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Callable
 from numbers import Integral, Real
 from reprlib import Repr
 from typing import Any
@@ -128,6 +129,11 @@ def number_or_null(key: str, value, least: float, most: float) -> float | None:
     good = value is None or (is_number(value) and least <= value <= most)
     expect(good, key, value, f"a number between {least:g} and {most:g}, or null")
     return value
+
+
+def or_null(check: Callable[..., Any], key: str, value, *limits) -> Any:
+    """Return None for None, and what a validator returns for any other value."""
+    return None if value is None else check(key, value, *limits)
 
 
 def check_inputs(key: str, count: int) -> None:

@@ -4,7 +4,7 @@ import json
 from numbers import Real
 from typing import Any
 
-from pickplace.common.validate import excerpt, number, whole_number
+from pickplace.common.validate import excerpt, number, or_null, whole_number
 from pickplace.config.errors import sentence
 from pickplace.config.registry import build
 from pickplace.evaluation.play import Episodes
@@ -46,8 +46,8 @@ class EarlyStopping(Callback):
         key = "callbacks.early_stopping."
         if occupancy is None and patience is None:
             raise ValueError(f"{key}occupancy=None: expected a number, here or in {key}patience.")
-        self.occupancy = None if occupancy is None else number(f"{key}occupancy", occupancy, 0, 1)
-        self.patience = None if patience is None else whole_number(f"{key}patience", patience)
+        self.occupancy = or_null(number, f"{key}occupancy", occupancy, 0, 1)
+        self.patience = or_null(whole_number, f"{key}patience", patience)
         self.best, self.stale = -1.0, 0
 
     def on_validation(self, trainer, episodes, metrics):

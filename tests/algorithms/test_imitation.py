@@ -22,6 +22,7 @@ from pickplace.policies.fcn_grasp.policy import fcn_grasp
 from pickplace.policies.individual.policy import IndividualRl, individual_grasp
 from pickplace.rules.step import apply
 from pickplace.runs.provenance import imitated_planner
+from pickplace.training.settings import check_settings
 
 FCN = {"filters": 8, "hidden": 8}
 MODELS = {  # constructor, mask_infeasible, sizes
@@ -146,18 +147,31 @@ def test_phases_follow_each_other():
 @pytest.mark.parametrize(
     ("cfg", "message"),
     [
-        (config(frames=-1), "warm_start.frames=-1: expected a whole number >= 0"),
-        (config(critic_frames=1.5), "warm_start.critic_frames=1.5: expected a whole number >= 0"),
         (config(None), "warm_start.frames=100: there is no teacher; expected warm_start=imitate"),
         (config("own_planner.Nothing"), "warm_start.teacher._target_=own_planner.Nothing: there is no such"),
-        (OmegaConf.create({**config(), "teacher": "mcts"}), "teacher='mcts': expected planner@warm_start.teacher=<"),
         (config("policy", candidates="all"), "warm_start.checkpoint=null: planner=policy needs a checkpoint"),
-        (config("policy", checkpoint="nowhere", candidates="all"), "nowhere"),
+        (
+            config("policy", checkpoint="nowhere", candidates="all"),
+            r"warm_start.checkpoint='.*nowhere': no checkpoint there",
+        ),
     ],
 )
-def test_bad_settings_are_refused(cfg, message):
+def test_a_teacher_that_cannot_be_made_is_refused(cfg, message):
     with pytest.raises(ValueError, match=message):
         warm_start(cfg)
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("frames=-1", "warm_start.frames=-1: expected a whole number >= 0"),
+        ("critic_frames=1.5", "warm_start.critic_frames=1.5: expected a whole number >= 0"),
+        ("teacher=mcts", "warm_start.teacher='mcts': expected the settings of an object"),
+    ],
+)
+def test_bad_settings_are_refused(word, message):
+    with pytest.raises(ValueError, match=message):
+        check_settings(composed(f"warm_start.{word}"))
 
 
 def test_results_name_the_teacher():

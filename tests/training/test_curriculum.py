@@ -195,7 +195,7 @@ ERRORS = [
     (lambda: Plateau(10, True), "curriculum.advance.patience=True: "),
     (lambda: Plateau(10, 3, -0.1), "curriculum.advance.min_improvement=-0.1: "),
     (lambda: Staged([]), r"curriculum.advance.stages=\[\]: "),
-    (lambda: Staged([{"frames": 1}]), "curriculum.advance.stages: got {'frames': 1}"),
+    (lambda: Staged([{"frames": 1}]), r"curriculum.advance.stages=\[{'frames': 1}\]: "),
     (lambda: Staged([STAGE] * 2), "curriculum.advance.stages: frames=5: .* >= 6"),
     (lambda: make(Staged([STAGE | {"height": 9}])), "curriculum.advance.stages: height=9: .* <= 5"),
     # States of another run; for damaged ones see test_resume.

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pickplace.common.validate import excerpt, integral_number, number
+from pickplace.common.validate import excerpt, integral_number, number, or_null
 
 TOLERANCE = 1e-6  # occupancies arrive as float32, in which 0.9 is slightly below 0.9
 
@@ -77,8 +77,7 @@ class NoAdvance(Advance):
     """No curriculum: the last height from the first frame on."""
 
     def setup(self, start, end, total_frames):
-        super().setup(start, end, total_frames)
-        return end
+        return super().setup(end, end, total_frames)
 
     def update(self, tally):
         return tally.level, {}
@@ -92,9 +91,7 @@ class Frames(Advance):
     """
 
     def __init__(self, frames_per_level: int | None = None):
-        if frames_per_level is not None:
-            frames_per_level = integral_number("curriculum.advance.frames_per_level", frames_per_level)
-        self.frames_per_level = frames_per_level
+        self.frames_per_level = or_null(integral_number, "curriculum.advance.frames_per_level", frames_per_level)
 
     def setup(self, start, end, total_frames):
         self.share = self.frames_per_level or max(1, total_frames // (end - start + 1))
@@ -128,14 +125,11 @@ class Threshold(Advance):
     ):
         self.occupancy = number("curriculum.advance.occupancy", occupancy, most=1)
         self.window = integral_number("curriculum.advance.window", window)
-        self.max_frames = math.inf
-        if max_frames_per_level is not None:
-            self.max_frames = integral_number("curriculum.advance.max_frames_per_level", max_frames_per_level)
-        self.demote_below = 0.0
-        if demote_below is not None:
-            self.demote_below = number("curriculum.advance.demote_below", demote_below, most=1)
-            if self.demote_below >= self.occupancy:
-                raise ValueError(f"curriculum.advance.demote_below={demote_below}: expected < {occupancy=}.")
+        key = "curriculum.advance.max_frames_per_level"
+        self.max_frames = or_null(integral_number, key, max_frames_per_level) or math.inf
+        self.demote_below = or_null(number, "curriculum.advance.demote_below", demote_below, 0, 1) or 0.0
+        if demote_below is not None and demote_below >= occupancy:
+            raise ValueError(f"curriculum.advance.demote_below={demote_below}: expected < {occupancy=}.")
 
     def update(self, tally):
         full = len(tally.window) == self.window
@@ -171,8 +165,8 @@ class Plateau(Advance):
         return super().setup(start, end, total_frames)
 
     def _clear(self):
-        self.best, self.stale = 0.0, 0  # the best window's mean, and the number of windows since
-        self.compared = 0  # the tally's episodes at the latest comparison
+        # The best window's mean, the number of windows since, and the tally's episodes at the latest comparison.
+        self.best, self.stale, self.compared = 0.0, 0, 0
 
     def update(self, tally):
         if tally.episodes - self.compared >= self.window:
@@ -200,31 +194,28 @@ class Staged(Advance):
     """
 
     def __init__(self, stages):
-        self.stages, least = [], 0
-        if not isinstance(stages, Sequence) or isinstance(stages, str):
+        found = stages if isinstance(stages, Sequence) else []
+        if not found or not all(isinstance(each, Mapping) and set(each) == {"frames", "height"} for each in found):
             raise ValueError(
                 f"curriculum.advance.stages={excerpt(stages)}: expected a list of {{frames: F, height: H}}."
             )
-        for stage in stages:
-            if not isinstance(stage, Mapping) or set(stage) != {"frames", "height"}:
-                raise ValueError(f"curriculum.advance.stages: got {excerpt(stage)}, expected {{frames: F, height: H}}.")
+        self.stages: dict[int, int | None] = {}  # heights by first frame
+        for stage in found:
+            least = max(self.stages, default=-1) + 1
             frames = integral_number("curriculum.advance.stages: frames", stage["frames"], least)
-            self.stages.append((frames, stage["height"]))
-            least = frames + 1
-        if not self.stages:
-            raise ValueError("curriculum.advance.stages=[]: expected at least one {frames: F, height: H}.")
+            self.stages[frames] = stage["height"]
 
     def setup(self, start, end, total_frames):
         super().setup(start, end, total_frames)
         key = "curriculum.advance.stages: height"
-        self.plan = [(f, end if h is None else integral_number(key, h, start, end)) for f, h in self.stages]
+        self.plan = {f: end if h is None else integral_number(key, h, start, end) for f, h in self.stages.items()}
         return self._height_at(0)
 
     def _height_at(self, frames: int) -> int:
-        return ([self.start] + [height for first, height in self.plan if first <= frames])[-1]
+        return ([self.start] + [height for first, height in self.plan.items() if first <= frames])[-1]
 
     def update(self, tally):
         return self._height_at(tally.frames), {}
 
     def least_frames(self, batch):
-        return min((f for f in (0, *dict(self.plan)) if self._height_at(f) == self.end), default=math.inf)
+        return min((f for f in (0, *self.plan) if self._height_at(f) == self.end), default=math.inf)

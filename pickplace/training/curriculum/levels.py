@@ -2,11 +2,11 @@
 
 import math
 from collections import deque
-from numbers import Integral, Real
+from numbers import Real
 
 from torch import Tensor
 
-from pickplace.common.validate import excerpt, integral_number, is_number, number
+from pickplace.common.validate import excerpt, integral_number, is_number, is_whole, number
 from pickplace.training.curriculum.advance import Advance, Tally
 from pickplace.training.curriculum.transform import ToteHeightCurriculum
 
@@ -30,7 +30,7 @@ class Curriculum:
             raise ValueError(
                 f"curriculum.sample={excerpt(sample)}: expected a sampler, such as curriculum/sample=recent."
             )
-        self.advance, self.sample = advance, sample
+        self.advance, self.sample, self._rule = advance, sample, f"curriculum.advance: {type(advance).__name__}"
         self.start_height, self.end_height = start_height, end_height
 
     def setup(self, min_height: int, max_height: int, total_frames: int) -> None:
@@ -101,7 +101,13 @@ class Curriculum:
         at_level = occupancy[heights == tally.level].tolist()
         tally.frames, tally.episodes = frames, tally.episodes + len(at_level)
         tally.window.extend(at_level)
-        level, logs = self._ask_rule()
+        answer = self.advance.update(tally)
+        if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], dict):
+            raise ValueError(f"{self._rule}: update returned {excerpt(answer)}; expected (level, {{name: number}}).")
+        level, logs = self._clamped(answer[0]), {**answer[1]}
+        if bad := [name for name, value in logs.items() if not isinstance(value, Real)]:
+            raise ValueError(f"{self._rule}: it logs {bad[0]}={excerpt(logs[bad[0]])}; expected a number.")
+        self._rule_state()
         logs |= {"level": level, "frames_at_level": tally.level_frames, "episodes": tally.episodes}
         logs["progress"] = (level - self.start) / (self.end - self.start) if self.end > self.start else 1.0
         if tally.window:
@@ -112,38 +118,19 @@ class Curriculum:
             self.tally = Tally(level, deque(maxlen=self.advance.window), frames, level_start=frames)
         return {f"curriculum/{key}": value for key, value in logs.items()}
 
-    def _ask_rule(self) -> tuple[int, dict]:
-        """Return the rule's next level and logs, checked: the rule may be a user's own."""
-        answer = self.advance.update(self.tally)
-        if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], dict):
-            raise ValueError(
-                f"{self._rule_name}: update returned {excerpt(answer)}; expected (level, {{name: number}})."
-            )
-        level, logs = self._clamped(answer[0]), {**answer[1]}
-        self._rule_state()
-        for name, value in logs.items():
-            if not isinstance(value, Real):
-                raise ValueError(f"{self._rule_name}: it logs {name}={excerpt(value)}; expected a number.")
-        return level, logs
-
-    @property
-    def _rule_name(self) -> str:
-        return f"curriculum.advance: {type(self.advance).__name__}"
-
     def _clamped(self, level) -> int:
         """Return a rule's level, limited to the first and the last height."""
-        if isinstance(level, bool) or not isinstance(level, Integral):
-            raise ValueError(f"{self._rule_name}: its level is {excerpt(level)}; expected a whole number.")
+        if not is_whole(level):
+            raise ValueError(f"{self._rule}: its level is {excerpt(level)}; expected a whole number.")
         return min(max(int(level), self.start), self.end)
 
     def _rule_state(self) -> dict:
         """Return the rule's own state; raise if a checkpoint could not store it."""
         state = {key: getattr(self.advance, key, None) for key in self.advance.state_keys}
-        for name, value in state.items():
-            if not isinstance(value, (int, float)) or not is_number(value):  # JSON stores these exactly
-                raise ValueError(
-                    f"{self._rule_name}: its state has {name}={excerpt(value)}; expected a finite Python number."
-                )
+        # JSON stores these numbers exactly.
+        if bad := [key for key, value in state.items() if not (isinstance(value, int | float) and is_number(value))]:
+            found = f"{bad[0]}={excerpt(state[bad[0]])}"
+            raise ValueError(f"{self._rule}: its state has {found}; expected a finite Python number.")
         return state
 
     def state_dict(self) -> dict:

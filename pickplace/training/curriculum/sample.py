@@ -13,7 +13,6 @@ class Current:
     """Height sampler: every episode plays at the level."""
 
     def __call__(self, level: int, min_height: int, count: int) -> Tensor:
-        """Return heights for ``count`` episodes, int64 ``[count]``."""
         return torch.full((count,), level, dtype=torch.int64)
 
 
@@ -21,7 +20,6 @@ class Uniform:
     """Height sampler: uniform from the least height to the level, drawn from torch's global generator."""
 
     def __call__(self, level: int, min_height: int, count: int) -> Tensor:
-        """Return heights for ``count`` episodes, int64 ``[count]``."""
         return torch.randint(min_height, level + 1, (count,))
 
 
@@ -36,6 +34,5 @@ class Recent:
         self.share = number("curriculum.sample.share", share, most=1)
 
     def __call__(self, level: int, min_height: int, count: int) -> Tensor:
-        """Return heights for ``count`` episodes, int64 ``[count]``."""
         earlier = torch.randint(min_height, max(level, min_height + 1), (count,))
         return torch.where(torch.rand(count) < self.share, earlier, level)

@@ -55,5 +55,4 @@ def push_level(collector, level: int) -> None:
     list; a multi-process one calls it once in each worker and needs ``num_workers`` entries. Results travel back
     through a pipe, so the path ends at a method that returns nothing.
     """
-    workers = getattr(collector, "num_workers", 1)
-    collector.map_fn("env.transform[0].set_level", [(level,)] * workers)
+    collector.map_fn("env.transform[0].set_level", [(level,)] * getattr(collector, "num_workers", 1))
