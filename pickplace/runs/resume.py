@@ -7,7 +7,6 @@ import signal
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from loky import cpu_count
 from omegaconf import DictConfig, OmegaConf
@@ -21,10 +20,6 @@ from pickplace.runs import checkpoint
 from pickplace.runs.folder import occupied, refuse_occupied
 
 log = logging.getLogger(__name__)
-
-#: Counters in a checkpoint, with their values in a new run: frames and batches trained, best validation occupancy, and
-#: the latest validation.
-COUNTERS: dict[str, Any] = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
 
 #: Types of the facts in the checkpoint of a training, beside the config and the frames.
 FACT_TYPES = {

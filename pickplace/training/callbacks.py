@@ -116,6 +116,5 @@ def call(callbacks: dict[str, Callback], hook: str, trainer: Any, *arguments: An
         getattr(callback, hook)(trainer, *arguments)
         if removed := [key for key in before if key not in metrics]:
             raise ValueError(f"callbacks.{name}: it removes {removed[0]} from the metrics; expected changed values.")
-        for key, value in metrics.items():
-            if not isinstance(value, Real):
-                raise ValueError(f"callbacks.{name}: it logs {key}={excerpt(value)}; expected a number.")
+        if bad := [key for key, value in metrics.items() if not isinstance(value, Real)]:
+            raise ValueError(f"callbacks.{name}: it logs {bad[0]}={excerpt(metrics[bad[0]])}; expected a number.")

@@ -72,9 +72,19 @@ class ResumableCollector(Collector):
         # The carrier has no device, so tensors would stay on the device on which they were loaded.
         carried = TensorDict(state_dict["carried"], batch_size=self.env.batch_size, device=self.env.device)
         self._carrier.update(carried)
-        self._frames = int(state_dict["counters"]["frames"])
-        self._iter = int(state_dict["counters"]["iterations"])
+        self._frames, self._iter = (int(state_dict["counters"][key]) for key in ("frames", "iterations"))
         set_rng_state(state_dict, self.env.device)
+
+
+@contextmanager
+def _ray_errors():
+    """Raise Ray's error for a dead actor as :class:`WorkerDied`."""
+    from ray.exceptions import RayActorError
+
+    try:
+        yield
+    except RayActorError as error:
+        raise WorkerDied("a Ray worker of the collector has died.") from error
 
 
 class ResumableRayCollector(RayCollector):
@@ -85,7 +95,7 @@ class ResumableRayCollector(RayCollector):
     """
 
     def iterator(self):
-        with self._worker_errors():
+        with _ray_errors():
             for batch in super().iterator():
                 yield batch.flatten(0, 1)  # TorchRL 0.14.1 stacks: [workers, share, rollout_length]
 
@@ -94,30 +104,19 @@ class ResumableRayCollector(RayCollector):
         # another process must start within 60 s, which fails on a busy machine.
         import ray
 
-        reference = ray.put(weights)
-        self.map_fn("update_policy_weights_", [(reference,)] * self.num_collectors)
+        self.map_fn("update_policy_weights_", [(ray.put(weights),)] * self.num_collectors)
 
+    @_ray_errors()
     def map_fn(self, *args, **kwargs) -> list:
-        with self._worker_errors():
-            return super().map_fn(*args, **kwargs)
+        return super().map_fn(*args, **kwargs)
 
+    @_ray_errors()
     def state_dict(self) -> OrderedDict:
-        with self._worker_errors():
-            return OrderedDict((f"worker{worker}", state) for worker, state in enumerate(super().state_dict()))
+        return OrderedDict((f"worker{worker}", state) for worker, state in enumerate(super().state_dict()))
 
+    @_ray_errors()
     def load_state_dict(self, state_dict, **kwargs) -> None:
-        with self._worker_errors():
-            super().load_state_dict([state_dict[f"worker{worker}"] for worker in range(self.num_collectors)])
-
-    @contextmanager
-    def _worker_errors(self):
-        """Raise Ray's error for a dead actor as :class:`WorkerDied`."""
-        from ray.exceptions import RayActorError
-
-        try:
-            yield
-        except RayActorError as error:
-            raise WorkerDied("a Ray worker of the collector has died.") from error
+        super().load_state_dict([state_dict[f"worker{worker}"] for worker in range(self.num_collectors)])
 
 
 def rng_state(device: torch.device) -> dict[str, torch.Tensor]:
@@ -166,17 +165,17 @@ def watch_workers(collector):
         return [worker for worker in workers if not worker._closed]
 
     def check(signum=None, _=None):
-        dead = [number for number, worker in enumerate(workers) if not worker._closed and not worker.is_alive()]
-        if dead:  # name a killed worker first: others may have ended because of it
-            number = min(dead, key=lambda number: workers[number].exitcode == 0)
-            code = workers[number].exitcode
+        if dead := [worker for worker in open_workers() if not worker.is_alive()]:
+            # Name a killed worker first: others may have ended because of it.
+            worker = min(dead, key=lambda worker: worker.exitcode == 0)
             # Loggers and finalizers swallow an error raised while they run, so repeat it until this context ends.
             repeat = threading.Timer(0.5, signal.pthread_kill, (threading.main_thread().ident, signal.SIGCHLD))
             repeat.daemon = True
             repeat.start()
             if signum and sys.exc_info()[1]:
                 return  # another error, perhaps of this death, is being handled: do not interrupt its cleanup
-            raise WorkerDied(f"collector worker {number + 1} of {len(workers)} has died (exit code {code}).")
+            number, code = 1 + workers.index(worker), worker.exitcode
+            raise WorkerDied(f"collector worker {number} of {len(workers)} has died (exit code {code}).")
 
     previous = signal.signal(signal.SIGCHLD, check)
     try:
@@ -270,8 +269,6 @@ def ray(
     if any(parameter.is_cuda for parameter in policy.parameters()):
         raise ValueError("collector=ray: its workers have no GPU; expected device=cpu, or collector=single.")
     share = _share(num_envs, workers, 1_024)
-    # A new Ray gets a core per worker, however few this machine has; a cluster states its own number.
-    resources = {"num_cpus": workers} if address == "local" else {}
     collector = ResumableRayCollector(
         [partial(make_env, worker * share, share) for worker in range(workers)],
         policy,
@@ -288,7 +285,8 @@ def ray(
         remote_configs={"num_cpus": 1, "num_gpus": 0},
         ray_init_config={
             "address": address, "include_dashboard": False, "logging_level": "warning", "log_to_driver": False,
-            **resources,
+            # A new Ray gets a core per worker, however few this machine has; a cluster states its own number.
+            **({"num_cpus": workers} if address == "local" else {}),
         },
     )  # fmt: skip
     collector._weight_sync_initialized = True  # silences a warning about the missing scheme

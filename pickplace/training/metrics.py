@@ -10,15 +10,13 @@ from pickplace.training.curriculum import Curriculum
 
 def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
     """Mean reward, and of the episodes that ended in the batch: number, mean occupancy and shares of failures."""
-    metrics = {"train/reward": batch["next", "reward"].mean().item()}
     done = batch["next", "done"]
-    ended = int(done.sum())
-    metrics["train/episodes"] = ended
-    if ended:
+    metrics = {"train/reward": batch["next", "reward"].mean().item(), "train/episodes": int(done.sum())}
+    if done.any():
         metrics["train/occupancy"] = batch["next", "occupancy"][done].mean().item()
         reasons = batch["next", "failure"][done]
-        for failure in Failure:
-            metrics[f"train/failure_{failure.name.lower()}"] = (reasons == failure).float().mean().item()
+        shares = {failure.name.lower(): (reasons == failure).float().mean().item() for failure in Failure}
+        metrics |= {f"train/failure_{name}": share for name, share in shares.items()}
     return metrics
 
 

@@ -33,18 +33,19 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
     Raises:
         OSError: naming the report, if it cannot be written.
     """
-    rows = read_csv(run_dir / "metrics.csv")
-    failures = io.BytesIO()
+    rows, failures = read_csv(run_dir / "metrics.csv"), io.BytesIO()
     failure_mix(run_dir / "metrics.csv", failures)
     best = max((row for row in rows if "eval/occupancy" in row), key=lambda row: row["eval/occupancy"])
     ordered = sorted(episodes.recordings, key=lambda recording: recording.occupancy)
-    sizes = "x".join(map(str, cell.tote_size))
-    policy = str(cfg.model.actor._target_).rpartition(".")[2]
-    count, mean = len(episodes.occupancy), float(episodes.occupancy.mean())
+    policy, sizes = str(cfg.model.actor._target_).rpartition(".")[2], "x".join(map(str, cell.tote_size))
+    words = map(shlex.quote, [*noted_config_folders(run_dir), *noted_overrides(run_dir)])
+    command, changed = " ".join(["pickplace-train", *words]), changed_values(run_dir, cfg)
+    if changed:
+        command += f"\n\nChanged when it was resumed: {', '.join(changed)}"
     tiles = [
         (f"{best['eval/occupancy']:.4f}", f"best validation, after {best['frames']:,} frames (checkpoints/best)"),
-        (f"{mean:.4f}", f"last validation, {count} episodes at full height"),
-        (f"{float(episodes.occupancy.min()):.4f}", "its worst episode"),
+        (f"{episodes.occupancy.mean():.4f}", f"last validation, {len(episodes.occupancy)} episodes at full height"),
+        (f"{episodes.occupancy.min():.4f}", "its worst episode"),
         (f"{int(rows[-1]['curriculum/level'])} of {cell.tote_size[2]}", "tote height reached"),
     ]
     parts = {
@@ -57,23 +58,22 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
         "curve": base64.b64encode((run_dir / "learning_curve.png").read_bytes()).decode(),
         "failures": base64.b64encode(failures.getvalue()).decode(),
         "tables": validation_table(rows) + level_table(rows),
-        "command": escape(_command(run_dir, cfg)),
+        "command": escape(command),
         "config": escape(OmegaConf.to_yaml(cfg, resolve=True)),
         "versions": escape("\n".join(f"{name}: {value}" for name, value in facts.items())),
         "replay": escape(page(ordered, cell, f"{cfg.evaluation.stream} stream, seed {cfg.evaluation.seed}")),
     }
-    html = (ASSETS / "report.html").read_text(encoding="utf-8")
-    # In one pass, so that no content is taken for a placeholder.
-    html = re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], html)
+    template = (ASSETS / "report.html").read_text(encoding="utf-8")
     with replaced_file(run_dir / REPORT) as new:
-        new.write_text(html, encoding="utf-8")
+        # In one pass, so that no content is taken for a placeholder.
+        new.write_text(re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], template), encoding="utf-8")
 
 
 def _table(head: tuple, rows: list[tuple]) -> str:
     """An HTML table."""
-    cells = "".join(f"<th>{name}</th>" for name in head)
     lines = ["".join(f"<td>{value}</td>" for value in row) for row in rows]
-    return f"<table><tr>{cells}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
+    lines.insert(0, "".join(f"<th>{name}</th>" for name in head))
+    return f"<table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
 
 def validation_table(rows: list[dict]) -> str:
@@ -103,11 +103,3 @@ def level_table(rows: list[dict]) -> str:
         lines.append((height, f"{np.mean(values):.4f}", f"{seen[0]['frames']:,} to {seen[-1]['frames']:,}"))
     head = ("tote height", "training occupancy when last trained", "frames")
     return "<br>" + _table(head, lines) if lines else ""
-
-
-def _command(run_dir: Path, cfg: DictConfig) -> str:
-    """The command that began the run, and the values that were changed when it was resumed."""
-    words = [*noted_config_folders(run_dir), *noted_overrides(run_dir)]
-    command = " ".join(["pickplace-train", *map(shlex.quote, words)])
-    changed = changed_values(run_dir, cfg)
-    return f"{command}\n\nChanged when it was resumed: {', '.join(changed)}" if changed else command

@@ -11,6 +11,7 @@ import logging
 import re
 import sys
 import textwrap
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,7 +28,6 @@ log = logging.getLogger(__name__)
 
 TABLE, SETTINGS_TABLE, FIGURE = "sweep.csv", "sweep_settings.csv", "sweep.png"
 LARGEST_LEGEND = 40  # settings that the figure and the console name; of more, the best
-RESAMPLES = 9999  # of the bootstrap
 COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c"]  # Okabe and Ito's, no yellow
 
 
@@ -36,7 +36,7 @@ class SweepRun:
     """One run of a sweep."""
 
     name: str  # of its folder
-    overrides: dict[str, str]  # of the command line, by key
+    overrides: dict[str, str] = field(default_factory=dict)  # of the command line, by key
     status: str = "stopped"  # or finished, running, failed, unreadable
     frames: int = 0  # environment steps trained
     validations: list[dict[str, float]] = field(default_factory=list)  # rows of metrics.csv with a validation
@@ -55,76 +55,56 @@ class SweepRun:
 
 def read_run(folder: Path) -> SweepRun:
     """Read a run folder, in whatever state the run left it."""
-    run = SweepRun(folder.name, {})
+    run = SweepRun(folder.name)
     try:
-        _read_results(run, folder)
+        words = read_note(folder, "overrides.yaml")
+        if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+            note = folder / ".hydra" / "overrides.yaml"
+            raise ValueError(f"{note}: expected the overrides of the run, as Hydra notes.")
+        run.overrides = dict(word.lstrip("+").partition("=")[::2] for word in words)
+        facts = read_facts(folder, "last")
+        if (folder / "metrics.csv").is_file():
+            rows = read_csv(folder / "metrics.csv")
+        else:  # logger=none
+            latest = {f"eval/{key}": float(value) for key, value in (facts.get("latest") or {}).items()}
+            rows = [{"frames": facts["frames"], **latest}] if facts else []
+        run.frames = int(rows[-1]["frames"]) if rows else 0
+        run.validations = [row for row in rows if "eval/occupancy" in row]
+        if (folder / FAILURE).is_file():
+            run.status, run.error = "failed", read_text(folder / FAILURE).strip()
+        elif is_claimed(folder):
+            run.status = "running"
+        else:  # the checkpoint's config first: a resumed run may have a larger budget
+            config = facts.get("config") or read_note(folder, "config.yaml")
+            budget = config.get("total_frames") if isinstance(config, dict) else None
+            is_complete = (isinstance(budget, int) and run.frames >= budget) or facts.get("ended") is True
+            run.status = "finished" if is_complete else "stopped"
     except Exception as error:  # of any type: the checkpoint's facts are unchecked
         run.status, run.error = "unreadable", sentence(error)
     return run
 
 
-def _read_results(run: SweepRun, folder: Path) -> None:
-    """Fill in what a run folder holds."""
-    words = read_note(folder, "overrides.yaml")
-    if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
-        raise ValueError(f"{folder / '.hydra' / 'overrides.yaml'}: expected the overrides of the run, as Hydra notes.")
-    run.overrides = dict(word.lstrip("+").partition("=")[::2] for word in words)
-    facts = read_facts(folder, "last")
-    if (folder / "metrics.csv").is_file():
-        rows = read_csv(folder / "metrics.csv")
-        run.frames = int(rows[-1]["frames"]) if rows else 0
-        run.validations = [row for row in rows if "eval/occupancy" in row]
-    elif facts:  # logger=none
-        run.frames = facts["frames"]
-        if latest := facts.get("latest"):
-            run.validations = [{"frames": run.frames, **{f"eval/{key}": float(value) for key, value in latest.items()}}]
-    if (folder / FAILURE).is_file():
-        run.status, run.error = "failed", read_text(folder / FAILURE).strip()
-    elif is_claimed(folder):
-        run.status = "running"
-    else:  # the checkpoint's config first: a resumed run may have a larger budget
-        config = facts.get("config") or read_note(folder, "config.yaml")
-        budget = config.get("total_frames") if isinstance(config, dict) else None
-        is_complete = (isinstance(budget, int) and run.frames >= budget) or facts.get("ended") is True
-        run.status = "finished" if is_complete else "stopped"
-
-
-@dataclass
 class Setting:
-    """The runs of a sweep that differ in their seed only, and statistics over those that finished."""
+    """The runs of a sweep that differ in their seed only, and statistics over those that finished.
 
-    overrides: dict[str, str]  # without the seed
-    runs: list[SweepRun]
+    Attributes:
+        overrides: without the seed.
+        finished: the runs that finished, with a validation.
+        mean: their mean final validation occupancy; None without any.
+        interquartile_mean: the mean of their middle half; None with fewer than four, of which it would be the mean.
+        interval: the 95% interval of their mean, see :func:`bootstrap95`; two times None with fewer than two.
+    """
 
-    @property
-    def finished(self) -> list[SweepRun]:
-        """The runs that finished, with a validation."""
-        return [run for run in self.runs if run.status == "finished" and run.final is not None]
-
-    @property
-    def finals(self) -> np.ndarray:
-        """Their final validation occupancies, float ``[S]``."""
-        return np.array([run.final for run in self.finished], dtype=float)
-
-    @property
-    def mean(self) -> float | None:
-        """Their mean."""
-        return float(self.finals.mean()) if len(self.finals) else None
-
-    @property
-    def interquartile_mean(self) -> float | None:
-        """The mean of their middle half; None with fewer than four, of which it would be the plain mean."""
+    def __init__(self, runs: list[SweepRun]):
         from scipy.stats import trim_mean
 
-        return float(trim_mean(self.finals, 0.25)) if len(self.finals) >= 4 else None
-
-    @property
-    def interval(self) -> tuple[float, float] | tuple[None, None]:
-        """The 95% interval of their mean, see :func:`bootstrap95`; None with fewer than two."""
-        if len(self.finals) < 2:
-            return None, None
-        low, high = bootstrap95(self.finals)
-        return float(low), float(high)
+        self.runs = runs
+        self.overrides = {key: value for key, value in runs[0].overrides.items() if key != "seed"}
+        self.finished = [run for run in runs if run.status == "finished" and run.final is not None]
+        finals, count = np.array([run.final for run in self.finished], dtype=float), len(self.finished)
+        self.mean = float(finals.mean()) if count else None
+        self.interquartile_mean = float(trim_mean(finals, 0.25)) if count >= 4 else None
+        self.interval = tuple(map(float, bootstrap95(finals))) if count >= 2 else (None, None)
 
     @property
     def curves(self) -> tuple[np.ndarray, np.ndarray]:
@@ -151,10 +131,8 @@ def bootstrap95(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     from scipy.stats import bootstrap
 
-    found = bootstrap(
-        (values,), np.mean, axis=-1, n_resamples=RESAMPLES, batch=1000, method="percentile", random_state=0
-    ).confidence_interval
-    return found.low, found.high
+    settings = {"n_resamples": 9999, "batch": 1000, "method": "percentile", "random_state": 0}
+    return bootstrap((values,), np.mean, axis=-1, **settings).confidence_interval
 
 
 def group_by_setting(runs: list[SweepRun]) -> list[Setting]:
@@ -162,18 +140,11 @@ def group_by_setting(runs: list[SweepRun]) -> list[Setting]:
 
     A run whose overrides cannot be read belongs to none.
     """
-    settings: dict[tuple, Setting] = {}
+    groups: dict[frozenset, list[SweepRun]] = defaultdict(list)
     for run in runs:
-        if run.status == "unreadable" and not run.overrides:
-            continue
-        overrides = {key: value for key, value in run.overrides.items() if key != "seed"}
-        settings.setdefault(tuple(sorted(overrides.items())), Setting(overrides, [])).runs.append(run)
-    return list(settings.values())
-
-
-def rank_settings(settings: list[Setting]) -> list[Setting]:
-    """Return settings with the best mean first; those without a finished run are last."""
-    return sorted(settings, key=lambda setting: -1.0 if setting.mean is None else setting.mean, reverse=True)
+        if run.status != "unreadable" or run.overrides:
+            groups[frozenset(item for item in run.overrides.items() if item[0] != "seed")].append(run)
+    return [*map(Setting, groups.values())]
 
 
 def summarize(folder: Path) -> list[Setting]:
@@ -189,12 +160,13 @@ def summarize(folder: Path) -> list[Setting]:
     runs = [read_run(path) for path in found]
     settings = group_by_setting(runs)
     keys = list(dict.fromkeys(key for run in runs for key in run.overrides))
-    columns = ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "error"]
     rows = []
     for run in runs:
         last = run.validations[-1] if run.validations else {}
-        results = run.frames, run.best, run.final, last.get("eval/ci95_low"), last.get("eval/ci95_high"), run.error
-        rows.append([run.name, run.status, *(run.overrides.get(key) for key in keys), *results])
+        interval = last.get("eval/ci95_low"), last.get("eval/ci95_high")
+        settings_of_run = (run.overrides.get(key) for key in keys)
+        rows.append([run.name, run.status, *settings_of_run, run.frames, run.best, run.final, *interval, run.error])
+    columns = ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "error"]
     _write_table(folder / TABLE, ["run", "status", *keys, *columns], rows)
     keys = [key for key in keys if key != "seed"]
     columns = ["runs", "finished", "mean_occupancy", "interquartile_mean", "mean_ci95_low", "mean_ci95_high"]
@@ -204,8 +176,10 @@ def summarize(folder: Path) -> list[Setting]:
         for each in settings
     ]
     _write_table(folder / SETTINGS_TABLE, [*keys, *columns], rows)
-    draw(settings, folder / FIGURE)
-    for setting in rank_settings(settings)[:LARGEST_LEGEND]:
+    # The best mean first; those without a finished run are last.
+    ranked = sorted(settings, key=lambda setting: -1.0 if setting.mean is None else setting.mean, reverse=True)
+    draw(ranked, folder / FIGURE)
+    for setting in ranked[:LARGEST_LEGEND]:
         log.info("%s  %s", result(setting), label(setting, settings))
     log.info("tables and figure of the sweep: %s, %s, %s", folder / SETTINGS_TABLE, folder / TABLE, folder / FIGURE)
     return settings
@@ -213,57 +187,55 @@ def summarize(folder: Path) -> list[Setting]:
 
 def _write_table(path: Path, columns: list[str], rows: list[list]) -> None:
     with replaced_file(path) as new, new.open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(columns)
-        table.writerows(rows)
+        csv.writer(file).writerows([columns, *rows])
 
 
 def label(setting: Setting, settings: list[Setting]) -> str:
     """Label of a setting: the overrides in which the settings differ, and its runs that did not finish."""
     differing = [key for key in setting.overrides if len({other.overrides.get(key) for other in settings}) > 1]
     words = [f"{key}={setting.overrides[key]}" for key in differing]
-    words = words or ["all runs" if len(settings) == 1 else "defaults"]
-    open_ends = [run.status for run in setting.runs if run.status != "finished"]
-    counts = [f"{open_ends.count(status)} {status}" for status in dict.fromkeys(open_ends)]
-    return ", ".join(words) + (f" ({', '.join(counts)})" if counts else "")
+    unfinished = Counter(run.status for run in setting.runs if run.status != "finished")
+    counts = ", ".join(f"{count} {status}" for status, count in unfinished.items())
+    return (", ".join(words) or ("all runs" if len(settings) == 1 else "defaults")) + (f" ({counts})" if counts else "")
 
 
 def result(setting: Setting) -> str:
     """Mean final occupancy of a setting, its interval and number of seeds, as text of equal width."""
     if setting.mean is None:
         return f"{'none finished':<34}"
-    low, high = setting.interval
-    interval = "" if low is None else f"({low:.4f} to {high:.4f})"
-    count = len(setting.finals)
+    count = len(setting.finished)
+    interval = "({:.4f} to {:.4f})".format(*setting.interval) if count > 1 else ""
     return f"{setting.mean:.4f} {interval:<18} {f'{count} seed' + 's' * (count > 1):>8}"
 
 
 def draw(settings: list[Setting], path: Path) -> None:
-    """Draw the mean validation curve of each setting over its finished runs, with its 95% interval, best first.
+    """Draw the mean validation curve of each setting over its finished runs, with its 95% interval, in this order.
 
     Runs that did not finish are single dashed lines.
     """
     from matplotlib import colormaps
     from matplotlib.ticker import EngFormatter
 
-    order = rank_settings(settings)
-    figure = figure_of(8, max(4.5, 0.6 + 0.18 * min(len(order), LARGEST_LEGEND)))
+    figure = figure_of(8, max(4.5, 0.6 + 0.18 * min(len(settings), LARGEST_LEGEND)))
     axes = figure.subplots()
-    for rank, setting in enumerate(order):
-        few = len(order) <= len(COLOURS)
-        colour = COLOURS[rank] if few else colormaps["viridis"](0.95 * rank / len(order))
+    shades = colormaps["viridis"](0.95 * np.arange(len(settings)) / max(len(settings), 1))
+    for rank, setting in enumerate(settings):
+        colour = COLOURS[rank] if len(settings) <= len(COLOURS) else shades[rank]
         for run in setting.runs:
             if run.status != "finished":
-                points = [(row["frames"], row["eval/occupancy"]) for row in run.validations]
-                axes.plot(*np.array(points).reshape(-1, 2).T, ".--", color=colour, lw=0.8)
+                points = ([row[key] for row in run.validations] for key in ("frames", "eval/occupancy"))
+                axes.plot(*points, ".--", color=colour, lw=0.8)
         frames, values = setting.curves
         text = f"{result(setting)}  {textwrap.shorten(label(setting, settings), 90, placeholder=' ...')}"
         means = values.mean(1) if len(frames) else frames
         axes.plot(frames, means, "o-", color=colour, ms=3.5, label=text if rank < LARGEST_LEGEND else None)
         if len(frames) and values.shape[1] > 1:
             axes.fill_between(frames, *bootstrap95(values), color=colour, alpha=0.2, lw=0)
-    axes.set(title="Validation at full height: mean over seeds and its 95% interval; dashed: not finished")
-    axes.set(xlabel="frames (environment steps)", ylabel="occupancy (0 to 1)")
+    axes.set(
+        title="Validation at full height: mean over seeds and its 95% interval; dashed: not finished",
+        xlabel="frames (environment steps)",
+        ylabel="occupancy (0 to 1)",
+    )
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
     legend = axes.legend(

@@ -66,18 +66,19 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             before = trainer.frames
             metrics = trainer.learn(batch)
             finished = time.perf_counter()
-            metrics["time/collect_ms"] = (collected - started) * 1e3
-            metrics["time/update_ms"] = (finished - collected) * 1e3
-            metrics["time/fps"] = batch.numel() / (finished - started)
+            metrics |= {
+                "time/collect_ms": (collected - started) * 1e3,
+                "time/update_ms": (finished - collected) * 1e3,
+                "time/fps": batch.numel() / (finished - started),
+            }
 
             # On their intervals: validate, save, print progress.
             trainer.finish_batch(metrics, before)
         if trainer.last_saved != trainer.frames:  # after the loop, so that a stop request is never missed
             trainer.save("last")
 
-    trainer.log_ending(stop.requested)
     with checkpoint_hint(lambda: trainer.safe_folder, trainer.resume_overrides):
-        trainer.write_report()
+        trainer.report(stop.requested)
     log.info("run folder: %s", run_dir)
     if stop.requested:
         raise KeyboardInterrupt(stop.signal)  # ends a whole sweep, not only this run

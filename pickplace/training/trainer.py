@@ -21,13 +21,11 @@ from pickplace.common.machine import use_machine
 from pickplace.common.validate import excerpt
 from pickplace.config.registry import build
 from pickplace.envs.saved_state import check_saved_states
-from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.evaluation.play import Episodes, play
 from pickplace.policies.base import EstimatesValue, Policy, as_critic, refuse_large_network
 from pickplace.runs import checkpoint
 from pickplace.runs.provenance import commit, versions
 from pickplace.runs.resume import (
-    COUNTERS,
     StopRequest,
     checkpoint_config,
     checkpoint_hint,
@@ -43,6 +41,9 @@ from pickplace.training.settings import check_memory, check_settings
 from pickplace.views.figures import learning_curve
 
 log = logging.getLogger(__name__)
+
+#: Frames and batches trained, best validation occupancy, and the latest validation, in a new run.
+NEW: dict[str, Any] = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
 
 
 class Trainer:
@@ -68,91 +69,71 @@ class Trainer:
 
     def __init__(self, cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None = None):
         check_settings(cfg)
-        self.cfg, self.run_dir = cfg, run_dir
+        self.cfg, self.run_dir, self.resumed = cfg, run_dir, resume is not None
         self.saved_config, self.resume_overrides = checkpoint_config(cfg)
         self.device = use_machine(cfg)
         torch.manual_seed(cfg.seed)
-        self.resumed = resume is not None
         self.safe_folder: Path | None
         self.state, self.facts, self.safe_folder = resume or ({}, {}, None)
-        self.frames: int
-        self.iteration: int
-        self.best: float
-        self.latest: dict
-        for key, default in COUNTERS.items():
-            setattr(self, key, self.facts.get(key, default))
+        self.frames, self.iteration, self.best, self.latest = ({**NEW, **self.facts}[key] for key in NEW)
         self.episodes: Episodes | None = None
         # With other settings, a training that a callback had ended goes on.
         self.ended = self.facts.get("ended") is True and has_config(self.facts, self.saved_config)
         self.callbacks = callbacks.make_callbacks(cfg.get("callbacks") or {}, self.facts.get("callbacks") or {})
         # The order of these fixes the random draws of a seed.
         self._make_networks()
-        self._make_algorithm()
         self._make_curriculum()
         self._make_collector()
 
     def _make_networks(self) -> None:
-        """Make the items, the policy, the planner that validates it, the warm start and the critic."""
-        cfg = self.cfg
-        self.items = build("items", cfg["items"])
-        self.env_config = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
-        self.build_env = partial(build_env, self.env_config, items=self.items, device=cfg.device)
-        self.probe = probe = self.build_env(num_envs=1, masks=())
-        self.cell, self.terms, self.min_tote_height = probe.cell, probe.terms, probe.min_tote_height
-        make_actor = partial(
-            build, "model.actor", cfg.model.actor, cell=self.cell, mask_infeasible=cfg.model.mask_infeasible
-        )
-        weights = self.state if self.resumed else self._first_weights()
+        """Make the environment, the policy, the planner that validates it, the warm start, critic and algorithm."""
+        cfg, items = self.cfg, build("items", self.cfg["items"])
+        env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
+        del env["num_envs"]  # differs
+        self.build_env = partial(build, "env", env, items=items, device=cfg.device, masks=())
+        probe = self.build_env(num_envs=1)
+        self.cell, self.min_tote_height = probe.cell, probe.min_tote_height
+        weights = self.state
+        if not self.resumed and (path := cfg.warm_start.weights) is not None:
+            weights, facts = checkpoint.read(checkpoint.locate(path, key="warm_start.weights"))
+            log.info("beginning with the weights of %s, after %s frames", path, f"{facts['frames']:,}")
+        masked = cfg.model.mask_infeasible
+        make_actor = partial(build, "model.actor", cfg.model.actor, cell=self.cell, mask_infeasible=masked)
         self.policy: Policy = self._restored("policy", make_actor, weights)
         for warning in self.policy.check_sizes():
             log.warning(warning)
         self.planner = build("planner", cfg.planner, cell=self.cell, policy=self.policy)
-        self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, self.items, self.terms, cfg.seed, cfg.trust)
+        self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, items, probe.terms, cfg.seed, cfg.trust)
         self.critic = None
         if isinstance(self.policy, EstimatesValue):
             if cfg.model.critic is not None:
-                raise ValueError(
-                    f"model.critic={excerpt(dict(cfg.model.critic))}: expected null; the actor is the critic."
-                )
+                found = excerpt(dict(cfg.model.critic))
+                raise ValueError(f"model.critic={found}: expected null; the actor is the critic.")
             self.critic = as_critic(self.policy.value_network())
         elif cfg.model.critic is not None:
             make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
             self.critic = self._restored("critic", lambda: as_critic(make_critic()), weights)
-
-    def _make_algorithm(self) -> None:
-        """Make the algorithm, with its warm start, and check that its batches fit into memory."""
-        cfg = self.cfg
         observation = self.build_env(num_envs=1, masks=self.policy.masks).observation_spec.zero()
-        task = Task(self.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
+        task = Task(probe.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
         algorithm = build("algo", cfg.algo, policy=self.policy, critic=self.critic, task=task)
         if not isinstance(algorithm, Algorithm):
             raise ValueError(f"algo={excerpt(algorithm)}: expected an algorithm, such as algo=ppo.")
         self.algorithm = with_warm_start(algorithm, self.warm_start)
-        check_memory(cfg, self.probe, self.policy, self.algorithm)
-
-    def _first_weights(self) -> dict:
-        """Return the networks with whose weights a new training begins; empty without ``warm_start.weights``."""
-        if (path := self.cfg.warm_start.weights) is None:
-            return {}
-        state, facts = checkpoint.read(checkpoint.locate(path, key="warm_start.weights"))
-        log.info("beginning with the weights of %s, after %s frames", path, f"{facts['frames']:,}")
-        return state
+        check_memory(cfg, probe, self.policy, self.algorithm)
 
     def _restored(self, key: str, make, weights: dict) -> Any:
         """Make a module, with the weights of the checkpoint that the run continues or begins with."""
         refuse_large_network(make, f"model.{'actor' if key == 'policy' else key}")
         try:
-            module = checkpoint.restore(make, weights.get(key, {}), key) if weights else make()
+            return (checkpoint.restore(make, weights.get(key, {}), key) if weights else make()).to(self.device)
         except checkpoint.CheckpointError as error:
             if self.resumed:
                 raise
             if key == "policy":
-                raise checkpoint.CheckpointError(
-                    f"warm_start.weights={self.cfg.warm_start.weights}: {error}"
-                ) from error
+                message = f"warm_start.weights={self.cfg.warm_start.weights}: {error}"
+                raise checkpoint.CheckpointError(message) from error
             log.warning("warm_start.weights: the critic begins anew. %s", error)
-            module = make()
-        return module.to(self.device)
+            return make().to(self.device)
 
     def _make_curriculum(self) -> None:
         """Make the curriculum, and warn of a budget that is too small and of a best checkpoint that is stale."""
@@ -161,9 +142,8 @@ class Trainer:
         self.curriculum.setup(self.min_tote_height, self.cell.tote_size[2], cfg.total_frames)
         if self.resumed:
             self.curriculum.load_state_dict(self.facts["curriculum"])
-            stale = stale_best_frames(self.run_dir, self.frames, self.saved_config)
-            if stale is not None:
-                self.best = COUNTERS["best"]
+            if (stale := stale_best_frames(self.run_dir, self.frames, self.saved_config)) is not None:
+                self.best = NEW["best"]
                 log.warning(
                     "checkpoints/best is of frame %s and of other settings; the next validation replaces it",
                     f"{stale:,}",
@@ -174,16 +154,14 @@ class Trainer:
     def _make_collector(self) -> None:
         """Make the collector of the algorithm's acting policy."""
         cfg = self.cfg
-        make_env = partial(
-            training_env, self.env_config, self.items, cfg.device, self.policy.masks, cfg.env.num_envs, self.curriculum
-        )
+        base_env = partial(self.build_env, masks=self.policy.masks, episode_stride=cfg.env.num_envs)
         self.acting = self.algorithm.acting_policy()
         if self.resumed:
             refuse_other_workers(cfg.collector, self.state.get("collector"))
         self.collector = build(
             "collector",
             cfg.collector,
-            make_env=make_env,
+            make_env=partial(training_env, base_env, self.curriculum),
             policy=self.acting,
             num_envs=cfg.env.num_envs,
             rollout_length=cfg.rollout_length,
@@ -219,7 +197,17 @@ class Trainer:
         with ExitStack() as cleanup:
             cleanup.callback(self.collector.shutdown)
             if self.resumed:
-                self._restore_state()
+                self.algorithm.load_state_dict(self.state.get("algorithm"))
+                with watch_workers(self.collector):
+                    own = self.collector.state_dict()
+                    saved = checkpoint.matching_state(self.state.get("collector"), own, "collector")
+                    check_saved_states(self.build_env(num_envs=1), saved)
+                    self.collector.load_state_dict(saved)
+                    push_level(self.collector, self.curriculum.level)
+                # Last: everything above may have drawn.
+                random = checkpoint.matching_state(self.state, rng_state(self.device), "random generator")
+                set_rng_state(random, self.device)
+                self.state = {}  # not needed any more
             settings = OmegaConf.to_container(cfg, resolve=True)
             with checkpoint_hint(lambda: self.safe_folder, self.resume_overrides, OSError):
                 self.logger = build("logger", cfg.logger, folder=self.run_dir, frames=self.frames, settings=settings)
@@ -241,53 +229,34 @@ class Trainer:
             cleanup.enter_context(watch_workers(self.collector))
             yield stop
 
-    def _restore_state(self) -> None:
-        """Restore algorithm, collector and random generators from the checkpoint."""
-        self.algorithm.load_state_dict(self.state.get("algorithm"))
-        with watch_workers(self.collector):
-            own = self.collector.state_dict()
-            saved = checkpoint.matching_state(self.state.get("collector"), own, "collector")
-            check_saved_states(self.build_env(num_envs=1, masks=()), saved)
-            self.collector.load_state_dict(saved)
-            push_level(self.collector, self.curriculum.level)
-        # Last: everything above may have drawn.
-        set_rng_state(checkpoint.matching_state(self.state, rng_state(self.device), "random generator"), self.device)
-        self.state = {}  # not needed any more
-
     def push_weights(self) -> None:
         """Send the newest weights to the collector's processes."""
         self.collector.update_policy_weights_(TensorDict.from_module(self.acting).data)
 
-    def advance_curriculum(self, batch: TensorDictBase) -> dict:
-        """Move the curriculum by the episodes that finished in the batch; return its metrics."""
+    def learn(self, batch: TensorDictBase) -> dict:
+        """Count a batch ``[N, T]``, move the curriculum by it and learn from it; return metrics."""
+        at = At(self.frames, self.frames + batch.numel(), self.iteration + 1, self.cfg.total_frames)
+        self.frames, self.iteration, level = at.frames, at.iteration, self.curriculum.level
         done = batch["next", "done"][..., 0]
         heights, occupancy = (batch["next", key][done][:, 0] for key in ("tote_height", "occupancy"))
-        level = self.curriculum.level
-        metrics = self.curriculum.update(heights, occupancy, self.frames)
+        metrics = episode_metrics(batch) | self.curriculum.update(heights, occupancy, self.frames)
         if self.curriculum.level != level:
             push_level(self.collector, self.curriculum.level)
             log.info("%s frames: tote height %d -> %d", f"{self.frames:,}", level, self.curriculum.level)
             callbacks.call(self.callbacks, "on_level_change", self, level, self.curriculum.level)
-        return metrics
-
-    def learn(self, batch: TensorDictBase) -> dict:
-        """Count a batch ``[N, T]``, move the curriculum by it and learn from it; return metrics."""
-        before = self.frames
-        self.frames += batch.numel()
-        self.iteration += 1
-        metrics = episode_metrics(batch) | self.advance_curriculum(batch)
-        at = At(before, self.frames, self.iteration, self.cfg.total_frames)
         return metrics | self.algorithm.learn(batch, at)
 
     def validate(self, record=()) -> Episodes:
         """Play the validation stream at full height, and record the episodes of these numbers."""
         evaluation = self.cfg.evaluation
-
-        def make_env(first, count):
-            stream = {"stream": evaluation.stream, "seed": evaluation.seed, "first_episode": first}
-            return self.build_env(num_envs=count, masks=(), **stream)
-
-        return play(make_env, self.planner, evaluation.episodes, evaluation.batch_size, record)
+        base_env = partial(self.build_env, stream=evaluation.stream, seed=evaluation.seed)
+        return play(
+            lambda first, count: base_env(first_episode=first, num_envs=count),
+            self.planner,
+            evaluation.episodes,
+            evaluation.batch_size,
+            record,
+        )
 
     def finish_batch(self, metrics: dict, before: int) -> None:
         """Validate, log, save and print progress where their intervals ended between ``before`` and now."""
@@ -320,7 +289,7 @@ class Trainer:
             **rng_state(self.device),
         }
         facts = {
-            **{key: getattr(self, key) for key in COUNTERS},
+            **{key: getattr(self, key) for key in NEW},
             "curriculum": self.curriculum.state_dict(),
             "callbacks": callbacks.saved_states(self.callbacks),
             "ended": self.ended,
@@ -334,11 +303,16 @@ class Trainer:
         if name == "last":
             self.last_saved = self.frames
 
-    def log_ending(self, stopped: bool) -> None:
-        """Log how a stopped run is continued, or that the curriculum did not reach its last height."""
-        level, end = self.curriculum.level, self.curriculum.end
+    def report(self, stopped: bool) -> None:
+        """Log how the run ended, draw the learning curve, and write ``report.html`` of a complete run if it is not up
+        to date.
+
+        Args:
+            stopped: whether a signal has ended the loop.
+        """
+        run_dir, level, end = self.run_dir, self.curriculum.level, self.curriculum.end
         if stopped:
-            command = f"pickplace-train resume={shlex.quote(str(self.run_dir))}{self.resume_overrides}"
+            command = f"pickplace-train resume={shlex.quote(str(run_dir))}{self.resume_overrides}"
             log.info("stopped at %s frames; continue with: %s", f"{self.frames:,}", command)
         elif level < end:
             log.info(
@@ -347,38 +321,19 @@ class Trainer:
                 level,
                 end,
             )
-
-    def write_report(self) -> None:
-        """Draw the learning curve; for a complete run also write ``report.html``, unless it is up to date."""
-        run_dir = self.run_dir
         if not (run_dir / "metrics.csv").is_file():
             return
         with replaced_file(run_dir / "learning_curve.png") as new:
             learning_curve(run_dir / "metrics.csv", new)
-        up_to_date = self.episodes is None and (run_dir / REPORT).is_file()  # nothing was trained since
-        if self.is_complete and not up_to_date:
+        # Without an episode of this process nothing was trained since the report was written.
+        if self.is_complete and (self.episodes is not None or not (run_dir / REPORT).is_file()):
             log.info("writing the report")
-            episodes = self.episodes or self.validate()
-            extremes = {int(episodes.occupancy.argmin()), int(episodes.occupancy.argmax())}
-            replayed = self.validate(record=extremes)
+            occupancy = (self.episodes or self.validate()).occupancy
+            replayed = self.validate(record={int(occupancy.argmin()), int(occupancy.argmax())})
             write_report(run_dir, self.cfg, replayed, self.cell, versions() | {"commit": commit()})
 
 
-def build_env(env_config: dict, num_envs: int, **kwargs) -> PickPlaceEnv:
-    """Make the environment of the config group ``env`` with another number of slots."""
-    return build("env", {**env_config, "num_envs": num_envs}, **kwargs)
-
-
-def training_env(env_config, items, device, masks, total_envs, curriculum, first_episode, num_envs) -> TransformedEnv:
-    """Make the environment of one collector process: slots ``first_episode ..`` of ``total_envs``, under the
-    curriculum."""
-    env = build_env(
-        env_config,
-        num_envs,
-        items=items,
-        device=device,
-        masks=masks,
-        first_episode=first_episode,
-        episode_stride=total_envs,
-    )
+def training_env(base_env, curriculum: Curriculum, first_episode: int, num_envs: int) -> TransformedEnv:
+    """Make the environment of one collector process: slots ``first_episode ..``, under the curriculum."""
+    env = base_env(first_episode=first_episode, num_envs=num_envs)
     return TransformedEnv(env, Compose(curriculum.transform()))

@@ -19,7 +19,7 @@ def test_the_same_training_twice(smoke, tmp_path, monkeypatch):
     """For PPO see test_resume: a run that is killed equals one that is not."""
     settings = ["algo=a2c", "curriculum=mixture", "warm_start=imitate", "planner@warm_start.teacher=random"]
     quick = ["total_frames=384", "warm_start.frames=128", "evaluation.episodes=2", "seed=3"]
-    monkeypatch.setattr(Trainer, "write_report", lambda self: None)
+    monkeypatch.setattr(Trainer, "report", lambda self, stopped: None)
     for name in "ab":
         smoke(tmp_path / name, *quick, *settings)
     assert_same(tmp_path / "a", tmp_path / "b")

@@ -1,12 +1,12 @@
 """Training: advantages by hand, what each loss and step consists of, and the wiring of stream, slots and curriculum."""
 
 from copy import deepcopy
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 import torch
 from commands import algorithm_of, composed
-from omegaconf import OmegaConf
 from torch import nn
 from torchrl.modules import ValueOperator
 
@@ -155,7 +155,7 @@ def test_a_run_counts_logs_scales_and_saves(smoke, tmp_path, monkeypatch):
     occupancies, rows, pushed = iter([0.5, 0.8, 0.6, 0.7, 0.1]), [], []
     interval = {"ci95_low": 0.0, "ci95_high": 1.0}
     monkeypatch.setattr(trainer, "validation_metrics", lambda _: {"occupancy": next(occupancies), **interval})
-    monkeypatch.setattr(Trainer, "write_report", lambda self: None)
+    monkeypatch.setattr(Trainer, "report", lambda self, stopped: None)
     monkeypatch.setattr(Trainer, "push_weights", lambda self: pushed.append(self.frames))
     levels = ["curriculum=paper", "curriculum.advance.frames_per_level=256", "env.tote_size=[4,4,3]"]
     quick = ["algo.minibatch_size=128", "evaluation.episodes=1", "evaluation_interval=128"]
@@ -187,10 +187,9 @@ def test_the_slots_of_all_workers_share_the_episodes_of_a_stream():
     """Each episode is played once, by one of them."""
     curriculum, cfg, played = Curriculum(NoAdvance(), Current()), composed("env.tote_size=[4,4,2]"), []
     curriculum.setup(1, 2, 100)
-    env_config = OmegaConf.to_container(cfg.env)
-    common = (env_config, build("items", cfg["items"]), "cpu", ("footprint",), 4, curriculum)
+    base_env = partial(PickPlaceEnv, tote_size=(4, 4, 2), items=build("items", cfg["items"]), episode_stride=4)
     for first in (0, 2):
-        env = training_env(*common, first_episode=first, num_envs=2)
+        env = training_env(base_env, curriculum, first_episode=first, num_envs=2)
         env.set_seed(0)
         for _ in range(3):
             env.reset()
