@@ -315,7 +315,7 @@ def test_another_number_of_workers_starts_none(smoke_run, tmp_path):
     folder = checkpoint.locate(smoke_run, "last")
     state, facts = checkpoint.read(folder)
     cfg = OmegaConf.create(facts["config"] | {"collector": {"_target_": "multi_sync", "workers": 8}})
-    with pytest.raises(ValueError, match="collector.workers=8: the checkpoint has 0 workers; expected as many"):
+    with pytest.raises(ValueError, match="collector.workers=8: expected 0, as many as the checkpoint has"):
         Trainer(cfg, tmp_path, (state, facts, folder))
     refuse_other_workers({"_target_": "multi_sync"}, {"worker0": {}, "worker1": {}})  # the default number
     cfg.collector = {"_target_": "single", "workers": 0}

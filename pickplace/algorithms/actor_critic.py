@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torchrl.modules import ValueOperator
 from torchrl.objectives import A2CLoss, ClipPPOLoss
@@ -14,8 +14,8 @@ from torchrl.objectives.value import GAE
 
 from pickplace.algorithms.base import At, Task
 from pickplace.algorithms.descent import MAX_WEIGHT, MinibatchDescent
-from pickplace.common.validate import flag, number
-from pickplace.policies.base import EstimatesValue, Policy, as_actor, as_collection_policy
+from pickplace.common.validate import expect, flag, number
+from pickplace.policies.base import EstimatesValue, Policy, as_actor
 
 
 class ActorCritic(MinibatchDescent):
@@ -40,7 +40,7 @@ class ActorCritic(MinibatchDescent):
     def __init__(
         self,
         policy: Policy,
-        critic: ValueOperator | None,
+        critic: ValueOperator,
         task: Task,
         gamma: float,
         lmbda: float,
@@ -50,10 +50,10 @@ class ActorCritic(MinibatchDescent):
         **descent,
     ):
         super().__init__(policy, task, **descent)
-        if isinstance(policy, EstimatesValue):
-            raise ValueError("algo: this model follows from the value that it learns; expected algo=td.")
-        if critic is None:
-            raise ValueError("model.critic=None: expected a network, from whose values the advantages follow.")
+        expect(
+            not isinstance(policy, EstimatesValue), "algo", type(self).__name__, "algo=td, of whose values it follows"
+        )
+        expect(critic is not None, "model.critic", critic, "a network, from whose values the advantages follow")
         self.critic, self.gamma = critic, number("algo.gamma", gamma, most=1)
         self.normalize_advantage = flag("algo.normalize_advantage", normalize_advantage)
         coefficients = {
@@ -82,9 +82,6 @@ class ActorCritic(MinibatchDescent):
         """Return the policy as the loss wants it."""
         return as_actor(self.policy)
 
-    def acting_policy(self) -> TensorDictModuleBase:
-        return as_collection_policy(self.policy)
-
     def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
         return self.descend(self.prepare(batch, at), at, self.objective)
 
@@ -101,7 +98,6 @@ class ActorCritic(MinibatchDescent):
         return batch.select(*keys, "advantage", "value_target").reshape(-1)
 
     def losses(self, data: TensorDictBase) -> TensorDictBase:
-        """Return the parts of TorchRL's loss of a minibatch ``[B]``."""
         return self.loss(data)
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, Mapping[str, Any]]:

@@ -6,11 +6,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from pickplace.algorithms.base import Algorithm, At, Objective, Task, load_optimizer
 from pickplace.common.validate import number, or_null, whole_number
-from pickplace.policies.base import Policy
+from pickplace.policies.base import Policy, as_collection_policy
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +61,9 @@ class MinibatchDescent(Algorithm):
         self.lr = number("algo.lr", lr, most=MAX_WEIGHT)
         self.lr_decay_start = or_null(number, "algo.lr_decay_start", lr_decay_start, 0, 1)
         self.max_grad_norm = number("algo.max_grad_norm", max_grad_norm, 1e-9, MAX_WEIGHT)
+
+    def acting_policy(self) -> TensorDictModuleBase:
+        return as_collection_policy(self.policy)
 
     def use_parameters(self, parameters: Iterable[torch.nn.Parameter]) -> None:
         """Make the optimizer of these parameters."""

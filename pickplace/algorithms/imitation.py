@@ -1,7 +1,6 @@
 """Warm start: a policy imitates a planner before it learns from reward."""
 
 import re
-from collections.abc import Mapping
 from contextlib import contextmanager
 from typing import Any, cast
 
@@ -13,14 +12,13 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from pickplace.algorithms.base import Algorithm, At, Imitable
+from pickplace.common.validate import expect
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import accepted_arguments, build, find
-from pickplace.items.distributions import ItemDistribution
+from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.planners.base import BatchPlanner
 from pickplace.planners.use import decide, planner_parts
 from pickplace.policies.base import MASKED, Policy
-from pickplace.rules.cell import CellSpec
-from pickplace.rules.observation import Term
 from pickplace.rules.state import State
 from pickplace.rules.step import apply
 from pickplace.runs import checkpoint
@@ -42,9 +40,7 @@ class WarmStart:
     Args:
         cfg: the config group ``warm_start``.
         policy: the policy that is trained.
-        cell: the sizes.
-        items: the item distribution, for a teacher that samples items.
-        terms: of the observation, by key.
+        env: an environment of the training, for its sizes, items and terms.
         seed: seed of a teacher that draws.
         trust: modules of the user whose classes the config of the teacher's checkpoint may name.
 
@@ -57,18 +53,15 @@ class WarmStart:
         self,
         cfg: DictConfig,
         policy: Policy,
-        cell: CellSpec,
-        items: ItemDistribution,
-        terms: Mapping[str, Term],
+        env: PickPlaceEnv,
         seed: int,
         trust=(),
     ):
         self.frames, self.critic_frames = cfg.frames, cfg.critic_frames
-        self.policy, self.cell, self.seed = policy, cell, seed
+        self.policy, self.cell, self.seed = policy, env.cell, seed
         if not cfg.frames:
             return
-        if cfg.teacher is None:
-            raise ValueError(f"warm_start.frames={cfg.frames}: there is no teacher; expected warm_start=imitate.")
+        expect(cfg.teacher is not None, "warm_start.frames", cfg.frames, "0 without a teacher, or warm_start=imitate")
         trained = None
         if cfg.checkpoint is not None:
             state, facts = checkpoint.read(checkpoint.locate(cfg.checkpoint))
@@ -77,7 +70,7 @@ class WarmStart:
         known = accepted_arguments(find("warm_start.teacher", cfg.teacher._target_))
         self._draws = "seed" in (cfg.teacher if known is None else known)
         self._settings = cast(dict, OmegaConf.to_container(cfg.teacher, resolve=True))
-        self._parts = planner_parts(cfg.teacher, cell, items, terms, trained)
+        self._parts = planner_parts(cfg.teacher, env.cell, env.items, env.terms, trained)
         self._make_teacher(0)  # refuses bad settings before the first batch
 
     def _make_teacher(self, iteration: int) -> BatchPlanner:
@@ -161,8 +154,10 @@ def with_warm_start(algorithm: Algorithm, warm_start: WarmStart) -> Algorithm:
         ValueError: for an algorithm whose policy cannot imitate.
     """
     for key in ("frames", "critic_frames"):
-        if (frames := getattr(warm_start, key)) and not isinstance(algorithm, Imitable):
-            raise ValueError(f"warm_start.{key}={frames}: expected 0; {type(algorithm).__name__} imitates no teacher.")
+        frames, can_imitate = getattr(warm_start, key), isinstance(algorithm, Imitable)
+        expect(
+            can_imitate or not frames, f"warm_start.{key}", frames, f"0; {type(algorithm).__name__} imitates no teacher"
+        )
     return Imitation(algorithm, warm_start) if warm_start.frames + warm_start.critic_frames else algorithm
 
 

@@ -15,7 +15,7 @@ from torchrl.objectives import ClipPPOLoss
 from pickplace.algorithms.base import At
 from pickplace.algorithms.ppo import PPO
 from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS, as_sampled_actor, as_sampling_policy
-from pickplace.common.validate import excerpt, number, one_of, whole_number
+from pickplace.common.validate import expect, number, one_of, whole_number
 from pickplace.rules.item import Item
 from pickplace.rules.masks import footprint_mask, placing_maps
 from pickplace.rules.observation import observe
@@ -41,11 +41,13 @@ class SampledPPO(PPO):
         self.temperature = number("algo.temperature", temperature, 0.01, 100.0)
         self.advantages = one_of("algo.advantages", advantages, ("vine", "gae"))
         super().__init__(*networks, **settings)
-        if (several := self.policy.cell.bin_items) != 1 and advantages == "vine":
-            raise ValueError(
-                f"algo.advantages=vine: expected gae with env.bin_items={excerpt(several)}; vine knows one item in the "
-                "bin."
-            )
+        items = self.policy.cell.bin_items
+        expect(
+            items == 1 or advantages == "gae",
+            "algo.advantages",
+            advantages,
+            f"gae with env.bin_items={items}; vine knows one item in the bin",
+        )
 
     def make_loss(self, **common) -> ClipPPOLoss:
         # Advantages are normalised in prepare(): most of those that the loss sees are 0.

@@ -5,15 +5,14 @@ from collections.abc import Mapping
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import ValueOperator
 from torchrl.objectives.value import GAE
 
 from pickplace.algorithms.base import At, Task
 from pickplace.algorithms.descent import MinibatchDescent
-from pickplace.common.validate import number, whole_number
-from pickplace.policies.base import EstimatesValue, Policy, as_collection_policy
+from pickplace.common.validate import expect, number, whole_number
+from pickplace.policies.base import EstimatesValue, Policy
 
 
 class TD(MinibatchDescent):
@@ -29,12 +28,11 @@ class TD(MinibatchDescent):
     """
 
     def __init__(self, policy: Policy, critic: ValueOperator, task: Task, gamma: float, lmbda: float, **descent):
-        if not isinstance(policy, EstimatesValue):
-            raise ValueError("algo: td learns the values that a policy follows from; expected model=afterstate.")
+        expect(isinstance(policy, EstimatesValue), "algo", "td", "model=afterstate, which follows from the values")
         super().__init__(policy, task, **descent)
         whole_number("rollout_length", task.rollout_length, 2)
-        if (scale := policy.value_network().reward_scale) != task.reward_scale:
-            raise ValueError(f"model.actor.reward_scale={scale}: expected reward_scale={task.reward_scale}.")
+        scale = policy.value_network().reward_scale
+        expect(scale == task.reward_scale, "model.actor.reward_scale", scale, f"reward_scale={task.reward_scale}")
         self.critic = critic
         self.advantage = GAE(
             gamma=number("algo.gamma", gamma, most=1),
@@ -43,9 +41,6 @@ class TD(MinibatchDescent):
             deactivate_vmap=True,
         )
         self.use_parameters(critic.parameters())
-
-    def acting_policy(self) -> TensorDictModuleBase:
-        return as_collection_policy(self.policy)
 
     def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
         return self.descend(afterstates(batch, self.advantage, self.task.reward_scale), at, self.objective)

@@ -4,7 +4,7 @@ import json
 from numbers import Real
 from typing import Any
 
-from pickplace.common.validate import excerpt, number, or_null, whole_number
+from pickplace.common.validate import excerpt, expect, number, or_null, whole_number
 from pickplace.config.errors import sentence
 from pickplace.config.registry import build
 from pickplace.evaluation.play import Episodes
@@ -44,8 +44,9 @@ class EarlyStopping(Callback):
 
     def __init__(self, occupancy: float | None = None, patience: int | None = None):
         key = "callbacks.early_stopping."
-        if occupancy is None and patience is None:
-            raise ValueError(f"{key}occupancy=None: expected a number, here or in {key}patience.")
+        expect(
+            (occupancy, patience) != (None, None), f"{key}occupancy", occupancy, f"a number, here or in {key}patience"
+        )
         self.occupancy = or_null(number, f"{key}occupancy", occupancy, 0, 1)
         self.patience = or_null(whole_number, f"{key}patience", patience)
         self.best, self.stale = -1.0, 0
@@ -78,8 +79,8 @@ def make_callbacks(cfg, states) -> dict[str, Callback]:
     """
     callbacks = {name: build(f"callbacks.{name}", node) for name, node in cfg.items()}
     for name, callback in callbacks.items():
-        if not isinstance(callback, Callback):
-            raise ValueError(f"callbacks.{name}: expected the settings of a callback, with its _target_.")
+        expected = "the settings of a callback, with its _target_"
+        expect(isinstance(callback, Callback), f"callbacks.{name}", callback, expected)
         try:
             if name in states:
                 callback.load_state_dict(states[name])

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 
-from pickplace.common.validate import excerpt, whole_number
+from pickplace.common.validate import expect, whole_number
 from pickplace.config.errors import WorkerDied, missing_extra
 from pickplace.config.registry import names_at
 from pickplace.runs.checkpoint import CheckpointError
@@ -304,10 +304,8 @@ def _started(collector, seeds: Sequence[tuple[int, ...]]):
 
 
 def _share(num_envs: int, workers: int, most: int) -> int:
-    """Number of slots of each worker, of which there may be ``most``."""
     whole_number("collector.workers", workers, most=most)
-    if num_envs % workers:
-        raise ValueError(f"collector.workers={workers}: expected a divisor of env.num_envs={num_envs}.")
+    expect(num_envs % workers == 0, "collector.workers", workers, f"a divisor of env.num_envs={num_envs}")
     return num_envs // workers
 
 
@@ -319,14 +317,12 @@ def refuse_other_workers(settings: Mapping, state: object) -> None:
         state: the checkpoint's state of the collector.
 
     Raises:
-        CheckpointError: naming both numbers.
+        ValueError: naming both numbers.
     """
     saved = sum(str(key).startswith("worker") for key in state) if isinstance(state, dict) else 0
     workers = settings.get("workers", saved)
-    if settings["_target_"] in names_at("collector") and workers != saved:
-        raise CheckpointError(
-            f"collector.workers={excerpt(workers)}: the checkpoint has {saved} workers; expected as many."
-        )
+    if settings["_target_"] in names_at("collector"):
+        expect(workers == saved, "collector.workers", workers, f"{saved}, as many as the checkpoint has")
 
 
 def _seeds(seed: int, workers: int) -> list[tuple[int, int]]:

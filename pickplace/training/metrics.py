@@ -1,11 +1,10 @@
-"""Metrics of a batch and of a validation, and the progress line."""
+"""Metrics of a batch and of a validation, and the intervals at which something happens."""
 
 from tensordict import TensorDictBase
 
 from pickplace.evaluation.play import Episodes
 from pickplace.evaluation.result import confidence95
 from pickplace.rules.state import Failure
-from pickplace.training.curriculum import Curriculum
 
 
 def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
@@ -29,14 +28,3 @@ def validation_metrics(episodes: Episodes) -> dict[str, float]:
 def has_passed(before: int, now: int, interval: int) -> bool:
     """Return whether a multiple of ``interval`` lies in ``(before, now]``; it works for any batch size."""
     return before // interval != now // interval
-
-
-def progress_line(frames: int, total: int, speed: float, curriculum: Curriculum, metrics: dict) -> str:
-    """Frames, speed, level, occupancy and remaining time, as one line."""
-    left = int(max(total - frames, 0) / speed)  # the last batch is collected whole
-    occupancy = metrics.get("train/occupancy", float("nan"))
-    return (
-        f"{frames / total:4.0%} {frames:>11,} frames | {speed:6,.0f}/s | "
-        f"tote height {curriculum.level}/{curriculum.end} | occupancy {occupancy:.3f} | "
-        f"{left // 60}:{left % 60:02d} to go"
-    )

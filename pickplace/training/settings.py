@@ -7,7 +7,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.algorithms.base import Algorithm
-from pickplace.common.validate import check_bytes, excerpt, flag, number, or_null, whole_number
+from pickplace.common.validate import check_bytes, expect, flag, number, or_null, whole_number
 from pickplace.config.allowlist import own_modules
 from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
@@ -16,21 +16,15 @@ from pickplace.items.distributions import check_seed
 from pickplace.policies.base import Policy
 
 
-def _expect(is_right: Callable[[Any], bool], expected: str) -> Callable[[str, Any], None]:
-    """Return a check that refuses other values."""
-
-    def check(key: str, value) -> None:
-        if not is_right(value):
-            raise ValueError(f"{key}={excerpt(value)}: expected {expected}.")
-
-    return check
+def _check(is_right: Callable[[Any], bool], expected: str) -> Callable[[str, Any], None]:
+    return lambda key, value: expect(is_right(value), key, value, expected)
 
 
-_group = _expect(OmegaConf.is_dict, "settings by their names")
-_node = _expect(
+_group = _check(OmegaConf.is_dict, "settings by their names")
+_node = _check(
     lambda value: OmegaConf.is_dict(value) and "_target_" in value, "the settings of an object, with its _target_"
 )
-_text = _expect(lambda value: isinstance(value, str) and len(value) <= 1_000, "a text of at most 1,000 characters")
+_text = _check(lambda value: isinstance(value, str) and len(value) <= 1_000, "a text of at most 1,000 characters")
 
 #: The check of each key, in this order.
 CHECKS: dict[str, Callable] = {
@@ -45,8 +39,8 @@ CHECKS: dict[str, Callable] = {
     "env.num_envs": partial(whole_number, most=32_768),
     "rollout_length": whole_number,
     "model.mask_infeasible": flag,
-    "planner._target_": _expect(lambda value: value == "policy", "policy, since training validates its own policy"),
-    "evaluation.stream": _expect(
+    "planner._target_": _check(lambda value: value == "policy", "policy, since training validates its own policy"),
+    "evaluation.stream": _check(
         lambda value: value == "validation", "validation, on which training selects its best policy"
     ),
     "reward_scale": partial(number, least=1e-9, most=1e38),  # float32 ends there
@@ -81,11 +75,10 @@ def check_memory(cfg: DictConfig, env: PickPlaceEnv, policy: Policy, algorithm: 
         ValueError: naming the keys, their values, and the memory.
     """
     cell, masks, slots, steps = env.cell, policy.masks, cfg.env.num_envs, cfg.rollout_length
-    choice = 20  # bytes of choice, log-probability and action
-    frame = 2 * env.observation_bytes + sum(MASKS[name].size(cell) for name in masks) + 200 * cell.num_places + choice
+    # The last 20 bytes are choice, log-probability and action.
+    frame = 2 * env.observation_bytes + sum(MASKS[name].size(cell) for name in masks) + 200 * cell.num_places + 20
     check_bytes(f"env.num_envs={slots}, rollout_length={steps}", slots * steps * frame, env.device)
     for setting, needed in algorithm.memory(frame).items():
         check_bytes(setting, needed, env.device)
-    problem = max(problem_bytes(cell, masks), policy.acting_bytes)
-    check_bytes(f"env.num_envs={slots}", slots * problem, env.device)
+    check_bytes(f"env.num_envs={slots}", slots * max(problem_bytes(cell, masks), policy.acting_bytes), env.device)
     check_play(cfg.evaluation, cell, env.device)

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from pickplace.common.files import read_text, replaced_file
+from pickplace.common.validate import expect
 from pickplace.config.errors import one_sentence, sentence
 from pickplace.runs.checkpoint import read_facts
 from pickplace.runs.folder import FAILURE, is_claimed, read_note
@@ -58,9 +59,8 @@ def read_run(folder: Path) -> SweepRun:
     run = SweepRun(folder.name)
     try:
         words = read_note(folder, "overrides.yaml")
-        if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
-            note = folder / ".hydra" / "overrides.yaml"
-            raise ValueError(f"{note}: expected the overrides of the run, as Hydra notes.")
+        good = isinstance(words, list) and all(isinstance(word, str) for word in words)
+        expect(good, f"{folder}/.hydra/overrides.yaml", words, "the overrides of the run, as Hydra notes them")
         run.overrides = dict(word.lstrip("+").partition("=")[::2] for word in words)
         facts = read_facts(folder, "last")
         if (folder / "metrics.csv").is_file():

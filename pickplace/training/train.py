@@ -7,6 +7,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from pickplace.common.validate import expect
 from pickplace.config.errors import one_sentence
 from pickplace.config.hydra_app import Command
 from pickplace.runs import checkpoint
@@ -33,8 +34,7 @@ def train(cfg: DictConfig, run_dir: Path) -> float:
         ValueError: for settings that make no sense, or a run folder that holds another training.
         KeyboardInterrupt: as :func:`run`.
     """
-    if cfg.resume is not None:
-        raise ValueError(f"resume={cfg.resume}: expected as resume=<run folder> on the command line, without a +.")
+    expect(cfg.resume is None, "resume", cfg.resume, "as resume=<run folder> on the command line, without a +")
     with claim(run_dir):
         return run(cfg, run_dir, interrupted_run(cfg, run_dir))
 
@@ -96,15 +96,13 @@ def resume_run(overrides: list[str]) -> float:
     """
     place = next(item for item in overrides if item.startswith("resume=")).partition("=")[2]
     folder = checkpoint.locate(place, prefer="last")
-    if folder.parent.name != "checkpoints":
-        raise ValueError(f"resume={place}: expected a run folder, or one of its checkpoints: last, best or previous.")
-    run_dir = folder.parent.parent
+    run_dir, expected = folder.parent.parent, "a run folder, or one of its checkpoints: last, best or previous"
+    expect(folder.parent.name == "checkpoints", "resume", place, expected)
     refuse_links(run_dir)
     with claim(run_dir):  # before reading what another process may be writing
         state, facts = checkpoint.read(folder)
         cfg = resumed_config(place, facts, [item for item in overrides if not item.startswith("resume=")])
-        log_file = run_dir / "train.log"
-        handlers: list[logging.Handler] = [logging.StreamHandler(sys.stdout), logging.FileHandler(log_file)]
+        handlers = (logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log"))
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
         (run_dir / FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")

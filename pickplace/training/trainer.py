@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from math import nan
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,7 +19,7 @@ from pickplace.algorithms.base import Algorithm, At, Task
 from pickplace.algorithms.imitation import WarmStart, with_warm_start
 from pickplace.common.files import replaced_file
 from pickplace.common.machine import use_machine
-from pickplace.common.validate import excerpt
+from pickplace.common.validate import expect
 from pickplace.config.registry import build
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.evaluation.play import Episodes, play
@@ -34,8 +35,9 @@ from pickplace.runs.resume import (
 )
 from pickplace.training import callbacks
 from pickplace.training.collectors import refuse_other_workers, rng_state, set_rng_state, watch_workers
-from pickplace.training.curriculum import Curriculum, push_level
-from pickplace.training.metrics import episode_metrics, has_passed, progress_line, validation_metrics
+from pickplace.training.curriculum.levels import Curriculum
+from pickplace.training.curriculum.transform import push_level
+from pickplace.training.metrics import episode_metrics, has_passed, validation_metrics
 from pickplace.training.report import REPORT, write_report
 from pickplace.training.settings import check_memory, check_settings
 from pickplace.views.figures import learning_curve
@@ -87,10 +89,10 @@ class Trainer:
 
     def _make_networks(self) -> None:
         """Make the environment, the policy, the planner that validates it, the warm start, critic and algorithm."""
-        cfg, items = self.cfg, build("items", self.cfg["items"])
+        cfg = self.cfg
         env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
         del env["num_envs"]  # differs
-        self.build_env = partial(build, "env", env, items=items, device=cfg.device, masks=())
+        self.build_env = partial(build, "env", env, items=build("items", cfg["items"]), device=cfg.device, masks=())
         probe = self.build_env(num_envs=1)
         self.cell, self.min_tote_height = probe.cell, probe.min_tote_height
         weights = self.state
@@ -103,21 +105,18 @@ class Trainer:
         for warning in self.policy.check_sizes():
             log.warning(warning)
         self.planner = build("planner", cfg.planner, cell=self.cell, policy=self.policy)
-        self.warm_start = WarmStart(cfg.warm_start, self.policy, self.cell, items, probe.terms, cfg.seed, cfg.trust)
+        self.warm_start = WarmStart(cfg.warm_start, self.policy, probe, cfg.seed, cfg.trust)
         self.critic = None
         if isinstance(self.policy, EstimatesValue):
-            if cfg.model.critic is not None:
-                found = excerpt(dict(cfg.model.critic))
-                raise ValueError(f"model.critic={found}: expected null; the actor is the critic.")
+            expect(cfg.model.critic is None, "model.critic", cfg.model.critic, "null; the actor is the critic")
             self.critic = as_critic(self.policy.value_network())
         elif cfg.model.critic is not None:
             make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
             self.critic = self._restored("critic", lambda: as_critic(make_critic()), weights)
         observation = self.build_env(num_envs=1, masks=self.policy.masks).observation_spec.zero()
-        task = Task(probe.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
-        algorithm = build("algo", cfg.algo, policy=self.policy, critic=self.critic, task=task)
-        if not isinstance(algorithm, Algorithm):
-            raise ValueError(f"algo={excerpt(algorithm)}: expected an algorithm, such as algo=ppo.")
+        self.task = Task(probe.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
+        algorithm = build("algo", cfg.algo, policy=self.policy, critic=self.critic, task=self.task)
+        expect(isinstance(algorithm, Algorithm), "algo", algorithm, "an algorithm, such as algo=ppo")
         self.algorithm = with_warm_start(algorithm, self.warm_start)
         check_memory(cfg, probe, self.policy, self.algorithm)
 
@@ -137,9 +136,9 @@ class Trainer:
 
     def _make_curriculum(self) -> None:
         """Make the curriculum, and warn of a budget that is too small and of a best checkpoint that is stale."""
-        cfg = self.cfg
-        self.curriculum: Curriculum = build("curriculum", cfg.curriculum)
-        self.curriculum.setup(self.min_tote_height, self.cell.tote_size[2], cfg.total_frames)
+        total = self.cfg.total_frames
+        self.curriculum: Curriculum = build("curriculum", self.cfg.curriculum)
+        self.curriculum.setup(self.min_tote_height, self.cell.tote_size[2], total)
         if self.resumed:
             self.curriculum.load_state_dict(self.facts["curriculum"])
             if (stale := stale_best_frames(self.run_dir, self.frames, self.saved_config)) is not None:
@@ -148,11 +147,10 @@ class Trainer:
                     "checkpoints/best is of frame %s and of other settings; the next validation replaces it",
                     f"{stale:,}",
                 )
-        if shortage := self.curriculum.check_budget(cfg.total_frames, cfg.env.num_envs * cfg.rollout_length):
+        if shortage := self.curriculum.check_budget(total, self.task.batch_frames):
             log.warning(shortage)
 
     def _make_collector(self) -> None:
-        """Make the collector of the algorithm's acting policy."""
         cfg = self.cfg
         base_env = partial(self.build_env, masks=self.policy.masks, episode_stride=cfg.env.num_envs)
         self.acting = self.algorithm.acting_policy()
@@ -180,8 +178,7 @@ class Trainer:
         Args:
             reason: a sentence for the log.
         """
-        if not self.ended:
-            log.info("%s frames: %s", f"{self.frames:,}", reason)
+        log.info("%s frames: %s", f"{self.frames:,}", reason)
         self.ended = True
 
     @contextmanager
@@ -212,8 +209,8 @@ class Trainer:
             with checkpoint_hint(lambda: self.safe_folder, self.resume_overrides, OSError):
                 self.logger = build("logger", cfg.logger, folder=self.run_dir, frames=self.frames, settings=settings)
             stop, self.start_time, self.start_frames = StopRequest(), time.perf_counter(), self.frames
-            is_last = self.safe_folder is None or "last" in self.safe_folder.name
-            self.last_saved = self.frames if is_last else None  # frames of checkpoints/last
+            # Frames of checkpoints/last, or None.
+            self.last_saved = self.frames if self.safe_folder is None or "last" in self.safe_folder.name else None
             cleanup.callback(stop.restore)
             cleanup.callback(self.logger.close)
             if self.ended:
@@ -277,7 +274,12 @@ class Trainer:
             self.save("last")
         if has_passed(before, frames, cfg.progress_interval) and not self.ended:
             speed = (frames - self.start_frames) / (time.perf_counter() - self.start_time)
-            log.info(progress_line(frames, cfg.total_frames, speed, self.curriculum, metrics))
+            left = int(max(cfg.total_frames - frames, 0) / speed)  # s; the last batch is collected whole
+            log.info(
+                f"{frames / cfg.total_frames:4.0%} {frames:>11,} frames | {speed:6,.0f}/s | "
+                f"tote height {self.curriculum.level}/{self.curriculum.end} | "
+                f"occupancy {metrics.get('train/occupancy', nan):.3f} | {left // 60}:{left % 60:02d} to go"
+            )
 
     def save(self, name: str) -> None:
         """Write the checkpoint ``checkpoints/<name>``; a ``last`` keeps the one before it as ``previous``."""

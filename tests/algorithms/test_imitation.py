@@ -44,7 +44,7 @@ def warm_start(cfg, name="footprint", env=None, seed=0):
     env = env or PickPlaceEnv(num_envs=1)
     make, masked, sizes = MODELS[name]
     policy = make(env.cell, mask_infeasible=masked, **sizes)
-    return WarmStart(cfg, policy, env.cell, env.items, env.terms, seed), policy
+    return WarmStart(cfg, policy, env, seed), policy
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +147,7 @@ def test_phases_follow_each_other():
 @pytest.mark.parametrize(
     ("cfg", "message"),
     [
-        (config(None), "warm_start.frames=100: there is no teacher; expected warm_start=imitate"),
+        (config(None), "warm_start.frames=100: expected 0 without a teacher, or warm_start=imitate"),
         (config("own_planner.Nothing"), "warm_start.teacher._target_=own_planner.Nothing: there is no such"),
         (config("policy", candidates="all"), "warm_start.checkpoint=null: planner=policy needs a checkpoint"),
         (

@@ -104,7 +104,7 @@ BAD = [
     # resume
     ("train", "resume=nowhere", ["nowhere'", "run folder"]),
     ("train", "resume=nowhere -m", ["resume", "flags"]),
-    ("train", "++resume=nowhere", ["resume=nowhere", "without a +"]),
+    ("train", "++resume=nowhere", ["resume='nowhere'", "without a +"]),
     # evaluation
     ("evaluate", "", ["checkpoint=null", "run folder"]),
     ("evaluate", "checkpoint=nowhere", ["nowhere'", "run folder"]),

@@ -180,8 +180,8 @@ def shared(state):
 
 
 @pytest.mark.parametrize(("words", "refusal"), [
-    (["model=afterstate"], "algo: .*expected algo=td"),
-    (["algo=td"], "algo: .*expected model=afterstate"),
+    (["model=afterstate"], "algo='PPO': expected algo=td"),
+    (["algo=td"], "algo='td': expected model=afterstate"),
     (["model=afterstate", "algo=td", "warm_start=imitate"], "warm_start.frames=200000: expected 0"),
     (["model=afterstate", "algo=td", "+algo.samples=2"], "algo.samples: there is no key"),
     (["model=afterstate", "algo=td", "rollout_length=1"], "rollout_length=1: expected a whole number >= 2"),

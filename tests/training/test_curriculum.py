@@ -10,7 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pickplace.config.registry import build
-from pickplace.training.curriculum import Advance, Current, Curriculum, Frames, NoAdvance, Plateau, Staged, Threshold
+from pickplace.training.curriculum.advance import Advance, Frames, NoAdvance, Plateau, Staged, Threshold
+from pickplace.training.curriculum.levels import Curriculum
+from pickplace.training.curriculum.sample import Current
 
 
 def make(advance, sample=None, low=1, high=5, total_frames=1000, **heights):
@@ -206,7 +208,7 @@ ERRORS = [
     ),
     (lambda: make(NONE).load_state_dict({"level": 1}), "The checkpoint's curriculum is .* saved"),
     # A user's rule.
-    (lambda: play(make(Own(1.5)), 10), "advance: Own: its level is 1.5; expected a whole number"),
+    (lambda: play(make(Own(1.5)), 10), "advance: Own: its level=1.5: expected a whole number"),
     (lambda: play(make(Own(1, logs={"mood": "good"})), 10), "Own: it logs mood='good'; expected a number"),
     (lambda: make(Own(1, torch.tensor(1))), r"Own: its state has seen=tensor\(1\); expected a finite Python number"),
     (lambda: make(Own(1, float("nan"))), "Own: its state has seen=nan"),

@@ -23,7 +23,9 @@ from pickplace.policies.fcn_grasp.policy import fcn_grasp
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
 from pickplace.training import trainer
-from pickplace.training.curriculum import Current, Curriculum, NoAdvance
+from pickplace.training.curriculum.advance import NoAdvance
+from pickplace.training.curriculum.levels import Curriculum
+from pickplace.training.curriculum.sample import Current
 from pickplace.training.metrics import episode_metrics, has_passed
 from pickplace.training.trainer import Trainer, training_env
 

@@ -14,7 +14,8 @@ from pickplace.config.errors import WorkerDied
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
 from pickplace.training import collectors
-from pickplace.training.curriculum import Current, ToteHeightCurriculum, push_level
+from pickplace.training.curriculum.sample import Current
+from pickplace.training.curriculum.transform import ToteHeightCurriculum, push_level
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,10 @@ from torchrl.envs.utils import check_env_specs
 
 from pickplace import PickPlaceEnv
 from pickplace.training import collectors
-from pickplace.training.curriculum import Current, Curriculum, NoAdvance, Recent, Uniform, push_level
+from pickplace.training.curriculum.advance import NoAdvance
+from pickplace.training.curriculum.levels import Curriculum
+from pickplace.training.curriculum.sample import Current, Recent, Uniform
+from pickplace.training.curriculum.transform import push_level
 
 SAMPLERS = [  # shares of the heights 2 to 5, at level 5
     (Current(), [0, 0, 0, 1]), (Uniform(), [1 / 4] * 4), (Recent(0.25), [1 / 12] * 3 + [3 / 4]),

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pickplace.common.validate import excerpt, integral_number, number, or_null
+from pickplace.common.validate import expect, integral_number, number, or_null
 
 TOLERANCE = 1e-6  # occupancies arrive as float32, in which 0.9 is slightly below 0.9
 
@@ -128,8 +128,8 @@ class Threshold(Advance):
         key = "curriculum.advance.max_frames_per_level"
         self.max_frames = or_null(integral_number, key, max_frames_per_level) or math.inf
         self.demote_below = or_null(number, "curriculum.advance.demote_below", demote_below, 0, 1) or 0.0
-        if demote_below is not None and demote_below >= occupancy:
-            raise ValueError(f"curriculum.advance.demote_below={demote_below}: expected < {occupancy=}.")
+        rises = demote_below is None or demote_below < occupancy
+        expect(rises, "curriculum.advance.demote_below", demote_below, f"< {occupancy=}")
 
     def update(self, tally):
         full = len(tally.window) == self.window
@@ -195,10 +195,12 @@ class Staged(Advance):
 
     def __init__(self, stages):
         found = stages if isinstance(stages, Sequence) else []
-        if not found or not all(isinstance(each, Mapping) and set(each) == {"frames", "height"} for each in found):
-            raise ValueError(
-                f"curriculum.advance.stages={excerpt(stages)}: expected a list of {{frames: F, height: H}}."
-            )
+        expect(
+            found and all(isinstance(each, Mapping) and set(each) == {"frames", "height"} for each in found),
+            "curriculum.advance.stages",
+            stages,
+            "a list of {frames: F, height: H}",
+        )
         self.stages: dict[int, int | None] = {}  # heights by first frame
         for stage in found:
             least = max(self.stages, default=-1) + 1

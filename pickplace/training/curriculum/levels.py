@@ -6,7 +6,7 @@ from numbers import Real
 
 from torch import Tensor
 
-from pickplace.common.validate import excerpt, integral_number, is_number, is_whole, number
+from pickplace.common.validate import excerpt, expect, integral_number, is_number, is_whole, number
 from pickplace.training.curriculum.advance import Advance, Tally
 from pickplace.training.curriculum.transform import ToteHeightCurriculum
 
@@ -22,14 +22,9 @@ class Curriculum:
     """
 
     def __init__(self, advance: Advance, sample, start_height: int | None = None, end_height: int | None = None):
-        if not isinstance(advance, Advance):
-            raise ValueError(
-                f"curriculum.advance={excerpt(advance)}: expected a rule, such as curriculum/advance=threshold."
-            )
-        if not callable(sample):
-            raise ValueError(
-                f"curriculum.sample={excerpt(sample)}: expected a sampler, such as curriculum/sample=recent."
-            )
+        is_rule = isinstance(advance, Advance)
+        expect(is_rule, "curriculum.advance", advance, "a rule, such as curriculum/advance=threshold")
+        expect(callable(sample), "curriculum.sample", sample, "a sampler, such as curriculum/sample=recent")
         self.advance, self.sample, self._rule = advance, sample, f"curriculum.advance: {type(advance).__name__}"
         self.start_height, self.end_height = start_height, end_height
 
@@ -119,9 +114,7 @@ class Curriculum:
         return {f"curriculum/{key}": value for key, value in logs.items()}
 
     def _clamped(self, level) -> int:
-        """Return a rule's level, limited to the first and the last height."""
-        if not is_whole(level):
-            raise ValueError(f"{self._rule}: its level is {excerpt(level)}; expected a whole number.")
+        expect(is_whole(level), f"{self._rule}: its level", level, "a whole number")
         return min(max(int(level), self.start), self.end)
 
     def _rule_state(self) -> dict:
