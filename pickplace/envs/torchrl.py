@@ -11,7 +11,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from pickplace.common.machine import usable_device
-from pickplace.common.validate import check_bytes, excerpt, one_of, whole_number
+from pickplace.common.validate import check_bytes, expect, one_of, whole_number
 from pickplace.envs.checks import check_items, problem_bytes
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
@@ -24,6 +24,7 @@ from pickplace.rules.observation import Term, check_terms, observe
 from pickplace.rules.state import EMPTY, Failure, State
 from pickplace.rules.step import apply
 
+DONE_KEYS = ("done", "terminated", "truncated")
 CACHE_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes
 
 
@@ -113,16 +114,14 @@ class PickPlaceEnv(EnvBase):
         whole_number("num_envs", num_envs)
         check_seed(seed)
         one_of("stream", stream, STREAMS)
-        if not isinstance(masks, (tuple, list)) or not all(isinstance(name, str) and name in MASKS for name in masks):
-            raise ValueError(f"masks={excerpt(masks)}: expected any of {', '.join(map(repr, MASKS))}.")
+        known = isinstance(masks, (tuple, list)) and all(isinstance(name, str) and name in MASKS for name in masks)
+        expect(known, "masks", masks, f"any of {', '.join(map(repr, MASKS))}")
         whole_number("first_episode", first_episode, 0, MAX_SEED)
         if episode_stride is not None:
             whole_number("episode_stride", episode_stride, 1, MAX_SEED)
         items = Kinds(PAPER_KINDS) if items is None else items
-        if not isinstance(items, ItemDistribution):
-            raise ValueError(
-                f"items={excerpt(items)}: expected an ItemDistribution, such as pickplace.items.distributions.Kinds."
-            )
+        kind = "an ItemDistribution, such as pickplace.items.distributions.Kinds"
+        expect(isinstance(items, ItemDistribution), "items", items, kind)
         check_items(cell, items)
         self.terms = check_terms(observation, cell.bin_items)
         self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
@@ -138,18 +137,20 @@ class PickPlaceEnv(EnvBase):
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
 
         # All run-time state, in buffers, so that state_dict() has it.
-        self.register_buffer("surface", zeros(*cell.tote_size[:2], dtype=torch.int32) + EMPTY)
-        self.register_buffer("tote_height", zeros() + cell.tote_size[2])
-        self.register_buffer("item", zeros(cell.bin_items, len(Item._fields)))
-        self.register_buffer("arrived", zeros())  # items of the episode so far
-        self.register_buffer("volume", zeros())
-        self.register_buffer("steps", zeros())
-        self.register_buffer("episode", zeros())
-        self.register_buffer("item_seed", torch.tensor(0, device=self.device))
-        self.register_buffer("feasible", zeros(dtype=torch.bool))
-        for name in self.masks:
-            size = self.observation_spec[f"{name}_mask"].shape[1:]
-            self.register_buffer(f"{name}_mask", zeros(*size, dtype=torch.bool))
+        buffers = {
+            "surface": zeros(*cell.tote_size[:2], dtype=torch.int32) + EMPTY,
+            "tote_height": zeros() + cell.tote_size[2],
+            "item": zeros(cell.bin_items, len(Item._fields)),
+            "arrived": zeros(),  # items of the episode so far
+            "volume": zeros(),
+            "steps": zeros(),
+            "episode": zeros(),
+            "item_seed": torch.tensor(0, device=self.device),
+            "feasible": zeros(dtype=torch.bool),
+            **{f"{name}_mask": zeros(MASKS[name].size(self.cell), dtype=torch.bool) for name in self.masks},
+        }
+        for name, value in buffers.items():
+            self.register_buffer(name, value)
         self._starts: dict[tuple, tuple[Tensor, ...]] = {}  # the masks of empty totes, see `_masks_of_empty_totes`
         self.set_seed(seed)
 
@@ -166,14 +167,11 @@ class PickPlaceEnv(EnvBase):
             observation[f"{name}_mask"] = Binary(size, (n, size), device, torch.bool)
         self.observation_spec = Composite(observation, shape=(n,), device=device)
         # Declared as state too, so that reset() is handed the height that a curriculum writes.
-        height = observation["tote_height"].clone()
-        self.state_spec = Composite({"tote_height": height}, shape=(n,), device=device)
+        self.state_spec = Composite({"tote_height": observation["tote_height"].clone()}, shape=(n,), device=device)
         self.action_spec = Categorical(cell.num_actions, (n,), dtype=torch.int64, device=device)
         self.reward_spec = Unbounded((n, 1), dtype=torch.float32, device=device)
-        flag = Categorical(2, (n, 1), dtype=torch.bool, device=device)
-        self.done_spec = Composite(
-            {key: flag.clone() for key in ("done", "terminated", "truncated")}, shape=(n,), device=device
-        )
+        flags = {key: Categorical(2, (n, 1), dtype=torch.bool, device=device) for key in DONE_KEYS}
+        self.done_spec = Composite(flags, shape=(n,), device=device)
 
     @property
     def num_envs(self) -> int:
@@ -198,7 +196,7 @@ class PickPlaceEnv(EnvBase):
         rows = tensordict["_reset"].reshape(self.num_envs, 1)
         kwargs.pop("select_reset_only", None)  # of ``EnvBase.reset``: what an agent sees is all that counts here
         state = self._reset(tensordict, **kwargs)
-        for key in ("done", "terminated", "truncated", "failure"):
+        for key in (*DONE_KEYS, "failure"):
             if key in tensordict:
                 state[key] = torch.where(rows, state[key], tensordict[key])
         return tensordict.exclude("_reset").update(state)
@@ -206,52 +204,36 @@ class PickPlaceEnv(EnvBase):
     def _set_seed(self, seed: int | None):
         """Start the item stream over: the next reset of slot ``i`` plays episode ``first_episode + i``."""
         self.item_seed.fill_(0 if seed is None else check_seed(seed))
-        slots = torch.arange(self.num_envs, device=self.device)
-        self.episode.copy_(self.first_episode + slots - self.episode_stride)
+        first = self.first_episode - self.episode_stride
+        self.episode.copy_(torch.arange(first, first + self.num_envs, device=self.device))
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         if kwargs:
             name, value = next(iter(kwargs.items()))
             raise TypeError(f"reset({name}={value!r}): expected a TensorDict only; set_seed(seed) begins a stream.")
-        rows = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        height = None
-        if tensordict is not None:
-            rows = tensordict.get("_reset", rows).reshape(self.num_envs)
-            height = tensordict.get("tote_height", None)
-        if height is None:
-            height = torch.full_like(self.tote_height, self.cell.tote_size[2])
-        height = height.reshape(self.num_envs)
-        if not torch.can_cast(height.dtype, torch.int64):
-            raise ValueError(f"tote_height={height[0].item()} ({height.dtype}): expected whole numbers, as integers.")
-        height = height.to(torch.int64)
-        low, high = self.min_tote_height, self.cell.tote_size[2]
-        if bool((rows & ((height < low) | (height > high))).any()):
-            bad = height[rows & ((height < low) | (height > high))][0].item()
-            raise ValueError(f"tote_height={bad}: expected between {low} (the tallest item) and {high} (tote_size[2]).")
-        self.surface.masked_fill_(rows[:, None, None], EMPTY)
-        self.tote_height.copy_(torch.where(rows, height, self.tote_height))
-        self.volume.masked_fill_(rows, 0)
-        self.steps.masked_fill_(rows, 0)
+        given, high = {} if tensordict is None else tensordict, self.cell.tote_size[2]
+        rows = given.get("_reset", torch.ones_like(self.feasible)).reshape(self.num_envs)
+        height = given.get("tote_height", torch.full_like(self.tote_height, high)).reshape(self.num_envs)
+        expected = f"between {self.min_tote_height} (the tallest item) and {high} (tote_size[2])"
+        height = torch.where(rows, height, self.tote_height)
+        self.tote_height.copy_(_checked("tote_height", height, self.min_tote_height, high, expected))
         self.episode.add_(rows * self.episode_stride)
+        self.surface.masked_fill_(rows[:, None, None], EMPTY)
         self.item.masked_fill_(rows[:, None, None], 0)
-        self.arrived.masked_fill_(rows, 0)
+        for count in (self.arrived, self.volume, self.steps):
+            count.masked_fill_(rows, 0)
         self._refill(rows, self.current_items)
         self._update_masks(rows, empty=True)
         if (jammed := rows & ~self.feasible).any():  # the first one alone always has a feasible action
             self.item[:, 1:] *= ~jammed[:, None, None]
             self.arrived.masked_fill_(jammed, 1)
             self._update_masks(jammed, empty=True)
-        done = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
-        return self._observation().update({"done": done, "terminated": done.clone(), "truncated": done.clone()})
+        return self._observation().update({key: torch.zeros_like(rows)[:, None] for key in DONE_KEYS})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict["action"].reshape(self.num_envs)
-        if not torch.can_cast(action.dtype, torch.int64):
-            raise ValueError(f"action={action[0].item()} ({action.dtype}): expected whole numbers, as integers.")
-        if bool(((action < 0) | (action >= self.cell.num_actions)).any()):
-            bad = action[(action < 0) | (action >= self.cell.num_actions)][0].item()
-            raise ValueError(f"action={bad}: expected between 0 and {self.cell.num_actions - 1} (N_a - 1).")
-        state = self.state
+        most, state = self.cell.num_actions - 1, self.state
+        given = tensordict["action"].reshape(self.num_envs)
+        action = _checked("action", given, 0, most, f"between 0 and {most} (N_a - 1)")
         step = apply(self.cell, state, action)
         placed = step.failure == 0
         gained = torch.where(placed, step.item.volume, 0)
@@ -274,7 +256,7 @@ class PickPlaceEnv(EnvBase):
 
     # ------------------------------------------------------------------ state
     def _load_from_state_dict(self, *args, **kwargs):
-        """Load into masks of our own: the last ones have been handed out with an observation, see `_store`."""
+        """Load into masks of our own: the last ones have been handed out with an observation, see `_update_masks`."""
         for name in self.masks:
             setattr(self, f"{name}_mask", getattr(self, f"{name}_mask").clone())
         super()._load_from_state_dict(*args, **kwargs)
@@ -314,9 +296,12 @@ class PickPlaceEnv(EnvBase):
         index = slice(None) if len(numbers) == len(rows) else numbers
         make = self._masks_of_empty_totes if empty and self.device.type == "cpu" else self._masks_of
         masks = make(self.surface[index], self.tote_height[index], self.item[index])
-        self.feasible[index] = _any(next(iter(masks.values())))
+        mask = next(iter(masks.values()))
+        self.feasible[index] = mask.view(torch.uint8).amax(1) > 0  # as any(1), which is far slower on a CPU
         for name in self.masks:
-            self._store(f"{name}_mask", index, masks[name])
+            # A tensor of its own: the last one has been handed out with an observation.
+            old, new = getattr(self, f"{name}_mask"), masks[name]
+            setattr(self, f"{name}_mask", new if len(numbers) == len(rows) else old.index_copy(0, numbers, new))
 
     def _masks_of(self, surface: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
         """Return the masks that are emitted, or ``footprint``, bool ``[M, ...]``, of problems ``[M, ...]``."""
@@ -337,22 +322,20 @@ class PickPlaceEnv(EnvBase):
         columns = zip(*(self._starts[key] for key in keys), strict=True)
         return dict(zip(self.masks or ("footprint",), map(torch.stack, columns), strict=True))
 
-    def _store(self, name: str, index: Tensor | slice, values: Tensor):
-        """Keep a mask in a tensor of its own: the last one has been handed out with an observation."""
-        if not isinstance(index, slice):
-            values = getattr(self, name).index_copy(0, index, values)
-        setattr(self, name, values)
-
     def _observation(self) -> TensorDictBase:
         """Return what the agent sees, with ``failure`` 0."""
         observation = observe(self.terms, self.cell, self.state)
         observation["occupancy"] = self.exact_occupancy.float()[:, None]
         observation["failure"] = torch.zeros_like(self.tote_height)[:, None]
         for name in self.masks:
-            observation[f"{name}_mask"] = getattr(self, f"{name}_mask")  # never written to again, see `_store`
+            observation[f"{name}_mask"] = getattr(self, f"{name}_mask")  # never written to again, see `_update_masks`
         return TensorDict(observation, batch_size=self.batch_size, device=self.device)
 
 
-def _any(mask: Tensor) -> Tensor:
-    """Return ``mask.any(1)`` of a bool ``[N, M]``; on a CPU the maximum of bytes is vectorised, and far faster."""
-    return mask.view(torch.uint8).amax(1) > 0
+def _checked(key: str, values: Tensor, low: int, high: int, expected: str) -> Tensor:
+    """Return whole numbers in ``[low, high]`` as int64; ``ValueError`` for others."""
+    if not torch.can_cast(values.dtype, torch.int64):
+        raise ValueError(f"{key}={values[0].item()} ({values.dtype}): expected whole numbers, as integers.")
+    if (bad := (values < low) | (values > high)).any():
+        raise ValueError(f"{key}={values[bad][0].item()}: expected {expected}.")
+    return values.to(torch.int64)

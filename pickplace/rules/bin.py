@@ -5,8 +5,6 @@ or higher would be lifted, too, or hit. Nothing is in the way of an item that li
 functions take a shorter path to the same result.
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
@@ -25,7 +23,7 @@ def blocked_picks(cell: CellSpec, items: Item) -> Tensor | None:
         bool ``[N * M, P]``, for each item, those of a bin one after the other, the picks that would take it; None with
         ``M = 1``: no pick is blocked.
     """
-    if items.x.shape[1] == 1:
+    if (count := items.x.shape[1]) == 1:
         return None
     near = [torch.arange(side, device=items.x.device).view(-1, 1, 1) for side in cell.bin_size[:2]]
     shape = cell.effector(0)
@@ -36,7 +34,6 @@ def blocked_picks(cell: CellSpec, items: Item) -> Tensor | None:
         in_y = (front + box.y < items.y + items.d) & (front + box.y + box.depth > items.y)
         touches |= in_x[:, None] & in_y
     touches &= ~items.is_empty
-    count = items.x.shape[1]
     blocked = torch.zeros_like(touches)
     for other in range(count):
         in_the_way = items.h[:, other, None] >= items.h  # [N, M]
@@ -45,22 +42,19 @@ def blocked_picks(cell: CellSpec, items: Item) -> Tensor | None:
     return blocked.flatten(2).flatten(0, 1).t()
 
 
-class Taken(NamedTuple):
-    """The item that each of ``N`` picks takes, of the ``M`` in its bin."""
+def take_item(cell: CellSpec, items: Item, action: Tensor) -> tuple[Tensor, Item, Tensor | None]:
+    """Return what flat actions, int64 ``[N]``, take out of bins ``[N, M]``.
 
-    number: Tensor  # int64 [N], from 0
-    item: Item  # [N]
-    blocked: Tensor | None  # bool [N, P], see `blocked_picks`
-
-
-def take_item(cell: CellSpec, items: Item, action: Tensor) -> Taken:
-    """Return what flat actions, int64 ``[N]``, take out of bins ``[N, M]``."""
+    Returns:
+        the number of the item in its bin, int64 ``[N]``; the item, ``[N]``; and bool ``[N, P]``, as of
+        :func:`blocked_picks`.
+    """
     blocked = blocked_picks(cell, items)
     if blocked is None:
-        return Taken(torch.zeros_like(action), items.flatten(), None)
+        return torch.zeros_like(action), items.flatten(), None
     number = taken_item(cell, items, *split_action(cell, action)[:2])
     row = torch.arange(len(number), device=number.device)
-    return Taken(number, select_item(items, number), blocked.unflatten(0, items.x.shape)[row, number])
+    return number, select_item(items, number), blocked.unflatten(0, items.x.shape)[row, number]
 
 
 def taken_item(cell: CellSpec, items: Item, x: Tensor, y: Tensor) -> Tensor:

@@ -195,6 +195,5 @@ CELL_SETTINGS = tuple(item.name for item in fields(CellSpec) if not item.metadat
 def cell_from_settings(settings: dict) -> CellSpec:
     """Return the cell of settings by name, such as a config's; raises ``ValueError`` for a name that there is not."""
     for name, value in settings.items():
-        known = name in signature(CellSpec).parameters
-        expect(known, short_text(name), value, f"one of {', '.join(CELL_SETTINGS)}")
+        expect(name in signature(CellSpec).parameters, short_text(name), value, f"one of {', '.join(CELL_SETTINGS)}")
     return CellSpec(**settings)

@@ -265,5 +265,4 @@ def pick_blocks(cell: CellSpec, item: Item) -> Tensor:
     number = torch.arange(cell.num_picks, device=item.x.device)
     x = item.x[:, None] - (number // bin_d - reference_cell(ee_w)) - cell.min_offset
     y = item.y[:, None] - (number % bin_d - reference_cell(ee_d)) - cell.min_offset
-    inside = ~is_outside(x, 1, count) & ~is_outside(y, 1, count)
-    return torch.where(inside, class_index(cell, 0, x, y), count * count)
+    return torch.where(is_outside(x, 1, count) | is_outside(y, 1, count), count**2, class_index(cell, 0, x, y))

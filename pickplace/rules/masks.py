@@ -102,19 +102,18 @@ class PlacingMaps(NamedTuple):
 
 def placing_maps(cell: CellSpec, state: State) -> PlacingMaps:
     """Return everything that decides which actions succeed: see :class:`PlacingMaps`."""
-    surface, tote_height, item = state.each_item()
-    return _complete(cell, state, item, *resting_top(cell, surface, tote_height, item))
+    return _maps(cell, state, resting_top)
 
 
 def unchecked_maps(cell: CellSpec, state: State) -> PlacingMaps:
     """Return the maps of footprints that are known to be stable and below the rim, without a look at either."""
-    surface, _, item = state.each_item()
-    return _complete(cell, state, item, *unchecked_top(cell, surface, item))
+    return _maps(cell, state, unchecked_top)
 
 
-def _complete(cell: CellSpec, state: State, item: Item, top: Tensor, rest: Tensor) -> PlacingMaps:
-    """Return the maps with what the end effector must clear, in the tote and in the bin."""
+def _maps(cell: CellSpec, state: State, find_top: Callable[..., tuple[Tensor, Tensor]]) -> PlacingMaps:
+    surface, tote_height, item = state.each_item()
     over = over_tote(cell, state.surface, state.tote_height)
+    top, rest = find_top(cell, surface, tote_height, item)
     return PlacingMaps.of(top, rest, over, item, blocked_picks(cell, state.items))
 
 
@@ -162,25 +161,21 @@ def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     check_actions(cell, len(maps.top), maps.top.device)
     places, batch, rotations = cell.num_places, len(maps.top), cell.rotations
     available, classes = available_offsets(cell, maps.item, maps.blocked)
-    by_class = class_mask(cell, maps)
-    num_classes = len(by_class)
-    by_class = by_class.permute(2, 0, 1).reshape(-1, places).view(torch.uint8)  # [N * T * K, places]
+    by_class = class_mask(cell, maps).permute(2, 0, 1).reshape(-1, places).view(torch.uint8)  # [N * T * K, places]
     # The flags of all rotations side by side in one number, so that a pick cell's whole block is copied at once:
     # blocks [N * K + 1, places], of which the last, for picks that fail, is empty.
     packed, slots = {1: (torch.uint8, 1), 2: (torch.int16, 2)}.get(rotations, (torch.int32, 4))
     flags = torch.eye(slots, dtype=torch.uint8).view(packed)[:, 0].tolist()
-    count = len(available)
-    first = torch.arange(batch, device=by_class.device)
+    count, first = len(available), torch.arange(batch, device=by_class.device)
     blocks = by_class.new_zeros(batch * count + 1, places, dtype=packed)
     for bit, turned in zip(flags, classes, strict=False):
-        row = (turned + first * num_classes).t().reshape(-1)
+        row = (turned + first * (num_turns(cell) * count)).t().reshape(-1)
         blocks[:-1].add_(by_class.index_select(0, row).to(packed), alpha=bit)
     # The block of each pick cell.
     block = pick_blocks(cell, maps.item)
     usable = torch.cat([available.t(), available.new_zeros(batch, 1)], 1)
     block = torch.where(usable.gather(1, block), block + first[:, None] * count, batch * count)
-    mask = blocks.index_select(0, block.flatten()).view(torch.bool)
-    mask = mask.view(batch, cell.num_picks, places, slots)
+    mask = blocks.index_select(0, block.flatten()).view(torch.bool).view(batch, cell.num_picks, places, slots)
     mask = mask[..., :rotations].reshape(batch, cell.num_actions)
     return mask if maps.bin_items == 1 else mask.unflatten(0, (-1, maps.bin_items)).any(1)
 
@@ -234,16 +229,6 @@ def _footprint_margins(cell: CellSpec, parity: int) -> tuple[int, int, int, int]
     return high - ref_x, ref_x - low, high - ref_y, ref_y - low
 
 
-def _sides(kinds: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Return the offsets along x and along y, bool ``[O, 1, 1, N]`` each, if grasps are all pairs of these; else None.
-
-    Args:
-        kinds: whether there is a grasp with an offset, bool ``[O, O, 1, 1, N]``.
-    """
-    in_x, in_y = kinds.any(1), kinds.any(0)
-    return (in_x, in_y) if torch.equal(kinds, in_x[:, None] & in_y) else None
-
-
 def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Tensor) -> Tensor:
     """Return the least clearance with which any grasp reaches each footprint, ``[W_T, D_T, N]``; FAR if none does."""
     (tote_w, tote_d, _), count = cell.tote_size, cell.num_offsets
@@ -251,9 +236,8 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Te
     least = []
     for turn in range(parity, len(grasped), 2):
         clear, kinds = surround(maps.clearance_in(turn), margins, FAR), grasped[turn].flip(0, 1)  # as the windows are
-        if sides := _sides(kinds) if count > 3 else None:
-            # Mostly so. The least in a rectangle is the least along x, then along y.
-            in_x, in_y = sides
+        if count > 3 and torch.equal(kinds, (in_x := kinds.any(1))[:, None] & (in_y := kinds.any(0))):
+            # The offsets are mostly all pairs of some along x and y. Then the least is one along x, then along y.
             along = reduce(torch.minimum, (torch.where(in_x[i], clear[i : i + tote_w], FAR) for i in range(count)))
             usable = (torch.where(in_y[j], along[:, j : j + tote_d], FAR) for j in range(count))
         else:
@@ -292,13 +276,10 @@ def actions_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Te
     Returns:
         int64 ``[N, P * R]``: for each pick cell and rotation the flat action, or -1 if it does not succeed.
     """
-    tote_w, tote_d, _ = cell.tote_size
-    device = footprint.device
+    (tote_w, tote_d, _), device = cell.tote_size, footprint.device
     maps, footprint = maps.of_choice(cell, footprint)
     lifted, offset = all_grasps(cell, maps.item, maps.blocked)
-    rotation = torch.arange(cell.rotations, device=device)
-    parity = rotation % 2
-    refs = _reference_cells(cell, device)
+    rotation, refs = torch.arange(cell.rotations, device=device), _reference_cells(cell, device)
     turned, x, y = split_footprint(cell.tote_size, footprint)
     place_x, place_y = (torch.stack([x, y], -1)[:, None, None] + refs - offset).unbind(-1)  # [N, P, R]
     in_tote = ~is_outside(place_x, 1, tote_w) & ~is_outside(place_y, 1, tote_d)
@@ -306,13 +287,12 @@ def actions_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Te
     index = footprint_index(cell.tote_size, rotation % maps.clearance.shape[1], place_x, place_y)
     clear = maps.clearance.flatten(1).gather(1, index.flatten(1)).view_as(index)
     top = maps.top.flatten(1).gather(1, footprint[:, None])[..., None]
-    same = (maps.item.w == maps.item.d)[:, None, None] | (parity == turned[:, None, None])
+    same = (maps.item.w == maps.item.d)[:, None, None] | (rotation % 2 == turned[:, None, None])
     good = in_tote & same & (top >= clear) & lifted[..., None]
     if maps.greatest_top is not None:
         good &= top <= maps.greatest_top.flatten(1).gather(1, index.flatten(1)).view_as(index)
     pick = torch.arange(cell.num_picks, device=device)[:, None]
-    action = join_action(cell, pick, place_x * tote_d + place_y, rotation)
-    return torch.where(good, action, -1).flatten(1)
+    return torch.where(good, join_action(cell, pick, place_x * tote_d + place_y, rotation), -1).flatten(1)
 
 
 def first_action_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Tensor:
@@ -336,13 +316,11 @@ def action_footprints(cell: CellSpec, items: Item, blocked: Tensor | None = None
         blocked: as of :attr:`PlacingMaps.blocked`; None: by :func:`~pickplace.rules.bin.blocked_picks`.
     """
     (tote_w, tote_d, _), count = cell.tote_size, items.x.shape[1]
-    item = items.flatten()
+    item, device = items.flatten(), items.x.device
     lifted, offset = all_grasps(cell, item, blocked_picks(cell, items) if blocked is None else blocked)
-    device = offset.device
     check_actions(cell, len(lifted), device)
     turned = torch.arange(cell.rotations, device=device) % 2  # [R]
-    refs = _reference_cells(cell, device)
-    corner = (offset - refs)[:, :, None, None]  # [N * M, P, 1, 1, R, 2]
+    corner = (offset - _reference_cells(cell, device))[:, :, None, None]  # [N * M, P, 1, 1, R, 2]
     x = corner[..., 0] + torch.arange(tote_w, device=device)[:, None, None]
     y = corner[..., 1] + torch.arange(tote_d, device=device)[:, None]
     sizes = turned_size(item.rows((slice(None), None)), turned == 1)  # [N * M, R] each

@@ -43,7 +43,7 @@ def resting_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
 
-def unchecked_top(cell: CellSpec, surface: Tensor, item: Item) -> tuple[Tensor, Tensor]:
+def unchecked_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item) -> tuple[Tensor, Tensor]:
     """Return the same as :func:`resting_top`, but for every footprint in the tote, stable or not."""
     z = OnFootprints(cell, surface, *footprint_sizes(cell, item)).z
     return (z + item.h.to(z.dtype)).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)

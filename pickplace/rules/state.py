@@ -12,40 +12,30 @@ EMPTY = 1  # surface of an empty tote, see `surface_from`
 
 
 class Failure(IntEnum):
-    """The reason why an episode ended; 1 to 6 in the order of the checks."""
+    """The reason why an episode ended; 1 to 6 in the order of the checks.
 
-    NONE = 0
-    PICK_MISS = 1
-    BIN_COLLISION = 2
-    TOTE_COLLISION = 3
-    OVERFLOW = 4
-    ITEM_COLLISION = 5
-    UNSTABLE = 6
-    STUCK = 7
-    OUT_OF_REACH = 8  # judged after 1 to 6
+    Attributes:
+        sentence: the reason for a reader who does not know the rules.
+        label: the reason in a word or two.
+    """
 
-    @property
-    def sentence(self) -> str:
-        """The reason for a reader who does not know the rules."""
-        return _WORDS[self][0]
+    sentence: str
+    label: str
 
-    @property
-    def label(self) -> str:
-        """The reason in a word or two."""
-        return _WORDS[self][1]
+    NONE = 0, "The item stream is over.", "stream over"
+    PICK_MISS = 1, "The gripper does not cover the item.", "missed the item"
+    BIN_COLLISION = 2, "The gripper would hit the bin's wall, or another item in it.", "hit the bin"
+    TOTE_COLLISION = 3, "The gripper or the item would hit the tote's wall.", "hit the tote"
+    OVERFLOW = 4, "The item would stick out of the tote.", "too high"
+    ITEM_COLLISION = 5, "The gripper would hit an item in the tote.", "hit an item"
+    UNSTABLE = 6, "The item would not rest stably.", "unstable"
+    STUCK = 7, "This item fits nowhere any more.", "no place left"
+    OUT_OF_REACH = 8, "The robot does not reach this pick or this place.", "out of reach"  # judged after 1 to 6
 
-
-_WORDS = {
-    Failure.NONE: ("The item stream is over.", "stream over"),
-    Failure.PICK_MISS: ("The gripper does not cover the item.", "missed the item"),
-    Failure.BIN_COLLISION: ("The gripper would hit the bin's wall, or another item in it.", "hit the bin"),
-    Failure.TOTE_COLLISION: ("The gripper or the item would hit the tote's wall.", "hit the tote"),
-    Failure.OVERFLOW: ("The item would stick out of the tote.", "too high"),
-    Failure.ITEM_COLLISION: ("The gripper would hit an item in the tote.", "hit an item"),
-    Failure.UNSTABLE: ("The item would not rest stably.", "unstable"),
-    Failure.STUCK: ("This item fits nowhere any more.", "no place left"),
-    Failure.OUT_OF_REACH: ("The robot does not reach this pick or this place.", "out of reach"),
-}
+    def __new__(cls, code: int, sentence: str = "", label: str = ""):
+        failure = int.__new__(cls, code)
+        failure._value_, failure.sentence, failure.label = code, sentence, label
+        return failure
 
 
 class State(NamedTuple):
@@ -59,9 +49,8 @@ class State(NamedTuple):
     def from_observation(cls, observation: Observation) -> "State":
         """Return the state that the standard terms of an observation ``[N]`` show."""
         tote_height = observation["tote_height"].reshape(-1)
-        heights = heights_from_depth(observation["tote_depth"], tote_height)
-        surface = surface_from(heights, observation["tote_bearing"])
-        return cls(surface, tote_height, items_from_observation(observation))
+        heights = tote_height[:, None, None] - observation["tote_depth"]
+        return cls(surface_from(heights, observation["tote_bearing"]), tote_height, items_from_observation(observation))
 
     @property
     def heights(self) -> Tensor:
@@ -109,8 +98,3 @@ def surface_from(heights: Tensor, bearing: Tensor | int = 1) -> Tensor:
 def depth_from_heights(heights: Tensor, tote_height: Tensor) -> Tensor:
     """Return the remaining depth ``H_T - height`` of each cell, float32 ``[N, W_T, D_T]``."""
     return (tote_height[:, None, None] - heights).float()
-
-
-def heights_from_depth(tote_depth: Tensor, tote_height: Tensor) -> Tensor:
-    """Return the heights, int32 ``[N, W_T, D_T]``: the inverse of :func:`depth_from_heights`."""
-    return (tote_height[:, None, None] - tote_depth).int()

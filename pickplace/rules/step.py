@@ -33,11 +33,6 @@ class Step(NamedTuple):
     item: Item  # the item that is taken, [N]
     taken: Tensor  # int64 [N]: its number in the bin
 
-    @property
-    def heights(self) -> Tensor:
-        """The height of each cell of the tote, int32 ``[N, W_T, D_T]``."""
-        return self.surface >> 1
-
 
 def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     """Try one action per problem.

@@ -19,7 +19,7 @@ def results(cell, case):
     """Return failure codes ``[W_B, D_B, W_T, D_T, R]``, and the heights after each action, ``[.., W_T, D_T]``."""
     step = apply(cell, state_of(case).repeat(cell.num_actions), torch.arange(cell.num_actions))
     grid = (*cell.bin_size[:2], *cell.tote_size[:2], cell.rotations)
-    return step.failure.reshape(grid).numpy(), step.heights.reshape(*grid, *cell.tote_size[:2]).numpy()
+    return step.failure.reshape(grid).numpy(), (step.surface >> 1).reshape(*grid, *cell.tote_size[:2]).numpy()
 
 
 @settings(max_examples=50)

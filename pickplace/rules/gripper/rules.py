@@ -73,5 +73,4 @@ def changed_gripper(gripper: Gripper, pick_rule: str | None = None, **settings) 
     given = {key: value for key, value in settings.items() if value is not None and key in known}
     if rule is type(gripper) and not given:
         return gripper
-    kept = {key: getattr(gripper, key) for key in known if hasattr(gripper, key)}
-    return rule(**{**kept, **given})
+    return rule(**{key: getattr(gripper, key) for key in known if hasattr(gripper, key)} | given)

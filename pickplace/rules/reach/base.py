@@ -83,6 +83,5 @@ class Limits(Reach):
 
 def whole_heights(cell: Any, lowest: Tensor, highest: Tensor) -> tuple[Tensor, Tensor]:
     """Return the ranges of whole height units inside ranges in sides of a cell, int32; from 0 to beyond any height."""
-    low = (lowest / cell.height_unit - ROUNDING).clamp(0, FAR).ceil()
-    high = (highest / cell.height_unit + ROUNDING).clamp(NEVER, FAR).floor()
-    return low.int(), high.int()
+    low, high = lowest / cell.height_unit - ROUNDING, highest / cell.height_unit + ROUNDING
+    return low.clamp(0, FAR).ceil().int(), high.clamp(NEVER, FAR).floor().int()

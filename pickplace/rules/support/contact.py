@@ -170,6 +170,6 @@ class Patches:
         """
         margin = max(margin * self.per_cell, self.MARGIN if self.per_cell > 1 else 0.0) + self.slack
         if margin not in self._inside:
-            reached = self.supports.double() @ (self.along > margin).double().t()  # [W, D, directions]
-            self._inside[margin] = (reached > 0).all(-1)
+            # [W, D, directions], of which the last is combined.
+            self._inside[margin] = (self.supports.double() @ (self.along > margin).double().t() > 0).all(-1)
         return self._inside[margin]

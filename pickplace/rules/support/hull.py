@@ -61,8 +61,7 @@ def hull_patterns(side: int, margin: float, device: torch.device) -> list[tuple[
     for chunk in normals.split(BITS):
         furthest = (chunk[:, :, None, None, None] * ends).amax(2)  # [normals, axis, cell, size]
         along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
-        distance = 2 * margin * chunk.double().norm(dim=1).view(-1, 1, 1, 1, 1)
-        beyond = along > distance
+        beyond = along > 2 * margin * chunk.double().norm(dim=1).view(-1, 1, 1, 1, 1)
         # No edge has the direction from one cell to another that is not in the footprint.
         x, y = chunk.abs()[:, :, None, None].unbind(1)
         fits = ((y < size[:, None]) & (x < size)) | (x + y == 1)
