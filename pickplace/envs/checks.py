@@ -66,9 +66,8 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
         ways = np.packbits(available.numpy(), axis=0).T
         sizes = rows[numbers, 2 : 4 if cell.limits is None else 5].contiguous()
         keys = np.concatenate([sizes.numpy().view(np.uint8), ways], 1)
-        _, first = np.unique(keys.view(f"V{keys.shape[1]}"), return_index=True)
-        for index in sorted(first.tolist()):
-            distinct.setdefault(keys[index].tobytes(), int(numbers[index]))
+        for key, number in zip(keys, numbers.tolist(), strict=True):
+            distinct.setdefault(key.tobytes(), number)
     for chunk in rows[list(distinct.values())].split(max(1, min(1024, 2**24 // cell.num_footprints))):
         lying = Item.from_table(chunk[:, None, :5])
         empty = torch.full((len(chunk), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
