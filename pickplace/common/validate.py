@@ -70,6 +70,12 @@ def whole_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:
     return int(value)
 
 
+def whole_numbers(place: str, most: int, **values) -> None:
+    """Check settings at one place of the config, by their keys: each is a whole number in ``[1, most]``."""
+    for key, value in values.items():
+        whole_number(f"{place}.{key}", value, most=most)
+
+
 def integral_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:
     """Return ``value`` as an int, as :func:`whole_number`; a float such as 5e6 is accepted."""
     is_integral = isinstance(value, float) and value.is_integer()

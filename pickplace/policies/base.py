@@ -8,7 +8,7 @@ of the choice.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
-from typing import Protocol, Self, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
@@ -64,7 +64,7 @@ class Policy(TensorDictModuleBase, ABC):
     choice_key: str
     map_keys: tuple[str, ...] = DEPTH_KEYS
     excludes: str | None = None
-    network: torch.nn.Module
+    network: Any
 
     def __init__(self, cell: CellSpec, masks: Sequence[str] = ()):
         super().__init__()
@@ -163,21 +163,49 @@ class Policy(TensorDictModuleBase, ABC):
         Returns:
             A sentence for each condition that is not met; the policy can be trained all the same.
         """
-        field = getattr(self.network, "receptive_field", None)
-        if field is None:
-            return []
-        side, found = self.cell.longest_side or self.cell.max_side, []
-        if side > field / 2 + 1:
-            most = f"{field / 2 + 1:g}"
-            found.append(
-                f"items: the longest side is {side}, expected at most {most} (receptive field {field}, eq. 2)."
-            )
-        for key, size in (("bin_size", self.cell.bin_size), ("tote_size", self.cell.tote_size)):
-            if min(size[:2]) < field:
-                found.append(
-                    f"env.{key}={list(size)}: expected sides of at least {field} (receptive field {field}, eq. 3)."
-                )
+        field, side = getattr(self.network, "receptive_field", 0), self.cell.longest_side or self.cell.max_side
+        found = [
+            f"env.{key}={list(size)}: expected sides of at least {field} (receptive field {field}, eq. 3)."
+            for key, size in (("bin_size", self.cell.bin_size), ("tote_size", self.cell.tote_size))
+            if min(size[:2]) < field
+        ]
+        if field and side > (most := field / 2 + 1):
+            wanted = f"expected at most {most:g} (receptive field {field}, eq. 2)"
+            found.insert(0, f"items: the longest side is {side}, {wanted}.")
         return found
+
+
+class ActionPolicy(Policy):
+    """Chooses among all ``N_a`` flat actions, by a score for each.
+
+    Args:
+        cell: the sizes.
+        mask_infeasible: choose among feasible actions only.
+    """
+
+    choice_key = "action"
+
+    def __init__(self, cell: CellSpec, mask_infeasible: bool = False):
+        super().__init__(cell, masks=("action",) if mask_infeasible else ())
+
+    @abstractmethod
+    def action_scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
+        """Return logits ``[N, N_a]``; with a mask, bool ``[N, N_a]``, :data:`MASKED` where it forbids an action."""
+
+    def logits(self, observation: Observation) -> Tensor:
+        return self.action_scores(observation, observation["action_mask"] if self.masks else None)
+
+    def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
+        return choice
+
+    def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
+        return action
+
+    def action_log_probs(self, observation: Observation) -> Tensor:
+        return self.action_scores(observation).log_softmax(-1)
+
+    def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
+        return self.action_scores(observation, action_mask(self.cell, maps)).argmax(1)
 
 
 @runtime_checkable
@@ -186,7 +214,6 @@ class EstimatesValue(Protocol):
 
     def value_network(self) -> torch.nn.Module:
         """Return the module from the entries of the observation in its ``in_keys`` to values ``[..., 1]``."""
-        ...
 
 
 @runtime_checkable
@@ -195,11 +222,9 @@ class ScoresFootprints(Protocol):
 
     def ranked(self, maps: PlacingMaps) -> Tensor:
         """Return the footprints among which it chooses, bool ``[N, M * Q * W_T * D_T]``; some, if any is feasible."""
-        ...
 
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
         """Return logits of the footprints, float32 in the shape of the mask; :data:`MASKED` where it forbids one."""
-        ...
 
 
 @runtime_checkable
@@ -208,7 +233,6 @@ class ScoresActions(Protocol):
 
     def action_scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
         """Return logits, float32 ``[N, N_a]``; with a mask of that shape, :data:`MASKED` where it forbids an action."""
-        ...
 
 
 @runtime_checkable
@@ -224,7 +248,6 @@ class ScoresAnySize(Protocol):
     def unmasked_scores(self, observation: Observation) -> Tensor:
         """Return the score of everything that it scores, feasible or not, float32 ``[N, scores]``; it reads the entries
         ``in_keys`` but for the masks."""
-        ...
 
 
 class Choice(Categorical):
@@ -258,13 +281,9 @@ def refuse_several_items(policy: Policy, cell: CellSpec) -> None:
 
 def pick_one(candidates: Tensor) -> Tensor:
     """Return an entry >= 0 of each row of int64 ``[N, M]``, -1 if none: drawn when exploring, else the lowest."""
-    if exploration_type() == ExplorationType.RANDOM:
-        draw = torch.rand(candidates.shape, device=candidates.device)
-        index = torch.where(candidates >= 0, draw, -1.0).argmax(1, keepdim=True)
-    else:
-        highest = torch.iinfo(candidates.dtype).max
-        index = torch.where(candidates >= 0, candidates, highest).argmin(1, keepdim=True)
-    return candidates.gather(1, index)[:, 0]
+    explores = exploration_type() == ExplorationType.RANDOM
+    order = torch.rand(candidates.shape, device=candidates.device) if explores else FAR**2 - candidates
+    return candidates.gather(1, torch.where(candidates >= 0, order, -1).argmax(1, keepdim=True))[:, 0]
 
 
 def refuse_large_network(make: Callable[[], torch.nn.Module], key: str) -> None:

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_number
+from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_numbers
 from pickplace.policies.base import MAP_KEYS
 from pickplace.policies.depth import clip_depth, item_code
 from pickplace.policies.fcn4d.network import BIN_PADDING, TOTE_PADDING, check_clips, clip_and_pad
@@ -55,13 +55,11 @@ class Pooled(nn.Module):
     ):
         super().__init__()
         odd_number("model.critic.receptive_field", receptive_field)
-        for key, value in {"filters": filters, "hidden": hidden, "level": level, "stride": stride}.items():
-            whole_number(f"model.critic.{key}", value, most=MAX_WIDTH)
-        self.in_keys = self.keys_for(cell.bin_items)
-        self.level, self.stride = level, stride
-        for key, value in {"tote_clip": tote_clip, "depth_range": depth_range, "item_range": item_range}.items():
-            whole_number(f"model.critic.{key}", value, most=MAX_LEVELS)
+        whole_numbers("model.critic", MAX_WIDTH, filters=filters, hidden=hidden, level=level, stride=stride)
+        levels = {"tote_clip": tote_clip, "depth_range": depth_range, "item_range": item_range}
+        whole_numbers("model.critic", MAX_LEVELS, **levels)
         check_inputs(f"model.critic.receptive_field={receptive_field}", depth_range * receptive_field**2)
+        self.in_keys, self.level, self.stride = self.keys_for(cell.bin_items), level, stride
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
         self.compute_dtype = one_of("model.critic.compute_dtype", compute_dtype, DTYPES)
         self.around = nn.Conv2d(depth_range, filters, receptive_field, stride, padding=receptive_field // 2)
@@ -86,14 +84,11 @@ class Pooled(nn.Module):
         with torch.autocast(tote_depth.device.type, dtype, enabled=dtype != torch.float32):
             x = self.around(planes.to(dtype, memory_format=torch.channels_last))
             x = x + F.conv2d(1 - bearing[:, None].to(dtype), self.weak, None, self.stride, len(self.weak[0, 0]) // 2)
-            x = x.permute(0, 2, 3, 1)
             code = self._item_code(read_items(bin_depth, None if items is None else items.flatten(0, -3)))
-            x = x + self.item(code.to(dtype))[:, None, None]
-            x = x + room.to(dtype) * self.room.to(dtype)
+            x = x.permute(0, 2, 3, 1) + self.item(code.to(dtype))[:, None, None] + room.to(dtype) * self.room.to(dtype)
             x = F.relu(self.hidden(F.relu(x)))
         share, more = self.head(x.float()).unbind(-1)
-        value = (share * room[..., 0] + more / 5).sum((1, 2))
-        return value.view(*batch, 1)
+        return (share * room[..., 0] + more / 5).sum((1, 2)).view(*batch, 1)
 
     @staticmethod
     def keys_for(bin_items: int) -> tuple[str, ...]:
@@ -137,8 +132,7 @@ class Conv4d(nn.Module):
         compute_dtype: str = "float32",
     ):
         super().__init__()
-        whole_number("model.critic.filters", filters, most=MAX_WIDTH)
-        whole_number("model.critic.hidden", hidden, most=MAX_WIDTH)
+        whole_numbers("model.critic", MAX_WIDTH, filters=filters, hidden=hidden)
         one_of("model.critic.compute_dtype", compute_dtype, CONV4D_DTYPES)
         check_clips("model.critic", bin_clip, tote_clip, floor)
         number("model.critic.depth_scale", depth_scale, 1e-3, 1e6)
@@ -158,8 +152,7 @@ class Conv4d(nn.Module):
     def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
         """Return values ``[..., 1]`` of bin depth ``[..., W_B, D_B]`` and tote depth ``[..., W_T, D_T]``."""
         for name, depth, size in (("bin", bin_depth, self.bin_size), ("tote", tote_depth, self.tote_size)):
-            got = tuple(depth.shape[-2:])
-            if got != size:
+            if (got := tuple(depth.shape[-2:])) != size:
                 raise ValueError(
                     f"{name}_depth: got {list(got)}, expected {list(size)}, for which the critic was made."
                 )

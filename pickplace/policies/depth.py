@@ -14,10 +14,6 @@ class Contents(NamedTuple):
     items: Item  # [N, M]
     number: Tensor  # int64, one for each footprint that is scored
 
-    def part(self, index: Tensor) -> "Contents":
-        """Return the same for some of the footprints."""
-        return Contents(self.items, self.number[index])
-
     def sizes(self, row: Tensor) -> list[Tensor]:
         """Return width, depth and height of each footprint's item; ``row`` is the bin of each."""
         at = row * self.items.x.shape[1] + self.number

@@ -5,7 +5,7 @@ mask knows that. Where bins hold several items, a choice is a pair of an item an
 ``item * num_footprints + footprint``.
 """
 
-from typing import Any
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -58,9 +58,11 @@ class FootprintScorer(Policy):
     Args:
         cell: the sizes.
         mask_infeasible: must be true, as the choices come from what is feasible.
+        **network: arguments of the network.
 
     Attributes:
         mask: the mask that it needs in training.
+        network_class: makes the network.
 
     Raises:
         ValueError: without a mask.
@@ -69,15 +71,16 @@ class FootprintScorer(Policy):
     choice_key = "footprint"
     map_keys = MAP_KEYS
     mask: str
-    network: Any
+    network_class: Callable[..., torch.nn.Module]
 
-    def __init__(self, cell: CellSpec, mask_infeasible: bool = True):
+    def __init__(self, cell: CellSpec, mask_infeasible: bool = True, **network):
         if not mask_infeasible:
             raise ValueError(
                 f"model.mask_infeasible=False: expected true with {type(self).__name__}; its choices are feasible ones."
             )
         super().__init__(cell, masks=(self.mask,))
         self.in_keys += item_keys(cell.bin_items)
+        self.network = self.network_class(**network)
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
         """Return the scores of some footprints, float32 ``[M]``; a subclass may add what further terms tell.
@@ -88,9 +91,8 @@ class FootprintScorer(Policy):
         """
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
         places = self.cell.parities * totes.shape[1] * totes.shape[2]
-        number = footprint // places
-        contents = Contents(items_from_observation(observation), number)
-        return self.network.at(bins, totes, bearing, row, footprint - number * places, contents)[:, 0]
+        contents = Contents(items_from_observation(observation), footprint // places)
+        return self.network.at(bins, totes, bearing, row, footprint - contents.number * places, contents)[:, 0]
 
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
         """Return logits of the footprints that a mask ``[N, M * Q * W_T * D_T]`` allows; the others are not

@@ -3,8 +3,7 @@
 import torch
 from torch import nn
 
-from pickplace.policies.actions import ActionPolicy
-from pickplace.policies.base import MASKED
+from pickplace.policies.base import MASKED, ActionPolicy
 from pickplace.policies.depth import clip_depth
 
 

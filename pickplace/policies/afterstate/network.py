@@ -12,7 +12,7 @@ from pickplace.common.validate import (
     odd_number,
     one_of,
     size_tuple,
-    whole_number,
+    whole_numbers,
 )
 from pickplace.policies.fcn_grasp.network import DTYPES, matrix_dtype
 
@@ -57,8 +57,7 @@ class ToteValue(nn.Module):
         if min(self.grid[:2]) < 2:
             raise ValueError(f"model.actor.grid={list(self.grid)}: expected at least 2 cells along x and y.")
         odd_number("model.actor.receptive_field", receptive_field)
-        for key, value in {"filters": filters, "hidden": hidden}.items():
-            whole_number(f"model.actor.{key}", value, most=MAX_WIDTH)
+        whole_numbers("model.actor", MAX_WIDTH, filters=filters, hidden=hidden)
         self.mirrored = flag("model.actor.mirrored", mirrored)
         self.reward_scale = number("model.actor.reward_scale", reward_scale)
         self.compute_dtype = one_of("model.actor.compute_dtype", compute_dtype, DTYPES)

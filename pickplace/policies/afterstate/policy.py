@@ -29,13 +29,12 @@ class Afterstate(FootprintPolicy):
 
     map_keys = ("bin_depth", "tote_depth", "tote_height")
     mask = "corner"
+    network_class = ToteValue
     check_cell = refuse_several_items
-    network: ToteValue
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = True, temperature: float = 0.003, **network):
-        super().__init__(cell, mask_infeasible)
+        super().__init__(cell, mask_infeasible, **network)
         self.temperature = number("model.actor.temperature", temperature, 1e-6)
-        self.network = ToteValue(**network)
 
     def value_network(self) -> ToteValue:
         return self.network

@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.common.validate import MAX_WIDTH, check_inputs, excerpt, number, whole_number
+from pickplace.common.validate import MAX_WIDTH, check_inputs, excerpt, number, whole_numbers
 from pickplace.policies.depth import Contents
 from pickplace.rules.grasps import split_footprint
 
@@ -41,10 +41,8 @@ class CornerNet(nn.Module):
         head_std: float = 0.01,
     ):
         super().__init__()
-        for key, value in {"filters": filters, "hidden": hidden}.items():
-            whole_number(f"model.actor.{key}", value, most=MAX_WIDTH)
-        for key, value in {"inside": inside, "near": near}.items():
-            whole_number(f"model.actor.{key}", value, most=64)
+        whole_numbers("model.actor", MAX_WIDTH, filters=filters, hidden=hidden)
+        whole_numbers("model.actor", 64, inside=inside, near=near)
         if not isinstance(item_scale, (list, tuple)) or len(item_scale) != 2:
             raise ValueError(f"model.actor.item_scale={excerpt(item_scale)}: expected [side, height].")
         self.item_scale = tuple(number("model.actor.item_scale", value, 1e-3, 1e6) for value in item_scale)
@@ -80,32 +78,28 @@ class CornerNet(nn.Module):
     ) -> Tensor:  # fmt: skip
         """Return what the first layer sees, float32 ``[M, inputs]``; arguments as of :meth:`at`."""
         _, wide, deep = tote_depth.shape
-        parity, x, y = split_footprint((wide, deep), footprint)
-        turned = (parity == 1)[:, None]
-        w, d, h = (part[:, None] for part in contents.sizes(row))
-        h = h.float()
+        parity, x, y, w, d, h = (
+            part[:, None] for part in (*split_footprint((wide, deep), footprint), *contents.sizes(row))
+        )
+        turned, h = parity == 1, h.float()
 
         # The points along the item's width and depth, as cells of the tote: outside it, a cell of the margin.
-        along, across = self._points(w), self._points(d)  # [M, points]
-        begin_x, begin_y = x[:, None], y[:, None]
-        begin_w, begin_d = torch.where(turned, begin_y, begin_x), torch.where(turned, begin_x, begin_y)
+        begin_w, begin_d = torch.where(turned, y, x), torch.where(turned, x, y)
         size_w, size_d = torch.where(turned, deep, wide), torch.where(turned, wide, deep)
-        along = torch.minimum((begin_w + along).clamp(min=-1), size_w) + 1
-        across = torch.minimum((begin_d + across).clamp(min=-1), size_d) + 1
+        along = torch.minimum((begin_w + self._points(w)).clamp(min=-1), size_w) + 1  # [M, points]
+        across = torch.minimum((begin_d + self._points(d)).clamp(min=-1), size_d) + 1
         stride = deep + 2
         step_w, step_d = torch.where(turned, 1, stride), torch.where(turned, stride, 1)
         origin = (row * ((wide + 2) * stride))[:, None]
         cells = (origin + along * step_w)[:, :, None] + (across * step_d)[:, None]  # [M, points, points]
-        outside = F.pad(torch.zeros_like(tote_depth), (1, 1, 1, 1), value=1.0).flatten()[cells]
-        depth = F.pad(tote_depth, (1, 1, 1, 1)).flatten()[cells]
-        weak = F.pad(1.0 - bearing, (1, 1, 1, 1)).flatten()[cells]
+        maps = (tote_depth, 1.0 - bearing, torch.ones_like(tote_depth))
+        depth, weak, inside = (F.pad(each, (1, 1, 1, 1)).flatten()[cells] for each in maps)
 
         longest = torch.sym_max(*bin_depth.shape[1:])
         rest = self._rest(tote_depth, longest, row, x, y, turned, w, d)  # depth of what the item rests on, [M, 1]
         above = (rest[..., None] - depth) / h[..., None]  # of the surface, in heights of the item
-        inside = 1 - outside
-        planes = [above.clamp(-1.5, 1.5) * inside, (above > 1) * inside, (above == 1) * inside]
-        planes += [(above == 0) * (1 - weak) * inside, weak, outside]
+        levels = [above.clamp(-1.5, 1.5), above > 1, above == 1, (above == 0) * (1 - weak)]
+        planes = [*(level * inside for level in levels), weak, 1 - inside]
         side, height = self.item_scale
         # The depth of the deepest place, and of the floor, tell how high the item lies.
         deepest = tote_depth.amax((1, 2))[row][:, None]
@@ -126,12 +120,12 @@ class CornerNet(nn.Module):
     def _rest(
         tote_depth: Tensor, longest: int, row: Tensor, x: Tensor, y: Tensor, turned: Tensor, w: Tensor, d: Tensor
     ) -> Tensor:
-        """Return the least depth under each footprint ``[M, 1]``; no item is longer than ``longest``."""
+        """Return the least depth under each footprint, ``[M, 1]`` as all arguments; none is longer than ``longest``."""
         _, wide, deep = tote_depth.shape
         step = torch.arange(longest, device=row.device)
         # The cells of a square; those beyond the footprint stand for its last row or column.
         wx, wy = torch.where(turned, d, w), torch.where(turned, w, d)
-        column = (x[:, None] + torch.minimum(step, wx - 1)).clamp(max=wide - 1)
-        line = (y[:, None] + torch.minimum(step, wy - 1)).clamp(max=deep - 1)
+        column = (x + torch.minimum(step, wx - 1)).clamp(max=wide - 1)
+        line = (y + torch.minimum(step, wy - 1)).clamp(max=deep - 1)
         cells = (row[:, None] * wide + column)[:, :, None] * deep + line[:, None]
         return tote_depth.flatten()[cells].amin((1, 2))[:, None]

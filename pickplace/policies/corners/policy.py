@@ -2,7 +2,6 @@
 
 from pickplace.policies.corners.network import CornerNet
 from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintPolicy
-from pickplace.rules.cell import CellSpec
 
 
 class Corners(FootprintPolicy):
@@ -11,13 +10,9 @@ class Corners(FootprintPolicy):
     Args:
         cell: the sizes.
         mask_infeasible: must be true.
-        network: arguments of :class:`~pickplace.policies.corners.network.CornerNet`.
+        **network: arguments of :class:`~pickplace.policies.corners.network.CornerNet`.
     """
 
     mask = "corner"
+    network_class = CornerNet
     score_index = FOOTPRINT_INDEX
-    network: CornerNet
-
-    def __init__(self, cell: CellSpec, mask_infeasible: bool = True, **network):
-        super().__init__(cell, mask_infeasible)
-        self.network = CornerNet(**network)

@@ -5,8 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from pickplace.policies.actions import ActionPolicy
-from pickplace.policies.base import MASKED
+from pickplace.policies.base import MASKED, ActionPolicy
 from pickplace.policies.fcn4d.network import Conv4dNet
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_flat
@@ -23,8 +22,6 @@ class Conv4dPolicy(ActionPolicy):
         mask_infeasible: choose among feasible actions only (the paper does not).
         network: arguments of :class:`~pickplace.policies.fcn4d.network.Conv4dNet`.
     """
-
-    network: Conv4dNet
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
         super().__init__(cell, mask_infeasible)

@@ -1,17 +1,16 @@
 """The fully convolutional network behind ``fcn_grasp``: the tote around a footprint, seen from what would lie there."""
 
-from collections.abc import Sequence
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_number
+from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_numbers
 from pickplace.policies.depth import Contents, clip_depth
 from pickplace.policies.footprints import every_footprint
 from pickplace.rules.grasps import split_footprint
 from pickplace.rules.gripper.base import reference_cell
 from pickplace.rules.item import read_items
+from pickplace.rules.maps import rectangle
 
 DTYPES = ("auto", "float32", "bfloat16")
 CHUNK_BYTES = 2**29  # inputs of the first layer that are held at a time when gradients are off
@@ -70,19 +69,16 @@ class FootprintFcn(nn.Module):
         headroom_bins: int | None = None,
     ):
         super().__init__()
-        odd_number("model.actor.receptive_field", receptive_field, least=3)
-        sizes = {"filters": filters, "hidden": hidden, "depth_range": depth_range, "item_range": item_range}
-        sizes["headroom_bins"] = headroom_bins = depth_range if headroom_bins is None else headroom_bins
-        for key, value in {**sizes, "tote_clip": tote_clip, "reach": reach}.items():
-            whole_number(f"model.actor.{key}", value, most=MAX_WIDTH if key in ("filters", "hidden") else MAX_LEVELS)
-        number("model.actor.head_std", head_std, most=1e3)
-        self.receptive_field, self.reach = receptive_field, reach
+        self.headroom_bins = headroom_bins = depth_range if headroom_bins is None else headroom_bins
+        self.receptive_field, self.reach = odd_number("model.actor.receptive_field", receptive_field, least=3), reach
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
-        self.headroom_bins = headroom_bins
+        whole_numbers("model.actor", MAX_WIDTH, filters=filters, hidden=hidden)
+        levels = {"tote_clip": tote_clip, "depth_range": depth_range, "item_range": item_range, "reach": reach}
+        whole_numbers("model.actor", MAX_LEVELS, headroom_bins=headroom_bins, **levels)
+        number("model.actor.head_std", head_std, most=1e3)
         self.compute_dtype = one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
-        self.planes = max(
-            3 * reach + 2, depth_range, item_range, headroom_bins
-        )  # around: -reach .. reach; under: holes 0 .. reach
+        # Around the footprint -reach .. reach, under it holes 0 .. reach.
+        self.planes = max(3 * reach + 2, depth_range, item_range, headroom_bins)
         inputs = self.planes * (receptive_field**2 + 5)
         check_inputs(f"model.actor.receptive_field={receptive_field}, {self.planes} planes", inputs)
         self.patch = nn.Linear(inputs, filters)
@@ -121,27 +117,16 @@ class FootprintFcn(nn.Module):
         """
         at_once = CHUNK_BYTES // (4 * self.patch.in_features)
         if not torch.is_grad_enabled() and len(row) > at_once:  # of large totes: a part at a time, to save memory
-            return torch.cat(
-                [
-                    self.at(
-                        bin_depth,
-                        tote_depth,
-                        bearing,
-                        row[part],
-                        footprint[part],
-                        contents.part(part),
-                    )
-                    for part in torch.arange(len(row), device=row.device).split(at_once)
-                ]
-            )
+            split = (index.split(at_once) for index in (row, footprint, contents.number))
+            parts = ((*part, contents._replace(number=number)) for *part, number in zip(*split, strict=True))
+            return torch.cat([self.at(bin_depth, tote_depth, bearing, *part) for part in parts])
         dtype, count = matrix_dtype(self.compute_dtype, tote_depth.device.type), row.shape[0]
         lower = dtype != torch.float32
         if lower:
             padding = next((-count % step for beyond, step in PADDED_ROWS if count > beyond), 0)
             row, footprint = (F.pad(index, (0, padding)) for index in (row, footprint))
             contents = contents._replace(number=F.pad(contents.number, (0, padding)))
-        sizes = contents.sizes(row)
-        x, weak = self._inputs(bin_depth, tote_depth, bearing, row, footprint, sizes, dtype)
+        x, weak = self._inputs(bin_depth, tote_depth, bearing, row, footprint, contents.sizes(row), dtype)
         with torch.autocast(tote_depth.device.type, dtype, enabled=lower):
             x = self.patch(x) + F.linear(weak, self.weak)
             if contents.items.x.shape[1] > 1:  # else a gradient of zeros would change the norm that clipping sees
@@ -150,15 +135,9 @@ class FootprintFcn(nn.Module):
         return self.head(x.float())[:count]  # in full: scores that differ a little must not be rounded to a tie
 
     def _inputs(
-        self,
-        bin_depth: Tensor,
-        tote_depth: Tensor,
-        bearing: Tensor,
-        row: Tensor,
-        footprint: Tensor,
-        sizes: Sequence[Tensor],
-        dtype,
-    ) -> tuple[Tensor, Tensor]:
+        self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor,
+        sizes: list[Tensor], dtype: torch.dtype,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Return the inputs of the first layer: ``[M, inputs]``, one-hot, cell by cell, then the five codes; and marks,
         ``[M, side * side]``."""
         side, reach, (w, d, h) = self.receptive_field, self.reach, sizes
@@ -182,7 +161,7 @@ class FootprintFcn(nn.Module):
         cells = steps[turned.long()] + first[:, None]  # [M, side * side]
         seen = depth.flatten()[cells]
         weak = F.pad(1 - bearing, (margin,) * 4).flatten()[cells].to(dtype)
-        under = self._under(bin_depth.shape[1:], row.device)[w, d]
+        under = rectangle((side, side), before_w, before_d, w, d).flatten(0, 1).t()
         rest = torch.where(under, seen, FAR_DOWN).amin(1)  # depth of what the item rests on
         headroom = rest - h.to(small)  # above its top
         around = (headroom[:, None] - seen).clamp_(-reach, reach).add_(reach)
@@ -194,19 +173,8 @@ class FootprintFcn(nn.Module):
             (headroom + 1).clamp(0, self.headroom_bins - 1),
             (deepest - rest).clamp(0, self.depth_range - 1),
         ]
-        level = torch.cat([level, torch.stack(codes, 1)], 1)
         planes = torch.eye(self.planes + 1, self.planes, dtype=dtype, device=row.device)
-        return F.embedding(level.int(), planes).flatten(1), weak
-
-    def _under(self, bin_size, device: torch.device) -> Tensor:
-        """Return which cells of a patch lie under an item of ``w x d``, bool ``[W_B + 1, D_B + 1, side * side]``."""
-        side, maps = self.receptive_field, []
-        tap = torch.arange(side, device=device)
-        for longest in bin_size:
-            size = torch.arange(longest + 1, device=device)[:, None]
-            begin = reference_cell(side) - reference_cell(size)
-            maps.append((tap >= begin) & (tap < begin + size))
-        return (maps[0][:, None, :, None] & maps[1][None, :, None]).flatten(2)
+        return F.embedding(torch.cat([level, torch.stack(codes, 1)], 1).int(), planes).flatten(1), weak
 
 
 def matrix_dtype(name: str, device: str) -> torch.dtype:

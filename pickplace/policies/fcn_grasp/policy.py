@@ -9,7 +9,6 @@ from pickplace.policies.fcn_grasp.network import FootprintFcn
 from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintPolicy
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import (
-    class_index,
     footprint_index,
     is_outside,
     join_action,
@@ -26,15 +25,11 @@ class FcnGrasp(FootprintPolicy):
     Args:
         cell: the sizes.
         mask_infeasible: must be true.
-        network: arguments of :class:`~pickplace.policies.fcn_grasp.network.FootprintFcn`.
+        **network: arguments of :class:`~pickplace.policies.fcn_grasp.network.FootprintFcn`.
     """
 
+    network_class = FootprintFcn
     score_index = FOOTPRINT_INDEX
-    network: FootprintFcn
-
-    def __init__(self, cell: CellSpec, mask_infeasible: bool = True, **network):
-        super().__init__(cell, mask_infeasible)
-        self.network = FootprintFcn(**network)
 
 
 class UnmaskedFcnGrasp(Policy):
@@ -45,14 +40,13 @@ class UnmaskedFcnGrasp(Policy):
 
     Args:
         cell: the sizes.
-        network: arguments of :class:`~pickplace.policies.fcn_grasp.network.FootprintFcn`, which scores each
+        **network: arguments of :class:`~pickplace.policies.fcn_grasp.network.FootprintFcn`, which scores each
             footprint once for every offset of the item under the end effector.
     """
 
     choice_key = "grasp"
     map_keys = MAP_KEYS
     check_cell = refuse_several_items
-    network: FootprintFcn
     scored: Tensor  # see `_scored`
 
     def __init__(self, cell: CellSpec, **network):
@@ -69,18 +63,16 @@ class UnmaskedFcnGrasp(Policy):
         """
         (tote_w, tote_d, _), offsets, low = self.cell.tote_size, self.cell.num_offsets, self.cell.min_offset
         step, x, y = torch.arange(offsets), torch.arange(tote_w), torch.arange(tote_d)
-        found = []
+        channel, found = torch.arange(offsets**2).view(offsets, offsets, 1, 1), []
         for turn in range(num_grasp_turns(self.cell)):  # those of one parity have the same scores
             parity, shape = turn % 2, self.cell.effector(turn)
             left = x[:, None] + (step[:, None, None, None] + low - shape.ref_x)  # [O, 1, W_T, 1]
             front = y + (step[:, None, None] + low - shape.ref_y)  # [O, 1, D_T]
-            # The network sees a turned footprint along the item's own axes.
-            along, across = (step[:, None], step) if parity == 0 else (step, step[:, None])
-            channel = class_index(self.cell, 0, along, across)
             inside = ~is_outside(left, 1, tote_w) & ~is_outside(front, 1, tote_d)
-            index = footprint_index(self.cell.tote_size, parity, left, front) * offsets**2 + channel[:, :, None, None]
-            last = self.cell.num_footprints * offsets**2
-            found.append(torch.where(inside, index, last).flatten(2).flatten(0, 1))
+            footprint = footprint_index(self.cell.tote_size, parity, left, front)
+            # The network sees a turned footprint along the item's own axes.
+            index = footprint * offsets**2 + (channel.transpose(0, 1) if parity else channel)
+            found.append(torch.where(inside, index, self.cell.num_footprints * offsets**2).flatten(2).flatten(0, 1))
         return torch.cat(found)
 
     def class_scores(self, observation: Observation) -> Tensor:
@@ -90,7 +82,7 @@ class UnmaskedFcnGrasp(Policy):
         return torch.cat([scores, self.outside.expand(len(scores), 1)], 1)[:, self.scored]
 
     def _choices(self, observation: Observation) -> tuple[Tensor, Tensor, Tensor]:
-        """Return per choice a logit for each of its flat actions, and how many these are; and each pick's class."""
+        """Return the logit of each choice, and of each of its flat actions; and each pick's class."""
         maps, places = self.class_scores(observation), self.cell.num_places
         logits = torch.cat([maps.flatten(1), self.miss.expand(len(maps), 1)], 1)
         picks = pick_classes(self.cell, item_from_depth(observation["bin_depth"]))
@@ -99,11 +91,10 @@ class UnmaskedFcnGrasp(Policy):
             1, picks.flatten(1) + 1, torch.ones_like(picks, dtype=maps.dtype).flatten(1)
         )
         ways = torch.cat([counts[:, 1:].repeat_interleave(places, 1), missing[:, None]], 1)
-        return logits, ways, picks
+        return torch.where(ways > 0, logits + ways.clamp(min=1).log(), MASKED), logits, picks
 
     def logits(self, observation: Observation) -> Tensor:
-        logits, ways, _ = self._choices(observation)
-        return torch.where(ways > 0, logits + ways.clamp(min=1).log(), MASKED)
+        return self._choices(observation)[0]
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
         cell, places = self.cell, self.cell.num_places
@@ -112,9 +103,8 @@ class UnmaskedFcnGrasp(Policy):
         classes = pick_classes(cell, item_from_depth(observation["bin_depth"])).flatten(1)
         pairs = classes == wanted[:, None]  # [N, P * R]
         pair = pick_one(torch.where(pairs, torch.arange(pairs.shape[1], device=choice.device), -1))
-        anywhere = torch.zeros_like(choice)
-        if exploration_type() == ExplorationType.RANDOM:
-            anywhere = torch.randint(places, choice.shape, device=choice.device)
+        explores = exploration_type() == ExplorationType.RANDOM
+        anywhere = torch.randint(places, choice.shape, device=choice.device) if explores else 0
         place = torch.where(missed, anywhere, choice % places)
         return join_action(cell, pair // cell.rotations, place, pair % cell.rotations)
 
@@ -126,11 +116,10 @@ class UnmaskedFcnGrasp(Policy):
         return torch.where(grasp < 0, self.classes * places, grasp * places + place)
 
     def action_log_probs(self, observation: Observation) -> Tensor:
-        logits, ways, picks = self._choices(observation)
-        total = torch.where(ways > 0, logits + ways.clamp(min=1).log(), MASKED).logsumexp(1, keepdim=True)
-        maps = (logits - total)[:, :-1].unflatten(1, (-1, self.cell.num_places))
-        missed = (logits - total)[:, -1:, None].expand(-1, 1, self.cell.num_places)
-        rows = torch.cat([missed, maps], 1)  # row 0 is a miss
+        logits, each, picks = self._choices(observation)
+        log_probs = each - logits.logsumexp(1, keepdim=True)
+        maps = log_probs[:, :-1].unflatten(1, (-1, self.cell.num_places))
+        rows = torch.cat([log_probs[:, -1:, None].expand_as(maps[:, :1]), maps], 1)  # row 0 is a miss
         batch = torch.arange(len(rows), device=rows.device)[:, None, None]
         return rows[batch, picks + 1].transpose(2, 3).flatten(1)  # [N, P, R, places] -> [N, N_a]
 

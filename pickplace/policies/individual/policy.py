@@ -13,8 +13,7 @@ from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintScorer, coun
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import heuristic_pick, join_pick, pick_classes, select_pick
 from pickplace.rules.item import Observation, item_from_depth, items_from_observation
-from pickplace.rules.masks import PlacingMaps, action_footprints, action_mask, placing_maps
-from pickplace.rules.state import State
+from pickplace.rules.masks import PlacingMaps, action_footprints, action_mask
 
 EXCLUDES = "every pick but the heuristic one"
 
@@ -107,12 +106,8 @@ class IndividualGrasp(FootprintScorer):
     mask = "action"
     excludes = EXCLUDES
     check_cell = refuse_several_items
+    network_class = FootprintFcn
     score_index = FOOTPRINT_INDEX
-    network: FootprintFcn
-
-    def __init__(self, cell: CellSpec, mask_infeasible: bool = True, **network):
-        super().__init__(cell, mask_infeasible)
-        self.network = FootprintFcn(**network)
 
     def _reached(self, observation: Observation, mask: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Return the heuristic pick, the footprints that it leaves, and those to choose among.
@@ -121,34 +116,26 @@ class IndividualGrasp(FootprintScorer):
             the pick cell, int64 ``[N]``; the footprint for each place and rotation, int64 ``[N, W_T * D_T * R]``, -1
             outside the tote; bool of the same shape.
         """
-        item = item_from_depth(observation["bin_depth"])
-        pick = heuristic_pick(self.cell, item)
+        pick = heuristic_pick(self.cell, item_from_depth(observation["bin_depth"]))
         footprint = select_pick(self.cell, action_footprints(self.cell, items_from_observation(observation)), pick)
         if mask is None:
             return pick, footprint, footprint >= 0
         allowed = select_pick(self.cell, mask, pick)
         return pick, footprint, torch.where(allowed.any(1, keepdim=True), allowed, footprint >= 0)
 
-    def _masked_logits(self, observation: Observation, mask: Tensor) -> Tensor:
-        _, footprint, allowed = self._reached(observation, mask)
+    def logits(self, observation: Observation) -> Tensor:
+        _, footprint, allowed = self._reached(observation, observation["action_mask"])
         return self.footprint_logits(observation, count_ways(self.cell.num_footprints, footprint, allowed) > 0)
 
-    def logits(self, observation: Observation) -> Tensor:
-        return self._masked_logits(observation, observation["action_mask"])
-
-    def _action(self, choice: Tensor, observation: Observation, mask: Tensor) -> Tensor:
-        pick, footprint, allowed = self._reached(observation, mask)
+    def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
+        pick, footprint, allowed = self._reached(observation, observation["action_mask"])
         number = torch.arange(footprint.shape[1], device=choice.device)
         place_rotation = pick_one(torch.where(allowed & (footprint == choice[:, None]), number, -1))
         return join_pick(self.cell, pick, place_rotation.clamp(min=0))
 
-    def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        maps = placing_maps(self.cell, State.from_observation(observation))
-        return self._action(choice, observation, action_mask(self.cell, maps))
-
     def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
-        mask = action_mask(self.cell, maps)
-        return self._action(self._masked_logits(observation, mask).argmax(1), observation, mask)
+        seen = {**observation, "action_mask": action_mask(self.cell, maps)}
+        return self.to_action(self.logits(seen).argmax(1), seen)
 
     def action_log_probs(self, observation: Observation) -> Tensor:
         """Return the distribution over flat actions; minus infinity for other picks, and outside the tote."""
