@@ -62,5 +62,5 @@ def test_the_rules_need_torch_alone():
 
 
 def test_the_protocol_of_planners_knows_the_rules_only():
-    assert {name.split(".")[1] for name in imports("pickplace.planners.base")} == {"rules", "common"}
+    assert {name.split(".")[1] for name in imports("pickplace.planners.base")} <= {"rules", "common"}
     assert "omegaconf" not in MODULES["pickplace.planners.base"].read_text()

@@ -6,7 +6,6 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import one_of
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, select_pick
 from pickplace.rules.item import Observation
@@ -34,7 +33,6 @@ class BatchPlanner(Protocol):
 
     def decide(self, observation: Observation) -> Tensor:
         """Return flat actions, int64 ``[N]``."""
-        ...
 
 
 class MapPlanner(ABC):
@@ -66,13 +64,8 @@ class MapPlanner(ABC):
         return self.choose(self.cell, state, placing_maps(self.cell, state), observation)
 
 
-#: Which of the items in the bin a planner considers.
+#: Rules of :func:`restrict_items`, for the setting ``planner.item``.
 ITEM_RULES = ("any", "first", "nearest")
-
-
-def check_item_rule(rule: str) -> str:
-    """Return the setting ``planner.item`` if it is one of :data:`ITEM_RULES`."""
-    return one_of("planner.item", rule, ITEM_RULES)
 
 
 def restrict_items(rule: str, state: State, mask: Tensor) -> Tensor:
@@ -84,10 +77,9 @@ def restrict_items(rule: str, state: State, mask: Tensor) -> Tensor:
         state: has the items.
         mask: bool ``[N, M * C]``, those of an item side by side.
     """
-    items = state.items
-    count = items.x.shape[1]
     if rule == "any":
         return mask
+    items, count = state.items, state.items.x.shape[1]
     mask = mask.unflatten(1, (count, -1))
     order = torch.arange(count, device=mask.device).expand_as(items.x)
     if rule == "nearest":

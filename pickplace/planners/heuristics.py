@@ -5,9 +5,9 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import number
+from pickplace.common.validate import number, one_of
 from pickplace.items.distributions import check_seed
-from pickplace.planners.base import MapPlanner, check_item_rule, restrict_items
+from pickplace.planners.base import ITEM_RULES, MapPlanner, restrict_items
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR, rectangle_sums
@@ -22,10 +22,18 @@ from pickplace.rules.placing import footprint_sizes
 from pickplace.rules.state import State
 
 
-def dbl_order(cell: CellSpec, top: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Return a number that orders footprints by (top, y, x): deepest-bottom-left has the least one."""
-    tote_w, tote_d, _ = cell.tote_size
-    return (top * tote_d + y) * tote_w + x
+def dbl_order(cell: CellSpec, top: Tensor) -> Tensor:
+    """Return a number that orders footprints by (top, y, x): deepest-bottom-left has the least one.
+
+    Args:
+        cell: the sizes.
+        top: whole numbers ``[..., W_T, D_T]``.
+
+    Returns:
+        int64, of the same shape
+    """
+    x, y = (torch.arange(side, device=top.device) for side in cell.tote_size[:2])
+    return (top.long() * len(y) + y) * len(x) + x[:, None]
 
 
 class UniformRandom:
@@ -44,8 +52,7 @@ class UniformRandom:
     def decide(self, observation: Observation) -> Tensor:
         """Return flat actions, int64 ``[N]``."""
         depth = observation["bin_depth"]
-        draw = torch.randint(self.cell.num_actions, (len(depth),), generator=self._generator)
-        return draw.to(depth.device)
+        return torch.randint(self.cell.num_actions, (len(depth),), generator=self._generator).to(depth.device)
 
 
 class RandomFeasible(MapPlanner):
@@ -95,25 +102,19 @@ class JointDBL(MapPlanner):
     name = "joint_dbl"
 
     def __init__(self, cell: CellSpec, item: str = "any"):
-        self.cell, self.item = cell, check_item_rule(item)
+        self.cell, self.item = cell, one_of("planner.item", item, ITEM_RULES)
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        tote_w, tote_d, _ = cell.tote_size
         feasible = restrict_items(self.item, state, choice_mask(cell, maps))  # [N, M * Q * W_T * D_T]
-        x = torch.arange(tote_w, device=feasible.device)[:, None]
-        y = torch.arange(tote_d, device=feasible.device)
-        # Items and parities that share the least order are tied.
-        order = torch.where(feasible, maps.join(dbl_order(cell, maps.top.long(), x, y)), FAR**2)
+        order = torch.where(feasible, maps.join(dbl_order(cell, maps.top)), FAR**2)
         best, place = order.unflatten(1, (-1, cell.num_places)).min(2)  # [N, M * Q]
-        least = best.amin(1, keepdim=True)
-        highest = cell.num_actions
-        action = torch.full_like(least, highest)
+        # Items and parities that share the least order are tied.
+        tied, actions = best == best.amin(1, keepdim=True), []
         for index in range(best.shape[1]):
-            choice = index * cell.num_places + place[:, index]
-            reaching = actions_reaching(cell, maps, choice)
-            reaching = torch.where((reaching >= 0) & (best[:, index, None] == least), reaching, highest)
-            action = torch.minimum(action, reaching.amin(1, keepdim=True))
-        return action[:, 0].clamp(max=highest - 1)
+            reaching = actions_reaching(cell, maps, index * cell.num_places + place[:, index])
+            good = (reaching >= 0) & tied[:, index, None]
+            actions.append(torch.where(good, reaching, cell.num_actions - 1).amin(1))
+        return torch.stack(actions).amin(0)
 
 
 class _Cheapest(MapPlanner):
@@ -153,8 +154,8 @@ class Corner(_Cheapest):
     name = "corner"
 
     def __init__(self, cell: CellSpec, height_weight: float = 10, item: str = "any"):
-        self.cell, self.height_weight = cell, number("planner.height_weight", height_weight)
-        self.item = check_item_rule(item)
+        self.cell, self.item = cell, one_of("planner.item", item, ITEM_RULES)
+        self.height_weight = number("planner.height_weight", height_weight)
 
     def cost(self, cell: CellSpec, state: State, maps: PlacingMaps, distance: Tensor) -> Tensor:
         return self.height_weight * maps.top + distance
@@ -177,20 +178,12 @@ class HeightmapMinimisation(_Cheapest):
     name = "heightmap_minimisation"
 
     def __init__(self, cell: CellSpec, distance_weight: float = 0.01, item: str = "any"):
-        self.cell, self.distance_weight = cell, number("planner.distance_weight", distance_weight)
-        self.item = check_item_rule(item)
+        self.cell, self.item = cell, one_of("planner.item", item, ITEM_RULES)
+        self.distance_weight = number("planner.distance_weight", distance_weight)
 
     def cost(self, cell: CellSpec, state: State, maps: PlacingMaps, distance: Tensor) -> Tensor:
-        return added_volume(cell, state, maps) + self.distance_weight * distance.double()
-
-
-def added_volume(cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:
-    """Return by how much an item on each feasible footprint raises the sum of all heights, int64 ``[N, Q, W_T, D_T]``.
-
-    That is the item's volume and the empty space that it encloses below itself.
-    """
-    surface, _, item = state.each_item()
-    w, d = footprint_sizes(cell, item)
-    before = rectangle_sums((surface >> 1).permute(1, 2, 0)[None], w, d)
-    area = item.w * item.d
-    return area.view(-1, 1, 1, 1) * maps.top - before.permute(3, 0, 1, 2)
+        surface, _, item = state.each_item()
+        before = rectangle_sums((surface >> 1).permute(1, 2, 0)[None], *footprint_sizes(cell, item))
+        # The item's volume, and the empty space that it encloses below itself.
+        added = (item.w * item.d).view(-1, 1, 1, 1) * maps.top - before.permute(3, 0, 1, 2)
+        return added + self.distance_weight * distance.double()

@@ -1,13 +1,14 @@
 """Individual planning by heuristics: the pick is decided first, and without a look at the tote."""
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from pickplace.common.validate import one_of
 from pickplace.planners.base import MapPlanner, pick_first, restrict_items
 from pickplace.planners.heuristics import dbl_order
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.grasps import PICKS, all_grasps, join_pick, split_footprint
+from pickplace.rules.grasps import PICKS, all_grasps, join_pick
 from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps
@@ -48,13 +49,10 @@ class IndividualHeuristic(MapPlanner):
         number = lifted.unflatten(1, (maps.bin_items, -1)).any(2).int().argmax(1)
         maps, _ = maps.of_choice(cell, number * cell.num_footprints)
         pick, footprint, succeeds = pick_first(cell, maps, self.pick)
-        allowed = footprint >= 0
+        allowed, footprint = footprint >= 0, footprint.clamp(min=0)
         if self.candidates == "corners":
-            corners = corner_footprints(cell, state.heights, maps).flatten(1)
-            allowed &= corners.gather(1, footprint.clamp(min=0))
-        top = maps.top.flatten(1).gather(1, footprint.clamp(min=0)).long()
-        _, x, y = split_footprint(cell.tote_size, footprint)
-        order = dbl_order(cell, top, x, y)
+            allowed &= corner_footprints(cell, state.heights, maps).flatten(1).gather(1, footprint)
+        order = dbl_order(cell, maps.top).flatten(1).gather(1, footprint)
         # Those that succeed, in order; then those that fail, in order; ties by the lowest flat index.
         order = torch.where(allowed, order + FAR * ~(succeeds & allowed) * cell.num_places, FAR**2)
         return join_pick(cell, pick, order.argmin(1))
@@ -72,10 +70,10 @@ def corner_footprints(cell: CellSpec, heights: Tensor, maps: PlacingMaps) -> Ten
     top, item = maps.top, maps.item
     found = torch.zeros_like(top, dtype=torch.bool)
     level = top - item.h[:, None, None, None]
-    sizes = ((item.w, item.d), (item.d, item.w))[: cell.parities]
+    sides = item.w[:, None, None], item.d[:, None, None]
     for z in level[top >= 0].unique().tolist():
         free = heights <= z
-        for parity, (w, d) in enumerate(sizes):
+        for parity, (w, d) in enumerate((sides, sides[::-1])[: cell.parities]):
             corners = torch.zeros_like(free)
             for axes in ((), (1,), (2,), (1, 2)):
                 # The corner at which both coordinates are least, after flipping the tote.
@@ -91,36 +89,24 @@ def corner_footprints(cell: CellSpec, heights: Tensor, maps: PlacingMaps) -> Ten
 def _least_corners(free: Tensor, w: Tensor, d: Tensor) -> Tensor:
     """Return the cells at which a maximal rectangle of free cells, at least ``w x d``, begins, bool ``[N, W, D]``."""
     tote_w, tote_d = free.shape[1:]
-    # How many cells are free from each one on along x.
-    run = torch.zeros_like(free, dtype=torch.int64)
-    count = torch.zeros_like(run[:, 0])
-    for x in reversed(range(tote_w)):
-        count = torch.where(free[:, x], count + 1, 0)
-        run[:, x] = count
-    blocked_left = torch.ones_like(free)  # is the cell before this one, along x, not free?
-    blocked_left[:, 1:] = ~free[:, :-1]
-    # How many cells are free from each one on along x in the row before, where the tote begins: none.
-    before = torch.zeros_like(run)
-    before[:, :, 1:] = run[:, :, :-1]
-    corner = torch.zeros_like(free)
+    x = torch.arange(tote_w, device=free.device)[:, None]
+    # How many cells are free from each one on along x; the same in the row before; is the cell before it not free?
+    run = torch.where(free, tote_w, x).flip(1).cummin(1).values.flip(1) - x
+    before = F.pad(run[:, :, :-1], (1, 0))
+    blocked_left = F.pad(~free[:, :-1], (0, 0, 1, 0), value=True)
     # Of the rectangles that begin at a cell, the widest of every depth; each is maximal if no side can move outwards.
-    width, closed = run.clone(), blocked_left.clone()
+    corner, width, closed = torch.zeros_like(free), run, blocked_left
     for depth in range(1, tote_d + 1):
-        last = torch.zeros_like(run)  # the width that one row more would leave
-        if depth < tote_d:
-            last[:, :, : tote_d - depth] = run[:, :, depth:]
-        longer = torch.minimum(width, last)
-        fits = (width >= w[:, None, None]) & (d[:, None, None] <= depth)
+        longer = torch.minimum(width, F.pad(run[:, :, depth:], (0, depth)))  # the width that one row more would leave
+        fits = (width >= w) & (d <= depth)
         corner |= fits & closed & (before < width) & (longer < width) & (width > 0)
-        if depth < tote_d:
-            closed[:, :, : tote_d - depth] |= blocked_left[:, :, depth:]
-        width = longer
+        width, closed = longer, closed | F.pad(blocked_left[:, :, depth:], (0, depth))
     return corner
 
 
 def _shift(maps: Tensor, axis: int, by: Tensor) -> Tensor:
-    """Return maps ``[N, W, D]`` shifted towards 0 along an axis, by a number of cells for each; zeros come in."""
+    """Return maps ``[N, W, D]`` shifted towards 0 along an axis, by ``[N, 1, 1]`` cells; zeros come in."""
     size = maps.shape[axis]
     cell = torch.arange(size, device=maps.device).view(*[-1 if a == axis else 1 for a in range(3)])
-    source = (cell + by[:, None, None]).expand_as(maps)
+    source = (cell + by).expand_as(maps)
     return maps.gather(axis, source.clamp(max=size - 1)) & (source < size)

@@ -7,7 +7,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace.common.validate import excerpt, is_whole, one_of
-from pickplace.planners.base import MapPlanner, check_item_rule, pick_first, restrict_items
+from pickplace.planners.base import ITEM_RULES, MapPlanner, pick_first, restrict_items
 from pickplace.policies.base import Policy, ScoresFootprints
 from pickplace.policies.footprints import FootprintPolicy, count_ways
 from pickplace.rules.cell import CellSpec
@@ -45,7 +45,8 @@ class PolicyPlanner(MapPlanner):
     ):
         if candidates != "all" and not (is_whole(candidates) and candidates >= 1):
             raise ValueError(f"planner.candidates={excerpt(candidates)}: expected 'all' or a whole number >= 1.")
-        self.cell, self.policy, self.candidates, self.item = cell, policy, candidates, check_item_rule(item)
+        self.cell, self.policy, self.candidates = cell, policy, candidates
+        self.item = one_of("planner.item", item, ITEM_RULES)
         self.pick = one_of("planner.pick", pick, ("any", *PICKS))
         for key, value in (("item", item), ("pick", pick)):
             if value != "any" and not (isinstance(policy, ScoresFootprints) and candidates == "all"):

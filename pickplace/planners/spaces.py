@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import check_bytes, flag
-from pickplace.planners.base import MapPlanner, check_item_rule, restrict_items
+from pickplace.common.validate import check_bytes, flag, one_of
+from pickplace.planners.base import ITEM_RULES, MapPlanner, restrict_items
 from pickplace.planners.heuristics import dbl_order
 from pickplace.rules.cell import MAX_SIDE, CellSpec
 from pickplace.rules.item import Observation
@@ -39,13 +39,8 @@ class Rectangles(NamedTuple):
         count = wide * (wide + 1) // 2 * (deep * (deep + 1) // 2)
         check_bytes(f"tote_size: {count:,} rectangles of cells", 100 * count, device)
         along_x, along_y = (torch.combinations(torch.arange(side + 1, device=device)) for side in (wide, deep))
-        x = along_x.repeat_interleave(len(along_y), 0)
-        y = along_y.repeat(len(along_x), 1)
+        x, y = along_x.repeat_interleave(len(along_y), 0), along_y.repeat(len(along_x), 1)
         return cls(x[:, 0], y[:, 0], x[:, 1], y[:, 1])
-
-    def grow(self, left: int, front: int, right: int, back: int) -> "Rectangles":
-        """Return them with further cells on each side."""
-        return Rectangles(self.x0 - left, self.y0 - front, self.x1 + right, self.y1 + back)
 
 
 def empty_spaces(heights: Tensor, rectangles: Rectangles, level_step: int = 0) -> Iterator[tuple[int, Tensor]]:
@@ -60,7 +55,8 @@ def empty_spaces(heights: Tensor, rectangles: Rectangles, level_step: int = 0) -
         the height, and bool ``[S, N]``, batch last
     """
     area = ((rectangles.x1 - rectangles.x0) * (rectangles.y1 - rectangles.y0))[:, None]
-    sides = [rectangles.grow(*(int(side == n) for n in range(4))) for side in range(4)]
+    steps = zip(rectangles._asdict().items(), (-1, -1, 1, 1), strict=True)
+    sides = [rectangles._replace(**{key: edge + step}) for (key, edge), step in steps]  # a side further out
     for level in heights.unique().tolist():
         higher = _counter(heights > level + level_step)
         lower = _counter(heights < level, outside=0)
@@ -102,11 +98,8 @@ class SpacePlanner(MapPlanner):
     holds_item = True  # whether a space must hold the item; else it may begin there and stick out
 
     def __init__(self, cell: CellSpec, item: str = "any", dbl_fallback: bool = True):
-        self.cell, self.item, self.dbl_fallback = (
-            cell,
-            check_item_rule(item),
-            flag("planner.dbl_fallback", dbl_fallback),
-        )
+        self.cell, self.item = cell, one_of("planner.item", item, ITEM_RULES)
+        self.dbl_fallback = flag("planner.dbl_fallback", dbl_fallback)
 
     @abstractmethod
     def space_order(self, floor: int, left_x: Tensor, left_y: Tensor) -> Tensor | int:
@@ -119,13 +112,12 @@ class SpacePlanner(MapPlanner):
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         feasible = restrict_items(self.item, state, choice_mask(cell, maps))
-        x, y = (torch.arange(side, device=feasible.device) for side in cell.tote_size[:2])
         parity = torch.arange(cell.parities, device=feasible.device)[:, None, None]
-        orders, last = [], LAST * cell.num_footprints
-        for order in (self._least_order(cell, state, maps), maps.top.long()):
-            order = dbl_order(cell, order, x[:, None], y) * cell.parities + parity
-            orders.append(torch.where(feasible, maps.join(order), last))
-        at_origin, elsewhere = orders
+        last = LAST * cell.num_footprints
+        at_origin, elsewhere = (
+            torch.where(feasible, maps.join(dbl_order(cell, order) * cell.parities + parity), last)
+            for order in (self._least_order(cell, state, maps), maps.top)
+        )
         has_origin = (at_origin < last).any(1, keepdim=True)
         action = first_action_reaching(cell, maps, torch.where(has_origin, at_origin, elsewhere).argmin(1))
         if self.dbl_fallback or has_origin.all():
@@ -147,9 +139,8 @@ class SpacePlanner(MapPlanner):
                     w, d = w_and_d[:: 1 - 2 * parity]
                     left_x, left_y = wide - w, deep - d
                     fits = (left_x >= 0) & (left_y >= 0) & (floor + height <= tote_height[rows])
-                    found = torch.where(
-                        space & fits if self.holds_item else space, self.space_order(floor, left_x, left_y), LAST
-                    )
+                    usable = space & fits if self.holds_item else space
+                    found = torch.where(usable, self.space_order(floor, left_x, left_y), LAST)
                     least = order[parity][:, rows].scatter_reduce(0, origin.expand_as(found), found, "amin")
                     order[parity, :, rows] = least
         return order.permute(2, 0, 1).unflatten(2, cell.tote_size[:2])

@@ -74,7 +74,7 @@ class FootprintFcn(nn.Module):
         self.tote_clip, self.depth_range, self.item_range = tote_clip, depth_range, item_range
         whole_numbers("model.actor", MAX_WIDTH, filters=filters, hidden=hidden)
         levels = {"tote_clip": tote_clip, "depth_range": depth_range, "item_range": item_range, "reach": reach}
-        whole_numbers("model.actor", MAX_LEVELS, headroom_bins=headroom_bins, **levels)
+        whole_numbers("model.actor", MAX_LEVELS, **levels, headroom_bins=headroom_bins)
         number("model.actor.head_std", head_std, most=1e3)
         self.compute_dtype = one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
         # Around the footprint -reach .. reach, under it holes 0 .. reach.
