@@ -1,5 +1,7 @@
 """Search on top of a trained policy."""
 
+import itertools
+
 import torch
 from torch import Tensor
 
@@ -60,23 +62,23 @@ class Lookahead(MapPlanner):
         confidence: float = 2.0,
         seed: int = 0,
     ):
-        for key, value, least, most in (
-            ("candidates", candidates, 1, 1_000),
-            ("samples", samples, 2, 10_000),
-            ("rounds", rounds, 1, 10),
-        ):
-            whole_number(f"planner.{key}", value, least, most)
+        self.candidates = whole_number("planner.candidates", candidates, most=1_000)
+        self.samples = whole_number("planner.samples", samples, 2, 10_000)
+        self.rounds = whole_number("planner.rounds", rounds, most=10)
+        self.confidence = number("planner.confidence", confidence)
         if horizon is not None:
             whole_number("planner.horizon", horizon)
-        number("planner.confidence", confidence)
         if not isinstance(policy, ScoresFootprints):
             raise ValueError(
                 "planner=lookahead: expected a checkpoint of model=fcn_grasp, corners or afterstate, with a mask."
             )
-        self.cell, self.policy, self.critic, self.terms = cell, policy, critic, check_terms(terms, cell.bin_items)
-        self.horizon = horizon if critic is not None else None
-        self.items = search_items(items)
-        self.candidates, self.samples, self.rounds, self.confidence = candidates, samples, rounds, confidence
+        self.cell, self.policy, self.items, self.terms = (
+            cell,
+            policy,
+            search_items(items),
+            check_terms(terms, cell.bin_items),
+        )
+        self.critic, self.horizon = critic, None if critic is None else horizon
         self.seed, self._decisions = check_seed(seed, "planner.seed"), 0
 
     @torch.no_grad()
@@ -89,10 +91,9 @@ class Lookahead(MapPlanner):
         )
         logits = self.policy.footprint_logits(observation, self.policy.with_cell(cell).ranked(maps))
         # Of equals the first, as the policy itself plays.
-        value, choice = torch.sort(logits, dim=1, descending=True, stable=True)
-        value, choice = value[:, : self.candidates], choice[:, : self.candidates]
-        seen = State.from_observation(observation)  # what is imagined goes on from there
-        best = self._best(seen, choice, value > MASKED / 2)
+        ranked = torch.sort(logits, dim=1, descending=True, stable=True)
+        value, choice = (part[:, : self.candidates] for part in ranked)
+        best = self._best(State.from_observation(observation), choice, value > MASKED / 2)
         return first_action_reaching(cell, maps, choice.gather(1, best[:, None])[:, 0])
 
     def evaluation_facts(self) -> dict:
@@ -131,9 +132,8 @@ class Lookahead(MapPlanner):
             streams *= 2
         surely = (count > 0) & (mean > self.confidence * error) & (mean > 0)
         best = torch.where(surely, mean, 0.0).argmax(1)
-        if self.horizon is None or isinstance(self.policy, EstimatesValue):
-            return best
-        return self._confirm(best, state, choice)
+        is_known = self.horizon is None or isinstance(self.policy, EstimatesValue)
+        return best if is_known else self._confirm(best, state, choice)
 
     def _confirm(self, best: Tensor, state: State, choice: Tensor) -> Tensor:
         """Return ``best``, int64 ``[N]``, without the departures that gain nothing when played out to the end.
@@ -168,9 +168,7 @@ class Lookahead(MapPlanner):
             problem: int64 ``[M]``; equal ones meet equal items.
             horizon: items after which the critic judges the state; None: played out to the end.
         """
-        cell, policy = self.cell, self.policy
-        critic_keys = getattr(self.critic, "in_keys", ())
-        keys = [*policy.in_keys, *critic_keys]
+        cell, policy, critic_keys = self.cell, self.policy, getattr(self.critic, "in_keys", ())
         # A critic that sees the tote alone judges it before the next item arrives.
         sees_items = not critic_keys or not {"bin_depth", "items"}.isdisjoint(critic_keys)
         self._decisions += 1
@@ -179,11 +177,9 @@ class Lookahead(MapPlanner):
         # The address of an imagined item: the planner's seed, this call, the problem and the stream.
         seed = problem * 1_000_003 + self._decisions * 7_919 + self.seed
         volume = torch.zeros(len(problem), dtype=torch.float64, device=problem.device)
-        arrived = torch.zeros_like(problem)
+        arrived, row = torch.zeros_like(problem), torch.arange(len(problem), device=problem.device)
         source = _Imagined(self.items, streams)
-        row = torch.arange(len(problem), device=problem.device)
-        step = 0
-        while len(row):
+        for step in itertools.count():
             if step == horizon and not sees_items:
                 volume[row] += self.critic(observe(self.terms, cell, state, critic_keys))[:, 0].double()
                 break
@@ -196,14 +192,13 @@ class Lookahead(MapPlanner):
                 row, state, mask, arrived = row[going], state.rows(going), mask[going], arrived[going]
             if len(row) == 0:
                 break
-            observation = observe(self.terms, cell, state, keys)
+            observation = observe(self.terms, cell, state, [*policy.in_keys, *critic_keys])
             if step == horizon:
                 volume[row] += self.critic(observation)[:, 0].double()
                 break
             choice = policy.footprint_logits(observation, mask).argmax(1)
             state, placed = put_down(cell, state, choice)
             volume[row] += placed.volume.double()
-            step += 1
         return volume.view(-1, streams)
 
 

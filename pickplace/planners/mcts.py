@@ -1,7 +1,6 @@
 """Monte-Carlo tree search, with which the paper compares."""
 
 from dataclasses import dataclass, field
-from typing import cast
 
 import numpy as np
 import torch
@@ -40,8 +39,7 @@ class _Edge:
     visits: int = 0
     total: float = 0.0  # of the returns
     volume: int = 0  # that the action places
-    surface: Tensor | None = None  # what it leaves; None until it is simulated, and where it fails
-    items: Tensor | None = None  # what it leaves in the bin, as in _Node
+    left: tuple[Tensor, Tensor] | None = None  # surface and items as in _Node; None until simulated, and if it fails
     failed: bool = False
     bins: list[_Node] = field(default_factory=list)
 
@@ -81,33 +79,30 @@ class MCTS(MapPlanner):
         wave: int = 256,
         seed: int = 0,
     ):
-        whole_number("planner.simulations", simulations, most=MAX_NODES)
-        whole_number("planner.wave", wave, most=4_096)
-        number("planner.exploration", exploration, most=1e6)
-        number("planner.widening", widening, most=1)
-        flag("planner.mask", mask)
-        self.cell, self.items, self.simulations, self.mask = cell, search_items(items), simulations, mask
-        self.exploration, self.widening, self.wave = exploration, widening, wave
+        self.cell, self.items, self.mask = cell, search_items(items), flag("planner.mask", mask)
+        self.simulations = whole_number("planner.simulations", simulations, most=MAX_NODES)
+        self.wave = whole_number("planner.wave", wave, most=4_096)
+        self.exploration = number("planner.exploration", exploration, most=1e6)
+        self.widening = number("planner.widening", widening, most=1)
         self.seed = check_seed(seed, "planner.seed")
         self._random = np.random.default_rng(seed)
         self._sampled, self._depths, self._walks = 0, 0, 0
 
     def decide(self, observation: Observation) -> Tensor:
         """Return flat actions, int64 ``[N]``."""
-        state, maps = _on_cpu(observation), None
         if self.mask:
-            maps = placing_maps(self.cell, state)
-        return self._search(state, self._nodes(state), self.cell, maps).to(observation["tote_depth"].device)
+            return super().decide(observation)
+        return self._search(_on_cpu(observation), None).to(observation["tote_depth"].device)
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        seen, maps = _on_cpu(observation), maps.map(Tensor.cpu)
-        mask = choice_mask(cell, maps) if self.mask else action_mask(cell, maps)
-        roots = self._nodes(seen, mask)
-        return self._search(seen, roots, cell, maps).to(observation["tote_depth"].device)
+        maps = maps.map(Tensor.cpu)
+        chosen = self._search(_on_cpu(observation), (choice_mask if self.mask else action_mask)(cell, maps))
+        action = first_action_reaching(cell, maps, chosen) if self.mask else chosen
+        return action.to(observation["tote_depth"].device)
 
-    def _search(self, state: State, roots: list["_Node"], cell: CellSpec, maps: PlacingMaps | None) -> Tensor:
-        """Return the most visited action of each root, int64 ``[N]``; ``cell`` and ``maps`` are of the true problem."""
-        tote_height = state.tote_height
+    def _search(self, state: State, mask: Tensor | None) -> Tensor:
+        """Return the most visited choice of each problem, int64 ``[N]``, of those of a mask or of all flat actions."""
+        roots = self._nodes(state, mask)
         if self.simulations * len(roots) > MAX_NODES:
             raise ValueError(
                 f"planner.simulations={self.simulations}: for {len(roots)} problems at once the trees would have more "
@@ -120,13 +115,9 @@ class MCTS(MapPlanner):
                 for problem, root in enumerate(roots)
                 for _ in range(min(each, self.simulations - done))
             ]
-            self._simulate(walks, tote_height)
+            self._simulate(walks, state.tote_height)
         best = [max(root.edges.values(), key=lambda edge: (edge.visits, edge.total), default=None) for root in roots]
-        chosen = torch.tensor([0 if edge is None else edge.action for edge in best])
-        if self.mask:
-            assert maps is not None
-            chosen = first_action_reaching(cell, maps, chosen)
-        return chosen
+        return torch.tensor([0 if edge is None else edge.action for edge in best])
 
     def statistics(self) -> dict[str, float]:
         """Return the mean number of actions on a walk down the tree, over all searches so far."""
@@ -141,7 +132,7 @@ class MCTS(MapPlanner):
         while (edge := self._choose(node)) is not None:
             edge.visits += 1
             path.append(edge)
-            if edge.surface is None or len(edge.bins) < int(edge.visits**self.widening):
+            if edge.left is None or len(edge.bins) < int(edge.visits**self.widening):
                 break
             node = edge.bins[self._random.integers(len(edge.bins))]
         self._walks += 1
@@ -173,42 +164,27 @@ class MCTS(MapPlanner):
             tote_height: int64 ``[N]``, of the problems.
         """
         walks = [walk for walk in walks if walk[1]]
-        last = [(problem, path[-1]) for problem, path, over in walks if not over and not path[-1].failed]
-        self._carry_out([(problem, edge) for problem, edge in last if edge.surface is None], tote_height)
-        going = {  # the walks that go on, and the surface that they leave
-            number: path[-1].surface
-            for number, (_, path, over) in enumerate(walks)
-            if not over and path[-1].surface is not None
-        }
+        last = [(number, problem, path[-1]) for number, (problem, path, over) in enumerate(walks) if not over]
+        if tried := [(problem, edge) for _, problem, edge in last if edge.left is None and not edge.failed]:
+            totes = [(edge.node.surface, edge.node.items) for _, edge in tried]
+            before = _stack(totes, tote_height[[problem for problem, _ in tried]])
+            after, placed, good = self._move(before, torch.tensor([edge.action for _, edge in tried]))
+            parts = zip(after.surface, after.items.table, placed.volume.tolist(), good.tolist(), strict=True)
+            for (_, edge), (surface, items, volume, succeeds) in zip(tried, parts, strict=True):
+                edge.failed = not succeeds
+                if succeeds:
+                    edge.left, edge.volume = (surface, items), volume
         returns = torch.zeros(len(walks), dtype=torch.float64)
-        if going:
-            height = tote_height[[walks[number][0] for number in going]]
-            surface = torch.stack(list(going.values()))
-            left = torch.stack([cast(Tensor, walks[number][1][-1].items) for number in going])
-            arrived = self._arrive(State(surface, height, Item.from_table(left)))
-            nodes = self._nodes(arrived)
-            for number, node in zip(going, nodes, strict=True):
-                walks[number][1][-1].bins.append(node)
-            returns[list(going)] = self._play_out(arrived)
+        if going := [(number, problem, edge) for number, problem, edge in last if edge.left is not None]:
+            numbers, problems, edges = map(list, zip(*going, strict=True))
+            arrived = self._arrive(_stack([edge.left for edge in edges], tote_height[problems]))
+            for edge, node in zip(edges, self._nodes(arrived), strict=True):
+                edge.bins.append(node)
+            returns[numbers] = self._play_out(arrived)
         for (problem, path, _), volume in zip(walks, returns.tolist(), strict=True):
             for edge in reversed(path):
                 volume += edge.volume
                 edge.total += volume / float(self.cell.tote_volume(tote_height[problem]))
-
-    def _carry_out(self, tried: list[tuple[int, _Edge]], tote_height: Tensor) -> None:
-        """Simulate actions, and keep on their edges what they leave in the tote."""
-        if not tried:
-            return
-        height = tote_height[[problem for problem, _ in tried]]
-        surface = torch.stack([edge.node.surface for _, edge in tried])
-        state = State(surface, height, Item.from_table(torch.stack([edge.node.items for _, edge in tried])))
-        action = torch.tensor([edge.action for _, edge in tried])
-        after, placed, going = self._move(state, action)
-        parts = zip(after.surface, after.items.table, placed.volume.tolist(), going.tolist(), strict=True)
-        for (_, edge), (left, items, volume, good) in zip(tried, parts, strict=True):
-            edge.failed = not good
-            if good:
-                edge.surface, edge.items, edge.volume = left, items, volume
 
     def _move(self, state: State, action: Tensor) -> tuple[State, Item, Tensor]:
         """Return the states after the search's actions, the items placed, and which actions succeed, bool ``[N]``."""
@@ -258,5 +234,10 @@ class MCTS(MapPlanner):
 
 def _on_cpu(observation: Observation) -> State:
     """Return the state that an observation shows, on the CPU."""
-    surface, tote_height, items = State.from_observation(observation)
-    return State(surface.cpu(), tote_height.cpu(), items.map(Tensor.cpu))
+    return State.from_observation({key: entry.cpu() for key, entry in observation.items()})
+
+
+def _stack(parts: list[tuple[Tensor, Tensor]], tote_height: Tensor) -> State:
+    """Return the state of totes of these heights, from the surface and the table of items of each."""
+    surface, items = map(torch.stack, zip(*parts, strict=True))
+    return State(surface, tote_height, Item.from_table(items))

@@ -67,8 +67,8 @@ def planner_parts(
         ValueError: for a planner that needs a checkpoint without one, or with one that does not serve these sizes.
     """
     needs = getattr(find("planner", planner._target_), "needs", ())
-    parts: dict[str, Any] = {"cell": cell}
-    parts |= {key: value for key, value in {"items": items, "terms": terms}.items() if key in needs}
+    given: dict[str, Any] = {"items": items, "terms": terms}
+    parts = {"cell": cell, **{key: given[key] for key in given if key in needs}}
     if "policy" in needs:
         if trained is None:
             raise ValueError(f"checkpoint=null: planner={planner._target_} needs a checkpoint; expected a run folder.")
