@@ -8,7 +8,16 @@ from pickplace.config.errors import Parser, one_sentence, write_output
 def main() -> None:
     """Entry point of ``pickplace-export``."""
     with one_sentence():
-        run(parser().parse_args())
+        arguments = parser().parse_args()
+        from pickplace.policies.onnx_model import export_onnx  # not before help is answered
+
+        sizes = {} if arguments.rotations is None else {"rotations": arguments.rotations}
+        differences = export_onnx(arguments.checkpoint, arguments.file, arguments.trust, **sizes)
+        totes = ", ".join(f"{wide}x{deep}" for wide, deep in differences)
+        write_output(
+            f"{arguments.file}: onnxruntime agrees with torch at totes of {totes} cells; greatest difference "
+            f"{max(differences.values()):.1e} of the greatest score.\n"
+        )
 
 
 def parser() -> argparse.ArgumentParser:
@@ -28,20 +37,6 @@ def parser() -> argparse.ArgumentParser:
         help="your own module whose classes the checkpoint's config may name; may be repeated",
     )  # fmt: skip
     return options
-
-
-def run(arguments: argparse.Namespace) -> None:
-    """Export as the command line says, and print what was checked."""
-    from pickplace.policies.onnx_model import export_onnx  # not before help is answered
-
-    sizes = {} if arguments.rotations is None else {"rotations": arguments.rotations}
-    differences = export_onnx(arguments.checkpoint, arguments.file, arguments.trust, **sizes)
-    totes = ", ".join(f"{wide}x{deep}" for wide, deep in differences)
-    greatest = max(differences.values())
-    write_output(
-        f"{arguments.file}: onnxruntime agrees with torch at totes of {totes} cells; greatest difference "
-        f"{greatest:.1e} of the greatest score.\n"
-    )
 
 
 if __name__ == "__main__":

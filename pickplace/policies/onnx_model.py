@@ -82,13 +82,12 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
         )
     keys = [key for key in policy.in_keys if not key.endswith("_mask")]
     seen = _observations(trained, keys, 1)
-    facts = cell_settings(cell) | {"reach": None}  # scores do not depend on it
     model = _convert(Scores(policy, keys).eval(), keys, seen)
     model.model.metadata_props.update({
         "pickplace": pickplace.__version__,
         "checkpoint": str(checkpoint),
         "policy": type(policy).__name__,
-        "cell": json.dumps(facts),
+        "cell": json.dumps(cell_settings(cell) | {"reach": None}),  # scores do not depend on it
         "index": policy.score_index,
     })  # fmt: skip
     differences: dict[tuple[int, ...], float] = {}
@@ -106,14 +105,13 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
                 expected = Scores(other.policy, keys)(*asked)
             found = session.run(None, {key: entry.numpy() for key, entry in zip(keys, asked, strict=True)})[0]
             difference = (torch.from_numpy(found) - expected).abs().max() / expected.abs().max().clamp(min=1)
-            tote = other.cell.tote_size[:2]
-            differences[tote] = float(difference)
-            if not differences[tote] <= TOLERANCE:  # nan, too
+            wide, deep, _ = other.cell.tote_size
+            if not difference <= TOLERANCE:  # nan, too
                 raise ValueError(
-                    f"{path}: at a tote of {tote[0]}x{tote[1]} cells onnxruntime and torch differ by "
-                    f"{differences[tote]:.1e} of the greatest score; expected at most {TOLERANCE:g}. "
-                    "Nothing was written."
+                    f"{path}: at a tote of {wide}x{deep} cells onnxruntime and torch differ by {difference:.1e} of the "
+                    f"greatest score; expected at most {TOLERANCE:g}. Nothing was written."
                 )
+            differences[wide, deep] = float(difference)
     return differences
 
 
@@ -143,8 +141,7 @@ def _convert(scores: Scores, keys: Sequence[str], seen: list[Tensor]):
     before = logger.level
     try:
         logger.setLevel(logging.ERROR)  # it tells of operators of packages that are not used
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             return torch.onnx.export(
                 scores, tuple(seen), input_names=list(keys), output_names=["logits"],
                 dynamic_shapes=(shapes,), dynamo=True, verbose=False,

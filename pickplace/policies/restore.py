@@ -110,11 +110,10 @@ class TrainedPolicy(TensorDictModuleBase):
             num_envs: ``N``.
             **options: further arguments of :class:`PickPlaceEnv`, such as ``items`` or ``stream="test"``.
         """
-        if options.get("items") is None:
-            options["items"] = build("items", self.config["items"])
+        items = options.pop("items", None) or build("items", self.config["items"])
         cell = {item.name: getattr(self.cell, item.name) for item in fields(CellSpec)}
         device = next(self.parameters()).device
-        return PickPlaceEnv(num_envs=num_envs, observation=self.terms, device=device, **cell, **options)
+        return PickPlaceEnv(num_envs=num_envs, items=items, observation=self.terms, device=device, **cell, **options)
 
 
 def build_cell(env: dict, **given) -> CellSpec:
@@ -215,14 +214,8 @@ def restore_critic(cfg: DictConfig, policy: Policy, state: dict, trained_env: di
         return RestoredCritic(critic.module, list(critic.in_keys), cfg.reward_scale)
     if "critic" not in state or cfg.model.critic is None:
         return None
-    cell = policy.cell
-
-    def make():
-        return as_critic(build("model.critic", cfg.model.critic, cell=cell))
-
-    with torch.device("meta"):
-        any_size = getattr(make().module, "any_size", False)
-    if tuple(trained_env["tote_size"][:2]) != cell.tote_size[:2] and not any_size:
-        return None
-    critic = checkpoint.restore(make, state["critic"], "critic").to(cfg.device).eval()
-    return RestoredCritic(critic.module, list(critic.in_keys), cfg.reward_scale)
+    sizes: dict[str, Any] = {key: tuple(trained_env[key]) for key in ("bin_size", "tote_size")}
+    make = partial(build, "model.critic", cfg.model.critic, cell=replace(policy.cell, reach=None, **sizes))
+    critic = checkpoint.restore(lambda: as_critic(make()), state["critic"], "critic").to(cfg.device).eval()
+    serves = sizes["tote_size"][:2] == policy.cell.tote_size[:2] or getattr(critic.module, "any_size", False)
+    return RestoredCritic(critic.module, list(critic.in_keys), cfg.reward_scale) if serves else None

@@ -125,11 +125,11 @@ class Conv4dNet(nn.Module):
         Returns:
             ``[..., W_B * D_B * W_T * D_T * R]``, or ``[..., W_T * D_T * R]`` for given pick cells.
         """
-        batch = tote_depth.shape[:-2]
-        bins = self._prepare(bin_depth, self.bin_clip, BIN_PADDING).flatten(0, -3)
-        totes = self._prepare(tote_depth, self.tote_clip, TOTE_PADDING).flatten(0, -3)
-        if pick is not None:
-            bins = self._windows(bins, torch.arange(len(bins), device=bins.device), pick.flatten())
+        bins, totes = self._prepare(bin_depth, tote_depth)
+        if pick is not None:  # the windows around these cells
+            pick, field, row = pick.flatten(), self.receptive_field, torch.arange(len(bins), device=bins.device)
+            windows, deep = bins.unfold(1, field, 1).unfold(2, field, 1), bin_depth.shape[-1]
+            bins = windows[row, pick // deep, pick % deep]
         if torch.compiler.is_exporting():  # at once: the number of pieces depends on the sizes
             parts = [self._logits(bins, totes)]
         else:
@@ -142,7 +142,7 @@ class Conv4dNet(nn.Module):
                 for b, t in zip(bins.split(states_at_once), totes.split(states_at_once), strict=True)
             ]
         out = torch.cat(parts).flatten(1)
-        return out.reshape(*batch, out.shape[1])
+        return out.reshape(*tote_depth.shape[:-2], out.shape[1])
 
     def pair_logits(self, bin_depth: Tensor, tote_depth: Tensor, row: Tensor, pick: Tensor, place: Tensor) -> Tensor:
         """Return the logits of single pairs of a pick and a place, each from its 5x5 windows of the maps.
@@ -160,9 +160,8 @@ class Conv4dNet(nn.Module):
         """
         count = len(row)
         row, pick, place = (F.pad(index, (0, -count % PADDED_PAIRS)) for index in (row, pick, place))
-        bins = self._prepare(bin_depth, self.bin_clip, BIN_PADDING)
-        totes = self._prepare(tote_depth, self.tote_clip, TOTE_PADDING)
-        first = [part.permute(0, 2, 3, 1).flatten(0, 2) for part in self._first_layer(bins, totes)]
+        maps = self._first_layer(*self._prepare(bin_depth, tote_depth))
+        first = [part.permute(0, 2, 3, 1).flatten(0, 2) for part in maps]
         at_once = PAIRS_AT_ONCE[row.device.type]
         patches = _patches(bin_depth, row, pick).split(at_once), _patches(tote_depth, row, place).split(at_once)
         # [filters, place tap * pick tap * filters]
@@ -176,15 +175,11 @@ class Conv4dNet(nn.Module):
         features = torch.cat(parts).to(self.head.weight.dtype)
         return F.linear(features, self.head.weight.flatten(1), self.head.bias)[:count]
 
-    def _prepare(self, depth: Tensor, limit: float | None, padding: float) -> Tensor:
-        depth = depth.to(self.first.weight.dtype)
-        depth = depth if depth.dim() > 2 else depth[None]
-        return clip_and_pad(depth, limit, self.floor, padding)
-
-    def _windows(self, maps: Tensor, row: Tensor, cell: Tensor) -> Tensor:
-        """Return the windows ``[M, 5, 5]`` of padded maps ``[N, W + 4, D + 4]`` around flat cells of rows, ``[M]``."""
-        field, depth = self.receptive_field, maps.shape[-1] - 4
-        return maps.unfold(1, field, 1).unfold(2, field, 1)[row, cell // depth, cell % depth]
+    def _prepare(self, bin_depth: Tensor, tote_depth: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the maps clipped and padded, ``[N, W + 4, D + 4]`` each, with all leading dimensions in one."""
+        bins, totes = (depth.to(self.first.weight.dtype)[None].flatten(0, -3) for depth in (bin_depth, tote_depth))
+        bins = clip_and_pad(bins, self.bin_clip, self.floor, BIN_PADDING)
+        return bins, clip_and_pad(totes, self.tote_clip, self.floor, TOTE_PADDING)
 
     def _chunk_sizes(self, bins: Tensor, totes: Tensor) -> tuple[int, int]:
         """Return how many states, and how many rows of pick cells of each, to compute at a time."""
@@ -241,8 +236,8 @@ class Conv4dNet(nn.Module):
         """
         hidden = (from_bin.flatten(1, 2)[:, None, None] + from_tote[:, :, :, None]).relu_().flatten(3)
         kernel = self.second.weight.to(hidden.dtype).permute(0, 2, 3, 1, 4, 5).flatten(1, 3)
-        kernel = kernel.contiguous(memory_format=torch.channels_last)
-        out = F.conv2d(hidden.permute(0, 3, 1, 2), kernel, self.second.bias.to(hidden.dtype))
+        kernel, bias = kernel.contiguous(memory_format=torch.channels_last), self.second.bias.to(hidden.dtype)
+        out = F.conv2d(hidden.permute(0, 3, 1, 2), kernel, bias)
         return out.relu_().permute(0, 2, 3, 1)[None, :, None]
 
     def _logits(self, bins: Tensor, totes: Tensor) -> Tensor:

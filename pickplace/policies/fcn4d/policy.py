@@ -46,10 +46,10 @@ class Conv4dPolicy(ActionPolicy):
         return torch.where(mask, logits.flatten(1), MASKED)
 
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
-        maps = observation["bin_depth"], observation["tote_depth"]
         row = torch.arange(len(choices), device=choices.device).repeat_interleave(choices.shape[1])
         pick, place, rotation = split_flat(self.cell, choices.flatten())
-        return self.network.pair_logits(*maps, row, pick, place).gather(1, rotation[:, None]).view(choices.shape)
+        logits = self.network.pair_logits(observation["bin_depth"], observation["tote_depth"], row, pick, place)
+        return logits.gather(1, rotation[:, None]).view(choices.shape)
 
     def learning_bytes(self, samples: int | None = None) -> int:
         """Return about how many bytes a frame takes, measured at bins and totes of 5x5 to 12x12."""
@@ -77,10 +77,7 @@ class Fcn4d(Conv4dPolicy):
     """The paper's policy (config ``model=fcn4d``; Sec. III); arguments as of :class:`Conv4dPolicy`."""
 
     score_index = "(((x_B * D_B + y_B) * W_T + x_T) * D_T + y_T) * R + r: pick cell, place cell, quarter turns"
-
-    def unmasked_scores(self, observation: Observation) -> Tensor:
-        """Return the scores of all flat actions, float32 ``[N, N_a]``; bins and totes may have any size."""
-        return self.action_scores(observation)
+    unmasked_scores = Conv4dPolicy.action_scores
 
 
 class Typical(Conv4dPolicy):
