@@ -11,7 +11,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from pickplace.common.machine import usable_device
-from pickplace.common.validate import check_bytes, expect, one_of, whole_number
+from pickplace.common.validate import check_bytes, expect, one_of, or_null, whole_number
 from pickplace.envs.checks import check_items, problem_bytes
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
@@ -117,8 +117,7 @@ class PickPlaceEnv(EnvBase):
         known = isinstance(masks, (tuple, list)) and all(isinstance(name, str) and name in MASKS for name in masks)
         expect(known, "masks", masks, f"any of {', '.join(map(repr, MASKS))}")
         whole_number("first_episode", first_episode, 0, MAX_SEED)
-        if episode_stride is not None:
-            whole_number("episode_stride", episode_stride, 1, MAX_SEED)
+        or_null(whole_number, "episode_stride", episode_stride, 1, MAX_SEED)
         items = Kinds(PAPER_KINDS) if items is None else items
         kind = "an ItemDistribution, such as pickplace.items.distributions.Kinds"
         expect(isinstance(items, ItemDistribution), "items", items, kind)
@@ -131,7 +130,21 @@ class PickPlaceEnv(EnvBase):
         self.items, self.stream, self.masks = items, stream, tuple(masks)
         self.min_tote_height = int(items.sizes[:, 2].max())
         self.first_episode, self.episode_stride = first_episode, episode_stride or num_envs
-        self._make_specs()
+        specs: dict = {}
+        for key, term in self.terms.items():
+            low, high, shape, dtype = term.bounds(self.cell, self.min_tote_height)
+            specs[key] = Bounded(low, high, (num_envs, *shape), dtype=dtype, device=device)
+        specs["occupancy"] = Bounded(0, 1, (num_envs, 1), dtype=torch.float32, device=device)
+        specs["failure"] = Categorical(len(Failure), (num_envs, 1), dtype=torch.int64, device=device)
+        sizes = {f"{name}_mask": MASKS[name].size(self.cell) for name in self.masks}
+        specs |= {name: Binary(size, (num_envs, size), device, torch.bool) for name, size in sizes.items()}
+        self.observation_spec = Composite(specs, shape=(num_envs,), device=device)
+        # Declared as state too, so that reset() is handed the height that a curriculum writes.
+        self.state_spec = Composite({"tote_height": specs["tote_height"].clone()}, shape=(num_envs,), device=device)
+        self.action_spec = Categorical(self.cell.num_actions, (num_envs,), dtype=torch.int64, device=device)
+        self.reward_spec = Unbounded((num_envs, 1), dtype=torch.float32, device=device)
+        flags = {key: Categorical(2, (num_envs, 1), dtype=torch.bool, device=device) for key in DONE_KEYS}
+        self.done_spec = Composite(flags, shape=(num_envs,), device=device)
 
         def zeros(*shape, dtype=torch.int64):
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
@@ -147,31 +160,12 @@ class PickPlaceEnv(EnvBase):
             "episode": zeros(),
             "item_seed": torch.tensor(0, device=self.device),
             "feasible": zeros(dtype=torch.bool),
-            **{f"{name}_mask": zeros(MASKS[name].size(self.cell), dtype=torch.bool) for name in self.masks},
+            **{name: zeros(size, dtype=torch.bool) for name, size in sizes.items()},
         }
         for name, value in buffers.items():
             self.register_buffer(name, value)
         self._starts: dict[tuple, tuple[Tensor, ...]] = {}  # the masks of empty totes, see `_masks_of_empty_totes`
         self.set_seed(seed)
-
-    def _make_specs(self):
-        cell, n, device = self.cell, self.num_envs, self.device
-        observation: dict = {}
-        for key, term in self.terms.items():
-            low, high, shape, dtype = term.bounds(cell, self.min_tote_height)
-            observation[key] = Bounded(low, high, (n, *shape), dtype=dtype, device=device)
-        observation["occupancy"] = Bounded(0, 1, (n, 1), dtype=torch.float32, device=device)
-        observation["failure"] = Categorical(len(Failure), (n, 1), dtype=torch.int64, device=device)
-        for name in self.masks:
-            size = MASKS[name].size(cell)
-            observation[f"{name}_mask"] = Binary(size, (n, size), device, torch.bool)
-        self.observation_spec = Composite(observation, shape=(n,), device=device)
-        # Declared as state too, so that reset() is handed the height that a curriculum writes.
-        self.state_spec = Composite({"tote_height": observation["tote_height"].clone()}, shape=(n,), device=device)
-        self.action_spec = Categorical(cell.num_actions, (n,), dtype=torch.int64, device=device)
-        self.reward_spec = Unbounded((n, 1), dtype=torch.float32, device=device)
-        flags = {key: Categorical(2, (n, 1), dtype=torch.bool, device=device) for key in DONE_KEYS}
-        self.done_spec = Composite(flags, shape=(n,), device=device)
 
     @property
     def num_envs(self) -> int:

@@ -161,14 +161,12 @@ class Uniform(Kinds):
 
     def __init__(self, width=(1, 3), depth=(1, 3), height=(1, 3), unit=1):
         ranges = {"width": width, "depth": depth, "height": height}
-        for name, limits in ranges.items():
-            check_range(f"items.{name}", limits)
+        pairs = (check_range(f"items.{name}", limits) for name, limits in ranges.items())
+        lengths = [range(low, high + 1) for low, high in pairs]
         words = ", ".join(f"items.{name}={[*limits]}" for name, limits in ranges.items())
-        count = math.prod(high - low + 1 for low, high in ranges.values())
-        at_most(f"{words}: the ranges have", count, "kinds of items", MAX_KINDS)
+        at_most(f"{words}: the ranges have", math.prod(map(len, lengths)), "kinds of items", MAX_KINDS)
         whole_number("items.unit", unit, most=MAX_LENGTH)
-        sides = ([unit * length for length in range(low, high + 1)] for low, high in ranges.values())
-        super().__init__(list(product(*sides)))
+        super().__init__([tuple(unit * side for side in sides) for sides in product(*lengths)])
 
 
 class Recorded(ItemDistribution):

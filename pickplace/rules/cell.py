@@ -10,6 +10,7 @@ from pickplace.common.validate import (
     is_whole,
     number,
     one_of,
+    or_null,
     short_text,
     size_tuple,
     whole_number,
@@ -92,8 +93,7 @@ class CellSpec:
         expect(good, "rotations", self.rotations, "1, 2, 3 or 4 (quarter turns to choose from)")
         whole_number("bin_items", self.bin_items, most=MAX_BIN_ITEMS)
         one_of("refill", self.refill, ("each", "batch"))
-        if self.longest_side is not None:
-            whole_number("longest_side", self.longest_side)
+        or_null(whole_number, "longest_side", self.longest_side)
         expect(isinstance(self.reach, Reach | None), "reach", self.reach, "a Reach, such as an Annulus, or None")
         # Sizes each of which is possible, but whose products would fill the memory.
         bin_size, tote_size = f"bin_size={[*self.bin_size]}", f"tote_size={[*self.tote_size]}"
