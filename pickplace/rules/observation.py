@@ -117,9 +117,6 @@ STANDARD_TERMS: Mapping[str, Term] = {
     "tote_height": ToteHeight(),
 }
 
-#: What is there besides where a bin holds several items.
-SEVERAL_ITEMS: Mapping[str, Term] = {"bin_labels": BinLabels(), "items": Items()}
-
 #: Keys of the environment, the policies and the learner that no term may have.
 RESERVED = (
     "action",
@@ -151,7 +148,7 @@ RESERVED = (
 
 def standard_terms(bin_items: int) -> dict[str, Term]:
     """Return the terms that an observation of a bin with that many items always has."""
-    return {**STANDARD_TERMS, **(SEVERAL_ITEMS if bin_items > 1 else {})}
+    return {**STANDARD_TERMS, **({"bin_labels": BinLabels(), "items": Items()} if bin_items > 1 else {})}
 
 
 def item_keys(bin_items: int) -> tuple[str, ...]:

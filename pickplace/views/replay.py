@@ -60,8 +60,11 @@ def asset(name: str) -> str:
 
 def filled(template: str, **parts: str) -> str:
     """Return a page: a template in which ``{{name}}`` stands for a part, or for what all pages share."""
-    shared = {"style": asset("page.css").rstrip(), "scene": asset("scene.js").rstrip()}
-    shared["three"] = asset("three.min.js").replace("</script", "<\\/script")  # it stands in a script element
+    shared = {
+        "style": asset("page.css").rstrip(),
+        "scene": asset("scene.js").rstrip(),
+        "three": asset("three.min.js").replace("</script", "<\\/script"),  # it stands in a script element
+    }
     return re.sub(r"\{\{(\w+)\}\}", lambda mark: {**shared, **parts}[mark[1]], asset(template))
 
 
