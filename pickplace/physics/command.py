@@ -20,14 +20,15 @@ def run(arguments: argparse.Namespace) -> None:
     from pickplace.physics.engine import build_engine
     from pickplace.physics.plans import read_plans
 
+    settings = OmegaConf.create({"_target_": arguments.method})
     for word in arguments.settings:
         key, equals, _ = word.partition("=")
-        if not equals or not key.isidentifier() or key == "_target_":
-            raise ValueError(f"{word}: expected <key>=<value>, such as friction=0.3.")
-    try:
-        settings = OmegaConf.from_dotlist([*arguments.settings, f"_target_={arguments.method}"])
-    except YAMLError as error:
-        raise ValueError(f"{' '.join(arguments.settings)}: expected <key>=<value>, such as friction=0.3.") from error
+        try:
+            if not equals or not key.isidentifier() or key == "_target_":
+                raise ValueError(key)
+            settings.merge_with_dotlist([word])
+        except (YAMLError, ValueError) as error:
+            raise ValueError(f"{word}: expected <key>=<value>, such as friction=0.3.") from error
     for outcome in build_engine(settings).carry_out(read_plans(arguments.plans)):
         write_output(json.dumps(outcome.facts()) + "\n")
 
@@ -48,7 +49,3 @@ def parser() -> argparse.ArgumentParser:
         "a class of your own (default %(default)s)",
     )  # fmt: skip
     return options
-
-
-if __name__ == "__main__":
-    main()

@@ -35,6 +35,8 @@ def build_engine(node: DictConfig) -> Engine:
     """
     engine = build("physics", node)
     if not isinstance(engine, Engine):
-        expected = "expected name, cell_size and carry_out(plans, record)"
-        raise ValueError(f"physics._target_={node._target_}: no physics engine; {expected}.")
+        raise ValueError(
+            f"physics._target_={node._target_}: no physics engine; expected name, cell_size and "
+            "carry_out(plans, record)."
+        )
     return engine

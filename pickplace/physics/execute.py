@@ -77,8 +77,7 @@ class Execute(Simulation):
     def make_scene(self, plan: EpisodePlan) -> "Gantry":
         if not (plan.bin and plan.effector):
             raise ValueError(f"physics=execute: episode {plan.episode} has no bin; expected plans with all keys.")
-        if self.plate_diameter is not None and self.plate_diameter > min(plan.effector):
-            most = min(plan.effector)
+        if self.plate_diameter is not None and self.plate_diameter > (most := min(plan.effector)):
             raise ValueError(f"physics.plate_diameter={self.plate_diameter:g}: expected at most {most:g}, its cells.")
         for _, _, *sides in plan_body(plan):
             self.check_width(f"episode {plan.episode}, end effector", sides)
@@ -88,25 +87,19 @@ class Execute(Simulation):
         return Gantry(self, plan)
 
     def place(self, gantry: "Gantry", placement: Placement, error: np.ndarray) -> Loss | None:
-        height = placement.size[2]
+        w, d, height = placement.size
         gantry.fill(placement.neighbours)
-        gantry.take((*placement.item, *bin_size(placement)), placement.centre)
+        lying = (d, w, height) if placement.rotation % 180 else placement.size
+        gantry.take((*placement.item, *lying), placement.centre)
         low = placement.corner[2] + height + self.lip + self.release_height
         pick, place = gantry.bin + placement.pick, placement.place + error
         turn = ((placement.rotation + 90) % 360 - 90) / 180 * pi  # the short way round
-        loss = gantry.bring((*pick, height + self.lip, 0.0), (*place, low, turn), height)
+        if loss := gantry.bring((*pick, height + self.lip, 0.0), (*place, low, turn), height):
+            return loss
         expected = placement.centre + np.array((*error, self.release_height))
-        if loss is None and np.linalg.norm(gantry.centre - expected) > self.tolerance:
-            loss = Loss("wedged", len(gantry.boxes) - 1)
-        if loss is None:
-            loss = gantry.leave(height)
-        return loss
-
-
-def bin_size(placement: Placement) -> tuple[float, ...]:
-    """Return the sides of an item as it lies in the bin."""
-    w, d, h = placement.size
-    return (d, w, h) if placement.rotation % 180 else (w, d, h)
+        if np.linalg.norm(gantry.centre - expected) > self.tolerance:
+            return gantry.loss("wedged")
+        return gantry.leave(height)
 
 
 def plan_body(plan: EpisodePlan) -> tuple[Point, ...]:
@@ -146,11 +139,8 @@ class Gantry(Scene):
     def _add_plate(self, plan: EpisodePlan) -> None:
         """Add the end effector: a disc, or a box for each rectangle of its body; each is narrower by the gap."""
         self.plate = self.spec.worldbody.add_body(name="plate", gravcomp=1.0)
-        thickness, diameter, boxes = (
-            self.options.plate_thickness,
-            self.options.plate_diameter,
-            np.array(plan_body(plan)),
-        )
+        thickness, diameter = self.options.plate_thickness, self.options.plate_diameter
+        boxes = np.array(plan_body(plan))
         sides, centres = boxes[:, 2:] - self.gap, boxes[:, :2] + boxes[:, 2:] / 2 - np.divide(plan.effector, 2)
         if diameter is not None:
             sides, centres = np.array([[diameter - self.gap] * 2]), np.zeros((1, 2))
@@ -167,10 +157,10 @@ class Gantry(Scene):
             drive.set_to_position(kp=STIFFNESS[joint.name == "turn"], dampratio=1.0)
 
     def compile(self) -> None:
+        if self.boxes and self.weld is None:
+            kinds = {"type": mujoco.mjtEq.mjEQ_WELD, "objtype": mujoco.mjtObj.mjOBJ_BODY}
+            self.weld = self.spec.add_equality(**kinds, name1="plate", active=False, **STIFF)
         if self.boxes:
-            if self.weld is None:
-                kinds = {"type": mujoco.mjtEq.mjEQ_WELD, "objtype": mujoco.mjtObj.mjOBJ_BODY}
-                self.weld = self.spec.add_equality(**kinds, name1="plate", active=False, **STIFF)
             self.weld.name2 = self.boxes[-1].name
         super().compile()
         self.data.ctrl[:] = self.goal
@@ -181,14 +171,10 @@ class Gantry(Scene):
         Args:
             boxes: near corner in the bin and sides, x, y, w, d, h.
         """
-        count = len(self.bodies)
-        for box in boxes:
-            if self._find(box) is None:
-                self.waiting[box] = self._add_body((*(self.bin + box[:2]), 0.0), box[2:])
-        if len(self.bodies) > count:
+        if new := [box for box in boxes if self._find(box) is None]:
+            self.waiting |= {box: self._add_body((*(self.bin + box[:2]), 0.0), box[2:]) for box in new}
             self.compile()
-            if self.motion:
-                self.record()
+            self.record()
 
     def take(self, box: Point, planned: Point) -> None:
         """Choose the item that is carried next, ``box`` as of :meth:`fill`; ``planned`` is its centre in the tote."""
@@ -209,9 +195,12 @@ class Gantry(Scene):
         """The centre of the item that is carried, the last one of :attr:`boxes`, m, ``[3]``."""
         return self.data.xpos[self.boxes[-1].id]
 
-    @property
-    def is_disturbed(self) -> bool:
-        """Whether an item that waits in the bin has left its place."""
+    def loss(self, reason: str) -> Loss:
+        """Return the loss of that item."""
+        return Loss(reason, len(self.boxes) - 1)
+
+    def _is_disturbed(self) -> bool:
+        """Return whether an item that waits in the bin has left its place."""
         places = [(*(self.bin + box[:2]), 0.0) + np.divide(box[2:], 2) for box in self.waiting]
         shifts = self.data.xpos[[body.id for body in self.waiting.values()]] - np.reshape(places, (-1, 3))
         return bool((np.linalg.norm(shifts, axis=1) > self.options.tolerance).any())
@@ -278,9 +267,9 @@ class Gantry(Scene):
         """Suck the item in the bin; return the loss if the lip does not reach it, or another one as well."""
         plate, item = self.plate.id, self.boxes[-1].id
         if not self._is_reached(self.boxes[-1]):
-            return Loss("dropped", len(self.boxes) - 1)
+            return self.loss("dropped")
         if any(self._is_reached(body, below=True) for body in self.waiting.values()):
-            return Loss("effector_contact", len(self.boxes) - 1)
+            return self.loss("effector_contact")
         offset = self.data.xmat[plate].reshape(3, 3).T @ (self.data.xpos[item] - self.data.xpos[plate])
         inverse, relative = np.zeros(4), np.zeros(4)
         mujoco.mju_negQuat(inverse, self.data.xquat[plate])
@@ -311,22 +300,22 @@ class Gantry(Scene):
 
     def _step(self) -> Loss | None:
         """Let a little time pass; return what was lost in it."""
-        number, start = len(self.boxes) - 1, self.model.body_dofadr[self.boxes[-1].id]
+        start = self.model.body_dofadr[self.boxes[-1].id]
         velocity = self.data.qvel[start : start + 3]
         before = velocity.copy()
         self.step(STEPS_PER_LOOK)
         if self.diverged:
-            return Loss("diverged", number)
+            return self.loss("diverged")
         item, pairs, force, total = self.boxes[-1], self.data.contact.geom, np.zeros(6), 0.0
         for index in np.nonzero(np.isin(pairs, self._plate_geoms).any(1))[0]:
             if not self.holding or item.geoms[0].id not in pairs[index]:
                 mujoco.mj_contactForce(self.model, self.data, index, force)
                 total += abs(force[0])
         if total > self.options.contact_force:
-            return Loss("effector_contact", number)
+            return self.loss("effector_contact")
         if self.holding:
             # From the motion: with drives that are integrated implicitly, the weld's force is not what it transmits.
             acceleration = (velocity - before) / (STEPS_PER_LOOK * TIMESTEP) - self.model.opt.gravity
             if self.model.body_mass[item.id] * np.linalg.norm(acceleration) > self.options.suction:
-                return Loss("dropped", number)
-        return Loss("disturbed", number) if self.waiting and self.is_disturbed else None
+                return self.loss("dropped")
+        return self.loss("disturbed") if self.waiting and self._is_disturbed() else None

@@ -21,11 +21,12 @@ the bin)
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from pickplace.common.files import read_text
 from pickplace.common.validate import excerpt, is_number, is_whole
@@ -40,24 +41,44 @@ MAX_FILE = 2**28  # greatest size of a file, bytes
 MAX_BODY = 2_048  # rectangles of a body
 
 
-class Value(NamedTuple):
-    """What a key of a line holds: a whole number, or ``parts`` lengths and coordinates."""
-
-    expected: str
-    parts: int = 0  # numbers of a point or size; 0: one whole number
-    sides: int = 0  # how many of the lengths, the last ones, are sides above 0
-    most: int = 0  # greatest number of boxes of a list; 0: no list
+def _are_numbers(value, count: int, sides: int = 0) -> bool:
+    """Return whether a value is a list of lengths and coordinates, the last ones of them ``sides`` above 0."""
+    is_list = isinstance(value, list) and len(value) == count and all(map(is_number, value))
+    return is_list and max(map(abs, value)) <= MAX_LENGTH and all(side >= 1e-6 for side in value[count - sides :])
 
 
-SIDES, CORNER = (Value("3 lengths above 0, in metres", 3, 3), Value("3 coordinates, in metres", 3))
-POINT = Value("2 coordinates, in metres", 2)
-#: Keys of every line, further ones for a robot, and those that a robot may do without.
-KEYS = {"episode": Value("a whole number >= 0"), "tote": SIDES, "corner": CORNER, "size": SIDES}
-ROBOT_KEYS = {"bin": SIDES, "item": POINT, "effector": Value("2 lengths above 0, in metres", 2, 2), "pick": POINT}
-ROBOT_KEYS |= {"place": POINT, "rotation": Value("0, 90, 180 or 270")}
-OPTIONAL_KEYS = {
-    "body": Value(f"up to {MAX_BODY:,} rectangles x, y, w, d, in metres", 4, 2, MAX_BODY),
-    "neighbours": Value(f"up to {MAX_BIN_ITEMS} boxes x, y, w, d, h, in metres", 5, 3, MAX_BIN_ITEMS),
+def _are_boxes(value, count: int, sides: int, most: int) -> bool:
+    """Return whether a value is a list of at most so many lists, see :func:`_are_numbers`."""
+    return isinstance(value, list) and len(value) <= most and all(_are_numbers(box, count, sides) for box in value)
+
+
+SIDES = "3 lengths above 0, in metres", partial(_are_numbers, count=3, sides=3)
+POINT = "2 coordinates, in metres", partial(_are_numbers, count=2)
+#: What a key holds, and a function that tells whether a value is that: of every line, of one for a robot, and of what a
+#: robot may do without.
+KEYS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "episode": ("a whole number >= 0", lambda value: is_whole(value) and value >= 0),
+    "tote": SIDES,
+    "corner": ("3 coordinates, in metres", partial(_are_numbers, count=3)),
+    "size": SIDES,
+}
+ROBOT_KEYS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "bin": SIDES,
+    "item": POINT,
+    "effector": ("2 lengths above 0, in metres", partial(_are_numbers, count=2, sides=2)),
+    "pick": POINT,
+    "place": POINT,
+    "rotation": ("0, 90, 180 or 270", lambda value: is_whole(value) and value in (0, 90, 180, 270)),
+}
+OPTIONAL_KEYS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "body": (
+        f"up to {MAX_BODY:,} rectangles x, y, w, d, in metres",
+        partial(_are_boxes, count=4, sides=2, most=MAX_BODY),
+    ),
+    "neighbours": (
+        f"up to {MAX_BIN_ITEMS} boxes x, y, w, d, h, in metres",
+        partial(_are_boxes, count=5, sides=3, most=MAX_BIN_ITEMS),
+    ),
 }
 
 Point = tuple[float, ...]
@@ -102,11 +123,10 @@ def to_lines(plans: Iterable[EpisodePlan]) -> str:
     """Return plans as the text of a ``plans.jsonl``."""
     lines = []
     for plan in plans:
-        for placement in plan.placements:
-            values = {**vars(plan), **vars(placement)}
+        for values in ({**vars(plan), **vars(placement)} for placement in plan.placements):
             keys = [*KEYS, *ROBOT_KEYS, *(key for key in OPTIONAL_KEYS if values[key])] if plan.bin else KEYS
-            lines.append(json.dumps({key: values[key] for key in keys}))
-    return "".join(f"{line}\n" for line in lines)
+            lines.append(json.dumps({key: values[key] for key in keys}) + "\n")
+    return "".join(lines)
 
 
 def read_plans(path: str | Path) -> list[EpisodePlan]:
@@ -119,91 +139,84 @@ def read_plans(path: str | Path) -> list[EpisodePlan]:
     """
     plans: list[EpisodePlan] = []
     for number, line in enumerate(read_text(path, MAX_FILE).splitlines(), 1):
-        where = f"{path}, line {number}"
-        values = _read_line(where, line)
-        sizes = {key: values.get(key, ()) for key in ("tote", "bin", "effector", "body")}
-        if not plans or plans[-1].episode != values["episode"]:
-            if any(plan.episode == values["episode"] for plan in plans):
-                raise ValueError(f"{where}: episode={values['episode']}: expected its lines to follow one another.")
-            plans.append(EpisodePlan(values["episode"], **sizes))
-        for key, value in sizes.items():
-            if getattr(plans[-1], key) != value:
-                raise ValueError(f"{where}: {key}: expected the same in all lines of episode {values['episode']}.")
-        placement = Placement(**{key: values[key] for key in values if key not in ("episode", *sizes)})
-        if fault := _fault(placement, plans[-1]):
-            raise ValueError(f"{where}: the item {fault}.")
-        plans[-1].placements.append(placement)
+        try:
+            values = _read_line(line)
+            episode = values.pop("episode")
+            sizes = {key: values.pop(key, ()) for key in ("tote", "bin", "effector", "body")}
+            if not plans or plans[-1].episode != episode:
+                if any(plan.episode == episode for plan in plans):
+                    raise ValueError(f"episode={episode}: expected its lines to follow one another.")
+                plans.append(EpisodePlan(episode, **sizes))
+            if changed := [key for key, value in sizes.items() if getattr(plans[-1], key) != value]:
+                raise ValueError(f"{changed[0]}: expected the same in all lines of episode {episode}.")
+            placement = Placement(**values)
+            _check_place(placement, plans[-1])
+            plans[-1].placements.append(placement)
+        except ValueError as error:
+            raise ValueError(f"{path}, line {number}: {error}") from error
     return plans
 
 
-def _read_line(where: str, line: str) -> dict:
+def _read_line(line: str) -> dict:
     """Return the values of a line."""
     try:
-        values = json.loads(line)
+        given = json.loads(line)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{where}: expected an object in JSON ({error}).") from error
-    if not isinstance(values, dict):
-        raise ValueError(f"{where}: got {type(values).__name__}, expected an object with {', '.join(KEYS)}.")
+        raise ValueError(f"expected an object in JSON ({error}).") from error
+    if not isinstance(given, dict):
+        raise ValueError(f"got {type(given).__name__}, expected an object with {', '.join(KEYS)}.")
     known = {**KEYS, **ROBOT_KEYS}
     kinds = {**known, **OPTIONAL_KEYS}
-    if unknown := [key for key in values if key not in kinds]:
-        raise ValueError(f"{where}: {excerpt(unknown[0])}: there is no such key; expected {', '.join(known)}.")
-    needed = known if values.keys() - KEYS.keys() else KEYS
-    if missing := [key for key in needed if key not in values]:
-        raise ValueError(f"{where}: {missing[0]}: missing; expected {', '.join(needed)}.")
-    found = {key: _read_value(f"{where}: {key}", value, kinds[key]) for key, value in values.items()}
-    if found.get("rotation", 0) not in (0, 90, 180, 270):
-        raise ValueError(f"{where}: rotation={found['rotation']}: expected {ROBOT_KEYS['rotation'].expected}.")
+    if unknown := [key for key in given if key not in kinds]:
+        raise ValueError(f"{excerpt(unknown[0])}: there is no such key; expected {', '.join(known)}.")
+    needed = known if given.keys() - KEYS.keys() else KEYS
+    if missing := [key for key in needed if key not in given]:
+        raise ValueError(f"{missing[0]}: missing; expected {', '.join(needed)}.")
+    for key, value in given.items():
+        expected, is_good = kinds[key]
+        if not is_good(value):
+            raise ValueError(f"{key}={excerpt(value)}: expected {expected}.")
+    values = {key: _frozen(value) for key, value in given.items()}
     for key, outer in (("body", "effector"), ("neighbours", "bin")):
-        for x, y, w, d, *_ in found.get(key, ()):
-            wide, deep, *_ = found[outer]
+        for x, y, w, d, *_ in values.get(key, ()):
+            wide, deep, *_ = values[outer]
             if min(x, y) < -TOLERANCE or x + w > wide + TOLERANCE or y + d > deep + TOLERANCE:
-                raise ValueError(f"{where}: {key}: {[x, y, w, d]} leaves the {outer} of {wide:g} x {deep:g} m.")
-    if "neighbours" in found:
-        w, d, _ = found["size"]
-        item = *found["item"], *((d, w) if found["rotation"] % 180 else (w, d))
-        for one, other in combinations([item, *found["neighbours"]], 2):
-            shared = [min(one[i] + one[i + 2], other[i] + other[i + 2]) - max(one[i], other[i]) for i in (0, 1)]
-            if min(shared) > TOLERANCE:
-                raise ValueError(f"{where}: neighbours: {excerpt([*other])} overlaps {excerpt([*one])} in the bin.")
-    return found
+                raise ValueError(f"{key}: {[x, y, w, d]} leaves the {outer} of {wide:g} x {deep:g} m.")
+    if "neighbours" in values:
+        w, d, _ = values["size"]
+        item = *values["item"], *((d, w) if values["rotation"] % 180 else (w, d))
+        for one, other in combinations([item, *values["neighbours"]], 2):
+            if min(_shared(one[:2], one[2:4], other[:2], other[2:4])) > TOLERANCE:
+                raise ValueError(f"neighbours: {excerpt([*other])} overlaps {excerpt([*one])} in the bin.")
+    return values
 
 
-def _read_value(where: str, value, kind: Value):
-    """Return the value of a key: a whole number, a tuple of numbers, or a tuple of such tuples."""
-
-    def is_good(point) -> bool:
-        if not isinstance(point, list) or len(point) != kind.parts or not all(map(is_number, point)):
-            return False
-        return max(map(abs, point)) <= MAX_LENGTH and all(side >= 1e-6 for side in point[kind.parts - kind.sides :])
-
-    if kind.parts == 0:
-        points: list = []
-        good = is_whole(value) and value >= 0
-    else:
-        points = value if kind.most else [value]
-        good = isinstance(points, list) and len(points) <= max(kind.most, 1) and all(map(is_good, points))
-    if not good:
-        raise ValueError(f"{where}={excerpt(value)}: expected {kind.expected}.")
-    boxes = tuple(tuple(map(float, point)) for point in points)
-    return boxes if kind.most else boxes[0] if kind.parts else value
+def _frozen(value):
+    """Return lists as tuples of floats."""
+    if not isinstance(value, list):
+        return value
+    return tuple(_frozen(part) if isinstance(part, list) else float(part) for part in value)
 
 
-def _fault(placement: Placement, plan: EpisodePlan) -> str:
-    """Return why the item cannot lie where it is planned; empty if it can."""
-    size, corner = placement.size, placement.corner
-    for axis, name in enumerate("xyz"):
-        low, high = corner[axis], corner[axis] + size[axis]
-        if low < -TOLERANCE or high > plan.tote[axis] + TOLERANCE:
-            return f"leaves the tote: along {name} from {low:g} to {high:g} m, expected 0 to {plan.tote[axis]:g} m"
-    below = 0.0
+def _shared(corner: Point, size: Point, other: Point, other_size: Point) -> list[float]:
+    """Return the length that two boxes share along each axis; below 0: the distance between them."""
+    axes = zip(corner, size, other, other_size, strict=True)
+    return [min(a + length, b + other_length) - max(a, b) for a, length, b, other_length in axes]
+
+
+def _check_place(placement: Placement, plan: EpisodePlan) -> None:
+    """Refuse an item that cannot lie where it is planned."""
+    size, corner, below = placement.size, placement.corner, 0.0
+    for name, low, side, most in zip("xyz", corner, size, plan.tote, strict=True):
+        if low < -TOLERANCE or low + side > most + TOLERANCE:
+            raise ValueError(
+                f"the item leaves the tote: along {name} from {low:g} to {low + side:g} m, expected 0 to {most:g} m."
+            )
     for number, other in enumerate(plan.placements, 1):
-        far, others = ([at + side for at, side in zip(one.corner, one.size, strict=True)] for one in (placement, other))
-        shared = [min(a, b) - max(c, d) for a, b, c, d in zip(far, others, corner, other.corner, strict=True)]
+        shared, top = _shared(corner, size, other.corner, other.size), other.corner[2] + other.size[2]
         if min(shared) > TOLERANCE:
-            return f"overlaps item {number} of its episode by {1e3 * min(shared):.1f} mm"
-        if min(shared[:2]) > 0 and others[2] <= corner[2] + TOLERANCE:
-            below = max(below, others[2])
+            raise ValueError(f"the item overlaps item {number} of its episode by {1e3 * min(shared):.1f} mm.")
+        if min(shared[:2]) > 0 and top <= corner[2] + TOLERANCE:
+            below = max(below, top)
     if corner[2] - below > TOLERANCE:
-        return f"floats {1e3 * (corner[2] - below):.1f} mm above what lies below it"
-    return ""
+        raise ValueError(f"the item floats {1e3 * (corner[2] - below):.1f} mm above what lies below it.")

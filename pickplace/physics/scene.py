@@ -95,8 +95,7 @@ class Scene:
         self.planned = np.vstack([self.planned, planned])
         self.boxes.append(self._add_body(corner, size, yaw))
         self.compile()
-        if self.motion:
-            self.record()
+        self.record()
 
     def _add_body(self, corner: Vector, size: Vector, yaw: float = 0.0):
         """Add the body of a box, see :meth:`add`."""
@@ -129,8 +128,9 @@ class Scene:
             mujoco.mj_step(self.model, self.data)
 
     def record(self) -> None:
-        """Add a picture to the motion."""
-        assert self.motion is not None
+        """Add a picture to the motion, if there is one."""
+        if self.motion is None:
+            return
         mujoco.mj_kinematics(self.model, self.data)  # of what was added since the last step, too
         poses = np.hstack([self.data.xpos, self.data.xquat])
         ids = [body.id for body in self.bodies]

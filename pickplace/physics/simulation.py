@@ -160,8 +160,9 @@ class Simulation(ABC):
     def check_width(self, name: str, size: Sequence[float]) -> None:
         """Refuse what is hardly wider than the gap, with a ``ValueError`` that names it."""
         if min(size[:2]) < 2 * self.gap:
-            expected = f"expected sides of at least twice physics.gap, {2 * self.gap:g} m"
-            raise ValueError(f"{name}: {min(size[:2]):g} m wide; {expected}.")
+            raise ValueError(
+                f"{name}: {min(size[:2]):g} m wide; expected sides of at least twice physics.gap, {2 * self.gap:g} m."
+            )
 
     def find_loss(self, scene: Scene) -> Loss | None:
         """Return the item that has moved furthest of those that have moved or tilted too far, if any has."""

@@ -45,14 +45,13 @@ def list_alternatives(
     else:
         log_probs = policy.action_log_probs(observation)[0]
         tried = cell.num_actions if candidates == "all" else min(candidates, cell.num_actions)
-        actions = log_probs.topk(tried).indices[:count]  # the same call as the planner's, so that ties agree
-        if chosen is not None and not (actions == chosen).any():
-            actions = torch.cat([actions, chosen])
+        # The same call as the planner's, so that ties agree.
+        actions = _with_chosen(log_probs.topk(tried).indices[:count], chosen)
         probability = log_probs[actions].exp()
     if not len(actions):
         return []
-    failure, item = problem.failures(actions), problem.taken_items(actions)
-    columns = [column.tolist() for column in split_action(cell, actions)]
+    columns = *split_action(cell, actions), probability, problem.failures(actions), problem.taken_items(actions)
+    rows = zip(actions.tolist(), *(column.tolist() for column in columns), strict=True)
     return [
         Alternative(
             action=action,
@@ -64,10 +63,13 @@ def list_alternatives(
             chosen=chosen is not None and action == int(chosen),
             item_number=number,
         )
-        for action, x_bin, y_bin, x_tote, y_tote, rotation, share, code, number in zip(
-            actions.tolist(), *columns, probability.tolist(), failure.tolist(), item.tolist(), strict=True
-        )
+        for action, x_bin, y_bin, x_tote, y_tote, rotation, share, code, number in rows
     ]
+
+
+def _with_chosen(listed: Tensor, chosen: Tensor | None) -> Tensor:
+    """Return what is listed, and behind it what is chosen, if it is not listed."""
+    return listed if chosen is None or (listed == chosen).any() else torch.cat([listed, chosen])
 
 
 def _probable_footprints(
@@ -83,7 +85,7 @@ def _probable_footprints(
     lands = footprint >= 0
     reachable = torch.zeros(cell.num_choices, dtype=torch.bool, device=footprint.device)
     reachable[footprint[lands]] = True
-    if problem.bin_items == 1:
+    if problem.maps.bin_items == 1:
         log_probs = policy.action_log_probs(observation)[0]
         total = log_probs.new_zeros(cell.num_choices)
         total.scatter_add_(0, footprint[lands], log_probs[lands].exp())
@@ -91,10 +93,8 @@ def _probable_footprints(
         scores = policy.unmasked_scores(observation)[0]
         total = torch.where(reachable, scores, -torch.inf).softmax(0).nan_to_num(0)
     ranked = torch.where(reachable, total, -1).argsort(descending=True, stable=True)[: int(reachable.sum())][:count]
-    if chosen is not None and not (ranked == footprint[chosen]).any():
-        ranked = torch.cat([ranked, footprint[chosen]])
     preference = action_mask(cell, problem.maps)[0].int()
     if chosen is not None:
-        preference[chosen] = 2
+        ranked, preference[chosen] = _with_chosen(ranked, footprint[chosen]), 2
     shown = [torch.where(footprint == wanted, preference, -1).argmax() for wanted in ranked]
     return torch.stack(shown) if shown else ranked, total[ranked]

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from pickplace.robot.box import ACCURACY, Box, DepthMapError, HiddenBox
-from pickplace.robot.measure import MAX_PATCHES, SNAPPED, ToteMap, is_inside, smallest_rectangle
+from pickplace.robot.measure import MAX_PATCHES, SNAPPED, ToteMap, is_inside, smallest_rectangle, turned_axes
 from pickplace.rules.cell import CellSpec
 
 #: Greatest share of a tote that the camera may not see.
@@ -86,14 +86,15 @@ class Camera:
         """
         image = np.asarray(depth)
         if image.ndim != 2 or min(image.shape) < 3 or image.dtype.kind not in "fiu":
-            found = f"shape {list(image.shape)} of {image.dtype}"
-            raise DepthMapError(f"depth: got {found}, expected an image of distances, [rows, columns].")
+            raise DepthMapError(
+                f"depth: got shape {list(image.shape)} of {image.dtype}, expected an image of distances, "
+                "[rows, columns]."
+            )
         image = np.where(image > 0, image, np.nan).astype(np.float64)  # NaN is not above 0
         image[~np.isfinite(image)] = np.nan
         if np.isnan(image).all():
             raise DepthMapError("depth: got no distance above 0; expected metres, and 0 or NaN where nothing is known.")
-        if np.nanmedian(image) > 20:
-            far = np.nanmedian(image)
+        if (far := np.nanmedian(image)) > 20:
             raise DepthMapError(f"depth: got distances of {far:g}, expected metres; divide millimetres by 1000.")
         return self.rays(image.shape) * image[..., None] + self.pose[:3, 3]
 
@@ -125,8 +126,9 @@ class Camera:
         rim = cell.tote_size[2] * cell.height_unit * cell_size if tote_height is None else tote_height
         pixel = self.pixel()
         if pixel * LEAST_PIXELS > cell_size:
-            wide = cell_size / pixel
-            raise DepthMapError(f"depth: a cell is {wide:.1f} pixels wide, expected at least {LEAST_PIXELS}.")
+            raise DepthMapError(
+                f"depth: a cell is {cell_size / pixel:.1f} pixels wide, expected at least {LEAST_PIXELS}."
+            )
         points = self._inside(depth, sides, rim, "tote")
         along = min(MAX_PATCHES, int(cell_size / (LEAST_PIXELS * pixel)))
         shape = [side * along for side in cell.tote_size[:2]]
@@ -184,14 +186,13 @@ class Camera:
         if labels is None:
             step = 4 * accuracy + self.pixel()
             flat = ndimage.maximum_filter(height, 3) - ndimage.minimum_filter(height, 3) < step
-            segments, count = ndimage.label(above & flat)
+            segments, _ = ndimage.label(above & flat)
         else:
             labels = np.asarray(labels)
             if labels.shape != above.shape or labels.dtype.kind not in "iu":
                 found = f"shape {list(labels.shape)} of {labels.dtype}"
                 raise DepthMapError(f"labels: got {found}, expected whole numbers, {list(above.shape)} as of depth.")
-            numbers, segments = np.unique(np.where(above & (labels > 0), labels, 0), return_inverse=True)
-            segments, count = segments.reshape(above.shape) + (numbers[0] != 0), len(numbers) - (numbers[0] == 0)
+            segments = np.where(above & (labels > 0), labels, 0)
             known = ndimage.binary_dilation(labels > 0, np.ones((3, 3)), iterations=2)
             if (left := above & ~known & ~np.isnan(points[..., 2])).sum() >= MIN_ITEM_PIXELS:
                 row, column = np.argwhere(left)[0].tolist()
@@ -199,11 +200,9 @@ class Camera:
                     f"labels[{row}, {column}]: got 0, but something {height[row, column]:.3f} m high lies there; "
                     "expected a label for each item."
                 )
-        boxes = []
-        for number in range(1, count + 1):
-            segment = segments == number
-            if segment.sum() >= MIN_ITEM_PIXELS:
-                boxes.append(self._box(points, segment, narrowed=labels is None))
+        numbers, counts = np.unique(segments[segments > 0], return_counts=True)
+        large = numbers[counts >= MIN_ITEM_PIXELS]
+        boxes = [self._box(points, segments == number, narrowed=labels is None) for number in large]
         hidden = [self._hidden_length(box, boxes) for box in boxes]
         for box, length in zip(boxes, hidden, strict=True):
             if not length:
@@ -221,8 +220,7 @@ class Camera:
         heights = np.where(np.isnan(heights), np.nan, ndimage.median_filter(filled, 3, mode="nearest"))
         points = np.concatenate([points[..., :2], heights[..., None]], -1)
         wall = self._wall()
-        x, y = points[..., 0], points[..., 1]
-        within = (x > wall) & (x < sides[0] - wall) & (y > wall) & (y < sides[1] - wall)
+        within = np.all((points[..., :2] > wall) & (points[..., :2] < np.subtract(sides, wall)), axis=-1)
         if within.sum() < 0.5 * (sides[0] / self.pixel()) * (sides[1] / self.pixel()) * (1 - MOST_UNSEEN):
             raise DepthMapError(
                 f"depth: {within.sum()} pixels lie inside the {name}, which is too few; expected the whole {name} in "
@@ -247,7 +245,10 @@ class Camera:
         x, y, w, d, yaw = smallest_rectangle(points[segment][:, :2])
         # Every pixel that shows a place well inside the rectangle must show the top.
         border = BORDER * pixel + SNAPPED * max(w, d) * (yaw == 0)
-        inside = is_inside(self._at_height(segment.shape, height), (x, y), (w - 2 * border, d - 2 * border), yaw)
+        rays = self.rays(segment.shape)
+        # The place where the ray of every pixel passes the height, [rows, columns, 2].
+        at_height = self.pose[:2, 3] + rays[..., :2] * ((height - self.pose[2, 3]) / rays[..., 2])[..., None]
+        inside = is_inside(at_height, (x, y), (w - 2 * border, d - 2 * border), yaw)
         grown = (3 if narrowed else 1) * pixel  # what the steps' filter took off, and half a pixel on each side
         if inside.any() and (missing := 1 - segment[inside].mean()) > MOST_MISSING:
             raise DepthMapError(
@@ -262,24 +263,17 @@ class Camera:
         side = np.linspace(-1, 1, EDGE_POINTS)
         one = np.ones_like(side)
         edge = np.concatenate([[side, one], [side, -one], [one, side], [-one, side]], 1).T
-        turn, grown = math.radians(box.yaw), HIDDEN_PIXELS * self.pixel(box.h)
-        axes = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
-        edge = (box.x, box.y) + edge * (box.w / 2 + grown, box.d / 2 + grown) @ axes  # [points, 2]
+        grown = HIDDEN_PIXELS * self.pixel(box.h)
+        sides = (box.w / 2 + grown, box.d / 2 + grown)
+        edge = (box.x, box.y) + edge * sides @ turned_axes(math.radians(box.yaw))  # [points, 2]
         to_camera, longest = self.pose[:2, 3] - edge, 0.0
-        for other in boxes:
+        for other in (each for each in boxes if each.h > box.h):
             share = (other.h - box.h) / (self.pose[2, 3] - box.h)  # of the ray that runs below the other's top
-            if share <= 0:
-                continue
             ray = edge + np.linspace(0, share, EDGE_POINTS)[:, None, None] * to_camera
             inside = is_inside(ray, (other.x, other.y), (other.w, other.d), other.yaw)
             hides = inside.any(0) & ~inside[0]  # what lies in the other is no part of the box
             longest = max(longest, float((share * np.linalg.norm(to_camera[hides], axis=1)).max(initial=0.0)))
         return longest if longest > self.pixel(box.h) / 2 else 0.0
-
-    def _at_height(self, shape: tuple[int, ...], height: float) -> np.ndarray:
-        """Return where the ray of every pixel passes a height, ``[rows, columns, 2]``."""
-        rays = self.rays(shape)
-        return self.pose[:2, 3] + rays[..., :2] * ((height - self.pose[2, 3]) / rays[..., 2])[..., None]
 
 
 def _check_reading(box: Box, sizes, tolerance: float) -> None:

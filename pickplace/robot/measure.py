@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -130,24 +131,41 @@ def whole_units(lengths, unit: float, up: bool) -> Tensor:
     return torch.from_numpy(np.asarray(np.ceil(units - ROUNDING) if up else np.floor(units + ROUNDING))).int()
 
 
-def labels_of_map(values, heights: np.ndarray, least: float) -> dict[int, np.ndarray]:
-    """Return where each label of ``bin_labels`` stands, bool in the shape of ``heights``; by ascending labels.
+def segments_of_map(labels, heights: np.ndarray, least: float) -> dict[str, np.ndarray]:
+    """Return where each item of a bin lies, bool in the shape of ``heights``; by ascending labels.
+
+    The keys tell items apart in messages: ``" with label 3"``; empty if there are no labels, and one item lies there.
 
     Args:
-        values: whole numbers, 0 where the bin is empty.
+        labels: ``bin_labels``: whole numbers, 0 where the bin is empty; or None.
         heights: ``bin_depth``.
         least: a height above it is an item's, so it must have a label, and each label must have one.
 
     Raises:
-        DepthMapError: naming the first value that is no such number, or does not fit the heights.
+        DepthMapError: for an empty bin; naming the first label that is no such number, or does not fit the heights.
     """
-    array, is_item = whole_map("bin_labels", values, heights.shape, MAX_LABEL), heights > least
+    is_item = heights > least
+    if labels is None:
+        if not is_item.any():
+            raise DepthMapError("bin_depth: got no cell above 0, expected one item.")
+        return {"": is_item}
+    array = whole_map("bin_labels", labels, heights.shape, MAX_LABEL)
     refuse("bin_labels", is_item & (array == 0), array, "", "a label, as bin_depth shows an item")
     refuse("bin_labels", (array > 0) & ~np.isin(array, array[is_item]), array, "", "0, as bin_depth shows no item")
-    labels = np.unique(array[is_item]).tolist()
-    if not 1 <= len(labels) <= MAX_BIN_ITEMS:
-        raise DepthMapError(f"bin_labels: got {len(labels)} labels, expected 1 to {MAX_BIN_ITEMS}, one for each item.")
-    return {label: array == label for label in labels}
+    found = np.unique(array[is_item]).tolist()
+    if not 1 <= len(found) <= MAX_BIN_ITEMS:
+        raise DepthMapError(f"bin_labels: got {len(found)} labels, expected 1 to {MAX_BIN_ITEMS}, one for each item.")
+    return {f" with label {label}": array == label for label in found}
+
+
+def label_hint(name: str) -> str:
+    """Return what a message adds for an item without a name, see :func:`segments_of_map`."""
+    return "" if name else "; of several items give bin_labels, too"
+
+
+def turned_axes(angle: float) -> np.ndarray:
+    """Return the unit vectors along x and y after a counter-clockwise turn in radians, ``[2, 2]``."""
+    return np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
 
 
 def is_inside(points: np.ndarray, centre: Sequence[float], sides: Sequence[float], yaw: float) -> np.ndarray:
@@ -198,23 +216,6 @@ def refuse_stacked(boxes: list[Box], tolerance: float) -> None:
                 )
 
 
-def boxes_of_map(heights: np.ndarray, labels, side: float, accuracy: float, is_cell_map: bool = False) -> list[Box]:
-    """Return the cuboid of each label in a bin's map, by ascending labels; without labels the one that lies there.
-
-    Args:
-        labels: ``bin_labels``, see :func:`labels_of_map`, or None; the others as of :func:`box_of_map`.
-
-    Raises:
-        DepthMapError: for labels that do not fit the map, or a label of something else than one cuboid.
-    """
-    if labels is None:
-        return [box_of_map(heights, side, accuracy, is_cell_map)]
-    return [
-        box_of_map(np.where(segment, heights, 0.0), side, accuracy, is_cell_map, f" with label {label}")
-        for label, segment in labels_of_map(labels, heights, least_height(accuracy)).items()
-    ]
-
-
 def least_height(accuracy: float) -> float:
     """Return the height up to which a bin's map shows its floor, m."""
     return max(2 * accuracy, MILLIMETRE / 2)
@@ -224,28 +225,24 @@ def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: b
     """Return the one cuboid that a bin's map shows.
 
     Args:
-        heights: above the bin's floor, m.
+        heights: above the bin's floor, m; not all of them the floor's.
         side: of a value's square, m.
         accuracy: greatest error of a height, m.
         is_cell_map: whether the map has one value a cell: then the item is all cells in which it lies.
-        name: of the item, for messages; none if it should lie alone.
+        name: of the item, see :func:`segments_of_map`.
 
     Raises:
-        DepthMapError: for an empty bin, or something else than one cuboid.
+        DepthMapError: for something else than one cuboid.
     """
-    filled = heights > least_height(accuracy)
-    if not filled.any():
-        raise DepthMapError("bin_depth: got no cell above 0, expected one item.")
-    where = np.argwhere(filled)
-    corners = np.unique(np.concatenate([where + step for step in ((0, 0), (0, 1), (1, 0), (1, 1))]), axis=0)
+    where = np.argwhere(heights > least_height(accuracy))
+    corners = np.unique(np.concatenate([where + step for step in product((0, 1), repeat=2)]), axis=0)
     x, y, w, d, yaw = smallest_rectangle(corners * side)
     box = Box(x, y, w, d, float(heights.max()), yaw)
     # All that lies well inside the rectangle must be the item's top.
     centres = (np.indices(heights.shape).transpose(1, 2, 0) + 0.5) * side
     border = 0.0 if is_cell_map else side + SNAPPED * max(w, d) * (yaw == 0)
     inside = is_inside(centres, (x, y), (w - 2 * border, d - 2 * border), yaw)
-    hint = "" if name else "; of several items give bin_labels, too"
-    expected = f"{box.h:g} m: one cuboid, {w:g} x {d:g} m with its centre at [{x:g}, {y:g}]{hint}"
+    expected = f"{box.h:g} m: one cuboid, {w:g} x {d:g} m with its centre at [{x:g}, {y:g}]{label_hint(name)}"
     refuse("bin_depth", inside & (heights < box.h - 2 * accuracy - ROUNDING), heights, f" m{name}", expected)
     return box.upright()
 
@@ -261,15 +258,13 @@ def smallest_rectangle(points: np.ndarray) -> tuple[float, float, float, float, 
         hull = points
     hull = np.roll(hull, -np.lexsort(hull.T[::-1])[0], 0)  # of equally good rectangles the same is taken each time
     edges = np.roll(hull, -1, 0) - hull
-    best = None
+    least, best = math.inf, (0.0, 0.0, 0.0, 0.0, 0.0)
     for angle in [0.0, *(np.arctan2(edges[:, 1], edges[:, 0]) % (math.pi / 2)).tolist()]:
-        axes = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+        axes = turned_axes(angle)
         turned = hull @ axes.T
         low, high = turned.min(0), turned.max(0)
         area = float(np.prod(high - low))
-        if best is None or area < 0.97 * best[0] or (area < best[0] and best[4] != 0.0):
-            centre = (low + high) / 2 @ axes
-            best = (area, *centre.tolist(), (high - low).tolist(), angle)
-    assert best is not None
-    _, x, y, (w, d), angle = best
-    return x, y, w, d, math.degrees(angle)
+        if area < 0.97 * least or (area < least and best[4] != 0.0):
+            x, y = ((low + high) / 2 @ axes).tolist()
+            least, best = area, (x, y, *(high - low).tolist(), math.degrees(angle))
+    return best

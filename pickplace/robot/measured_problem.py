@@ -1,9 +1,9 @@
 """The problem that a robot's planner solves for items and a tote that were measured in metres."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,11 +16,14 @@ from pickplace.robot.measure import (
     ROUNDING,
     ToteMap,
     as_array,
-    boxes_of_map,
+    box_of_map,
+    least_height,
     metric_map,
     patches,
     refuse_stacked,
+    segments_of_map,
     touches,
+    turned_axes,
     whole_units,
 )
 from pickplace.robot.problem import Problem, check_longest, join_items, read_bearing
@@ -38,125 +41,68 @@ from pickplace.rules.reach.base import Limits
 from pickplace.rules.state import State, surface_from
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeasuredProblem(Problem):
-    """One item and one tote, in metres; heights are counted in millimetres.
+class MeasuredItem(NamedTuple):
+    """An item on a grid that lies along it, and what decides which actions succeed with it."""
 
-    The pick cells are those of a grid along the item. Where other items lie in the bin, the robot's limits forbid the
-    picks at which the end effector would touch one that may be as high.
-    """
-
+    limits: Limits  # of the robot on this item
+    cell: CellSpec  # with these limits
     measured: MeasuredMaps
-    tote: MeasuredTote
     sides: tuple[float, float]  # of the item, in cells
     bin_clear: Tensor  # bool [P], see `failures`
-    grip: float  # height of the suction face when it grips the item
-    box: Box
+    centres: np.ndarray  # of the end effector at each pick cell, in the bin's frame, [P, 2]; m
+    grip: float  # height of the suction face when it grips the item, m
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredProblem(Problem):
+    """Items and one tote, in metres; heights are counted in millimetres.
+
+    The pick cells are those of a grid along each item; no two items share an action. Where other items lie in the bin,
+    the robot's limits forbid the picks at which the end effector would touch one that may be as high.
+    """
+
+    parts: list[MeasuredItem]
+    tote: MeasuredTote
 
     def is_feasible_in_an_empty_tote(self) -> bool:
         flat = torch.zeros_like(self.tote.highest)
         empty = self.tote._replace(highest=flat, lowest=flat, bears=torch.ones_like(self.tote.bears))
-        maps = measured_maps(self.cell, empty, self.maps.item, self.sides).maps
-        return bool(footprint_mask(self.cell, maps).any())
-
-    def failures(self, actions: Tensor) -> Tensor:
-        return failures(self.cell, self.measured, actions, self.bin_clear)
-
-    def bearing_after(self, action: Tensor | None) -> Tensor:
-        if action is None:
-            return self.tote.bears
-        footprint = self._footprint(action)
-        return bearing_after(self.cell, self.tote, self.maps.item, self.sides, self.measured, footprint)
-
-    def filled(self) -> float:
-        return float(self.tote.highest.double().mean()) / self.tote.height
-
-    def item_share(self) -> float:
-        wide, deep, _ = self.cell.tote_size
-        box = self.box
-        return box.w * box.d * box.h / (wide * deep * self.side**2 * self.tote.height * self.unit)
-
-    def _suction_face(self, x_bin: int, y_bin: int) -> tuple[float, float, float]:
-        centres = effector_centres(self.cell, self.maps.item, self.box, self.side)
-        return *centres[x_bin * self.cell.bin_size[1] + y_bin], self.grip
-
-    def _top(self, action: Tensor) -> int:
-        return int(self.measured.maps.rest.flatten()[self._footprint(action)] + self.maps.item.h)
-
-    def _footprint(self, action: Tensor) -> int:
-        carried = carry(self.cell, self.maps.item, action)
-        return int(footprint_index(self.cell.tote_size, carried.rotation % 2, carried.x, carried.y))
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeasuredBin(Problem):
-    """Several items and one tote, in metres: a problem for each item, none of which shares an action with another."""
-
-    parts: list[MeasuredProblem]
-
-    @classmethod
-    def of(cls, parts: list[MeasuredProblem]) -> "MeasuredBin":
-        """Return what joins the problems of the items in a bin."""
-        limits = parts[0].cell.limits
-        assert limits is not None
-        everywhere = replace(limits, pick_ok=torch.ones_like(limits.pick_ok))  # each item has its own picks
-        cell = replace(parts[0].cell, reach=everywhere, bin_items=len(parts))
-        keys = ("top", "clearance", "rest", "greatest_top")
-        joined = {key: torch.cat([getattr(part.maps, key) for part in parts]) for key in keys}
-        step = parts[0].maps.level_step
-        items = join_items([part.maps.item for part in parts])
-        seen_items = join_items([part.seen.items.rows(0) for part in parts])
-        blocked = ~torch.stack([part.cell.limits.pick_ok for part in parts if part.cell.limits is not None])
-        state, seen = parts[0].state._replace(items=items), parts[0].seen._replace(items=seen_items)
-        maps = PlacingMaps(**joined, item=items.rows(0), blocked=blocked, bin_items=len(parts), level_step=step)
-        return cls(cell=cell, state=state, seen=seen, maps=maps, parts=parts)
-
-    def of_item(self, number: int) -> Problem:
-        return self.parts[number]
-
-    def is_feasible_in_an_empty_tote(self) -> bool:
-        return any(part.is_feasible_in_an_empty_tote() for part in self.parts)
+        maps = (measured_maps(part.cell, empty, part.measured.maps.item, part.sides).maps for part in self.parts)
+        return any(footprint_mask(part.cell, each).any() for part, each in zip(self.parts, maps, strict=True))
 
     def failures(self, actions: Tensor) -> Tensor:
         taken, codes = self.taken_items(actions), torch.empty_like(actions)
         for number, part in enumerate(self.parts):
-            codes[taken == number] = part.failures(actions[taken == number])
+            codes[taken == number] = failures(part.cell, part.measured, actions[taken == number], part.bin_clear)
         return codes
 
     def bearing_after(self, action: Tensor | None) -> Tensor:
-        part = self.parts[0 if action is None else int(self.taken_items(action))]
-        return part.bearing_after(action)
+        if action is None:
+            return self.tote.bears
+        part, item, footprint = self._placed(action)
+        return bearing_after(part.cell, self.tote, item, part.sides, part.measured, footprint)
 
     def filled(self) -> float:
-        return self.parts[0].filled()
+        return float(self.tote.highest.double().mean()) / self.tote.height
 
+    def item_share(self, number: int) -> float:
+        (wide, deep, _), box = self.cell.tote_size, self.boxes[number]
+        return box.w * box.d * box.h / (wide * deep * self.side**2 * self.tote.height * self.unit)
 
-def effector_centres(cell: CellSpec, item: Item, box: Box, side: float) -> np.ndarray:
-    """Return the centre of the end effector in the bin's frame at every pick cell, ``[P, 2]``; m.
+    def _suction_face(self, number: int, x_bin: int, y_bin: int) -> tuple[float, float, float]:
+        part = self.parts[number]
+        return *part.centres[x_bin * self.cell.bin_size[1] + y_bin], part.grip
 
-    The cells are those of a grid along the item, in which it lies at whole cells.
+    def _top(self, action: Tensor) -> int:
+        part, item, footprint = self._placed(action)
+        return int(part.measured.maps.rest.flatten()[footprint] + item.h)
 
-    Args:
-        item: of one problem, on that grid.
-        box: the same as it was measured.
-        side: length of a cell, m.
-    """
-    (ee_w, ee_d), (x, y, w, d) = cell.gripper.size, map(int, item[:4])
-    number = np.arange(cell.num_picks)
-    x_bin, y_bin = number // cell.bin_size[1], number % cell.bin_size[1]
-    along = np.stack([effector_centre(x_bin, ee_w) - (x + w / 2), effector_centre(y_bin, ee_d) - (y + d / 2)], -1)
-    turn = math.radians(box.yaw)
-    axes = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
-    return np.array((box.x, box.y)) + side * along @ axes
-
-
-class _PlacedItem(NamedTuple):
-    """An item as it was measured, and at whole cells of a grid that lies along it."""
-
-    box: Box
-    item: Item  # of one problem; its height in millimetres
-    sides: tuple[float, float]  # in cells
-    inset: tuple[int, int]  # cells at each edge that the item, narrower by its clearance, does not cover as a whole
+    def _placed(self, action: Tensor) -> tuple[MeasuredItem, Item, int]:
+        """Return the part of the item that an action takes, the item, and the footprint that it leaves."""
+        part = self.parts[int(self.taken_items(action))]
+        carried = carry(part.cell, part.measured.maps.item, action)
+        footprint = footprint_index(self.cell.tote_size, carried.rotation % 2, carried.x, carried.y)
+        return part, part.measured.maps.item, int(footprint)
 
 
 def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
@@ -166,46 +112,83 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
     unit = cell_size * cell.height_unit
     boxes, clearance = _read_boxes(cell, scene, cell_size)
     tote = _read_tote(cell, scene, unit, device)
-    placed = [_place(cell, box, cell_size, clearance, f"items[{number}]", device) for number, box in enumerate(boxes)]
-
-    ratio = unit / MILLIMETRE
-    longest = max(int(side) for one in placed for side in one.item[2:4])
+    each = [_on_grid(cell, box, cell_size, clearance, f"items[{number}]", device) for number, box in enumerate(boxes)]
+    items, sides = join_items(each), [(box.w / cell_size, box.d / cell_size) for box in boxes]
+    # Cells at each edge that an item, narrower by its clearance, does not cover as a whole.
+    inset_x, inset_y = (
+        max(
+            math.ceil((int(item[2 + axis]) - side[axis]) / 2 + clearance / cell_size - ROUNDING)
+            for item, side in zip(each, sides, strict=True)
+        )
+        for axis in (0, 1)
+    )
+    longest = max(int(side) for item in each for side in item[2:4])
     free = replace(
         cell,
         bin_size=(*cell.bin_size[:2], 1),
         tote_size=(*cell.tote_size[:2], tote.height),
         height_unit=MILLIMETRE / cell_size,
         bin_items=1,
-        item_inset=(max(one.inset[0] for one in placed), max(one.inset[1] for one in placed)),
+        item_inset=(inset_x, inset_y),
         longest_side=cell.longest_side or (None if cell.has_known_offsets else longest),
     )
-    # A policy sees heights as in training.
-    state, seen_rim = tote.state(free, placed[0].item), max(1, round(tote.height / ratio))
-    heights = (state.heights / ratio).round().clamp(max=seen_rim).int()
-    seen = State(surface_from(heights, tote.bears[None]), torch.tensor([seen_rim], device=device), state.items)
-    parts, taken = [], _item_of_each_pick(free, placed)
-    for number, (box, item, sides, _) in enumerate(placed):
-        h = int(item.h)
-        centres = effector_centres(free, item, box, cell_size)
-        above_walls = box.h - accuracy >= cell.bin_size[2] * unit - ROUNDING
-        clear = above_walls | _misses_walls(centres, cell, box.yaw, cell_size)
-        if isinstance(box, HiddenBox):
-            clear = np.zeros_like(clear)
-        clear &= ~_hits_others(centres, cell, number, boxes, cell_size, accuracy, clearance)
+    # Each item has a grid of its own. A pick cell that grips several stands for the highest, as on the grid.
+    pick = torch.arange(free.num_picks, device=device)
+    in_each = items.map(lambda part: part.expand(len(pick), -1))
+    taken = taken_item(free, in_each, pick // free.bin_size[1], pick % free.bin_size[1])
+    parts = []
+    for number, (box, item) in enumerate(zip(boxes, each, strict=True)):
+        grip = int(item.h) + tote.accuracy
+        centres = _effector_centres(free, item, box, cell_size)
+        clear = np.zeros(len(centres), dtype=bool)
+        if not isinstance(box, HiddenBox):
+            above_walls = box.h - accuracy >= cell.bin_size[2] * unit - ROUNDING
+            clear = above_walls | _misses_walls(centres, cell, box.yaw, cell_size)
+            clear = clear & ~_hits_others(centres, cell, number, boxes, cell_size, accuracy, clearance)
         bin_clear = torch.from_numpy(clear).to(device)
-        limits = _limits(cell, free, bin_clear, centres / cell_size, h + tote.accuracy, 2 * tote.accuracy)
+        limits = _limits(cell, free, bin_clear, centres / cell_size, grip, 2 * tote.accuracy)
         limits = replace(limits, pick_ok=limits.pick_ok & (taken == number))
         limited = replace(free, reach=limits)
-        measured = measured_maps(limited, tote, item, sides)
-        alone = item.rows((slice(None), None))
-        seen_item = alone._replace(h=torch.tensor([[max(1, round(h / ratio))]], device=device))
-        parts.append(MeasuredProblem(
-            cell=limited, state=state._replace(items=alone), maps=measured.maps, seen=seen._replace(items=seen_item),
-            yaw=box.yaw, side=cell_size, unit=MILLIMETRE, grip=(h + tote.accuracy) * MILLIMETRE,
-            release=2 * tote.accuracy * MILLIMETRE, box=box, measured=measured, tote=tote, sides=sides,
-            bin_clear=bin_clear,
-        ))  # fmt: skip
-    return parts[0] if len(parts) == 1 else MeasuredBin.of(parts)
+        measured = measured_maps(limited, tote, item, sides[number])
+        parts.append(MeasuredItem(limits, limited, measured, sides[number], bin_clear, centres, grip * MILLIMETRE))
+    joint, maps = _join(parts, items)
+    # A policy sees heights as in training.
+    ratio = unit / MILLIMETRE
+    state, seen_rim = tote.state(free, each[0])._replace(items=items), max(1, round(tote.height / ratio))
+    heights = (state.heights / ratio).round().clamp(max=seen_rim).int()
+    seen_items = items._replace(h=(items.h.double() / ratio).round().long().clamp(min=1))
+    seen = State(surface_from(heights, tote.bears[None]), torch.tensor([seen_rim], device=device), seen_items)
+    return MeasuredProblem(
+        cell=joint, state=state, seen=seen, maps=maps, boxes=boxes, side=cell_size, unit=MILLIMETRE,
+        release=2 * tote.accuracy * MILLIMETRE, parts=parts, tote=tote,
+    )  # fmt: skip
+
+
+def _join(parts: list[MeasuredItem], items: Item) -> tuple[CellSpec, PlacingMaps]:
+    """Return the cell and the maps of all items ``[1, M]``; of several the maps forbid the picks out of reach."""
+    limits, cell, each = parts[0].limits, parts[0].cell, [part.measured.maps for part in parts]
+    if len(parts) == 1:
+        return cell, each[0]
+    keys = ("top", "clearance", "rest", "greatest_top")
+    joined: dict[str, Any] = {key: torch.cat([getattr(maps, key) for maps in each]) for key in keys}
+    blocked = ~torch.stack([part.limits.pick_ok for part in parts])
+    maps = each[0]._replace(**joined, item=items.rows(0), blocked=blocked, bin_items=len(parts))
+    everywhere = replace(limits, pick_ok=torch.ones_like(limits.pick_ok))
+    return replace(cell, reach=everywhere, bin_items=len(parts)), maps
+
+
+def _effector_centres(cell: CellSpec, item: Item, box: Box, side: float) -> np.ndarray:
+    """Return the centre of the end effector in the bin's frame at every pick cell of a grid along an item; m.
+
+    Args:
+        item: of one problem, on that grid.
+        box: the same as it was measured.
+        side: length of a cell, m.
+    """
+    (ee_w, ee_d), (x, y, w, d) = cell.gripper.size, map(int, item[:4])
+    x_bin, y_bin = np.divmod(np.arange(cell.num_picks), cell.bin_size[1])
+    along = np.stack([effector_centre(x_bin, ee_w) - (x + w / 2), effector_centre(y_bin, ee_d) - (y + d / 2)], -1)
+    return np.array((box.x, box.y)) + side * along @ turned_axes(math.radians(box.yaw))
 
 
 def _read_boxes(cell: CellSpec, scene: Scene, side: float) -> tuple[list[Box], float]:
@@ -216,7 +199,13 @@ def _read_boxes(cell: CellSpec, scene: Scene, side: float) -> tuple[list[Box], f
         heights = metric_map("bin_depth", scene.items.depth, cell.bin_size[:2], least, MAX_SIDE * MILLIMETRE)
         is_cell_map, square = len(heights) == cell.bin_size[0], side * cell.bin_size[0] / len(heights)
         clearance = 0.0 if is_cell_map else clearance
-        boxes = boxes_of_map(heights, scene.items.labels, square, accuracy, is_cell_map)
+        labels = scene.items.labels
+        boxes = [
+            box_of_map(
+                heights if labels is None else np.where(segment, heights, 0.0), square, accuracy, is_cell_map, name
+            )
+            for name, segment in segments_of_map(labels, heights, least_height(accuracy)).items()
+        ]
     else:
         boxes = [box.upright() for box in scene.items]
         for number, box in enumerate(boxes):
@@ -253,9 +242,8 @@ def _read_tote(cell: CellSpec, scene: Scene, unit: float, device) -> MeasuredTot
     return MeasuredTote(high.to(device), low.to(device), bears.to(device), rim, over_rim, slack)
 
 
-def _place(cell: CellSpec, box: Box, cell_size: float, clearance: float, name: str, device) -> _PlacedItem:
-    """Return an item at whole cells of a grid that lies along it; refuse one that is too large."""
-    sides = box.w / cell_size, box.d / cell_size
+def _on_grid(cell: CellSpec, box: Box, cell_size: float, clearance: float, name: str, device) -> Item:
+    """Return an item at whole cells of a grid that lies along it, in millimetres; refuse one that is too large."""
     whole = [max(1, math.ceil((side + 2 * clearance) / cell_size - ROUNDING)) for side in (box.w, box.d)]
     for key, size, most_cells in zip("wd", whole, cell.bin_size[:2], strict=True):
         if size > most_cells:
@@ -263,27 +251,14 @@ def _place(cell: CellSpec, box: Box, cell_size: float, clearance: float, name: s
                 f"{name}.{key}={getattr(box, key):g}: with its clearance it takes {size} cells; expected at most "
                 f"{most_cells}, those of the bin."
             )
-    h = int(whole_units(box.h, MILLIMETRE, up=True))
     least = [
         min(max(0, round(at / cell_size - size / 2)), most_cells - size)
         for at, size, most_cells in zip((box.x, box.y), whole, cell.bin_size[:2], strict=True)
     ]
+    h = int(whole_units(box.h, MILLIMETRE, up=True))
     item = Item(*(torch.tensor([part], device=device) for part in (*least, *whole, h)))
     check_longest(cell, item, name)
-    inset = [
-        math.ceil((size - side) / 2 + clearance / cell_size - ROUNDING) for size, side in zip(whole, sides, strict=True)
-    ]
-    return _PlacedItem(box, item, sides, (inset[0], inset[1]))
-
-
-def _item_of_each_pick(cell: CellSpec, placed: Sequence[_PlacedItem]) -> Tensor:
-    """Return the number of the item that each pick cell takes, int64 ``[P]``, so that an action means one pose.
-
-    Each item has a grid of its own. A pick cell that grips several of them stands for the highest, as on the grid.
-    """
-    pick = torch.arange(cell.num_picks, device=placed[0].item.x.device)
-    items = join_items([one.item for one in placed]).map(lambda part: part.expand(len(pick), -1))
-    return taken_item(cell, items, pick // cell.bin_size[1], pick % cell.bin_size[1])
+    return item
 
 
 def _misses_walls(centres: np.ndarray, cell: CellSpec, yaw: float, side: float) -> np.ndarray:
@@ -329,41 +304,36 @@ def _limits(cell: CellSpec, free: CellSpec, bin_clear: Tensor, centres: np.ndarr
         grip: height of the suction face when it grips the item, mm.
         release: height of the suction face above the item's planned top when it lets go, mm.
     """
-    device, limits, ratio = bin_clear.device, free.limits, 1.0
-    if isinstance(cell.reach, Limits):  # tables in the height units of the cell
-        ratio = cell.height_unit / free.height_unit
+    device, limits = bin_clear.device, free.limits
     if limits is None:
         places = torch.zeros(cell.rotations, *cell.tote_size[:2], dtype=torch.int64, device=device)
         return Limits(bin_clear, places, places + FAR)
+    # Millimetres in a unit of the limits: tables are in the height units of the cell.
+    ratio = cell.height_unit / free.height_unit if isinstance(cell.reach, Limits) else 1.0
     return Limits(
-        bin_clear & _reached_picks(cell, free, limits, ratio, centres, grip).to(device),
+        bin_clear & _reached_picks(free, limits, ratio, centres, torch.tensor(grip)).to(device),
         (limits.lowest_top * ratio - release).ceil().long().to(device),
         (limits.highest_top.clamp(max=FAR) * ratio - release).floor().clamp(max=FAR).long().to(device),
     )
 
 
-def _reached_picks(
-    cell: CellSpec, free: CellSpec, limits: Limits, ratio: float, centres: np.ndarray, grip: int
-) -> Tensor:
-    """Return at which of its centres ``[P, 2]`` in the bin the robot reaches the item, bool ``[P]``.
+def _reached_picks(cell: CellSpec, limits: Limits, ratio: float, centres: np.ndarray, face: Tensor) -> Tensor:
+    """Return at which of its centres ``[P, 2]`` in the bin the robot reaches an item, bool ``[P]``.
 
     Args:
         limits: of picks at whole cells; the centres lie between these, and all neighbours must be allowed.
         ratio: millimetres of their height unit.
-        cell, free, grip: as of :func:`_limits`.
+        face: height of the suction face, mm.
     """
-    face = torch.tensor(grip)
-    if cell.reach is not None and (exact := cell.reach.picks(free, *torch.from_numpy(centres).unbind(1))):
+    if cell.reach is not None and (exact := cell.reach.picks(cell, *torch.from_numpy(centres).unbind(1))):
         return is_within_reach(*exact, face)
-    (bin_w, bin_d, _), reached = cell.bin_size, limits.pick_ok
+    sides, reached = cell.bin_size[:2], limits.pick_ok
     if limits.lowest_pick is not None and limits.highest_pick is not None:
         reached = reached & is_within_reach(limits.lowest_pick * ratio, limits.highest_pick * ratio, face)
-    allowed = F.pad(reached.view(bin_w, bin_d), (1, 1, 1, 1), value=False).cpu().numpy()
-    at = [centres[:, axis] - side / 2 + reference_cell(side) for axis, side in enumerate(cell.gripper.size)]
-    good = np.ones(len(centres), dtype=bool)
-    for round_x in (np.floor, np.ceil):
-        for round_y in (np.floor, np.ceil):
-            x, y = (part.round(6) for part in at)
-            x, y = round_x(x).clip(-1, bin_w).astype(int) + 1, round_y(y).clip(-1, bin_d).astype(int) + 1
-            good &= allowed[x, y]
-    return torch.from_numpy(good)
+    allowed = F.pad(reached.view(sides), (1, 1, 1, 1), value=False).cpu().numpy()
+    at = [centres[:, axis] - size / 2 + reference_cell(size) for axis, size in enumerate(cell.gripper.size)]
+    near_x, near_y = (
+        [rounded(part.round(6)).clip(-1, side).astype(int) + 1 for rounded in (np.floor, np.ceil)]
+        for part, side in zip(at, sides, strict=True)
+    )
+    return torch.from_numpy(np.all([allowed[x, y] for x, y in product(near_x, near_y)], 0))

@@ -10,6 +10,7 @@ seen from above.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -31,6 +32,7 @@ from pickplace.robot.scene import Scene
 from pickplace.robot.training_envelope import TrainingEnvelope
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
+from pickplace.rules.masks import footprint_mask
 from pickplace.rules.observation import Term, check_terms, observe
 from pickplace.rules.state import Failure
 
@@ -154,25 +156,25 @@ class Planner:
         device = torch.device("cpu") if self.policy is None else next(self.policy.parameters()).device
         is_metric = scene.cell_size is not None
         problem = (read_metric if is_metric else read_grid)(self.cell, scene, device)
-        planner, terms = self._planner_of(problem.bin_items, is_metric)
+        planner, terms = self._planner_of(problem.maps.bin_items, is_metric)
         observation = observe(terms, problem.cell, problem.seen)
         status, action = _decide(planner, problem, observation)
         number = None if action is None else int(problem.taken_items(action))
-        item = problem if number is None else problem.of_item(number)
-        is_known = number is not None or problem.bin_items == 1
-        pick, place, turn, top = (None,) * 4 if action is None else item.poses(action)
-        before, bearing = problem.filled(), item.bearing_after(action)
+        known = 0 if problem.maps.bin_items == 1 else number
+        pick, place, turn, drop_height = (None,) * 4 if action is None else problem.motion(action)
+        seen = None if known is None else problem.seen.items.cuboids[0, known].tolist()
+        before, bearing = problem.filled(), problem.bearing_after(action)
         return Plan(
             status=status,
-            item=dict(zip("xywdh", item.seen.items.cuboids[0, 0].tolist(), strict=True)) if is_known else None,
-            box=item.box if is_known else None,
+            item=None if seen is None else dict(zip("xywdh", seen, strict=True)),
+            box=None if known is None or not problem.boxes else problem.boxes[known],
             pick=pick,
             place=place,
             rotation_degrees=turn,
-            drop_height=None if top is None else item.drop_height(top),
+            drop_height=drop_height,
             action=None if action is None else int(action),
             occupancy_before=before,
-            occupancy_after=before if action is None else before + item.item_share(),
+            occupancy_after=before if number is None else before + problem.item_share(number),
             alternatives=list_alternatives(planner, problem, observation, action, alternatives),
             reasons=_reasons(problem) if status in ("stuck", "impossible") else None,
             tote_bearing=bearing.int().tolist() if self.cell.support.marks_bearing else None,
@@ -238,12 +240,10 @@ def _several_items(policy, count: int) -> DepthMapError:
 
 def _decide(planner: MapPlanner, problem: Problem, observation: Observation) -> tuple[str, Tensor | None]:
     """Return the status, and the action if one was found that succeeds."""
-    if not problem.is_feasible():
+    if not footprint_mask(problem.cell, problem.maps).any():
         return "stuck" if problem.is_feasible_in_an_empty_tote() else "impossible", None
 
-    def choose(observation):
-        return planner.choose(problem.cell, problem.state, problem.maps, observation)
-
+    choose = partial(planner.choose, problem.cell, problem.state, problem.maps)
     action = decide(planner, problem.cell, observation, choose)
     return ("ok", action) if int(problem.failures(action)) == 0 else ("rejected", None)
 

@@ -60,8 +60,18 @@ class Scene:
             number("tote_height", self.tote_height, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
         elif self.tote_height is not None:
             integral_number("tote_height", self.tote_height, 1, FAR - 1)
-        if not isinstance(self.items, BinMap):
-            check_boxes(self.items)
+        if isinstance(self.items, BinMap):
+            return
+        if not isinstance(self.items, (list, tuple)) or not all(isinstance(item, Box) for item in self.items):
+            raise DepthMapError(f"items={excerpt(self.items)}: expected a list of Box.")
+        if not 1 <= len(self.items) <= MAX_BIN_ITEMS:
+            found = "too many" if self.items else "an empty bin"
+            raise DepthMapError(f"items: got {len(self.items)} boxes, expected 1 to {MAX_BIN_ITEMS}: {found}.")
+        for at, box in enumerate(self.items):
+            for key, value in vars(box).items():
+                if not is_number(value) or abs(value) > MAX_VALUE or (key in "wdh" and value < MILLIMETRE):
+                    expected = "a length of at least 0.001 m" if key in "wdh" else "a finite number"
+                    raise DepthMapError(f"items[{at}].{key}={excerpt(value)}: expected {expected}.")
 
     @classmethod
     def from_maps(cls, bin_depth, tote_depth, bin_labels=None, **settings) -> "Scene":
@@ -91,21 +101,3 @@ class Scene:
         items = over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes)
         tote = over_tote.tote_map(tote_image, cell, cell_size, tote_height)
         return cls(items, tote, cell_size, accuracy, tote_height=tote_height, **settings)
-
-
-def check_boxes(items) -> None:
-    """Check measured items.
-
-    Raises:
-        DepthMapError: for anything but boxes whose values are lengths.
-    """
-    if not isinstance(items, (list, tuple)) or not all(isinstance(item, Box) for item in items):
-        raise DepthMapError(f"items={excerpt(items)}: expected a list of Box.")
-    if not 1 <= len(items) <= MAX_BIN_ITEMS:
-        found = "an empty bin" if not items else "too many"
-        raise DepthMapError(f"items: got {len(items)} boxes, expected 1 to {MAX_BIN_ITEMS}: {found}.")
-    for at, box in enumerate(items):
-        for key, value in vars(box).items():
-            if not is_number(value) or abs(value) > MAX_VALUE or (key in "wdh" and value < MILLIMETRE):
-                expected = "a length of at least 0.001 m" if key in "wdh" else "a finite number"
-                raise DepthMapError(f"items[{at}].{key}={excerpt(value)}: expected {expected}.")

@@ -1,7 +1,7 @@
 """The items, sizes and rules of a policy's training, and warnings about what lies outside of them."""
 
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -20,23 +20,18 @@ class TrainingEnvelope:
 
     Attributes:
         kinds: every size ``(w, d, h)`` of its items, in cells and height units.
-        tote_size: greatest tote, ``(W_T, D_T, H_T)``.
-        bin_items: number of items that the bin holds.
-        rules: its options that are no sizes, such as ``support``, by name.
+        cell: its sizes, with the greatest tote, and its rules.
     """
 
     kinds: frozenset[tuple[int, int, int]]
-    tote_size: tuple[int, ...]
-    bin_items: int
-    rules: dict[str, Any]
+    cell: CellSpec
 
     @classmethod
     def of(cls, config: DictConfig, items: ItemDistribution) -> "TrainingEnvelope":
         """Return what a checkpoint's config says."""
         kinds = frozenset((int(w), int(d), int(h)) for w, d, h in items.sizes.tolist())
         env = cast(dict, OmegaConf.to_container(config.env, resolve=True))
-        cell = build_cell(env, reach=None)  # a table of reach may be elsewhere
-        return cls(kinds, cell.tote_size, cell.bin_items, cell_settings(cell, RULES))
+        return cls(kinds, build_cell(env, reach=None))  # a table of reach may be elsewhere
 
     def warnings(self, cell: CellSpec, items: Item) -> list[str]:
         """Return a sentence for each thing that the policy never met: an item, the tote, the effector, the rule.
@@ -45,21 +40,23 @@ class TrainingEnvelope:
             cell: the sizes.
             items: all in the bin, ``[1, M]``, as the policy sees them.
         """
-        longest = [max(kind[axis] for kind in self.kinds) for axis in range(3)]
+        known, longest = self.cell, [max(kind[axis] for kind in self.kinds) for axis in range(3)]
         new = {
             f"item of {w}x{d}x{h} cells: the policy met other sizes, up to {_sides(longest)}."
             for w, d, h in items.cuboids[0, :, 2:].tolist()
             if not {(w, d, h), (d, w, h)} & self.kinds
         }
         found = sorted(new)
-        if (count := items.x.shape[1]) > self.bin_items:
-            found.append(f"{count} items in the bin: the policy met at most {self.bin_items}.")
-        if self.tote_size[:2] != cell.tote_size[:2] or cell.tote_size[2] > self.tote_size[2]:
-            found.append(f"tote of {_sides(cell.tote_size)} cells: the policy met {_sides(self.tote_size)}.")
-        for key, ours, theirs in differences(cell_settings(cell, RULES), self.rules):
-            if key != "gripper.size" or sorted(ours) != sorted(theirs):
-                found.append(f"{key}={ours}: the policy met {theirs}.")
-        return found
+        if (count := items.x.shape[1]) > known.bin_items:
+            found.append(f"{count} items in the bin: the policy met at most {known.bin_items}.")
+        if known.tote_size[:2] != cell.tote_size[:2] or cell.tote_size[2] > known.tote_size[2]:
+            found.append(f"tote of {_sides(cell.tote_size)} cells: the policy met {_sides(known.tote_size)}.")
+        rules = differences(cell_settings(cell, RULES), cell_settings(known, RULES))
+        return found + [
+            f"{key}={ours}: the policy met {theirs}."
+            for key, ours, theirs in rules
+            if key != "gripper.size" or sorted(ours) != sorted(theirs)
+        ]
 
 
 def _sides(sizes) -> str:

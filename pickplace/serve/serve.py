@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> None:
     """Load the planner and serve it until Ctrl-C.
 
     Raises:
-        ValueError: for arguments, a token or a checkpoint that cannot be used, or a missing extra.
+        ValueError: for arguments, a token, an address or a checkpoint that cannot be used, or a missing extra.
     """
     token = checked_token(args.host)
     whole_number("--port", args.port, 0, 65_535)
@@ -63,19 +63,24 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"pickplace-serve: {error.name} is missing; pip install 'pickplace[serve]'.") from error
 
     planner, defaults = load_planner(args)
-    name = args.planner or "policy"
-    app = make_app(
-        planner,
-        defaults,
-        name,
-        args.checkpoint,
-        token,
-        args.rate,
-        args.history,
-        allowed_hosts(args.host, args.allow_host),
-    )
-    listener = listen(args.host, args.port)
     host = f"[{args.host}]" if ":" in args.host else args.host
+    # The names by which clients may call the service. A page of a stranger that has its name lead to this machine (DNS
+    # rebinding) calls it by another. Where the service listens at all addresses and no name is given, any will do: the
+    # token, which the page lacks, is asked for anyway.
+    hosts = ["localhost", "127.0.0.1", "[::1]", host, *args.allow_host]
+    if args.host in ("0.0.0.0", "::") and not args.allow_host:
+        hosts = ["*"]
+    name = args.planner or "policy"
+    app = make_app(planner, defaults, name, args.checkpoint, token, args.rate, args.history, hosts)
+    try:
+        family = socket.AF_INET6 if ":" in args.host else socket.AF_INET
+        listener = socket.create_server((args.host, args.port), family=family)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ValueError(
+            f"--host={excerpt(args.host)} --port={args.port}: {reason}; expected an address of this machine and a free "
+            "port."
+        ) from error
     write_output(f"Listening at http://{host}:{listener.getsockname()[1]}; Ctrl-C ends it.\n")
     config = uvicorn.Config(
         app, http=Connection, ws="none", log_level="warning", access_log=False, server_header=False,
@@ -111,30 +116,3 @@ def checked_token(host: str) -> str | None:
             f"{TOKEN}: got {len(token)} letters; expected at least {LEAST_TOKEN}, of ASCII without spaces."
         )
     return token
-
-
-def allowed_hosts(host: str, more: list[str]) -> list[str]:
-    """Return the names by which clients may call the service.
-
-    A page of a stranger that has its name lead to this machine (DNS rebinding) calls it by another. Where the service
-    listens at all addresses and no name is given, any will do: the token, which the page lacks, is asked for anyway.
-    """
-    if host in ("0.0.0.0", "::") and not more:
-        return ["*"]
-    return ["localhost", "127.0.0.1", "[::1]", f"[{host}]" if ":" in host else host, *more]
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """Return a socket that listens.
-
-    Raises:
-        ValueError: if the address is taken, or is none of this machine.
-    """
-    try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        return socket.create_server((host, port), family=family)
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise ValueError(
-            f"--host={excerpt(host)} --port={port}: {reason}; expected an address of this machine and a free port."
-        ) from error

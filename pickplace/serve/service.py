@@ -30,8 +30,7 @@ from pickplace.serve.request import MAX_REQUEST, PlanRequest, answer
 MAX_WAITING = 16  # requests whose body is read, or that wait for their turn
 BODY_SECONDS = 30  # time that a client has to send its request
 
-EMPTY = [[5] * 6] * 6
-GRID = {"bin_depth": [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0] * 5, [0] * 5], "tote_depth": EMPTY}
+GRID = {"bin_depth": [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0] * 5, [0] * 5], "tote_depth": [[5] * 6] * 6}
 METRES = {
     "items": [{"x": 0.1, "y": 0.12, "w": 0.09, "d": 0.04, "h": 0.05, "yaw": 20}],
     "tote_depth": [[0.25] * 6] * 6,
@@ -93,11 +92,8 @@ class Service:
         self.waiting = self.count = 0
         self.history: deque[dict] = deque(maxlen=history)
 
-    async def answer(self, body: bytes) -> tuple[int, str]:
-        """Return the status and the JSON text of the answer to a request."""
-        return await asyncio.get_running_loop().run_in_executor(self.worker, self._answer, body)
-
-    def _answer(self, body: bytes) -> tuple[int, str]:
+    def answer(self, body: bytes) -> tuple[int, str]:
+        """Return the status and the JSON text of the answer to a request; only the worker calls it."""
         start, number = time.perf_counter(), self.count + 1
         status, reply, request = answer(self.planner, body, self.defaults)
         self.history.append(live.entry(self.planner.cell, number, request, reply, time.perf_counter() - start))
@@ -169,37 +165,26 @@ def make_app(
         if "*" not in hosts and re.sub(r":\d*$", "", host).lower() not in map(str.lower, hosts):
             raise HTTPException(400, f"Host: got {excerpt(host)}; expected a name of this service, see --allow-host.")
 
+    async def refuse(_, error: Exception):
+        status, text, headers = 500, "the service failed; its log says more.", None
+        if isinstance(error, StarletteHTTPException):
+            status, text, headers = error.status_code, error.detail, error.headers
+        elif isinstance(error, RequestValidationError):
+            status, text = 422, "{}: {msg}.".format(".".join(map(str, error.errors()[0]["loc"])), **error.errors()[0])
+        return JSONResponse({"error": text}, status, headers)
+
     app = FastAPI(
         title="pickplace", version=pickplace.__version__, lifespan=lifespan, docs_url=None, redoc_url=None,
         dependencies=[Depends(check_host)],
         description="Where a suction robot picks an item in a bin, and where and how it places it in a tote.",
+        exception_handlers=dict.fromkeys((Exception, StarletteHTTPException, RequestValidationError), refuse),
     )  # fmt: skip
-
-    @app.exception_handler(Exception)
-    async def report_fault(_, error):
-        return JSONResponse({"error": "the service failed; its log says more."}, 500)
-
-    @app.exception_handler(StarletteHTTPException)
-    async def refuse(_, error):
-        return JSONResponse({"error": error.detail}, error.status_code, error.headers)
-
-    @app.exception_handler(RequestValidationError)
-    async def refuse_parameters(_, error):
-        where = ".".join(map(str, error.errors()[0]["loc"]))
-        return JSONResponse({"error": f"{where}: {error.errors()[0]['msg']}."}, 422)
 
     def authorize(sent: HTTPAuthorizationCredentials | None = Depends(HTTPBearer(auto_error=False))) -> None:  # noqa: B008
         given = "" if sent is None else sent.credentials
         if token is not None and not hmac.compare_digest(given.encode(), token.encode()):
             headers = {"WWW-Authenticate": "Bearer"}
             raise HTTPException(401, "the token is missing or wrong; expected Authorization: Bearer <token>.", headers)
-
-    def limit() -> None:
-        wait = 1.0 if service.waiting >= MAX_WAITING else budget.take()
-        if wait:
-            seconds = math.ceil(wait)
-            detail = f"too many plans are asked for; expected the next request after {seconds} s."
-            raise HTTPException(429, detail, {"Retry-After": str(seconds)})
 
     reasons = {
         400: "No JSON object, or a wrong Host", 401: "No token, or a wrong one", 408: "The body came too slowly",
@@ -216,10 +201,13 @@ def make_app(
         if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
             # A page of a stranger can send forms and plain text without asking, but no JSON.
             raise HTTPException(415, "Content-Type: expected application/json.")
-        limit()
+        if seconds := math.ceil(1 if service.waiting >= MAX_WAITING else budget.take()):
+            detail = f"too many plans are asked for; expected the next request after {seconds} s."
+            raise HTTPException(429, detail, {"Retry-After": str(seconds)})
         service.waiting += 1  # from now on: reading a slow body takes up a place, too
         try:
-            status, text = await service.answer(await read_body(request))
+            body, loop = await read_body(request), asyncio.get_running_loop()
+            status, text = await loop.run_in_executor(service.worker, service.answer, body)
         finally:
             service.waiting -= 1
         return Response(text, status, media_type="application/json")
