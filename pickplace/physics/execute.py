@@ -199,12 +199,6 @@ class Gantry(Scene):
         """Return the loss of that item."""
         return Loss(reason, len(self.boxes) - 1)
 
-    def _is_disturbed(self) -> bool:
-        """Return whether an item that waits in the bin has left its place."""
-        places = [(*(self.bin + box[:2]), 0.0) + np.divide(box[2:], 2) for box in self.waiting]
-        shifts = self.data.xpos[[body.id for body in self.waiting.values()]] - np.reshape(places, (-1, 3))
-        return bool((np.linalg.norm(shifts, axis=1) > self.options.tolerance).any())
-
     def travel(self, goal, speed: float | None = None) -> Loss | None:
         """Move the plate along a line, from rest to rest; return the first loss on the way.
 
@@ -241,7 +235,10 @@ class Gantry(Scene):
 
     def leave(self, height: float) -> Loss | None:
         """Let go of an item of a height, move up, and wait until all items are at rest."""
-        self.release()
+        self.data.eq_active[self.weld.id] = self.holding = False
+        self.data.xfrc_applied[self.boxes[-1].id, 2] = -WAKING_FORCE  # else it could sleep on in the air
+        self.step(1)
+        self.data.xfrc_applied[self.boxes[-1].id, 2] = 0.0
         loss = self.lift(self._high(height))
         wait(self)
         return loss
@@ -291,13 +288,6 @@ class Gantry(Scene):
     def _plate_geoms(self) -> list[int]:
         return [geom.id for geom in self.plate.geoms]
 
-    def release(self) -> None:
-        """Let go of the item."""
-        self.data.eq_active[self.weld.id] = self.holding = False
-        self.data.xfrc_applied[self.boxes[-1].id, 2] = -WAKING_FORCE  # else it could sleep on in the air
-        self.step(1)
-        self.data.xfrc_applied[self.boxes[-1].id, 2] = 0.0
-
     def _step(self) -> Loss | None:
         """Let a little time pass; return what was lost in it."""
         start = self.model.body_dofadr[self.boxes[-1].id]
@@ -318,4 +308,7 @@ class Gantry(Scene):
             acceleration = (velocity - before) / (STEPS_PER_LOOK * TIMESTEP) - self.model.opt.gravity
             if self.model.body_mass[item.id] * np.linalg.norm(acceleration) > self.options.suction:
                 return self.loss("dropped")
-        return self.loss("disturbed") if self.waiting and self._is_disturbed() else None
+        waits = {body.id: (*(self.bin + box[:2]), 0.0) + np.divide(box[2:], 2) for box, body in self.waiting.items()}
+        shifts = np.linalg.norm(self.data.xpos[[*waits]] - [*waits.values()], axis=1) if waits else np.zeros(1)
+        is_disturbed = (shifts > self.options.tolerance).any()
+        return self.loss("disturbed") if is_disturbed else None

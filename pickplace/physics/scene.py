@@ -50,8 +50,13 @@ class Scene:
     bin: Any = None
 
     def __init__(self, friction: float, density: float, gap: float, sleep: bool = True, contact_damping: float = 1.0):
-        self.friction, self.density, self.gap = friction, density, gap
-        self._stiff = {**STIFF, "solref": (STIFF["solref"][0], contact_damping)}
+        self.gap = gap
+        self._surface = {
+            **STIFF,
+            "solref": (STIFF["solref"][0], contact_damping),
+            "friction": [friction, 0.005, 0.0001],
+            "density": density,
+        }
         self.spec = mujoco.MjSpec()
         option = self.spec.option
         option.timestep, option.cone, option.impratio = TIMESTEP, mujoco.mjtCone.mjCONE_ELLIPTIC, 10
@@ -99,9 +104,8 @@ class Scene:
 
     def _add_body(self, corner: Vector, size: Vector, yaw: float = 0.0):
         """Add the body of a box, see :meth:`add`."""
-        turn = np.array((np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)))
-        centre = np.add(corner, np.divide(size, 2))
-        body = self.spec.worldbody.add_body(name=f"item{len(self.bodies)}", pos=centre, quat=turn)
+        pose = {"pos": np.add(corner, np.divide(size, 2)), "quat": (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))}
+        body = self.spec.worldbody.add_body(name=f"item{len(self.bodies)}", **pose)
         body.add_freejoint()
         self.add_geom(body, np.subtract(size, (self.gap, self.gap, 0)))
         self.bodies.append(body)
@@ -109,9 +113,8 @@ class Scene:
 
     def add_geom(self, body, size: Vector, centre: Vector = (0.0, 0.0, 0.0)):
         """Add a box-shaped surface to a body."""
-        friction = [self.friction, 0.005, 0.0001]
         box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": np.divide(size, 2), "pos": centre}
-        return body.add_geom(**box, friction=friction, density=self.density, **self._stiff)
+        return body.add_geom(**box, **self._surface)
 
     def run(self, seconds: float) -> None:
         """Let time pass."""
@@ -133,8 +136,8 @@ class Scene:
             return
         mujoco.mj_kinematics(self.model, self.data)  # of what was added since the last step, too
         poses = np.hstack([self.data.xpos, self.data.xquat])
-        ids = [body.id for body in self.bodies]
-        self.motion.add(poses[ids], None if self.plate is None else poses[self.plate.id])
+        boxes = poses[[body.id for body in self.bodies]]
+        self.motion.add(boxes, None if self.plate is None else poses[self.plate.id])
         self._next_picture = self.data.time + INTERVAL
 
     def finish_motion(self) -> None:

@@ -117,8 +117,8 @@ class Simulation(ABC):
         Raises:
             ValueError: for an item or an end effector that is hardly wider than the gap.
         """
-        for index, size in enumerate([placement.size for placement in plan.placements], 1):
-            self.check_width(f"episode {plan.episode}, item {index}", size)
+        for index, placement in enumerate(plan.placements, 1):
+            self.check_width(f"episode {plan.episode}, item {index}", placement.size)
         started, count = process_time(), len(plan.placements)
         errors = self.noise * np.random.default_rng((self.seed, plan.episode)).standard_normal((count, 2))
         scene, loss, placed = self.make_scene(plan), None, 0

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -39,36 +39,62 @@ def parser() -> argparse.ArgumentParser:
         "for bin_depth. A bad request is answered with an error, and the process goes on.",
         epilog="Maps, frames of reference and errors: docs/robot.md",
     )
-    add = options.add_argument
-    add("--bin", metavar="NPY", help="depth map [W_B, D_B] or finer: height above the bin's floor")
-    add("--bin-labels", metavar="NPY", help="map in the shape of --bin: a number for each of several items, else 0")
-    add("--tote", metavar="NPY", help="depth map [W_T, D_T] or finer: remaining height, from surface to rim")
-    add("--tote-bearing", metavar="NPY", help="map [W_T, D_T]: tote_bearing of the plan before; default: all 1")
-    add("--time", action="store_true", help="print the latency of each plan on standard error")
-    add_planner_options(options)
+    add_options(options, {
+        "--bin": {"metavar": "NPY", "help": "depth map [W_B, D_B] or finer: height above the bin's floor"},
+        "--bin-labels": {
+            "metavar": "NPY", "help": "map in the shape of --bin: a number for each of several items, else 0",
+        },
+        "--tote": {"metavar": "NPY", "help": "depth map [W_T, D_T] or finer: remaining height, from surface to rim"},
+        "--tote-bearing": {
+            "metavar": "NPY", "help": "map [W_T, D_T]: tote_bearing of the plan before; default: all 1",
+        },
+        "--time": {"action": "store_true", "help": "print the latency of each plan on standard error"},
+        **planner_options(),
+    })  # fmt: skip
     return options
 
 
-def add_planner_options(options: argparse.ArgumentParser) -> None:
-    """Add what says how to plan, which :func:`load_planner` reads."""
-    add = options.add_argument
-    add("checkpoint", nargs="?", help="a run folder, a checkpoint, or pretrained/<name>")
-    add("--planner", metavar="NAME", help="what decides, such as joint_dbl or lookahead; default: the policy")
-    for key in PLAN_OPTIONS:
-        text = key.metadata["description"] + (" (default %(default)s)" if key.default is not None else "")
-        add(f"--{key.name.replace('_', '-')}", type=key.metadata["option"], metavar="N", default=key.default, help=text)
-    add("--candidates", metavar="K", default="all", help="number of most probable actions tried, or all (the default)")
-    add("--bin-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
-    add("--tote-size", type=int, nargs=3, metavar=("W", "D", "H"), help="cells; default: as trained")
-    add("--effector-size", type=int, nargs=2, metavar=("W", "D"), help="cells; default: as trained")
-    add("--rotations", type=int, metavar="R", help="quarter turns to choose from; default: as trained")
-    add("--reach", metavar="YAML", help="file such as conf/reach/annulus.yaml, the robot's reach; default: as trained")
-    add(
-        "--trust", action="append", metavar="MODULE", default=[],
-        help="your own module whose classes the checkpoint's config may name; may be repeated",
-    )  # fmt: skip
-    add("--threads", type=int, metavar="N", help="CPU threads; default: as many as it may use")
-    add("--device", default="cpu", help="cpu (the default) or cuda")
+def add_options(parser: argparse.ArgumentParser, options: dict[str, dict[str, Any]]) -> None:
+    """Add options to a parser: the arguments of ``add_argument``, by name."""
+    for name, settings in options.items():
+        parser.add_argument(name, **settings)
+
+
+def planner_options() -> dict[str, dict[str, Any]]:
+    """Return the options that say how to plan, which :func:`load_planner` reads; see :func:`add_options`."""
+    of_requests = {
+        f"--{key.name.replace('_', '-')}": {
+            "type": key.metadata["option"], "metavar": "N", "default": key.default,
+            "help": key.metadata["description"] + (" (default %(default)s)" if key.default is not None else ""),
+        }
+        for key in PLAN_OPTIONS
+    }  # fmt: skip
+    return {
+        "checkpoint": {"nargs": "?", "help": "a run folder, a checkpoint, or pretrained/<name>"},
+        "--planner": {
+            "metavar": "NAME", "help": "what decides, such as joint_dbl or lookahead; default: the policy",
+        },
+        **of_requests,
+        "--candidates": {
+            "metavar": "K", "default": "all", "help": "number of most probable actions tried, or all (the default)",
+        },
+        "--bin-size": {"type": int, "nargs": 3, "metavar": ("W", "D", "H"), "help": "cells; default: as trained"},
+        "--tote-size": {"type": int, "nargs": 3, "metavar": ("W", "D", "H"), "help": "cells; default: as trained"},
+        "--effector-size": {"type": int, "nargs": 2, "metavar": ("W", "D"), "help": "cells; default: as trained"},
+        "--rotations": {
+            "type": int, "metavar": "R", "help": "quarter turns to choose from; default: as trained",
+        },
+        "--reach": {
+            "metavar": "YAML",
+            "help": "file such as conf/reach/annulus.yaml, the robot's reach; default: as trained",
+        },
+        "--trust": {
+            "action": "append", "metavar": "MODULE", "default": [],
+            "help": "your own module whose classes the checkpoint's config may name; may be repeated",
+        },
+        "--threads": {"type": int, "metavar": "N", "help": "CPU threads; default: as many as it may use"},
+        "--device": {"default": "cpu", "help": "cpu (the default) or cuda"},
+    }  # fmt: skip
 
 
 def load_planner(args: argparse.Namespace) -> tuple["Planner", dict]:
@@ -82,20 +108,19 @@ def load_planner(args: argparse.Namespace) -> tuple["Planner", dict]:
     from pickplace.rules.cell import CellSpec
 
     use_threads("--threads", args.threads)
-    sizes = {key: getattr(args, key) for key in ("bin_size", "tote_size", "effector_size", "rotations")}
-    sizes = {key: value for key, value in sizes.items() if value is not None}
+    keys = ("bin_size", "tote_size", "effector_size", "rotations")
+    sizes = {key: value for key in keys if (value := getattr(args, key)) is not None}
     if args.reach is not None:
         sizes["reach"] = read_reach(args.reach)
     candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates
     if args.checkpoint is not None:
-        options = {"candidates": candidates, "device": args.device, "trust": args.trust, "planner": args.planner}
-        planner = Planner.load(args.checkpoint, **options, **sizes)
-    elif args.planner is not None:
-        if candidates != "all":
-            raise ValueError(f"--candidates={args.candidates}: only a policy has candidates; expected a checkpoint.")
-        planner = Planner(CellSpec(**sizes), planner=args.planner)
-    else:
+        planner = Planner.load(args.checkpoint, candidates, args.device, args.trust, args.planner, **sizes)
+    elif args.planner is None:
         raise ValueError("checkpoint: missing; expected a checkpoint, or --planner joint_dbl or the like.")
+    elif candidates != "all":
+        raise ValueError(f"--candidates={args.candidates}: only a policy has candidates; expected a checkpoint.")
+    else:
+        planner = Planner(CellSpec(**sizes), planner=args.planner)
     defaults = {key.name: getattr(args, key.name) for key in PLAN_OPTIONS}
     PlanRequest(**defaults).scene()  # refuses settings now, not in the answer to each request
     whole_number("--alternatives", args.alternatives, 0, MAX_ALTERNATIVES)
@@ -118,8 +143,10 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError("standard input or output is closed; expected requests and a place for the plans.")
     planner, defaults = load_planner(args)
     if args.bin is not None:
-        files = {"bin_depth": args.bin, "bin_labels": args.bin_labels, "tote_depth": args.tote}
-        files["tote_bearing"] = args.tote_bearing
+        files = {
+            "bin_depth": args.bin, "bin_labels": args.bin_labels, "tote_depth": args.tote,
+            "tote_bearing": args.tote_bearing,
+        }  # fmt: skip
         maps = {key: read_map(path) for key, path in files.items() if path is not None}
         try:
             with latency(args.time):
@@ -150,8 +177,7 @@ def latency(is_printed: bool) -> Iterator[None]:
     start = time.perf_counter()
     yield
     if is_printed:
-        sys.stderr.write(f"planned in {(time.perf_counter() - start) * 1e3:.1f} ms\n")
-        sys.stderr.flush()
+        sys.stderr.write(f"planned in {(time.perf_counter() - start) * 1e3:.1f} ms\n")  # a line leaves at once
 
 
 def read_reach(path: str):

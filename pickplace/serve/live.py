@@ -19,12 +19,12 @@ MOST_COLUMNS = 60  # greatest number of columns along a side of the tote that th
 
 def page(cell: CellSpec) -> str:
     """Return the page of a service for a cell; it loads nothing but ``/plans`` of the service itself."""
-    unit = cell.height_unit
+    wide, deep, height = cell.bin_size
     data = {
-        "bin": [*cell.bin_size[:2], cell.bin_size[2] * unit],
+        "bin": [wide, deep, height * cell.height_unit],
         "tote": cell.tote_size[:2],
         **effector_parts(cell),
-        "height": cell.tote_size[2] * unit,
+        "height": cell.tote_size[2] * cell.height_unit,
     }
     return filled("live.html", data=json.dumps(data))
 
@@ -50,16 +50,15 @@ def entry(cell: CellSpec, number: int, request: PlanRequest | None, reply: dict,
         reply: a plan, or an error.
         seconds: how long it took.
     """
-    shown = {
+    return {
         "number": number,
         "time": time.time(),
         "milliseconds": round(1e3 * seconds, 1),
         "id": excerpt(reply["id"]) if "id" in reply else None,
         "status": reply.get("status", "refused"),
         "error": reply.get("error"),
-        "scene": None,
+        "scene": None if "error" in reply or request is None else _scene(cell, request, reply),
     }
-    return shown if "error" in reply or request is None else {**shown, "scene": _scene(cell, request, reply)}
 
 
 def _scene(cell: CellSpec, request: PlanRequest, plan: dict) -> dict:
@@ -67,13 +66,13 @@ def _scene(cell: CellSpec, request: PlanRequest, plan: dict) -> dict:
     side = request.cell_size
     along, up = (1.0, cell.height_unit) if side is None else (1 / side, 1 / side)  # cells in a length
     height = cell.tote_size[2] * cell.height_unit if request.tote_height is None else request.tote_height * up
-    box = plan["box"] or (plan["item"] and _box_of_item(plan["item"]))  # None: of several items none is taken
+    box, item = plan["box"], plan["item"]  # both None: of several items none is taken
+    if item and not box:
+        box = {**item, "x": item["x"] + item["w"] / 2, "y": item["y"] + item["d"] / 2, "yaw": 0.0}
 
     def pose(key: str) -> list[float] | None:
-        if plan[key] is None:
-            return None
-        x, y, z = plan[key]["center"]
-        return [x * along, y * along, z * up, plan[key]["yaw"]]
+        x, y, z = plan[key]["center"] if plan[key] else (0, 0, 0)
+        return plan[key] and [x * along, y * along, z * up, plan[key]["yaw"]]
 
     return {
         "height": height,
@@ -90,12 +89,6 @@ def _scene(cell: CellSpec, request: PlanRequest, plan: dict) -> dict:
         "reasons": plan["reasons"],
         "warnings": plan["warnings"],
     }
-
-
-def _box_of_item(item: dict) -> dict:
-    """Return an item of a grid as a box: its centre and sides."""
-    x, y = (item[at] + item[side] / 2 for at, side in ("xw", "yd"))
-    return {"x": x, "y": y, "w": item["w"], "d": item["d"], "h": item["h"], "yaw": 0.0}
 
 
 def surface(heights: np.ndarray, cell: CellSpec) -> np.ndarray:

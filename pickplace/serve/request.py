@@ -96,8 +96,7 @@ def read_boxes(items) -> list[Box]:
         try:
             boxes.append(Box(**item))
         except TypeError as error:
-            expected = "expected the keys x, y, w, d, h and, if it is turned, yaw."
-            raise ValueError(f"items[{number}]: {expected}") from error
+            raise ValueError(f"items[{number}]: expected the keys x, y, w, d, h and, if it is turned, yaw.") from error
     return boxes
 
 

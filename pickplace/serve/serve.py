@@ -7,7 +7,7 @@ import socket
 
 from pickplace.common.validate import excerpt, number, short_text, whole_number
 from pickplace.config.errors import Parser, one_sentence, write_output
-from pickplace.serve.json_lines import add_planner_options, load_planner
+from pickplace.serve.json_lines import add_options, load_planner, planner_options
 
 TOKEN = "PICKPLACE_TOKEN"  # the environment variable; a command line can be read by every user of the machine
 LEAST_TOKEN = 16  # letters
@@ -27,18 +27,24 @@ def parser() -> argparse.ArgumentParser:
         "last plans in 3D. Without a token it serves this machine only.",
         epilog=f"The environment variable {TOKEN} holds the token. Requests, errors and limits: docs/robot.md",
     )
-    add_planner_options(options)
-    add = options.add_argument
-    add("--host", default="127.0.0.1", help="address to listen at (default %(default)s); others need a token")
-    add("--port", type=int, default=8000, help="port to listen at, or 0 for a free one (default %(default)s)")
-    add(
-        "--allow-host", action="append", metavar="NAME", default=[],
-        help="a further name by which clients call this machine; may be repeated",
-    )  # fmt: skip
-    add(
-        "--rate", type=float, metavar="N", default=600, help="most plans a minute, of all clients (default %(default)s)"
-    )
-    add("--history", type=int, metavar="N", default=20, help="plans that the page shows (default %(default)s)")
+    add_options(options, {
+        **planner_options(),
+        "--host": {"default": "127.0.0.1", "help": "address to listen at (default %(default)s); others need a token"},
+        "--port": {
+            "type": int, "default": 8000, "help": "port to listen at, or 0 for a free one (default %(default)s)",
+        },
+        "--allow-host": {
+            "action": "append", "metavar": "NAME", "default": [],
+            "help": "a further name by which clients call this machine; may be repeated",
+        },
+        "--rate": {
+            "type": float, "metavar": "N", "default": 600,
+            "help": "most plans a minute, of all clients (default %(default)s)",
+        },
+        "--history": {
+            "type": int, "metavar": "N", "default": 20, "help": "plans that the page shows (default %(default)s)",
+        },
+    })  # fmt: skip
     return options
 
 
