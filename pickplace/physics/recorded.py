@@ -17,20 +17,17 @@ def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePl
     def middle(corner, sides) -> Point:
         return metres(*(at + side / 2 for at, side in zip(corner, sides, strict=True)))
 
-    tote = metres(*cell.tote_size[:2], recording.tote_height)
-    sizes = tote, metres(*cell.bin_size), metres(*cell.gripper.size)
-    plan = EpisodePlan(recording.episode, *sizes, body=body_of(cell, cell_size))
-    for move in recording.moves:
-        if not move.failure:
-            x, y, w, d = move.footprint
-            shape = cell.effector(move.rotation)
-            placement = Placement(
-                metres(x, y, move.z), metres(w, d, move.item[4]), metres(*move.item[:2]),
-                middle(move.pick, cell.gripper.size), middle(move.place, shape[:2]), 90 * move.rotation,
-                tuple((*metres(*other[:2]), *metres(*other[2:])) for other in move.others),
-            )  # fmt: skip
-            plan.placements.append(placement)
-    return plan
+    placements = [
+        Placement(
+            metres(*move.footprint[:2], move.z), metres(*move.footprint[2:], move.item[4]), metres(*move.item[:2]),
+            middle(move.pick, cell.gripper.size), middle(move.place, cell.effector(move.rotation)[:2]),
+            90 * move.rotation, tuple((*metres(*other[:2]), *metres(*other[2:])) for other in move.others),
+        )
+        for move in recording.moves
+        if not move.failure
+    ]  # fmt: skip
+    sizes = metres(*cell.tote_size[:2], recording.tote_height), metres(*cell.bin_size), metres(*cell.gripper.size)
+    return EpisodePlan(recording.episode, *sizes, placements, body_of(cell, cell_size))
 
 
 def body_of(cell: CellSpec, cell_size: float) -> tuple[Point, ...]:

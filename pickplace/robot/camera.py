@@ -205,7 +205,7 @@ class Camera:
         boxes = [self._box(points, segments == number, narrowed=labels is None) for number in large]
         hidden = [self._hidden_length(box, boxes) for box in boxes]
         for box, length in zip(boxes, hidden, strict=True):
-            if not length:
+            if sizes is not None and not length:
                 _check_reading(box, sizes, 2 * self.pixel() + 2 * accuracy)
         return [
             HiddenBox(box.x, box.y, box.w + 2 * length, box.d + 2 * length, box.h, box.yaw) if length else box
@@ -214,19 +214,17 @@ class Camera:
 
     def _inside(self, depth, sides: Sequence[float], rim: float, name: str) -> np.ndarray:
         """Return the points between the walls, median-filtered, NaN elsewhere, ``[rows, columns, 3]``."""
-        points = self.points(depth)
-        heights = points[..., 2]
-        filled = np.where(np.isnan(heights), np.nanmax(heights), heights)
-        heights = np.where(np.isnan(heights), np.nan, ndimage.median_filter(filled, 3, mode="nearest"))
-        points = np.concatenate([points[..., :2], heights[..., None]], -1)
-        wall = self._wall()
+        points, wall = self.points(depth), self._wall()
+        unknown = np.isnan(points[..., 2])
+        filled = np.where(unknown, np.nanmax(points[..., 2]), points[..., 2])
+        points[..., 2] = np.where(unknown, np.nan, ndimage.median_filter(filled, 3, mode="nearest"))
         within = np.all((points[..., :2] > wall) & (points[..., :2] < np.subtract(sides, wall)), axis=-1)
         if within.sum() < 0.5 * (sides[0] / self.pixel()) * (sides[1] / self.pixel()) * (1 - MOST_UNSEEN):
             raise DepthMapError(
                 f"depth: {within.sum()} pixels lie inside the {name}, which is too few; expected the whole {name} in "
                 "the image: check the camera's pose, its focal lengths, and the unit of the image."
             )
-        middle = float(np.median(heights[within]))
+        middle = float(np.median(points[within][:, 2]))
         if not -0.05 < middle < rim + 0.5:
             raise DepthMapError(
                 f"depth: the {name} is seen at a height of {middle:.3f} m, expected 0 to {rim:g} m: check the camera's "
@@ -260,12 +258,10 @@ class Camera:
 
     def _hidden_length(self, box: Box, boxes: Sequence[Box]) -> float:
         """Return how far a box may go on where higher ones hide what is beside it, m; 0 if its whole edge is seen."""
-        side = np.linspace(-1, 1, EDGE_POINTS)
+        side, grown = np.linspace(-1, 1, EDGE_POINTS), HIDDEN_PIXELS * self.pixel(box.h)
         one = np.ones_like(side)
         edge = np.concatenate([[side, one], [side, -one], [one, side], [-one, side]], 1).T
-        grown = HIDDEN_PIXELS * self.pixel(box.h)
-        sides = (box.w / 2 + grown, box.d / 2 + grown)
-        edge = (box.x, box.y) + edge * sides @ turned_axes(math.radians(box.yaw))  # [points, 2]
+        edge = edge * (box.w / 2 + grown, box.d / 2 + grown) @ turned_axes(math.radians(box.yaw)) + (box.x, box.y)
         to_camera, longest = self.pose[:2, 3] - edge, 0.0
         for other in (each for each in boxes if each.h > box.h):
             share = (other.h - box.h) / (self.pose[2, 3] - box.h)  # of the ray that runs below the other's top
@@ -278,8 +274,6 @@ class Camera:
 
 def _check_reading(box: Box, sizes, tolerance: float) -> None:
     """Refuse a box that could be two items of known sizes, or is none; both readings are named."""
-    if sizes is None:
-        return
     known = [(w, d, h) for a, b, h in sizes for w, d in {(a, b), (b, a)}]
 
     def is_like(w: float, d: float) -> bool:

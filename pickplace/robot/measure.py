@@ -56,8 +56,8 @@ def as_array(name: str, values, grid: Sequence[int], kinds: str = "iuf") -> np.n
         array = np.asarray(values)
     except (TypeError, ValueError) as error:
         raise DepthMapError(f"{name}: expected an array of {grid[0]}x{grid[1]} numbers ({error}).") from error
-    fine = array.ndim == 2 and array.size and array.shape[0] * grid[1] == array.shape[1] * grid[0]
-    if not fine or array.shape[0] % grid[0]:
+    count = array.shape[0] // grid[0] if array.ndim else 0
+    if not count or array.shape != (count * grid[0], count * grid[1]):
         raise DepthMapError(
             f"{name}: got shape {list(array.shape)}, expected {list(grid)}, the grid that the planner was loaded for, "
             "or a multiple of it."
@@ -90,8 +90,8 @@ def whole_map(name: str, values, grid: Sequence[int], most: int, unit: str = "",
     with np.errstate(all="ignore"):
         whole = np.round(units)
         near = np.abs(units - whole) <= ROUNDING * np.maximum(1, np.abs(units))  # False for NaN
-    hint = "; measured heights are in metres, with cell_size" * bool(unit)
-    refuse(name, ~near, units, unit, f"a whole number{unit and f' of{unit}'}{hint}")
+    hint = unit and f" of{unit}; measured heights are in metres, with cell_size"
+    refuse(name, ~near, units, unit, f"a whole number{hint}")
     refuse(name, (whole < 0) | (whole > most), units, unit, f"0 to {most:,}{unit}")
     return whole.astype(np.int64)
 
@@ -113,15 +113,14 @@ def metric_map(name: str, values, grid: Sequence[int], least: float, most: float
 
 def patches(array: np.ndarray, grid: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the greatest and the least value of each patch of a map, at most :data:`MAX_PATCHES` along a cell."""
-    along = array.shape[0] // grid[0]
+    along, highest, lowest = array.shape[0] // grid[0], array, array
     count = min(along, MAX_PATCHES)
-    highest = lowest = array
     for axis, cells in enumerate(grid):
         edges = np.arange(cells * count) * along  # over `count`: where a patch begins, in values
         # A value that lies in two patches belongs to both.
-        parts = np.stack([edges // count, -(-(edges + along) // count)], 1)
-        highest = np.stack([highest.take(range(*part), axis).max(axis) for part in parts], axis)
-        lowest = np.stack([lowest.take(range(*part), axis).min(axis) for part in parts], axis)
+        parts = [range(*part) for part in zip(edges // count, -(-(edges + along) // count), strict=True)]
+        highest = np.stack([highest.take(part, axis).max(axis) for part in parts], axis)
+        lowest = np.stack([lowest.take(part, axis).min(axis) for part in parts], axis)
     return highest, lowest
 
 
@@ -145,9 +144,9 @@ def segments_of_map(labels, heights: np.ndarray, least: float) -> dict[str, np.n
         DepthMapError: for an empty bin; naming the first label that is no such number, or does not fit the heights.
     """
     is_item = heights > least
+    if labels is None and not is_item.any():
+        raise DepthMapError("bin_depth: got no cell above 0, expected one item.")
     if labels is None:
-        if not is_item.any():
-            raise DepthMapError("bin_depth: got no cell above 0, expected one item.")
         return {"": is_item}
     array = whole_map("bin_labels", labels, heights.shape, MAX_LABEL)
     refuse("bin_labels", is_item & (array == 0), array, "", "a label, as bin_depth shows an item")
@@ -170,9 +169,8 @@ def turned_axes(angle: float) -> np.ndarray:
 
 def is_inside(points: np.ndarray, centre: Sequence[float], sides: Sequence[float], yaw: float) -> np.ndarray:
     """Return which of the points ``[..., 2]`` lie in a rectangle with a yaw in degrees, bool ``[...]``."""
-    turn, away = math.radians(yaw), points - centre
-    along = away @ (math.cos(turn), math.sin(turn)), away @ (-math.sin(turn), math.cos(turn))
-    return (np.abs(along[0]) < sides[0] / 2) & (np.abs(along[1]) < sides[1] / 2)
+    axes, away = turned_axes(math.radians(yaw)), points - centre
+    return (np.abs(away @ axes[0]) < sides[0] / 2) & (np.abs(away @ axes[1]) < sides[1] / 2)
 
 
 def touches(centres: np.ndarray, sides: Sequence[float], yaw: float, box: Box) -> np.ndarray:
@@ -183,14 +181,14 @@ def touches(centres: np.ndarray, sides: Sequence[float], yaw: float, box: Box) -
     Args:
         sides, yaw: of the rectangle; m, degrees.
     """
-    away = centres - (box.x, box.y)
-    halves = []  # the vectors from a centre to the middles of two sides, of each rectangle
-    for (w, d), degrees in ((sides, yaw), ((box.w, box.d), box.yaw)):
-        cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-        halves += [(w / 2 * cos, w / 2 * sin), (-d / 2 * sin, d / 2 * cos)]
-    axes = np.array(halves) / np.linalg.norm(halves, axis=1, keepdims=True)
-    reach = np.abs(axes @ np.array(halves).T).sum(1)
-    return (np.abs(away @ axes.T) < reach - ROUNDING).all(1)
+    rectangles = ((sides, yaw), ((box.w, box.d), box.yaw))
+    # The vectors from a centre to the middles of two sides, of each rectangle.
+    halves = np.concatenate(
+        [np.divide(each, 2)[:, None] * turned_axes(math.radians(turn)) for each, turn in rectangles]
+    )
+    axes = halves / np.linalg.norm(halves, axis=1, keepdims=True)
+    reach = np.abs(axes @ halves.T).sum(1)
+    return (np.abs((centres - (box.x, box.y)) @ axes.T) < reach - ROUNDING).all(1)
 
 
 def refuse_stacked(boxes: list[Box], tolerance: float) -> None:

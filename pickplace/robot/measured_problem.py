@@ -107,11 +107,10 @@ class MeasuredProblem(Problem):
 
 def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
     """Return the problem of a scene in metres; errors as of :meth:`Planner.plan`."""
-    cell_size, accuracy = scene.cell_size, scene.accuracy
+    cell_size = scene.cell_size
     assert cell_size is not None
-    unit = cell_size * cell.height_unit
     boxes, clearance = _read_boxes(cell, scene, cell_size)
-    tote = _read_tote(cell, scene, unit, device)
+    tote = _read_tote(cell, scene, cell_size * cell.height_unit, device)
     each = [_on_grid(cell, box, cell_size, clearance, f"items[{number}]", device) for number, box in enumerate(boxes)]
     items, sides = join_items(each), [(box.w / cell_size, box.d / cell_size) for box in boxes]
     # Cells at each edge that an item, narrower by its clearance, does not cover as a whole.
@@ -140,12 +139,9 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
     for number, (box, item) in enumerate(zip(boxes, each, strict=True)):
         grip = int(item.h) + tote.accuracy
         centres = _effector_centres(free, item, box, cell_size)
-        clear = np.zeros(len(centres), dtype=bool)
-        if not isinstance(box, HiddenBox):
-            above_walls = box.h - accuracy >= cell.bin_size[2] * unit - ROUNDING
-            clear = above_walls | _misses_walls(centres, cell, box.yaw, cell_size)
-            clear = clear & ~_hits_others(centres, cell, number, boxes, cell_size, accuracy, clearance)
-        bin_clear = torch.from_numpy(clear).to(device)
+        bin_clear = torch.from_numpy(
+            _clear_picks(cell, number, boxes, centres, cell_size, scene.accuracy, clearance)
+        ).to(device)
         limits = _limits(cell, free, bin_clear, centres / cell_size, grip, 2 * tote.accuracy)
         limits = replace(limits, pick_ok=limits.pick_ok & (taken == number))
         limited = replace(free, reach=limits)
@@ -153,7 +149,7 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
         parts.append(MeasuredItem(limits, limited, measured, sides[number], bin_clear, centres, grip * MILLIMETRE))
     joint, maps = _join(parts, items)
     # A policy sees heights as in training.
-    ratio = unit / MILLIMETRE
+    ratio = cell_size * cell.height_unit / MILLIMETRE
     state, seen_rim = tote.state(free, each[0])._replace(items=items), max(1, round(tote.height / ratio))
     heights = (state.heights / ratio).round().clamp(max=seen_rim).int()
     seen_items = items._replace(h=(items.h.double() / ratio).round().long().clamp(min=1))
@@ -213,11 +209,9 @@ def _read_boxes(cell: CellSpec, scene: Scene, side: float) -> tuple[list[Box], f
                 if not 0 <= (at := getattr(box, key)) <= size * side:
                     raise DepthMapError(f"items[{number}].{key}={at:g}: expected 0 to {size * side:g} m, in the bin.")
         refuse_stacked(boxes, max(clearance, accuracy))
-    for number, box in enumerate(boxes):
-        if cell.rotations == 1 and abs(box.yaw) > ROUNDING:
-            raise DepthMapError(
-                f"items[{number}].yaw={box.yaw:g}: expected 0 with rotations=1: this robot turns nothing."
-            )
+    turned = [f"items[{number}].yaw={box.yaw:g}" for number, box in enumerate(boxes) if abs(box.yaw) > ROUNDING]
+    if turned and cell.rotations == 1:
+        raise DepthMapError(f"{turned[0]}: expected 0 with rotations=1: this robot turns nothing.")
     return boxes, clearance
 
 
@@ -251,46 +245,40 @@ def _on_grid(cell: CellSpec, box: Box, cell_size: float, clearance: float, name:
                 f"{name}.{key}={getattr(box, key):g}: with its clearance it takes {size} cells; expected at most "
                 f"{most_cells}, those of the bin."
             )
-    least = [
+    x, y = (
         min(max(0, round(at / cell_size - size / 2)), most_cells - size)
         for at, size, most_cells in zip((box.x, box.y), whole, cell.bin_size[:2], strict=True)
-    ]
+    )
     h = int(whole_units(box.h, MILLIMETRE, up=True))
-    item = Item(*(torch.tensor([part], device=device) for part in (*least, *whole, h)))
+    item = Item(*(torch.tensor([part], device=device) for part in (x, y, *whole, h)))
     check_longest(cell, item, name)
     return item
 
 
-def _misses_walls(centres: np.ndarray, cell: CellSpec, yaw: float, side: float) -> np.ndarray:
-    """Return at which of its centres ``[P, 2]`` the end effector misses the bin's walls, bool ``[P]``.
-
-    The rectangle around it decides.
-    """
-    turn, (wide, deep) = math.radians(yaw), (size * side / 2 for size in cell.gripper.size)
-    cos, sin = abs(math.cos(turn)), abs(math.sin(turn))
-    reach, far = np.array([wide * cos + deep * sin, wide * sin + deep * cos]), np.array(cell.bin_size[:2]) * side
-    return ((centres >= reach - ROUNDING) & (centres <= far - reach + ROUNDING)).all(1)
-
-
-def _hits_others(
-    centres: np.ndarray, cell: CellSpec, number: int, boxes: list[Box], side: float, accuracy: float, clearance: float
+def _clear_picks(
+    cell: CellSpec, number: int, boxes: list[Box], centres: np.ndarray, side: float, accuracy: float, clearance: float
 ) -> np.ndarray:
-    """Return at which of its centres ``[P, 2]`` the end effector touches another box that may be as high, ``[P]``.
+    """Return at which of its centres ``[P, 2]`` the end effector hits nothing in the bin, bool ``[P]``.
 
-    The rectangle around it decides, which is turned with the item; other boxes are wider by the clearance. Boxes that
-    are clearly lower are ignored.
+    The rectangle around it decides, which is turned with the item. It misses the bin's walls, or passes over them. It
+    touches no other box, wider by the clearance, that may be as high; boxes that are clearly lower are ignored.
 
     Args:
         number: of the item that is picked, among the boxes.
     """
     box = boxes[number]
-    sides = cell.gripper.size[0] * side, cell.gripper.size[1] * side
-    wide = [
-        replace(other, w=other.w + 2 * clearance, d=other.d + 2 * clearance)
-        for other in boxes[:number] + boxes[number + 1 :]
-        if other.h + accuracy >= box.h - accuracy - ROUNDING
-    ]
-    return np.any([np.zeros(len(centres)), *(touches(centres, sides, box.yaw, other) for other in wide)], 0)
+    if isinstance(box, HiddenBox):
+        return np.zeros(len(centres), dtype=bool)
+    turn, (wide, deep) = math.radians(box.yaw), (size * side for size in cell.gripper.size)
+    cos, sin, far = abs(math.cos(turn)), abs(math.sin(turn)), np.array(cell.bin_size[:2]) * side
+    reach = np.array([wide / 2 * cos + deep / 2 * sin, wide / 2 * sin + deep / 2 * cos])
+    clear = ((centres >= reach - ROUNDING) & (centres <= far - reach + ROUNDING)).all(1)
+    clear |= box.h - accuracy >= cell.bin_size[2] * (side * cell.height_unit) - ROUNDING
+    for other in boxes[:number] + boxes[number + 1 :]:
+        if other.h + accuracy >= box.h - accuracy - ROUNDING:
+            wider = replace(other, w=other.w + 2 * clearance, d=other.d + 2 * clearance)
+            clear &= ~touches(centres, (wide, deep), box.yaw, wider)
+    return clear
 
 
 def _limits(cell: CellSpec, free: CellSpec, bin_clear: Tensor, centres: np.ndarray, grip: int, release: int) -> Limits:

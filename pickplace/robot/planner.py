@@ -38,8 +38,6 @@ from pickplace.rules.state import Failure
 
 CHOOSERS = "expected one item, or a checkpoint of model=fcn_grasp or corners that was trained with a mask"
 
-__all__ = ["Alternative", "Box", "DepthMapError", "Plan", "Planner", "Pose", "Scene"]
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -150,8 +148,9 @@ class Planner:
             ValueError: for another argument that cannot be used.
         """
         if not isinstance(scene, Scene):
-            found = type(scene).__name__
-            raise ValueError(f"scene: got {found}, expected a Scene, such as Scene.from_maps(bin_depth, tote_depth).")
+            raise ValueError(
+                f"scene: got {type(scene).__name__}, expected a Scene, such as Scene.from_maps(bin_depth, tote_depth)."
+            )
         whole_number("alternatives", alternatives, 0, MAX_ALTERNATIVES)
         device = torch.device("cpu") if self.policy is None else next(self.policy.parameters()).device
         is_metric = scene.cell_size is not None
@@ -222,11 +221,9 @@ def _check_choice(planner: MapPlanner, count: int, is_metric: bool) -> None:
             f"bin: got {count} items, expected one: the planner was made for a cell with bin_items=1; expected one "
             f"made with bin_items={count}, or its name."
         )
-    if policy is None or isinstance(policy, ScoresFootprints):
-        return
-    if not isinstance(policy, ScoresActions):
+    if policy is not None and not isinstance(policy, (ScoresFootprints, ScoresActions)):
         raise _several_items(policy, count)
-    if is_metric:
+    if is_metric and policy is not None and not isinstance(policy, ScoresFootprints):
         raise DepthMapError(
             f"bin: got {count} items in metres, each on a grid of its own, while {type(policy).__name__} sees the bin "
             f"as one grid; {CHOOSERS}."
@@ -252,4 +249,4 @@ def _reasons(problem: Problem) -> dict[str, int]:
     """Return how many of all flat actions fail for each reason, each with the item that its pick takes."""
     codes = problem.failures(torch.arange(problem.cell.num_actions, device=problem.state.surface.device))
     counts = codes.bincount(minlength=len(Failure)).tolist()
-    return {failure.name.lower(): counts[failure] for failure in Failure if counts[failure]}
+    return {failure.name.lower(): count for failure, count in zip(Failure, counts, strict=True) if count}

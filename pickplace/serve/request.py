@@ -69,12 +69,11 @@ class PlanRequest:
         Raises:
             ValueError: as of :class:`~pickplace.robot.scene.Scene`.
         """
-        from pickplace.robot.scene import Scene  # here, so that --help need not wait for torch
+        from pickplace.robot.scene import BinMap, Scene  # here, so that --help need not wait for torch
 
         settings = {key.name: getattr(self, key.name) for key in fields(Scene) if key.name not in ("items", "tote")}
-        if self.items is None:
-            return Scene.from_maps(self.bin_depth, self.tote_depth, self.bin_labels, **settings)
-        return Scene(self.items, self.tote_depth, **settings)
+        items = BinMap(self.bin_depth, self.bin_labels) if self.items is None else self.items
+        return Scene(items, self.tote_depth, **settings)
 
     def plan(self, planner: "Planner") -> "Plan":
         """Return the plan for the request; errors as of :meth:`Planner.plan`."""
