@@ -46,6 +46,12 @@ def expect(good: Any, key: str, value: Any, expected: str) -> None:
         raise ValueError(f"{key}={excerpt(value)}: expected {expected}.")
 
 
+def refuse_if(bad: Any, message: str, error: type[ValueError] = ValueError) -> None:
+    """Raise an error with a message if something is bad."""
+    if bad:
+        raise error(message)
+
+
 def at_most(words: str, count: int, what: str, most: int) -> None:
     """Refuse a count that is too great; the message begins with ``words``."""
     if count > most:

@@ -5,6 +5,7 @@ from typing import Protocol, runtime_checkable
 
 from omegaconf import DictConfig
 
+from pickplace.common.validate import refuse_if
 from pickplace.config.registry import build
 from pickplace.physics.plans import EpisodePlan
 from pickplace.views.motion import Outcome
@@ -34,9 +35,8 @@ def build_engine(node: DictConfig) -> Engine:
         ValueError: for settings that make no sense, or a class that is no engine.
     """
     engine = build("physics", node)
-    if not isinstance(engine, Engine):
-        raise ValueError(
-            f"physics._target_={node._target_}: no physics engine; expected name, cell_size and "
-            "carry_out(plans, record)."
-        )
+    refuse_if(
+        not isinstance(engine, Engine),
+        f"physics._target_={node._target_}: no physics engine; expected name, cell_size and carry_out(plans, record).",
+    )
     return engine

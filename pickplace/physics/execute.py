@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pickplace.common.validate import number_or_null
+from pickplace.common.validate import number_or_null, refuse_if
 from pickplace.physics.plans import TOLERANCE, EpisodePlan, Placement, Point
 from pickplace.physics.scene import STIFF, TIMESTEP, WALL, Scene, mujoco
 from pickplace.physics.simulation import Loss, Simulation, wait
@@ -75,8 +75,10 @@ class Execute(Simulation):
         number_or_null("physics.plate_diameter", self.plate_diameter, 1e-3, 10)
 
     def make_scene(self, plan: EpisodePlan) -> "Gantry":
-        if not (plan.bin and plan.effector):
-            raise ValueError(f"physics=execute: episode {plan.episode} has no bin; expected plans with all keys.")
+        refuse_if(
+            not (plan.bin and plan.effector),
+            f"physics=execute: episode {plan.episode} has no bin; expected plans with all keys.",
+        )
         if self.plate_diameter is not None and self.plate_diameter > (most := min(plan.effector)):
             raise ValueError(f"physics.plate_diameter={self.plate_diameter:g}: expected at most {most:g}, its cells.")
         for _, _, *sides in plan_body(plan):

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from pickplace.common.files import read_text
-from pickplace.common.validate import excerpt, is_number, is_whole
+from pickplace.common.validate import excerpt, is_number, is_whole, refuse_if
 from pickplace.rules.cell import MAX_BIN_ITEMS
 
 PLANS = "plans.jsonl"
@@ -144,8 +144,10 @@ def read_plans(path: str | Path) -> list[EpisodePlan]:
             episode = values.pop("episode")
             sizes = {key: values.pop(key, ()) for key in ("tote", "bin", "effector", "body")}
             if not plans or plans[-1].episode != episode:
-                if any(plan.episode == episode for plan in plans):
-                    raise ValueError(f"episode={episode}: expected its lines to follow one another.")
+                refuse_if(
+                    any(plan.episode == episode for plan in plans),
+                    f"episode={episode}: expected its lines to follow one another.",
+                )
                 plans.append(EpisodePlan(episode, **sizes))
             if changed := [key for key, value in sizes.items() if getattr(plans[-1], key) != value]:
                 raise ValueError(f"{changed[0]}: expected the same in all lines of episode {episode}.")
@@ -163,8 +165,7 @@ def _read_line(line: str) -> dict:
         given = json.loads(line)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"expected an object in JSON ({error}).") from error
-    if not isinstance(given, dict):
-        raise ValueError(f"got {type(given).__name__}, expected an object with {', '.join(KEYS)}.")
+    refuse_if(not isinstance(given, dict), f"got {type(given).__name__}, expected an object with {', '.join(KEYS)}.")
     known = {**KEYS, **ROBOT_KEYS}
     kinds = {**known, **OPTIONAL_KEYS}
     if unknown := [key for key in given if key not in kinds]:
@@ -174,8 +175,7 @@ def _read_line(line: str) -> dict:
         raise ValueError(f"{missing[0]}: missing; expected {', '.join(needed)}.")
     for key, value in given.items():
         expected, is_good = kinds[key]
-        if not is_good(value):
-            raise ValueError(f"{key}={excerpt(value)}: expected {expected}.")
+        refuse_if(not is_good(value), f"{key}={excerpt(value)}: expected {expected}.")
     values = {key: _frozen(value) for key, value in given.items()}
     for key, outer in (("body", "effector"), ("neighbours", "bin")):
         for x, y, w, d, *_ in values.get(key, ()):
@@ -208,15 +208,17 @@ def _check_place(placement: Placement, plan: EpisodePlan) -> None:
     """Refuse an item that cannot lie where it is planned."""
     size, corner, below = placement.size, placement.corner, 0.0
     for name, low, side, most in zip("xyz", corner, size, plan.tote, strict=True):
-        if low < -TOLERANCE or low + side > most + TOLERANCE:
-            raise ValueError(
-                f"the item leaves the tote: along {name} from {low:g} to {low + side:g} m, expected 0 to {most:g} m."
-            )
+        refuse_if(
+            low < -TOLERANCE or low + side > most + TOLERANCE,
+            f"the item leaves the tote: along {name} from {low:g} to {low + side:g} m, expected 0 to {most:g} m.",
+        )
     for number, other in enumerate(plan.placements, 1):
         shared, top = _shared(corner, size, other.corner, other.size), other.corner[2] + other.size[2]
-        if min(shared) > TOLERANCE:
-            raise ValueError(f"the item overlaps item {number} of its episode by {1e3 * min(shared):.1f} mm.")
+        refuse_if(
+            min(shared) > TOLERANCE, f"the item overlaps item {number} of its episode by {1e3 * min(shared):.1f} mm."
+        )
         if min(shared[:2]) > 0 and top <= corner[2] + TOLERANCE:
             below = max(below, top)
-    if corner[2] - below > TOLERANCE:
-        raise ValueError(f"the item floats {1e3 * (corner[2] - below):.1f} mm above what lies below it.")
+    refuse_if(
+        corner[2] - below > TOLERANCE, f"the item floats {1e3 * (corner[2] - below):.1f} mm above what lies below it."
+    )

@@ -12,7 +12,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from pickplace.common.validate import flag, number, whole_number
+from pickplace.common.validate import flag, number, refuse_if, whole_number
 from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement
 from pickplace.physics.scene import Scene, mujoco
 from pickplace.views.motion import Motion, Outcome
@@ -86,10 +86,11 @@ class Simulation(ABC):
         flag("physics.sleep", self.sleep)
         whole_number("physics.seed", self.seed, 0)
         whole_number("physics.workers", self.workers, 1, 64)
-        if self.gap > self.cell_size / 2:
-            raise ValueError(f"physics.gap={self.gap:g}: expected at most half of a cell, {self.cell_size / 2:g}.")
-        if mujoco is None:
-            raise ValueError(f"physics={self.name}: MuJoCo is missing; pip install 'pickplace[physics]'.")
+        refuse_if(
+            self.gap > self.cell_size / 2,
+            f"physics.gap={self.gap:g}: expected at most half of a cell, {self.cell_size / 2:g}.",
+        )
+        refuse_if(mujoco is None, f"physics={self.name}: MuJoCo is missing; pip install 'pickplace[physics]'.")
 
     @abstractmethod
     def make_scene(self, plan: EpisodePlan) -> Scene:
@@ -159,10 +160,10 @@ class Simulation(ABC):
 
     def check_width(self, name: str, size: Sequence[float]) -> None:
         """Refuse what is hardly wider than the gap, with a ``ValueError`` that names it."""
-        if min(size[:2]) < 2 * self.gap:
-            raise ValueError(
-                f"{name}: {min(size[:2]):g} m wide; expected sides of at least twice physics.gap, {2 * self.gap:g} m."
-            )
+        refuse_if(
+            min(size[:2]) < 2 * self.gap,
+            f"{name}: {min(size[:2]):g} m wide; expected sides of at least twice physics.gap, {2 * self.gap:g} m.",
+        )
 
     def find_loss(self, scene: Scene) -> Loss | None:
         """Return the item that has moved furthest of those that have moved or tilted too far, if any has."""

@@ -13,6 +13,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy import ndimage
 
+from pickplace.common.validate import refuse_if
 from pickplace.robot.box import ACCURACY, Box, DepthMapError, HiddenBox
 from pickplace.robot.measure import MAX_PATCHES, SNAPPED, ToteMap, is_inside, smallest_rectangle, turned_axes
 from pickplace.rules.cell import CellSpec
@@ -50,19 +51,23 @@ class Camera:
 
     def __post_init__(self):
         for key in ("fx", "fy"):
-            if not 0 < getattr(self, key) < math.inf:
-                raise ValueError(f"camera.{key}={getattr(self, key)}: expected a number of pixels above 0.")
+            refuse_if(
+                not 0 < getattr(self, key) < math.inf,
+                f"camera.{key}={getattr(self, key)}: expected a number of pixels above 0.",
+            )
         pose = np.asarray(self.pose, dtype=np.float64)
         object.__setattr__(self, "pose", pose)
         good = pose.shape == (4, 4) and np.isfinite(pose).all() and np.allclose(pose[3], (0, 0, 0, 1))
         turn = pose[:3, :3] if good else np.zeros((3, 3))
-        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) or np.linalg.det(turn) < 0:
-            raise ValueError("camera.pose: expected [4, 4]: a rotation, a position in metres, and the row 0 0 0 1.")
-        if turn[2, 2] > -0.5:
-            raise ValueError(
-                "camera.pose: the camera does not look down: its z axis, the optical axis, should point to -z of the "
-                "bin or tote; expected the pose of the camera in that frame, not the inverse."
-            )
+        refuse_if(
+            not np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) or np.linalg.det(turn) < 0,
+            "camera.pose: expected [4, 4]: a rotation, a position in metres, and the row 0 0 0 1.",
+        )
+        refuse_if(
+            turn[2, 2] > -0.5,
+            "camera.pose: the camera does not look down: its z axis, the optical axis, should point to -z of the "
+            "bin or tote; expected the pose of the camera in that frame, not the inverse.",
+        )
 
     @classmethod
     def looking_down(cls, centre: Sequence[float], height: float, focal: float, shape: Sequence[int]) -> "Camera":
@@ -85,15 +90,18 @@ class Camera:
             DepthMapError: for an image that is none, or not in metres.
         """
         image = np.asarray(depth)
-        if image.ndim != 2 or min(image.shape) < 3 or image.dtype.kind not in "fiu":
-            raise DepthMapError(
-                f"depth: got shape {list(image.shape)} of {image.dtype}, expected an image of distances, "
-                "[rows, columns]."
-            )
+        refuse_if(
+            image.ndim != 2 or min(image.shape) < 3 or image.dtype.kind not in "fiu",
+            f"depth: got shape {list(image.shape)} of {image.dtype}, expected an image of distances, [rows, columns].",
+            DepthMapError,
+        )
         image = np.where(image > 0, image, np.nan).astype(np.float64)  # NaN is not above 0
         image[~np.isfinite(image)] = np.nan
-        if np.isnan(image).all():
-            raise DepthMapError("depth: got no distance above 0; expected metres, and 0 or NaN where nothing is known.")
+        refuse_if(
+            np.isnan(image).all(),
+            "depth: got no distance above 0; expected metres, and 0 or NaN where nothing is known.",
+            DepthMapError,
+        )
         if (far := np.nanmedian(image)) > 20:
             raise DepthMapError(f"depth: got distances of {far:g}, expected metres; divide millimetres by 1000.")
         return self.rays(image.shape) * image[..., None] + self.pose[:3, 3]
@@ -125,10 +133,11 @@ class Camera:
         sides = [side * cell_size for side in cell.tote_size[:2]]
         rim = cell.tote_size[2] * cell.height_unit * cell_size if tote_height is None else tote_height
         pixel = self.pixel()
-        if pixel * LEAST_PIXELS > cell_size:
-            raise DepthMapError(
-                f"depth: a cell is {cell_size / pixel:.1f} pixels wide, expected at least {LEAST_PIXELS}."
-            )
+        refuse_if(
+            pixel * LEAST_PIXELS > cell_size,
+            f"depth: a cell is {cell_size / pixel:.1f} pixels wide, expected at least {LEAST_PIXELS}.",
+            DepthMapError,
+        )
         points = self._inside(depth, sides, rim, "tote")
         along = min(MAX_PATCHES, int(cell_size / (LEAST_PIXELS * pixel)))
         shape = [side * along for side in cell.tote_size[:2]]
@@ -140,10 +149,11 @@ class Camera:
         np.maximum.at(highest, tuple(patch.T), high[known])
         np.minimum.at(lowest, tuple(patch.T), low[known])
         unseen = np.isinf(highest)
-        if unseen.mean() > MOST_UNSEEN:
-            raise DepthMapError(
-                f"depth: {unseen.mean():.0%} of the tote are not seen, expected {MOST_UNSEEN:.0%} at most."
-            )
+        refuse_if(
+            unseen.mean() > MOST_UNSEEN,
+            f"depth: {unseen.mean():.0%} of the tote are not seen, expected {MOST_UNSEEN:.0%} at most.",
+            DepthMapError,
+        )
         # At the walls the nearest place that is seen; there the camera sees the wall, not what is beside it.
         border = np.ones(shape, dtype=bool)
         edge = math.ceil(self._wall() * along / cell_size)
@@ -189,9 +199,12 @@ class Camera:
             segments, _ = ndimage.label(above & flat)
         else:
             labels = np.asarray(labels)
-            if labels.shape != above.shape or labels.dtype.kind not in "iu":
-                found = f"shape {list(labels.shape)} of {labels.dtype}"
-                raise DepthMapError(f"labels: got {found}, expected whole numbers, {list(above.shape)} as of depth.")
+            refuse_if(
+                labels.shape != above.shape or labels.dtype.kind not in "iu",
+                f"labels: got shape {list(labels.shape)} of {labels.dtype}, expected whole numbers, "
+                f"{list(above.shape)} as of depth.",
+                DepthMapError,
+            )
             segments = np.where(above & (labels > 0), labels, 0)
             known = ndimage.binary_dilation(labels > 0, np.ones((3, 3)), iterations=2)
             if (left := above & ~known & ~np.isnan(points[..., 2])).sum() >= MIN_ITEM_PIXELS:
@@ -219,17 +232,19 @@ class Camera:
         filled = np.where(unknown, np.nanmax(points[..., 2]), points[..., 2])
         points[..., 2] = np.where(unknown, np.nan, ndimage.median_filter(filled, 3, mode="nearest"))
         within = np.all((points[..., :2] > wall) & (points[..., :2] < np.subtract(sides, wall)), axis=-1)
-        if within.sum() < 0.5 * (sides[0] / self.pixel()) * (sides[1] / self.pixel()) * (1 - MOST_UNSEEN):
-            raise DepthMapError(
-                f"depth: {within.sum()} pixels lie inside the {name}, which is too few; expected the whole {name} in "
-                "the image: check the camera's pose, its focal lengths, and the unit of the image."
-            )
+        refuse_if(
+            within.sum() < 0.5 * (sides[0] / self.pixel()) * (sides[1] / self.pixel()) * (1 - MOST_UNSEEN),
+            f"depth: {within.sum()} pixels lie inside the {name}, which is too few; expected the whole {name} in "
+            "the image: check the camera's pose, its focal lengths, and the unit of the image.",
+            DepthMapError,
+        )
         middle = float(np.median(points[within][:, 2]))
-        if not -0.05 < middle < rim + 0.5:
-            raise DepthMapError(
-                f"depth: the {name} is seen at a height of {middle:.3f} m, expected 0 to {rim:g} m: check the camera's "
-                "pose, which is relative to the floor, and the unit of the image."
-            )
+        refuse_if(
+            not -0.05 < middle < rim + 0.5,
+            f"depth: the {name} is seen at a height of {middle:.3f} m, expected 0 to {rim:g} m: check the camera's "
+            "pose, which is relative to the floor, and the unit of the image.",
+            DepthMapError,
+        )
         return np.where(within[..., None], points, np.nan)
 
     def _wall(self) -> float:
@@ -291,5 +306,4 @@ def _check_reading(box: Box, sizes, tolerance: float) -> None:
         pair = " and ".join(f"{w:g} x {d:g}" for w, d in two[0])
         single = f"one item of {one[0][0]:g} x {one[0][1]:g} m or " if one else ""
         raise DepthMapError(f"{found} is {single}two of {pair} m that touch; separate them, or pass labels.")
-    if not one:
-        raise DepthMapError(f"{found} is no item of the given sizes.")
+    refuse_if(not one, f"{found} is no item of the given sizes.", DepthMapError)

@@ -11,6 +11,7 @@ import torch
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
+from pickplace.common.validate import refuse_if
 from pickplace.robot.box import MILLIMETRE, Box, DepthMapError, HiddenBox
 from pickplace.rules.cell import MAX_BIN_ITEMS
 
@@ -57,13 +58,15 @@ def as_array(name: str, values, grid: Sequence[int], kinds: str = "iuf") -> np.n
     except (TypeError, ValueError) as error:
         raise DepthMapError(f"{name}: expected an array of {grid[0]}x{grid[1]} numbers ({error}).") from error
     count = array.shape[0] // grid[0] if array.ndim else 0
-    if not count or array.shape != (count * grid[0], count * grid[1]):
-        raise DepthMapError(
-            f"{name}: got shape {list(array.shape)}, expected {list(grid)}, the grid that the planner was loaded for, "
-            "or a multiple of it."
-        )
-    if array.dtype.kind not in kinds:
-        raise DepthMapError(f"{name}: got values of type {array.dtype}, expected numbers.")
+    refuse_if(
+        not count or array.shape != (count * grid[0], count * grid[1]),
+        f"{name}: got shape {list(array.shape)}, expected {list(grid)}, the grid that the planner was loaded for, "
+        "or a multiple of it.",
+        DepthMapError,
+    )
+    refuse_if(
+        array.dtype.kind not in kinds, f"{name}: got values of type {array.dtype}, expected numbers.", DepthMapError
+    )
     if isinstance(values, np.ma.MaskedArray):
         refuse(name, np.ma.getmaskarray(values), array, ", which is masked", "a measured value")
     return array
@@ -83,9 +86,12 @@ def whole_map(name: str, values, grid: Sequence[int], most: int, unit: str = "",
         DepthMapError: naming the first cell that is out of range, or no whole number.
     """
     array = as_array(name, values, grid, kinds)
-    if array.shape != tuple(grid):
-        hint = "; finer maps are in metres, with cell_size" * bool(unit)
-        raise DepthMapError(f"{name}: got shape {list(array.shape)}, expected {list(grid)}{hint}.")
+    hint = unit and "; finer maps are in metres, with cell_size"
+    refuse_if(
+        array.shape != tuple(grid),
+        f"{name}: got shape {list(array.shape)}, expected {list(grid)}{hint}.",
+        DepthMapError,
+    )
     units = array.astype(np.float64)
     with np.errstate(all="ignore"):
         whole = np.round(units)
@@ -111,10 +117,10 @@ def metric_map(name: str, values, grid: Sequence[int], least: float, most: float
     return array
 
 
-def patches(array: np.ndarray, grid: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the greatest and the least value of each patch of a map, at most :data:`MAX_PATCHES` along a cell."""
+def patches(array: np.ndarray, grid: Sequence[int], most: int = MAX_PATCHES) -> tuple[np.ndarray, np.ndarray]:
+    """Return the greatest and the least value of each patch of a map, with at most so many patches along a cell."""
     along, highest, lowest = array.shape[0] // grid[0], array, array
-    count = min(along, MAX_PATCHES)
+    count = min(along, most)
     for axis, cells in enumerate(grid):
         edges = np.arange(cells * count) * along  # over `count`: where a patch begins, in values
         # A value that lies in two patches belongs to both.
@@ -144,16 +150,18 @@ def segments_of_map(labels, heights: np.ndarray, least: float) -> dict[str, np.n
         DepthMapError: for an empty bin; naming the first label that is no such number, or does not fit the heights.
     """
     is_item = heights > least
-    if labels is None and not is_item.any():
-        raise DepthMapError("bin_depth: got no cell above 0, expected one item.")
+    refuse_if(labels is None and not is_item.any(), "bin_depth: got no cell above 0, expected one item.", DepthMapError)
     if labels is None:
         return {"": is_item}
     array = whole_map("bin_labels", labels, heights.shape, MAX_LABEL)
     refuse("bin_labels", is_item & (array == 0), array, "", "a label, as bin_depth shows an item")
     refuse("bin_labels", (array > 0) & ~np.isin(array, array[is_item]), array, "", "0, as bin_depth shows no item")
     found = np.unique(array[is_item]).tolist()
-    if not 1 <= len(found) <= MAX_BIN_ITEMS:
-        raise DepthMapError(f"bin_labels: got {len(found)} labels, expected 1 to {MAX_BIN_ITEMS}, one for each item.")
+    refuse_if(
+        not 1 <= len(found) <= MAX_BIN_ITEMS,
+        f"bin_labels: got {len(found)} labels, expected 1 to {MAX_BIN_ITEMS}, one for each item.",
+        DepthMapError,
+    )
     return {f" with label {label}": array == label for label in found}
 
 
@@ -207,11 +215,12 @@ def refuse_stacked(boxes: list[Box], tolerance: float) -> None:
     ]
     for index, (number, box) in enumerate(seen):
         for other_number, other in seen[:index]:
-            if touches(np.array([[box.x, box.y]]), (box.w, box.d), box.yaw, other).any():
-                raise DepthMapError(
-                    f"items[{number}] overlaps items[{other_number}] in plan view; expected items that stand side by "
-                    "side on the bin's floor, none on another."
-                )
+            refuse_if(
+                touches(np.array([[box.x, box.y]]), (box.w, box.d), box.yaw, other).any(),
+                f"items[{number}] overlaps items[{other_number}] in plan view; expected items that stand side by side "
+                "on the bin's floor, none on another.",
+                DepthMapError,
+            )
 
 
 def least_height(accuracy: float) -> float:

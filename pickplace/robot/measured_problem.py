@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pickplace.common.validate import number as checked_number
+from pickplace.common.validate import number, refuse_if
 from pickplace.robot.box import MILLIMETRE, Box, DepthMapError, HiddenBox
 from pickplace.robot.measure import (
     ROUNDING,
@@ -82,12 +82,10 @@ class MeasuredProblem(Problem):
         part, item, footprint = self._placed(action)
         return bearing_after(part.cell, self.tote, item, part.sides, part.measured, footprint)
 
-    def filled(self) -> float:
-        return float(self.tote.highest.double().mean()) / self.tote.height
-
-    def item_share(self, number: int) -> float:
+    def shares(self, number: int) -> tuple[float, float]:
         (wide, deep, _), box = self.cell.tote_size, self.boxes[number]
-        return box.w * box.d * box.h / (wide * deep * self.side**2 * self.tote.height * self.unit)
+        share = box.w * box.d * box.h / (wide * deep * self.side**2 * self.tote.height * self.unit)
+        return float(self.tote.highest.double().mean()) / self.tote.height, share
 
     def _suction_face(self, number: int, x_bin: int, y_bin: int) -> tuple[float, float, float]:
         part = self.parts[number]
@@ -111,7 +109,7 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
     assert cell_size is not None
     boxes, clearance = _read_boxes(cell, scene, cell_size)
     tote = _read_tote(cell, scene, cell_size * cell.height_unit, device)
-    each = [_on_grid(cell, box, cell_size, clearance, f"items[{number}]", device) for number, box in enumerate(boxes)]
+    each = [_on_grid(cell, box, cell_size, clearance, f"items[{index}]", device) for index, box in enumerate(boxes)]
     items, sides = join_items(each), [(box.w / cell_size, box.d / cell_size) for box in boxes]
     # Cells at each edge that an item, narrower by its clearance, does not cover as a whole.
     inset_x, inset_y = (
@@ -136,17 +134,17 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
     in_each = items.map(lambda part: part.expand(len(pick), -1))
     taken = taken_item(free, in_each, pick // free.bin_size[1], pick % free.bin_size[1])
     parts = []
-    for number, (box, item) in enumerate(zip(boxes, each, strict=True)):
+    for index, (box, item) in enumerate(zip(boxes, each, strict=True)):
         grip = int(item.h) + tote.accuracy
         centres = _effector_centres(free, item, box, cell_size)
         bin_clear = torch.from_numpy(
-            _clear_picks(cell, number, boxes, centres, cell_size, scene.accuracy, clearance)
+            _clear_picks(cell, index, boxes, centres, cell_size, scene.accuracy, clearance)
         ).to(device)
         limits = _limits(cell, free, bin_clear, centres / cell_size, grip, 2 * tote.accuracy)
-        limits = replace(limits, pick_ok=limits.pick_ok & (taken == number))
+        limits = replace(limits, pick_ok=limits.pick_ok & (taken == index))
         limited = replace(free, reach=limits)
-        measured = measured_maps(limited, tote, item, sides[number])
-        parts.append(MeasuredItem(limits, limited, measured, sides[number], bin_clear, centres, grip * MILLIMETRE))
+        measured = measured_maps(limited, tote, item, sides[index])
+        parts.append(MeasuredItem(limits, limited, measured, sides[index], bin_clear, centres, grip * MILLIMETRE))
     joint, maps = _join(parts, items)
     # A policy sees heights as in training.
     ratio = cell_size * cell.height_unit / MILLIMETRE
@@ -204,14 +202,17 @@ def _read_boxes(cell: CellSpec, scene: Scene, side: float) -> tuple[list[Box], f
         ]
     else:
         boxes = [box.upright() for box in scene.items]
-        for number, box in enumerate(boxes):
+        for index, box in enumerate(boxes):
             for key, size in zip("xy", cell.bin_size[:2], strict=True):
                 if not 0 <= (at := getattr(box, key)) <= size * side:
-                    raise DepthMapError(f"items[{number}].{key}={at:g}: expected 0 to {size * side:g} m, in the bin.")
+                    raise DepthMapError(f"items[{index}].{key}={at:g}: expected 0 to {size * side:g} m, in the bin.")
         refuse_stacked(boxes, max(clearance, accuracy))
-    turned = [f"items[{number}].yaw={box.yaw:g}" for number, box in enumerate(boxes) if abs(box.yaw) > ROUNDING]
-    if turned and cell.rotations == 1:
-        raise DepthMapError(f"{turned[0]}: expected 0 with rotations=1: this robot turns nothing.")
+    for index, box in enumerate(boxes):
+        refuse_if(
+            cell.rotations == 1 and abs(box.yaw) > ROUNDING,
+            f"items[{index}].yaw={box.yaw:g}: expected 0 with rotations=1: this robot turns nothing.",
+            DepthMapError,
+        )
     return boxes, clearance
 
 
@@ -219,7 +220,7 @@ def _read_tote(cell: CellSpec, scene: Scene, unit: float, device) -> MeasuredTot
     """Return the tote, in millimetres; ``unit`` is the length of a height unit, in metres."""
     grid, slack, height = cell.tote_size[:2], math.ceil(scene.accuracy / MILLIMETRE - ROUNDING), scene.tote_height
     if height is None:
-        height = checked_number("tote_height", cell.tote_size[2] * unit, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
+        height = number("tote_height", cell.tote_size[2] * unit, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
     rim, over_rim = (int(whole_units(height, MILLIMETRE, up)) for up in (False, True))
     if isinstance(scene.tote, ToteMap):
         highest, lowest = (as_array("tote", part, grid) for part in scene.tote)
@@ -240,11 +241,12 @@ def _on_grid(cell: CellSpec, box: Box, cell_size: float, clearance: float, name:
     """Return an item at whole cells of a grid that lies along it, in millimetres; refuse one that is too large."""
     whole = [max(1, math.ceil((side + 2 * clearance) / cell_size - ROUNDING)) for side in (box.w, box.d)]
     for key, size, most_cells in zip("wd", whole, cell.bin_size[:2], strict=True):
-        if size > most_cells:
-            raise DepthMapError(
-                f"{name}.{key}={getattr(box, key):g}: with its clearance it takes {size} cells; expected at most "
-                f"{most_cells}, those of the bin."
-            )
+        refuse_if(
+            size > most_cells,
+            f"{name}.{key}={getattr(box, key):g}: with its clearance it takes {size} cells; expected at most "
+            f"{most_cells}, those of the bin.",
+            DepthMapError,
+        )
     x, y = (
         min(max(0, round(at / cell_size - size / 2)), most_cells - size)
         for at, size, most_cells in zip((box.x, box.y), whole, cell.bin_size[:2], strict=True)
@@ -256,7 +258,7 @@ def _on_grid(cell: CellSpec, box: Box, cell_size: float, clearance: float, name:
 
 
 def _clear_picks(
-    cell: CellSpec, number: int, boxes: list[Box], centres: np.ndarray, side: float, accuracy: float, clearance: float
+    cell: CellSpec, index: int, boxes: list[Box], centres: np.ndarray, side: float, accuracy: float, clearance: float
 ) -> np.ndarray:
     """Return at which of its centres ``[P, 2]`` the end effector hits nothing in the bin, bool ``[P]``.
 
@@ -264,9 +266,9 @@ def _clear_picks(
     touches no other box, wider by the clearance, that may be as high; boxes that are clearly lower are ignored.
 
     Args:
-        number: of the item that is picked, among the boxes.
+        index: of the item that is picked, among the boxes.
     """
-    box = boxes[number]
+    box = boxes[index]
     if isinstance(box, HiddenBox):
         return np.zeros(len(centres), dtype=bool)
     turn, (wide, deep) = math.radians(box.yaw), (size * side for size in cell.gripper.size)
@@ -274,7 +276,7 @@ def _clear_picks(
     reach = np.array([wide / 2 * cos + deep / 2 * sin, wide / 2 * sin + deep / 2 * cos])
     clear = ((centres >= reach - ROUNDING) & (centres <= far - reach + ROUNDING)).all(1)
     clear |= box.h - accuracy >= cell.bin_size[2] * (side * cell.height_unit) - ROUNDING
-    for other in boxes[:number] + boxes[number + 1 :]:
+    for other in boxes[:index] + boxes[index + 1 :]:
         if other.h + accuracy >= box.h - accuracy - ROUNDING:
             wider = replace(other, w=other.w + 2 * clearance, d=other.d + 2 * clearance)
             clear &= ~touches(centres, (wide, deep), box.yaw, wider)

@@ -16,7 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import excerpt, whole_number
+from pickplace.common.validate import excerpt, refuse_if, whole_number
 from pickplace.config.registry import build, find
 from pickplace.items.distributions import ItemDistribution
 from pickplace.planners.base import MapPlanner
@@ -147,10 +147,10 @@ class Planner:
                 among which the planner cannot choose.
             ValueError: for another argument that cannot be used.
         """
-        if not isinstance(scene, Scene):
-            raise ValueError(
-                f"scene: got {type(scene).__name__}, expected a Scene, such as Scene.from_maps(bin_depth, tote_depth)."
-            )
+        refuse_if(
+            not isinstance(scene, Scene),
+            f"scene: got {type(scene).__name__}, expected a Scene, such as Scene.from_maps(bin_depth, tote_depth).",
+        )
         whole_number("alternatives", alternatives, 0, MAX_ALTERNATIVES)
         device = torch.device("cpu") if self.policy is None else next(self.policy.parameters()).device
         is_metric = scene.cell_size is not None
@@ -162,7 +162,7 @@ class Planner:
         known = 0 if problem.maps.bin_items == 1 else number
         pick, place, turn, drop_height = (None,) * 4 if action is None else problem.motion(action)
         seen = None if known is None else problem.seen.items.cuboids[0, known].tolist()
-        before, bearing = problem.filled(), problem.bearing_after(action)
+        (before, gained), bearing = problem.shares(number or 0), problem.bearing_after(action)
         return Plan(
             status=status,
             item=None if seen is None else dict(zip("xywdh", seen, strict=True)),
@@ -173,7 +173,7 @@ class Planner:
             drop_height=drop_height,
             action=None if action is None else int(action),
             occupancy_before=before,
-            occupancy_after=before if number is None else before + problem.item_share(number),
+            occupancy_after=before if action is None else before + gained,
             alternatives=list_alternatives(planner, problem, observation, action, alternatives),
             reasons=_reasons(problem) if status in ("stuck", "impossible") else None,
             tote_bearing=bearing.int().tolist() if self.cell.support.marks_bearing else None,
@@ -205,8 +205,10 @@ class Planner:
         maker = find("planner", self._name)
         parts, needs = {**self._parts, "policy": policy, "terms": terms}, getattr(maker, "needs", ())
         for key in ("policy", "items"):
-            if key in needs and parts[key] is None:
-                raise ValueError(f"{key}=None: planner={self._name!r} needs it; Planner.load has it from a checkpoint.")
+            refuse_if(
+                key in needs and parts[key] is None,
+                f"{key}=None: planner={self._name!r} needs it; Planner.load has it from a checkpoint.",
+            )
         if "critic" in needs:
             parts["critic"] = parts["critic"].with_bin_items(cell.bin_items)
         given = (*needs, "candidates") if maker is PolicyPlanner else needs
@@ -216,18 +218,20 @@ class Planner:
 def _check_choice(planner: MapPlanner, count: int, is_metric: bool) -> None:
     """Refuse several items in the bin for a planner that cannot choose among them."""
     policy = getattr(planner, "policy", None)
-    if planner.cell.bin_items == 1:
-        raise DepthMapError(
-            f"bin: got {count} items, expected one: the planner was made for a cell with bin_items=1; expected one "
-            f"made with bin_items={count}, or its name."
-        )
+    refuse_if(
+        planner.cell.bin_items == 1,
+        f"bin: got {count} items, expected one: the planner was made for a cell with bin_items=1; expected one "
+        f"made with bin_items={count}, or its name.",
+        DepthMapError,
+    )
     if policy is not None and not isinstance(policy, (ScoresFootprints, ScoresActions)):
         raise _several_items(policy, count)
-    if is_metric and policy is not None and not isinstance(policy, ScoresFootprints):
-        raise DepthMapError(
-            f"bin: got {count} items in metres, each on a grid of its own, while {type(policy).__name__} sees the bin "
-            f"as one grid; {CHOOSERS}."
-        )
+    refuse_if(
+        is_metric and policy is not None and not isinstance(policy, ScoresFootprints),
+        f"bin: got {count} items in metres, each on a grid of its own, while {type(policy).__name__} sees the bin "
+        f"as one grid; {CHOOSERS}.",
+        DepthMapError,
+    )
 
 
 def _several_items(policy, count: int) -> DepthMapError:

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pickplace.common.validate import refuse_if
 from pickplace.robot.box import Box, DepthMapError
 from pickplace.robot.measure import label_hint, refuse, segments_of_map, whole_map
 from pickplace.robot.scene import BinMap, Scene
@@ -66,13 +67,10 @@ class Problem:
         surface = self.state.surface if action is None else apply(self.cell, self.state, action).surface
         return (surface[0] & 1).bool()
 
-    def filled(self) -> float:
-        """Return the share of the tote's volume below its surface, 0 to 1."""
-        return int(self.state.heights.sum()) / self.cell.tote_volume(int(self.state.tote_height))
-
-    def item_share(self, number: int) -> float:
-        """Return an item's share of the tote's volume."""
-        return int(self.state.items.volume[0, number]) / self.cell.tote_volume(int(self.state.tote_height))
+    def shares(self, number: int) -> tuple[float, float]:
+        """Return the shares of the tote's volume that are below its surface, 0 to 1, and that an item takes."""
+        total = self.cell.tote_volume(int(self.state.tote_height))
+        return int(self.state.heights.sum()) / total, int(self.state.items.volume[0, number]) / total
 
     def motion(self, action: Tensor) -> tuple[Pose, Pose, float, float]:
         """Return the poses at pick and place, the turn in degrees, and the height of the item's underside at rest."""
@@ -138,10 +136,11 @@ def _read_cuboid(bin_map: np.ndarray, segment: np.ndarray, unit: str, name: str)
 def check_longest(cell: CellSpec, item: Item, key: str) -> None:
     """Refuse an item that is longer than the tables of grasps hold."""
     longest = max(int(item.w), int(item.d))
-    if cell.gripper.largest_item is None and longest > cell.max_side:
-        raise DepthMapError(
-            f"{key}: the item is {longest} cells long, longer than any in training; expected at most {cell.max_side}."
-        )
+    refuse_if(
+        cell.gripper.largest_item is None and longest > cell.max_side,
+        f"{key}: the item is {longest} cells long, longer than any in training; expected at most {cell.max_side}.",
+        DepthMapError,
+    )
 
 
 def read_bearing(cell: CellSpec, tote_bearing, on_floor: Tensor) -> Tensor:
@@ -150,6 +149,9 @@ def read_bearing(cell: CellSpec, tote_bearing, on_floor: Tensor) -> Tensor:
         return torch.ones_like(on_floor, dtype=torch.int64)
     bearing = torch.from_numpy(whole_map("tote_bearing", tote_bearing, cell.tote_size[:2], 1, kinds="biuf"))
     bearing = torch.where(on_floor, 1, bearing)  # this may be another tote
-    if not cell.support.marks_bearing and not bearing.all():
-        raise DepthMapError(f"tote_bearing: got a 0 with support={cell.support}, expected support=bearing.")
+    refuse_if(
+        not cell.support.marks_bearing and not bearing.all(),
+        f"tote_bearing: got a 0 with support={cell.support}, expected support=bearing.",
+        DepthMapError,
+    )
     return bearing

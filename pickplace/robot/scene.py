@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from pickplace.common.validate import excerpt, integral_number, is_number, number
+from pickplace.common.validate import excerpt, integral_number, is_number, number, refuse_if
 from pickplace.robot.box import ACCURACY, CLEARANCE, MILLIMETRE, Box, DepthMapError
 from pickplace.robot.camera import Camera
 from pickplace.robot.measure import ToteMap
@@ -62,16 +62,19 @@ class Scene:
             integral_number("tote_height", self.tote_height, 1, FAR - 1)
         if isinstance(self.items, BinMap):
             return
-        if not isinstance(self.items, (list, tuple)) or not all(isinstance(item, Box) for item in self.items):
-            raise DepthMapError(f"items={excerpt(self.items)}: expected a list of Box.")
-        if not 1 <= len(self.items) <= MAX_BIN_ITEMS:
-            found = "too many" if self.items else "an empty bin"
-            raise DepthMapError(f"items: got {len(self.items)} boxes, expected 1 to {MAX_BIN_ITEMS}: {found}.")
+        are_boxes = isinstance(self.items, (list, tuple)) and all(isinstance(item, Box) for item in self.items)
+        refuse_if(not are_boxes, f"items={excerpt(self.items)}: expected a list of Box.", DepthMapError)
+        found = f"got {len(self.items)} boxes, expected 1 to {MAX_BIN_ITEMS}"
+        refuse_if(not self.items, f"items: {found}: an empty bin.", DepthMapError)
+        refuse_if(len(self.items) > MAX_BIN_ITEMS, f"items: {found}: too many.", DepthMapError)
         for at, box in enumerate(self.items):
             for key, value in vars(box).items():
-                if not is_number(value) or abs(value) > MAX_VALUE or (key in "wdh" and value < MILLIMETRE):
-                    expected = "a length of at least 0.001 m" if key in "wdh" else "a finite number"
-                    raise DepthMapError(f"items[{at}].{key}={excerpt(value)}: expected {expected}.")
+                expected = "a length of at least 0.001 m" if key in "wdh" else "a finite number"
+                refuse_if(
+                    not is_number(value) or abs(value) > MAX_VALUE or (key in "wdh" and value < MILLIMETRE),
+                    f"items[{at}].{key}={excerpt(value)}: expected {expected}.",
+                    DepthMapError,
+                )
 
     @classmethod
     def from_maps(cls, bin_depth, tote_depth, bin_labels=None, **settings) -> "Scene":

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from pickplace.common.files import read_file, read_text
-from pickplace.common.validate import whole_number
+from pickplace.common.validate import refuse_if, whole_number
 from pickplace.config.errors import Parser, one_sentence, write_output
 from pickplace.robot.box import DepthMapError
 from pickplace.serve.request import MAX_REQUEST, PLAN_OPTIONS, PlanRequest, answer
@@ -133,14 +133,17 @@ def run(args: argparse.Namespace) -> None:
     Raises:
         ValueError: for arguments, a checkpoint or maps that cannot be used.
     """
-    if (args.bin is None) != (args.tote is None):
-        missing = "--bin" if args.bin is None else "--tote"
-        raise ValueError(f"{missing}: no file; expected both --bin and --tote, or neither to read JSON lines.")
+    missing = "--bin" if args.bin is None else "--tote"
+    refuse_if(
+        (args.bin is None) != (args.tote is None),
+        f"{missing}: no file; expected both --bin and --tote, or neither to read JSON lines.",
+    )
     for option, path in (("--bin-labels", args.bin_labels), ("--tote-bearing", args.tote_bearing)):
-        if path is not None and args.tote is None:
-            raise ValueError(f"{option}={path}: expected --bin and --tote, too.")
-    if sys.stdout is None or (sys.stdin is None and args.bin is None):
-        raise ValueError("standard input or output is closed; expected requests and a place for the plans.")
+        refuse_if(path is not None and args.tote is None, f"{option}={path}: expected --bin and --tote, too.")
+    refuse_if(
+        sys.stdout is None or (sys.stdin is None and args.bin is None),
+        "standard input or output is closed; expected requests and a place for the plans.",
+    )
     planner, defaults = load_planner(args)
     if args.bin is not None:
         files = {
@@ -195,8 +198,7 @@ def read_reach(path: str):
         content = safe_load(read_text(path, MAX_REQUEST))
     except (OSError, ValueError, YAMLError) as error:
         raise ValueError(f"--reach={path}: {str(error).splitlines()[0]}; {expected}") from error
-    if not isinstance(content, dict) or [*content] != ["reach"]:
-        raise ValueError(f"--reach={path}: {expected}")
+    refuse_if(not isinstance(content, dict) or [*content] != ["reach"], f"--reach={path}: {expected}")
     return build("env", content)["reach"]
 
 
@@ -214,6 +216,5 @@ def read_map(path: str) -> np.ndarray:
         values = np.load(io.BytesIO(content), allow_pickle=False)
     except Exception as error:  # of any type: numpy evaluates the header
         raise ValueError(f"{path}: cannot be read; expected a .npy file with one array of numbers.") from error
-    if not isinstance(values, np.ndarray):
-        raise ValueError(f"{path}: expected a .npy file with one array, got an archive.")
+    refuse_if(not isinstance(values, np.ndarray), f"{path}: expected a .npy file with one array, got an archive.")
     return values

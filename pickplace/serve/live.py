@@ -3,13 +3,13 @@
 import base64
 import hashlib
 import json
-import math
 import re
 import time
 
 import numpy as np
 
 from pickplace.common.validate import excerpt
+from pickplace.robot.measure import patches
 from pickplace.rules.cell import CellSpec
 from pickplace.serve.request import PlanRequest
 from pickplace.views.replay import effector_parts, filled
@@ -66,6 +66,8 @@ def _scene(cell: CellSpec, request: PlanRequest, plan: dict) -> dict:
     side = request.cell_size
     along, up = (1.0, cell.height_unit) if side is None else (1 / side, 1 / side)  # cells in a length
     height = cell.tote_size[2] * cell.height_unit if request.tote_height is None else request.tote_height * up
+    sides = cell.tote_size[:2]
+    heights, _ = patches(height - np.asarray(request.tote_depth, float) * up, sides, max(1, MOST_COLUMNS // max(sides)))
     box, item = plan["box"], plan["item"]  # both None: of several items none is taken
     if item and not box:
         box = {**item, "x": item["x"] + item["w"] / 2, "y": item["y"] + item["d"] / 2, "yaw": 0.0}
@@ -76,7 +78,7 @@ def _scene(cell: CellSpec, request: PlanRequest, plan: dict) -> dict:
 
     return {
         "height": height,
-        "heights": surface(height - np.asarray(request.tote_depth, float) * up, cell).round(3).tolist(),
+        "heights": heights.clip(0, None).round(3).tolist(),
         "item": box and [*(box[key] * along for key in "xywd"), box["h"] * up, box["yaw"]],
         "lengths": box and [box["w"], box["d"], box["h"]],
         "unit": "cells" if side is None else "m",
@@ -89,13 +91,3 @@ def _scene(cell: CellSpec, request: PlanRequest, plan: dict) -> dict:
         "reasons": plan["reasons"],
         "warnings": plan["warnings"],
     }
-
-
-def surface(heights: np.ndarray, cell: CellSpec) -> np.ndarray:
-    """Return heights ``[k W_T, k D_T]`` with at most :data:`MOST_COLUMNS` values a side: the greatest of each patch."""
-    wide, deep = cell.tote_size[:2]
-    count = len(heights) // wide
-    most = max(1, MOST_COLUMNS // max(wide, deep))
-    kept = max(number for number in range(1, min(count, most) + 1) if count % number == 0)
-    patch = count // kept
-    return heights.reshape(wide * kept, patch, deep * kept, patch).max((1, 3)).clip(0, math.inf)

@@ -5,6 +5,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Self
 
+from pickplace.common.validate import refuse_if
 from pickplace.config.errors import sentence
 from pickplace.robot.box import ACCURACY, CLEARANCE, Box
 
@@ -59,8 +60,7 @@ class PlanRequest:
             if both := [key for key in ("bin_depth", "bin_labels") if key in given]:
                 raise ValueError(f"{both[0]}, items: got both, expected one of the two.")
         for key in ("tote_depth",) if "items" in given else ("bin_depth", "tote_depth"):
-            if key not in given:
-                raise ValueError(f"{key}: missing; expected a depth map as a list of rows.")
+            refuse_if(key not in given, f"{key}: missing; expected a depth map as a list of rows.")
         return cls(**{**defaults, **given})
 
     def scene(self) -> "Scene":
@@ -105,14 +105,14 @@ def parse_json(text: bytes) -> dict:
     Raises:
         ValueError: for a text that is too long, or is no object in JSON.
     """
-    if len(text) > MAX_REQUEST:
-        raise ValueError(f"the request has more than {MAX_REQUEST:,} bytes; expected a shorter one.")
+    refuse_if(len(text) > MAX_REQUEST, f"the request has more than {MAX_REQUEST:,} bytes; expected a shorter one.")
     try:
         given = json.loads(text.decode(), parse_constant=finite_float, parse_float=finite_float)
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"the request is not JSON: {error}.") from error
-    if not isinstance(given, dict):
-        raise ValueError(f"got {type(given).__name__}, expected an object with bin_depth and tote_depth.")
+    refuse_if(
+        not isinstance(given, dict), f"got {type(given).__name__}, expected an object with bin_depth and tote_depth."
+    )
     return given
 
 

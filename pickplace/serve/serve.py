@@ -5,7 +5,7 @@ import ipaddress
 import os
 import socket
 
-from pickplace.common.validate import excerpt, number, short_text, whole_number
+from pickplace.common.validate import excerpt, number, refuse_if, short_text, whole_number
 from pickplace.config.errors import Parser, one_sentence, write_output
 from pickplace.serve.json_lines import add_options, load_planner, planner_options
 
@@ -78,8 +78,8 @@ def run(args: argparse.Namespace) -> None:
         hosts = ["*"]
     name = args.planner or "policy"
     app = make_app(planner, defaults, name, args.checkpoint, token, args.rate, args.history, hosts)
+    family = socket.AF_INET6 if ":" in args.host else socket.AF_INET
     try:
-        family = socket.AF_INET6 if ":" in args.host else socket.AF_INET
         listener = socket.create_server((args.host, args.port), family=family)
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
@@ -110,15 +110,14 @@ def checked_token(host: str) -> str | None:
         ValueError: for another host without a token, or a token that is too short or no ASCII.
     """
     token = os.environ.get(TOKEN)
-    if token is None:
-        if not is_local(host):
-            raise ValueError(
-                f"--host={short_text(host)}: other machines can reach it; expected a token in the environment variable "
-                f"{TOKEN}, or --host 127.0.0.1."
-            )
-        return None
-    if len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
-        raise ValueError(
-            f"{TOKEN}: got {len(token)} letters; expected at least {LEAST_TOKEN}, of ASCII without spaces."
+    refuse_if(
+        token is None and not is_local(host),
+        f"--host={short_text(host)}: other machines can reach it; expected a token in the environment variable "
+        f"{TOKEN}, or --host 127.0.0.1.",
+    )
+    if token is not None:
+        refuse_if(
+            len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable() or " " in token,
+            f"{TOKEN}: got {len(token)} letters; expected at least {LEAST_TOKEN}, of ASCII without spaces.",
         )
     return token
