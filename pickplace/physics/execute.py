@@ -129,8 +129,9 @@ class Gantry(Scene):
         # So far apart that an end effector that hangs over a wall of one hits no wall of the other.
         distance = 2 * WALL + 2 * max(plan.effector) + 0.1
         self.bin = np.array((-plan.bin[0] - distance, (plan.tote[1] - plan.bin[1]) / 2))
-        neighbours = [box[4] for placement in plan.placements for box in placement.neighbours]
-        self.rim = max(plan.tote[2], plan.bin[2], *neighbours)
+        self.rim = max(
+            plan.tote[2], plan.bin[2], *(box[4] for placement in plan.placements for box in placement.neighbours)
+        )
         self.add_container(plan.tote)
         self.add_container(plan.bin, self.bin)
         self._add_plate(plan)
@@ -312,5 +313,4 @@ class Gantry(Scene):
                 return self.loss("dropped")
         waits = {body.id: (*(self.bin + box[:2]), 0.0) + np.divide(box[2:], 2) for box, body in self.waiting.items()}
         shifts = np.linalg.norm(self.data.xpos[[*waits]] - [*waits.values()], axis=1) if waits else np.zeros(1)
-        is_disturbed = (shifts > self.options.tolerance).any()
-        return self.loss("disturbed") if is_disturbed else None
+        return self.loss("disturbed") if (shifts > self.options.tolerance).any() else None

@@ -176,7 +176,7 @@ def _read_line(line: str) -> dict:
     for key, value in given.items():
         expected, is_good = kinds[key]
         refuse_if(not is_good(value), f"{key}={excerpt(value)}: expected {expected}.")
-    values = {key: _frozen(value) for key, value in given.items()}
+    values: dict[str, Any] = {key: _frozen(value) if isinstance(value, list) else value for key, value in given.items()}
     for key, outer in (("body", "effector"), ("neighbours", "bin")):
         for x, y, w, d, *_ in values.get(key, ()):
             wide, deep, *_ = values[outer]
@@ -191,17 +191,17 @@ def _read_line(line: str) -> dict:
     return values
 
 
-def _frozen(value):
-    """Return lists as tuples of floats."""
-    if not isinstance(value, list):
-        return value
+def _frozen(value: list) -> tuple:
+    """Return a list, or a list of lists, as tuples of floats."""
     return tuple(_frozen(part) if isinstance(part, list) else float(part) for part in value)
 
 
 def _shared(corner: Point, size: Point, other: Point, other_size: Point) -> list[float]:
     """Return the length that two boxes share along each axis; below 0: the distance between them."""
-    axes = zip(corner, size, other, other_size, strict=True)
-    return [min(a + length, b + other_length) - max(a, b) for a, length, b, other_length in axes]
+    return [
+        min(a + length, b + other_length) - max(a, b)
+        for a, length, b, other_length in zip(corner, size, other, other_size, strict=True)
+    ]
 
 
 def _check_place(placement: Placement, plan: EpisodePlan) -> None:

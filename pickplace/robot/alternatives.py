@@ -90,8 +90,7 @@ def _probable_footprints(
         total = log_probs.new_zeros(cell.num_choices)
         total.scatter_add_(0, footprint[lands], log_probs[lands].exp())
     else:  # measured items are on grids of their own: what the policy sees does not tell which picks lift them
-        scores = policy.unmasked_scores(observation)[0]
-        total = torch.where(reachable, scores, -torch.inf).softmax(0).nan_to_num(0)
+        total = torch.where(reachable, policy.unmasked_scores(observation)[0], -torch.inf).softmax(0).nan_to_num(0)
     ranked = torch.where(reachable, total, -1).argsort(descending=True, stable=True)[: int(reachable.sum())][:count]
     preference = action_mask(cell, problem.maps)[0].int()
     if chosen is not None:

@@ -109,8 +109,10 @@ class Camera:
     def rays(self, shape: Sequence[int]) -> np.ndarray:
         """Return the way along every pixel's ray that goes one metre along the optical axis, ``[rows, columns, 3]``."""
         row, column = np.indices(shape)
-        rays = np.stack([(column - self.cx) / self.fx, (row - self.cy) / self.fy, np.ones(shape)], -1)
-        return rays @ self.pose[:3, :3].T
+        return (
+            np.stack([(column - self.cx) / self.fx, (row - self.cy) / self.fy, np.ones(shape)], -1)
+            @ self.pose[:3, :3].T
+        )
 
     def pixel(self, height: float = 0.0) -> float:
         """Return the side of a pixel's square at a height above the floor, in metres."""
@@ -130,7 +132,6 @@ class Camera:
         Raises:
             DepthMapError: for an image that does not show the tote, or too little of it.
         """
-        sides = [side * cell_size for side in cell.tote_size[:2]]
         rim = cell.tote_size[2] * cell.height_unit * cell_size if tote_height is None else tote_height
         pixel = self.pixel()
         refuse_if(
@@ -138,7 +139,7 @@ class Camera:
             f"depth: a cell is {cell_size / pixel:.1f} pixels wide, expected at least {LEAST_PIXELS}.",
             DepthMapError,
         )
-        points = self._inside(depth, sides, rim, "tote")
+        points = self._inside(depth, cell.tote_size, cell_size, rim, "tote")
         along = min(MAX_PATCHES, int(cell_size / (LEAST_PIXELS * pixel)))
         shape = [side * along for side in cell.tote_size[:2]]
         known = ~np.isnan(points[..., 2])
@@ -189,14 +190,13 @@ class Camera:
         Raises:
             DepthMapError: for an image that does not show the bin, or something that could be two items.
         """
-        sides = [side * cell_size for side in cell.bin_size[:2]]
-        points = self._inside(depth, sides, cell.bin_size[2] * cell.height_unit * cell_size, "bin")
+        rim = cell.bin_size[2] * cell.height_unit * cell_size
+        points = self._inside(depth, cell.bin_size, cell_size, rim, "bin")
         height = np.nan_to_num(points[..., 2], nan=0.0)
         above = height > max(3 * accuracy, 0.005)
         if labels is None:
-            step = 4 * accuracy + self.pixel()
-            flat = ndimage.maximum_filter(height, 3) - ndimage.minimum_filter(height, 3) < step
-            segments, _ = ndimage.label(above & flat)
+            steps = ndimage.maximum_filter(height, 3) - ndimage.minimum_filter(height, 3)
+            segments, _ = ndimage.label(above & (steps < 4 * accuracy + self.pixel()))
         else:
             labels = np.asarray(labels)
             refuse_if(
@@ -214,8 +214,10 @@ class Camera:
                     "expected a label for each item."
                 )
         numbers, counts = np.unique(segments[segments > 0], return_counts=True)
-        large = numbers[counts >= MIN_ITEM_PIXELS]
-        boxes = [self._box(points, segments == number, narrowed=labels is None) for number in large]
+        boxes = [
+            self._box(points, segments == number, narrowed=labels is None)
+            for number in numbers[counts >= MIN_ITEM_PIXELS]
+        ]
         hidden = [self._hidden_length(box, boxes) for box in boxes]
         for box, length in zip(boxes, hidden, strict=True):
             if sizes is not None and not length:
@@ -225,9 +227,9 @@ class Camera:
             for box, length in zip(boxes, hidden, strict=True)
         ]
 
-    def _inside(self, depth, sides: Sequence[float], rim: float, name: str) -> np.ndarray:
+    def _inside(self, depth, size: Sequence[int], cell_size: float, rim: float, name: str) -> np.ndarray:
         """Return the points between the walls, median-filtered, NaN elsewhere, ``[rows, columns, 3]``."""
-        points, wall = self.points(depth), self._wall()
+        points, wall, sides = self.points(depth), self._wall(), [side * cell_size for side in size[:2]]
         unknown = np.isnan(points[..., 2])
         filled = np.where(unknown, np.nanmax(points[..., 2]), points[..., 2])
         points[..., 2] = np.where(unknown, np.nan, ndimage.median_filter(filled, 3, mode="nearest"))
@@ -282,19 +284,18 @@ class Camera:
             share = (other.h - box.h) / (self.pose[2, 3] - box.h)  # of the ray that runs below the other's top
             ray = edge + np.linspace(0, share, EDGE_POINTS)[:, None, None] * to_camera
             inside = is_inside(ray, (other.x, other.y), (other.w, other.d), other.yaw)
-            hides = inside.any(0) & ~inside[0]  # what lies in the other is no part of the box
-            longest = max(longest, float((share * np.linalg.norm(to_camera[hides], axis=1)).max(initial=0.0)))
+            hidden = to_camera[inside.any(0) & ~inside[0]]  # what lies in the other is no part of the box
+            longest = max(longest, float((share * np.linalg.norm(hidden, axis=1)).max(initial=0.0)))
         return longest if longest > self.pixel(box.h) / 2 else 0.0
 
 
 def _check_reading(box: Box, sizes, tolerance: float) -> None:
     """Refuse a box that could be two items of known sizes, or is none; both readings are named."""
-    known = [(w, d, h) for a, b, h in sizes for w, d in {(a, b), (b, a)}]
+    tall = [(w, d) for a, b, h in sizes for w, d in {(a, b), (b, a)} if abs(box.h - h) <= tolerance]
 
     def is_like(w: float, d: float) -> bool:
         return abs(box.w - w) <= tolerance and abs(box.d - d) <= tolerance
 
-    tall = [(w, d) for w, d, h in known if abs(box.h - h) <= tolerance]
     one = [(w, d) for w, d in tall if is_like(w, d)]
     two = [
         (a, b)

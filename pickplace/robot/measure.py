@@ -20,6 +20,7 @@ from pickplace.rules.cell import MAX_BIN_ITEMS
 ROUNDING = 1e-6
 MAX_PATCHES = 8  # greatest number of patches along a cell; finer maps are reduced to it
 MAX_LABEL = 2**31 - 1
+LABEL_HINT = "; of several items give bin_labels, too"
 #: Width of the border of an item that is taken to be parallel to the walls, as a share of its side: sine of a degree.
 SNAPPED = 0.02
 
@@ -112,8 +113,8 @@ def metric_map(name: str, values, grid: Sequence[int], least: float, most: float
         DepthMapError: naming the first value that is out of range.
     """
     array = as_array(name, values, grid).astype(np.float64)
-    inside = (array >= least - ROUNDING) & (array <= most + ROUNDING)  # False for NaN
-    refuse(name, ~inside, array, " m", f"{least:g} to {most:g} m")
+    # Not the opposite comparisons: all are False for NaN.
+    refuse(name, ~((array >= least - ROUNDING) & (array <= most + ROUNDING)), array, " m", f"{least:g} to {most:g} m")
     return array
 
 
@@ -163,11 +164,6 @@ def segments_of_map(labels, heights: np.ndarray, least: float) -> dict[str, np.n
         DepthMapError,
     )
     return {f" with label {label}": array == label for label in found}
-
-
-def label_hint(name: str) -> str:
-    """Return what a message adds for an item without a name, see :func:`segments_of_map`."""
-    return "" if name else "; of several items give bin_labels, too"
 
 
 def turned_axes(angle: float) -> np.ndarray:
@@ -249,7 +245,7 @@ def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: b
     centres = (np.indices(heights.shape).transpose(1, 2, 0) + 0.5) * side
     border = 0.0 if is_cell_map else side + SNAPPED * max(w, d) * (yaw == 0)
     inside = is_inside(centres, (x, y), (w - 2 * border, d - 2 * border), yaw)
-    expected = f"{box.h:g} m: one cuboid, {w:g} x {d:g} m with its centre at [{x:g}, {y:g}]{label_hint(name)}"
+    expected = f"{box.h:g} m: one cuboid, {w:g} x {d:g} m with its centre at [{x:g}, {y:g}]{'' if name else LABEL_HINT}"
     refuse("bin_depth", inside & (heights < box.h - 2 * accuracy - ROUNDING), heights, f" m{name}", expected)
     return box.upright()
 

@@ -67,8 +67,10 @@ class MeasuredProblem(Problem):
     def is_feasible_in_an_empty_tote(self) -> bool:
         flat = torch.zeros_like(self.tote.highest)
         empty = self.tote._replace(highest=flat, lowest=flat, bears=torch.ones_like(self.tote.bears))
-        maps = (measured_maps(part.cell, empty, part.measured.maps.item, part.sides).maps for part in self.parts)
-        return any(footprint_mask(part.cell, each).any() for part, each in zip(self.parts, maps, strict=True))
+        return any(
+            footprint_mask(part.cell, measured_maps(part.cell, empty, part.measured.maps.item, part.sides).maps).any()
+            for part in self.parts
+        )
 
     def failures(self, actions: Tensor) -> Tensor:
         taken, codes = self.taken_items(actions), torch.empty_like(actions)
@@ -163,8 +165,9 @@ def _join(parts: list[MeasuredItem], items: Item) -> tuple[CellSpec, PlacingMaps
     limits, cell, each = parts[0].limits, parts[0].cell, [part.measured.maps for part in parts]
     if len(parts) == 1:
         return cell, each[0]
-    keys = ("top", "clearance", "rest", "greatest_top")
-    joined: dict[str, Any] = {key: torch.cat([getattr(maps, key) for maps in each]) for key in keys}
+    joined: dict[str, Any] = {
+        key: torch.cat([getattr(maps, key) for maps in each]) for key in ("top", "clearance", "rest", "greatest_top")
+    }
     blocked = ~torch.stack([part.limits.pick_ok for part in parts])
     maps = each[0]._replace(**joined, item=items.rows(0), blocked=blocked, bin_items=len(parts))
     everywhere = replace(limits, pick_ok=torch.ones_like(limits.pick_ok))
@@ -231,9 +234,9 @@ def _read_tote(cell: CellSpec, scene: Scene, unit: float, device) -> MeasuredTot
     high, low = (whole_units(part.clip(0, None), MILLIMETRE, up) for part, up in ((highest, True), (lowest, False)))
     count = len(high) // grid[0]
     on_floor = (high <= floor_height(slack)).unflatten(0, (-1, count)).unflatten(2, (-1, count)).all(3).all(1)
-    bears = read_bearing(cell, scene.tote_bearing, on_floor).bool()
-    if scene.tote_bearing is None and count == 1:
-        bears = on_floor  # one value a cell does not tell whether the cell is level
+    # One value a cell does not tell whether the cell is level.
+    is_unknown = scene.tote_bearing is None and count == 1
+    bears = on_floor if is_unknown else read_bearing(cell, scene.tote_bearing, on_floor).bool()
     return MeasuredTote(high.to(device), low.to(device), bears.to(device), rim, over_rim, slack)
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pickplace.common.validate import refuse_if
 from pickplace.robot.box import Box, DepthMapError
-from pickplace.robot.measure import label_hint, refuse, segments_of_map, whole_map
+from pickplace.robot.measure import LABEL_HINT, refuse, segments_of_map, whole_map
 from pickplace.robot.scene import BinMap, Scene
 from pickplace.rules.bin import taken_item
 from pickplace.rules.cell import CellSpec
@@ -128,7 +128,7 @@ def _read_cuboid(bin_map: np.ndarray, segment: np.ndarray, unit: str, name: str)
     (x, y), (w, d), h = filled.min(0), np.ptp(filled, 0) + 1, heights.max()
     bad = np.zeros_like(segment)
     bad[x : x + w, y : y + d] = heights[x : x + w, y : y + d] != h
-    expected = f"{h}: one cuboid that fills its bounding box, {w}x{d} cells from [{x}, {y}]{label_hint(name)}"
+    expected = f"{h}: one cuboid that fills its bounding box, {w}x{d} cells from [{x}, {y}]{'' if name else LABEL_HINT}"
     refuse("bin_depth", bad, heights, unit + name, expected)
     return Item(*(torch.tensor([int(value)]) for value in (x, y, w, d, h)))
 

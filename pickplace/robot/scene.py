@@ -101,6 +101,8 @@ class Scene:
             **settings: the other fields.
         """
         (over_bin, bin_image), (over_tote, tote_image) = bin_view, tote_view
-        items = over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes)
-        tote = over_tote.tote_map(tote_image, cell, cell_size, tote_height)
-        return cls(items, tote, cell_size, accuracy, tote_height=tote_height, **settings)
+        return cls(
+            over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes),
+            over_tote.tote_map(tote_image, cell, cell_size, tote_height),
+            cell_size, accuracy, tote_height=tote_height, **settings,
+        )  # fmt: skip

@@ -51,10 +51,9 @@ class TrainingEnvelope:
             found.append(f"{count} items in the bin: the policy met at most {known.bin_items}.")
         if known.tote_size[:2] != cell.tote_size[:2] or cell.tote_size[2] > known.tote_size[2]:
             found.append(f"tote of {_sides(cell.tote_size)} cells: the policy met {_sides(known.tote_size)}.")
-        rules = differences(cell_settings(cell, RULES), cell_settings(known, RULES))
         return found + [
             f"{key}={ours}: the policy met {theirs}."
-            for key, ours, theirs in rules
+            for key, ours, theirs in differences(cell_settings(cell, RULES), cell_settings(known, RULES))
             if key != "gripper.size" or sorted(ours) != sorted(theirs)
         ]
 

@@ -73,11 +73,9 @@ def run(args: argparse.Namespace) -> None:
     # The names by which clients may call the service. A page of a stranger that has its name lead to this machine (DNS
     # rebinding) calls it by another. Where the service listens at all addresses and no name is given, any will do: the
     # token, which the page lacks, is asked for anyway.
-    hosts = ["localhost", "127.0.0.1", "[::1]", host, *args.allow_host]
-    if args.host in ("0.0.0.0", "::") and not args.allow_host:
-        hosts = ["*"]
-    name = args.planner or "policy"
-    app = make_app(planner, defaults, name, args.checkpoint, token, args.rate, args.history, hosts)
+    is_any = args.host in ("0.0.0.0", "::") and not args.allow_host
+    hosts = ["*"] if is_any else ["localhost", "127.0.0.1", "[::1]", host, *args.allow_host]
+    app = make_app(planner, defaults, args.planner or "policy", args.checkpoint, token, args.rate, args.history, hosts)
     family = socket.AF_INET6 if ":" in args.host else socket.AF_INET
     try:
         listener = socket.create_server((args.host, args.port), family=family)

@@ -183,17 +183,19 @@ def make_app(
     def authorize(sent: HTTPAuthorizationCredentials | None = Depends(HTTPBearer(auto_error=False))) -> None:  # noqa: B008
         given = "" if sent is None else sent.credentials
         if token is not None and not hmac.compare_digest(given.encode(), token.encode()):
-            headers = {"WWW-Authenticate": "Bearer"}
-            raise HTTPException(401, "the token is missing or wrong; expected Authorization: Bearer <token>.", headers)
+            detail = "the token is missing or wrong; expected Authorization: Bearer <token>."
+            raise HTTPException(401, detail, {"WWW-Authenticate": "Bearer"})
 
-    reasons = {
+    refusals = {
         400: "No JSON object, or a wrong Host", 401: "No token, or a wrong one", 408: "The body came too slowly",
         413: "The body is too long", 415: "Not application/json", 422: "Maps or settings that cannot be used",
         429: "Too many plans; Retry-After says when to come back", 500: "The service failed; its log says more",
         503: "Too many connections; Retry-After says when to come back",
     }  # fmt: skip
-    answers: dict = {200: {"description": "A plan; status says whether there is one", "model": Plan}}
-    answers |= {code: {"description": text, "model": Refusal} for code, text in reasons.items()}
+    answers: dict = {
+        200: {"description": "A plan; status says whether there is one", "model": Plan},
+        **{code: {"description": text, "model": Refusal} for code, text in refusals.items()},
+    }
 
     @app.post("/plan", responses=answers, dependencies=[Depends(authorize)], response_class=Response)
     async def plan(request: Request):
@@ -228,16 +230,14 @@ def make_app(
         """Return the page, which asks for ``/plans``; it holds no plans itself and needs no token."""
         return HTMLResponse(page, headers=page_headers)
 
-    _describe_requests(app)
-    return app
-
-
-def _describe_requests(app: FastAPI) -> None:
-    """Add the schema of requests to the OpenAPI description: FastAPI does not see it, as it does not parse them."""
+    # The schema of requests, for the OpenAPI description: FastAPI does not see it, as it does not parse them.
     described = app.openapi()
     schema = TypeAdapter(PlanRequest).json_schema(ref_template="#/components/schemas/{model}")
     schema |= {"examples": [GRID, METRES], "required": ["tote_depth"], "additionalProperties": False}
     schemas = described["components"]["schemas"]
     schemas |= schema.pop("$defs", {}) | {"PlanRequest": schema}
-    content = {"application/json": {"schema": {"$ref": "#/components/schemas/PlanRequest"}}}
-    described["paths"]["/plan"]["post"]["requestBody"] = {"required": True, "content": content}
+    described["paths"]["/plan"]["post"]["requestBody"] = {
+        "required": True,
+        "content": {"application/json": {"schema": {"$ref": "#/components/schemas/PlanRequest"}}},
+    }
+    return app
