@@ -226,7 +226,7 @@ class Gantry(Scene):
             pick, place: goals of the plate, where it sucks and where it shall let go.
             height: of the item, m.
         """
-        (*over_pick, _, start), (*over_place, _, turn), high = pick, place, self._high(height)
+        (*over_pick, _, start), (*over_place, _, turn), high = pick, place, self.rim + height + HEADROOM
         return (
             self.travel((*over_pick, high, start))
             or self.lower(pick)
@@ -242,13 +242,9 @@ class Gantry(Scene):
         self.data.xfrc_applied[self.boxes[-1].id, 2] = -WAKING_FORCE  # else it could sleep on in the air
         self.step(1)
         self.data.xfrc_applied[self.boxes[-1].id, 2] = 0.0
-        loss = self.lift(self._high(height))
+        loss = self.lift(self.rim + height + HEADROOM)
         wait(self)
         return loss
-
-    def _high(self, height: float) -> float:
-        """Return the height of the plate's lower face at which an item below it clears the rims."""
-        return self.rim + height + HEADROOM
 
     def lower(self, goal) -> Loss | None:
         """Move the plate down, the last centimetres slowly, and let it come to rest."""

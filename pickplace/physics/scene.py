@@ -154,20 +154,11 @@ class Scene:
         return bool(self.data.warning.number[: mujoco.mjtWarning.mjWARN_BADCTRL].any())
 
     @property
-    def speeds(self) -> np.ndarray:
-        """The velocity of each body, linear and angular, ``[n, 6]``; m/s and rad/s."""
-        return self.data.qvel[-6 * len(self.bodies) :].reshape(-1, 6)
-
-    @property
     def shifts(self) -> np.ndarray:
         """The distance of each box's centre from where it is planned to rest, ``[n]``."""
-        return np.linalg.norm(self.data.xpos[self._ids] - self.planned, axis=1)
+        return np.linalg.norm(self.data.xpos[[body.id for body in self.boxes]] - self.planned, axis=1)
 
     @property
     def tilts(self) -> np.ndarray:
         """The angle between each box's axis and the vertical, ``[n]``; degrees."""
-        return np.degrees(np.arccos(np.clip(self.data.xmat[self._ids, 8], -1, 1)))
-
-    @property
-    def _ids(self) -> list[int]:
-        return [body.id for body in self.boxes]
+        return np.degrees(np.arccos(np.clip(self.data.xmat[[body.id for body in self.boxes], 8], -1, 1)))

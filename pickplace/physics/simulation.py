@@ -178,6 +178,7 @@ def wait(scene: Scene) -> None:
     """Let time pass until all items are at rest, or :data:`MAX_WAIT`."""
     scene.run(MIN_WAIT)
     for _ in range(round((MAX_WAIT - MIN_WAIT) / LOOK)):
-        if (np.abs(scene.speeds) < REST_SPEEDS).all():
+        speeds = scene.data.qvel[-6 * len(scene.bodies) :].reshape(-1, 6)  # of each body
+        if (np.abs(speeds) < REST_SPEEDS).all():
             return
         scene.run(LOOK)

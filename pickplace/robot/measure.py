@@ -53,8 +53,8 @@ def as_array(name: str, values, grid: Sequence[int], kinds: str = "iuf") -> np.n
     """
     try:
         if isinstance(values, Tensor):
-            values = values.detach().cpu()
-            values = values.float() if values.dtype == torch.bfloat16 else values  # numpy has no bfloat16
+            # numpy has no bfloat16
+            values = values.detach().cpu().to(torch.float32 if values.dtype == torch.bfloat16 else values.dtype)
         array = np.asarray(values)
     except (TypeError, ValueError) as error:
         raise DepthMapError(f"{name}: expected an array of {grid[0]}x{grid[1]} numbers ({error}).") from error

@@ -74,8 +74,8 @@ class MeasuredProblem(Problem):
 
     def failures(self, actions: Tensor) -> Tensor:
         taken, codes = self.taken_items(actions), torch.empty_like(actions)
-        for number, part in enumerate(self.parts):
-            codes[taken == number] = failures(part.cell, part.measured, actions[taken == number], part.bin_clear)
+        for index, part in enumerate(self.parts):
+            codes[taken == index] = failures(part.cell, part.measured, actions[taken == index], part.bin_clear)
         return codes
 
     def bearing_after(self, action: Tensor | None) -> Tensor:
@@ -162,7 +162,7 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
 
 def _join(parts: list[MeasuredItem], items: Item) -> tuple[CellSpec, PlacingMaps]:
     """Return the cell and the maps of all items ``[1, M]``; of several the maps forbid the picks out of reach."""
-    limits, cell, each = parts[0].limits, parts[0].cell, [part.measured.maps for part in parts]
+    cell, each = parts[0].cell, [part.measured.maps for part in parts]
     if len(parts) == 1:
         return cell, each[0]
     joined: dict[str, Any] = {
@@ -170,8 +170,8 @@ def _join(parts: list[MeasuredItem], items: Item) -> tuple[CellSpec, PlacingMaps
     }
     blocked = ~torch.stack([part.limits.pick_ok for part in parts])
     maps = each[0]._replace(**joined, item=items.rows(0), blocked=blocked, bin_items=len(parts))
-    everywhere = replace(limits, pick_ok=torch.ones_like(limits.pick_ok))
-    return replace(cell, reach=everywhere, bin_items=len(parts)), maps
+    reach = replace(parts[0].limits, pick_ok=torch.ones_like(blocked[0]))
+    return replace(cell, reach=reach, bin_items=len(parts)), maps
 
 
 def _effector_centres(cell: CellSpec, item: Item, box: Box, side: float) -> np.ndarray:

@@ -129,8 +129,10 @@ class Planner:
         trained = load_policy(path, device, trust, **sizes)
         items = build("items", trained.config["items"])
         critic = load_critic(path, trained) if planner == "lookahead" else None
-        training = TrainingEnvelope.of(trained.config, items)
-        return cls(trained.cell, trained.policy, candidates, trained.terms, planner, items, training, critic)
+        return cls(
+            trained.cell, trained.policy, candidates, trained.terms, planner, items,
+            TrainingEnvelope.of(trained.config, items), critic,
+        )  # fmt: skip
 
     @torch.inference_mode()
     def plan(self, scene: Scene, *, alternatives: int = 10) -> Plan:

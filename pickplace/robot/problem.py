@@ -103,8 +103,10 @@ def read_grid(cell: CellSpec, scene: Scene, device) -> Problem:
     height = cell.tote_size[2] if scene.tote_height is None else round(scene.tote_height)
     bin_map = whole_map("bin_depth", scene.items.depth, cell.bin_size[:2], FAR, unit)
     tote_map = torch.from_numpy(whole_map("tote_depth", scene.tote, cell.tote_size[:2], height, unit))
-    segments = segments_of_map(scene.items.labels, bin_map, 0)
-    items = [_read_cuboid(bin_map, segment, unit, name) for name, segment in segments.items()]
+    items = [
+        _read_cuboid(bin_map, segment, unit, name)
+        for name, segment in segments_of_map(scene.items.labels, bin_map, 0).items()
+    ]
     for item in items:
         check_longest(cell, item, "bin_depth")
     bearing = read_bearing(cell, scene.tote_bearing, tote_map == height)
