@@ -80,8 +80,8 @@ class Problem:
         x, y = effector_centre(x_tote, shape.width) * self.side, effector_centre(y_tote, shape.depth) * self.side
         pick = Pose((x_bin, y_bin), _point(*self._suction_face(number, x_bin, y_bin)), round(yaw, 6))
         place = Pose((x_tote, y_tote), _point(x, y, top * self.unit + self.release), 90.0 * rotation)
-        *_, rest = _point(x, y, (top - int(self.state.items.h[0, number])) * self.unit)
-        return pick, place, round(90 * rotation - yaw, 6), rest
+        rest = (top - int(self.state.items.h[0, number])) * self.unit
+        return pick, place, round(90 * rotation - yaw, 6), round(float(rest), 9)
 
     def _suction_face(self, number: int, x_bin: int, y_bin: int) -> tuple[float, float, float]:
         """Return the centre of the suction face over a pick cell when it grips an item."""

@@ -64,9 +64,12 @@ class Scene:
             return
         are_boxes = isinstance(self.items, (list, tuple)) and all(isinstance(item, Box) for item in self.items)
         refuse_if(not are_boxes, f"items={excerpt(self.items)}: expected a list of Box.", DepthMapError)
-        found = f"got {len(self.items)} boxes, expected 1 to {MAX_BIN_ITEMS}"
-        refuse_if(not self.items, f"items: {found}: an empty bin.", DepthMapError)
-        refuse_if(len(self.items) > MAX_BIN_ITEMS, f"items: {found}: too many.", DepthMapError)
+        found = "too many" if self.items else "an empty bin"
+        refuse_if(
+            not 1 <= len(self.items) <= MAX_BIN_ITEMS,
+            f"items: got {len(self.items)} boxes, expected 1 to {MAX_BIN_ITEMS}: {found}.",
+            DepthMapError,
+        )
         for at, box in enumerate(self.items):
             for key, value in vars(box).items():
                 expected = "a length of at least 0.001 m" if key in "wdh" else "a finite number"

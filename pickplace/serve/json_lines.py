@@ -207,11 +207,9 @@ def read_map(path: str) -> np.ndarray:
 
     Raises:
         ValueError: naming the file.
+        OSError: if there is none, or it cannot be read.
     """
-    try:
-        content = read_file(path, MAX_MAP, empty=False)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: cannot be read ({error}).") from error
+    content = read_file(path, MAX_MAP, empty=False)
     try:
         values = np.load(io.BytesIO(content), allow_pickle=False)
     except Exception as error:  # of any type: numpy evaluates the header
