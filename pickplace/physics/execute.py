@@ -161,8 +161,9 @@ class Gantry(Scene):
 
     def compile(self) -> None:
         if self.boxes and self.weld is None:
-            kinds = {"type": mujoco.mjtEq.mjEQ_WELD, "objtype": mujoco.mjtObj.mjOBJ_BODY}
-            self.weld = self.spec.add_equality(**kinds, name1="plate", active=False, **STIFF)
+            self.weld = self.spec.add_equality(
+                type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="plate", active=False, **STIFF
+            )
         if self.boxes:
             self.weld.name2 = self.boxes[-1].name
         super().compile()
