@@ -62,7 +62,7 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     check("item", (cuboids[..., None, 2:] == sizes).all(-1).any(-1), "sizes of the distribution")
     covered = (bin_labels_from_items(items, cell.bin_size) > 0).sum((1, 2))
     check("item", covered == (items.w * items.d).sum(1), "items that do not overlap")
-    count = (~items.is_empty).sum(1)
+    count = items.exists.sum(1)
     check("arrived", saved["arrived"] == steps + count, "the items placed and those in the bin")
     newest = select_item(items, (count - 1).clamp(min=0)).table
     arrival = env.items.sample(env.stream, seed.expand_as(episode), episode, saved["arrived"] - 1, cell.bin_size)

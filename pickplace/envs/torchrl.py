@@ -236,7 +236,7 @@ class PickPlaceEnv(EnvBase):
         self.steps.add_(placed)
         items = self._refill(placed, remove_item(state.items, step.taken, placed))
         self._update_masks(placed)
-        ended = placed & items.is_empty.all(1)  # the stream has no further item
+        ended = placed & ~items.exists.any(1)  # the stream has no further item
         stuck = placed & ~self.feasible & ~ended
         failure = torch.where(stuck, int(Failure.STUCK), step.failure)
         result = {

@@ -29,19 +29,17 @@ def refill(
         items: ``[N, M]``, the first ones filled.
         rows: bool ``[N]``, the bins in which items may arrive.
     """
-    count, most = (items.h > 0).sum(1), items.x.shape[1]
-    open_ = rows & (count == 0) if cell.refill == "batch" else rows
-    for _ in range(most):
-        open_ = open_ & (count < most)
-        if not open_.any():
+    open_ = rows & ~items.exists[:, 0] if cell.refill == "batch" else rows
+    for number in range(items.x.shape[1]):
+        open_ = open_ & ~items.exists[:, -1]
+        if number and not open_.any():
             break
         item = source.sample(stream, seed, episode, arrived, cell.bin_size)
         if must_share(items, open_):
             uniform = hashed_uniform(stream, seed, episode, arrived, 4)[3]
-            item = _find_room(cell, item, items, (count == 0) | source.has_corners, uniform)
-        open_ = open_ & (item.h > 0)
-        items = add_item(items, item, open_)
-        arrived, count = arrived + open_, count + open_
+            item = _find_room(cell, item, items, ~items.exists[:, 0] | source.has_corners, uniform)
+        open_ = open_ & item.exists
+        items, arrived = add_item(items, item, open_), arrived + open_
     return items, arrived
 
 
@@ -68,5 +66,5 @@ def _find_room(cell: CellSpec, item: Item, others: Item, keeps_place: Tensor, un
     wanted = (uniform * rank[:, -1]).long() + 1
     drawn = torch.searchsorted(rank, wanted[:, None])[:, 0].clamp(max=bin_w * bin_d - 1)
     place = torch.where(keeps_place, item.x * bin_d + item.y, drawn)
-    found = free[torch.arange(count, device=place.device), place] & ~item.is_empty
+    found = free[torch.arange(count, device=place.device), place] & item.exists
     return item._replace(x=place // bin_d, y=place % bin_d).map(lambda part: torch.where(found, part, 0))

@@ -89,7 +89,7 @@ class Cut(ItemDistribution):
         item = place_at_random(sizes, across, along, bin_size)
         if len(self._kept) > max(KEPT_EPISODES, 2 * len(keys)):
             self._kept = {key: self._kept[key] for key in keys}
-        return item.map(lambda part: torch.where(item.is_empty, 0, part))
+        return item.map(lambda part: torch.where(item.exists, part, 0))
 
     def _keep(self, stream: str, keys: list[tuple[str, int, int]]) -> None:
         """Cut the episodes of these keys, ``(stream, seed, episode)``, and keep the sizes of their items."""

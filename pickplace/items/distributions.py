@@ -34,25 +34,30 @@ def check_seed(seed, key: str = "seed") -> int:
 def _mix(x: Tensor) -> Tensor:
     """Return int64 counters scrambled (the finalizer of MurmurHash3, Appleby 2011)."""
     for factor in (-0x00AE502812AA7333, -0x3B314601E57A13AD):
-        x = x ^ ((x >> 33) & 0x7FFFFFFF)
-        x = x * factor
-    return x ^ ((x >> 33) & 0x7FFFFFFF)
+        x = _shifted(x).mul_(factor)
+    return _shifted(x)
+
+
+def _shifted(x: Tensor) -> Tensor:
+    """Return ``x`` xor its upper bits."""
+    return (x >> 33).bitwise_and_(0x7FFFFFFF).bitwise_xor_(x)
 
 
 def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, count: int) -> Tensor:
     """Return uniform numbers in [0, 1), float64 ``[count, N]``, that depend on the item's address alone."""
-    family = STREAMS.index(stream) + 1
-    key = seed
-    for part in (family, episode, step):
-        key = _mix(key * 0x2545F4914F6CDD1D + part + 0x1B873593)
-    key = _mix(key + torch.arange(1, count + 1, device=key.device)[:, None] * 0x1E3779B97F4A7C15)
+    factor, offset = 0x2545F4914F6CDD1D, 0x1B873593
+    key = _mix(seed * factor + (STREAMS.index(stream) + 1 + offset))
+    for part in (episode, step):
+        key = _mix(torch.add(part, key, alpha=factor).add_(offset))
+    number = torch.arange(1, count + 1, device=key.device)[:, None]
+    key = _mix(torch.add(key, number, alpha=0x1E3779B97F4A7C15))
     return ((key >> 11) & ((1 << 53) - 1)).double() / float(1 << 53)
 
 
 def place_at_random(size: Tensor, across: Tensor, along: Tensor, bin_size, kind: Tensor | None = None) -> Item:
     """Return items of given sizes, int64 ``[N, 3]``, in the bin, at places that two uniform numbers decide, ``[N]``."""
     w, d, h = size.unbind(-1)
-    x, y = (across * (bin_size[0] - w + 1)).long(), (along * (bin_size[1] - d + 1)).long()
+    x, y = (across * (bin_size[0] + 1 - w)).long(), (along * (bin_size[1] + 1 - d)).long()
     return Item(x, y, w, d, h, kind)
 
 

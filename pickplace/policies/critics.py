@@ -97,8 +97,8 @@ class Pooled(nn.Module):
 
     def _item_code(self, items: Item) -> Tensor:
         """Return the mean code of the items ``[N, M]`` in each bin, ``[N, 3 * item_range]``."""
-        code = item_code(items, self.item_range, self.level) * ~items.is_empty[..., None]
-        return code.sum(1) / (~items.is_empty).sum(1, keepdim=True).clamp(min=1)
+        code = item_code(items, self.item_range, self.level) * items.exists[..., None]
+        return code.sum(1) / items.exists.sum(1, keepdim=True).clamp(min=1)
 
 
 class Conv4d(nn.Module):

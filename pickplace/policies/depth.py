@@ -21,7 +21,7 @@ class Contents(NamedTuple):
 
     def rest_code(self, row: Tensor, item_range: int) -> Tensor:
         """Return the mean code of the other items in the bin, float32 ``[rows, 3 * item_range]``; 0 without any."""
-        there = ~self.items.is_empty
+        there = self.items.exists
         code = item_code(self.items, item_range) & there[..., None]
         rest = code.sum(1)[row] - code[row, self.number].int()
         return rest / (there.sum(1, keepdim=True) - 1).clamp(min=1)[row]

@@ -33,7 +33,7 @@ def blocked_picks(cell: CellSpec, items: Item) -> Tensor | None:
         in_x = (left + box.x < items.x + items.w) & (left + box.x + box.width > items.x)  # [W_B, N, M]
         in_y = (front + box.y < items.y + items.d) & (front + box.y + box.depth > items.y)
         touches |= in_x[:, None] & in_y
-    touches &= ~items.is_empty
+    touches &= items.exists
     blocked = torch.zeros_like(touches)
     for other in range(count):
         in_the_way = items.h[:, other, None] >= items.h  # [N, M]
@@ -70,7 +70,7 @@ def taken_item(cell: CellSpec, items: Item, x: Tensor, y: Tensor) -> Tensor:
         return torch.zeros_like(x)
     shape = cell.effector(0)
     near_x, near_y = items.x - (x - shape.ref_x)[:, None], items.y - (y - shape.ref_y)[:, None]
-    gripped = cell.gripper.is_gripped(near_x, near_y, items.w, items.d, cell.item_inset) & ~items.is_empty
+    gripped = cell.gripper.is_gripped(near_x, near_y, items.w, items.d, cell.item_inset) & items.exists
     return torch.where(gripped, items.h, 0).argmax(1)
 
 
@@ -90,7 +90,9 @@ def remove_item(items: Item, number: Tensor, removed: Tensor | None = None) -> I
     """
     table = items.table
     if table.shape[1] == 1:
-        return Item.from_table(torch.zeros_like(table) if removed is None else table * ~removed[:, None, None])
+        return Item.from_table(
+            torch.zeros_like(table) if removed is None else table.masked_fill(removed[:, None, None], 0)
+        )
     place = torch.arange(table.shape[1], device=table.device)
     later = place >= number[:, None]
     after = place + (later if removed is None else later & removed[:, None])  # [N, M]
@@ -100,7 +102,7 @@ def remove_item(items: Item, number: Tensor, removed: Tensor | None = None) -> I
 
 def must_share(items: Item, rows: Tensor) -> bool:
     """Return whether any of the bins in ``rows``, bool ``[N]``, holds an item already; all of them have room."""
-    return items.x.shape[1] > 1 and bool((rows & ~items.is_empty[:, 0]).any())
+    return items.x.shape[1] > 1 and bool((rows & items.exists[:, 0]).any())
 
 
 def add_item(items: Item, item: Item, rows: Tensor) -> Item:
@@ -113,5 +115,5 @@ def add_item(items: Item, item: Item, rows: Tensor) -> Item:
     """
     added, count = rows[:, None], items.x.shape[1]
     if count > 1:
-        added = added & (torch.arange(count, device=rows.device) == (~items.is_empty).sum(1, keepdim=True))
+        added = added & (torch.arange(count, device=rows.device) == items.exists.sum(1, keepdim=True))
     return Item.from_table(torch.where(added[..., None], item.table[:, None], items.table))

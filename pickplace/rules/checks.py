@@ -62,10 +62,12 @@ CHECKS: tuple[tuple[Failure, int, Callable[[Any], Tensor | None]], ...] = (
     (Failure.OUT_OF_REACH, GREATEST_TOP, lambda over: over.highest),
 )
 
+_FINDS = {scope: [find for _, where, find in CHECKS if where == scope] for scope in _COMBINE}
+
 
 def combine(scope: int, facts: Any) -> Any:
     """Return whether all checks of a scope are passed, bool; of a height the one that passes all; None: any does."""
-    values = [value for _, where, find in CHECKS if where == scope and (value := find(facts)) is not None]
+    values = [value for find in _FINDS[scope] if (value := find(facts)) is not None]
     return reduce(_COMBINE[scope], values) if values else None
 
 

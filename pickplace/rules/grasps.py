@@ -82,7 +82,7 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | No
         collides = collides | blocked.t().gather(0, pick.reshape(-1, pick.shape[-1])).view_as(pick)
     if cell.limits is not None:
         reachable = cell.limits.on(pick.device).allow_pick(pick, item.h)
-    return Grasp(gripped & ~item.is_empty, collides, reachable, near_x, near_y, back_x, back_y)
+    return Grasp(gripped & item.exists, collides, reachable, near_x, near_y, back_x, back_y)
 
 
 class Carried(NamedTuple):

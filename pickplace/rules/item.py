@@ -1,6 +1,7 @@
 """Items in bins: their columns, and how an observation shows them."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import torch
@@ -14,7 +15,12 @@ Observation: TypeAlias = TensorDictBase | Mapping[str, Tensor]
 
 ALL_TURNS = 0b1111  # a bit for each quarter turn
 NO_LIMIT = 2**31 - 1  # grams
-DEFAULTS = {"kind": -1, "turns": ALL_TURNS, "grams": 0, "max_load": NO_LIMIT}
+
+
+@lru_cache(maxsize=8)
+def _defaults(device: torch.device) -> tuple[Tensor, ...]:
+    """Return the defaults of the columns kind, turns, grams and max_load."""
+    return torch.tensor([-1, ALL_TURNS, 0, NO_LIMIT], device=device).unbind()
 
 
 class _Columns(NamedTuple):
@@ -50,8 +56,8 @@ class Item(_Columns):
     _table: Tensor | None = None  # of which the columns are views
 
     def __new__(cls, x, y, w, d, h, kind=None, turns=None, grams=None, max_load=None):
-        given = zip((kind, turns, grams, max_load), DEFAULTS.values(), strict=True)
-        rest = (torch.full_like(x, default) if part is None else part for part, default in given)
+        given = zip((kind, turns, grams, max_load), _defaults(x.device), strict=True)
+        rest = (default.expand_as(x) if part is None else part for part, default in given)
         return super().__new__(cls, x, y, w, d, h, *rest)
 
     @classmethod
@@ -80,9 +86,9 @@ class Item(_Columns):
         return self.w * self.d * self.h
 
     @property
-    def is_empty(self) -> Tensor:
-        """Whether there is no item, bool."""
-        return self.h <= 0
+    def exists(self) -> Tensor:
+        """Whether there is an item, bool."""
+        return self.h > 0
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Item":
         """Return the items with a function applied to each column."""
@@ -109,8 +115,8 @@ def bin_labels_from_items(items: Item, bin_size: Sequence[int]) -> Tensor:
 
 def _bin_map(items: Item, value: Tensor, bin_size: Sequence[int]) -> Tensor:
     """Return a map of a value of each item on its cells, 0 elsewhere, float32 ``[N, W_B, D_B]``."""
-    inside = rectangle(bin_size, *(part.flatten() for part in items[:4]))  # [W_B, D_B, N * M]
-    maps = inside * value.flatten().float()
+    inside = rectangle(bin_size, *items.flatten()[:4])  # [W_B, D_B, N * M]
+    maps = inside * value.reshape(-1).float()
     if items.x.shape[1] > 1:
         maps = maps.unflatten(2, items.x.shape).sum(3)
     return maps.permute(2, 0, 1).contiguous()

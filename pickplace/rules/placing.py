@@ -31,15 +31,16 @@ def resting_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item
     support is too small. The height below it is that on which it would lie, stable or not; ``FAR`` outside the tote.
     """
     w, d = footprint_sizes(cell, item)
-    count, at_once, kind = len(surface), max(1, len(surface)), OnFootprints
-    if cell.max_side >= LEAST_SIDE:
-        kind, at_once = LargeItems, max(1, MAX_ENTRIES // (len(surface.unique()) * cell.num_places))
-    parts = (slice(start, start + at_once) for start in range(0, max(1, count), at_once))
-    contacts = (kind(cell, surface[part], w[..., part], d[..., part]) for part in parts)
+    if cell.max_side < LEAST_SIDE:
+        contacts: list[OnFootprints] = [OnFootprints(cell, surface, w, d)]
+    else:
+        at_once = max(1, MAX_ENTRIES // (len(surface.unique()) * cell.num_places))
+        parts = zip(surface.split(at_once), w.split(at_once, -1), d.split(at_once, -1), strict=True)
+        contacts = [LargeItems(cell, *part) for part in parts]
     found = [(on.z, cell.support.stable(on)) for on in contacts]
     z, stable = found[0] if len(found) == 1 else (torch.cat(each, -1) for each in zip(*found, strict=True))
     top = z + item.h.to(z.dtype)
-    good = combine(FOOTPRINT, Resting(None, top, tote_height, stable)) & ~item.is_empty
+    good = combine(FOOTPRINT, Resting(None, top, tote_height, stable)) & item.exists
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
 
@@ -51,8 +52,8 @@ def unchecked_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: It
 
 def footprint_sizes(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:
     """Return width and depth of the item's footprint in each parity, int64 ``[Q, 1, 1, N]`` each."""
-    w, d = (torch.stack(pair)[: cell.parities, None, None] for pair in ((item.w, item.d), (item.d, item.w)))
-    return w, d
+    sides = torch.stack([item.w, item.d])[:, None, None]
+    return sides[: cell.parities], sides.flip(0)[: cell.parities]
 
 
 class OnFootprints(Contact):
@@ -78,11 +79,11 @@ class OnFootprints(Contact):
 
     @cached_property
     def surfaces(self):  # type: ignore[override]
-        return windows(self.padded, self.side).flatten(0, 1).unbind(0)
+        return [cells for row in windows(self.padded, self.side).unbind(0) for cells in row.unbind(0)]
 
     @cached_property
     def under(self):  # type: ignore[override]
-        return is_under(self.w, self.d, self.side).unbind(0)
+        return is_under(self.w, self.d, self.side)
 
 
 class LargeItems(OnFootprints):

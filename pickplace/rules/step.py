@@ -44,11 +44,9 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     taken, item, blocked = take_item(cell, items, action)
     picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
-    side, reach = cell.max_side, max(ee_w, ee_d)
-    cells, under = squares(surface, x, y, side), is_under(w, d, side)
-    z = torch.where(under, cells, NEVER).amax(0) >> 1
-    top = z.long() + item.h
-    covered = body_cells(cell.effectors, reach, action.device)  # [side * side, B]
+    contact, index = _contact(cell, surface, x, y, w, d)
+    top, reach = contact.z.long() + item.h, max(ee_w, ee_d)
+    covered = body_cells(cell.effectors, reach, action.device)  # [reach * reach, B]
     if len(cell.effectors) > 1:
         covered = covered[:, rotation % len(cell.effectors)]
     highest = torch.where(covered, squares(surface, left, front, reach), 0).amax(0) >> 1
@@ -59,11 +57,10 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     if cell.limits is not None:
         limits, place = cell.limits.on(action.device), (rotation, *split_action(cell, action)[2:4])
         over = over._replace(lowest=limits.lowest_top[place], highest=limits.highest_top[place])
-    resting = Resting(~item_leaves, top, tote_height, cell.support.stable(Contact(cells, under, z, w, d)))
+    resting = Resting(~item_leaves, top, tote_height, cell.support.stable(contact))
     failure = first_failure(picked, resting, over)
-    footprint = torch.stack([x, y, w, d], -1)
-    after = _add_item(cell, surface, footprint, z, torch.where(failure == 0, item.h, 0))
-    return Step(after, failure, top, footprint, item, taken)
+    after = _add_item(cell, surface, x, y, contact, index, torch.where(failure == 0, item.h, 0))
+    return Step(after, failure, top, torch.stack([x, y, w, d], -1), item, taken)
 
 
 @lru_cache(maxsize=64)
@@ -87,26 +84,40 @@ def put_down(cell: CellSpec, state: State, choice: Tensor) -> tuple[State, Item]
     item = select_item(state.items, taken)
     parity, x, y = split_footprint(cell.tote_size, choice - taken * cell.num_footprints)
     w, d = turned_size(item, parity == 1)
-    under = is_under(w, d, cell.max_side)
-    z = torch.where(under, squares(state.surface, x, y, cell.max_side), NEVER).amax(0) >> 1
-    surface = _add_item(cell, state.surface, torch.stack([x, y, w, d], -1), z, item.h)
+    surface = _add_item(cell, state.surface, x, y, *_contact(cell, state.surface, x, y, w, d), item.h)
     return State(surface, state.tote_height, remove_item(state.items, taken)), item
 
 
-def _add_item(cell: CellSpec, surface: Tensor, footprint: Tensor, z: Tensor, height: Tensor) -> Tensor:
-    """Return the tote with an item in it, int32 ``[N, W_T, D_T]``.
+def _contact(cell: CellSpec, surface: Tensor, x: Tensor, y: Tensor, w: Tensor, d: Tensor) -> tuple[Contact, Tensor]:
+    """Return the supporting cells under items on footprints, and the flat cells of the squares there.
 
     Args:
         surface: int32 ``[N, W_T, D_T]``.
-        footprint: int64 ``[N, 4]``: x, y, w, d.
-        z: the height on which it rests, ``[N]``.
+        x, y, w, d: minimum corner and sides of the footprints, int64 ``[N]``.
+
+    Returns:
+        the contact, with quantities ``[N]``; int64 ``[S * S, N]``, see :func:`~pickplace.rules.maps.square_cells`.
+    """
+    index = square_cells(surface.shape[1:], x, y, cell.max_side)
+    cells, under = surface.flatten(1).t().gather(0, index), is_under(w, d, cell.max_side)
+    return Contact(cells, under, torch.where(under, cells, NEVER).amax(0) >> 1, w, d), index
+
+
+def _add_item(
+    cell: CellSpec, surface: Tensor, x: Tensor, y: Tensor, contact: Contact, index: Tensor, height: Tensor
+) -> Tensor:
+    """Return the tote with an item in it, int32 ``[N, W_T, D_T]``; contact and index as of :func:`_contact`.
+
+    Args:
+        surface: int32 ``[N, W_T, D_T]``.
+        x, y: minimum corner of the footprint, int64 ``[N]``.
         height: of the item, int64 ``[N]``; 0 for no item.
     """
-    (x, y, w, d), side, grid = footprint.unbind(-1), cell.max_side, cell.tote_size[:2]
-    inside = rectangle(grid, x, y, w, d) & (height > 0)
-    after = torch.where(inside, surface_from(z + height), surface.permute(1, 2, 0)).flatten(0, 1)  # [W_T * D_T, N]
+    grid, added = cell.tote_size[:2], height > 0
+    inside = rectangle(grid, x, y, contact.w, contact.d) & added
+    highest = surface_from(contact.z + height)
+    after = torch.where(inside, highest, surface.permute(1, 2, 0)).flatten(0, 1)  # [W_T * D_T, N]
     if cell.support.marks_bearing:
-        cells, under = square_cells(grid, x, y, side), is_under(w, d, side) & (height > 0)
-        bearing = cell.support.bearing(Contact(surface.flatten(1).t().gather(0, cells), under, z, w, d))
-        after.scatter_add_(0, cells, -(under & ~bearing).int())
+        weak = contact.under & added & ~cell.support.bearing(contact)
+        after.scatter_add_(0, index, -weak.int())
     return after.t().unflatten(1, grid).contiguous()

@@ -204,5 +204,5 @@ def test_a_bin_for_one_item_takes_a_shorter_path_to_the_same_result(support):
     (after, placed), (after_two, placed_two) = (
         put_down(cell, each.rows(good), choice) for cell, each in ((lone, state), (two, general))
     )
-    assert same(placed, placed_two) and same(after[:2], after_two[:2]) and after_two.items.is_empty.all()
+    assert same(placed, placed_two) and same(after[:2], after_two[:2]) and not after_two.items.exists.any()
     assert same(after.items, after_two.items.rows(first))

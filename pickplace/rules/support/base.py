@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 
-import torch
 from torch import Tensor
 
 from pickplace.rules.support.contact import Contact, Patches
@@ -23,7 +22,7 @@ class Support(ABC):
 
         ``S`` is the side of the square of cells at each footprint's minimum corner.
         """
-        return torch.stack([*contact.under])
+        return contact.under
 
     def measured(self, patches: Patches) -> Tensor:
         """Return whether an item is stable on a surface that was measured, bool of the shape of ``patches.share``.

@@ -3,9 +3,8 @@
 The *supporting cells* are the cells under the footprint that are as high as the highest of them, and bear weight.
 """
 
-from collections.abc import Iterator, Sequence
-from functools import cached_property
-from typing import TypeAlias
+from collections.abc import Iterator
+from functools import cached_property, reduce
 
 import torch
 from torch import Tensor
@@ -13,15 +12,13 @@ from torch import Tensor
 from pickplace.rules.state import surface_from
 from pickplace.rules.support.hull import extents, hull_patterns
 
-Cells: TypeAlias = Sequence[Tensor] | Tensor  # a tensor for each cell of a square, row by row
-
 
 class Contact:
     """The supporting cells of many items; each quantity is computed when a rule asks for it.
 
     Args:
-        surfaces: for each cell of a square at the footprint's minimum corner its surface, int32, all of one shape.
-        under: whether the item covers that cell, bool, broadcastable.
+        surfaces: of each cell of a square at the footprint's minimum corner, row by row, int32 ``[S * S, ...]``.
+        under: whether the item covers these cells, bool, broadcastable.
         z: the height on which the item rests, int32.
         w, d: the footprint's sides, broadcastable; 0 for no item.
 
@@ -30,7 +27,7 @@ class Contact:
         side: ``S``, of the square.
     """
 
-    def __init__(self, surfaces: Cells, under: Cells, z: Tensor, w: Tensor, d: Tensor):
+    def __init__(self, surfaces: Tensor, under: Tensor, z: Tensor, w: Tensor, d: Tensor):
         self.surfaces, self.under, self.z, self.w, self.d = surfaces, under, z, w, d
         self.supporting, self.side = surface_from(z), round(len(under) ** 0.5)
 
@@ -92,7 +89,7 @@ class Contact:
             supports = supports.int().neg_()
             for bits, (patterns, _) in zip(reached, words, strict=True):
                 bits |= supports & patterns[number]
-        return torch.stack([bits == whole for bits, (_, whole) in zip(reached, words, strict=True)]).all(0)
+        return reduce(torch.bitwise_and, (bits == whole for bits, (_, whole) in zip(reached, words, strict=True)))
 
     def is_centre_in_hull_of_middles(self) -> Tensor:
         """Return whether the item's centre lies in the hull of the middles of the supporting cells, or on its edge.
@@ -118,7 +115,7 @@ class Contact:
 
     def in_hull(self) -> Tensor:
         """Return which cells under the items lie inside the hull of the supporting cells, bool ``[S * S, N]``."""
-        inside, supporting = torch.stack([*self.under]), torch.stack([*self.cells()])
+        inside, supporting = self.under.clone(), (self.surfaces == self.supporting) & self.under
         for along in extents(self.side, inside.device):
             reached = torch.where(supporting, along[:, :, None], along.min() - 1).amax(1, keepdim=True)
             inside &= (along[:, :, None] <= reached).all(0)  # [normals, S * S, N], of which the first is combined
