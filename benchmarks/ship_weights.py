@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from pickplace.common.errors import Parser, one_sentence
 from pickplace.common.files import read_text
 from pickplace.config.allowlist import trusted_config
-from pickplace.config.errors import Parser, one_sentence
 from pickplace.config.registry import build, find
 from pickplace.policies.restore import build_cell
 from pickplace.runs import checkpoint

@@ -4,6 +4,7 @@ import logging
 import os
 import signal
 import sys
+from functools import partial
 from importlib import import_module
 
 # A thread that waits for others sleeps. If it spun, it would hold up those that share its core. OpenMP reads this when
@@ -12,36 +13,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 #: Flags that need no torch.
 HELP = {"--help", "-h", "--hydra-help", "--version"}
-
-
-def train() -> None:
-    """Entry point of ``pickplace-train``, see :mod:`pickplace.training.train`."""
-    _run("pickplace.training.train", config_name="train")
-
-
-def evaluate() -> None:
-    """Entry point of ``pickplace-evaluate``, see :mod:`pickplace.evaluation.evaluate`."""
-    _run("pickplace.evaluation.evaluate", config_name="evaluate")
-
-
-def plan() -> None:
-    """Entry point of ``pickplace-plan``, see :mod:`pickplace.serve.json_lines`."""
-    _run("pickplace.serve.json_lines", "pickplace.robot.planner")
-
-
-def physics() -> None:
-    """Entry point of ``pickplace-physics``, see :mod:`pickplace.physics.command`."""
-    _run("pickplace.physics.command")
-
-
-def export() -> None:
-    """Entry point of ``pickplace-export``, see :mod:`pickplace.policies.export`."""
-    _run("pickplace.policies.export", "pickplace.policies.onnx_model")
-
-
-def serve() -> None:
-    """Entry point of ``pickplace-serve``, see :mod:`pickplace.serve.serve`."""
-    _run("pickplace.serve.serve", "pickplace.robot.planner")
 
 
 def _run(module: str, *needed: str, config_name: str | None = None) -> None:
@@ -78,3 +49,12 @@ def _run(module: str, *needed: str, config_name: str | None = None) -> None:
 
 def _end(*_) -> None:
     os._exit(130)
+
+
+# Entry points of pickplace-train and so on.
+train = partial(_run, "pickplace.training.train", config_name="train")
+evaluate = partial(_run, "pickplace.evaluation.evaluate", config_name="evaluate")
+plan = partial(_run, "pickplace.serve.json_lines", "pickplace.robot.planner")
+physics = partial(_run, "pickplace.physics.command")
+export = partial(_run, "pickplace.policies.export", "pickplace.policies.onnx_model")
+serve = partial(_run, "pickplace.serve.serve", "pickplace.robot.planner")

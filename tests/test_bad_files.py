@@ -18,14 +18,14 @@ from omegaconf import OmegaConf
 
 import pickplace
 from pickplace.algorithms.base import load_optimizer
+from pickplace.common.errors import one_sentence
 from pickplace.common.files import read_file, replaced_file
-from pickplace.config.errors import one_sentence
 from pickplace.evaluation import artifacts, evaluate
 from pickplace.evaluation.result import episode_settings, read_comparison
 from pickplace.items.distributions import Recorded
 from pickplace.rules.observation import ToteDepth
 from pickplace.runs import checkpoint
-from pickplace.runs.folder import changed_values, is_claimed, noted_config_folders, noted_overrides, refuse_links
+from pickplace.runs.folder import changed_values, is_claimed, noted_command, refuse_links
 from pickplace.runs.resume import StopRequest
 from pickplace.serve import json_lines, request
 from pickplace.training import trainer
@@ -84,7 +84,7 @@ def test_a_note_of_hydra_is_never_resolved(tmp_path, note):
     (tmp_path / ".hydra").mkdir()
     for name in ("config", "overrides", "hydra"):
         (tmp_path / ".hydra" / f"{name}.yaml").write_text(NOTES[note])
-    assert noted_overrides(tmp_path) == noted_config_folders(tmp_path) == []
+    assert noted_command(tmp_path) == []
     cfg = composed("experiment=smoke")
     changed = {word.partition("=")[0] for word in changed_values(tmp_path, cfg)}
     assert note != "interpolation" or "seed" not in changed

@@ -10,13 +10,12 @@ from commands import composed
 from omegaconf import OmegaConf
 
 from pickplace import CellSpec, PickPlaceEnv, Planner
+from pickplace.common import errors
 from pickplace.common import validate as checks
 from pickplace.common.validate import excerpt
-from pickplace.config import errors
-from pickplace.config.allowlist import MAX_DEPTH, MAX_NODES, MAX_TEXT, trusted_config
-from pickplace.config.references import saved_form
+from pickplace.config.allowlist import MAX_DEPTH, MAX_NODES, MAX_TEXT, saved_form, trusted_config
 from pickplace.config.registry import build
-from pickplace.evaluation.parts import prepare
+from pickplace.evaluation.evaluate import prepare
 from pickplace.items.distributions import Kinds, Uniform
 from pickplace.planners.mcts import MCTS
 from pickplace.policies.fcn_grasp import network as footprint_fcn

@@ -96,7 +96,9 @@ class MinibatchDescent(Algorithm):
                     parts = {key: value.detach() for key, value in losses.items() if key.startswith("loss_")}
                     floats = {key: value for key, value in {**parts, **part}.items() if value.is_floating_point()}
                     ranges = "; ".join(f"{key} {value_range(value)}" for key, value in floats.items())
-                    raise FloatingPointError(f"the loss or its gradient is not finite: {ranges}.")
+                    raise FloatingPointError(
+                        f"the loss or its gradient is not finite: {ranges}; expected a smaller algo.lr."
+                    )
                 self.optimizer.step()
                 diagnostics = {name: losses[key].detach() for key, name in DIAGNOSTICS.items() if key in losses}
                 history.append({**diagnostics, "grad_norm": norm})

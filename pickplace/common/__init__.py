@@ -1,1 +1,1 @@
-"""Validators, files and the machine; nothing else of pickplace."""
+"""Validators, errors, files and the machine; nothing else of pickplace."""

@@ -69,8 +69,7 @@ def read_table(key: str, path, *headers: str) -> tuple[str, list[tuple[int, list
     header = ",".join(table[0][1]) if table else ""
     rows = [(line, fields) for line, fields in table[1:] if any(fields)]
     if header not in headers:
-        expected = " or ".join(map(repr, headers))
-        raise ValueError(f"{path}: the header is {excerpt(header)}, expected {expected}.")
+        raise ValueError(f"{path}: the header is {excerpt(header)}, expected {' or '.join(map(repr, headers))}.")
     if not rows:
         raise ValueError(f"{path}: no rows, expected at least one below the header.")
     return header, rows
@@ -89,11 +88,10 @@ def replaced_file(path):
     path = Path(path)
     new = path.with_name(f".{path.stem}.new{path.suffix}")
     try:
-        try:
-            new.unlink(missing_ok=True)  # a link, perhaps
-            yield new
-            new.replace(path)
-        finally:
-            new.unlink(missing_ok=True)
+        new.unlink(missing_ok=True)  # a link, perhaps
+        yield new
+        new.replace(path)
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+    finally:
+        new.unlink(missing_ok=True)

@@ -1,5 +1,7 @@
 """The machine that a command runs on: threads and device."""
 
+from contextlib import suppress
+
 import torch
 from loky import cpu_count
 from omegaconf import DictConfig
@@ -23,8 +25,8 @@ def use_threads(key: str, threads: int | None) -> None:
     Raises:
         ValueError: naming the ``key``, for a bad number.
     """
-    default = min(torch.get_num_threads(), cpu_count())
-    torch.set_num_threads(default if threads is None else whole_number(key, threads, most=1024))
+    usable = min(torch.get_num_threads(), cpu_count()) if threads is None else whole_number(key, threads, most=1024)
+    torch.set_num_threads(usable)
 
 
 def usable_device(name: str) -> torch.device:
@@ -33,12 +35,7 @@ def usable_device(name: str) -> torch.device:
     Raises:
         ValueError: if this machine lacks it.
     """
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-        usable = device.type in ("cpu", "cuda")
-    except (RuntimeError, TypeError, AssertionError, ValueError, OverflowError):
-        usable = False
-    if not usable:
-        raise ValueError(f"device={short_text(name)}: expected cpu, or cuda on a machine that has it.")
-    return device
+    with suppress(RuntimeError, TypeError, AssertionError, ValueError, OverflowError):
+        if torch.empty(0, device=name).device.type in ("cpu", "cuda"):
+            return torch.device(name)
+    raise ValueError(f"device={short_text(name)}: expected cpu, or cuda on a machine that has it.")

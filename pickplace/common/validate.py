@@ -40,10 +40,11 @@ def short_text(name) -> str:
     return excerpt(str(name))[1:-1]
 
 
-def expect(good: Any, key: str, value: Any, expected: str) -> None:
-    """Refuse a value that is not good; the message says what was expected."""
+def expect(good: Any, key: str, value: Any, expected: str) -> Any:
+    """Return a value that is good, or refuse it; the message says what was expected."""
     if not good:
         raise ValueError(f"{key}={excerpt(value)}: expected {expected}.")
+    return value
 
 
 def refuse_if(bad: Any, message: str, error: type[ValueError] = ValueError) -> None:
@@ -72,8 +73,7 @@ def is_number(value: Any) -> bool:
 def whole_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:
     """Return ``value`` if it is a whole number in ``[least, most]``."""
     limit = "< 2**63" if most == MAX_COUNT else f"<= {most:,}"
-    expect(is_whole(value) and least <= value <= most, key, value, f"a whole number >= {least} and {limit}")
-    return int(value)
+    return int(expect(is_whole(value) and least <= value <= most, key, value, f"a whole number >= {least} and {limit}"))
 
 
 def whole_numbers(place: str, most: int, **values) -> None:
@@ -95,8 +95,8 @@ def number(key: str, value, least: float = 0.0, most: float | None = None, what:
         what: for the message: a number, or its unit.
     """
     limits = f">= {least:g}" if most is None else f"between {least:g} and {most:g}"
-    expect(is_number(value) and least <= value and (most is None or value <= most), key, value, f"{what} {limits}")
-    return value
+    good = is_number(value) and least <= value and (most is None or value <= most)
+    return expect(good, key, value, f"{what} {limits}")
 
 
 def is_name(value: Any) -> bool:
@@ -106,15 +106,13 @@ def is_name(value: Any) -> bool:
 
 def flag(key: str, value) -> bool:
     """Return ``value`` if it is true or false."""
-    expect(isinstance(value, bool), key, value, "true or false")
-    return value
+    return expect(isinstance(value, bool), key, value, "true or false")
 
 
 def one_of(key: str, value, choices, alternative: str | None = None) -> str:
     """Return ``value`` if it is a text among the choices; the message names an alternative, if there is one."""
     expected = [*map(repr, choices), *([alternative] if alternative else [])]
-    expect(isinstance(value, str) and value in choices, key, value, " or ".join(expected))
-    return value
+    return expect(isinstance(value, str) and value in choices, key, value, " or ".join(expected))
 
 
 def size_tuple(name: str, value, count: int, most: int) -> tuple[int, ...]:
@@ -132,15 +130,13 @@ def size_tuple(name: str, value, count: int, most: int) -> tuple[int, ...]:
 def odd_number(key: str, value, least: int = 1, most: int = 99) -> int:
     """Return ``value`` if it is an odd whole number in ``[least, most]``."""
     good = is_whole(value) and least <= value <= most and value % 2
-    expect(good, key, value, f"an odd number >= {least} and <= {most}")
-    return int(value)
+    return int(expect(good, key, value, f"an odd number >= {least} and <= {most}"))
 
 
 def number_or_null(key: str, value, least: float, most: float) -> float | None:
     """Return ``value`` if it is None or a finite number in ``[least, most]``."""
     good = value is None or (is_number(value) and least <= value <= most)
-    expect(good, key, value, f"a number between {least:g} and {most:g}, or null")
-    return value
+    return expect(good, key, value, f"a number between {least:g} and {most:g}, or null")
 
 
 def or_null(check: Callable[..., Any], key: str, value, *limits) -> Any:

@@ -1,1 +1,1 @@
-"""Configs: registry, composition, allowlist, errors."""
+"""Configs: registry, composition, allowlist; everything that knows Hydra."""

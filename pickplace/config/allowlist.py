@@ -1,17 +1,21 @@
-"""The allowlist: what a checkpoint's config, which may come from a stranger, may make (docs/reliability.md)."""
+"""The config of a checkpoint: what it keeps, and the allowlist of what a stranger's may make (docs/reliability.md)."""
 
 import importlib
 import inspect
 import re
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from copy import deepcopy
+from functools import reduce
 from importlib.metadata import packages_distributions
+from operator import getitem
+from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.common.validate import excerpt
-from pickplace.config.references import children, refusal, refuse_interpolations, select_groups, walk
+from pickplace.common.validate import at_most, excerpt, expect, short_text
 from pickplace.config.registry import names_at, qualified_names
 
 #: Modules that are never a user's own: with their functions a config could do anything.
@@ -28,6 +32,9 @@ POLICY_GROUPS = ("env", "items", "model", "reward_scale", "seed", "device")
 #: Greatest depth and number of nodes of a config, and length of a text in it: more would fill the memory.
 MAX_DEPTH, MAX_NODES, MAX_TEXT = 32, 50_000, 10_000
 
+#: A reference to another key of the same config, and nothing else.
+REFERENCE = re.compile(r"\$\{(\.*)([A-Za-z_]\w*(?:\.\w+)*)\}")
+
 
 def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POLICY_GROUPS) -> DictConfig:
     """Return a checkpoint's config, after checking that it is one of a training and makes nothing unexpected.
@@ -41,9 +48,7 @@ def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POL
     Raises:
         ValueError: naming the key that is missing, or refused.
     """
-    own = own_modules(trust)
-    if groups is None:
-        groups = tuple(content)
+    own, groups = own_modules(trust), tuple(content) if groups is None else groups
     refuse_large_config({key: content[key] for key in groups if key in content})
     content = select_groups(content, groups)
     try:
@@ -53,8 +58,8 @@ def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POL
         refuse_foreign_targets(OmegaConf.to_container(cfg, resolve=True), own)
         missing = [key for key in REQUIRED_KEYS if OmegaConf.select(cfg, key) is None]
     except (OmegaConfBaseException, RecursionError, AttributeError, TypeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"The checkpoint's config cannot be read ({reason}).") from error
+        first = next(iter(str(error).splitlines()), type(error).__name__)
+        raise ValueError(f"The checkpoint's config cannot be read ({first}).") from error
     if missing:
         raise ValueError(f"The checkpoint's config has no {missing[0]}; expected the config of a training.")
     if type(cfg.seed) is not int:
@@ -63,42 +68,28 @@ def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POL
 
 
 def refuse_large_config(content) -> None:
-    """Refuse a config that would fill the memory, before OmegaConf makes an object of each of its nodes.
-
-    Raises:
-        ValueError: naming the limit.
-    """
-    level, count, depth = [content], 1, 0
-    while level:
-        pairs = [pair for node in level for pair in children(node)]
-        count, depth = count + len(pairs), depth + 1
-        longest = max((len(part) for pair in pairs for part in pair if isinstance(part, str)), default=0)
-        for found, most, what in (
-            (count, MAX_NODES, "entries"),
-            (depth, MAX_DEPTH, "levels"),
-            (longest, MAX_TEXT, "characters in a text"),
-        ):
-            if found > most:
-                raise ValueError(f"The checkpoint's config has {found:,} {what} or more; expected at most {most:,}.")
-        level = [value for _, value in pairs]
+    """Refuse a config that would fill the memory, before OmegaConf makes an object of each of its nodes."""
+    for count, (path, value) in enumerate(walk(content), start=1):
+        longest = max((len(part) for part in (*path[-1:], value) if isinstance(part, str)), default=0)
+        at_most("The checkpoint's config has", count, "entries or more", MAX_NODES)
+        at_most("The checkpoint's config has", len(path) + 1, "levels or more", MAX_DEPTH)
+        at_most("The checkpoint's config has", longest, "characters in a text or more", MAX_TEXT)
 
 
 def own_modules(trust) -> tuple[str, ...]:
     """Return the modules that a user trusts, given as ``trust=``: none, a name, or a list of names.
 
-    Raises:
-        ValueError: for anything but names of modules that may be the user's own.
+    A ``ValueError`` refuses anything but names of modules that may be the user's own.
     """
     names = list(trust) if isinstance(trust, (list, tuple, ListConfig)) else [] if trust is None else [trust]
     for name in names:
-        if not _may_be_own(name):
-            raise ValueError(f"trust={excerpt(name)}: expected names of modules of your own, such as trust=my_models.")
+        expect(_may_be_own(name), "trust", name, "names of modules of your own, such as trust=my_models")
     return tuple(names)
 
 
 def _may_be_own(module) -> bool:
-    is_name = isinstance(module, str) and len(module) <= 200 and all(part.isidentifier() for part in module.split("."))
-    return is_name and module.partition(".")[0] not in RESERVED_MODULES
+    parts = module.split(".") if isinstance(module, str) and len(module) <= 200 else [""]
+    return all(map(str.isidentifier, parts)) and parts[0] not in RESERVED_MODULES
 
 
 def refuse_foreign_targets(node, trust: Collection[str] = (), place: str = "", in_own: bool = False) -> None:
@@ -110,9 +101,6 @@ def refuse_foreign_targets(node, trust: Collection[str] = (), place: str = "", i
             are imported to know what that is.
         place: the place of the part in the config.
         in_own: whether it is a part of something that a trusted module defines.
-
-    Raises:
-        ValueError: naming the ``_target_`` and its place.
     """
     if isinstance(node, dict) and "_target_" in node:
         target = node["_target_"]
@@ -155,3 +143,78 @@ def modules_to_trust(config) -> tuple[str, ...]:
     """Return the modules that a reader of this config, resolved, has to trust."""
     modules = {_module(node.get("_target_")) for _, node in walk(config) if isinstance(node, dict)}
     return tuple(sorted(filter(_may_be_own, modules)))
+
+
+# ---------------------------------------------------------------------- references between keys, ${..actor.filters}
+def saved_form(cfg: DictConfig) -> dict:
+    """Return the config of a run as its checkpoints hold it, without ``trust``, which every reader states anew.
+
+    References to values stay, so that an override reaches both keys. Other interpolations are resolved.
+    """
+    raw: Any = OmegaConf.to_container(cfg, resolve=False)
+    saved: Any = OmegaConf.to_container(cfg, resolve=True)
+    for path, value in walk(raw):
+        if _is_reference(value, path, raw):
+            _put(saved, path, value)
+    return {**saved, "trust": []}
+
+
+def refuse_interpolations(root: dict) -> None:
+    """Refuse all interpolations but references to values in the same config, before anything resolves them.
+
+    A resolver reads files and variables, or makes nodes. A reference to a part, or to another reference, could copy
+    parts into parts until the memory is full.
+    """
+    for path, value in walk(root):
+        if isinstance(value, str) and "${" in value and not _is_reference(value, path, root):
+            expected = "no interpolation but a reference to a number, a short text or a short list of such"
+            raise refusal(".".join(map(str, path)), value, expected)
+
+
+def select_groups(content: dict, groups: Collection[str]) -> dict:
+    """Return some groups of a config, in which references to values in other groups are replaced by the values."""
+    selected = deepcopy({key: content[key] for key in groups if key in content})
+    for path, value in list(walk(selected)):
+        if _is_reference(value, path, content) and (target := _target_path(value, path))[0] not in groups:
+            _put(selected, path, reduce(getitem, target, content))
+    return selected
+
+
+def _target_path(text: str, path: tuple) -> tuple:
+    ((dots, keys),) = REFERENCE.findall(text)
+    return (*(path[: -len(dots)] if dots else ()), *keys.split("."))
+
+
+def _is_reference(text, path: tuple, root) -> bool:
+    """Return whether a text at a path is a reference to a number, a short text, or a short list of such."""
+    if isinstance(text, str) and REFERENCE.fullmatch(text) and path[-1] != "_target_":
+        with suppress(KeyError, TypeError):  # a TypeError from a key of a list or of a value
+            found = reduce(getitem, _target_path(text, path), root)
+            values = found if isinstance(found, list) else [found]
+            return len(values) <= 100 and all(map(_is_plain, values))
+    return False
+
+
+def _is_plain(value) -> bool:
+    return not isinstance(value, (dict, list)) and "${" not in str(value) and len(str(value)) <= 1000
+
+
+def _put(root, path: tuple, value) -> None:
+    reduce(getitem, path[:-1], root)[path[-1]] = value
+
+
+def walk(node, path: tuple = ()) -> Iterator[tuple[tuple, Any]]:
+    """Yield the path and the value of a node and of all nodes within it."""
+    yield path, node
+    for key, value in children(node):
+        yield from walk(value, (*path, key))
+
+
+def children(node) -> Iterator[tuple]:
+    """Yield the keys and values of a dict, or the indices and values of a list; nothing for anything else."""
+    yield from node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+
+
+def refusal(key: str, value, expected: str) -> ValueError:
+    """Return the error for a value of a checkpoint's config."""
+    return ValueError(f"{short_text(key)}={excerpt(value)}: the checkpoint is refused; expected {expected}.")

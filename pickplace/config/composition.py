@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable
 from contextlib import nullcontext
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -11,22 +12,25 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import ConfigCompositionException, HydraException
-from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.config.errors import unknown_key
+from pickplace.common.errors import unknown_key
 from pickplace.config.registry import REGISTRY, names_at
 
-#: Groups whose options have plain settings in common, such as ``algo.lr``: what a preset says of these stays.
-SHARED = ("algo", "model")
+#: Groups of which a preset's settings belong to the experiment, whichever option the command line chooses: all of
+#: them, and the plain ones that the option has, too, such as ``algo.lr``.
+KEPT, SHARED = ("env", "evaluation"), ("algo", "model")
+
+#: Sweepers and launchers of Hydra that are optional extras.
+PLUGINS = ("optuna", "joblib", "submitit")
 
 
 def conf_dir() -> Path:
     """Return the folder of the config files: inside the package in a wheel, beside it in a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    inside = package / "conf"
-    return inside if inside.is_dir() else package.parent / "conf"
+    package, checkout = Path(__file__).resolve().parents[1:3]
+    return package / "conf" if (package / "conf").is_dir() else checkout / "conf"
 
 
 def config_files():
@@ -35,8 +39,12 @@ def config_files():
 
 
 def parse(words: Iterable[str]) -> list[Override]:
-    """Return the overrides that are words of a command line."""
-    return OverridesParser.create().parse_overrides(list(words))
+    """Return the overrides that are words of a command line; a ``ValueError`` names a word that is none."""
+    try:
+        return OverridesParser.create().parse_overrides(list(words))
+    except OverrideParseException as error:
+        reasons = [line for line in error.message.splitlines() if not line.startswith(("Error parsing", "See https"))]
+        raise ValueError(f"{error.override!r}: expected <key>=<value> ({' '.join(reasons)}).") from error
 
 
 def compose_plain(config_name: str) -> DictConfig:
@@ -45,14 +53,12 @@ def compose_plain(config_name: str) -> DictConfig:
         return hydra.compose(config_name)
 
 
-# ---------------------------------------------------------------------- the command line
 def merge_search_path(words: list[str], folders: Iterable[str]) -> list[str]:
     """Return words of a command line with all the user's folders of config files in one override, if there are any."""
+    search = _search_words(words)
+    values: list = [override.value() for override in parse(search)]
     paths = [f"file://{Path(folder).absolute()}" for folder in folders]
-    search = [word for word in words if word.lstrip("+").startswith("hydra.searchpath=")]
-    for override in parse(search):
-        value: Any = override.value()
-        paths += value if isinstance(value, list) else [value]
+    paths += [path for value in values for path in (value if isinstance(value, list) else [value])]
     merged = [f"hydra.searchpath=[{','.join(map(quoted, paths))}]"] if paths else []
     return [*merged, *(word for word in words if word not in search)]
 
@@ -63,48 +69,51 @@ def quoted(value) -> str:
 
 
 def compose_first_job(config_name: str, words: list[str]) -> DictConfig:
-    """Return Hydra's merge of a command line, ``hydra`` included; of a sweep, that of the first values.
-
-    Raises:
-        ValueError: naming the key, and what was expected.
-    """
+    """Return Hydra's merge of a command line, ``hydra`` included; of a sweep, that of the first values."""
+    parse(words)  # an error of these names the word
     try:
-        first = [_first_of_sweep(word) for word in parse(words)]
-        return hydra.compose(config_name, [word for word in first if word is not None], return_hydra_config=True)
-    except ConfigCompositionException as error:
+        return hydra.compose(config_name, _first_of_sweep(words), return_hydra_config=True)
+    except HydraException as error:
         raise clearer_error(error, config_name, words) from error
     except (ValueError, TypeError) as error:  # Hydra's own, which names no key
         for word in words:  # a group without an option, allowed for presets only
             group, _, option = word.lstrip("+").partition("=")
-            if option in ("null", "") and (names := _options(group, config_name, _search_words(words))):
+            if option in ("null", "") and (names := _options(group, _search_words(words))):
                 raise ValueError(f"{word}: expected {group}=<one of {', '.join(sorted(names))}>.") from error
         raise ValueError(f"{' '.join(words)}: {error}.") from error
 
 
-def _options(group: str, config_name: str, search: list[str]) -> list[str]:
-    """Return the options of a config group, those in the user's folders too; none if there is no such group."""
-    return GlobalHydra.instance().config_loader().get_group_options(group, config_name=config_name, overrides=search)
+def _options(group: str, search: list[str]) -> list[str]:
+    return GlobalHydra.instance().config_loader().get_group_options(group, overrides=search)
 
 
-def _first_of_sweep(override: Override) -> str | None:
-    """Return an override with the first of its values only; None if these cannot be listed."""
-    if not override.is_sweep_override():
-        return override.input_line
-    values = iter(override.sweep_string_iterator() if override.is_discrete_sweep() else ())
-    return next((f"{override.get_key_element()}={value}" for value in values if isinstance(value, str)), None)
+def _first_of_sweep(words: list[str]) -> list[str]:
+    """Return overrides with the first of their values only, without those whose values cannot be listed."""
+    first = []
+    for override in parse(words):
+        if not override.is_sweep_override():
+            first.append(_line(override))
+        elif override.is_discrete_sweep():
+            first += [f"{override.get_key_element()}={value}" for value in islice(override.sweep_string_iterator(), 1)]
+    return first
 
 
-def clearer_error(error: ConfigCompositionException, config_name: str, words: list[str]) -> Exception:
-    """Return an error that names the key which Hydra could not override, and the keys that there are."""
+def clearer_error(error: HydraException, config_name: str, words: list[str]) -> ValueError:
+    """Return an error that names the key or the option that Hydra does not find, and those that there are."""
+    if isinstance(error, MissingConfigException) and (missing := error.missing_cfg_file):
+        for extra in PLUGINS:
+            if missing.startswith((f"hydra/sweeper/{extra}", f"hydra/launcher/{extra}")):
+                return ValueError(f"{missing}: {extra} is missing; pip install 'pickplace[{extra}]'.")
+        if error.options:
+            return ValueError(f"{missing}: there is no such config; expected one of {', '.join(error.options)}.")
     if not (key := re.match("Could not override '(.*)'", str(error))):
-        return error
-    search = _search_words(words)
-    others = [word for word in words if word.lstrip("+~").partition("=")[0] != key[1] and word not in search]
+        return ValueError(str(error))
+    others = [word for word in words if word.lstrip("+~").partition("=")[0] != key[1]]
     with nullcontext() if GlobalHydra().is_initialized() else config_files():
         try:
-            known = hydra.compose(config_name, [*search, *filter(None, map(_first_of_sweep, parse(others)))])
+            known = hydra.compose(config_name, _first_of_sweep(others))
         except (HydraException, OmegaConfBaseException, ValueError):  # others are wrong, too
-            known = hydra.compose(config_name, search)
+            known = hydra.compose(config_name, _search_words(words))
     return ValueError(unknown_key(key[1], known))
 
 
@@ -112,90 +121,61 @@ def _search_words(words: Iterable[str]) -> list[str]:
     return [word for word in words if word.lstrip("+").startswith("hydra.searchpath=")]
 
 
-def without_hydra(cfg: DictConfig) -> DictConfig:
-    """Return a copy of a config without the group ``hydra``."""
-    cfg = cfg.copy()
-    with read_write(cfg), open_dict(cfg):
-        del cfg["hydra"]
-    return cfg
-
-
 def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> None:
     """Refuse misspelt keys: Hydra adds any key of a preset, or after a ``+``.
 
     Nodes with a ``_target_`` are left to :func:`pickplace.config.registry.build`, which knows their arguments.
-
-    Raises:
-        ValueError: naming the key, and the ones that there are.
     """
-    for key, node in cfg.items():
-        name = path + str(key)
-        if f"{path}*" in REGISTRY:  # a dict of parts with names of the user's choice
-            continue
+    if f"{path}*" in REGISTRY:  # a dict of parts with names of the user's choice
+        return
+    for key, node in ((str(key), node) for key, node in cfg.items()):
         if key not in known:
-            raise ValueError(unknown_key(name, known, path))
+            raise ValueError(unknown_key(f"{path}{key}", known, path))
         if OmegaConf.is_dict(node) and OmegaConf.is_dict(known[key]) and "_target_" not in node:
-            refuse_unknown_keys(node, known[key], f"{name}.")
+            refuse_unknown_keys(node, known[key], f"{path}{key}.")
 
 
-# ---------------------------------------------------------------------- values of replaced options
 def own_values(cfg: DictConfig) -> DictConfig:
     """Return the config of this run, in which an option chosen on the command line has no values of another one.
 
     Hydra merges what a preset, or a config file of the user, wrote for the option that it expected, such as
-    ``curriculum.advance.occupancy`` for ``threshold``, into the option that the command line chose instead. A part with
-    a ``_target_`` gets the values of the chosen option's own files, and the values on the command line, if without
-    that choice it had another option. ``env`` is exempt: its options differ in sizes only, and a preset's sizes belong
-    to the experiment. So do the plain settings that the options of :data:`SHARED` have in common.
+    ``curriculum.advance.occupancy`` for ``threshold``, into the option that the command line chose instead. If the
+    group had another option without that choice, its part gets the values of the chosen option's own files, and the
+    values on the command line, but for :data:`KEPT` and :data:`SHARED`.
     """
     running = HydraConfig.get()
-    search, given = _search_words(running.overrides.hydra), parse(task_overrides(running))
-    choices = [override for override in given if _is_choice(override)]
-    pairs = [(place, choice) for choice in choices if not choice.is_delete() for place in _places(choice, search)]
+    search = _search_words(running.overrides.hydra)
+    given = [(override, *_package_and_places(override, search)) for override in parse(task_overrides())]
+    pairs = [(place, choice) for choice, package, places in given for place in places if package and place not in KEPT]
     for place, choice in sorted(pairs, key=lambda pair: pair[0].count(".")):  # an outer part before its own parts
-        if place == "env" or OmegaConf.select(cfg, place) is None:
-            continue
-        inside = [override for override in given if override is not choice and _is_inside(override, place, search)]
-        others = [str(other.input_line) for other in choices if other is not choice and other not in inside]
-        try:
-            words = [f"+{str(choice.input_line).lstrip('+')}", *map(_added, inside)]
-            own = _part_at(hydra.compose(None, [*search, *words]), place)
-            if own == _part_at(cfg, place):
+        words, others = [], []  # what is changed at that place, and the other choices
+        for each, package, places in given:
+            if each is choice:
                 continue
+            if any(_is_in(other, place) or (not package and _is_in(place, other)) for other in places):
+                words.append(_line(each, "" if package or each.is_delete() else "++"))
+            elif package:
+                others.append(_line(each))
+        try:
+            own = _part_at(hydra.compose(None, [*search, _line(choice, "+"), *words]), place)
             before = hydra.compose(running.job.config_name, [*search, *others], return_hydra_config=True)
         except ConfigCompositionException:  # an option that depends on those of other groups
             continue
-        has_parts = _has_parts(own) or _has_parts(_part_at(before, place))
-        if has_parts and str(before.hydra.runtime.choices.get(_group(choice))) != str(choice.value()):
+        group = choice.get_key_element().lstrip("+~")  # as Hydra lists it, such as planner@warm_start.teacher
+        if str(before.hydra.runtime.choices.get(group)) != str(choice.value()):
             cfg = cfg.copy()
             if place in SHARED:
-                own |= _shared_values(_part_at(cfg, place), own)
+                merged = _part_at(cfg, place)
+                plain = [key for key in own if not isinstance(own[key], dict) and not isinstance(merged[key], dict)]
+                own |= {key: merged[key] for key in plain if key != "_target_"}
             OmegaConf.update(cfg, place, own, merge=False, force_add=True)
     return cfg
 
 
-def _shared_values(merged: dict, own: dict) -> dict:
-    """Return the values of a merged part, other than parts and their names, whose keys an option has, too."""
-    keys = [key for key in own if key in merged and key != "_target_"]
-    return {key: merged[key] for key in keys if not isinstance(own[key], dict) and not isinstance(merged[key], dict)}
-
-
-def correct_note(cfg: DictConfig, noted: DictConfig) -> None:
-    """Write the config of this run over Hydra's note on its merge, if they differ."""
-    notes = HydraConfig.get().output_subdir
-    if notes is not None and cfg != noted:
-        OmegaConf.save(cfg, output_dir() / notes / "config.yaml")
-
-
-def output_dir() -> Path:
-    """Return the folder of the run."""
-    return Path(HydraConfig.get().runtime.output_dir)
-
-
-def task_overrides(hydra_cfg: Any) -> list[str]:
+def task_overrides(hydra_cfg: Any = None) -> list[str]:
     """Return the words of the command line; references in them stay, which lead elsewhere from there."""
-    words: Any = OmegaConf.to_container(hydra_cfg.overrides.task, resolve=False)
-    return list(words)
+    words: Any = OmegaConf.to_container((hydra_cfg or HydraConfig.get()).overrides.task, resolve=False)
+    return words
 
 
 def places_in_other_groups(word: str) -> list[str]:
@@ -205,77 +185,52 @@ def places_in_other_groups(word: str) -> list[str]:
         ValueError: for one that is removed (``~reach``): nothing says what would be there instead.
     """
     (override,) = parse([word])
-    if not _is_choice(override):
+    group = override.key_or_group
+    package, places = _package_and_places(override, _search_words(HydraConfig.get().overrides.hydra))
+    if package is None or override.package or package in ("_global_", group.replace("/", ".")):
         return []
-    own = (override.key_or_group.replace("/", "."), override.package)
-    places = [
-        place for place in _places(override, _search_words(HydraConfig.get().overrides.hydra)) if place not in own
-    ]
-    if places and override.is_delete():
-        group = override.key_or_group
+    if override.is_delete():
         raise ValueError(f"{word}: the checkpoint's {group} can be exchanged, not removed; expected {group}=<option>.")
     return places
 
 
-def _is_choice(override: Override) -> bool:
-    """Return whether an override chooses the option of a group, rather than a value."""
-    group = override.key_or_group
-    is_removed = override.is_delete() and (conf_dir() / group).is_dir()
-    is_listed = group in HydraConfig.get().runtime.choices and not isinstance(override.value(), dict)
-    return bool(override.package or "/" in group or is_listed or is_removed)
+def _package_and_places(override: Override, search: list[str]) -> tuple[str | None, list[str]]:
+    """Return where an override changes the config.
 
-
-def _group(choice: Override) -> str:
-    """Return the group of a choice as Hydra lists it, such as ``planner@warm_start.teacher``."""
-    return choice.get_key_element().lstrip("+~")
-
-
-def _places(choice: Override, search: list[str]) -> list[str]:
-    """Return the places in the config that an option sets: its package, or its keys if that is another group's.
-
-    There are none of a preset, whose package is the whole config. All options of a group have the same package.
+    Returns:
+        The package of the group of which it chooses an option, ``_global_`` for presets; None if it sets a value. And
+        the places: the key of a value, and of an option its package, or its keys there if that is another group's.
     """
-    group, loader = choice.key_or_group, GlobalHydra.instance().config_loader()
-    own = choice.package or group.replace("/", ".")
-    option = next((f"{group}/{name}" for name in loader.get_group_options(group)), "")
-    found = [source for source in loader.get_sources() if option and source.is_config(option)]
-    package = found[0].load_config(option).header.get("package") if found and not choice.package else None
-    if package in (None, own):
-        return [own]
-    if package == "_global_" or choice.is_delete():
-        return [] if package == "_global_" else [f"{package}.{own}"]
-    part = OmegaConf.select(hydra.compose(None, [*search, f"+{str(choice.input_line).lstrip('+')}"]), package)
-    return [f"{package}.{key}" for key in part or ()]
+    group, sources = override.key_or_group, GlobalHydra.instance().config_loader().get_sources()
+    paths = [f"{group}/{name}" for name in _options(group, search)]  # all have the same package
+    if not paths or isinstance(override.value(), (dict, list)):
+        return None, [group]
+    files = (source.load_config(path) for path in paths for source in sources if source.is_config(path))
+    own = override.package or group.replace("/", ".")
+    package: Any = override.package or next((file.header for file in files), {}).get("package") or own
+    if package == "_global_" or override.value() is None:
+        return package, []
+    if package == own:
+        return package, [own]
+    part = _part_at(hydra.compose(None, [*search, _line(override, "+")]), package)
+    return package, [f"{package}.{key}" for key in part or ()]
 
 
-def _is_inside(override: Override, place: str, search: list[str]) -> bool:
-    """Return whether an override changes something at a place."""
-    if _is_choice(override):
-        return any(f"{other}.".startswith(f"{place}.") for other in _places(override, search))
-    key = override.key_or_group
-    return f"{key}.".startswith(f"{place}.") or f"{place}.".startswith(f"{key}.")
+def _is_in(place: str, outer: str) -> bool:
+    return f"{place}.".startswith(f"{outer}.")
 
 
-def _added(override: Override) -> str:
-    """Return an override for a config that may lack its key."""
+def _line(override: Override, prefix: str = "") -> str:
+    """Return an override as a word of the command line; a prefix replaces its own."""
     line = str(override.input_line)
-    return line if _is_choice(override) or override.is_delete() else f"++{line.lstrip('+')}"
+    return f"{prefix}{line.lstrip('+')}" if prefix else line
 
 
 def _part_at(cfg: DictConfig, place: str) -> Any:
-    """Return the part of a config at a place, unresolved; None if there is none."""
-    part: Any = OmegaConf.to_container(cfg, resolve=False)
-    for key in place.split("."):
-        part = part.get(key) if isinstance(part, dict) else None
-    return part
+    part = OmegaConf.select(cfg, place)
+    return OmegaConf.to_container(part, resolve=False) if OmegaConf.is_config(part) else part
 
 
-def _has_parts(node: Any) -> bool:
-    """Return whether a part of a config has a ``_target_``, itself or in its own parts."""
-    return isinstance(node, dict) and ("_target_" in node or any(map(_has_parts, node.values())))
-
-
-# ---------------------------------------------------------------------- saved configs
 def apply_overrides(saved: DictConfig, overrides: list[str], groups: Any = None) -> DictConfig:
     """Return a saved config with command-line overrides on top.
 

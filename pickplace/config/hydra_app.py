@@ -1,26 +1,27 @@
-"""The commands as Hydra applications: their command line, and refusals before anything is written."""
+"""The commands as Hydra applications: command line, refusals before anything is written, and sweeps."""
 
 import argparse
+import hashlib
 import logging
-import os
+import re
 import sys
 from collections.abc import Callable
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import ConfigCompositionException
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from pickplace.common.errors import Parser, one_sentence, sentence, write_output
 from pickplace.config import composition
-from pickplace.config.errors import JobFailed, Parser, one_sentence, sentence, write_output
-from pickplace.config.sweeps import sweep_words
 
 log = logging.getLogger(__name__)
+
+LONGEST_NAME = 150  # letters of the name of a run folder; file systems allow 255 bytes
 
 
 @dataclass
@@ -46,83 +47,70 @@ class Command:
 
         The config of the run, or of the first run of a sweep, is composed and checked before anything is written.
         """
-        with one_sentence(), _errors_raised():
+        with one_sentence():
             words, flags, options = read_command_line(sys.argv[1:])
-            unchecked = tuple(f"{group}." for group in self.from_checkpoint)
-            words = [f"++{word}" if word.startswith(unchecked) else word for word in words]
-            if options.is_about_hydra:
+            words = [f"++{word}" if word.partition(".")[0] in self.from_checkpoint else word for word in words]
+            if options.info or options.hydra_help or options.version or options.shell_completion:
                 return self._start(words, flags)
             with composition.config_files():
                 merged = composition.compose_first_job(self.config_name, words)
                 HydraConfig.instance().set_config(merged)
-                cfg = composition.own_values(composition.without_hydra(merged))
+                keys = [str(key) for key in merged if key != "hydra"]
+                cfg = composition.own_values(OmegaConf.masked_copy(merged, keys))
                 if options.cfg == "job":
                     return show(cfg, options)
                 if not (options.help or options.cfg):
                     self._check(cfg)
-            if options.help or options.cfg or self.folders is None:
+            if options.help or options.cfg:
                 return self._start(words, flags)
-            if options.multirun or merged.hydra.mode == RunMode.MULTIRUN:
-                return self._sweep(merged, words, flags)
-            return self._run(merged, cfg, words, flags)
+            return self._run(merged, words, flags, options.multirun or merged.hydra.mode == RunMode.MULTIRUN)
 
     def _check(self, cfg: DictConfig) -> None:
-        """Refuse a config without a value, or with an unknown key."""
         if missing := OmegaConf.missing_keys(cfg):
             raise ValueError(f"{min(missing)}: no value; expected {min(missing)}=<value>.")
         keys = [str(key) for key in cfg if key not in self.from_checkpoint]
         composition.refuse_unknown_keys(OmegaConf.masked_copy(cfg, keys), hydra.compose(self.config_name))
 
     def _start(self, words: list[str], flags: list[str], app: Callable[[DictConfig], Any] = lambda cfg: None) -> None:
-        """Start Hydra."""
         sys.argv[1:] = [*words, *flags]
         try:
             hydra.main(version_base="1.3", config_path=str(composition.conf_dir()), config_name=self.config_name)(app)()
-        except ConfigCompositionException as error:
+        except HydraException as error:
             raise composition.clearer_error(error, self.config_name, words) from error
 
-    def _run(self, merged: DictConfig, cfg: DictConfig, words: list[str], flags: list[str]) -> None:
-        """Run the task once."""
+    def _run(self, merged: DictConfig, words: list[str], flags: list[str], is_sweep: bool) -> None:
+        """Run the task once, or for each job of a sweep, in a folder that is not in use.
+
+        If one job fails, the others go on. A folder in which nothing was written is removed.
+        """
         errors: list[Exception] = []
 
         def app(hydras: DictConfig) -> Any:
-            try:
-                composition.correct_note(cfg, hydras)
-                return self.task(cfg, composition.output_dir())
-            except Exception as error:  # raised when Hydra has ended, which would print lines of its own
-                return errors.append(error)
-
-        with self._folder(merged, merged.hydra.run.dir) as folder:
-            self._start([*words, f"hydra.run.dir={folder}"], flags, app)
-            if errors:
-                raise errors[0]
-
-    def _sweep(self, merged: DictConfig, words: list[str], flags: list[str]) -> None:
-        """Run the task for each job of a sweep; if one fails, the others go on."""
-
-        def app(hydras: DictConfig) -> Any:
-            run_dir = composition.output_dir()
+            running = HydraConfig.get()
+            run_dir = Path(running.runtime.output_dir)
             try:
                 self.folders.refuse_for_job(run_dir)
                 cfg = composition.own_values(hydras)
                 self._check(cfg)
-                composition.correct_note(cfg, hydras)
+                if running.output_subdir is not None and cfg != hydras:  # correct Hydra's note on its merge
+                    OmegaConf.save(cfg, run_dir / running.output_subdir / "config.yaml")
                 return self.task(cfg, run_dir)
             except Exception as error:
+                if not is_sweep:  # raised when Hydra has ended, which would print lines of its own
+                    return errors.append(error)
                 self.folders.note_failure(run_dir, error)
                 log.error("run %s failed: %s", run_dir.name, sentence(error))
-                raise JobFailed(f"run {run_dir.name}: {sentence(error)}") from error
+                # The error itself may not cross processes.
+                raise ValueError(f"run {run_dir.name}: {sentence(error)}") from error
 
-        with self._folder(merged, merged.hydra.sweep.dir, is_sweep=True) as folder:
-            self._start([*sweep_words(merged, words), *words, f"hydra.sweep.dir={folder}"], flags, app)
-
-    @contextmanager
-    def _folder(self, merged: DictConfig, path: str, is_sweep: bool = False):
-        """Yield the name of a folder for an override, unless it is in use; remove it if nothing is written there."""
+        kind, settings = ("sweep", sweep_words(merged, words)) if is_sweep else ("run", [])
+        path = merged.hydra[kind].dir  # fixed from here on: it may hold the time
         folder, notes, is_done = Path(path), [".hydra", f"{merged.hydra.job.name}.log"], False
         (self.folders.refuse_for_sweep if is_sweep else self.folders.refuse_for_run)(folder, notes)
         try:
-            yield composition.quoted(path)  # fixed: it may hold the time
+            self._start([*settings, *words, f"hydra.{kind}.dir={composition.quoted(path)}"], flags, app)
+            if errors:
+                raise errors[0]
             is_done = True
         except OSError as error:
             if error.filename or error.errno is None:
@@ -142,27 +130,11 @@ class Command:
                     log.error(sentence(error))
 
 
-@contextmanager
-def _errors_raised():
-    """Let Hydra raise errors, which it would print over many lines."""
-    before = os.environ.get("HYDRA_FULL_ERROR")
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    try:
-        yield
-    finally:
-        del os.environ["HYDRA_FULL_ERROR"]
-        if before is not None:
-            os.environ["HYDRA_FULL_ERROR"] = before
-
-
 def read_command_line(arguments: list[str]) -> tuple[list[str], list[str], argparse.Namespace]:
     """Return the overrides of a command line, its flags for Hydra, and the values of these.
 
     Folders of ``--config-dir``, which may be given several times, are among the overrides, as Hydra's search path.
-
-    Raises:
-        UsageError: for an unknown flag.
-        ValueError: for a folder that does not exist.
+    A ``ValueError`` names an unknown flag, or a folder that does not exist.
     """
     parser = Parser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config-dir", "-cd", action="append", default=[])
@@ -175,26 +147,68 @@ def read_command_line(arguments: list[str]) -> tuple[list[str], list[str], argpa
     parser.add_argument("--cfg", "-c", choices=["job", "hydra", "all"])
     parser.add_argument("--package", "-p")
     parser.add_argument("--info", "-i", nargs="?", const="all")
-    for flags in (("--help", "-h"), ("--multirun", "-m"), ("--run", "-r"), ("--resolve",), ("--hydra-help",)):
-        parser.add_argument(*flags, action="store_true")
-    for flags in (("--version",), ("--shell-completion", "-sc")):
-        parser.add_argument(*flags, action="store_true")
+    names = (
+        "--help/-h",
+        "--multirun/-m",
+        "--run/-r",
+        "--resolve",
+        "--hydra-help",
+        "--version",
+        "--shell-completion/-sc",
+    )
+    for flags in names:
+        parser.add_argument(*flags.split("/"), action="store_true")
     options = parser.parse_intermixed_args(rest)
-    options.is_about_hydra = any((options.info, options.hydra_help, options.version, options.shell_completion))
     flags_of_hydra = [word for word in rest if word not in options.words]
     return composition.merge_search_path(options.words, folders.config_dir), flags_of_hydra, options
 
 
 def show(cfg: DictConfig, options: argparse.Namespace) -> None:
-    """Print a config, as Hydra's ``--cfg job`` with ``--package`` and ``--resolve``.
-
-    Raises:
-        ValueError: for a package that is not there.
-    """
+    """Print a config, as Hydra's ``--cfg job`` with ``--package`` and ``--resolve``."""
     if options.resolve:
         OmegaConf.resolve(cfg)
-    part = OmegaConf.select(cfg, options.package) if options.package not in (None, "_global_") else cfg
+    part = cfg if options.package in (None, "_global_") else OmegaConf.select(cfg, options.package)
     if part is None:
         raise ValueError(f"--package {options.package}: there is no such part of the config.")
     header = f"# @package {options.package}\n" if options.package else ""
     write_output(header + (OmegaConf.to_yaml(part) if OmegaConf.is_config(part) else f"{part}\n"))
+
+
+def sweep_words(merged: DictConfig, words: list[str]) -> list[str]:
+    """Return settings of Hydra's for a sweep, as overrides, by its merge of a command line and the command line."""
+    logging.getLogger("alembic").setLevel(logging.WARNING)  # Optuna's database tool logs every migration
+    keys = ",".join(map(composition.quoted, constant_keys(words)))
+    direction = ["hydra.sweeper.direction=maximize"] if "direction" in merged.hydra.sweeper else []  # Optuna's
+    return [f"hydra.job.config.override_dirname.exclude_keys=[{keys}]", *direction]
+
+
+def constant_keys(words: list[str]) -> list[str]:
+    """Return the keys that have the same value in all runs of a sweep's command line, but for the seed."""
+    constant = [each for each in composition.parse(words) if not (each.is_hydra_override() or each.is_sweep_override())]
+    return [key for each in constant if (key := each.get_key_element().lstrip("+~")) != "seed"]
+
+
+def folder_name(overrides: list[str], constant: list[str]) -> str:
+    """Return the name of the folder of a sweep's run: its overrides but for ``constant`` keys, the seed last.
+
+    The name needs no quotes in an override, which takes ``+`` and ``-``, but neither ``=`` nor ``,``. One that leaves
+    out letters, or would be too long, ends in a hash of the overrides.
+    """
+    pairs = sorted((word.lstrip("+~").partition("=")[::2] for word in overrides), key=lambda pair: pair[0] == "seed")
+    pairs = [pair for pair in pairs if pair[0] not in constant] or pairs
+    plain = "+".join(f"{key.replace('/', '.')}-{value}" for key, value in pairs) or "run"
+    name = re.sub(r"[^\w.+-]+", "-", plain, flags=re.ASCII)
+    if name == plain and len(name) <= LONGEST_NAME:
+        return name
+    name = re.sub(r"[-.]*([-+.])[-.]*", r"\1", name)[:LONGEST_NAME]
+    return f"{name}-{hashlib.sha256(plain.encode()).hexdigest()[:8]}".lstrip("-.")
+
+
+def _run_name(_root_: DictConfig) -> str:
+    """Return the name of the folder of a sweep's run; its number where a sampler may draw the same values twice."""
+    cfg = _root_.hydra
+    name = folder_name(composition.task_overrides(cfg), list(cfg.job.config.override_dirname.exclude_keys))
+    return name if cfg.sweeper._target_.endswith(".BasicSweeper") else str(cfg.job.num)
+
+
+OmegaConf.register_new_resolver("run_name", _run_name, replace=True)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pickplace.common.errors import sentence
 from pickplace.common.files import replaced_file
 from pickplace.common.validate import flag, whole_number
-from pickplace.config.errors import sentence
 from pickplace.physics.plans import PLANS, EpisodePlan, to_lines
 from pickplace.rules.cell import CellSpec
 from pickplace.runs.folder import EVALUATION
@@ -60,8 +60,8 @@ class Artifacts:
         """
         texts = {EVALUATION: json.dumps(result, indent=1, default=to_json), "evaluation.md": evaluation_table(result)}
         if self.replay:
-            how = f", carried out by {result['physics']['method']}" if "physics" in result else ""
-            texts["replay.html"] = page(recordings[: self.replay], cell, title + how)
+            title += f", carried out by {result['physics']['method']}" if "physics" in result else ""
+            texts["replay.html"] = page(recordings[: self.replay], cell, title)
         if self.plans:
             texts[PLANS] = to_lines(plans)
         try:
@@ -84,42 +84,35 @@ def to_json(value: Any) -> Any:
 
 def evaluation_table(result: dict) -> str:
     """Return the figures of an ``evaluation.json`` as a Markdown table."""
-    env, failures = result["env"], ", ".join(f"{name} {count}" for name, count in result["failures"].items())
-    rows = {"planner": result["planner"]}
-    rows["tote, rotations"] = f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}"
-    if (count := env.get("bin_items", 1)) > 1:
-        rows["items in the bin"] = f"up to {count}, refill: {env.get('refill', 'each')}"
+    env, physics, paired, latency = result["env"], *map(result.get, ("physics", "paired_difference", "latency_ms"))
+    count, occupancy, trained = env.get("bin_items", 1), result["occupancy"], result.get("trained", {})
     same = ", all of the same items" if result.get("same_items") else ""
-    rows |= {
+    words = {True: "yes", False: "no", None: "unknown"}
+    masks = (result.get(key) for key in ("mask_in_training", "mask_at_decision"))
+    training, decision = (words.get(mask, mask) for mask in masks)
+    rows = {
+        "planner": result["planner"],
+        "tote, rotations": f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}",
+        "items in the bin": count > 1 and f"up to {count}, refill: {env.get('refill', 'each')}",
         "episodes": f"{result['episodes']} of the {result['stream']} stream, seed {result['seed']}{same}",
-        "occupancy": f"{_interval(result['occupancy'], '.4f')}, least {result['occupancy']['min']:.4f}",
+        "occupancy": f"{_interval(occupancy, '.4f')}, least {occupancy['min']:.4f}",
         "items placed": f"{result['items_placed']:.1f} an episode",
-        "episodes ended by": failures,
+        "episodes ended by": ", ".join(f"{name} {count}" for name, count in result["failures"].items()),
         "feasible actions": f"{result['feasible_action_share']:.2%} of all, mean over decisions",
+        f"physics, {physics and physics['method']}": physics
+        and _interval(physics["carried_out"], ".1%", " of the episodes to their end"),
+        "occupancy carried out": physics and _interval(physics["occupancy"], ".4f"),
+        f"minus {paired and paired['against']}": paired and _interval(paired, "+.4f", of=" of the paired difference"),
+        "one decision": latency and f"{latency['p50']:.1f} ms (median), {latency['p95']:.1f} ms (95th percentile)",
+        "checkpoint": result.get("checkpoint")
+        and f"{result['checkpoint']} ({trained['frames']:,} frames, seed {trained['seed']})",
+        "warm start": result.get("warm_start") and f"imitated {result['warm_start']}",
+        "began with weights": result.get("first_weights"),
+        "mask; candidates K": "candidates" in result
+        and f"in training {training}, at decision {decision}; {result['candidates']}",
     }
-    if physics := result.get("physics"):
-        rows[f"physics, {physics['method']}"] = _interval(
-            physics["carried_out"], ".1%", " of the episodes to their end"
-        )
-        rows["occupancy carried out"] = _interval(physics["occupancy"], ".4f")
-    if paired := result.get("paired_difference"):
-        rows[f"minus {paired['against']}"] = _interval(paired, "+.4f", of=" of the paired difference")
-    if latency := result["latency_ms"]:
-        rows["one decision"] = f"{latency['p50']:.1f} ms (median), {latency['p95']:.1f} ms (95th percentile)"
-    if result.get("checkpoint"):
-        trained = result["trained"]
-        rows["checkpoint"] = f"{result['checkpoint']} ({trained['frames']:,} frames, seed {trained['seed']})"
-    if result.get("warm_start"):
-        rows["warm start"] = f"imitated {result['warm_start']}"
-    if result.get("first_weights"):
-        rows["began with weights"] = result["first_weights"]
-    if "candidates" in result:
-        words = {True: "yes", False: "no", None: "unknown"}
-        masks = (result.get(key) for key in ("mask_in_training", "mask_at_decision"))
-        training, decision = (words.get(mask, mask) for mask in masks)
-        rows["mask; candidates K"] = f"in training {training}, at decision {decision}; {result['candidates']}"
     # Names may have letters that end the cell or begin a tag.
-    cells = [[re.sub(r"([|<])", r"\\\1", text) for text in row] for row in rows.items()]
+    cells = [[re.sub(r"([|<])", r"\\\1", text) for text in row] for row in rows.items() if row[1]]
     name, value = (max(map(len, column)) for column in zip(*cells, strict=True))
     head, *lines = [f"| {row[0]:<{name}} | {row[1]:<{value}} |" for row in cells]
     return "\n".join([head, f"|{'-' * (name + 2)}|{'-' * (value + 2)}|", *lines]) + "\n"

@@ -2,14 +2,17 @@
 
 import logging
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf, open_dict
 
-from pickplace.config.allowlist import own_modules
+from pickplace.common.machine import use_machine
+from pickplace.config.allowlist import own_modules, trusted_config
+from pickplace.config.composition import apply_overrides, places_in_other_groups, task_overrides
 from pickplace.config.hydra_app import Command
+from pickplace.config.registry import build
 from pickplace.evaluation.artifacts import Artifacts, evaluation_table
-from pickplace.evaluation.parts import prepare
-from pickplace.evaluation.play import carry_out, decision_latency, play
+from pickplace.evaluation.play import MakeEnv, carry_out, check_episode_settings, check_play, decision_latency, play
 from pickplace.evaluation.result import (
     describe,
     episode_settings,
@@ -21,15 +24,22 @@ from pickplace.evaluation.result import (
 from pickplace.physics.engine import build_engine
 from pickplace.physics.plans import CELL_SIZE
 from pickplace.physics.recorded import plan_of
+from pickplace.planners.base import BatchPlanner
+from pickplace.planners.use import planner_parts
+from pickplace.runs import checkpoint
 from pickplace.runs import folder as run_folders
 from pickplace.runs.folder import claim, refuse_occupied
+from pickplace.runs.provenance import first_steps
 
 log = logging.getLogger(__name__)
+
+#: Config groups that an evaluation takes from the checkpoint.
+TRAINED = ("env", "items", "model")
 
 
 def main() -> None:
     """Entry point of ``pickplace-evaluate``."""
-    Command("evaluate", run, run_folders, from_checkpoint=("env", "items", "model"))()
+    Command("evaluate", run, run_folders, from_checkpoint=TRAINED)()
 
 
 def run(cfg: DictConfig, run_dir: Path) -> float:
@@ -58,8 +68,7 @@ def _evaluate(cfg: DictConfig, run_dir: Path) -> float:
     episodes = play(make_env, planner, ev.episodes, ev.batch_size, range(recorded), range(artifacts.replay))
     result = describe(planner, facts | settings, episodes)
     result["latency_ms"] = decision_latency(make_env, planner, ev.latency_decisions)
-    size = engine.cell_size if engine else CELL_SIZE
-    plans = [plan_of(recording, cell, size) for recording in episodes.recordings]
+    plans = [plan_of(each, cell, engine.cell_size if engine else CELL_SIZE) for each in episodes.recordings]
     if engine:
         outcomes = carry_out(engine, plans, episodes.recordings[: artifacts.replay])
         result["physics"] = summarise_physics(engine, resolved(cfg.physics), outcomes)
@@ -71,3 +80,79 @@ def _evaluate(cfg: DictConfig, run_dir: Path) -> float:
     artifacts.write(run_dir, result, cell, episodes.recordings, plans, title)
     log.info("run folder: %s", run_dir)
     return result["occupancy"]["mean"]
+
+
+def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
+    """Return what a config evaluates (``conf/evaluate.yaml``): the environment's maker, the planner, and facts.
+
+    The groups that a checkpoint brings are put into ``cfg``.
+
+    Raises:
+        ValueError: for settings that make no sense, or a checkpoint that does not fit them.
+    """
+    ev = cfg.evaluation
+    check_episode_settings(ev)
+    if "model" in cfg and cfg.checkpoint is None:
+        raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
+    own_modules(cfg.trust)
+    use_machine(cfg)
+    settings = {key: value for key, value in resolved(cfg.planner).items() if key != "_target_"}
+    facts: dict[str, Any] = {"planner_settings": settings, "checkpoint": None}
+    trained, about = load_trained(cfg) if cfg.checkpoint is not None else (None, {})
+    facts |= about
+    items = build("items", cfg["items"])
+    if not items.varies:
+        facts["same_items"] = True
+        if ev.episodes > 1:
+            log.warning("All episodes have the same items: the interval says nothing about other items.")
+
+    def make_env(first, count):
+        return build(
+            "env", {**resolved(cfg.env), "num_envs": count}, items=items, device=cfg.device, masks=(),
+            stream=ev.stream, seed=ev.seed, first_episode=first,
+        )  # fmt: skip
+
+    probe = make_env(0, 1)
+    check_play(ev, probe.cell, cfg.device)
+    planner = build("planner", cfg.planner, **planner_parts(cfg.planner, probe.cell, items, probe.terms, trained))
+    if not isinstance(planner, BatchPlanner) or not isinstance(planner.name, str):  # now, not after all episodes
+        raise ValueError(f"planner: {type(planner).__name__} has no name; expected an attribute name, a string.")
+    if hasattr(planner, "evaluation_facts"):
+        facts |= planner.evaluation_facts()
+    return make_env, planner, facts
+
+
+def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[str, Any]]:
+    """Return the parts of a checkpoint as :func:`planner_parts` wants them, and facts about its training.
+
+    The checkpoint's groups :data:`TRAINED` are put into ``cfg``, with the command line's overrides on top.
+
+    Raises:
+        ValueError: for a checkpoint that cannot be read, or overrides that do not fit it.
+    """
+    folder = checkpoint.locate(str(cfg.checkpoint))
+    state, saved = checkpoint.read(folder)
+    trained = trusted_config(saved["config"], cfg.trust)
+    groups = OmegaConf.create({key: resolved(cfg[key]) for key in ("env", "items")})
+    ours, changed = [], trained.copy()
+    for word in task_overrides():
+        key, _, option = word.lstrip("+~").partition("=")
+        if key == "benchmark":
+            ours += ["env=benchmark", "items=benchmark"] if option not in ("", "null") else []
+        elif places := places_in_other_groups(word):
+            for place in places:  # such as env.reach
+                OmegaConf.update(changed, place, OmegaConf.select(groups, place), merge=False, force_add=True)
+        elif key.split(".")[0] in TRAINED:
+            ours.append(word)
+    merged = apply_overrides(changed, ours, groups)
+    with open_dict(cfg):
+        for group in TRAINED:  # resolved where they come from: here a reference could lead elsewhere
+            cfg[group] = resolved(merged[group])
+        cfg.reward_scale = merged.reward_scale  # the scale of the critic's values
+    facts = {
+        "checkpoint": str(folder),
+        "trained": {"frames": saved["frames"], "seed": merged.seed, "commit": saved["commit"]},
+        "mask_in_training": merged.model.mask_infeasible,
+        **first_steps(saved["config"]),
+    }
+    return (cfg, state, resolved(trained.env)), facts

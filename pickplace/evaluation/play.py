@@ -32,9 +32,6 @@ MakeEnv = Callable[[int, int], PickPlaceEnv]
 #: Greatest number of episodes, or of decisions that are timed.
 MAX_EPISODES = 1_000_000
 
-#: The tensors of :class:`Episodes`.
-RESULTS = ("occupancy", "items_placed", "failure", "final_heights", "tote_height")
-
 
 @dataclass
 class Episodes:
@@ -47,7 +44,6 @@ class Episodes:
     tote_height: Tensor  # int64 [E]
     feasible_share: float  # mean share of the N_a actions that were feasible, over all decisions
     decisions: int  # over all episodes
-    seconds: float  # spent in the planner
     recordings: list[Recording] = field(default_factory=list)  # of the episodes that were to be recorded
 
 
@@ -65,8 +61,11 @@ class _Batch:
         self.running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
         self.observation = env.reset()
         self.results = {"tote_height": env.tote_height.clone()}  # entries of Episodes, of the slots that have ended
-        heights = enumerate(env.tote_height.tolist())
-        self.recordings = {slot: Recording(first + slot, high) for slot, high in heights if first + slot in record}
+        self.recordings = {
+            slot: Recording(first + slot, height)
+            for slot, height in enumerate(env.tote_height.tolist())
+            if first + slot in record
+        }
 
     def feasible_shares(self) -> float:
         """Return the share of the ``N_a`` actions that are feasible, summed over the running episodes."""
@@ -76,15 +75,14 @@ class _Batch:
 
     def record(self, planner: BatchPlanner, action: Tensor) -> None:
         """Add the moves that the actions are about to make to the recordings of running episodes."""
-        running = [slot for slot in self.recordings if self.running[slot]]
-        for with_heat in (True, False):
-            slots = [slot for slot in running if (self.recordings[slot].episode in self.heat_maps) == with_heat]
+        running = {slot: recording for slot, recording in self.recordings.items() if self.running[slot]}
+        for decided in (planner, None):  # with and without heat maps
+            slots = [slot for slot in running if (running[slot].episode in self.heat_maps) == (decided is not None)]
             if slots:
                 state = self.env.state.rows(slots)
-                decided = planner if with_heat else None
                 moves = record_moves(self.env.cell, decided, self.observation[slots], state, action[slots])
                 for slot, move in zip(slots, moves, strict=True):
-                    self.recordings[slot].moves.append(move)
+                    running[slot].moves.append(move)
 
     def step(self, action: Tensor) -> None:
         """Step the environment, and keep the results of the episodes that end.
@@ -154,7 +152,7 @@ def play(
         heat_maps: those of them to record with the planner's heat maps, which take time; None: all.
     """
     heat_maps = record if heat_maps is None else heat_maps
-    feasible, decisions, seconds = 0.0, 0, 0.0
+    feasible, decisions = 0.0, 0
     parts: list[dict[str, Tensor]] = []
     recordings: list[Recording] = []
     for first in range(0, episodes, batch_size):
@@ -162,16 +160,16 @@ def play(
         while batch.running.any():
             feasible += batch.feasible_shares()
             decisions += int(batch.running.sum())
-            start = time.perf_counter()
             action = decide(planner, batch.env.cell, batch.observation)
-            seconds += time.perf_counter() - start
             batch.record(planner, action)
             batch.step(action)
         parts.append(batch.results)
         recordings += batch.recordings.values()
-    results = {name: torch.cat([part[name] for part in parts]).cpu() for name in RESULTS}
     return Episodes(
-        **results, feasible_share=feasible / decisions, decisions=decisions, seconds=seconds, recordings=recordings
+        **{name: torch.cat([part[name] for part in parts]).cpu() for name in parts[0]},
+        feasible_share=feasible / decisions,
+        decisions=decisions,
+        recordings=recordings,
     )
 
 
@@ -185,19 +183,18 @@ def decision_latency(make_env: MakeEnv, planner: BatchPlanner, decisions: int) -
     if decisions < 1:
         return None
     env = make_env(0, 1)
-    observation, times, cpu_times = env.reset(), [], []
+    observation, times = env.reset(), []
     decide(planner, env.cell, observation)  # warm up
     for _ in range(decisions):
         start, cpu_start = time.perf_counter(), time.process_time()
         action = decide(planner, env.cell, observation)
         if action.device.type == "cuda":  # where a call returns before its work is done
             torch.cuda.synchronize(action.device)
-        times.append((time.perf_counter() - start) * 1e3)
-        cpu_times.append((time.process_time() - cpu_start) * 1e3)
+        times.append(((time.perf_counter() - start) * 1e3, (time.process_time() - cpu_start) * 1e3))
         _, observation = env.step_and_maybe_reset(observation.set("action", action))
-    wall, cpu = torch.tensor([times, cpu_times], dtype=torch.float64)
-    quantiles = {"p50": wall.quantile(0.5), "p95": wall.quantile(0.95), "cpu_p50": cpu.quantile(0.5)}
-    return {key: float(value) for key, value in {**quantiles, "cpu_mean": cpu.mean()}.items()}
+    wall, cpu = torch.tensor(times, dtype=torch.float64).T
+    figures = {"p50": wall.quantile(0.5), "p95": wall.quantile(0.95), "cpu_p50": cpu.quantile(0.5)}
+    return {key: float(value) for key, value in {**figures, "cpu_mean": cpu.mean()}.items()}
 
 
 def carry_out(engine: Engine, plans: Sequence[EpisodePlan], recordings: Sequence[Recording]) -> list[Outcome]:

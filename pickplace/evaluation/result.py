@@ -51,30 +51,23 @@ def describe(planner: BatchPlanner, facts: dict, episodes: Episodes) -> dict:
         facts: about the planner and its checkpoint, and :func:`episode_settings`.
         episodes: the results.
     """
+    occupancy = episodes.occupancy
+    reasons = Counter(Failure(code).name.lower() for code in episodes.failure.tolist())
     return {
         "planner": planner.name,
         **facts,
-        **summarise(episodes),
+        "occupancy": {
+            "mean": float(occupancy.mean()),
+            "ci95": list(confidence95(occupancy)),
+            "min": float(occupancy.min()),
+            "per_episode": occupancy.tolist(),
+        },
+        "items_placed": float(episodes.items_placed.double().mean()),
+        "failures": dict(sorted(reasons.items())),
+        "feasible_action_share": episodes.feasible_share,
         **(planner.statistics() if hasattr(planner, "statistics") else {}),
         "versions": versions(),
         "commit": commit(),
-    }
-
-
-def summarise(result: Episodes) -> dict:
-    """Return the figures of ``evaluation.json`` that come from the episodes."""
-    low, high = confidence95(result.occupancy)
-    reasons = Counter(Failure(code).name.lower() for code in result.failure.tolist())
-    return {
-        "occupancy": {
-            "mean": float(result.occupancy.mean()),
-            "ci95": [low, high],
-            "min": float(result.occupancy.min()),
-            "per_episode": result.occupancy.tolist(),
-        },
-        "items_placed": float(result.items_placed.double().mean()),
-        "failures": dict(sorted(reasons.items())),
-        "feasible_action_share": result.feasible_share,
     }
 
 
@@ -88,11 +81,10 @@ def summarise_physics(engine: Engine, settings: dict, outcomes: Sequence[Outcome
     """
     occupancy = torch.tensor([outcome.occupancy for outcome in outcomes], dtype=torch.float64)
     done = torch.tensor([outcome.ending == "done" for outcome in outcomes])
-    low, high = proportion95(int(done.sum()), len(done))
     return {
         "method": engine.name,
         "settings": {key: value for key, value in settings.items() if key != "_target_"},
-        "carried_out": {"mean": float(done.double().mean()), "ci95": [low, high]},
+        "carried_out": {"mean": float(done.double().mean()), "ci95": list(proportion95(int(done.sum()), len(done)))},
         "occupancy": {
             "mean": float(occupancy.mean()),
             "ci95": list(confidence95(occupancy)),
@@ -123,12 +115,8 @@ def paired_difference(result: dict, other: dict) -> dict:
         result, other: the contents of two ``evaluation.json``.
     """
     ours, theirs = (torch.tensor(r["occupancy"]["per_episode"], dtype=torch.float64) for r in (result, other))
-    difference = ours - theirs
-    return {
-        "against": other["planner"],
-        "mean": float(difference.mean()),
-        "ci95": list(confidence95(difference, least=-1.0)),
-    }
+    interval = confidence95(ours - theirs, least=-1.0)
+    return {"against": other["planner"], "mean": float((ours - theirs).mean()), "ci95": list(interval)}
 
 
 def episode_settings(cfg: DictConfig) -> dict:
@@ -181,21 +169,17 @@ def read_comparison(path: Path, expected: dict, trust: Collection[str] = ()) -> 
     if isinstance(items, dict) and items.get("_target_") == expected["items"]["_target_"]:
         expected, other = ({**each, "items": with_defaults("items", each["items"])} for each in (expected, other))
     for key in ("stream", "seed", "episodes", "items"):
-        if not is_same(expected[key], other.get(key)):
-            found = excerpt(other.get(key))
-            raise ValueError(f"compare={excerpt(str(path))}: its {key} is {found}, expected {excerpt(expected[key])}.")
+        if not is_same(ours := expected[key], theirs := other.get(key)):
+            raise ValueError(f"compare={excerpt(str(path))}: its {key} is {excerpt(theirs)}, expected {excerpt(ours)}.")
     cell = build_cell(expected["env"], reach=None)
     try:
         refuse_foreign_targets(env, trust, "env")
         other_cell = build_cell(env, reach=None)  # what is missing has its default
     except ValueError as error:
         raise ValueError(f"{refused} ({error})") from error
-    different = [*differences(cell_settings(cell), cell_settings(other_cell), "env")]
-    reach, other_reach = expected["env"].get("reach"), env.get("reach")
-    if not is_same(reach, other_reach):
-        different.append(("env.reach", reach, other_reach))
-    for key, ours, theirs in different:
-        if key != "env.refill" or cell.bin_items > 1:
+    reaches = ("env.reach", expected["env"].get("reach"), env.get("reach"))
+    for key, ours, theirs in (*differences(cell_settings(cell), cell_settings(other_cell), "env"), reaches):
+        if not is_same(ours, theirs) and (key != "env.refill" or cell.bin_items > 1):
             raise ValueError(f"compare={excerpt(str(path))}: {key}={excerpt(theirs)}, expected {ours}.")
     count = expected["episodes"]
     if not isinstance(values, list) or len(values) != count or not all(is_number(v) and 0 <= v <= 1 for v in values):

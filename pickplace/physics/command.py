@@ -3,7 +3,7 @@
 import argparse
 import json
 
-from pickplace.config.errors import Parser, one_sentence, write_output
+from pickplace.common.errors import Parser, one_sentence, write_output
 
 
 def main() -> None:

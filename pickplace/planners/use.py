@@ -7,7 +7,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from pickplace.config.errors import sentence
+from pickplace.common.errors import sentence
 from pickplace.config.registry import find
 from pickplace.items.distributions import ItemDistribution
 from pickplace.planners.base import BatchPlanner

@@ -2,7 +2,7 @@
 
 import argparse
 
-from pickplace.config.errors import Parser, one_sentence, write_output
+from pickplace.common.errors import Parser, one_sentence, write_output
 
 
 def main() -> None:

@@ -11,8 +11,9 @@ import os
 import shutil
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError
@@ -20,7 +21,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from pickplace.common.files import read_file
-from pickplace.common.validate import excerpt
+from pickplace.common.validate import excerpt, is_whole
 
 SCHEMA = 1
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"  # weights that the package ships
@@ -47,17 +48,14 @@ def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> No
     Raises:
         CheckpointError: if it cannot be written; the older one is whole, and nothing half-written stays.
     """
-    folder = Path(folder)
     new, old = folder.with_name(f".{folder.name}.new"), folder.with_name(f".{folder.name}.old")
     tensors, rest = flatten(state)
     blob = save(tensors)
-    digest = hashlib.sha256(blob).hexdigest()
-    text = json.dumps({"schema": SCHEMA, "sha256": digest, **facts, "state": rest}, indent=1)
-    contents = {TENSORS: blob, FACTS: text.encode()}
-    if large := [name for name, content in contents.items() if len(content) > MAX_BYTES[name]]:
-        raise CheckpointError(
-            f"{folder}: {large[0]} has more than {MAX_BYTES[large[0]]:,} bytes; nobody could read it."
-        )
+    facts = {"schema": SCHEMA, "sha256": hashlib.sha256(blob).hexdigest(), **facts, "state": rest}
+    contents = {TENSORS: blob, FACTS: json.dumps(facts, indent=1).encode()}
+    for name, content in contents.items():
+        if len(content) > (most := MAX_BYTES[name]):
+            raise CheckpointError(f"{folder}: {name} has more than {most:,} bytes; nobody could read it.")
     shutil.rmtree(new, ignore_errors=True)
     try:
         new.mkdir(parents=True)
@@ -73,9 +71,8 @@ def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> No
             folder.rename(old)  # locate() finds it there if the process is killed now
         new.rename(folder)
         if keep is not None and old.exists():
-            kept = folder.with_name(keep)
-            shutil.rmtree(kept, ignore_errors=True)
-            old.rename(kept)
+            shutil.rmtree(folder.with_name(keep), ignore_errors=True)
+            old.rename(folder.with_name(keep))
     except OSError as error:
         shutil.rmtree(new, ignore_errors=True)
         raise CheckpointError(f"{folder}: the checkpoint cannot be written ({error}).") from error
@@ -84,17 +81,15 @@ def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> No
 
 def flatten(tree, prefix: str = "") -> tuple[dict[str, Tensor], dict]:
     """Split nested dicts and lists into tensors by path, and plain values by path."""
-    tensors, facts = {}, {}
+    tensors: dict[str, Tensor] = {}
+    facts: dict = {}
     for key, value in enumerate(tree) if isinstance(tree, (list, tuple)) else tree.items():
         path = f"{prefix}{key}"
         if isinstance(value, Tensor):
             tensors[path] = value.detach().cpu().contiguous().clone()  # safetensors refuses tensors that share memory
-        elif isinstance(value, (dict, list, tuple)):
-            more_tensors, more_facts = flatten(value, path + "|")
-            tensors.update(more_tensors)
-            facts.update(more_facts)
-            if not value:
-                facts[path] = {} if isinstance(value, dict) else []
+        elif isinstance(value, (dict, list, tuple)) and value:
+            for found, more in zip((tensors, facts), flatten(value, path + "|"), strict=True):
+                found.update(more)
         else:
             facts[path] = value
     return tensors, facts
@@ -133,23 +128,24 @@ def locate(path, prefer: str = "best", key: str | None = None) -> Path:
     key = key or ("resume" if prefer == "last" else "checkpoint")
     parts = Path(path).parts
     if len(parts) == 2 and parts[0] == "pretrained" and not Path(path).exists():
-        if not (PRETRAINED / parts[1] / FACTS).is_file():
-            names = ", ".join(f"pretrained/{folder.parent.name}" for folder in sorted(PRETRAINED.glob(f"*/{FACTS}")))
-            raise CheckpointError(f"{key}={str(path)!r}: the package ships no such weights; expected {names}.")
-        return PRETRAINED / parts[1]
+        shipped = {facts.parent.name: facts.parent for facts in sorted(PRETRAINED.glob(f"*/{FACTS}"))}
+        if parts[1] in shipped:
+            return shipped[parts[1]]
+        names = ", ".join(f"pretrained/{name}" for name in shipped)
+        raise CheckpointError(f"{key}={str(path)!r}: the package ships no such weights; expected {names}.")
     path = Path(path).absolute()
-    preferred = ("last", "best") if prefer == "last" else (prefer,)
-    for folder in (*(path / "checkpoints" / name for name in preferred), path):
+    saved, preferred = path / "checkpoints", ("last", "best") if prefer == "last" else (prefer,)
+    for folder in (*map(saved.joinpath, preferred), path):
         for candidate in (folder, folder.with_name(f".{folder.name}.old")):
             if (candidate / FACTS).is_file():
                 return candidate
-    for other in (path / "checkpoints" / name for name in ("last", PREVIOUS)):
-        if (other / FACTS).is_file():
-            raise CheckpointError(f"{key}={str(path)!r}: no {prefer} checkpoint there; expected {key}={other}.")
-    raise CheckpointError(
-        f"{key}={str(path)!r}: no checkpoint there; expected a run folder, or one of its checkpoints: best, last or "
-        "previous."
+    others = [saved / name for name in ("last", PREVIOUS) if (saved / name / FACTS).is_file()]
+    missing = (
+        f"no {prefer} checkpoint there; expected {key}={others[0]}."
+        if others
+        else ("no checkpoint there; expected a run folder, or one of its checkpoints: best, last or previous.")
     )
+    raise CheckpointError(f"{key}={str(path)!r}: {missing}")
 
 
 def read_facts(path, prefer: str = "best") -> dict:
@@ -158,8 +154,12 @@ def read_facts(path, prefer: str = "best") -> dict:
         facts = json.loads(read_file(locate(path, prefer) / FACTS, MAX_BYTES[FACTS]))
     except (CheckpointError, OSError, ValueError, RecursionError):
         return {}
-    usable = isinstance(facts, dict) and isinstance(facts.get("frames"), int) and isinstance(facts.get("config"), dict)
-    return facts if usable else {}
+    return facts if _are_facts(facts) else {}
+
+
+def _are_facts(facts) -> bool:
+    frames: Any = facts.get("frames") if isinstance(facts, dict) else None
+    return is_whole(frames) and 0 <= frames < 2**63 and isinstance(facts.get("config"), dict)
 
 
 def read(folder: Path) -> tuple[dict, dict]:
@@ -169,32 +169,21 @@ def read(folder: Path) -> tuple[dict, dict]:
         CheckpointError: if a file is missing, truncated or altered, or of another schema; the sentence names the
             newest whole checkpoint beside it, if there is one.
     """
-    folder = Path(folder)
+    before = _identity(folder)
     try:
-        return _read_while_replaced(folder)
+        return _read(folder)
     except CheckpointError as error:
+        time.sleep(0.01)  # between the renames the folder is missing
+        if _identity(folder) != before:  # a training replaced it between the reading of its two files
+            return read(folder)
         whole = []
         for name in (PREVIOUS, "last", "best") if folder.parent.name == "checkpoints" else ():
-            try:
+            with suppress(CheckpointError):
                 whole.append((_read(folder.with_name(name))[1]["frames"], folder.with_name(name)))
-            except CheckpointError:
-                continue
         if not whole:
             raise
         frames, other = max(whole)
         raise CheckpointError(f"{error} {other}, at {frames:,} frames, is whole.") from error
-
-
-def _read_while_replaced(folder: Path) -> tuple[dict, dict]:
-    """Read a checkpoint, again if a training replaced it between the reading of its two files."""
-    while True:
-        before = _identity(folder)
-        try:
-            return _read(folder)
-        except CheckpointError:
-            time.sleep(0.01)  # between the renames the folder is missing
-            if _identity(folder) == before:
-                raise
 
 
 def _identity(folder: Path) -> list[tuple[int, int]] | None:
@@ -207,15 +196,24 @@ def _identity(folder: Path) -> list[tuple[int, int]] | None:
 
 
 def _read(folder: Path) -> tuple[dict, dict]:
-    facts, blob = _read_files(folder)
+    """Read a checkpoint's two files, and compare schema and checksum."""
+    try:
+        content, blob = (read_file(folder / name, MAX_BYTES[name], links=False) for name in (FACTS, TENSORS))
+        facts = json.loads(content)
+    except (OSError, ValueError, RecursionError) as error:  # a RecursionError from deeply nested JSON
+        raise CheckpointError(f"{folder}: the checkpoint cannot be read ({error}).") from error
+    found = facts.get("schema") if isinstance(facts, dict) else None
+    if found != SCHEMA:
+        raise CheckpointError(f"{folder}: schema {excerpt(found)}, expected {SCHEMA}; another version wrote it.")
+    if hashlib.sha256(blob).hexdigest() != facts.get("sha256"):
+        raise CheckpointError(f"{folder}: {TENSORS} is truncated or altered, its checksum does not match {FACTS}.")
     try:
         tensors = load(blob)
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:  # unknown types, absurd sizes
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CheckpointError(f"{folder}: {TENSORS} cannot be read ({reason}).") from error
-    state, frames = facts.pop("state", None), facts.get("frames")
-    is_count = isinstance(frames, int) and not isinstance(frames, bool) and 0 <= frames < 2**63
-    if not isinstance(state, dict) or not isinstance(facts.get("config"), dict) or not is_count:
+        first = next(iter(str(error).splitlines()), type(error).__name__)
+        raise CheckpointError(f"{folder}: {TENSORS} cannot be read ({first}).") from error
+    state = facts.pop("state", None)
+    if not isinstance(state, dict) or not _are_facts(facts):
         raise CheckpointError(f"{folder}: {FACTS} lacks its state, config or frames; expected what a training wrote.")
     try:
         state = unflatten(tensors, state)
@@ -224,21 +222,6 @@ def _read(folder: Path) -> tuple[dict, dict]:
     if not isinstance(state.get("policy"), dict):
         raise CheckpointError(f"{folder}: {TENSORS} has no policy; expected what a training wrote.")
     return state, facts
-
-
-def _read_files(folder: Path) -> tuple[dict, bytes]:
-    """Read the facts and the bytes of the tensors, and compare schema and checksum."""
-    try:
-        content, blob = (read_file(folder / name, MAX_BYTES[name], links=False) for name in (FACTS, TENSORS))
-        facts = json.loads(content)
-    except (OSError, ValueError, RecursionError) as error:  # a RecursionError from deeply nested JSON
-        raise CheckpointError(f"{folder}: the checkpoint cannot be read ({error}).") from error
-    if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
-        found = facts.get("schema") if isinstance(facts, dict) else None
-        raise CheckpointError(f"{folder}: schema {excerpt(found)}, expected {SCHEMA}; another version wrote it.")
-    if hashlib.sha256(blob).hexdigest() != facts.get("sha256"):
-        raise CheckpointError(f"{folder}: {TENSORS} is truncated or altered, its checksum does not match {FACTS}.")
-    return facts, blob
 
 
 def restore(make: Callable[[], Module], state: dict, what: str) -> Module:
@@ -271,25 +254,24 @@ def matching_state(saved, own: dict, what: str, path: str = "") -> dict:
     Raises:
         CheckpointError: naming the first value that is missing, of another type or shape, or not finite.
     """
-    found: dict = {}
+    found = {}
     for key, expected in own.items():
         value, name = saved.get(key) if isinstance(saved, dict) else None, f"{path}{key}"
         if key == "cuda_rng" and value is None:  # saved without a GPU
             continue
         if isinstance(expected, dict):
-            found[key] = matching_state(value, expected, what, f"{name}|")
-            continue
-        if (kind := _kind(value)) != _kind(expected):
-            words = f"{name} is {kind}, expected {_kind(expected)}"
-            raise CheckpointError(f"The checkpoint's {what} does not fit these settings: {words}.")
-        if isinstance(value, Tensor) and not value.isfinite().all():
+            value = matching_state(value, expected, what, f"{name}|")
+        elif (kind := _kind(value)) != (wanted := _kind(expected)):
+            raise CheckpointError(
+                f"The checkpoint's {what} does not fit these settings: {name} is {kind}, expected {wanted}."
+            )
+        elif isinstance(value, Tensor) and not value.isfinite().all():
             raise CheckpointError(f"The checkpoint's {what} is of no use: {name} holds values that are not finite.")
         found[key] = value
     return found
 
 
 def _kind(value) -> str:
-    """Return a value's type, and a tensor's shape."""
     if isinstance(value, Tensor):
         return f"{str(value.dtype).removeprefix('torch.')} of shape {tuple(value.shape)}"
     return "missing" if value is None else type(value).__name__

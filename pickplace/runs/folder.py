@@ -12,9 +12,9 @@ import yaml
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
+from pickplace.common.errors import sentence
 from pickplace.common.files import read_file, replaced_file
-from pickplace.config.errors import sentence
-from pickplace.config.references import REFERENCE, children
+from pickplace.config.allowlist import REFERENCE, walk
 
 LOCK = ".lock"  # held by the process that trains in the folder
 FAILURE = "failure.txt"  # the error of a failed run of a sweep
@@ -37,17 +37,14 @@ def claim(run_dir: Path):
         ValueError: if its lock is a link.
     """
     _refuse_link(Path(run_dir) / LOCK)
-    lock = FileLock(Path(run_dir) / LOCK)
     try:
-        lock.acquire(timeout=0)
+        held = FileLock(Path(run_dir) / LOCK).acquire(timeout=0)
     except Timeout:
         raise OccupiedError(
             f"{run_dir}: another process is working there; expected another run folder, or to wait for it."
         ) from None
-    try:
+    with held:
         yield
-    finally:
-        lock.release()
 
 
 def refuse_claimed(run_dir: Path) -> None:
@@ -81,8 +78,9 @@ def refuse_occupied(run_dir: Path) -> None:
         raise occupied(run_dir)
     for name, content in ((EVALUATION, "an evaluation"), (REPORT, "a report of a training")):
         if (run_dir / name).exists():
-            words = f"there is {content} already; expected another folder, hydra.run.dir=<folder>."
-            raise OccupiedError(f"{run_dir}: {words}")
+            raise OccupiedError(
+                f"{run_dir}: there is {content} already; expected another folder, hydra.run.dir=<folder>."
+            )
 
 
 def occupied(run_dir: Path) -> OccupiedError:
@@ -101,8 +99,7 @@ def refuse_parts(run_dir: Path) -> None:
         names = {"checkpoints": CHECKPOINTS, ".hydra": ("hydra.yaml",)}.get(part.name, ())
         is_checkpoint = part == folder and (part / "state.json").exists()
         if is_checkpoint or any((part / name).exists() for name in names):
-            words = "a part of another run; expected another folder, hydra.run.dir=<folder>."
-            raise OccupiedError(f"{run_dir}: {words}")
+            raise OccupiedError(f"{run_dir}: a part of another run; expected another folder, hydra.run.dir=<folder>.")
 
 
 def refuse_links(run_dir: Path) -> None:
@@ -177,23 +174,17 @@ def remove_empty(folder: Path, notes: Sequence[str], is_sweep: bool) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def noted_overrides(run_dir: Path) -> list[str]:
-    """Return the overrides of the command that began a run; empty if Hydra noted none."""
-    words = read_note(run_dir, "overrides.yaml")
-    return _texts(words)
-
-
-def noted_config_folders(run_dir: Path) -> list[str]:
-    """Return the words of the command that began a run that name folders of config files."""
-    notes = read_note(run_dir, "hydra.yaml")
+def noted_command(run_dir: Path) -> list[str]:
+    """Return the words of the command that began a run, folders of config files first; empty if Hydra noted none."""
     try:
-        return [word for word in _texts(notes["hydra"]["overrides"]["hydra"]) if "hydra.searchpath" in word]
+        words = read_note(run_dir, "hydra.yaml")["hydra"]["overrides"]["hydra"]
     except (KeyError, TypeError):
-        return []
+        words = []
+    folders = [word for word in _texts(words) if "hydra.searchpath" in word]
+    return folders + _texts(read_note(run_dir, "overrides.yaml"))
 
 
 def _texts(values) -> list[str]:
-    """Return the texts of a list; none of anything else."""
     return [value for value in values if isinstance(value, str)] if isinstance(values, list) else []
 
 
@@ -203,19 +194,17 @@ def changed_values(run_dir: Path, cfg: DictConfig) -> list[str]:
     Nothing in the note is resolved. An interpolation that checkpoints do not keep, such as of a variable of the
     environment, is taken as unchanged.
     """
-    began = read_note(run_dir, "config.yaml")
-    if not isinstance(began, dict):
+    if not isinstance(began := read_note(run_dir, "config.yaml"), dict):
         return []
 
-    def leaves(node, path: str = "") -> dict:
-        if not isinstance(node, dict):
-            return {path.removeprefix("."): node}
-        return {key: value for name, child in children(node) for key, value in leaves(child, f"{path}.{name}").items()}
+    def is_value(path: tuple, value) -> bool:
+        return not isinstance(value, dict) and all(isinstance(key, str) for key in path)
 
     def is_unknown(value) -> bool:
         return isinstance(value, str) and "${" in value and not REFERENCE.fullmatch(value)
 
-    before, now = leaves(began), leaves(OmegaConf.to_container(cfg, resolve=False))
+    nodes = walk(began), walk(OmegaConf.to_container(cfg, resolve=False))
+    before, now = ({".".join(path): value for path, value in each if is_value(path, value)} for each in nodes)
     return [f"{key}={now[key]}" for key in now if now[key] != before.get(key) and not is_unknown(before.get(key))]
 
 

@@ -6,13 +6,14 @@ All but ``logger=none`` write ``metrics.csv``, which reports, figures and sweeps
 import csv
 import logging
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
+from pickplace.common.errors import needs_extra
 from pickplace.common.files import read_text, replaced_file
 from pickplace.common.validate import excerpt
-from pickplace.config.errors import missing_extra
 
 if TYPE_CHECKING:
     from torchrl.record.loggers.common import Logger
@@ -33,14 +34,12 @@ class CsvLogger:
     """
 
     def __init__(self, folder, frames: int = 0, settings: dict | None = None):
-        self.path = Path(folder) / "metrics.csv"
-        self._columns = ["frames"]
+        self.path, self._columns = Path(folder) / "metrics.csv", ["frames"]
         earlier = read_csv(self.path) if frames and self.path.is_file() else []
         self._rewrite([row for row in earlier if row["frames"] <= frames])
 
     def _rewrite(self, rows):
-        """Write the file with these rows, and columns for all their metrics."""
-        self._columns += [key for key in dict.fromkeys(key for row in rows for key in row) if key not in self._columns]
+        self._columns = [*dict.fromkeys([*self._columns, *(key for row in rows for key in row)])]
         with replaced_file(self.path) as new, new.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
@@ -61,12 +60,11 @@ class CsvLogger:
                 self._writer.writerow(row)
                 self._file.flush()
             else:
-                self._rewrite([*self._rows(), row])
+                self._rewrite([*self._closed_rows(), row])
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(self.path)) from error
 
-    def _rows(self) -> list[dict[str, float]]:
-        """Return the rows of the open file, and close it."""
+    def _closed_rows(self) -> list[dict[str, float]]:
         with self._file as file:
             file.seek(0)
             return parse_csv(file.read(), self.path)
@@ -79,7 +77,7 @@ class CsvLogger:
                 return
         log.warning("%s was deleted, replaced or cut while the training writes it; it is written again", self.path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._rewrite(self._rows())
+        self._rewrite(self._closed_rows())
 
     def close(self) -> None:
         """Close the file; rows that a full disk did not take are lost."""
@@ -93,41 +91,51 @@ class TensorboardLogger(CsvLogger):
     """TensorBoard event files in the run folder; needs the extra ``pickplace[tensorboard]``. Args as `CsvLogger`."""
 
     def __init__(self, folder, frames: int = 0, settings: dict | None = None):
-        try:
+        with needs_extra("logger", "tensorboard"):
             from torch.utils.tensorboard import SummaryWriter
-        except ImportError as error:
-            raise missing_extra("logger", "tensorboard") from error
         super().__init__(folder, frames)
         # purge_step: TensorBoard hides events after the checkpoint of a resumed run.
         self._events = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
 
     def log(self, metrics: dict[str, float], frames: int) -> None:
-        """Add a point to each metric's curve."""
         super().log(metrics, frames)
         for key, value in metrics.items():
             self._events.add_scalar(key, value, frames)
 
     def close(self) -> None:
-        """Flush and close the event file."""
         super().close()
         self._events.close()
 
 
 class BackendLogger(CsvLogger):
-    """A TorchRL logger beside the table; subclasses make it as ``_backend``. Args as `CsvLogger`."""
+    """A TorchRL logger beside the table; subclasses make it as ``_backend``, and state how a run ends as ``_end_run``.
+
+    A resumed run continues under the run's id, which the run folder keeps in a file.
+
+    Args:
+        folder, frames: as in `CsvLogger`.
+        id_file: the name of that file.
+    """
 
     _backend: "Logger"
+    _end_run: Callable[[], Any]
+
+    def __init__(self, folder, frames: int, id_file: str):
+        super().__init__(folder, frames)
+        self._id_file = Path(folder).absolute() / id_file
+        self._run_id = self._id_file.read_text() if frames and self._id_file.is_file() else None
 
     def log(self, metrics: dict[str, float], frames: int) -> None:
-        """Add a point to each metric's curve."""
         super().log(metrics, frames)
         self._backend.log_metrics(metrics, step=frames)
+
+    def close(self) -> None:
+        super().close()
+        self._end_run()
 
 
 class WandbLogger(BackendLogger):
     """Weights & Biases, through TorchRL's logger; needs the extra ``pickplace[wandb]``.
-
-    A resumed run continues under the run's id, which the run folder keeps in ``wandb_run_id``.
 
     Args:
         folder, frames, settings: as in `CsvLogger`.
@@ -143,37 +151,28 @@ class WandbLogger(BackendLogger):
         project: str = "pickplace",
         offline: bool = True,
     ):
-        try:
+        with needs_extra("logger", "wandb"):
             import wandb  # noqa: F401
-        except ImportError as error:
-            raise missing_extra("logger", "wandb") from error
         from torchrl.record.loggers.wandb import WandbLogger as Backend
 
-        super().__init__(folder, frames)
-        id_file = Path(folder) / "wandb_run_id"
+        super().__init__(folder, frames, "wandb_run_id")
         self._backend = Backend(
             Path(folder).name,
             offline=offline,
             save_dir=str(folder),
-            id=_run_id(id_file, frames),
+            id=self._run_id,
             project=project,
             log_env_packages=False,  # they hold paths of this machine; checkpoints hold the versions
             settings={"silent": offline, "console": "off"},
         )
-        id_file.write_text(self._backend.experiment.id)
+        self._id_file.write_text(self._backend.experiment.id)
+        self._end_run = self._backend.experiment.finish
         if settings:
             self._backend.log_hparams(settings)
-
-    def close(self) -> None:
-        """Finish the run."""
-        super().close()
-        self._backend.experiment.finish()
 
 
 class MlflowLogger(BackendLogger):
     """MLflow, through TorchRL's logger; needs the extra ``pickplace[mlflow]``.
-
-    A resumed run continues under the run's id, which the run folder keeps in ``mlflow_run_id``.
 
     Args:
         folder, frames, settings: as in `CsvLogger`.
@@ -189,36 +188,28 @@ class MlflowLogger(BackendLogger):
         experiment: str = "pickplace",
         uri: str | None = None,
     ):
-        try:
+        with needs_extra("logger", "mlflow"):
             import mlflow
-        except ImportError as error:
-            raise missing_extra("logger", "mlflow") from error
         from torchrl.record.loggers.mlflow import MLFlowLogger as Backend
 
-        super().__init__(folder, frames)
+        super().__init__(folder, frames, "mlflow_run_id")
         folder = Path(folder).absolute()
-        id_file = folder / "mlflow_run_id"
         local = {} if uri else {"artifact_location": (folder / "mlflow_artifacts").as_uri()}
         before = os.environ.pop("MLFLOW_RUN_ID", None)
-        if run_id := _run_id(id_file, frames):
-            os.environ["MLFLOW_RUN_ID"] = run_id  # MLflow reads it; TorchRL's logger has no argument for it
+        if self._run_id:
+            os.environ["MLFLOW_RUN_ID"] = self._run_id  # MLflow reads it; TorchRL's logger has no argument for it
         try:
             self._backend = Backend(experiment, uri or f"sqlite:///{folder / 'mlflow.db'}", **local)
         finally:
             os.environ.pop("MLFLOW_RUN_ID", None)
             if before is not None:
                 os.environ["MLFLOW_RUN_ID"] = before
-        id_file.write_text(self._backend.experiment.info.run_id)
+        self._id_file.write_text(self._backend.experiment.info.run_id)
         self._end_run = mlflow.end_run
-        if not run_id:
+        if not self._run_id:
             mlflow.set_tag("mlflow.runName", folder.name)
             if settings:  # in a new run only: MLflow refuses changed values, which a resumed run may have
                 self._backend.log_hparams(settings)
-
-    def close(self) -> None:
-        """End the run."""
-        super().close()
-        self._end_run()
 
 
 class NoLogger:
@@ -234,11 +225,6 @@ class NoLogger:
         """Nothing to close."""
 
 
-def _run_id(id_file: Path, frames: int) -> str | None:
-    """Return the id of a resumed run, or None."""
-    return id_file.read_text() if frames and id_file.is_file() else None
-
-
 def read_csv(path) -> list[dict[str, float]]:
     """Return the complete rows of a ``metrics.csv``; empty cells are left out.
 
@@ -251,8 +237,7 @@ def read_csv(path) -> list[dict[str, float]]:
 def parse_csv(text: str, path) -> list[dict[str, float]]:
     """Return the rows of a table's text, as :func:`read_csv` does of a file; ``path`` is for errors."""
     lines = text[: text.rfind("\n") + 1].splitlines()  # a killed run may leave an incomplete last line
-    rows = []
-    table = csv.DictReader(lines or [text])
+    rows, table = [], csv.DictReader(lines or [text])
     if table.fieldnames and "frames" not in table.fieldnames:
         raise ValueError(f"{path}, line 1: expected a column frames, got {excerpt(','.join(table.fieldnames))}.")
     for number, row in enumerate(table, start=2):

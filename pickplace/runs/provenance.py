@@ -3,6 +3,7 @@
 import platform
 import subprocess
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import tensordict
@@ -30,32 +31,33 @@ def commit() -> str | None:
     None without a checkout.
     """
     root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return None
 
     def git(*arguments):
         command = ["git", "-C", str(root), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
-    try:
-        modified = git("status", "--porcelain", "-uno", "--", ".", ":!docs").strip()
-        return git("rev-parse", "HEAD").strip() + ("+" if modified else "")
-    except (OSError, subprocess.CalledProcessError):
-        return None
-
-
-def imitated_planner(cfg: dict) -> str | None:
-    """Return the name of the planner that a run with this saved config, unchecked, imitated first, or None."""
-    warm_start = cfg.get("warm_start")
-    if not isinstance(warm_start, Mapping) or not warm_start.get("frames"):
-        return None
-    teacher = warm_start.get("teacher")
-    name = teacher.get("_target_") if isinstance(teacher, Mapping) else None
-    return name if is_name(name) else None
+    with suppress(OSError, subprocess.CalledProcessError):
+        if (root / ".git").exists():
+            modified = git("status", "--porcelain", "-uno", "--", ".", ":!docs")
+            return git("rev-parse", "HEAD") + ("+" if modified else "")
+    return None
 
 
-def first_weights(cfg: dict) -> str | None:
-    """Return the checkpoint with whose weights a run began, or None; ``cfg`` is its saved config, unchecked."""
-    warm_start = cfg.get("warm_start")
-    path = warm_start.get("weights") if isinstance(warm_start, Mapping) else None
-    return short_text(path) if isinstance(path, str) else None
+def first_steps(cfg: dict) -> dict[str, str | None]:
+    """Return what a run with this saved config, unchecked, began with.
+
+    Returns:
+        ``warm_start``, the name of the planner that it imitated first, and ``first_weights``, the checkpoint with whose
+        weights it began, or None.
+    """
+    warm_start = _group(cfg, "warm_start")
+    name = _group(warm_start, "teacher").get("_target_") if warm_start.get("frames") else None
+    path = warm_start.get("weights")
+    return {
+        "warm_start": name if is_name(name) else None,
+        "first_weights": short_text(path) if isinstance(path, str) else None,
+    }
+
+
+def _group(cfg: Mapping, key: str) -> Mapping:
+    return group if isinstance(group := cfg.get(key), Mapping) else {}

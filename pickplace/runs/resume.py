@@ -11,11 +11,10 @@ from pathlib import Path
 from loky import cpu_count
 from omegaconf import DictConfig, OmegaConf
 
+from pickplace.common.errors import WorkerDied, sentence
 from pickplace.common.validate import MAX_COUNT, excerpt, is_name, is_whole, number, whole_number
-from pickplace.config.allowlist import modules_to_trust, own_modules, trusted_config
+from pickplace.config.allowlist import modules_to_trust, own_modules, saved_form, trusted_config
 from pickplace.config.composition import apply_overrides, compose_plain, parse, refuse_unknown_keys
-from pickplace.config.errors import WorkerDied, sentence
-from pickplace.config.references import saved_form
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import occupied, refuse_occupied
 
@@ -52,9 +51,12 @@ def checkpoint_config(cfg: DictConfig) -> tuple[dict, str]:
         trusted_config(content, own, groups=None)
     except ValueError as error:
         log.warning("checkpoints of this run will not be loaded again: %s", error)
-    values = {key: OmegaConf.select(cfg, key) for key in LOCAL_VALUES}
-    words = [f" {key}={value}" for key, value in values.items() if value not in LOCAL_VALUES[key]]
+    words = [f" {key}={value}" for key, value in _remote_values(cfg)]
     return content, "".join([f" trust=[{','.join(own)}]" if own else "", *words])
+
+
+def _remote_values(cfg: DictConfig) -> list[tuple]:
+    return [(key, value) for key, local in LOCAL_VALUES.items() if (value := OmegaConf.select(cfg, key)) not in local]
 
 
 def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
@@ -78,7 +80,12 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     except ValueError as error:
         raise ValueError(f"resume={place}: in the checkpoint's config, {error}") from error
     repeated = {word.key_or_group for word in given}
-    _refuse_remote_values(saved, repeated)
+    for key, value in _remote_values(saved):
+        if key not in repeated:
+            raise ValueError(
+                f"{key}={value}: the checkpoint would write outside this run's folder or this machine; expected "
+                f"{key}={value} again on the command line, or {key}={LOCAL_VALUES[key][0]}."
+            )
     if "threads" not in repeated and is_whole(saved.get("threads")) and saved.threads > cpu_count():
         log.warning("threads=%s of the checkpoint: going on with %d, all of this machine", saved.threads, cpu_count())
         saved["threads"] = cpu_count()
@@ -90,8 +97,7 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
                 f"{key}={now}: the run began with {before}, and a resumed run cannot change it; expected a new run, "
                 f"such as one with warm_start.weights={place}."
             )
-    if type(cfg.total_frames) is not int:
-        raise ValueError(f"total_frames={cfg.total_frames}: expected a whole number >= 1 and < 2**63.")
+    whole_number("total_frames", cfg.total_frames)
     if cfg.total_frames != saved.total_frames and cfg.total_frames < facts["frames"]:
         raise ValueError(
             f"total_frames={cfg.total_frames}: the run has trained {facts['frames']} frames already; expected more."
@@ -100,7 +106,6 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
 
 
 def _check_facts(place: str, facts: dict) -> None:
-    """Refuse facts that no training wrote."""
     saved = f"resume={place}: the checkpoint's "
     for key, kind in FACT_TYPES.items():
         if key not in facts or not isinstance(facts[key], kind):
@@ -115,16 +120,6 @@ def _check_facts(place: str, facts: dict) -> None:
         shares = key in ("occupancy", "ci95_low", "ci95_high")
         number(f"{saved}{key}", value, 0 if shares else -MAX_COUNT, 1 if shares else MAX_COUNT)
     whole_number(f"{saved}curriculum|frames", facts["curriculum"].get("frames", 0), 0, frames)
-
-
-def _refuse_remote_values(saved: DictConfig, repeated: set[str]) -> None:
-    for key, local in LOCAL_VALUES.items():
-        value = OmegaConf.select(saved, key)
-        if value not in local and key not in repeated:
-            raise ValueError(
-                f"{key}={value}: the checkpoint would write outside this run's folder or this machine; expected "
-                f"{key}={value} again on the command line, or {key}={local[0]}."
-            )
 
 
 def interrupted_run(cfg: DictConfig, run_dir: Path) -> tuple[dict, dict, Path] | None:
@@ -161,8 +156,7 @@ def stale_best_frames(run_dir: Path, frames: int, config: dict) -> int | None:
         config: the settings from now on, in the form that checkpoints hold.
     """
     facts = checkpoint.read_facts(run_dir)
-    is_stale = facts and facts["frames"] > frames and not has_config(facts, config)
-    return facts["frames"] if is_stale else None
+    return facts["frames"] if facts and facts["frames"] > frames and not has_config(facts, config) else None
 
 
 def has_config(facts: dict, config: dict) -> bool:
@@ -181,26 +175,22 @@ class StopRequest:
 
     Attributes:
         signal: number of the first signal; None: there was none.
+        requested: whether a signal came.
     """
 
     def __init__(self):
         self.signal: int | None = None
+        self.requested = False
         ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
         numbers = [number for number in STOP_SIGNALS if number != signal.SIGHUP or not ignored]
         self._previous = {number: signal.signal(number, self._request) for number in numbers}
 
-    @property
-    def requested(self) -> bool:
-        """Whether a signal came."""
-        return self.signal is not None
-
     def _request(self, number, frame):
-        if self.requested:
-            if number == signal.SIGINT:
-                os._exit(130)
-            return  # a terminal sends several
-        self.signal = number
-        log.info("stopping after this batch; press Ctrl-C again to stop at once")
+        if self.requested and number == signal.SIGINT:
+            os._exit(130)
+        if not self.requested:  # a terminal sends several
+            self.signal, self.requested = number, True
+            log.info("stopping after this batch; press Ctrl-C again to stop at once")
 
     def restore(self) -> None:
         """Restore the earlier signal handlers."""
@@ -220,11 +210,11 @@ def checkpoint_hint(latest: Callable[[], Path | None], arguments: str = "", erro
     try:
         yield
     except errors as error:
-        hint = "Nothing had been saved before."
-        if folder := latest():
-            # With the same settings, the same batch would lead to the same numbers.
-            change = " algo.lr=<a smaller one>" if isinstance(error, FloatingPointError) else ""
-            hint = f"What was saved before is whole: pickplace-train resume={folder}{arguments}{change}"
-        kept = (FloatingPointError, WorkerDied, checkpoint.CheckpointError)
-        kind = type(error) if isinstance(error, kept) else ValueError
-        raise kind(f"{sentence(error).rstrip('.')}. {hint}") from error
+        whole = (
+            f"What was saved before is whole: pickplace-train resume={folder}{arguments}"
+            if (folder := latest())
+            else ""
+        )
+        is_kept = isinstance(error, (FloatingPointError, WorkerDied, checkpoint.CheckpointError))
+        kind = type(error) if is_kept else ValueError
+        raise kind(f"{sentence(error).rstrip('.')}. {whole or 'Nothing had been saved before.'}") from error

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from pickplace.common.errors import Parser, one_sentence, write_output
 from pickplace.common.files import read_file, read_text
 from pickplace.common.validate import refuse_if, whole_number
-from pickplace.config.errors import Parser, one_sentence, write_output
 from pickplace.robot.box import DepthMapError
 from pickplace.serve.request import MAX_REQUEST, PLAN_OPTIONS, PlanRequest, answer
 

@@ -5,8 +5,8 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Self
 
+from pickplace.common.errors import sentence
 from pickplace.common.validate import refuse_if
-from pickplace.config.errors import sentence
 from pickplace.robot.box import ACCURACY, CLEARANCE, Box
 
 if TYPE_CHECKING:

@@ -5,8 +5,8 @@ import ipaddress
 import os
 import socket
 
+from pickplace.common.errors import Parser, one_sentence, write_output
 from pickplace.common.validate import excerpt, number, refuse_if, short_text, whole_number
-from pickplace.config.errors import Parser, one_sentence, write_output
 from pickplace.serve.json_lines import add_options, load_planner, planner_options
 
 TOKEN = "PICKPLACE_TOKEN"  # the environment variable; a command line can be read by every user of the machine

@@ -4,8 +4,8 @@ import json
 from numbers import Real
 from typing import Any
 
+from pickplace.common.errors import sentence
 from pickplace.common.validate import excerpt, expect, number, or_null, whole_number
-from pickplace.config.errors import sentence
 from pickplace.config.registry import build
 from pickplace.evaluation.play import Episodes
 

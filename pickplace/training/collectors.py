@@ -13,8 +13,8 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 
+from pickplace.common.errors import WorkerDied, needs_extra
 from pickplace.common.validate import expect, whole_number
-from pickplace.config.errors import WorkerDied, missing_extra
 from pickplace.config.registry import names_at
 from pickplace.runs.checkpoint import CheckpointError
 from pickplace.runs.resume import STOP_SIGNALS
@@ -262,10 +262,8 @@ def ray(
     Raises:
         ValueError: without the extra, with a policy on a GPU, or if the workers do not divide the slots.
     """
-    try:
+    with needs_extra("collector", "ray"):
         import ray  # noqa: F401
-    except ImportError as error:
-        raise missing_extra("collector", "ray") from error
     if any(parameter.is_cuda for parameter in policy.parameters()):
         raise ValueError("collector=ray: its workers have no GPU; expected device=cpu, or collector=single.")
     share = _share(num_envs, workers, 1_024)

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.files import replaced_file
 from pickplace.rules.cell import CellSpec
-from pickplace.runs.folder import changed_values, noted_config_folders, noted_overrides
+from pickplace.runs.folder import changed_values, noted_command
 from pickplace.runs.loggers import read_csv
 from pickplace.views.figures import failure_mix
 from pickplace.views.replay import ASSETS, page
@@ -38,7 +38,7 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
     best = max((row for row in rows if "eval/occupancy" in row), key=lambda row: row["eval/occupancy"])
     ordered = sorted(episodes.recordings, key=lambda recording: recording.occupancy)
     policy, sizes = str(cfg.model.actor._target_).rpartition(".")[2], "x".join(map(str, cell.tote_size))
-    words = map(shlex.quote, [*noted_config_folders(run_dir), *noted_overrides(run_dir)])
+    words = map(shlex.quote, noted_command(run_dir))
     command, changed = " ".join(["pickplace-train", *words]), changed_values(run_dir, cfg)
     if changed:
         command += f"\n\nChanged when it was resumed: {', '.join(changed)}"

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pickplace.common.errors import one_sentence, sentence
 from pickplace.common.files import read_text, replaced_file
 from pickplace.common.validate import expect
-from pickplace.config.errors import one_sentence, sentence
 from pickplace.runs.checkpoint import read_facts
 from pickplace.runs.folder import FAILURE, is_claimed, read_note
 from pickplace.runs.loggers import read_csv

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from pickplace.common.errors import one_sentence
 from pickplace.common.validate import expect
-from pickplace.config.errors import one_sentence
 from pickplace.config.hydra_app import Command
 from pickplace.runs import checkpoint
 from pickplace.runs import folder as run_folders

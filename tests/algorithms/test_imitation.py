@@ -21,7 +21,7 @@ from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.fcn_grasp.policy import fcn_grasp
 from pickplace.policies.individual.policy import IndividualRl, individual_grasp
 from pickplace.rules.step import apply
-from pickplace.runs.provenance import imitated_planner
+from pickplace.runs.provenance import first_steps
 from pickplace.training.settings import check_settings
 
 FCN = {"filters": 8, "hidden": 8}
@@ -101,7 +101,7 @@ def test_every_planner_teaches_by_its_name(name, states):
     words += ["warm_start.checkpoint=pretrained/r4"] if name in ("policy", "lookahead") else []
     cfg = composed("warm_start=imitate", f"planner@warm_start.teacher={name}", *words).warm_start
     taught = warm_start(cfg, env=states[0])[0].ask(states[1], 0)
-    assert imitated_planner({"warm_start": dict(cfg)}) == name and (taught >= 0).any()
+    assert first_steps({"warm_start": dict(cfg)})["warm_start"] == name and (taught >= 0).any()
 
 
 @pytest.mark.parametrize("settings", [{}, {"seed": 0}])
@@ -175,5 +175,5 @@ def test_bad_settings_are_refused(word, message):
 
 
 def test_results_name_the_teacher():
-    found = [imitated_planner({"warm_start": dict(cfg)}) for cfg in (config(), config(None, 0, 0))]
-    assert found == ["joint_dbl", None] and imitated_planner({}) is None
+    found = [first_steps({"warm_start": dict(cfg)})["warm_start"] for cfg in (config(), config(None, 0, 0))]
+    assert found == ["joint_dbl", None] and first_steps({}) == {"warm_start": None, "first_weights": None}

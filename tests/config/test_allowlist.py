@@ -11,8 +11,7 @@ from commands import composed, options
 from omegaconf import OmegaConf
 
 from pickplace import Planner
-from pickplace.config.allowlist import REQUIRED_KEYS, modules_to_trust, own_modules, trusted_config
-from pickplace.config.references import saved_form
+from pickplace.config.allowlist import REQUIRED_KEYS, modules_to_trust, own_modules, saved_form, trusted_config
 from pickplace.runs import checkpoint
 
 SHIPPED = checkpoint.PRETRAINED / "r4"

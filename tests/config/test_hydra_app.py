@@ -10,9 +10,9 @@ from commands import composed
 from omegaconf import OmegaConf
 
 import pickplace
+from pickplace.common.errors import sentence
 from pickplace.config.composition import apply_overrides
-from pickplace.config.errors import sentence
-from pickplace.runs.folder import noted_overrides
+from pickplace.runs.folder import noted_command
 from pickplace.training import train
 
 EXAMPLES = Path(__file__).parents[2] / "docs/examples"
@@ -312,8 +312,8 @@ def test_notes_of_a_run_are_read_unresolved(tmp_path, monkeypatch):
     monkeypatch.setenv("MY_SECRET", "secret")
     (tmp_path / ".hydra").mkdir()
     (tmp_path / ".hydra" / "overrides.yaml").write_text("- seed=1\n- a='${oc.env:MY_SECRET}'\n- [nested]\n- 5\n")
-    assert noted_overrides(tmp_path) == ["seed=1", "a='${oc.env:MY_SECRET}'"]
-    assert noted_overrides(tmp_path / "nowhere") == []
+    assert noted_command(tmp_path) == ["seed=1", "a='${oc.env:MY_SECRET}'"]
+    assert noted_command(tmp_path / "nowhere") == []
 
 
 def test_errors_hold_nothing_that_controls_a_terminal():

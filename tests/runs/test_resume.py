@@ -16,7 +16,7 @@ from long import chaos
 from omegaconf import OmegaConf
 
 from pickplace import PickPlaceEnv
-from pickplace.config.references import saved_form
+from pickplace.config.allowlist import saved_form
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import claim

@@ -20,8 +20,8 @@ from torchrl.collectors import RandomPolicy
 from torchrl.envs import TransformedEnv
 
 from pickplace import PickPlaceEnv, Planner
+from pickplace.common.errors import WorkerDied
 from pickplace.config.composition import conf_dir
-from pickplace.config.errors import WorkerDied
 from pickplace.evaluation.evaluate import main as evaluate_main
 from pickplace.runs import checkpoint
 from pickplace.training import collectors

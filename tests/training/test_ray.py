@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
 
 from pickplace import PickPlaceEnv
-from pickplace.config.errors import WorkerDied
+from pickplace.common.errors import WorkerDied
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
 from pickplace.training import collectors

@@ -14,7 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from pickplace.config.composition import config_files
-from pickplace.config.sweeps import constant_keys, folder_name, sweep_words
+from pickplace.config.hydra_app import constant_keys, folder_name, sweep_words
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import FAILURE
 from pickplace.training.sweep import group_by_setting, label, read_run, summarize

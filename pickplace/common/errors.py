@@ -10,15 +10,10 @@ from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from typing import NoReturn
 
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from pickplace.common.validate import excerpt, short_text
-
-
-class JobFailed(Exception):
-    """A run of a sweep failed; the message is one sentence. It crosses processes, which the error itself may not."""
 
 
 class WorkerDied(Exception):
@@ -26,21 +21,21 @@ class WorkerDied(Exception):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser of command lines that raises its errors."""
+    """A parser of command lines that raises its errors as ``ValueError``."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise a ``ValueError``."""
         raise ValueError(f"{message}; expected the arguments that --help shows.")
 
 
 #: Errors caused by the user or the machine. Any other may be a fault of the program, and its type is printed too.
-EXPECTED = (ValueError, OSError, FloatingPointError, JobFailed, WorkerDied, HydraException, OmegaConfBaseException)
+EXPECTED = (ValueError, OSError, FloatingPointError, WorkerDied, OmegaConfBaseException)
 
 #: Greatest length of an error that is shown, and of a word in it; the middle of a longer one is left out.
 MAX_LENGTH, MAX_WORD = 1_000, 300
 
-#: Config files of Hydra plugins, and the optional extras that bring them.
-EXTRAS = {"hydra/sweeper/optuna": "optuna", "hydra/launcher/joblib": "joblib", "hydra/launcher/submitit": "submitit"}
+#: What an error of the operating system asks for; others ask for another path.
+REMEDIES = dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "a place where you may read and write")
+REMEDIES |= dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free space")
 
 
 @contextmanager
@@ -49,7 +44,8 @@ def one_sentence():
 
     A command that a signal ended has the exit code 128 + its number: 130 after Ctrl-C, 143 after SIGTERM.
     """
-    shows_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    before = os.environ.get("HYDRA_FULL_ERROR", "0")
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # let Hydra raise errors, which it would print over many lines
     try:
         yield
         write_output()
@@ -58,12 +54,13 @@ def one_sentence():
     except BrokenPipeError:  # the reader of the output, such as head, has closed it
         sys.exit(141)
     except Exception as error:
-        if shows_traceback:
+        if before == "1":
             raise
         with suppress(OSError):  # a terminal that was closed
             sys.stderr.write(f"error: {sentence(error)}\n")
         sys.exit(2)
     finally:
+        os.environ["HYDRA_FULL_ERROR"] = before
         with suppress(OSError):
             write_output()
 
@@ -93,21 +90,8 @@ def sentence(error: Exception) -> str:
 
 
 def _sentence(error: Exception) -> str:
-    if isinstance(error, OverrideParseException):
-        reasons = [line for line in error.message.splitlines() if not line.startswith(("Error parsing", "See https"))]
-        return f"{error.override!r}: expected <key>=<value> ({' '.join(reasons)})."
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
-        for start, extra in EXTRAS.items():
-            if error.missing_cfg_file.startswith(start):
-                return f"{error.missing_cfg_file}: {extra} is missing; pip install 'pickplace[{extra}]'."
-        if error.options:
-            return f"{error.missing_cfg_file}: there is no such config; expected one of {', '.join(error.options)}."
-    if isinstance(error, OSError) and error.filename and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return f"{error.filename}: {error.strerror}; expected a place where you may read and write."
-    if isinstance(error, OSError) and error.filename and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f"{error.filename}: {error.strerror}; expected free space."
     if isinstance(error, OSError) and error.filename and error.strerror:
-        return f"{error.filename}: {error.strerror}; expected another path."
+        return f"{error.filename}: {error.strerror}; expected {REMEDIES.get(error.errno or 0, 'another path')}."
     if isinstance(error, EXPECTED):
         noise = ("full_key", "object_type", "See https", "To append", "Config search path", "provider=")
         lines = [line.strip() for line in str(error).splitlines()]
@@ -117,9 +101,13 @@ def _sentence(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())} (HYDRA_FULL_ERROR=1 shows where)"
 
 
-def missing_extra(group: str, extra: str) -> ValueError:
-    """Return the error for an option of a config group whose optional extra is not installed."""
-    return ValueError(f"{group}={extra}: {extra} is missing; pip install 'pickplace[{extra}]'.")
+@contextmanager
+def needs_extra(group: str, extra: str):
+    """Name the optional extra of an option of a config group, if an import in the block fails."""
+    try:
+        yield
+    except ImportError as error:
+        raise ValueError(f"{group}={extra}: {extra} is missing; pip install 'pickplace[{extra}]'.") from error
 
 
 def unknown_key(key: str, node: DictConfig | dict, prefix: str = "") -> str:
@@ -132,17 +120,15 @@ def unknown_key(key: str, node: DictConfig | dict, prefix: str = "") -> str:
     """
     *parents, leaf = key.removeprefix(prefix).split(".")
     for parent in parents:
-        child = node.get(parent) if parent in node else None
-        if not isinstance(child, DictConfig):
-            if parent in node:
-                place, value = short_text(prefix + parent), "null" if child is None else excerpt(child)
-                return f"{short_text(key)}: {place} is {value}, without keys; expected an option that gives it some."
+        if parent not in node:
             leaf = parent
             break
+        if not isinstance(child := node.get(parent), DictConfig):
+            place, value = short_text(prefix + parent), "null" if child is None else excerpt(child)
+            return f"{short_text(key)}: {place} is {value}, without keys; expected an option that gives it some."
         prefix, node = f"{prefix}{parent}.", child
     known = [str(name) for name in node if name not in ("_target_", "hydra")]
     close = get_close_matches(leaf, known, 1)
-    expected = f"one of {', '.join(known)}" if known else "no key"
-    hint = f"did you mean {close[0]!r}?" if close else f"expected {expected}."
-    key, leaf = map(short_text, (key, leaf))
-    return f"{key}: there is no key {leaf!r} in {prefix[:-1] or 'the config'}; {hint}"
+    hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}."
+    hint = hint if known else "expected no key."
+    return f"{short_text(key)}: there is no key {short_text(leaf)!r} in {prefix[:-1] or 'the config'}; {hint}"
