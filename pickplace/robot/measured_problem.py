@@ -100,8 +100,8 @@ class MeasuredProblem(Problem):
     def _placed(self, action: Tensor) -> tuple[MeasuredItem, Item, int]:
         """Return the part of the item that an action takes, the item, and the footprint that it leaves."""
         part = self.parts[int(self.taken_items(action))]
-        carried = carry(part.cell, part.measured.maps.item, action)
-        footprint = footprint_index(self.cell.tote_size, carried.rotation % 2, carried.x, carried.y)
+        _, rotation, _, (x, y, *_) = carry(part.cell, part.measured.maps.item, action)
+        footprint = footprint_index(self.cell.tote_size, rotation % 2, x, y)
         return part, part.measured.maps.item, int(footprint)
 
 

@@ -85,23 +85,17 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | No
     return Grasp(gripped & item.exists, collides, reachable, near_x, near_y, back_x, back_y)
 
 
-class Carried(NamedTuple):
-    """The rectangles of item and end effector over the tote, int64 ``[A]`` each, before anything is checked."""
+def carry(
+    cell: CellSpec, item: Item, action: Tensor, blocked: Tensor | None = None
+) -> tuple[Grasp, Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Return where flat actions ``[A]`` bring items, of which there are ``[A]``, before anything is checked.
 
-    picked: Grasp
-    rotation: Tensor
-    left: Tensor  # minimum corner and sides of the turned end effector
-    front: Tensor
-    wide: Tensor
-    deep: Tensor
-    x: Tensor  # minimum corner and sides of the item
-    y: Tensor
-    w: Tensor
-    d: Tensor
+    ``blocked`` is as of :func:`grasp`.
 
-
-def carry(cell: CellSpec, item: Item, action: Tensor, blocked: Tensor | None = None) -> Carried:
-    """Return where flat actions ``[A]`` bring items, of which there are ``[A]``; ``blocked`` as of :func:`grasp`."""
+    Returns:
+        the pick, the rotation, and minimum corner and sides ``(x, y, w, d)`` over the tote of the turned end effector
+        and of the item, int64 ``[A]`` each.
+    """
     (ee_w, ee_d), (x_bin, y_bin, x_tote, y_tote, rotation) = cell.gripper.size, split_action(cell, action)
     odd = rotation % 2 == 1
     picked = grasp(cell, item, x_bin, y_bin, blocked)
@@ -110,7 +104,7 @@ def carry(cell: CellSpec, item: Item, action: Tensor, blocked: Tensor | None = N
     w, d = turned_size(item, odd)
     wide, deep = torch.where(odd, ee_d, ee_w), torch.where(odd, ee_w, ee_d)
     left, front = x_tote - reference_cell(wide), y_tote - reference_cell(deep)
-    return Carried(picked, rotation, left, front, wide, deep, left + offset_x, front + offset_y, w, d)
+    return picked, rotation, (left, front, wide, deep), (left + offset_x, front + offset_y, w, d)
 
 
 # ---------------------------------------------------------------------- flat indices

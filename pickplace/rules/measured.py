@@ -182,7 +182,7 @@ def failures(cell: CellSpec, measured: MeasuredMaps, action: Tensor, bin_clear: 
     (maps, stable, highest, over), (tote_w, tote_d, _) = measured, cell.tote_size
     x_bin, y_bin, x_tote, y_tote, _ = split_action(cell, action)
     item = maps.item.map(lambda part: part.expand(len(action)))
-    picked, rotation, *_, x, y, w, d = carry(cell, item, action)
+    picked, rotation, _, (x, y, w, d) = carry(cell, item, action)
     inside = ~is_outside(x, w, tote_w) & ~is_outside(y, d, tote_d)
     footprint = footprint_index(cell.tote_size, rotation % 2, x.clamp(0, tote_w - 1), y.clamp(0, tote_d - 1))
     place = footprint_index(cell.tote_size, rotation % len(over.leaves), x_tote, y_tote)

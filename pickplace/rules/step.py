@@ -42,7 +42,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     """
     (surface, tote_height, items), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.gripper.size
     taken, item, blocked = take_item(cell, items, action)
-    picked, rotation, left, front, wide, deep, x, y, w, d = carry(cell, item, action, blocked)
+    picked, rotation, (left, front, wide, deep), (x, y, w, d) = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
     contact, index = _contact(cell, surface, x, y, w, d)
     top, reach = contact.z.long() + item.h, max(ee_w, ee_d)
