@@ -59,7 +59,6 @@ class MapPlanner(ABC):
 
     @torch.no_grad()
     def decide(self, observation: Observation) -> Tensor:
-        """Return flat actions, int64 ``[N]``."""
         state = State.from_observation(observation)
         return self.choose(self.cell, state, placing_maps(self.cell, state), observation)
 
@@ -81,10 +80,8 @@ def restrict_items(rule: str, state: State, mask: Tensor) -> Tensor:
         return mask
     items, count = state.items, state.items.x.shape[1]
     mask = mask.unflatten(1, (count, -1))
-    order = torch.arange(count, device=mask.device).expand_as(items.x)
-    if rule == "nearest":
-        distance = (2 * items.x + items.w) ** 2 + (2 * items.y + items.d) ** 2
-        order = distance * count + order
+    distance = (2 * items.x + items.w) ** 2 + (2 * items.y + items.d) ** 2 if rule == "nearest" else 0
+    order = distance * count + torch.arange(count, device=mask.device)
     order = torch.where(mask.any(2), order, torch.iinfo(order.dtype).max)
     chosen = order == order.amin(1, keepdim=True)
     return (mask & chosen[:, :, None]).flatten(1)

@@ -50,7 +50,6 @@ class UniformRandom:
         self.cell, self._generator = cell, torch.Generator().manual_seed(check_seed(seed, "planner.seed"))
 
     def decide(self, observation: Observation) -> Tensor:
-        """Return flat actions, int64 ``[N]``."""
         depth = observation["bin_depth"]
         return torch.randint(self.cell.num_actions, (len(depth),), generator=self._generator).to(depth.device)
 
@@ -70,7 +69,6 @@ class RandomFeasible(MapPlanner):
         self._generator: torch.Generator | None = None
 
     def decide(self, observation: Observation) -> Tensor:
-        """Return flat actions, int64 ``[N]``."""
         mask = observation.get("action_mask", None)
         return super().decide(observation) if mask is None else self._draw(mask)
 

@@ -74,15 +74,13 @@ def corner_footprints(cell: CellSpec, heights: Tensor, maps: PlacingMaps) -> Ten
     for z in level[top >= 0].unique().tolist():
         free = heights <= z
         for parity, (w, d) in enumerate((sides, sides[::-1])[: cell.parities]):
-            corners = torch.zeros_like(free)
+            on_level = (level[:, parity] == z) & (top[:, parity] >= 0)
             for axes in ((), (1,), (2,), (1, 2)):
                 # The corner at which both coordinates are least, after flipping the tote.
                 corner = _least_corners(free.flip(axes), w, d).flip(axes)
-                for axis, size in ((1, w), (2, d)):
-                    if axis in axes:  # from the footprint's last cell to its first
-                        corner = _shift(corner, axis, size - 1)
-                corners |= corner
-            found[:, parity] |= corners & (level[:, parity] == z) & (top[:, parity] >= 0)
+                for axis in axes:  # from the footprint's last cell to its first
+                    corner = _shift(corner, axis, (w, d)[axis - 1] - 1)
+                found[:, parity] |= corner & on_level
     return found
 
 

@@ -89,7 +89,6 @@ class MCTS(MapPlanner):
         self._sampled, self._depths, self._walks = 0, 0, 0
 
     def decide(self, observation: Observation) -> Tensor:
-        """Return flat actions, int64 ``[N]``."""
         if self.mask:
             return super().decide(observation)
         return self._search(_on_cpu(observation), None).to(observation["tote_depth"].device)
@@ -233,7 +232,6 @@ class MCTS(MapPlanner):
 
 
 def _on_cpu(observation: Observation) -> State:
-    """Return the state that an observation shows, on the CPU."""
     return State.from_observation({key: entry.cpu() for key, entry in observation.items()})
 
 

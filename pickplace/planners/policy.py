@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from pickplace.common.validate import excerpt, is_whole, one_of
+from pickplace.common.validate import expect, is_whole, one_of
 from pickplace.planners.base import ITEM_RULES, MapPlanner, pick_first, restrict_items
 from pickplace.policies.base import Policy, ScoresFootprints
 from pickplace.policies.footprints import FootprintPolicy, count_ways
@@ -43,19 +43,17 @@ class PolicyPlanner(MapPlanner):
         item: str = "any",
         pick: str = "any",
     ):
-        if candidates != "all" and not (is_whole(candidates) and candidates >= 1):
-            raise ValueError(f"planner.candidates={excerpt(candidates)}: expected 'all' or a whole number >= 1.")
+        is_count = is_whole(candidates) and int(candidates) >= 1
+        expect(is_count or candidates == "all", "planner.candidates", candidates, "'all' or a whole number >= 1")
         self.cell, self.policy, self.candidates = cell, policy, candidates
         self.item = one_of("planner.item", item, ITEM_RULES)
         self.pick = one_of("planner.pick", pick, ("any", *PICKS))
-        for key, value in (("item", item), ("pick", pick)):
-            if value != "any" and not (isinstance(policy, ScoresFootprints) and candidates == "all"):
-                raise ValueError(
-                    f"planner.{key}={value!r}: expected 'any', or planner.candidates=all and a checkpoint of "
-                    "model=fcn_grasp or corners that was trained with a mask."
-                )
-        if pick != "any" and cell.bin_items > 1:
-            raise ValueError(f"planner.pick={pick!r}: expected 'any' with env.bin_items={cell.bin_items}.")
+        ranks = isinstance(policy, ScoresFootprints) and candidates == "all"
+        model = "a checkpoint of model=fcn_grasp or corners that was trained with a mask"
+        for key, value in (("planner.item", item), ("planner.pick", pick)):
+            expect(ranks or value == "any", key, value, f"'any', or planner.candidates=all and {model}")
+        is_alone = cell.bin_items == 1
+        expect(is_alone or pick == "any", "planner.pick", pick, f"'any' with env.bin_items={cell.bin_items}")
 
     @torch.no_grad()
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:

@@ -7,7 +7,6 @@ the least x and y.
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,44 +24,41 @@ LAST = FAR**2  # order of a footprint at the origin of no space
 MAX_RECTANGLES = 2**23  # that are looked at together, over all problems
 
 
-class Rectangles(NamedTuple):
-    """All rectangles of a grid, int64 ``[S]`` each: from ``x0`` to before ``x1``, and the same along y."""
+def all_rectangles(wide: int, deep: int, device) -> list[Tensor]:
+    """Return all rectangles of a grid: ``x0``, ``y0``, ``x1`` and ``y1``, int64 ``[S]`` each.
 
-    x0: Tensor
-    y0: Tensor
-    x1: Tensor
-    y1: Tensor
+    They reach from ``x0`` to before ``x1``, and the same along y.
 
-    @classmethod
-    def of_grid(cls, wide: int, deep: int, device) -> "Rectangles":
-        """Return those of a grid; raises ``ValueError`` if the memory does not hold them."""
-        count = wide * (wide + 1) // 2 * (deep * (deep + 1) // 2)
-        check_bytes(f"tote_size: {count:,} rectangles of cells", 100 * count, device)
-        along_x, along_y = (torch.combinations(torch.arange(side + 1, device=device)) for side in (wide, deep))
-        x, y = along_x.repeat_interleave(len(along_y), 0), along_y.repeat(len(along_x), 1)
-        return cls(x[:, 0], y[:, 0], x[:, 1], y[:, 1])
+    Raises:
+        ValueError: if the memory does not hold them.
+    """
+    count = wide * (wide + 1) // 2 * (deep * (deep + 1) // 2)
+    check_bytes(f"tote_size: {count:,} rectangles of cells", 100 * count, device)
+    along_x, along_y = (torch.combinations(torch.arange(side + 1, device=device)) for side in (wide, deep))
+    x, y = along_x.repeat_interleave(len(along_y), 0), along_y.repeat(len(along_x), 1)
+    return [x[:, 0], y[:, 0], x[:, 1], y[:, 1]]
 
 
-def empty_spaces(heights: Tensor, rectangles: Rectangles, level_step: int = 0) -> Iterator[tuple[int, Tensor]]:
+def empty_spaces(heights: Tensor, rectangles: list[Tensor], level_step: int = 0) -> Iterator[tuple[int, Tensor]]:
     """Yield each height in the totes, and which rectangles are maximal empty spaces with their floor there.
 
     Args:
         heights: int32 ``[N, W_T, D_T]``.
-        rectangles: of the grid.
+        rectangles: see :func:`all_rectangles`.
         level_step: by how much the heights of a level surface may differ.
 
     Yields:
         the height, and bool ``[S, N]``, batch last
     """
-    area = ((rectangles.x1 - rectangles.x0) * (rectangles.y1 - rectangles.y0))[:, None]
-    steps = zip(rectangles._asdict().items(), (-1, -1, 1, 1), strict=True)
-    sides = [rectangles._replace(**{key: edge + step}) for (key, edge), step in steps]  # a side further out
+    x0, y0, x1, y1 = rectangles
+    area = ((x1 - x0) * (y1 - y0))[:, None]
+    one_further = [(x0 - 1, y0, x1, y1), (x0, y0 - 1, x1, y1), (x0, y0, x1 + 1, y1), (x0, y0, x1, y1 + 1)]
     for level in heights.unique().tolist():
         higher = _counter(heights > level + level_step)
         lower = _counter(heights < level, outside=0)
-        space = (higher(rectangles) == 0) & (lower(rectangles) < area)
-        for grown in sides:
-            space &= higher(grown) > 0
+        space = (higher(*rectangles) == 0) & (lower(*rectangles) < area)
+        for grown in one_further:
+            space &= higher(*grown) > 0
         yield level, space
 
 
@@ -75,7 +71,7 @@ def _counter(cells: Tensor, outside: int = 1):
     def at(x: Tensor, y: Tensor) -> Tensor:
         return table.index_select(0, (x + 1) * deep + y + 1)
 
-    return lambda r: at(r.x1, r.y1) - at(r.x0, r.y1) - at(r.x1, r.y0) + at(r.x0, r.y0)
+    return lambda x0, y0, x1, y1: at(x1, y1) - at(x0, y1) - at(x1, y0) + at(x0, y0)
 
 
 class SpacePlanner(MapPlanner):
@@ -128,9 +124,8 @@ class SpacePlanner(MapPlanner):
         """Return the least order of a space at whose origin a footprint lies, int64 ``[N * M, Q, W_T, D_T]``."""
         surface, tote_height, item = state.each_item()
         heights = surface >> 1
-        rectangles = Rectangles.of_grid(*cell.tote_size[:2], heights.device)
-        wide, deep = (rectangles.x1 - rectangles.x0)[:, None], (rectangles.y1 - rectangles.y0)[:, None]
-        origin = (rectangles.x0 * cell.tote_size[1] + rectangles.y0)[:, None]
+        x0, y0, x1, y1 = rectangles = all_rectangles(*cell.tote_size[:2], heights.device)
+        wide, deep, origin = (sides[:, None] for sides in (x1 - x0, y1 - y0, x0 * cell.tote_size[1] + y0))
         order = torch.full((cell.parities, cell.num_places, len(heights)), LAST, device=origin.device)
         for rows in torch.arange(len(heights), device=origin.device).split(max(1, MAX_RECTANGLES // len(origin))):
             w_and_d, height = (item.w[rows], item.d[rows]), item.h[rows]

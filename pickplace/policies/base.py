@@ -24,6 +24,7 @@ from torch.distributions import Categorical
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ValueOperator
 
+from pickplace.common.validate import at_most, expect
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
@@ -53,6 +54,7 @@ class Policy(TensorDictModuleBase, ABC):
 
     Attributes:
         choice_key: name of the choice in the TensorDict.
+        masks: the masks among :attr:`in_keys`.
         in_keys: entries of the observation that :meth:`logits` reads.
         map_keys: entries of the observation that its network reads.
         excludes: what :meth:`action_log_probs` gives probability 0 by construction; None if nothing.
@@ -69,16 +71,11 @@ class Policy(TensorDictModuleBase, ABC):
     def __init__(self, cell: CellSpec, masks: Sequence[str] = ()):
         super().__init__()
         self.check_cell(cell)
-        self.cell = cell
+        self.cell, self.masks = cell, tuple(masks)
         self.in_keys, self.out_keys = [*self.map_keys, *(f"{mask}_mask" for mask in masks)], ["logits"]
 
     def check_cell(self, cell: CellSpec) -> None:
         """Refuse a cell that the policy does not serve, with a ``ValueError``."""
-
-    @property
-    def masks(self) -> tuple[str, ...]:
-        """The masks among :attr:`in_keys`, which the environment must emit for training it."""
-        return tuple(key.removesuffix("_mask") for key in self.in_keys if key.endswith("_mask"))
 
     @abstractmethod
     def logits(self, observation: Observation) -> Tensor:
@@ -108,7 +105,6 @@ class Policy(TensorDictModuleBase, ABC):
         """Return the distribution over flat actions, ``[N, N_a]``, without any mask."""
 
     def forward(self, observation: TensorDictBase) -> TensorDictBase:
-        """Write ``logits`` into the observation."""
         return observation.set("logits", self.logits(observation))
 
     def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
@@ -258,7 +254,6 @@ class Choice(Categorical):
 
     @property
     def deterministic_sample(self) -> Tensor:
-        """The most probable choice."""
         return self.logits.argmax(-1)
 
     def sample(self, sample_shape=()):
@@ -272,11 +267,8 @@ class Choice(Categorical):
 
 def refuse_several_items(policy: Policy, cell: CellSpec) -> None:
     """Refuse a bin with several items: the ``check_cell`` of a policy that does not choose among them."""
-    if cell.bin_items > 1:
-        raise ValueError(
-            f"env.bin_items={cell.bin_items}: expected 1 with {type(policy).__name__}; model=fcn_grasp or corners with "
-            "a mask, and fcn4d, choose among several items."
-        )
+    others = "model=fcn_grasp or corners with a mask, and fcn4d, choose among several items"
+    expect(cell.bin_items == 1, "env.bin_items", cell.bin_items, f"1 with {type(policy).__name__}; {others}")
 
 
 def pick_one(candidates: Tensor) -> Tensor:
@@ -304,8 +296,7 @@ def refuse_large_network(make: Callable[[], torch.nn.Module], key: str) -> None:
     except RuntimeError:  # meta tensors have no values
         return
     count = sum(parameter.numel() for parameter in network.parameters())
-    if count > MAX_PARAMETERS:
-        raise ValueError(f"{key}: the network has {count:,} parameters; expected at most {MAX_PARAMETERS:,}.")
+    at_most(f"{key}: the network has", count, "parameters", MAX_PARAMETERS)
 
 
 def as_critic(critic: torch.nn.Module) -> ValueOperator:

@@ -21,7 +21,6 @@ def main() -> None:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
     options = Parser(
         prog="pickplace-export",
         description="Export the scoring network of a checkpoint to ONNX, for batches, bins and totes of any size, and "

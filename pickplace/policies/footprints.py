@@ -10,6 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from pickplace.common.validate import expect
 from pickplace.envs.torchrl import MASKS
 from pickplace.policies.base import MAP_KEYS, MASKED, Policy, pick_one
 from pickplace.policies.depth import Contents
@@ -74,10 +75,8 @@ class FootprintScorer(Policy):
     network_class: Callable[..., torch.nn.Module]
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = True, **network):
-        if not mask_infeasible:
-            raise ValueError(
-                f"model.mask_infeasible=False: expected true with {type(self).__name__}; its choices are feasible ones."
-            )
+        expected = f"true with {type(self).__name__}; its choices are feasible ones"
+        expect(mask_infeasible, "model.mask_infeasible", mask_infeasible, expected)
         super().__init__(cell, masks=(self.mask,))
         self.in_keys += item_keys(cell.bin_items)
         self.network = self.network_class(**network)
@@ -126,7 +125,6 @@ class FootprintPolicy(FootprintScorer):
     excludes: str | None = "failed picks and footprints outside the tote"
 
     def ranked(self, maps: PlacingMaps) -> Tensor:
-        """Return the footprints among which it chooses, bool ``[N, M * Q * W_T * D_T]``; some, if any is feasible."""
         return MASKS[self.mask].make(self.cell, maps)
 
     def logits(self, observation: Observation) -> Tensor:

@@ -42,7 +42,6 @@ class Scores(torch.nn.Module):
         self.policy, self.keys = policy, keys
 
     def forward(self, *entries: Tensor) -> Tensor:
-        """Return the scores, float32 ``[N, scores]``."""
         return self.policy.unmasked_scores(dict(zip(self.keys, entries, strict=True)))
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from pickplace.common.machine import usable_device
+from pickplace.common.validate import expect
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import build, node_of
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
@@ -92,7 +93,6 @@ class TrainedPolicy(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` into the observation."""
         seen = tensordict.select(*self.in_keys).reshape(-1)
         maps = placing_maps(self.cell, State.from_observation(seen))
         if exploration_type() == ExplorationType.RANDOM:
@@ -158,8 +158,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     Raises:
         ValueError: for a checkpoint that cannot be used, or bad sizes.
     """
-    if not isinstance(path, (str, os.PathLike)):
-        raise ValueError(f"path={path!r}: expected a run folder, a checkpoint, or pretrained/<name>.")
+    expect(isinstance(path, (str, os.PathLike)), "path", path, "a run folder, a checkpoint, or pretrained/<name>")
     state, facts = checkpoint.read(checkpoint.locate(path))
     cfg = trusted_config(facts["config"], trust)
     env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))

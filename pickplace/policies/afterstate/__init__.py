@@ -1,1 +1,0 @@
-"""``afterstate``: values of the tote after a placement."""

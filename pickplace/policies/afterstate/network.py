@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from pickplace.common.validate import (
     MAX_WIDTH,
     check_inputs,
+    expect,
     flag,
     number,
     odd_number,
@@ -54,8 +55,7 @@ class ToteValue(nn.Module):
     ):
         super().__init__()
         self.grid = size_tuple("model.actor.grid", grid, 3, MAX_GRID)
-        if min(self.grid[:2]) < 2:
-            raise ValueError(f"model.actor.grid={list(self.grid)}: expected at least 2 cells along x and y.")
+        expect(min(self.grid[:2]) > 1, "model.actor.grid", [*self.grid], "at least 2 cells along x and y")
         odd_number("model.actor.receptive_field", receptive_field)
         whole_numbers("model.actor", MAX_WIDTH, filters=filters, hidden=hidden)
         self.mirrored = flag("model.actor.mirrored", mirrored)

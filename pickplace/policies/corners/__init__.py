@@ -1,1 +1,0 @@
-"""``corners``: scores of corner footprints on fine grids."""

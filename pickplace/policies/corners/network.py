@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.common.validate import MAX_WIDTH, check_inputs, excerpt, number, whole_numbers
+from pickplace.common.validate import MAX_WIDTH, check_inputs, expect, number, whole_numbers
 from pickplace.policies.depth import Contents
 from pickplace.rules.grasps import split_footprint
 
@@ -43,8 +43,8 @@ class CornerNet(nn.Module):
         super().__init__()
         whole_numbers("model.actor", MAX_WIDTH, filters=filters, hidden=hidden)
         whole_numbers("model.actor", 64, inside=inside, near=near)
-        if not isinstance(item_scale, (list, tuple)) or len(item_scale) != 2:
-            raise ValueError(f"model.actor.item_scale={excerpt(item_scale)}: expected [side, height].")
+        is_pair = isinstance(item_scale, (list, tuple)) and len(item_scale) == 2
+        expect(is_pair, "model.actor.item_scale", item_scale, "[side, height]")
         self.item_scale = tuple(number("model.actor.item_scale", value, 1e-3, 1e6) for value in item_scale)
         number("model.actor.head_std", head_std, most=1e3)
         self.inside, self.near = inside, near

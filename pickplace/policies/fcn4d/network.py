@@ -217,7 +217,6 @@ class Conv4dNet(nn.Module):
 
     @property
     def _dtype(self) -> torch.dtype:
-        """Type of the hidden layers."""
         return torch.bfloat16 if self.compute_dtype == "bfloat16" else self.first.weight.dtype
 
     def _first_layer(self, bins: Tensor, totes: Tensor) -> tuple[Tensor, Tensor]:

@@ -28,7 +28,6 @@ class Conv4dPolicy(ActionPolicy):
         self.network = Conv4dNet(4, **network)  # of which the first R count: the weights serve fewer rotations too
 
     def action_scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
-        """Return logits ``[N, N_a]``, of the actions that a mask allows if there is one."""
         maps, rotations = (observation["bin_depth"], observation["tote_depth"]), self.cell.rotations
         if mask is None:
             return self.network(*maps).unflatten(1, (-1, 4))[..., :rotations].flatten(1)

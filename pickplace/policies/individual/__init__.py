@@ -1,1 +1,0 @@
-"""Policies whose pick is heuristic."""

@@ -54,7 +54,6 @@ class PlaceRotationPolicy(Policy):
         return join_pick(self.cell, self._pick(observation), choice)
 
     def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
-        """Return place and rotation, whatever the pick."""
         return action % (self.cell.num_places * self.cell.rotations)
 
     def action_log_probs(self, observation: Observation) -> Tensor:
