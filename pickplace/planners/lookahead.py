@@ -97,8 +97,7 @@ class Lookahead(MapPlanner):
         return first_action_reaching(cell, maps, choice.gather(1, best[:, None])[:, 0])
 
     def evaluation_facts(self) -> dict:
-        """Return the same facts as of a policy's planner: the best of all feasible actions is played."""
-        return {"candidates": "all", "mask_at_decision": True}
+        return {"candidates": "all", "mask_at_decision": True}  # as a policy's planner
 
     def _best(self, state: State, choice: Tensor, open_: Tensor) -> Tensor:
         """Return which candidate to play, int64 ``[N]``.
@@ -109,17 +108,15 @@ class Lookahead(MapPlanner):
         """
         total = torch.zeros(choice.shape, dtype=torch.float64, device=choice.device)  # of the differences to the first
         squares, count = torch.zeros_like(total), torch.zeros_like(total)
-        mean, error = total, torch.full_like(total, torch.inf)
-        streams = self.samples
-        for _ in range(self.rounds):
+        mean = error = total
+        for streams in [self.samples * 2**done for done in range(self.rounds)]:
             open_ = open_ & (open_.sum(1, keepdim=True) > 1)  # nothing to decide where one is left
             row, column = open_.nonzero(as_tuple=True)
             if len(row) == 0:
                 break
             volume = self._returns(state, row, choice[row, column], streams, self.horizon)  # [rows, streams]
             first = volume[(column == 0).nonzero()[:, 0]]  # one for each problem that is open
-            problem = torch.unique_consecutive(row, return_inverse=True)[1]
-            difference = volume - first[problem]
+            difference = volume - first[torch.unique_consecutive(row, return_inverse=True)[1]]
             total[row, column] += difference.sum(1)
             squares[row, column] += difference.square().sum(1)
             count[row, column] += streams
@@ -129,7 +126,6 @@ class Lookahead(MapPlanner):
             hopeless |= (count > 0) & (error == 0) & (mean <= 0)
             hopeless[:, 0] = False
             open_ = open_ & ~hopeless
-            streams *= 2
         surely = (count > 0) & (mean > self.confidence * error) & (mean > 0)
         best = torch.where(surely, mean, 0.0).argmax(1)
         is_known = self.horizon is None or isinstance(self.policy, EstimatesValue)

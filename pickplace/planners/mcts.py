@@ -190,36 +190,33 @@ class MCTS(MapPlanner):
         if self.mask:
             return *put_down(self.cell, state, action), torch.ones_like(action, dtype=torch.bool)
         step = apply(self.cell, state, action)
-        left = State(step.surface, state.tote_height, remove_item(state.items, step.taken))
-        return left, step.item, step.failure == 0
+        items = remove_item(state.items, step.taken)
+        return State(step.surface, state.tote_height, items), step.item, step.failure == 0
 
     def _nodes(self, state: State, mask: Tensor | None = None) -> list[_Node]:
         """Return new nodes, with the actions to try: those of a mask, or that the rules allow."""
-        untried = [None] * len(state.surface)
         if self.mask and mask is None:
             mask = choice_mask(self.cell, placing_maps(self.cell, state))
-        if mask is not None:
-            untried = [self._random.permutation(row.nonzero()[0]).tolist() for row in mask.numpy()]
+        rows = [None] * len(state.surface) if mask is None else mask.numpy()
+        untried = (row if row is None else self._random.permutation(row.nonzero()[0]).tolist() for row in rows)
         return [_Node(*parts) for parts in zip(state.surface, state.items.table, untried, strict=True)]
 
     def _arrive(self, state: State) -> State:
         """Return the states with items in the bins that come from the item distribution, each drawn once."""
-        count = len(state.surface)
-        number = torch.arange(self._sampled, self._sampled + count)
-        self._sampled += count
+        number = torch.arange(self._sampled, self._sampled + len(state.surface))
+        self._sampled += len(number)
         seed, first, rows = torch.full_like(number, self.seed), torch.zeros_like(number), number >= 0
         return state._replace(items=refill(self.cell, self.items, "train", seed, number, first, state.items, rows)[0])
 
     def _play_out(self, state: State) -> Tensor:
         """Return the volume that uniformly random actions place until the episode ends, float64 ``[M]``."""
-        cell, count = self.cell, len(state.surface)
-        volume, row = torch.zeros(count, dtype=torch.float64), torch.arange(count)
+        cell, row = self.cell, torch.arange(len(state.surface))
+        volume = torch.zeros(len(row), dtype=torch.float64)
         while True:
             if self.mask:
                 mask = choice_mask(cell, placing_maps(cell, state))
                 draw = torch.from_numpy(self._random.random(mask.shape, dtype=np.float32))
-                action = torch.where(mask, draw, -1.0).argmax(1)
-                going = mask.view(torch.uint8).amax(1) > 0
+                action, going = torch.where(mask, draw, -1.0).argmax(1), mask.view(torch.uint8).amax(1) > 0
                 state, placed, _ = self._move(state, action)
             else:
                 action = torch.from_numpy(self._random.integers(cell.num_actions, size=len(state.surface)))

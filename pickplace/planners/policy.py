@@ -81,7 +81,6 @@ class PolicyPlanner(MapPlanner):
         return join_pick(cell, pick, (succeeds & (footprint == choice)).int().argmax(1))
 
     def evaluation_facts(self) -> dict:
-        """Return ``K`` and the mask with which actions are chosen: True, False, or what the policy never chooses."""
         mask = self.candidates == "all" or self.policy.excludes or False
         return {"candidates": self.candidates, "mask_at_decision": mask}
 

@@ -42,8 +42,10 @@ def decide(
         found = f"action {outside[0]}"
     else:
         return action
-    wanted = f"a tensor of flat actions, int64 of shape [{count}], from 0 to {cell.num_actions - 1}"
-    raise ValueError(f"{type(planner).__name__}.decide returned {found}: expected {wanted}.")
+    raise ValueError(
+        f"{type(planner).__name__}.decide returned {found}: expected a tensor of flat actions, int64 of shape "
+        f"[{count}], from 0 to {cell.num_actions - 1}."
+    )
 
 
 def planner_parts(

@@ -146,8 +146,8 @@ class Conv4d(nn.Module):
 
     @staticmethod
     def _map_layers(filters: int) -> nn.Sequential:
-        first, second = nn.Conv2d(1, filters, 3), nn.Conv2d(filters, filters, 3)
-        return nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), nn.Flatten())
+        convolutions = nn.Conv2d(1, filters, 3), nn.ReLU(), nn.Conv2d(filters, filters, 3), nn.ReLU()
+        return nn.Sequential(*convolutions, nn.Flatten())
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
         """Return values ``[..., 1]`` of bin depth ``[..., W_B, D_B]`` and tote depth ``[..., W_T, D_T]``."""

@@ -114,8 +114,7 @@ class FootprintScorer(Policy):
         step = apply(self.cell, State.from_observation(observation), action)
         x, y, w, _ = step.footprint.unbind(-1)
         turned = (w != step.item.w).long()  # a square item is the same either way
-        footprint = footprint_index(self.cell.tote_size, turned, x, y)
-        return footprint + step.taken * self.cell.num_footprints
+        return footprint_index(self.cell.tote_size, turned, x, y) + step.taken * self.cell.num_footprints
 
 
 class FootprintPolicy(FootprintScorer):
@@ -135,15 +134,11 @@ class FootprintPolicy(FootprintScorer):
         return pick_one(actions_reaching(self.cell, maps, choice))
 
     def action_log_probs(self, observation: Observation) -> Tensor:
-        """Return the distribution over flat actions ``[N, N_a]``.
-
-        An action whose pick misses, or whose item leaves the tote, has no footprint, so probability 0.
-        """
+        # An action whose pick misses, or whose item leaves the tote, has no footprint, so probability 0.
         footprint = action_footprints(self.cell, items_from_observation(observation))
         scores = self.unmasked_scores(observation)
         ways = count_ways(scores.shape[1], footprint, footprint >= 0)
-        logits = torch.where(ways > 0, scores, MASKED)
-        share = logits.log_softmax(-1) - ways.clamp(min=1).log()
+        share = torch.where(ways > 0, scores, MASKED).log_softmax(-1) - ways.clamp(min=1).log()
         return torch.where(footprint >= 0, share.gather(1, footprint.clamp(min=0)), MASKED)
 
     def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:

@@ -174,9 +174,8 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
 
 def load_critic(path, trained: TrainedPolicy) -> "RestoredCritic | None":
     """Return the critic of the checkpoint of a policy that :func:`load_policy` returned; None if it does not serve."""
-    state, _ = checkpoint.read(checkpoint.locate(path))
     env = cast(dict, OmegaConf.to_container(trained.config.env, resolve=True))
-    return restore_critic(trained.config, trained.policy, state, env)
+    return restore_critic(trained.config, trained.policy, checkpoint.read(checkpoint.locate(path))[0], env)
 
 
 @dataclass(frozen=True)

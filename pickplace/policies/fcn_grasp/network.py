@@ -97,8 +97,7 @@ class FootprintFcn(nn.Module):
             bearing: 1 where a cell of the tote bears weight, else 0, ``[N, W_T, D_T]``.
             parities: 1, or 2 to turn the footprints too.
         """
-        batch, wide, long = tote_depth.shape
-        row, footprint = every_footprint(tote_depth, parities)
+        (batch, wide, long), (row, footprint) = tote_depth.shape, every_footprint(tote_depth, parities)
         contents = Contents(read_items(bin_depth), torch.zeros_like(row))
         out = self.at(bin_depth, tote_depth, bearing, row, footprint, contents)
         return out.view(batch, parities, wide, long, -1)
@@ -167,7 +166,6 @@ class FootprintFcn(nn.Module):
         around = (headroom[:, None] - seen).clamp_(-reach, reach).add_(reach)
         hole = (seen - rest[:, None]).clamp_(0, reach).add_(2 * reach + 1)
         level = torch.where(under, hole, around).masked_fill_(seen == OUTSIDE, self.planes)
-
         codes = [
             *((size - 1).clamp(0, self.item_range - 1).to(small) for size in sizes),
             (headroom + 1).clamp(0, self.headroom_bins - 1),

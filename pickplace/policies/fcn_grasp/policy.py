@@ -99,9 +99,8 @@ class UnmaskedFcnGrasp(Policy):
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
         cell, places = self.cell, self.cell.num_places
         missed = choice == self.classes * places
-        wanted = torch.where(missed, -1, choice // places)
-        classes = pick_classes(cell, item_from_depth(observation["bin_depth"])).flatten(1)
-        pairs = classes == wanted[:, None]  # [N, P * R]
+        wanted = torch.where(missed, -1, choice // places)[:, None]
+        pairs = pick_classes(cell, item_from_depth(observation["bin_depth"])).flatten(1) == wanted  # [N, P * R]
         pair = pick_one(torch.where(pairs, torch.arange(pairs.shape[1], device=choice.device), -1))
         explores = exploration_type() == ExplorationType.RANDOM
         anywhere = torch.randint(places, choice.shape, device=choice.device) if explores else 0

@@ -57,7 +57,6 @@ class PlaceRotationPolicy(Policy):
         return action % (self.cell.num_places * self.cell.rotations)
 
     def action_log_probs(self, observation: Observation) -> Tensor:
-        """Return the distribution over flat actions; minus infinity for every pick but the heuristic one."""
         pick = self._pick(observation)
         return spread_over_actions(self.cell, self.place_scores(observation, pick).log_softmax(-1), pick)
 
@@ -137,7 +136,6 @@ class IndividualGrasp(FootprintScorer):
         return self.to_action(self.logits(seen).argmax(1), seen)
 
     def action_log_probs(self, observation: Observation) -> Tensor:
-        """Return the distribution over flat actions; minus infinity for other picks, and outside the tote."""
         pick, footprint, allowed = self._reached(observation)
         ways = count_ways(self.cell.num_footprints, footprint, allowed)
         share = self.footprint_logits(observation, ways > 0).log_softmax(-1) - ways.clamp(min=1).log()
