@@ -27,7 +27,7 @@ def _classes(module: str, **names: str) -> dict[str, str]:
 PLANNERS = _classes(
     "planners", policy="policy.PolicyPlanner", lookahead="lookahead.Lookahead", joint_dbl="heuristics.JointDBL",
     corner="heuristics.Corner", best_fit="spaces.BestFit", online_bph="spaces.OnlineBPH",
-    heightmap_minimisation="heuristics.HeightmapMinimisation", individual_heuristic="individual.IndividualHeuristic",
+    heightmap_minimisation="heuristics.HeightmapMinimisation", individual_heuristic="heuristics.IndividualHeuristic",
     mcts="mcts.MCTS", random="heuristics.RandomFeasible", uniform="heuristics.UniformRandom",
 )  # fmt: skip
 

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_numbers
 from pickplace.policies.base import MAP_KEYS
 from pickplace.policies.depth import clip_depth, item_code
-from pickplace.policies.fcn4d.network import BIN_PADDING, TOTE_PADDING, check_clips, clip_and_pad
-from pickplace.policies.fcn4d.network import DTYPES as CONV4D_DTYPES
+from pickplace.policies.fcn4d.network import BIN_PADDING, HIDDEN_DTYPES, TOTE_PADDING, check_clips, clip_and_pad
 from pickplace.policies.fcn_grasp.network import DTYPES, MAX_LEVELS, matrix_dtype
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, read_items
@@ -133,7 +132,7 @@ class Conv4d(nn.Module):
     ):
         super().__init__()
         whole_numbers("model.critic", MAX_WIDTH, filters=filters, hidden=hidden)
-        one_of("model.critic.compute_dtype", compute_dtype, CONV4D_DTYPES)
+        one_of("model.critic.compute_dtype", compute_dtype, HIDDEN_DTYPES)
         check_clips("model.critic", bin_clip, tote_clip, floor)
         number("model.critic.depth_scale", depth_scale, 1e-3, 1e6)
         self.bin_size, self.tote_size = cell.bin_size[:2], cell.tote_size[:2]

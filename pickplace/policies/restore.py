@@ -96,8 +96,7 @@ class TrainedPolicy(TensorDictModuleBase):
         seen = tensordict.select(*self.in_keys).reshape(-1)
         maps = placing_maps(self.cell, State.from_observation(seen))
         if exploration_type() == ExplorationType.RANDOM:
-            for name in self.policy.masks:
-                seen[f"{name}_mask"] = MASKS[name].make(self.cell, maps)
+            seen.update({f"{name}_mask": MASKS[name].make(self.cell, maps) for name in self.policy.masks})
             action = self._draw(seen)["action"]
         else:
             action = self.policy.best_feasible(seen, maps)

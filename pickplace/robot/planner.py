@@ -211,7 +211,7 @@ class Planner:
                 key in needs and parts[key] is None,
                 f"{key}=None: planner={self._name!r} needs it; Planner.load has it from a checkpoint.",
             )
-        if "critic" in needs:
+        if "critic" in needs and parts["critic"] is not None:
             parts["critic"] = parts["critic"].with_bin_items(cell.bin_items)
         given = (*needs, "candidates") if maker is PolicyPlanner else needs
         return maker(cell=cell, **{key: parts[key] for key in given})

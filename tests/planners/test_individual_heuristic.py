@@ -10,7 +10,7 @@ from problems import late_state, occupancies, random_states
 
 from pickplace import CellSpec, Item, PickPlaceEnv, State
 from pickplace.items.distributions import Uniform
-from pickplace.planners.individual import IndividualHeuristic, corner_footprints
+from pickplace.planners.heuristics import IndividualHeuristic, corner_footprints
 from pickplace.rules.grasps import PICKS, all_grasps
 from pickplace.rules.masks import placing_maps
 from pickplace.rules.state import Failure, surface_from

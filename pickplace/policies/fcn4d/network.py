@@ -27,7 +27,7 @@ from pickplace.common.validate import MAX_WIDTH, number_or_null, one_of, whole_n
 from pickplace.policies.depth import clip_depth
 
 BIN_PADDING, TOTE_PADDING = -1.0, 0.0
-DTYPES = ("float32", "bfloat16")
+HIDDEN_DTYPES = ("float32", "bfloat16")
 MAX_DEPTH = 10_000  # height units; deeper than any tote
 PAIRS_AT_ONCE = {"cpu": 512, "cuda": 65_536}  # a CPU's caches hold the hidden activations of so many
 PADDED_PAIRS = 64  # their number is rounded up to a multiple; see PADDED_ROWS in fcn_grasp/network.py
@@ -99,7 +99,7 @@ class Conv4dNet(nn.Module):
     ):
         super().__init__()
         whole_number("model.actor.filters", filters, most=MAX_WIDTH)
-        one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
+        one_of("model.actor.compute_dtype", compute_dtype, HIDDEN_DTYPES)
         check_clips("model.actor", bin_clip, tote_clip, floor)
         number_or_null("model.actor.head_std", head_std, 0, 1e3)
         whole_number("model.actor.chunk_bytes", chunk_bytes, most=2**30)
