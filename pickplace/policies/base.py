@@ -48,6 +48,8 @@ MAP_KEYS = ("bin_depth", "tote_depth", "tote_bearing")
 class Policy(TensorDictModuleBase, ABC):
     """A distribution over choices, given an observation; as a module it writes ``logits`` ``[N, choices]``.
 
+    Choices are flat actions, unless a policy sets :attr:`choice_key` and overrides the methods that convert them.
+
     Args:
         cell: the sizes.
         masks: masks that the environment must emit for training it, of ``"action"``, ``"footprint"`` and ``"corner"``.
@@ -63,7 +65,7 @@ class Policy(TensorDictModuleBase, ABC):
         ValueError: as of :meth:`check_cell`.
     """
 
-    choice_key: str
+    choice_key: str = "action"
     map_keys: tuple[str, ...] = DEPTH_KEYS
     excludes: str | None = None
     network: Any
@@ -92,13 +94,13 @@ class Policy(TensorDictModuleBase, ABC):
         """
         return self.logits(observation).gather(1, choices)
 
-    @abstractmethod
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
         """Return a flat action of each choice's class, int64 ``[N]``; drawn evenly when exploring, else the lowest."""
+        return choice
 
-    @abstractmethod
     def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
         """Return the class of each flat action, int64 ``[N]``; the action must succeed."""
+        return action
 
     @abstractmethod
     def action_log_probs(self, observation: Observation) -> Tensor:
@@ -179,8 +181,6 @@ class ActionPolicy(Policy):
         mask_infeasible: choose among feasible actions only.
     """
 
-    choice_key = "action"
-
     def __init__(self, cell: CellSpec, mask_infeasible: bool = False):
         super().__init__(cell, masks=("action",) if mask_infeasible else ())
 
@@ -190,12 +190,6 @@ class ActionPolicy(Policy):
 
     def logits(self, observation: Observation) -> Tensor:
         return self.action_scores(observation, observation["action_mask"] if self.masks else None)
-
-    def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        return choice
-
-    def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
-        return action
 
     def action_log_probs(self, observation: Observation) -> Tensor:
         return self.action_scores(observation).log_softmax(-1)

@@ -27,11 +27,10 @@ def parser() -> argparse.ArgumentParser:
         "check it with onnxruntime at three tote sizes that the export has not seen.",
         epilog="Inputs, outputs and metadata of the file: docs/robot.md",
     )
-    add = options.add_argument
-    add("checkpoint", help="a run folder, a checkpoint, or pretrained/<name>")
-    add("file", help="the ONNX file to write")
-    add("--rotations", type=int, metavar="R", help="quarter turns to choose from; default: as trained")
-    add(
+    options.add_argument("checkpoint", help="a run folder, a checkpoint, or pretrained/<name>")
+    options.add_argument("file", help="the ONNX file to write")
+    options.add_argument("--rotations", type=int, metavar="R", help="quarter turns to choose from; default: as trained")
+    options.add_argument(
         "--trust", action="append", metavar="MODULE", default=[],
         help="your own module whose classes the checkpoint's config may name; may be repeated",
     )  # fmt: skip

@@ -87,8 +87,7 @@ class TrainedPolicy(TensorDictModuleBase):
     def __init__(self, policy: Policy, terms: Mapping[str, Term], config: DictConfig):
         super().__init__()
         self.policy, self.cell, self.terms, self.config = policy, policy.cell, terms, config
-        self.in_keys = [key for key in policy.act_keys if not key.endswith("_mask")]
-        self.out_keys = ["action"]
+        self.in_keys, self.out_keys = [key for key in policy.act_keys if not key.endswith("_mask")], ["action"]
         self._draw = as_collection_policy(policy)
 
     @torch.no_grad()
@@ -165,10 +164,11 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     if not (cell.has_known_offsets or cfg.model.mask_infeasible):  # the policy chooses among grasps: so many are there
         longest = int(build("items", cfg["items"]).sizes[:, :2].max())
         cell = replace(cell, longest_side=longest)
-    policy = restore_policy(cfg, cell, state["policy"], env)
-    nodes = cfg.env.get("observation") or {}
-    terms = {str(key): build(f"env.observation.{key}", node) for key, node in nodes.items()}
-    return TrainedPolicy(policy.to(usable_device(device)), check_terms(terms or None), cfg)
+    policy = restore_policy(cfg, cell, state["policy"], env).to(usable_device(device))
+    nodes = (cfg.env.get("observation") or {}).items()
+    return TrainedPolicy(
+        policy, check_terms({str(key): build(f"env.observation.{key}", node) for key, node in nodes}), cfg
+    )
 
 
 def load_critic(path, trained: TrainedPolicy) -> "RestoredCritic | None":

@@ -19,8 +19,6 @@ from pickplace.rules.step import apply
 class Fixed(Policy):
     """A policy whose distribution over flat actions is given."""
 
-    choice_key = "action"
-
     def __init__(self, cell, scores):
         super().__init__(cell)
         self.scores = scores
@@ -29,11 +27,6 @@ class Fixed(Policy):
         return self.scores.expand(len(observation["bin_depth"]), -1)
 
     action_log_probs = logits
-
-    def to_action(self, choice, observation):
-        return choice
-
-    to_choice = to_action
 
 
 @pytest.mark.parametrize("candidates", [1, 4, 30, 10**6, "all"])
