@@ -18,7 +18,8 @@ from pickplace.policies.critics import Pooled
 from pickplace.policies.depth import Contents
 from pickplace.policies.fcn_grasp.network import FootprintFcn, matrix_dtype
 from pickplace.policies.fcn_grasp.policy import FcnGrasp, UnmaskedFcnGrasp
-from pickplace.rules.item import item_from_depth
+from pickplace.policies.footprints import every_footprint
+from pickplace.rules.item import item_from_depth, read_items
 from pickplace.runs import checkpoint
 
 FLOAT = {"head_std": 1.0, "compute_dtype": "float32"}
@@ -33,6 +34,14 @@ def random_maps(seed, batch, bin_size, tote_size):
         one[x : x + 2, y : y + 1 + x % 3] = float(torch.randint(1, 5, (), generator=generator))
     totes = torch.randint(0, 8, (batch, *tote_size), generator=generator).float()
     return bins, totes, torch.randint(0, 2, totes.shape, generator=generator).float()
+
+
+def every_score(network, bins, totes, bearing, parities):
+    """Return the network's scores of all footprints, ``[N, parities, W_T, D_T, out_channels]``."""
+    row, footprint = every_footprint(totes, parities)
+    contents = Contents(read_items(bins), torch.zeros_like(row))
+    scores = network.at(bins, totes, bearing, row, footprint, contents)
+    return scores.view(len(totes), parities, *totes.shape[1:], -1)
 
 
 def by_hand(network, item, tote_depth, bearing, parity, x, y):
@@ -93,7 +102,7 @@ def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes,
     network.weak.data.normal_()
     bins, totes, bearing = random_maps(seed, 2, (4, 6), tote)
     totes += deeper  # depths are kept in 16 bits
-    scores = network(bins, totes, bearing, 2)
+    scores = every_score(network, bins, totes, bearing, 2)
     assert scores.shape == (2, 2, *tote, 3)
     item, found, expected = item_from_depth(bins), [], []
     for n, parity in itertools.product(range(2), range(2)):
@@ -113,7 +122,7 @@ def test_only_what_the_mask_allows_is_computed_and_it_is_the_same(rotations, mon
     monkeypatch.setattr(policy.network, "at", lambda *args: asked.append(len(args[3])) or at(*args))
     logits = policy.logits(state)
     assert asked == [int(mask.sum())] and asked[0] < mask.numel()
-    everywhere = policy.network(*(state[key] for key in MAP_KEYS), env.cell.parities).flatten(1)
+    everywhere = every_score(policy.network, *(state[key] for key in MAP_KEYS), env.cell.parities).flatten(1)
     torch.testing.assert_close(logits, torch.where(mask, everywhere, MASKED))
     logits.logsumexp(1).sum().backward()
     unused = [name for name, parameter in policy.named_parameters() if parameter.grad is None]
@@ -141,7 +150,7 @@ def test_without_a_mask_every_grasp_has_the_score_of_its_footprint(rotations, ef
     policy, count = UnmaskedFcnGrasp(env.cell, filters=8, **FLOAT), env.cell.num_offsets
     policy.outside.data.fill_(7.0)
     logits = policy.class_scores(state).flatten(1)
-    scores = policy.network(*(state[key] for key in MAP_KEYS), env.cell.parities)
+    scores = every_score(policy.network, *(state[key] for key in MAP_KEYS), env.cell.parities)
     for parity in range(env.cell.parities):
         _, _, ref_x, ref_y, _ = env.cell.effector(parity)
         for ox, oy, x, y in itertools.product(range(count), range(count), range(4), range(5)):

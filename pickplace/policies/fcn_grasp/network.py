@@ -6,10 +6,8 @@ from torch import Tensor, nn
 
 from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_numbers
 from pickplace.policies.depth import Contents, clip_depth
-from pickplace.policies.footprints import every_footprint
 from pickplace.rules.grasps import split_footprint
 from pickplace.rules.gripper.base import reference_cell
-from pickplace.rules.item import read_items
 from pickplace.rules.maps import rectangle
 
 DTYPES = ("auto", "float32", "bfloat16")
@@ -89,19 +87,6 @@ class FootprintFcn(nn.Module):
         nn.init.normal_(self.head.weight, std=head_std)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, parities: int) -> Tensor:
-        """Return scores of all footprints, float32 ``[N, parities, W_T, D_T, out_channels]``, in the tote or not.
-
-        Args:
-            bin_depth, tote_depth: ``[N, W_B, D_B]``, ``[N, W_T, D_T]``.
-            bearing: 1 where a cell of the tote bears weight, else 0, ``[N, W_T, D_T]``.
-            parities: 1, or 2 to turn the footprints too.
-        """
-        (batch, wide, long), (row, footprint) = tote_depth.shape, every_footprint(tote_depth, parities)
-        contents = Contents(read_items(bin_depth), torch.zeros_like(row))
-        out = self.at(bin_depth, tote_depth, bearing, row, footprint, contents)
-        return out.view(batch, parities, wide, long, -1)
-
     def at(
         self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor,
         contents: Contents,
@@ -109,7 +94,8 @@ class FootprintFcn(nn.Module):
         """Return the scores of some footprints only, float32 ``[M, out_channels]``.
 
         Args:
-            bin_depth, tote_depth, bearing: as in :meth:`forward`.
+            bin_depth, tote_depth: ``[N, W_B, D_B]``, ``[N, W_T, D_T]``.
+            bearing: 1 where a cell of the tote bears weight, else 0, ``[N, W_T, D_T]``.
             row: int64 ``[M]``, which problem.
             footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
             contents: the items in the bins, and which one each footprint is of.

@@ -5,8 +5,9 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from pickplace.policies.base import MAP_KEYS, MASKED, Policy, pick_one, refuse_several_items
+from pickplace.policies.depth import Contents
 from pickplace.policies.fcn_grasp.network import FootprintFcn
-from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintPolicy
+from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintPolicy, every_footprint
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import (
     footprint_index,
@@ -16,7 +17,7 @@ from pickplace.rules.grasps import (
     pick_classes,
     split_flat,
 )
-from pickplace.rules.item import Observation, item_from_depth
+from pickplace.rules.item import Observation, item_from_depth, items_from_observation
 
 
 class FcnGrasp(FootprintPolicy):
@@ -78,7 +79,9 @@ class UnmaskedFcnGrasp(Policy):
     def class_scores(self, observation: Observation) -> Tensor:
         """Return a logit for every (grasp class, place cell), ``[N, C, W_T * D_T]``."""
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
-        scores = self.network(bins, totes, bearing, self.cell.parities).flatten(1)
+        row, footprint = every_footprint(totes, self.cell.parities)
+        contents = Contents(items_from_observation(observation), torch.zeros_like(row))
+        scores = self.network.at(bins, totes, bearing, row, footprint, contents).view(len(totes), -1)
         return torch.cat([scores, self.outside.expand(len(scores), 1)], 1)[:, self.scored]
 
     def _choices(self, observation: Observation) -> tuple[Tensor, Tensor, Tensor]:
