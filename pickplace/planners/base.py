@@ -83,8 +83,7 @@ def restrict_items(rule: str, state: State, mask: Tensor) -> Tensor:
     distance = (2 * items.x + items.w) ** 2 + (2 * items.y + items.d) ** 2 if rule == "nearest" else 0
     order = distance * count + torch.arange(count, device=mask.device)
     order = torch.where(mask.any(2), order, torch.iinfo(order.dtype).max)
-    chosen = order == order.amin(1, keepdim=True)
-    return (mask & chosen[:, :, None]).flatten(1)
+    return (mask & (order == order.amin(1, keepdim=True))[:, :, None]).flatten(1)
 
 
 def pick_first(cell: CellSpec, maps: PlacingMaps, rule: str) -> tuple[Tensor, Tensor, Tensor]:

@@ -134,8 +134,7 @@ class _Cheapest(MapPlanner):
         feasible = restrict_items(self.item, state, choice_mask(cell, maps))
         x, y = (torch.arange(side, device=feasible.device) for side in cell.tote_size[:2])
         cost = self.cost(cell, state, maps, x[:, None] + y)
-        choice = torch.where(feasible, maps.join(cost), torch.inf).argmin(1)
-        return first_action_reaching(cell, maps, choice)
+        return first_action_reaching(cell, maps, torch.where(feasible, maps.join(cost), torch.inf).argmin(1))
 
 
 class Corner(_Cheapest):

@@ -91,8 +91,7 @@ class Lookahead(MapPlanner):
         )
         logits = self.policy.footprint_logits(observation, self.policy.with_cell(cell).ranked(maps))
         # Of equals the first, as the policy itself plays.
-        ranked = torch.sort(logits, dim=1, descending=True, stable=True)
-        value, choice = (part[:, : self.candidates] for part in ranked)
+        value, choice = (part[:, : self.candidates] for part in logits.sort(dim=1, descending=True, stable=True))
         best = self._best(State.from_observation(observation), choice, value > MASKED / 2)
         return first_action_reaching(cell, maps, choice.gather(1, best[:, None])[:, 0])
 
@@ -179,8 +178,7 @@ class Lookahead(MapPlanner):
             if step == horizon and not sees_items:
                 volume[row] += self.critic(observe(self.terms, cell, state, critic_keys))[:, 0].double()
                 break
-            address = "train", seed[row], stream[row], arrived
-            items, arrived = refill(cell, source, *address, state.items, torch.ones_like(row, dtype=torch.bool))
+            items, arrived = refill(cell, source, "train", seed[row], stream[row], arrived, state.items, row >= 0)
             state = state._replace(items=items)
             mask = policy.ranked(placing_maps(cell, state))
             going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]

@@ -52,8 +52,7 @@ class PolicyPlanner(MapPlanner):
         model = "a checkpoint of model=fcn_grasp or corners that was trained with a mask"
         for key, value in (("planner.item", item), ("planner.pick", pick)):
             expect(ranks or value == "any", key, value, f"'any', or planner.candidates=all and {model}")
-        is_alone = cell.bin_items == 1
-        expect(is_alone or pick == "any", "planner.pick", pick, f"'any' with env.bin_items={cell.bin_items}")
+        expect(cell.bin_items == 1 or pick == "any", "planner.pick", pick, f"'any' with env.bin_items={cell.bin_items}")
 
     @torch.no_grad()
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:

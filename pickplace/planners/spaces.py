@@ -136,8 +136,8 @@ class SpacePlanner(MapPlanner):
                     fits = (left_x >= 0) & (left_y >= 0) & (floor + height <= tote_height[rows])
                     usable = space & fits if self.holds_item else space
                     found = torch.where(usable, self.space_order(floor, left_x, left_y), LAST)
-                    least = order[parity][:, rows].scatter_reduce(0, origin.expand_as(found), found, "amin")
-                    order[parity, :, rows] = least
+                    at = origin.expand_as(found)
+                    order[parity, :, rows] = order[parity][:, rows].scatter_reduce(0, at, found, "amin")
         return order.permute(2, 0, 1).unflatten(2, cell.tote_size[:2])
 
 

@@ -51,5 +51,4 @@ def clip_depth(depth: Tensor, limit: float | None, floor: float | None = None) -
 def item_code(item: Item, item_range: int, level: int = 1) -> Tensor:
     """Return the item's width, depth, and height in levels, as one-hot codes, bool ``[..., 3 * item_range]``."""
     size = torch.stack([item.w, item.d, item.h // level], -1).clamp(1, item_range)
-    step = torch.arange(1, item_range + 1, device=size.device)
-    return (size[..., None] == step).flatten(-2)
+    return (size[..., None] == torch.arange(1, item_range + 1, device=size.device)).flatten(-2)

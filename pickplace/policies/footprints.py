@@ -142,5 +142,4 @@ class FootprintPolicy(FootprintScorer):
         return torch.where(footprint >= 0, share.gather(1, footprint.clamp(min=0)), MASKED)
 
     def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
-        choice = self.footprint_logits(observation, self.ranked(maps)).argmax(1)
-        return first_action_reaching(self.cell, maps, choice)
+        return first_action_reaching(self.cell, maps, self.footprint_logits(observation, self.ranked(maps)).argmax(1))

@@ -80,8 +80,7 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
             "model=fcn_grasp or corners that was trained with a mask, or model=fcn4d."
         )
     keys = [key for key in policy.in_keys if not key.endswith("_mask")]
-    seen = _observations(trained, keys, 1)
-    model = _convert(Scores(policy, keys).eval(), keys, seen)
+    model = _convert(Scores(policy, keys).eval(), keys, _observations(trained, keys, 1))
     model.model.metadata_props.update({
         "pickplace": pickplace.__version__,
         "checkpoint": str(checkpoint),

@@ -106,8 +106,7 @@ class CornerNet(nn.Module):
         walls = [begin_w / w, (size_w - begin_w - w) / w, begin_d / d, (size_d - begin_d - d) / d]
         sizes = [w / side, d / side, h / height, (w * d) / side**2, (rest - h) / h, rest / height, (deepest - rest) / h]
         flags = [(rest == h).float(), (deepest == rest).float()]
-        numbers = torch.cat([*sizes, *walls, *flags], 1).clamp(max=3)
-        return torch.cat([torch.stack(planes, 1).flatten(1), numbers], 1)
+        return torch.cat([torch.stack(planes, 1).flatten(1), torch.cat([*sizes, *walls, *flags], 1).clamp(max=3)], 1)
 
     def _points(self, side: Tensor) -> Tensor:
         """Return the points along sides of an item ``[M, 1]``, in cells from its beginning, int64 ``[M, points]``."""

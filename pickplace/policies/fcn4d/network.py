@@ -221,10 +221,9 @@ class Conv4dNet(nn.Module):
 
     def _first_layer(self, bins: Tensor, totes: Tensor) -> tuple[Tensor, Tensor]:
         """Return the bin's and the tote's part of the first layer, before its ReLU: ``[N, filters, W + 2, D + 2]``."""
-        bin_kernel = self.first.weight[:, 0].sum((3, 4))  # the bin's channel is equal under all place taps
-        tote_kernel = self.first.weight[:, 1].sum((1, 2))
-        from_bin = F.conv2d(bins[:, None], bin_kernel[:, None])
-        from_tote = F.conv2d(totes[:, None], tote_kernel[:, None], self.first.bias)
+        # The bin's channel is equal under all place taps, the tote's under all pick taps.
+        from_bin = F.conv2d(bins[:, None], self.first.weight[:, 0].sum((3, 4))[:, None])
+        from_tote = F.conv2d(totes[:, None], self.first.weight[:, 1].sum((1, 2))[:, None], self.first.bias)
         return from_bin.to(self._dtype), from_tote.to(self._dtype)
 
     def _convolve_one_pick(self, from_bin: Tensor, from_tote: Tensor) -> Tensor:

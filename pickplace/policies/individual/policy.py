@@ -73,8 +73,7 @@ class IndividualRl(PlaceRotationPolicy, Fcn4d):
     """
 
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
-        actions = join_pick(self.cell, self._pick(observation)[:, None], choices)
-        return Fcn4d.choice_logits(self, observation, actions)
+        return Fcn4d.choice_logits(self, observation, join_pick(self.cell, self._pick(observation)[:, None], choices))
 
     def place_scores(self, observation: Observation, pick: Tensor) -> Tensor:
         logits = self.network(observation["bin_depth"], observation["tote_depth"], pick).unflatten(1, (-1, 4))
