@@ -5,7 +5,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import check_bytes, number, whole_number
+from pickplace.common.validate import check_bytes, number, refuse_if, whole_number
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner
@@ -68,10 +68,10 @@ class Lookahead(MapPlanner):
         self.confidence = number("planner.confidence", confidence)
         if horizon is not None:
             whole_number("planner.horizon", horizon)
-        if not isinstance(policy, ScoresFootprints):
-            raise ValueError(
-                "planner=lookahead: expected a checkpoint of model=fcn_grasp, corners or afterstate, with a mask."
-            )
+        refuse_if(
+            not isinstance(policy, ScoresFootprints),
+            "planner=lookahead: expected a checkpoint of model=fcn_grasp, corners or afterstate, with a mask.",
+        )
         self.cell, self.policy, self.items, self.terms = (
             cell,
             policy,

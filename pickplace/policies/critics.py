@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_numbers
+from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, refuse_if, whole_numbers
 from pickplace.policies.base import MAP_KEYS
 from pickplace.policies.depth import clip_depth, item_code
 from pickplace.policies.fcn4d.network import BIN_PADDING, HIDDEN_DTYPES, TOTE_PADDING, check_clips, clip_and_pad
@@ -151,10 +151,10 @@ class Conv4d(nn.Module):
     def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
         """Return values ``[..., 1]`` of bin depth ``[..., W_B, D_B]`` and tote depth ``[..., W_T, D_T]``."""
         for name, depth, size in (("bin", bin_depth, self.bin_size), ("tote", tote_depth, self.tote_size)):
-            if (got := tuple(depth.shape[-2:])) != size:
-                raise ValueError(
-                    f"{name}_depth: got {list(got)}, expected {list(size)}, for which the critic was made."
-                )
+            got = tuple(depth.shape[-2:])
+            refuse_if(
+                got != size, f"{name}_depth: got {list(got)}, expected {list(size)}, for which the critic was made."
+            )
         batch, dtype = tote_depth.shape[:-2], next(self.parameters()).dtype
         bins = bin_depth.to(dtype).reshape(-1, 1, *self.bin_size)
         totes = tote_depth.to(dtype).reshape(-1, 1, *self.tote_size)

@@ -12,7 +12,7 @@ from torch.export import Dim
 
 import pickplace
 from pickplace.common.files import replaced_file
-from pickplace.common.validate import short_text
+from pickplace.common.validate import refuse_if, short_text
 from pickplace.policies.base import ScoresAnySize
 from pickplace.policies.restore import TrainedPolicy, cell_settings, load_policy
 
@@ -70,8 +70,7 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
     except ImportError as error:
         raise ValueError(f"pickplace-export: {error.name} is missing; pip install 'pickplace[onnx]'.") from error
     path = Path(path)
-    if path.is_dir() or not path.parent.is_dir():
-        raise ValueError(f"{path}: expected a file in a folder that exists.")
+    refuse_if(path.is_dir() or not path.parent.is_dir(), f"{path}: expected a file in a folder that exists.")
     trained = _load(checkpoint, trust, **sizes)
     policy, cell = trained.policy, trained.cell
     if not isinstance(policy, ScoresAnySize):
@@ -104,11 +103,11 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
             found = session.run(None, {key: entry.numpy() for key, entry in zip(keys, asked, strict=True)})[0]
             difference = (torch.from_numpy(found) - expected).abs().max() / expected.abs().max().clamp(min=1)
             wide, deep, _ = other.cell.tote_size
-            if not difference <= TOLERANCE:  # nan, too
-                raise ValueError(
-                    f"{path}: at a tote of {wide}x{deep} cells onnxruntime and torch differ by {difference:.1e} of the "
-                    f"greatest score; expected at most {TOLERANCE:g}. Nothing was written."
-                )
+            refuse_if(
+                not difference <= TOLERANCE,  # nan, too
+                f"{path}: at a tote of {wide}x{deep} cells onnxruntime and torch differ by {difference:.1e} of the "
+                f"greatest score; expected at most {TOLERANCE:g}. Nothing was written.",
+            )
             differences[wide, deep] = float(difference)
     return differences
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from pickplace.common.machine import usable_device
-from pickplace.common.validate import expect
+from pickplace.common.validate import expect, refuse_if
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import build, node_of
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
@@ -42,11 +42,11 @@ def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: di
     Raises:
         ValueError: for more rotations than were trained, or tensors that do not fit the config or the sizes.
     """
-    if cell.rotations > trained_env["rotations"]:
-        raise ValueError(
-            f"env.rotations={cell.rotations}: the checkpoint was trained with {trained_env['rotations']}; "
-            "expected no more."
-        )
+    refuse_if(
+        cell.rotations > trained_env["rotations"],
+        f"env.rotations={cell.rotations}: the checkpoint was trained with {trained_env['rotations']}; expected no "
+        "more.",
+    )
 
     def restored(cell: CellSpec) -> Policy:
         make = partial(build, "model.actor", cfg.model.actor, cell=cell, mask_infeasible=cfg.model.mask_infeasible)
