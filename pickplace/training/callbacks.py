@@ -5,7 +5,7 @@ from numbers import Real
 from typing import Any
 
 from pickplace.common.errors import sentence
-from pickplace.common.validate import excerpt, expect, number, or_null, whole_number
+from pickplace.common.validate import expect, number, or_null, whole_number
 from pickplace.config.registry import build
 from pickplace.evaluation.play import Episodes
 
@@ -117,5 +117,5 @@ def call(callbacks: dict[str, Callback], hook: str, trainer: Any, *arguments: An
         getattr(callback, hook)(trainer, *arguments)
         if removed := [key for key in before if key not in metrics]:
             raise ValueError(f"callbacks.{name}: it removes {removed[0]} from the metrics; expected changed values.")
-        if bad := [key for key, value in metrics.items() if not isinstance(value, Real)]:
-            raise ValueError(f"callbacks.{name}: it logs {bad[0]}={excerpt(metrics[bad[0]])}; expected a number.")
+        for key, value in metrics.items():
+            expect(isinstance(value, Real), f"callbacks.{name}: it logs {key}", value, "a number")

@@ -3,7 +3,6 @@
 import signal
 import sys
 import threading
-from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -56,15 +55,15 @@ class ResumableCollector(Collector):
             masks = {key for key in self.env.observation_spec.keys() if key.endswith("_mask")}  # noqa: SIM118
             self._compact_next_keys = tuple(("next", key) for key in sorted(masks.difference(self.next_keys)))
 
-    def state_dict(self) -> OrderedDict:
-        return OrderedDict(
-            environment=dict(self.env.base_env.state_dict()),
-            transforms=dict(self.env.transform.state_dict()),
+    def state_dict(self) -> dict:
+        return {
+            "environment": dict(self.env.base_env.state_dict()),
+            "transforms": dict(self.env.transform.state_dict()),
             # The input of the next step; not "collector", whose trajectory numbers come from a pool that workers share.
-            carried=self._carrier.select(*self.env.observation_spec.keys(), *self.env.done_keys).clone().to_dict(),
-            counters={"frames": torch.tensor(self._frames), "iterations": torch.tensor(self._iter)},
+            "carried": self._carrier.select(*self.env.observation_spec.keys(), *self.env.done_keys).clone().to_dict(),
+            "counters": {"frames": torch.tensor(self._frames), "iterations": torch.tensor(self._iter)},
             **rng_state(self.env.device),
-        )
+        }
 
     def load_state_dict(self, state_dict, **kwargs) -> None:
         self.env.base_env.load_state_dict(state_dict["environment"])
@@ -111,8 +110,8 @@ class ResumableRayCollector(RayCollector):
         return super().map_fn(*args, **kwargs)
 
     @_ray_errors()
-    def state_dict(self) -> OrderedDict:
-        return OrderedDict((f"worker{worker}", state) for worker, state in enumerate(super().state_dict()))
+    def state_dict(self) -> dict:
+        return {f"worker{worker}": state for worker, state in enumerate(super().state_dict())}
 
     @_ray_errors()
     def load_state_dict(self, state_dict, **kwargs) -> None:
@@ -187,14 +186,13 @@ def watch_workers(collector):
                 worker.join(0.5)
             check()
             raise
+        finally:
+            signal.signal(signal.SIGCHLD, previous)
     except WorkerDied:
-        signal.signal(signal.SIGCHLD, previous)
         for worker in open_workers():
             worker.kill()
             worker.join()
         raise
-    finally:
-        signal.signal(signal.SIGCHLD, previous)
 
 
 def single(make_env, policy, num_envs: int, rollout_length: int, seed: int, next_keys=()) -> Collector:

@@ -7,7 +7,6 @@ import shlex
 from html import escape
 from pathlib import Path
 
-import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.files import replaced_file
@@ -38,9 +37,8 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
     best = max((row for row in rows if "eval/occupancy" in row), key=lambda row: row["eval/occupancy"])
     ordered = sorted(episodes.recordings, key=lambda recording: recording.occupancy)
     policy, sizes = str(cfg.model.actor._target_).rpartition(".")[2], "x".join(map(str, cell.tote_size))
-    words = map(shlex.quote, noted_command(run_dir))
-    command, changed = " ".join(["pickplace-train", *words]), changed_values(run_dir, cfg)
-    if changed:
+    command = shlex.join(["pickplace-train", *noted_command(run_dir)])
+    if changed := changed_values(run_dir, cfg):
         command += f"\n\nChanged when it was resumed: {', '.join(changed)}"
     tiles = [
         (f"{best['eval/occupancy']:.4f}", f"best validation, after {best['frames']:,} frames (checkpoints/best)"),
@@ -70,7 +68,6 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
 
 
 def _table(head: tuple, rows: list[tuple]) -> str:
-    """An HTML table."""
     lines = ["".join(f"<td>{value}</td>" for value in row) for row in rows]
     lines.insert(0, "".join(f"<th>{name}</th>" for name in head))
     return f"<table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
@@ -100,6 +97,6 @@ def level_table(rows: list[dict]) -> str:
     for height in heights:
         seen = [row for row in rows if f"curriculum/occupancy_at_{height}" in row]
         values = [row[f"curriculum/occupancy_at_{height}"] for row in seen[-20:]]
-        lines.append((height, f"{np.mean(values):.4f}", f"{seen[0]['frames']:,} to {seen[-1]['frames']:,}"))
+        lines.append((height, f"{sum(values) / len(values):.4f}", f"{seen[0]['frames']:,} to {seen[-1]['frames']:,}"))
     head = ("tote height", "training occupancy when last trained", "frames")
     return "<br>" + _table(head, lines) if lines else ""

@@ -119,10 +119,3 @@ def main() -> None:
             resume_run(overrides)
     else:
         Command("train", train, run_folders, after_sweep=summarize)()
-
-
-if __name__ == "__main__":
-    # Import under its own name, under which launchers and collectors find it in other processes.
-    from pickplace.training.train import main
-
-    main()

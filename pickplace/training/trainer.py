@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from math import nan
 from pathlib import Path
 from typing import Any, cast
 
@@ -76,49 +75,59 @@ class Trainer:
         self.device = use_machine(cfg)
         torch.manual_seed(cfg.seed)
         self.safe_folder: Path | None
-        self.state, self.facts, self.safe_folder = resume or ({}, {}, None)
-        self.frames, self.iteration, self.best, self.latest = ({**NEW, **self.facts}[key] for key in NEW)
+        self.state, facts, self.safe_folder = resume or ({}, {}, None)
+        self.frames, self.iteration, self.best, self.latest = ({**NEW, **facts}[key] for key in NEW)
         self.episodes: Episodes | None = None
         # With other settings, a training that a callback had ended goes on.
-        self.ended = self.facts.get("ended") is True and has_config(self.facts, self.saved_config)
-        self.callbacks = callbacks.make_callbacks(cfg.get("callbacks") or {}, self.facts.get("callbacks") or {})
+        self.ended = facts.get("ended") is True and has_config(facts, self.saved_config)
+        self.callbacks = callbacks.make_callbacks(cfg.get("callbacks") or {}, facts.get("callbacks") or {})
         # The order of these fixes the random draws of a seed.
         self._make_networks()
-        self._make_curriculum()
+        self.curriculum: Curriculum = build("curriculum", cfg.curriculum)
+        self.curriculum.setup(self.env.min_tote_height, self.env.cell.tote_size[2], cfg.total_frames)
+        if self.resumed:
+            self.curriculum.load_state_dict(facts["curriculum"])
+            if (stale := stale_best_frames(run_dir, self.frames, self.saved_config)) is not None:
+                self.best = NEW["best"]
+                log.warning(
+                    "checkpoints/best is of frame %s and of other settings; the next validation replaces it",
+                    f"{stale:,}",
+                )
+        if shortage := self.curriculum.check_budget(cfg.total_frames, self.task.batch_frames):
+            log.warning(shortage)
         self._make_collector()
 
     def _make_networks(self) -> None:
         """Make the environment, the policy, the planner that validates it, the warm start, critic and algorithm."""
         cfg = self.cfg
         env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
-        del env["num_envs"]  # differs
+        del env["num_envs"]  # given with each call
         self.build_env = partial(build, "env", env, items=build("items", cfg["items"]), device=cfg.device, masks=())
-        probe = self.build_env(num_envs=1)
-        self.cell, self.min_tote_height = probe.cell, probe.min_tote_height
+        self.env = self.build_env(num_envs=1)  # for its sizes, terms and items
         weights = self.state
         if not self.resumed and (path := cfg.warm_start.weights) is not None:
             weights, facts = checkpoint.read(checkpoint.locate(path, key="warm_start.weights"))
             log.info("beginning with the weights of %s, after %s frames", path, f"{facts['frames']:,}")
-        masked = cfg.model.mask_infeasible
-        make_actor = partial(build, "model.actor", cfg.model.actor, cell=self.cell, mask_infeasible=masked)
+        make = partial(build, cell=self.env.cell)
+        make_actor = partial(make, "model.actor", cfg.model.actor, mask_infeasible=cfg.model.mask_infeasible)
         self.policy: Policy = self._restored("policy", make_actor, weights)
         for warning in self.policy.check_sizes():
             log.warning(warning)
-        self.planner = build("planner", cfg.planner, cell=self.cell, policy=self.policy)
-        self.warm_start = WarmStart(cfg.warm_start, self.policy, probe, cfg.seed, cfg.trust)
+        self.planner = make("planner", cfg.planner, policy=self.policy)
+        self.warm_start = WarmStart(cfg.warm_start, self.policy, self.env, cfg.seed, cfg.trust)
         self.critic = None
         if isinstance(self.policy, EstimatesValue):
             expect(cfg.model.critic is None, "model.critic", cfg.model.critic, "null; the actor is the critic")
             self.critic = as_critic(self.policy.value_network())
         elif cfg.model.critic is not None:
-            make_critic = partial(build, "model.critic", cfg.model.critic, cell=self.cell)
+            make_critic = partial(make, "model.critic", cfg.model.critic)
             self.critic = self._restored("critic", lambda: as_critic(make_critic()), weights)
         observation = self.build_env(num_envs=1, masks=self.policy.masks).observation_spec.zero()
-        self.task = Task(probe.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
+        self.task = Task(self.env.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
         algorithm = build("algo", cfg.algo, policy=self.policy, critic=self.critic, task=self.task)
         expect(isinstance(algorithm, Algorithm), "algo", algorithm, "an algorithm, such as algo=ppo")
         self.algorithm = with_warm_start(algorithm, self.warm_start)
-        check_memory(cfg, probe, self.policy, self.algorithm)
+        check_memory(cfg, self.env, self.policy, self.algorithm)
 
     def _restored(self, key: str, make, weights: dict) -> Any:
         """Make a module, with the weights of the checkpoint that the run continues or begins with."""
@@ -133,22 +142,6 @@ class Trainer:
                 raise checkpoint.CheckpointError(message) from error
             log.warning("warm_start.weights: the critic begins anew. %s", error)
             return make().to(self.device)
-
-    def _make_curriculum(self) -> None:
-        """Make the curriculum, and warn of a budget that is too small and of a best checkpoint that is stale."""
-        total = self.cfg.total_frames
-        self.curriculum: Curriculum = build("curriculum", self.cfg.curriculum)
-        self.curriculum.setup(self.min_tote_height, self.cell.tote_size[2], total)
-        if self.resumed:
-            self.curriculum.load_state_dict(self.facts["curriculum"])
-            if (stale := stale_best_frames(self.run_dir, self.frames, self.saved_config)) is not None:
-                self.best = NEW["best"]
-                log.warning(
-                    "checkpoints/best is of frame %s and of other settings; the next validation replaces it",
-                    f"{stale:,}",
-                )
-        if shortage := self.curriculum.check_budget(total, self.task.batch_frames):
-            log.warning(shortage)
 
     def _make_collector(self) -> None:
         cfg = self.cfg
@@ -198,7 +191,7 @@ class Trainer:
                 with watch_workers(self.collector):
                     own = self.collector.state_dict()
                     saved = checkpoint.matching_state(self.state.get("collector"), own, "collector")
-                    check_saved_states(self.build_env(num_envs=1), saved)
+                    check_saved_states(self.env, saved)
                     self.collector.load_state_dict(saved)
                     push_level(self.collector, self.curriculum.level)
                 # Last: everything above may have drawn.
@@ -278,7 +271,7 @@ class Trainer:
             log.info(
                 f"{frames / cfg.total_frames:4.0%} {frames:>11,} frames | {speed:6,.0f}/s | "
                 f"tote height {self.curriculum.level}/{self.curriculum.end} | "
-                f"occupancy {metrics.get('train/occupancy', nan):.3f} | {left // 60}:{left % 60:02d} to go"
+                f"occupancy {metrics.get('train/occupancy', float('nan')):.3f} | {left // 60}:{left % 60:02d} to go"
             )
 
     def save(self, name: str) -> None:
@@ -332,7 +325,7 @@ class Trainer:
             log.info("writing the report")
             occupancy = (self.episodes or self.validate()).occupancy
             replayed = self.validate(record={int(occupancy.argmin()), int(occupancy.argmax())})
-            write_report(run_dir, self.cfg, replayed, self.cell, versions() | {"commit": commit()})
+            write_report(run_dir, self.cfg, replayed, self.env.cell, versions() | {"commit": commit()})
 
 
 def training_env(base_env, curriculum: Curriculum, first_episode: int, num_envs: int) -> TransformedEnv:

@@ -174,7 +174,7 @@ def test_bad_callbacks_are_one_sentence(node, states, expected):
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ("metric: many", "callbacks.mine: it logs train/broken='many'; expected a number"),
+        ("metric: many", "callbacks.mine: it logs train/broken='many': expected a number"),
         ("clear: true", "callbacks.mine: it removes train/reward from the metrics"),
         ("later: true", "callbacks.mine: its state cannot be saved .* set is not JSON"),
     ],

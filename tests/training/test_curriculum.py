@@ -201,18 +201,18 @@ ERRORS = [
     (lambda: Staged([STAGE] * 2), "curriculum.advance.stages: frames=5: .* >= 6"),
     (lambda: make(Staged([STAGE | {"height": 9}])), "curriculum.advance.stages: height=9: .* <= 5"),
     # States of another run; for damaged ones see test_resume.
-    (lambda: make(Frames(1)).load_state_dict(make(Plateau(2, 2)).state_dict()), "advance=Frames.*'best'.*expected"),
+    (lambda: make(Frames(1)).load_state_dict(make(Plateau(2, 2)).state_dict()), "advance='Frames': expected .*'best'"),
     (
         lambda: make(NONE).load_state_dict(make(NONE, high=9).state_dict()),
         "of the checkpoint=9: expected .* <= 5",
     ),
-    (lambda: make(NONE).load_state_dict({"level": 1}), "The checkpoint's curriculum is .* saved"),
+    (lambda: make(NONE).load_state_dict({"level": 1}), "the checkpoint's curriculum=.* saved"),
     # A user's rule.
     (lambda: play(make(Own(1.5)), 10), "advance: Own: its level=1.5: expected a whole number"),
-    (lambda: play(make(Own(1, logs={"mood": "good"})), 10), "Own: it logs mood='good'; expected a number"),
-    (lambda: make(Own(1, torch.tensor(1))), r"Own: its state has seen=tensor\(1\); expected a finite Python number"),
+    (lambda: play(make(Own(1, logs={"mood": "good"})), 10), "Own: it logs mood='good': expected a number"),
+    (lambda: make(Own(1, torch.tensor(1))), r"Own: its state has seen=tensor\(1\): expected a finite Python number"),
     (lambda: make(Own(1, float("nan"))), "Own: its state has seen=nan"),
-    (lambda: play(make(Own(1, logs=None)), 10), r"Own: update returned \(1, None\); expected \(level, "),
+    (lambda: play(make(Own(1, logs=None)), 10), r"Own: its update=\(1, None\): expected \(level, "),
 ]
 
 

@@ -46,7 +46,7 @@ def heights(td):
 
 @pytest.mark.parametrize("drawn", [torch.ones(5).long(), torch.ones(6), [1] * 6], ids=["few", "floats", "list"])
 def test_a_sampler_that_returns_something_else_is_named(drawn):
-    message = r"curriculum.sample: function returned .*; expected heights, whole numbers in a tensor \[6\]"
+    message = r"curriculum.sample: its heights=.*: expected whole numbers in a tensor \[6\]"
     with pytest.raises(ValueError, match=message):
         make_env(sampler=lambda level, least, count: drawn).reset()
 

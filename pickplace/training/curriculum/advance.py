@@ -133,12 +133,9 @@ class Threshold(Advance):
 
     def update(self, tally):
         full = len(tally.window) == self.window
-        reached = full and tally.mean >= self.occupancy - TOLERANCE
-        if reached or tally.level_frames >= self.max_frames:
-            return tally.level + 1, {}
-        if full and tally.mean < self.demote_below - TOLERANCE:
-            return tally.level - 1, {}
-        return tally.level, {}
+        up = full and tally.mean >= self.occupancy - TOLERANCE or tally.level_frames >= self.max_frames
+        down = full and tally.mean < self.demote_below - TOLERANCE and not up
+        return tally.level + up - down, {}
 
     def least_frames(self, batch):  # an episode takes at least one frame
         return (self.end - self.start) * max(min(self.window, self.max_frames), batch)

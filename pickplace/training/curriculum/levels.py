@@ -3,10 +3,11 @@
 import math
 from collections import deque
 from numbers import Real
+from typing import Any
 
 from torch import Tensor
 
-from pickplace.common.validate import excerpt, expect, integral_number, is_number, is_whole, number
+from pickplace.common.validate import expect, integral_number, is_number, is_whole, number
 from pickplace.training.curriculum.advance import Advance, Tally
 from pickplace.training.curriculum.transform import ToteHeightCurriculum
 
@@ -22,8 +23,8 @@ class Curriculum:
     """
 
     def __init__(self, advance: Advance, sample, start_height: int | None = None, end_height: int | None = None):
-        is_rule = isinstance(advance, Advance)
-        expect(is_rule, "curriculum.advance", advance, "a rule, such as curriculum/advance=threshold")
+        expected = "a rule, such as curriculum/advance=threshold"
+        expect(isinstance(advance, Advance), "curriculum.advance", advance, expected)
         expect(callable(sample), "curriculum.sample", sample, "a sampler, such as curriculum/sample=recent")
         self.advance, self.sample, self._rule = advance, sample, f"curriculum.advance: {type(advance).__name__}"
         self.start_height, self.end_height = start_height, end_height
@@ -39,11 +40,11 @@ class Curriculum:
         Raises:
             ValueError: naming the setting that does not fit these numbers.
         """
+        start = min_height if self.start_height is None else self.start_height
         end = max_height if self.end_height is None else self.end_height
         self.end = integral_number("curriculum.end_height", end, min_height, max_height)
-        self.full_height = max_height
-        start = min_height if self.start_height is None else self.start_height
         self.start = integral_number("curriculum.start_height", start, min_height, self.end)
+        self.full_height = max_height
         first = self.advance.setup(self.start, self.end, integral_number("total_frames", total_frames))
         self.tally = Tally(self._clamped(first), deque(maxlen=self.advance.window))
         self._rule_state()  # raises here, not at the first checkpoint
@@ -97,18 +98,21 @@ class Curriculum:
         tally.frames, tally.episodes = frames, tally.episodes + len(at_level)
         tally.window.extend(at_level)
         answer = self.advance.update(tally)
-        if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], dict):
-            raise ValueError(f"{self._rule}: update returned {excerpt(answer)}; expected (level, {{name: number}}).")
+        good = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], dict)
+        expect(good, f"{self._rule}: its update", answer, "(level, {name: number})")
         level, logs = self._clamped(answer[0]), {**answer[1]}
-        if bad := [name for name, value in logs.items() if not isinstance(value, Real)]:
-            raise ValueError(f"{self._rule}: it logs {bad[0]}={excerpt(logs[bad[0]])}; expected a number.")
+        for name, value in logs.items():
+            expect(isinstance(value, Real), f"{self._rule}: it logs {name}", value, "a number")
         self._rule_state()
-        logs |= {"level": level, "frames_at_level": tally.level_frames, "episodes": tally.episodes}
-        logs["progress"] = (level - self.start) / (self.end - self.start) if self.end > self.start else 1.0
-        if tally.window:
-            logs["occupancy"] = tally.mean
-        for height in heights.unique().tolist():
-            logs[f"occupancy_at_{height}"] = occupancy[heights == height].mean().item()
+        means = {height: occupancy[heights == height].mean().item() for height in heights.unique().tolist()}
+        logs |= {
+            "level": level,
+            "frames_at_level": tally.level_frames,
+            "episodes": tally.episodes,
+            "progress": (level - self.start) / (self.end - self.start) if self.end > self.start else 1.0,
+            **({"occupancy": tally.mean} if tally.window else {}),
+            **{f"occupancy_at_{height}": mean for height, mean in means.items()},
+        }
         if level != tally.level:
             self.tally = Tally(level, deque(maxlen=self.advance.window), frames, level_start=frames)
         return {f"curriculum/{key}": value for key, value in logs.items()}
@@ -120,10 +124,9 @@ class Curriculum:
     def _rule_state(self) -> dict:
         """Return the rule's own state; raise if a checkpoint could not store it."""
         state = {key: getattr(self.advance, key, None) for key in self.advance.state_keys}
-        # JSON stores these numbers exactly.
-        if bad := [key for key, value in state.items() if not (isinstance(value, int | float) and is_number(value))]:
-            found = f"{bad[0]}={excerpt(state[bad[0]])}"
-            raise ValueError(f"{self._rule}: its state has {found}; expected a finite Python number.")
+        for key, value in state.items():
+            is_exact = isinstance(value, int | float) and is_number(value)  # in JSON
+            expect(is_exact, f"{self._rule}: its state has {key}", value, "a finite Python number")
         return state
 
     def state_dict(self) -> dict:
@@ -136,25 +139,19 @@ class Curriculum:
         Raises:
             ValueError: for the state of another advance rule, a level outside the heights, or no such state.
         """
-        rule = state.get("advance") if isinstance(state, dict) else None
-        if not isinstance(rule, dict) or set(state) != {*vars(self.tally), "advance"}:
-            raise ValueError(
-                f"The checkpoint's curriculum is {excerpt(state)}; expected the state that a training saved."
-            )
-        if set(rule) != set(self.advance.state_keys):
-            raise ValueError(
-                f"curriculum.advance={type(self.advance).__name__}: the checkpoint has the state "
-                f"{sorted(rule)}, expected {sorted(self.advance.state_keys)}; resume with the run's own rule."
-            )
+        rule: Any = state.get("advance") if isinstance(state, dict) else None
+        good = isinstance(rule, dict) and set(state) == {*vars(self.tally), "advance"}
+        expect(good, "the checkpoint's curriculum", state, "the state that a training saved")
+        fits = set(rule) == set(self.advance.state_keys)
+        expect(fits, "curriculum.advance", type(self.advance).__name__, f"the run's own rule, with {sorted(rule)}")
         key = "curriculum {} of the checkpoint".format
         level = integral_number(key("level"), state["level"], self.start, self.end)
         frames = integral_number(key("frames"), state["frames"], 0)
         counts = {name: integral_number(key(name), state[name], 0, frames) for name in ("level_start", "episodes")}
-        if not isinstance(state["window"], list):
-            raise ValueError(f"{key('window')}={excerpt(state['window'])}: expected a list of numbers between 0 and 1.")
-        window = deque((number(key("window"), value, most=1) for value in state["window"]), self.advance.window)
+        window = state["window"]
+        expect(isinstance(window, list), key("window"), window, "a list of numbers between 0 and 1")
+        window = deque((number(key("window"), value, most=1) for value in window), self.advance.window)
         for name, value in rule.items():
-            if not is_number(value):
-                raise ValueError(f"{key(name)}={excerpt(value)}: expected a number.")
+            expect(is_number(value), key(name), value, "a number")
         self.tally = Tally(level, window, frames, **counts)
         vars(self.advance).update(rule)

@@ -5,7 +5,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-from pickplace.common.validate import excerpt, integral_number
+from pickplace.common.validate import expect, integral_number
 
 
 class ToteHeightCurriculum(Transform):
@@ -35,11 +35,8 @@ class ToteHeightCurriculum(Transform):
             tensordict = TensorDict(batch_size=self.parent.batch_size, device=self.parent.device)
         count = tensordict.numel()
         height = self.sampler(int(self.level), self.min_height, count)
-        if not isinstance(height, Tensor) or height.numel() != count or height.is_floating_point():
-            raise ValueError(
-                f"curriculum.sample: {type(self.sampler).__name__} returned {excerpt(height)}; "
-                f"expected heights, whole numbers in a tensor [{count}]."
-            )
+        good = isinstance(height, Tensor) and height.numel() == count and not height.is_floating_point()
+        expect(good, "curriculum.sample: its heights", height, f"whole numbers in a tensor [{count}]")
         height = height.to(self.level.device).reshape(*tensordict.batch_size, 1)
         reset, running = tensordict.get("_reset", None), tensordict.get("tote_height", None)
         # Collectors hide `tote_height` from a reset; running rows then get a drawn height too, which nothing reads.
