@@ -1,8 +1,6 @@
 """The common part of PPO and A2C: advantages by GAE, and a loss of TorchRL's."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -35,7 +33,6 @@ class ActorCritic(MinibatchDescent):
     drawn_keys: tuple[str, ...] = ("log_prob",)  # entries that the acting policy writes and the loss reads
     log_prob_key = "log_prob"  # the one with the log-probabilities under the policy that collected
     averages = False  # whether GAE normalises advantages in each batch
-    loss: A2CLoss | ClipPPOLoss
 
     def __init__(
         self,
@@ -97,10 +94,7 @@ class ActorCritic(MinibatchDescent):
         keys = {*self.policy.in_keys, *self.critic.in_keys, *self.drawn_keys, self.policy.choice_key}
         return batch.select(*keys, "advantage", "value_target").reshape(-1)
 
-    def losses(self, data: TensorDictBase) -> TensorDictBase:
-        return self.loss(data)
-
-    def objective(self, data: TensorDictBase) -> tuple[Tensor, Mapping[str, Any]]:
-        """Return the whole loss of a minibatch, and its parts."""
-        losses = self.losses(data)
+    def objective(self, data: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        """Return TorchRL's loss of a minibatch ``[B]``, and its parts."""
+        losses = self.loss(data)
         return losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"], losses

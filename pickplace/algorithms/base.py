@@ -113,8 +113,8 @@ class Imitable(Protocol):
         """Return the frames ``[B]`` of a batch ``[N, T]`` with all that the loss reads; draws everything that is drawn
         for it."""
 
-    def losses(self, data: TensorDictBase) -> TensorDictBase:
-        """Return the parts of the loss of a minibatch; ``loss_critic`` is the critic's."""
+    def objective(self, data: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        """Return the loss of a minibatch, and its parts; ``loss_critic`` is the critic's."""
 
     def descend(self, data: TensorDictBase, at: At, objective: Objective) -> dict[str, float]:
         """Minimise an objective on frames ``[B]``; return metrics."""

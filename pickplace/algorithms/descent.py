@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Iterable
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -115,14 +114,13 @@ class MinibatchDescent(Algorithm):
     def state_dict(self) -> dict:
         return {"optimizer": self.optimizer.state_dict()["state"]}
 
-    def load_state_dict(self, state: Any) -> None:
+    def load_state_dict(self, state: object) -> None:
         load_optimizer(self.optimizer, state.get("optimizer") if isinstance(state, dict) else None)
 
     def memory(self, frame: int) -> dict[str, int]:
         return self.learning_memory(self.policy.learning_bytes())
 
     def learning_memory(self, frame: int) -> dict[str, int]:
-        """Return the bytes of a gradient step if each frame takes ``frame`` bytes, by its key."""
         size = min(self.minibatch_size, self.task.batch_frames)
         return {f"algo.minibatch_size={size}": size * frame}
 

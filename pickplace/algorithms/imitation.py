@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from typing import Any, cast
 
 import torch
-import torch.nn.functional as F
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -16,7 +15,6 @@ from pickplace.common.validate import expect
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import accepted_arguments, build, find
 from pickplace.envs.torchrl import PickPlaceEnv
-from pickplace.planners.base import BatchPlanner
 from pickplace.planners.use import decide, planner_parts
 from pickplace.policies.base import MASKED, Policy
 from pickplace.rules.state import State
@@ -73,7 +71,7 @@ class WarmStart:
         self._parts = planner_parts(cfg.teacher, env.cell, env.items, env.terms, trained)
         self._make_teacher(0)  # refuses bad settings before the first batch
 
-    def _make_teacher(self, iteration: int) -> BatchPlanner:
+    def _make_teacher(self, iteration: int):
         """Make the teacher anew; one that draws gets a seed of its own in each iteration."""
         seed = {"seed": self.seed + iteration} if self._draws else {}
         return build("warm_start.teacher", {**self._settings, **seed}, **self._parts)
@@ -127,7 +125,7 @@ class Imitation(Algorithm):
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         """Return the critic's loss, plus that of imitating ``data["taught"]`` if there is such an entry."""
-        losses = self.inner.losses(data)
+        _, losses = self.inner.objective(data)
         total = losses["loss_critic"]
         if "taught" in data:
             losses["loss_imitation"], losses["agreement"] = imitation_loss(self.warm_start.policy, data)
@@ -141,10 +139,9 @@ class Imitation(Algorithm):
         self.inner.load_state_dict(state)
 
     def memory(self, frame: int) -> dict[str, int]:
-        memory = self.inner.memory(frame)
-        if self.warm_start.frames:  # imitation needs all logits
-            memory |= self.inner.learning_memory(self.warm_start.policy.learning_bytes())
-        return memory
+        policy = self.warm_start.policy  # imitation needs all its logits
+        all_logits = self.inner.learning_memory(policy.learning_bytes()) if self.warm_start.frames else {}
+        return self.inner.memory(frame) | all_logits
 
 
 def with_warm_start(algorithm: Algorithm, warm_start: WarmStart) -> Algorithm:
@@ -170,4 +167,5 @@ def imitation_loss(policy: Policy, data: TensorDictBase) -> tuple[Tensor, Tensor
     taught = torch.where(reached, taught, -1)
     known = (taught >= 0).sum().clamp(min=1)
     agreed = (logits.argmax(-1) == taught).sum() / known
-    return F.cross_entropy(logits, taught, ignore_index=-1, reduction="sum") / known, agreed
+    loss = torch.nn.functional.cross_entropy(logits, taught, ignore_index=-1, reduction="sum")
+    return loss / known, agreed

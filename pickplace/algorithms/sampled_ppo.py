@@ -6,7 +6,6 @@ may be tried in the simulator, not only the one that is taken, and the loss lear
 """
 
 import torch
-import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -64,9 +63,10 @@ class SampledPPO(PPO):
         count = data[CANDIDATE_KEYS[0]].shape[1]
         return data.set("advantage", of_taken_choice(data["advantage"], count, self.normalize_advantage))
 
-    def losses(self, data: TensorDictBase) -> TensorDictBase:
+    def objective(self, data: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        total, losses = super().objective(data)
         # TorchRL's means over candidates have no weights, and say nothing about the policy.
-        return super().losses(data).exclude("kl_approx", "clip_fraction")
+        return total, losses.exclude("kl_approx", "clip_fraction")
 
     def memory(self, frame: int) -> dict[str, int]:
         candidates = 20 * (1 + self.samples) * self.task.batch_frames
@@ -131,7 +131,7 @@ def of_taken_choice(advantage: Tensor, candidates: int, normalize: bool) -> Tens
     """
     if normalize:
         advantage = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
-    return F.pad(candidates * advantage[:, None], (0, 0, 0, candidates - 1))
+    return torch.nn.functional.pad(candidates * advantage[:, None], (0, 0, 0, candidates - 1))
 
 
 def _arrivals(frames: TensorDictBase) -> Item:

@@ -22,7 +22,6 @@ Once every choice is a candidate, all of this is exact. With few, gradients are 
 """
 
 import torch
-import torch.nn.functional as F
 from tensordict import TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
@@ -87,7 +86,8 @@ def draw_candidates(logits: Tensor, samples: int, temperature: float) -> tuple[T
     taken = _add_noise(every).argmax(1, keepdim=True)
     others = (every / temperature).scatter(1, taken, -torch.inf)
     scale = others.logsumexp(1, keepdim=True)
-    noisy = F.pad(_add_noise(others - scale), (0, 1), value=-torch.inf)  # of the one that is left out, if none is
+    # The one that is left out, if none is, has no chance.
+    noisy = torch.nn.functional.pad(_add_noise(others - scale), (0, 1), value=-torch.inf)
     score, order = noisy.topk(1 + samples)
     candidates = torch.cat([taken, order[:, :-1]], 1)
     log_prob = every.gather(1, candidates)

@@ -1,9 +1,6 @@
 """TD(lambda): values of totes, from which the policy follows."""
 
-from collections.abc import Mapping
-
 import torch
-import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.modules import ValueOperator
@@ -45,10 +42,10 @@ class TD(MinibatchDescent):
     def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
         return self.descend(afterstates(batch, self.advantage, self.task.reward_scale), at, self.objective)
 
-    def objective(self, data: TensorDictBase) -> tuple[Tensor, Mapping[str, Tensor]]:
+    def objective(self, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the mean squared error of the values, and the share of the targets' variance that they explain."""
         target, value = data["value_target"], self.critic(data)["state_value"]
-        loss = F.mse_loss(target, value, reduction="none").mean()
+        loss = torch.nn.functional.mse_loss(target, value, reduction="none").mean()
         with torch.no_grad():
             rest, variance = (torch.var(values, correction=0, dim=0) for values in (target - value, target))
             explained = 1.0 - rest / (variance + torch.finfo(target.dtype).eps)

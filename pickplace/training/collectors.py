@@ -226,9 +226,8 @@ def multi_sync(
 
     Args: as :func:`single`, and ``workers``, the number of processes; it must divide ``num_envs``.
     """
-    share = _share(num_envs, workers, 64)
     collector = MultiSyncCollector(
-        [partial(make_env, worker * share, share) for worker in range(workers)],
+        _shares(make_env, num_envs, workers, 64),
         policy,
         frames_per_batch=num_envs * rollout_length,
         total_frames=-1,
@@ -262,11 +261,10 @@ def ray(
     """
     with needs_extra("collector", "ray"):
         import ray  # noqa: F401
-    if any(parameter.is_cuda for parameter in policy.parameters()):
-        raise ValueError("collector=ray: its workers have no GPU; expected device=cpu, or collector=single.")
-    share = _share(num_envs, workers, 1_024)
+    on_cpu = not any(parameter.is_cuda for parameter in policy.parameters())
+    expect(on_cpu, "collector", "ray", "collector=single, or device=cpu, since its workers have no GPU")
     collector = ResumableRayCollector(
-        [partial(make_env, worker * share, share) for worker in range(workers)],
+        _shares(make_env, num_envs, workers, 1_024),
         policy,
         frames_per_batch=num_envs * rollout_length,
         total_frames=sys.maxsize,  # -1 would end it before its first batch
@@ -299,10 +297,12 @@ def _started(collector, seeds: Sequence[tuple[int, ...]]):
     return collector
 
 
-def _share(num_envs: int, workers: int, most: int) -> int:
+def _shares(make_env, num_envs: int, workers: int, most: int) -> list[partial]:
+    """Return the makers of the environments of each worker, of which there may be ``most``."""
     whole_number("collector.workers", workers, most=most)
     expect(num_envs % workers == 0, "collector.workers", workers, f"a divisor of env.num_envs={num_envs}")
-    return num_envs // workers
+    share = num_envs // workers
+    return [partial(make_env, worker * share, share) for worker in range(workers)]
 
 
 def refuse_other_workers(settings: Mapping, state: object) -> None:

@@ -1,8 +1,6 @@
 """Checks of a training config before anything is built."""
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -16,7 +14,7 @@ from pickplace.items.distributions import check_seed
 from pickplace.policies.base import Policy
 
 
-def _check(is_right: Callable[[Any], bool], expected: str) -> Callable[[str, Any], None]:
+def _check(is_right, expected: str):
     return lambda key, value: expect(is_right(value), key, value, expected)
 
 
@@ -27,7 +25,7 @@ _node = _check(
 _text = _check(lambda value: isinstance(value, str) and len(value) <= 1_000, "a text of at most 1,000 characters")
 
 #: The check of each key, in this order.
-CHECKS: dict[str, Callable] = {
+CHECKS: dict = {
     **dict.fromkeys(("env", "items", "algo", "curriculum", "collector", "planner", "logger"), _node),
     **dict.fromkeys(("model", "evaluation", "warm_start"), _group),
     "model.actor": _node,

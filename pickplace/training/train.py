@@ -6,13 +6,13 @@ import time
 from pathlib import Path
 
 from omegaconf import DictConfig
+from tensordict import TensorDict
 
 from pickplace.common.errors import one_sentence
 from pickplace.common.validate import expect
 from pickplace.config.hydra_app import Command
 from pickplace.runs import checkpoint
 from pickplace.runs import folder as run_folders
-from pickplace.runs.folder import FAILURE, claim, refuse_links
 from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config
 from pickplace.training.sweep import summarize
 from pickplace.training.trainer import Trainer
@@ -35,7 +35,7 @@ def train(cfg: DictConfig, run_dir: Path) -> float:
         KeyboardInterrupt: as :func:`run`.
     """
     expect(cfg.resume is None, "resume", cfg.resume, "as resume=<run folder> on the command line, without a +")
-    with claim(run_dir):
+    with run_folders.claim(run_dir):
         return run(cfg, run_dir, interrupted_run(cfg, run_dir))
 
 
@@ -57,7 +57,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
         batches = iter(trainer.collector)
         while not (trainer.is_complete or stop.requested):
             # Collect a batch, [num_envs, rollout_length], with the newest weights.
-            trainer.push_weights()
+            trainer.collector.update_policy_weights_(TensorDict.from_module(trainer.acting).data)
             started = time.perf_counter()
             batch = next(batches)
             collected = time.perf_counter()
@@ -98,13 +98,13 @@ def resume_run(overrides: list[str]) -> float:
     folder = checkpoint.locate(place, prefer="last")
     run_dir, expected = folder.parent.parent, "a run folder, or one of its checkpoints: last, best or previous"
     expect(folder.parent.name == "checkpoints", "resume", place, expected)
-    refuse_links(run_dir)
-    with claim(run_dir):  # before reading what another process may be writing
+    run_folders.refuse_links(run_dir)
+    with run_folders.claim(run_dir):  # before reading what another process may be writing
         state, facts = checkpoint.read(folder)
         cfg = resumed_config(place, facts, [item for item in overrides if not item.startswith("resume=")])
         handlers = (logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log"))
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
-        (run_dir / FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
+        (run_dir / run_folders.FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
         return run(cfg, run_dir, (state, facts, folder))
 

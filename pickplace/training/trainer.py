@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
 from pickplace.algorithms.base import Algorithm, At, Task
@@ -23,8 +23,7 @@ from pickplace.config.registry import build
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.evaluation.play import Episodes, play
 from pickplace.policies.base import EstimatesValue, Policy, as_critic, refuse_large_network
-from pickplace.runs import checkpoint
-from pickplace.runs.provenance import commit, versions
+from pickplace.runs import checkpoint, provenance
 from pickplace.runs.resume import (
     StopRequest,
     checkpoint_config,
@@ -132,15 +131,13 @@ class Trainer:
     def _restored(self, key: str, make, weights: dict) -> Any:
         """Make a module, with the weights of the checkpoint that the run continues or begins with."""
         refuse_large_network(make, f"model.{'actor' if key == 'policy' else key}")
+        what = key if self.resumed else f"{key} in warm_start.weights={self.cfg.warm_start.weights}"
         try:
-            return (checkpoint.restore(make, weights.get(key, {}), key) if weights else make()).to(self.device)
+            return (checkpoint.restore(make, weights.get(key, {}), what) if weights else make()).to(self.device)
         except checkpoint.CheckpointError as error:
-            if self.resumed:
+            if self.resumed or key == "policy":
                 raise
-            if key == "policy":
-                message = f"warm_start.weights={self.cfg.warm_start.weights}: {error}"
-                raise checkpoint.CheckpointError(message) from error
-            log.warning("warm_start.weights: the critic begins anew. %s", error)
+            log.warning("the critic begins anew. %s", error)
             return make().to(self.device)
 
     def _make_collector(self) -> None:
@@ -198,9 +195,9 @@ class Trainer:
                 random = checkpoint.matching_state(self.state, rng_state(self.device), "random generator")
                 set_rng_state(random, self.device)
                 self.state = {}  # not needed any more
-            settings = OmegaConf.to_container(cfg, resolve=True)
             with checkpoint_hint(lambda: self.safe_folder, self.resume_overrides, OSError):
-                self.logger = build("logger", cfg.logger, folder=self.run_dir, frames=self.frames, settings=settings)
+                shown = OmegaConf.to_container(cfg, resolve=True)
+                self.logger = build("logger", cfg.logger, folder=self.run_dir, frames=self.frames, settings=shown)
             stop, self.start_time, self.start_frames = StopRequest(), time.perf_counter(), self.frames
             # Frames of checkpoints/last, or None.
             self.last_saved = self.frames if self.safe_folder is None or "last" in self.safe_folder.name else None
@@ -218,10 +215,6 @@ class Trainer:
             cleanup.enter_context(checkpoint_hint(lambda: self.safe_folder, self.resume_overrides))
             cleanup.enter_context(watch_workers(self.collector))
             yield stop
-
-    def push_weights(self) -> None:
-        """Send the newest weights to the collector's processes."""
-        self.collector.update_policy_weights_(TensorDict.from_module(self.acting).data)
 
     def learn(self, batch: TensorDictBase) -> dict:
         """Count a batch ``[N, T]``, move the curriculum by it and learn from it; return metrics."""
@@ -289,8 +282,8 @@ class Trainer:
             "callbacks": callbacks.saved_states(self.callbacks),
             "ended": self.ended,
             "config": self.saved_config,
-            "versions": versions(),
-            "commit": commit(),
+            "versions": provenance.versions(),
+            "commit": provenance.commit(),
         }
         folder = self.run_dir / "checkpoints" / name
         checkpoint.write(folder, state, facts, checkpoint.PREVIOUS if name == "last" else None)
@@ -325,7 +318,8 @@ class Trainer:
             log.info("writing the report")
             occupancy = (self.episodes or self.validate()).occupancy
             replayed = self.validate(record={int(occupancy.argmin()), int(occupancy.argmax())})
-            write_report(run_dir, self.cfg, replayed, self.env.cell, versions() | {"commit": commit()})
+            facts = provenance.versions() | {"commit": provenance.commit()}
+            write_report(run_dir, self.cfg, replayed, self.env.cell, facts)
 
 
 def training_env(base_env, curriculum: Curriculum, first_episode: int, num_envs: int) -> TransformedEnv:

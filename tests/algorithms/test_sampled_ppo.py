@@ -118,7 +118,7 @@ def test_the_loss_has_the_policy_gradient(samples, frames, error):
     gain = value[data["candidates"]]
     data["advantage"] = ((gain - (weight * gain).sum(1, keepdim=True)) * weight * weight.shape[1])[..., None]
     data["action"], data["value_target"] = data["candidates"][:, 0], torch.zeros(frames, 1)
-    losses = algorithm_of(policy, CRITIC, "algo=sampled_ppo", "algo.samples=3").losses(data)
+    _, losses = algorithm_of(policy, CRITIC, "algo=sampled_ppo", "algo.samples=3").objective(data)
     chance = policy.values.detach().softmax(0)
     wanted = -chance * (value - (chance * value).sum())
     got = torch.autograd.grad(losses["loss_objective"], policy.values, retain_graph=True)[0]
@@ -145,7 +145,7 @@ def test_with_every_choice_a_candidate_and_gae_the_loss_is_the_exact_one():
     for name in ("ppo", "sampled_ppo"):
         if name == "sampled_ppo":
             data["advantage"] = of_taken_choice(gae, 7, normalize=True)
-        losses = algorithm_of(policy, CRITIC, f"algo={name}").losses(data)
+        _, losses = algorithm_of(policy, CRITIC, f"algo={name}").objective(data)
         total = losses["loss_objective"] + losses["loss_entropy"]
         gradients += torch.autograd.grad(total, policy.values)
     torch.testing.assert_close(*gradients)

@@ -23,6 +23,7 @@ from pickplace.policies.fcn_grasp.policy import fcn_grasp
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
 from pickplace.training import trainer
+from pickplace.training.collectors import ResumableCollector
 from pickplace.training.curriculum.advance import NoAdvance
 from pickplace.training.curriculum.levels import Curriculum
 from pickplace.training.curriculum.sample import Current
@@ -80,7 +81,7 @@ def test_losses_are_weighted_as_the_config_says(collected, algo):
     made = algorithm_of(policy, ValueOperator(MeanDepthCritic(), OBSERVED), *words)
     with torch.no_grad():
         made.advantage(data)
-        losses, value = made.losses(data), 0.1 * data["tote_depth"].mean((-2, -1))[..., None]
+        losses, value = made.objective(data)[1], 0.1 * data["tote_depth"].mean((-2, -1))[..., None]
     torch.testing.assert_close(losses["loss_entropy"], -0.3 * losses["entropy"])
     torch.testing.assert_close(losses["loss_critic"], 0.05 * (value - data["value_target"]).square().mean())
 
@@ -98,7 +99,7 @@ def test_advantages_are_normalised_where_the_config_says_so(collected, algo, wan
         with torch.no_grad():
             made.advantage(data)
         policy.zero_grad()
-        made.losses(data.reshape(-1))["loss_objective"].backward()
+        made.objective(data.reshape(-1))[1]["loss_objective"].backward()
         gradients.append(torch.cat([part.grad.flatten() for part in made.parameters if part.grad is not None]))
         data["next", "reward"] = 2 * data["next", "reward"]
     torch.testing.assert_close(gradients[1], gradients[0] * (1 if wanted else 2), rtol=1e-3, atol=1e-5)
@@ -116,7 +117,7 @@ def test_a_step_follows_what_its_phase_learns_from(phase, limit, collected):
         made.advantage(data)
     if phase == "imitation":
         data["taught"] = data["footprint"]
-    losses = made.losses(data)
+    _, losses = made.objective(data)
     total = losses["loss_critic"]
     if phase == "reward":
         total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
@@ -158,7 +159,8 @@ def test_a_run_counts_logs_scales_and_saves(smoke, tmp_path, monkeypatch):
     interval = {"ci95_low": 0.0, "ci95_high": 1.0}
     monkeypatch.setattr(trainer, "validation_metrics", lambda _: {"occupancy": next(occupancies), **interval})
     monkeypatch.setattr(Trainer, "report", lambda self, stopped: None)
-    monkeypatch.setattr(Trainer, "push_weights", lambda self: pushed.append(self.frames))
+    push = "update_policy_weights_"
+    monkeypatch.setattr(ResumableCollector, push, lambda collector, weights: pushed.append(collector._frames))
     levels = ["curriculum=paper", "curriculum.advance.frames_per_level=256", "env.tote_size=[4,4,3]"]
     quick = ["algo.minibatch_size=128", "evaluation.episodes=1", "evaluation_interval=128"]
     for scale, frames, final in ((0.5, 512, 0.7), (5, 128, 0.1)):
@@ -251,7 +253,7 @@ def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path):
 @pytest.mark.parametrize(("weights", "complaint"), [
     ("pretrained/unknown", "the package ships no such weights; expected pretrained/cdrl_rs"),
     ("outputs/nowhere", "no checkpoint there"),
-    ("pretrained/fcn4d", "The checkpoint's policy does not fit these settings"),
+    ("pretrained/fcn4d", " does not fit these settings"),
     (3, "=3: expected a text"),
 ])  # fmt: skip
 def test_weights_that_do_not_serve_are_refused(weights, complaint, tmp_path):

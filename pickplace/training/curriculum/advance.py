@@ -99,8 +99,7 @@ class Frames(Advance):
 
     def update(self, tally):
         # Never down: a run resumed with a larger budget may have more frames per level.
-        due = self.start + tally.frames // self.share > tally.level
-        return tally.level + due, {}
+        return tally.level + (self.start + tally.frames // self.share > tally.level), {}
 
     def least_frames(self, batch):
         return (self.end - self.start) * max(self.share, batch)
@@ -125,8 +124,9 @@ class Threshold(Advance):
     ):
         self.occupancy = number("curriculum.advance.occupancy", occupancy, most=1)
         self.window = integral_number("curriculum.advance.window", window)
-        key = "curriculum.advance.max_frames_per_level"
-        self.max_frames = or_null(integral_number, key, max_frames_per_level) or math.inf
+        self.max_frames = (
+            or_null(integral_number, "curriculum.advance.max_frames_per_level", max_frames_per_level) or math.inf
+        )
         self.demote_below = or_null(number, "curriculum.advance.demote_below", demote_below, 0, 1) or 0.0
         rises = demote_below is None or demote_below < occupancy
         expect(rises, "curriculum.advance.demote_below", demote_below, f"< {occupancy=}")

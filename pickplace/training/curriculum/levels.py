@@ -3,7 +3,6 @@
 import math
 from collections import deque
 from numbers import Real
-from typing import Any
 
 from torch import Tensor
 
@@ -139,18 +138,16 @@ class Curriculum:
         Raises:
             ValueError: for the state of another advance rule, a level outside the heights, or no such state.
         """
-        rule: Any = state.get("advance") if isinstance(state, dict) else None
-        good = isinstance(rule, dict) and set(state) == {*vars(self.tally), "advance"}
+        good = isinstance(state, dict) and set(state) == {*vars(self.tally), "advance"}
+        good = good and isinstance(state["advance"], dict) and isinstance(state["window"], list)
         expect(good, "the checkpoint's curriculum", state, "the state that a training saved")
-        fits = set(rule) == set(self.advance.state_keys)
-        expect(fits, "curriculum.advance", type(self.advance).__name__, f"the run's own rule, with {sorted(rule)}")
+        rule, name = state["advance"], type(self.advance).__name__
+        expect(set(rule) == {*self.advance.state_keys}, "curriculum.advance", name, f"the run's, with {sorted(rule)}")
         key = "curriculum {} of the checkpoint".format
         level = integral_number(key("level"), state["level"], self.start, self.end)
         frames = integral_number(key("frames"), state["frames"], 0)
         counts = {name: integral_number(key(name), state[name], 0, frames) for name in ("level_start", "episodes")}
-        window = state["window"]
-        expect(isinstance(window, list), key("window"), window, "a list of numbers between 0 and 1")
-        window = deque((number(key("window"), value, most=1) for value in window), self.advance.window)
+        window = deque((number(key("window"), value, most=1) for value in state["window"]), self.advance.window)
         for name, value in rule.items():
             expect(is_number(value), key(name), value, "a number")
         self.tally = Tally(level, window, frames, **counts)
