@@ -52,7 +52,6 @@ class Task:
 
     @property
     def batch_frames(self) -> int:
-        """Frames of a batch."""
         return self.num_envs * self.rollout_length
 
 

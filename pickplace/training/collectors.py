@@ -69,8 +69,7 @@ class ResumableCollector(Collector):
         self.env.base_env.load_state_dict(state_dict["environment"])
         self.env.transform.load_state_dict(state_dict["transforms"])
         # The carrier has no device, so tensors would stay on the device on which they were loaded.
-        carried = TensorDict(state_dict["carried"], batch_size=self.env.batch_size, device=self.env.device)
-        self._carrier.update(carried)
+        self._carrier.update(TensorDict(state_dict["carried"], batch_size=self.env.batch_size, device=self.env.device))
         self._frames, self._iter = (int(state_dict["counters"][key]) for key in ("frames", "iterations"))
         set_rng_state(state_dict, self.env.device)
 
@@ -120,8 +119,8 @@ class ResumableRayCollector(RayCollector):
 
 def rng_state(device: torch.device) -> dict[str, torch.Tensor]:
     """Return the state of the global random generators of a process on this device."""
-    state = {"rng": torch.get_rng_state()}
-    return state | {"cuda_rng": torch.cuda.get_rng_state(device)} if device.type == "cuda" else state
+    cuda = {"cuda_rng": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {}
+    return {"rng": torch.get_rng_state(), **cuda}
 
 
 def set_rng_state(state: dict, device: torch.device) -> None:
@@ -173,8 +172,8 @@ def watch_workers(collector):
             repeat.start()
             if signum and sys.exc_info()[1]:
                 return  # another error, perhaps of this death, is being handled: do not interrupt its cleanup
-            number, code = 1 + workers.index(worker), worker.exitcode
-            raise WorkerDied(f"collector worker {number} of {len(workers)} has died (exit code {code}).")
+            which = f"collector worker {1 + workers.index(worker)} of {len(workers)}"
+            raise WorkerDied(f"{which} has died (exit code {worker.exitcode}).")
 
     previous = signal.signal(signal.SIGCHLD, check)
     try:

@@ -14,8 +14,8 @@ def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
     if done.any():
         metrics["train/occupancy"] = batch["next", "occupancy"][done].mean().item()
         reasons = batch["next", "failure"][done]
-        shares = {failure.name.lower(): (reasons == failure).float().mean().item() for failure in Failure}
-        metrics |= {f"train/failure_{name}": share for name, share in shares.items()}
+        for failure in Failure:
+            metrics[f"train/failure_{failure.name.lower()}"] = (reasons == failure).float().mean().item()
     return metrics
 
 

@@ -49,9 +49,9 @@ class SweepRun:
         return max((row["eval/occupancy"] for row in self.validations), default=None)
 
     @property
-    def final(self) -> float | None:
-        """The latest validation occupancy; None without a validation."""
-        return self.validations[-1]["eval/occupancy"] if self.validations else None
+    def last(self) -> dict[str, float]:
+        """The latest validation, by the names of its metrics; empty without one."""
+        return self.validations[-1] if self.validations else {}
 
 
 def read_run(folder: Path) -> SweepRun:
@@ -100,8 +100,8 @@ class Setting:
 
         self.runs = runs
         self.overrides = {key: value for key, value in runs[0].overrides.items() if key != "seed"}
-        self.finished = [run for run in runs if run.status == "finished" and run.final is not None]
-        finals, count = np.array([run.final for run in self.finished], dtype=float), len(self.finished)
+        self.finished = [run for run in runs if run.status == "finished" and run.last]
+        finals, count = np.array([run.last["eval/occupancy"] for run in self.finished]), len(self.finished)
         self.mean = float(finals.mean()) if count else None
         self.interquartile_mean = float(trim_mean(finals, 0.25)) if count >= 4 else None
         self.interval = tuple(map(float, bootstrap95(finals))) if count >= 2 else (None, None)
@@ -160,18 +160,18 @@ def summarize(folder: Path) -> list[Setting]:
     runs = [read_run(path) for path in found]
     settings = group_by_setting(runs)
     keys = list(dict.fromkeys(key for run in runs for key in run.overrides))
-    rows = []
-    for run in runs:
-        last = run.validations[-1] if run.validations else {}
-        interval = last.get("eval/ci95_low"), last.get("eval/ci95_high")
-        settings_of_run = (run.overrides.get(key) for key in keys)
-        rows.append([run.name, run.status, *settings_of_run, run.frames, run.best, run.final, *interval, run.error])
+    results = ("eval/occupancy", "eval/ci95_low", "eval/ci95_high")
+    rows = [
+        [run.name, run.status, *map(run.overrides.get, keys), run.frames, run.best]
+        + [*map(run.last.get, results), run.error]
+        for run in runs
+    ]
     columns = ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "error"]
     _write_table(folder / TABLE, ["run", "status", *keys, *columns], rows)
     keys = [key for key in keys if key != "seed"]
     columns = ["runs", "finished", "mean_occupancy", "interquartile_mean", "mean_ci95_low", "mean_ci95_high"]
     rows = [
-        [*(each.overrides.get(key) for key in keys), len(each.runs), len(each.finished), each.mean]
+        [*map(each.overrides.get, keys), len(each.runs), len(each.finished), each.mean]
         + [each.interquartile_mean, *each.interval]
         for each in settings
     ]

@@ -67,13 +67,12 @@ class Trainer:
         ValueError: for settings that make no sense.
     """
 
-    def __init__(self, cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None = None):
+    def __init__(self, cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path | None] | None = None):
         check_settings(cfg)
         self.cfg, self.run_dir, self.resumed = cfg, run_dir, resume is not None
         self.saved_config, self.resume_overrides = checkpoint_config(cfg)
         self.device = use_machine(cfg)
         torch.manual_seed(cfg.seed)
-        self.safe_folder: Path | None
         self.state, facts, self.safe_folder = resume or ({}, {}, None)
         self.frames, self.iteration, self.best, self.latest = ({**NEW, **facts}[key] for key in NEW)
         self.episodes: Episodes | None = None

@@ -51,7 +51,7 @@ def test_the_table_shows_how_every_run_ended(tmp_path):
     runs = [each for setting in settings for each in setting.runs]
     found = [(each.name, each.status, each.frames) for each in runs]
     assert found == [("0", "finished", 300), ("2", "stopped", 100), ("10", "failed", 0)]
-    assert (runs[0].best, runs[0].final, runs[2].best) == (0.9, 0.8, None)
+    assert (runs[0].best, runs[0].last["eval/occupancy"], runs[2].best) == (0.9, 0.8, None)
     labels = [label(each, settings) for each in settings]
     assert labels == ["algo.lr=0.001", "algo.lr=0.01 (1 stopped)", "algo.lr=1 (1 failed)"]
     first, _, last = table(tmp_path)
@@ -197,7 +197,8 @@ def test_a_run_without_metrics_is_known_by_its_checkpoint(smoke_run, tmp_path):
     (tmp_path / "0" / "metrics.csv").unlink()
     state, facts = checkpoint.read(tmp_path / "0/checkpoints/last")
     found = read_run(tmp_path / "0")
-    assert (found.status, found.frames, found.final) == ("finished", 512, facts["latest"]["occupancy"])
+    assert (found.status, found.frames) == ("finished", 512)
+    assert found.last["eval/occupancy"] == facts["latest"]["occupancy"]
     facts["config"]["total_frames"] = 4096
     checkpoint.write(tmp_path / "0/checkpoints/last", state, facts)
     assert read_run(tmp_path / "0").status == "stopped"
