@@ -3,6 +3,7 @@
 import copy
 import math
 import time
+from functools import partial
 
 import pytest
 import torch
@@ -23,6 +24,7 @@ from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.rules.masks import placing_maps
 from pickplace.rules.state import State
 from pickplace.runs import checkpoint
+from pickplace.training import trainer
 from pickplace.training.collectors import refuse_other_workers
 from pickplace.training.settings import check_settings
 from pickplace.training.trainer import Trainer
@@ -70,6 +72,14 @@ def changed(plain, path, value):
     return OmegaConf.create(content)
 
 
+def make_no_collector(monkeypatch):
+    """Make trainers without a collector, which takes long and reads no other settings."""
+    made = {"collector": lambda *args, **given: None}
+    monkeypatch.setattr(
+        trainer, "build", lambda place, *args, **given: made.get(place, partial(build, place))(*args, **given)
+    )
+
+
 def check_sentence(error, key):
     text = str(error)
     assert key in text and len(text) < 500 and "\n" not in text, text
@@ -78,7 +88,7 @@ def check_sentence(error, key):
 
 @pytest.mark.parametrize("name", TRAININGS)
 def test_every_leaf_of_a_training(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(Trainer, "_make_collector", lambda trainer: None)
+    make_no_collector(monkeypatch)
     torch.set_num_threads(1)
     plain = OmegaConf.to_container(composed("experiment=smoke", "threads=1", *TRAININGS[name]), resolve=True)
     for path in leaves({key: plain[key] for key in plain if key in name.split()}):
@@ -190,7 +200,7 @@ def test_a_real_cell_and_a_large_batch_are_accepted(tmp_path, monkeypatch):
     env = PickPlaceEnv(items=Kinds([(4, 3, 2)]), num_envs=2, masks=("footprint",), **sizes)
     assert env.reset()["footprint_mask"].any(1).all()
     large = composed("experiment=quick", "env.num_envs=4096", "rollout_length=32", "threads=1")
-    monkeypatch.setattr(Trainer, "_make_collector", lambda trainer: None)
+    make_no_collector(monkeypatch)
     with pytest.raises(ValueError, match="GB; expected at most 0.8 GB"):
         Trainer(large, tmp_path)
     Trainer(composed("experiment=afterstate", "benchmark=gopt_30", "env.num_envs=128"), tmp_path)

@@ -3,6 +3,7 @@
 from torchrl.objectives import A2CLoss
 
 from pickplace.algorithms.actor_critic import ActorCritic
+from pickplace.policies.base import as_actor
 
 
 class A2C(ActorCritic):
@@ -16,4 +17,4 @@ class A2C(ActorCritic):
                 "algo.normalize_advantage=True: a batch of one frame (env.num_envs x rollout_length) has no variance; "
                 "expected more frames, or false."
             )
-        return A2CLoss(self.actor(), self.critic, **common)
+        return A2CLoss(as_actor(self.policy), self.critic, **common)

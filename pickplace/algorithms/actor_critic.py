@@ -4,7 +4,6 @@ from abc import abstractmethod
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torchrl.modules import ValueOperator
 from torchrl.objectives import A2CLoss, ClipPPOLoss
@@ -13,7 +12,7 @@ from torchrl.objectives.value import GAE
 from pickplace.algorithms.base import At, Task
 from pickplace.algorithms.descent import MAX_WEIGHT, MinibatchDescent
 from pickplace.common.validate import expect, flag, number
-from pickplace.policies.base import EstimatesValue, Policy, as_actor
+from pickplace.policies.base import EstimatesValue, Policy
 
 
 class ActorCritic(MinibatchDescent):
@@ -74,10 +73,6 @@ class ActorCritic(MinibatchDescent):
     @abstractmethod
     def make_loss(self, **common) -> A2CLoss | ClipPPOLoss:
         """Return TorchRL's loss, with the arguments that all losses have in common."""
-
-    def actor(self) -> ProbabilisticTensorDictSequential:
-        """Return the policy as the loss wants it."""
-        return as_actor(self.policy)
 
     def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
         return self.descend(self.prepare(batch, at), at, self.objective)

@@ -4,6 +4,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from pickplace.algorithms.actor_critic import ActorCritic
 from pickplace.common.validate import number
+from pickplace.policies.base import as_actor
 
 
 class PPO(ActorCritic):
@@ -21,7 +22,7 @@ class PPO(ActorCritic):
 
     def make_loss(self, **common) -> ClipPPOLoss:
         return ClipPPOLoss(
-            self.actor(),
+            as_actor(self.policy),
             self.critic,
             clip_epsilon=self.clip_epsilon,
             normalize_advantage=self.normalize_advantage,

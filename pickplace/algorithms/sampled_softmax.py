@@ -80,8 +80,7 @@ def draw_candidates(logits: Tensor, samples: int, temperature: float) -> tuple[T
         samples: candidates beside the choice that is taken; fewer if there are not so many choices.
         temperature: divides the logits for these candidates; 1: they are drawn from the policy itself.
     """
-    count = logits.shape[1]
-    samples = min(samples, count - 1)
+    samples = min(samples, logits.shape[1] - 1)
     every = logits.log_softmax(1)
     taken = _add_noise(every).argmax(1, keepdim=True)
     others = (every / temperature).scatter(1, taken, -torch.inf)
@@ -149,5 +148,6 @@ def as_sampling_policy(policy: Policy, samples: int, temperature: float) -> Tens
 
     keys = [policy.choice_key, "log_prob", *CANDIDATE_KEYS]
     sampler = TensorDictModule(draw, in_keys=["logits"], out_keys=keys)
-    selected = list(dict.fromkeys([*keys, "action"]))
-    return TensorDictSequential(policy, sampler, act_module(policy), selected_out_keys=selected)
+    return TensorDictSequential(
+        policy, sampler, act_module(policy), selected_out_keys=[*dict.fromkeys([*keys, "action"])]
+    )

@@ -76,7 +76,6 @@ class ResumableCollector(Collector):
 
 @contextmanager
 def _ray_errors():
-    """Raise Ray's error for a dead actor as :class:`WorkerDied`."""
     from ray.exceptions import RayActorError
 
     try:

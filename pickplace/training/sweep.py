@@ -77,8 +77,8 @@ def read_run(folder: Path) -> SweepRun:
         else:  # the checkpoint's config first: a resumed run may have a larger budget
             config = facts.get("config") or read_note(folder, "config.yaml")
             budget = config.get("total_frames") if isinstance(config, dict) else None
-            is_complete = (isinstance(budget, int) and run.frames >= budget) or facts.get("ended") is True
-            run.status = "finished" if is_complete else "stopped"
+            if facts.get("ended") is True or (isinstance(budget, int) and run.frames >= budget):
+                run.status = "finished"
     except Exception as error:  # of any type: the checkpoint's facts are unchecked
         run.status, run.error = "unreadable", sentence(error)
     return run
@@ -166,16 +166,23 @@ def summarize(folder: Path) -> list[Setting]:
         + [*map(run.last.get, results), run.error]
         for run in runs
     ]
-    columns = ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "error"]
-    _write_table(folder / TABLE, ["run", "status", *keys, *columns], rows)
+    _write_table(
+        folder / TABLE,
+        ["run", "status", *keys]
+        + ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "error"],
+        rows,
+    )
     keys = [key for key in keys if key != "seed"]
-    columns = ["runs", "finished", "mean_occupancy", "interquartile_mean", "mean_ci95_low", "mean_ci95_high"]
     rows = [
         [*map(each.overrides.get, keys), len(each.runs), len(each.finished), each.mean]
         + [each.interquartile_mean, *each.interval]
         for each in settings
     ]
-    _write_table(folder / SETTINGS_TABLE, [*keys, *columns], rows)
+    _write_table(
+        folder / SETTINGS_TABLE,
+        [*keys, "runs", "finished", "mean_occupancy", "interquartile_mean", "mean_ci95_low", "mean_ci95_high"],
+        rows,
+    )
     # The best mean first; those without a finished run are last.
     ranked = sorted(settings, key=lambda setting: -1.0 if setting.mean is None else setting.mean, reverse=True)
     draw(ranked, folder / FIGURE)
@@ -192,8 +199,11 @@ def _write_table(path: Path, columns: list[str], rows: list[list]) -> None:
 
 def label(setting: Setting, settings: list[Setting]) -> str:
     """Label of a setting: the overrides in which the settings differ, and its runs that did not finish."""
-    differing = [key for key in setting.overrides if len({other.overrides.get(key) for other in settings}) > 1]
-    words = [f"{key}={setting.overrides[key]}" for key in differing]
+    words = [
+        f"{key}={value}"
+        for key, value in setting.overrides.items()
+        if any(other.overrides.get(key) != value for other in settings)
+    ]
     unfinished = Counter(run.status for run in setting.runs if run.status != "finished")
     counts = ", ".join(f"{count} {status}" for status, count in unfinished.items())
     return (", ".join(words) or ("all runs" if len(settings) == 1 else "defaults")) + (f" ({counts})" if counts else "")

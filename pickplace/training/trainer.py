@@ -93,7 +93,20 @@ class Trainer:
                 )
         if shortage := self.curriculum.check_budget(cfg.total_frames, self.task.batch_frames):
             log.warning(shortage)
-        self._make_collector()
+        self.acting = self.algorithm.acting_policy()
+        if self.resumed:
+            refuse_other_workers(cfg.collector, self.state.get("collector"))
+        base_env = partial(self.build_env, masks=self.policy.masks, episode_stride=cfg.env.num_envs)
+        self.collector = build(
+            "collector",
+            cfg.collector,
+            make_env=partial(training_env, base_env, self.curriculum),
+            policy=self.acting,
+            num_envs=cfg.env.num_envs,
+            rollout_length=cfg.rollout_length,
+            seed=cfg.seed,
+            next_keys=self.algorithm.next_keys,
+        )
 
     def _make_networks(self) -> None:
         """Make the environment, the policy, the planner that validates it, the warm start, critic and algorithm."""
@@ -138,23 +151,6 @@ class Trainer:
                 raise
             log.warning("the critic begins anew. %s", error)
             return make().to(self.device)
-
-    def _make_collector(self) -> None:
-        cfg = self.cfg
-        base_env = partial(self.build_env, masks=self.policy.masks, episode_stride=cfg.env.num_envs)
-        self.acting = self.algorithm.acting_policy()
-        if self.resumed:
-            refuse_other_workers(cfg.collector, self.state.get("collector"))
-        self.collector = build(
-            "collector",
-            cfg.collector,
-            make_env=partial(training_env, base_env, self.curriculum),
-            policy=self.acting,
-            num_envs=cfg.env.num_envs,
-            rollout_length=cfg.rollout_length,
-            seed=cfg.seed,
-            next_keys=self.algorithm.next_keys,
-        )
 
     @property
     def is_complete(self) -> bool:
