@@ -108,8 +108,7 @@ class Imitation(Algorithm):
     """
 
     def __init__(self, inner: Any, warm_start: WarmStart):
-        self.inner, self.warm_start = inner, warm_start
-        self.next_keys = inner.next_keys
+        self.inner, self.warm_start, self.next_keys = inner, warm_start, inner.next_keys
 
     def acting_policy(self) -> TensorDictModuleBase:
         return self.inner.acting_policy()

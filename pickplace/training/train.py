@@ -11,8 +11,7 @@ from tensordict import TensorDict
 from pickplace.common.errors import one_sentence
 from pickplace.common.validate import expect
 from pickplace.config.hydra_app import Command
-from pickplace.runs import checkpoint
-from pickplace.runs import folder as run_folders
+from pickplace.runs import checkpoint, folder
 from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config
 from pickplace.training.sweep import summarize
 from pickplace.training.trainer import Trainer
@@ -35,7 +34,7 @@ def train(cfg: DictConfig, run_dir: Path) -> float:
         KeyboardInterrupt: as :func:`run`.
     """
     expect(cfg.resume is None, "resume", cfg.resume, "as resume=<run folder> on the command line, without a +")
-    with run_folders.claim(run_dir):
+    with folder.claim(run_dir):
         return run(cfg, run_dir, interrupted_run(cfg, run_dir))
 
 
@@ -95,18 +94,18 @@ def resume_run(overrides: list[str]) -> float:
         ValueError: for a folder that is no run, or a change that a resumed run cannot follow.
     """
     place = next(item for item in overrides if item.startswith("resume=")).partition("=")[2]
-    folder = checkpoint.locate(place, prefer="last")
-    run_dir, expected = folder.parent.parent, "a run folder, or one of its checkpoints: last, best or previous"
-    expect(folder.parent.name == "checkpoints", "resume", place, expected)
-    run_folders.refuse_links(run_dir)
-    with run_folders.claim(run_dir):  # before reading what another process may be writing
-        state, facts = checkpoint.read(folder)
+    saved = checkpoint.locate(place, prefer="last")
+    run_dir, expected = saved.parent.parent, "a run folder, or one of its checkpoints: last, best or previous"
+    expect(saved.parent.name == "checkpoints", "resume", place, expected)
+    folder.refuse_links(run_dir)
+    with folder.claim(run_dir):  # before reading what another process may be writing
+        state, facts = checkpoint.read(saved)
         cfg = resumed_config(place, facts, [item for item in overrides if not item.startswith("resume=")])
         handlers = (logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log"))
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
-        (run_dir / run_folders.FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
+        (run_dir / folder.FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
-        return run(cfg, run_dir, (state, facts, folder))
+        return run(cfg, run_dir, (state, facts, saved))
 
 
 def main() -> None:
@@ -118,4 +117,4 @@ def main() -> None:
                 raise ValueError("resume=...: expected only key=value overrides beside it, no flags such as -m.")
             resume_run(overrides)
     else:
-        Command("train", train, run_folders, after_sweep=summarize)()
+        Command("train", train, folder, after_sweep=summarize)()

@@ -31,13 +31,11 @@ from pickplace.runs.resume import (
     has_config,
     stale_best_frames,
 )
-from pickplace.training import callbacks
-from pickplace.training.collectors import refuse_other_workers, rng_state, set_rng_state, watch_workers
+from pickplace.training import callbacks, collectors, settings
 from pickplace.training.curriculum.levels import Curriculum
-from pickplace.training.curriculum.transform import push_level
+from pickplace.training.curriculum.transform import ToteHeightCurriculum, push_level
 from pickplace.training.metrics import episode_metrics, has_passed, validation_metrics
 from pickplace.training.report import REPORT, write_report
-from pickplace.training.settings import check_memory, check_settings
 from pickplace.views.figures import learning_curve
 
 log = logging.getLogger(__name__)
@@ -68,7 +66,7 @@ class Trainer:
     """
 
     def __init__(self, cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path | None] | None = None):
-        check_settings(cfg)
+        settings.check_settings(cfg)
         self.cfg, self.run_dir, self.resumed = cfg, run_dir, resume is not None
         self.saved_config, self.resume_overrides = checkpoint_config(cfg)
         self.device = use_machine(cfg)
@@ -95,7 +93,7 @@ class Trainer:
             log.warning(shortage)
         self.acting = self.algorithm.acting_policy()
         if self.resumed:
-            refuse_other_workers(cfg.collector, self.state.get("collector"))
+            collectors.refuse_other_workers(cfg.collector, self.state.get("collector"))
         base_env = partial(self.build_env, masks=self.policy.masks, episode_stride=cfg.env.num_envs)
         self.collector = build(
             "collector",
@@ -138,7 +136,7 @@ class Trainer:
         algorithm = build("algo", cfg.algo, policy=self.policy, critic=self.critic, task=self.task)
         expect(isinstance(algorithm, Algorithm), "algo", algorithm, "an algorithm, such as algo=ppo")
         self.algorithm = with_warm_start(algorithm, self.warm_start)
-        check_memory(cfg, self.env, self.policy, self.algorithm)
+        settings.check_memory(cfg, self.env, self.policy, self.algorithm)
 
     def _restored(self, key: str, make, weights: dict) -> Any:
         """Make a module, with the weights of the checkpoint that the run continues or begins with."""
@@ -175,24 +173,23 @@ class Trainer:
         Returns:
             The request to stop, as the value of the ``with`` statement.
         """
-        cfg = self.cfg
         with ExitStack() as cleanup:
             cleanup.callback(self.collector.shutdown)
             if self.resumed:
                 self.algorithm.load_state_dict(self.state.get("algorithm"))
-                with watch_workers(self.collector):
+                with collectors.watch_workers(self.collector):
                     own = self.collector.state_dict()
                     saved = checkpoint.matching_state(self.state.get("collector"), own, "collector")
                     check_saved_states(self.env, saved)
                     self.collector.load_state_dict(saved)
                     push_level(self.collector, self.curriculum.level)
                 # Last: everything above may have drawn.
-                random = checkpoint.matching_state(self.state, rng_state(self.device), "random generator")
-                set_rng_state(random, self.device)
+                random = checkpoint.matching_state(self.state, collectors.rng_state(self.device), "random generator")
+                collectors.set_rng_state(random, self.device)
                 self.state = {}  # not needed any more
             with checkpoint_hint(lambda: self.safe_folder, self.resume_overrides, OSError):
-                shown = OmegaConf.to_container(cfg, resolve=True)
-                self.logger = build("logger", cfg.logger, folder=self.run_dir, frames=self.frames, settings=shown)
+                shown = OmegaConf.to_container(self.cfg, resolve=True)
+                self.logger = build("logger", self.cfg.logger, folder=self.run_dir, frames=self.frames, settings=shown)
             stop, self.start_time, self.start_frames = StopRequest(), time.perf_counter(), self.frames
             # Frames of checkpoints/last, or None.
             self.last_saved = self.frames if self.safe_folder is None or "last" in self.safe_folder.name else None
@@ -203,12 +200,12 @@ class Trainer:
             else:
                 log.info(
                     "%s frames to train, at tote height %d of %d",
-                    f"{max(cfg.total_frames - self.frames, 0):,}",
+                    f"{max(self.cfg.total_frames - self.frames, 0):,}",
                     self.curriculum.level,
                     self.curriculum.end,
                 )
             cleanup.enter_context(checkpoint_hint(lambda: self.safe_folder, self.resume_overrides))
-            cleanup.enter_context(watch_workers(self.collector))
+            cleanup.enter_context(collectors.watch_workers(self.collector))
             yield stop
 
     def learn(self, batch: TensorDictBase) -> dict:
@@ -269,7 +266,7 @@ class Trainer:
             **({} if self.critic is None else {"critic": self.critic.state_dict()}),
             "algorithm": self.algorithm.state_dict(),
             "collector": self.collector.state_dict(),
-            **rng_state(self.device),
+            **collectors.rng_state(self.device),
         }
         facts = {
             **{key: getattr(self, key) for key in NEW},
@@ -313,11 +310,11 @@ class Trainer:
             log.info("writing the report")
             occupancy = (self.episodes or self.validate()).occupancy
             replayed = self.validate(record={int(occupancy.argmin()), int(occupancy.argmax())})
-            facts = provenance.versions() | {"commit": provenance.commit()}
-            write_report(run_dir, self.cfg, replayed, self.env.cell, facts)
+            made_with = {**provenance.versions(), "commit": provenance.commit()}
+            write_report(run_dir, self.cfg, replayed, self.env.cell, made_with)
 
 
 def training_env(base_env, curriculum: Curriculum, first_episode: int, num_envs: int) -> TransformedEnv:
     """Make the environment of one collector process: slots ``first_episode ..``, under the curriculum."""
     env = base_env(first_episode=first_episode, num_envs=num_envs)
-    return TransformedEnv(env, Compose(curriculum.transform()))
+    return TransformedEnv(env, Compose(ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.start)))

@@ -15,7 +15,7 @@ from pickplace.training import collectors
 from pickplace.training.curriculum.advance import NoAdvance
 from pickplace.training.curriculum.levels import Curriculum
 from pickplace.training.curriculum.sample import Current, Recent, Uniform
-from pickplace.training.curriculum.transform import push_level
+from pickplace.training.curriculum.transform import ToteHeightCurriculum, push_level
 
 SAMPLERS = [  # shares of the heights 2 to 5, at level 5
     (Current(), [0, 0, 0, 1]), (Uniform(), [1 / 4] * 4), (Recent(0.25), [1 / 12] * 3 + [3 / 4]),
@@ -37,7 +37,8 @@ def make_env(level=3, sampler=None, num_envs=6, **settings):
     curriculum = Curriculum(NoAdvance(), sampler or Current())
     curriculum.setup(1, level, 1000)
     env = PickPlaceEnv(tote_size=(4, 4, 5), num_envs=num_envs, **settings)
-    return TransformedEnv(env, Compose(curriculum.transform(), RewardSum(), StepCounter()))
+    heights = ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.start)
+    return TransformedEnv(env, Compose(heights, RewardSum(), StepCounter()))
 
 
 def heights(td):

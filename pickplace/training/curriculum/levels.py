@@ -8,7 +8,6 @@ from torch import Tensor
 
 from pickplace.common.validate import expect, integral_number, is_number, is_whole, number
 from pickplace.training.curriculum.advance import Advance, Tally
-from pickplace.training.curriculum.transform import ToteHeightCurriculum
 
 
 class Curriculum:
@@ -22,8 +21,7 @@ class Curriculum:
     """
 
     def __init__(self, advance: Advance, sample, start_height: int | None = None, end_height: int | None = None):
-        expected = "a rule, such as curriculum/advance=threshold"
-        expect(isinstance(advance, Advance), "curriculum.advance", advance, expected)
+        expect(isinstance(advance, Advance), "curriculum.advance", advance, "a rule, such as curriculum/advance=paper")
         expect(callable(sample), "curriculum.sample", sample, "a sampler, such as curriculum/sample=recent")
         self.advance, self.sample, self._rule = advance, sample, f"curriculum.advance: {type(advance).__name__}"
         self.start_height, self.end_height = start_height, end_height
@@ -52,10 +50,6 @@ class Curriculum:
     def level(self) -> int:
         """The tote height trained at now, in cells."""
         return self.tally.level
-
-    def transform(self) -> ToteHeightCurriculum:
-        """Return a transform for one collector process, at the present level."""
-        return ToteHeightCurriculum(self.level, self.sample, self.start)
 
     def check_budget(self, total_frames: int, batch: int = 1) -> str | None:
         """Return a warning if full height cannot be trained within ``total_frames``, else None.

@@ -23,8 +23,7 @@ class ToteHeightCurriculum(Transform):
         super().__init__()
         self.sampler, self.min_height = sampler, integral_number("min_height", min_height)
         # A buffer, so that it is in state_dict() and follows the environment to its device.
-        self.register_buffer("level", torch.tensor(0, dtype=torch.int64))
-        self.set_level(level)
+        self.register_buffer("level", torch.tensor(integral_number("level", level, min_height)))
 
     def set_level(self, level: int) -> None:
         """Draw the heights of later episodes at this level."""
