@@ -93,8 +93,10 @@ class MinibatchDescent(Algorithm):
                 norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
                 if not torch.isfinite(norm + total.detach()):
                     parts = {key: value.detach() for key, value in losses.items() if key.startswith("loss_")}
-                    floats = {key: value for key, value in {**parts, **part}.items() if value.is_floating_point()}
-                    ranges = "; ".join(f"{key} {value_range(value)}" for key, value in floats.items())
+                    values = {**parts, **part}.items()
+                    ranges = "; ".join(
+                        f"{key} {value_range(value)}" for key, value in values if value.is_floating_point()
+                    )
                     raise FloatingPointError(
                         f"the loss or its gradient is not finite: {ranges}; expected a smaller algo.lr."
                     )

@@ -65,8 +65,7 @@ class WarmStart:
             state, facts = checkpoint.read(checkpoint.locate(cfg.checkpoint))
             trained_cfg = trusted_config(facts["config"], trust)
             trained = (trained_cfg, state, cast(dict, OmegaConf.to_container(trained_cfg.env, resolve=True)))
-        known = accepted_arguments(find("warm_start.teacher", cfg.teacher._target_))
-        self._draws = "seed" in (cfg.teacher if known is None else known)
+        self._draws = "seed" in (accepted_arguments(find("warm_start.teacher", cfg.teacher._target_)) or cfg.teacher)
         self._settings = cast(dict, OmegaConf.to_container(cfg.teacher, resolve=True))
         self._parts = planner_parts(cfg.teacher, env.cell, env.items, env.terms, trained)
         self._make_teacher(0)  # refuses bad settings before the first batch

@@ -41,7 +41,7 @@ class SampledPPO(PPO):
         self.advantages = one_of("algo.advantages", advantages, ("vine", "gae"))
         super().__init__(*networks, **settings)
         several = self.policy.cell.bin_items > 1
-        expect(not several or advantages == "gae", "algo.advantages", advantages, "gae with several items in the bin")
+        expect(not several or advantages == "gae", "algo.advantages", advantages, "gae with env.bin_items > 1")
 
     def make_loss(self, **common) -> ClipPPOLoss:
         # Advantages are normalised in prepare(): most of those that the loss sees are 0.

@@ -147,7 +147,9 @@ def as_sampling_policy(policy: Policy, samples: int, temperature: float) -> Tens
         return candidates[:, 0], log_prob[:, 0], candidates, log_prob, log_weight
 
     keys = [policy.choice_key, "log_prob", *CANDIDATE_KEYS]
-    sampler = TensorDictModule(draw, in_keys=["logits"], out_keys=keys)
     return TensorDictSequential(
-        policy, sampler, act_module(policy), selected_out_keys=[*dict.fromkeys([*keys, "action"])]
+        policy,
+        TensorDictModule(draw, in_keys=["logits"], out_keys=keys),
+        act_module(policy),
+        selected_out_keys=[*dict.fromkeys([*keys, "action"])],
     )

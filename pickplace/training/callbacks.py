@@ -79,8 +79,12 @@ def make_callbacks(cfg, states) -> dict[str, Callback]:
     """
     callbacks = {name: build(f"callbacks.{name}", node) for name, node in cfg.items()}
     for name, callback in callbacks.items():
-        expected = "the settings of a callback, with its _target_"
-        expect(isinstance(callback, Callback), f"callbacks.{name}", callback, expected)
+        expect(
+            isinstance(callback, Callback),
+            f"callbacks.{name}",
+            callback,
+            "the settings of a callback, with its _target_",
+        )
         try:
             if name in states:
                 callback.load_state_dict(states[name])

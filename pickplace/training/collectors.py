@@ -296,7 +296,6 @@ def _started(collector, seeds: Sequence[tuple[int, ...]]):
 
 
 def _shares(make_env, num_envs: int, workers: int, most: int) -> list[partial]:
-    """Return the makers of the environments of each worker, of which there may be ``most``."""
     whole_number("collector.workers", workers, most=most)
     expect(num_envs % workers == 0, "collector.workers", workers, f"a divisor of env.num_envs={num_envs}")
     share = num_envs // workers

@@ -11,12 +11,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.files import replaced_file
 from pickplace.rules.cell import CellSpec
-from pickplace.runs.folder import changed_values, noted_command
+from pickplace.runs.folder import REPORT, changed_values, noted_command
 from pickplace.runs.loggers import read_csv
 from pickplace.views.figures import failure_mix
 from pickplace.views.replay import ASSETS, page
-
-REPORT = "report.html"
 
 
 def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts: dict) -> None:
@@ -85,8 +83,8 @@ def validation_table(rows: list[dict]) -> str:
         for row in rows
         if "eval/occupancy" in row
     ]
-    step = max(1, len(found) // 12)
-    return _table(("frames", "validation", "95% interval", "tote height in training"), found[:-1:step] + found[-1:])
+    head = ("frames", "validation", "95% interval", "tote height in training")
+    return _table(head, found[: -1 : max(1, len(found) // 12)] + found[-1:])
 
 
 def level_table(rows: list[dict]) -> str:

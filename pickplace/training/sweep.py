@@ -44,11 +44,6 @@ class SweepRun:
     error: str = ""  # of a failed or unreadable run, in one sentence
 
     @property
-    def best(self) -> float | None:
-        """The best validation occupancy; None without a validation."""
-        return max((row["eval/occupancy"] for row in self.validations), default=None)
-
-    @property
     def last(self) -> dict[str, float]:
         """The latest validation, by the names of its metrics; empty without one."""
         return self.validations[-1] if self.validations else {}
@@ -162,7 +157,8 @@ def summarize(folder: Path) -> list[Setting]:
     keys = list(dict.fromkeys(key for run in runs for key in run.overrides))
     results = ("eval/occupancy", "eval/ci95_low", "eval/ci95_high")
     rows = [
-        [run.name, run.status, *map(run.overrides.get, keys), run.frames, run.best]
+        [run.name, run.status, *map(run.overrides.get, keys), run.frames]
+        + [max((row["eval/occupancy"] for row in run.validations), default=None)]
         + [*map(run.last.get, results), run.error]
         for run in runs
     ]

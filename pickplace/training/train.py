@@ -62,7 +62,6 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             collected = time.perf_counter()
 
             # Finished episodes move the curriculum; the algorithm learns.
-            before = trainer.frames
             metrics = trainer.learn(batch)
             finished = time.perf_counter()
             metrics |= {
@@ -72,7 +71,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             }
 
             # On their intervals: validate, save, print progress.
-            trainer.finish_batch(metrics, before)
+            trainer.finish_batch(metrics, trainer.frames - batch.numel())
         if trainer.last_saved != trainer.frames:  # after the loop, so that a stop request is never missed
             trainer.save("last")
 

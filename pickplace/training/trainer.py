@@ -23,7 +23,7 @@ from pickplace.config.registry import build
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.evaluation.play import Episodes, play
 from pickplace.policies.base import EstimatesValue, Policy, as_critic, refuse_large_network
-from pickplace.runs import checkpoint, provenance
+from pickplace.runs import checkpoint, folder, provenance
 from pickplace.runs.resume import (
     StopRequest,
     checkpoint_config,
@@ -35,7 +35,7 @@ from pickplace.training import callbacks, collectors, settings
 from pickplace.training.curriculum.levels import Curriculum
 from pickplace.training.curriculum.transform import ToteHeightCurriculum, push_level
 from pickplace.training.metrics import episode_metrics, has_passed, validation_metrics
-from pickplace.training.report import REPORT, write_report
+from pickplace.training.report import write_report
 from pickplace.views.figures import learning_curve
 
 log = logging.getLogger(__name__)
@@ -129,8 +129,7 @@ class Trainer:
             expect(cfg.model.critic is None, "model.critic", cfg.model.critic, "null; the actor is the critic")
             self.critic = as_critic(self.policy.value_network())
         elif cfg.model.critic is not None:
-            make_critic = partial(make, "model.critic", cfg.model.critic)
-            self.critic = self._restored("critic", lambda: as_critic(make_critic()), weights)
+            self.critic = self._restored("critic", lambda: as_critic(make("model.critic", cfg.model.critic)), weights)
         observation = self.build_env(num_envs=1, masks=self.policy.masks).observation_spec.zero()
         self.task = Task(self.env.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
         algorithm = build("algo", cfg.algo, policy=self.policy, critic=self.critic, task=self.task)
@@ -178,8 +177,9 @@ class Trainer:
             if self.resumed:
                 self.algorithm.load_state_dict(self.state.get("algorithm"))
                 with collectors.watch_workers(self.collector):
-                    own = self.collector.state_dict()
-                    saved = checkpoint.matching_state(self.state.get("collector"), own, "collector")
+                    saved = checkpoint.matching_state(
+                        self.state.get("collector"), self.collector.state_dict(), "collector"
+                    )
                     check_saved_states(self.env, saved)
                     self.collector.load_state_dict(saved)
                     push_level(self.collector, self.curriculum.level)
@@ -224,9 +224,9 @@ class Trainer:
     def validate(self, record=()) -> Episodes:
         """Play the validation stream at full height, and record the episodes of these numbers."""
         evaluation = self.cfg.evaluation
-        base_env = partial(self.build_env, stream=evaluation.stream, seed=evaluation.seed)
+        make_env = partial(self.build_env, stream=evaluation.stream, seed=evaluation.seed)
         return play(
-            lambda first, count: base_env(first_episode=first, num_envs=count),
+            lambda first, count: make_env(first_episode=first, num_envs=count),
             self.planner,
             evaluation.episodes,
             evaluation.batch_size,
@@ -277,9 +277,9 @@ class Trainer:
             "versions": provenance.versions(),
             "commit": provenance.commit(),
         }
-        folder = self.run_dir / "checkpoints" / name
-        checkpoint.write(folder, state, facts, checkpoint.PREVIOUS if name == "last" else None)
-        self.safe_folder = folder
+        place = self.run_dir / "checkpoints" / name
+        checkpoint.write(place, state, facts, checkpoint.PREVIOUS if name == "last" else None)
+        self.safe_folder = place
         if name == "last":
             self.last_saved = self.frames
 
@@ -306,7 +306,7 @@ class Trainer:
         with replaced_file(run_dir / "learning_curve.png") as new:
             learning_curve(run_dir / "metrics.csv", new)
         # Without an episode of this process nothing was trained since the report was written.
-        if self.is_complete and (self.episodes is not None or not (run_dir / REPORT).is_file()):
+        if self.is_complete and (self.episodes is not None or not (run_dir / folder.REPORT).is_file()):
             log.info("writing the report")
             occupancy = (self.episodes or self.validate()).occupancy
             replayed = self.validate(record={int(occupancy.argmin()), int(occupancy.argmax())})
@@ -316,5 +316,5 @@ class Trainer:
 
 def training_env(base_env, curriculum: Curriculum, first_episode: int, num_envs: int) -> TransformedEnv:
     """Make the environment of one collector process: slots ``first_episode ..``, under the curriculum."""
-    env = base_env(first_episode=first_episode, num_envs=num_envs)
-    return TransformedEnv(env, Compose(ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.start)))
+    heights = ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.start)
+    return TransformedEnv(base_env(first_episode=first_episode, num_envs=num_envs), Compose(heights))

@@ -191,15 +191,16 @@ class Staged(Advance):
     """
 
     def __init__(self, stages):
-        found = stages if isinstance(stages, Sequence) else []
         expect(
-            found and all(isinstance(each, Mapping) and set(each) == {"frames", "height"} for each in found),
+            isinstance(stages, Sequence)
+            and stages
+            and all(isinstance(stage, Mapping) and set(stage) == {"frames", "height"} for stage in stages),
             "curriculum.advance.stages",
             stages,
             "a list of {frames: F, height: H}",
         )
         self.stages: dict[int, int | None] = {}  # heights by first frame
-        for stage in found:
+        for stage in stages:
             least = max(self.stages, default=-1) + 1
             frames = integral_number("curriculum.advance.stages: frames", stage["frames"], least)
             self.stages[frames] = stage["height"]

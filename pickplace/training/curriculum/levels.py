@@ -91,8 +91,12 @@ class Curriculum:
         tally.frames, tally.episodes = frames, tally.episodes + len(at_level)
         tally.window.extend(at_level)
         answer = self.advance.update(tally)
-        good = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], dict)
-        expect(good, f"{self._rule}: its update", answer, "(level, {name: number})")
+        expect(
+            isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], dict),
+            f"{self._rule}: its update",
+            answer,
+            "(level, {name: number})",
+        )
         level, logs = self._clamped(answer[0]), {**answer[1]}
         for name, value in logs.items():
             expect(isinstance(value, Real), f"{self._rule}: it logs {name}", value, "a number")
@@ -132,9 +136,15 @@ class Curriculum:
         Raises:
             ValueError: for the state of another advance rule, a level outside the heights, or no such state.
         """
-        good = isinstance(state, dict) and set(state) == {*vars(self.tally), "advance"}
-        good = good and isinstance(state["advance"], dict) and isinstance(state["window"], list)
-        expect(good, "the checkpoint's curriculum", state, "the state that a training saved")
+        expect(
+            isinstance(state, dict)
+            and set(state) == {*vars(self.tally), "advance"}
+            and isinstance(state["advance"], dict)
+            and isinstance(state["window"], list),
+            "the checkpoint's curriculum",
+            state,
+            "the state that a training saved",
+        )
         rule, name = state["advance"], type(self.advance).__name__
         expect(set(rule) == {*self.advance.state_keys}, "curriculum.advance", name, f"the run's, with {sorted(rule)}")
         key = "curriculum {} of the checkpoint".format

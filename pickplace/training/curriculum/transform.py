@@ -34,8 +34,12 @@ class ToteHeightCurriculum(Transform):
             tensordict = TensorDict(batch_size=self.parent.batch_size, device=self.parent.device)
         count = tensordict.numel()
         height = self.sampler(int(self.level), self.min_height, count)
-        good = isinstance(height, Tensor) and height.numel() == count and not height.is_floating_point()
-        expect(good, "curriculum.sample: its heights", height, f"whole numbers in a tensor [{count}]")
+        expect(
+            isinstance(height, Tensor) and height.numel() == count and not height.is_floating_point(),
+            "curriculum.sample: its heights",
+            height,
+            f"whole numbers in a tensor [{count}]",
+        )
         height = height.to(self.level.device).reshape(*tensordict.batch_size, 1)
         reset, running = tensordict.get("_reset", None), tensordict.get("tote_height", None)
         # Collectors hide `tote_height` from a reset; running rows then get a drawn height too, which nothing reads.
