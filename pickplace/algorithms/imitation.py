@@ -164,6 +164,5 @@ def imitation_loss(policy: Policy, data: TensorDictBase) -> tuple[Tensor, Tensor
     reached = logits.gather(1, taught.clamp(min=0)[:, None])[:, 0] > MASKED / 2
     taught = torch.where(reached, taught, -1)
     known = (taught >= 0).sum().clamp(min=1)
-    agreed = (logits.argmax(-1) == taught).sum() / known
     loss = torch.nn.functional.cross_entropy(logits, taught, ignore_index=-1, reduction="sum")
-    return loss / known, agreed
+    return loss / known, (logits.argmax(-1) == taught).sum() / known

@@ -40,8 +40,12 @@ class SampledPPO(PPO):
         self.temperature = number("algo.temperature", temperature, 0.01, 100.0)
         self.advantages = one_of("algo.advantages", advantages, ("vine", "gae"))
         super().__init__(*networks, **settings)
-        several = self.policy.cell.bin_items > 1
-        expect(not several or advantages == "gae", "algo.advantages", advantages, "gae with env.bin_items > 1")
+        expect(
+            self.policy.cell.bin_items == 1 or advantages == "gae",
+            "algo.advantages",
+            advantages,
+            "gae with env.bin_items > 1; vine knows one item in the bin",
+        )
 
     def make_loss(self, **common) -> ClipPPOLoss:
         # Advantages are normalised in prepare(): most of those that the loss sees are 0.

@@ -118,8 +118,10 @@ class ResumableRayCollector(RayCollector):
 
 def rng_state(device: torch.device) -> dict[str, torch.Tensor]:
     """Return the state of the global random generators of a process on this device."""
-    cuda = {"cuda_rng": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {}
-    return {"rng": torch.get_rng_state(), **cuda}
+    return {
+        "rng": torch.get_rng_state(),
+        **({"cuda_rng": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {}),
+    }
 
 
 def set_rng_state(state: dict, device: torch.device) -> None:
@@ -171,8 +173,10 @@ def watch_workers(collector):
             repeat.start()
             if signum and sys.exc_info()[1]:
                 return  # another error, perhaps of this death, is being handled: do not interrupt its cleanup
-            which = f"collector worker {1 + workers.index(worker)} of {len(workers)}"
-            raise WorkerDied(f"{which} has died (exit code {worker.exitcode}).")
+            raise WorkerDied(
+                f"collector worker {1 + workers.index(worker)} of {len(workers)} has died "
+                f"(exit code {worker.exitcode})."
+            )
 
     previous = signal.signal(signal.SIGCHLD, check)
     try:
@@ -259,8 +263,12 @@ def ray(
     """
     with needs_extra("collector", "ray"):
         import ray  # noqa: F401
-    on_cpu = not any(parameter.is_cuda for parameter in policy.parameters())
-    expect(on_cpu, "collector", "ray", "collector=single, or device=cpu, since its workers have no GPU")
+    expect(
+        not any(parameter.is_cuda for parameter in policy.parameters()),
+        "collector",
+        "ray",
+        "collector=single, or device=cpu, since its workers have no GPU",
+    )
     collector = ResumableRayCollector(
         _shares(make_env, num_envs, workers, 1_024),
         policy,

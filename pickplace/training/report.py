@@ -83,8 +83,10 @@ def validation_table(rows: list[dict]) -> str:
         for row in rows
         if "eval/occupancy" in row
     ]
-    head = ("frames", "validation", "95% interval", "tote height in training")
-    return _table(head, found[: -1 : max(1, len(found) // 12)] + found[-1:])
+    return _table(
+        ("frames", "validation", "95% interval", "tote height in training"),
+        found[: -1 : max(1, len(found) // 12)] + found[-1:],
+    )
 
 
 def level_table(rows: list[dict]) -> str:

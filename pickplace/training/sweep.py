@@ -148,18 +148,19 @@ def summarize(folder: Path) -> list[Setting]:
     Raises:
         FileNotFoundError: if it contains no run.
     """
-    found = [path.parent.parent for path in Path(folder).glob("*/.hydra/overrides.yaml")]
+    found = sorted(
+        (path.parent.parent for path in Path(folder).glob("*/.hydra/overrides.yaml")),
+        key=lambda path: [part.zfill(9) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)],
+    )
     if not found:
         raise FileNotFoundError(f"{folder}: no run in it; expected the folder of a sweep.")
-    found.sort(key=lambda path: [part.zfill(9) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)])
     runs = [read_run(path) for path in found]
     settings = group_by_setting(runs)
     keys = list(dict.fromkeys(key for run in runs for key in run.overrides))
-    results = ("eval/occupancy", "eval/ci95_low", "eval/ci95_high")
     rows = [
         [run.name, run.status, *map(run.overrides.get, keys), run.frames]
         + [max((row["eval/occupancy"] for row in run.validations), default=None)]
-        + [*map(run.last.get, results), run.error]
+        + [*map(run.last.get, ("eval/occupancy", "eval/ci95_low", "eval/ci95_high")), run.error]
         for run in runs
     ]
     _write_table(

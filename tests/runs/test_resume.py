@@ -245,7 +245,7 @@ def test_a_damaged_checkpoint_is_refused_and_a_whole_one_is_named(smoke_run, tmp
         ("curriculum", {}, "curriculum={}: expected the state that a training saved"),
         ("curriculum|level", 2.5, "level of the checkpoint=2.5: expected a whole number"),
         ("curriculum|frames", -1, "frames=-1: expected a whole number"),
-        ("curriculum|window", "abc", "'window': 'abc'}: expected the state that a training saved"),
+        ("curriculum|window", "abc", "window of the checkpoint='abc': expected a list"),
         ("curriculum|window", [0.5, 7], "window of the checkpoint=7: expected a number between 0 and 1"),
         ("config|algo|foo", 1, "algo.foo: there is no key 'foo' in algo"),
         ("rng", torch.zeros(5056), "rng is float32 of shape (5056,), expected uint8 of shape (5056,)"),

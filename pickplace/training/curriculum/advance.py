@@ -128,8 +128,12 @@ class Threshold(Advance):
             or_null(integral_number, "curriculum.advance.max_frames_per_level", max_frames_per_level) or math.inf
         )
         self.demote_below = or_null(number, "curriculum.advance.demote_below", demote_below, 0, 1) or 0.0
-        rises = demote_below is None or demote_below < occupancy
-        expect(rises, "curriculum.advance.demote_below", demote_below, f"< {occupancy=}")
+        expect(
+            demote_below is None or demote_below < occupancy,
+            "curriculum.advance.demote_below",
+            demote_below,
+            f"< {occupancy=}",
+        )
 
     def update(self, tally):
         full = len(tally.window) == self.window

@@ -21,7 +21,12 @@ class Curriculum:
     """
 
     def __init__(self, advance: Advance, sample, start_height: int | None = None, end_height: int | None = None):
-        expect(isinstance(advance, Advance), "curriculum.advance", advance, "a rule, such as curriculum/advance=paper")
+        expect(
+            isinstance(advance, Advance),
+            "curriculum.advance",
+            advance,
+            "a rule, such as curriculum/advance=threshold",
+        )
         expect(callable(sample), "curriculum.sample", sample, "a sampler, such as curriculum/sample=recent")
         self.advance, self.sample, self._rule = advance, sample, f"curriculum.advance: {type(advance).__name__}"
         self.start_height, self.end_height = start_height, end_height
@@ -122,8 +127,12 @@ class Curriculum:
         """Return the rule's own state; raise if a checkpoint could not store it."""
         state = {key: getattr(self.advance, key, None) for key in self.advance.state_keys}
         for key, value in state.items():
-            is_exact = isinstance(value, int | float) and is_number(value)  # in JSON
-            expect(is_exact, f"{self._rule}: its state has {key}", value, "a finite Python number")
+            expect(
+                isinstance(value, int | float) and is_number(value),  # exact in JSON
+                f"{self._rule}: its state has {key}",
+                value,
+                "a finite Python number",
+            )
         return state
 
     def state_dict(self) -> dict:
@@ -139,8 +148,7 @@ class Curriculum:
         expect(
             isinstance(state, dict)
             and set(state) == {*vars(self.tally), "advance"}
-            and isinstance(state["advance"], dict)
-            and isinstance(state["window"], list),
+            and isinstance(state["advance"], dict),
             "the checkpoint's curriculum",
             state,
             "the state that a training saved",
@@ -151,6 +159,7 @@ class Curriculum:
         level = integral_number(key("level"), state["level"], self.start, self.end)
         frames = integral_number(key("frames"), state["frames"], 0)
         counts = {name: integral_number(key(name), state[name], 0, frames) for name in ("level_start", "episodes")}
+        expect(isinstance(state["window"], list), key("window"), state["window"], "a list of numbers between 0 and 1")
         window = deque((number(key("window"), value, most=1) for value in state["window"]), self.advance.window)
         for name, value in rule.items():
             expect(is_number(value), key(name), value, "a number")
