@@ -32,6 +32,9 @@ MakeEnv = Callable[[int, int], PickPlaceEnv]
 #: Greatest number of episodes, or of decisions that are timed.
 MAX_EPISODES = 1_000_000
 
+#: The tensors of :class:`Episodes`.
+RESULTS = ("occupancy", "items_placed", "failure", "final_heights", "tote_height")
+
 
 @dataclass
 class Episodes:
@@ -166,7 +169,7 @@ def play(
         parts.append(batch.results)
         recordings += batch.recordings.values()
     return Episodes(
-        **{name: torch.cat([part[name] for part in parts]).cpu() for name in parts[0]},
+        **{name: torch.cat([part[name] for part in parts]).cpu() for name in RESULTS},
         feasible_share=feasible / decisions,
         decisions=decisions,
         recordings=recordings,
