@@ -165,7 +165,7 @@ def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     # The flags of all rotations side by side in one number, so that a pick cell's whole block is copied at once:
     # blocks [N * K + 1, places], of which the last, for picks that fail, is empty.
     packed, slots = {1: (torch.uint8, 1), 2: (torch.int16, 2)}.get(rotations, (torch.int32, 4))
-    flags = torch.eye(slots, dtype=torch.uint8).view(packed)[:, 0].tolist()
+    flags = torch.eye(slots, dtype=torch.uint8).view(packed).flatten().tolist()
     count, first = len(available), torch.arange(batch, device=by_class.device)
     blocks = by_class.new_zeros(batch * count + 1, places, dtype=packed)
     for bit, turned in zip(flags, classes, strict=False):
