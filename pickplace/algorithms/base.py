@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from pickplace.common.validate import excerpt
+from pickplace.common.validate import excerpt, refuse_if
 from pickplace.rules.observation import Term
 from pickplace.runs.checkpoint import CheckpointError, matching_state
 
@@ -134,8 +134,11 @@ def load_optimizer(optimizer: torch.optim.Optimizer, state: Any) -> None:
     Raises:
         CheckpointError: if it does not fit the parameters, or has values that cannot be.
     """
-    if not isinstance(state, dict):
-        raise CheckpointError("The checkpoint has no optimizer; expected one that a training wrote.")
+    refuse_if(
+        not isinstance(state, dict),
+        "The checkpoint has no optimizer; expected one that a training wrote.",
+        CheckpointError,
+    )
     twin = deepcopy(optimizer)  # after a step it has a state for each parameter
     for group in twin.param_groups:
         for parameter in group["params"]:

@@ -6,7 +6,7 @@ import stat
 from contextlib import contextmanager
 from pathlib import Path
 
-from pickplace.common.validate import at_most, excerpt
+from pickplace.common.validate import at_most, excerpt, refuse_if
 
 #: Greatest size of a file that is read, in bytes, unless a reader sets its own: more would fill the memory.
 MAX_BYTES = 2**30
@@ -31,11 +31,9 @@ def read_file(path, most: int = MAX_BYTES, links: bool = True, empty: bool = Tru
     """
     path = Path(path)
     found = path.stat(follow_symlinks=links)
-    if not stat.S_ISREG(found.st_mode):
-        raise ValueError(f"{path}: a folder, link, pipe or device; expected a regular file.")
+    refuse_if(not stat.S_ISREG(found.st_mode), f"{path}: a folder, link, pipe or device; expected a regular file.")
     at_most(f"{path}:", found.st_size, "bytes", most)
-    if not (found.st_size or empty):
-        raise ValueError(f"{path}: 0 bytes; expected a file with content.")
+    refuse_if(not (found.st_size or empty), f"{path}: 0 bytes; expected a file with content.")
     with path.open("rb") as file:
         return file.read(found.st_size)
 
@@ -59,8 +57,10 @@ def read_table(key: str, path, *headers: str) -> tuple[str, list[tuple[int, list
     Raises:
         ValueError: naming the file, for one that is not there, has another header, or no row below it.
     """
-    if not Path(path).exists():
-        raise ValueError(f"{key}={str(path)!r}: no such file; expected a CSV with columns {' or '.join(headers)}.")
+    refuse_if(
+        not Path(path).exists(),
+        f"{key}={str(path)!r}: no such file; expected a CSV with columns {' or '.join(headers)}.",
+    )
     try:
         reader = csv.reader(io.StringIO(read_text(path, MAX_TABLE_BYTES, "utf-8-sig", empty=False), newline=""))
         table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
@@ -68,10 +68,10 @@ def read_table(key: str, path, *headers: str) -> tuple[str, list[tuple[int, list
         raise ValueError(f"{path}: {error}; expected a CSV in UTF-8.") from error
     header = ",".join(table[0][1]) if table else ""
     rows = [(line, fields) for line, fields in table[1:] if any(fields)]
-    if header not in headers:
-        raise ValueError(f"{path}: the header is {excerpt(header)}, expected {' or '.join(map(repr, headers))}.")
-    if not rows:
-        raise ValueError(f"{path}: no rows, expected at least one below the header.")
+    refuse_if(
+        header not in headers, f"{path}: the header is {excerpt(header)}, expected {' or '.join(map(repr, headers))}."
+    )
+    refuse_if(not rows, f"{path}: no rows, expected at least one below the header.")
     return header, rows
 
 

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pickplace.common.errors import unknown_key
+from pickplace.common.validate import refuse_if
 from pickplace.config.registry import REGISTRY, names_at
 
 #: Groups of which a preset's settings belong to the experiment, whichever option the command line chooses: all of
@@ -189,8 +190,10 @@ def places_in_other_groups(word: str) -> list[str]:
     package, places = _package_and_places(override, _search_words(HydraConfig.get().overrides.hydra))
     if package is None or override.package or package in ("_global_", group.replace("/", ".")):
         return []
-    if override.is_delete():
-        raise ValueError(f"{word}: the checkpoint's {group} can be exchanged, not removed; expected {group}=<option>.")
+    refuse_if(
+        override.is_delete(),
+        f"{word}: the checkpoint's {group} can be exchanged, not removed; expected {group}=<option>.",
+    )
     return places
 
 

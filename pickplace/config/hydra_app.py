@@ -17,6 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.errors import Parser, one_sentence, sentence, write_output
+from pickplace.common.validate import refuse_if
 from pickplace.config import composition
 
 log = logging.getLogger(__name__)
@@ -140,8 +141,7 @@ def read_command_line(arguments: list[str]) -> tuple[list[str], list[str], argpa
     parser.add_argument("--config-dir", "-cd", action="append", default=[])
     folders, rest = parser.parse_known_args(arguments)
     for folder in folders.config_dir:
-        if not Path(folder).is_dir():
-            raise ValueError(f"--config-dir {folder}: no such folder; expected one with config files.")
+        refuse_if(not Path(folder).is_dir(), f"--config-dir {folder}: no such folder; expected one with config files.")
     parser = Parser(add_help=False, allow_abbrev=False)
     parser.add_argument("words", nargs="*")
     parser.add_argument("--cfg", "-c", choices=["job", "hydra", "all"])
@@ -168,8 +168,7 @@ def show(cfg: DictConfig, options: argparse.Namespace) -> None:
     if options.resolve:
         OmegaConf.resolve(cfg)
     part = cfg if options.package in (None, "_global_") else OmegaConf.select(cfg, options.package)
-    if part is None:
-        raise ValueError(f"--package {options.package}: there is no such part of the config.")
+    refuse_if(part is None, f"--package {options.package}: there is no such part of the config.")
     header = f"# @package {options.package}\n" if options.package else ""
     write_output(header + (OmegaConf.to_yaml(part) if OmegaConf.is_config(part) else f"{part}\n"))
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from pickplace.common.validate import refuse_if
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.distributions import MAX_SEED
 from pickplace.rules.bin import select_item
@@ -39,8 +40,11 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     """
 
     def check(key: str, possible: Tensor, expected: str) -> None:
-        if not possible.all():
-            raise CheckpointError(f"The checkpoint's environment is of no use: {key}: expected {expected}.")
+        refuse_if(
+            not possible.all(),
+            f"The checkpoint's environment is of no use: {key}: expected {expected}.",
+            CheckpointError,
+        )
 
     cell = env.cell
     keys = ("surface", "tote_height", "volume", "steps", "episode", "item_seed")

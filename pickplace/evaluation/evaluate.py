@@ -7,6 +7,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from pickplace.common.machine import use_machine
+from pickplace.common.validate import refuse_if
 from pickplace.config.allowlist import own_modules, trusted_config
 from pickplace.config.composition import apply_overrides, places_in_other_groups, task_overrides
 from pickplace.config.hydra_app import Command
@@ -92,8 +93,10 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
     """
     ev = cfg.evaluation
     check_episode_settings(ev)
-    if "model" in cfg and cfg.checkpoint is None:
-        raise ValueError("model: there are no settings of a model without checkpoint=<run folder>.")
+    refuse_if(
+        "model" in cfg and cfg.checkpoint is None,
+        "model: there are no settings of a model without checkpoint=<run folder>.",
+    )
     own_modules(cfg.trust)
     use_machine(cfg)
     settings = {key: value for key, value in resolved(cfg.planner).items() if key != "_target_"}

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from pickplace.common.files import read_file
-from pickplace.common.validate import excerpt, is_name, is_number
+from pickplace.common.validate import excerpt, is_name, is_number, refuse_if
 from pickplace.config.allowlist import refuse_foreign_targets
 from pickplace.config.registry import build, node_of, with_defaults
 from pickplace.evaluation.play import Episodes
@@ -169,8 +169,10 @@ def read_comparison(path: Path, expected: dict, trust: Collection[str] = ()) -> 
     if isinstance(items, dict) and items.get("_target_") == expected["items"]["_target_"]:
         expected, other = ({**each, "items": with_defaults("items", each["items"])} for each in (expected, other))
     for key in ("stream", "seed", "episodes", "items"):
-        if not is_same(ours := expected[key], theirs := other.get(key)):
-            raise ValueError(f"compare={excerpt(str(path))}: its {key} is {excerpt(theirs)}, expected {excerpt(ours)}.")
+        refuse_if(
+            not is_same(ours := expected[key], theirs := other.get(key)),
+            f"compare={excerpt(str(path))}: its {key} is {excerpt(theirs)}, expected {excerpt(ours)}.",
+        )
     cell = build_cell(expected["env"], reach=None)
     try:
         refuse_foreign_targets(env, trust, "env")
@@ -179,13 +181,16 @@ def read_comparison(path: Path, expected: dict, trust: Collection[str] = ()) -> 
         raise ValueError(f"{refused} ({error})") from error
     reaches = ("env.reach", expected["env"].get("reach"), env.get("reach"))
     for key, ours, theirs in (*differences(cell_settings(cell), cell_settings(other_cell), "env"), reaches):
-        if not is_same(ours, theirs) and (key != "env.refill" or cell.bin_items > 1):
-            raise ValueError(f"compare={excerpt(str(path))}: {key}={excerpt(theirs)}, expected {ours}.")
+        refuse_if(
+            not is_same(ours, theirs) and (key != "env.refill" or cell.bin_items > 1),
+            f"compare={excerpt(str(path))}: {key}={excerpt(theirs)}, expected {ours}.",
+        )
     count = expected["episodes"]
-    if not isinstance(values, list) or len(values) != count or not all(is_number(v) and 0 <= v <= 1 for v in values):
-        raise ValueError(f"{refused} whose occupancy.per_episode is a list of {count} numbers between 0 and 1.")
-    if not is_name(name):
-        raise ValueError(f"{refused} whose planner is a name to print, got {excerpt(name)}.")
+    refuse_if(
+        not isinstance(values, list) or len(values) != count or not all(is_number(v) and 0 <= v <= 1 for v in values),
+        f"{refused} whose occupancy.per_episode is a list of {count} numbers between 0 and 1.",
+    )
+    refuse_if(not is_name(name), f"{refused} whose planner is a name to print, got {excerpt(name)}.")
     return other
 
 

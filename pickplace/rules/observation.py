@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import expect, short_text
+from pickplace.common.validate import expect, refuse_if, short_text
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import bin_depth_from_items, bin_labels_from_items
 from pickplace.rules.state import State, depth_from_heights
@@ -172,8 +172,10 @@ def check_terms(terms: Mapping[str, Term] | None, bin_items: int = 1) -> dict[st
     for key, term in given.items():
         place = f"observation.{short_text(key)}"
         expect(isinstance(term, Term), place, term, "a Term, such as pickplace.rules.observation.ToteDepth")
-        if not isinstance(key, str) or key in RESERVED or not key.isidentifier():
-            raise ValueError(f"{place}: expected another name; taken are {', '.join(RESERVED)}.")
+        refuse_if(
+            not isinstance(key, str) or key in RESERVED or not key.isidentifier(),
+            f"{place}: expected another name; taken are {', '.join(RESERVED)}.",
+        )
     found = {**standard, **given}
     for key, term in standard.items():
         expected = f"{type(term).__name__}, which is always there"

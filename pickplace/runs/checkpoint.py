@@ -21,7 +21,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from pickplace.common.files import read_file
-from pickplace.common.validate import excerpt, is_whole
+from pickplace.common.validate import excerpt, is_whole, refuse_if
 
 SCHEMA = 1
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"  # weights that the package ships
@@ -54,8 +54,11 @@ def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> No
     facts = {"schema": SCHEMA, "sha256": hashlib.sha256(blob).hexdigest(), **facts, "state": rest}
     contents = {TENSORS: blob, FACTS: json.dumps(facts, indent=1).encode()}
     for name, content in contents.items():
-        if len(content) > (most := MAX_BYTES[name]):
-            raise CheckpointError(f"{folder}: {name} has more than {most:,} bytes; nobody could read it.")
+        refuse_if(
+            len(content) > (most := MAX_BYTES[name]),
+            f"{folder}: {name} has more than {most:,} bytes; nobody could read it.",
+            CheckpointError,
+        )
     shutil.rmtree(new, ignore_errors=True)
     try:
         new.mkdir(parents=True)
@@ -107,8 +110,7 @@ def unflatten(tensors: dict[str, Tensor], facts: dict) -> dict:
         *parents, leaf = (int(part) if part.isdecimal() else part for part in path.split("|"))
         for parent in parents:
             node = node.setdefault(parent, {}) if isinstance(node, dict) else None
-        if not isinstance(node, dict) or leaf in node:
-            raise ValueError(f"{path!r} is below another value, or twice there")
+        refuse_if(not isinstance(node, dict) or leaf in node, f"{path!r} is below another value, or twice there")
         node[leaf] = value
     return tree
 
@@ -203,24 +205,36 @@ def _read(folder: Path) -> tuple[dict, dict]:
     except (OSError, ValueError, RecursionError) as error:  # a RecursionError from deeply nested JSON
         raise CheckpointError(f"{folder}: the checkpoint cannot be read ({error}).") from error
     found = facts.get("schema") if isinstance(facts, dict) else None
-    if found != SCHEMA:
-        raise CheckpointError(f"{folder}: schema {excerpt(found)}, expected {SCHEMA}; another version wrote it.")
-    if hashlib.sha256(blob).hexdigest() != facts.get("sha256"):
-        raise CheckpointError(f"{folder}: {TENSORS} is truncated or altered, its checksum does not match {FACTS}.")
+    refuse_if(
+        found != SCHEMA,
+        f"{folder}: schema {excerpt(found)}, expected {SCHEMA}; another version wrote it.",
+        CheckpointError,
+    )
+    refuse_if(
+        hashlib.sha256(blob).hexdigest() != facts.get("sha256"),
+        f"{folder}: {TENSORS} is truncated or altered, its checksum does not match {FACTS}.",
+        CheckpointError,
+    )
     try:
         tensors = load(blob)
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:  # unknown types, absurd sizes
         first = next(iter(str(error).splitlines()), type(error).__name__)
         raise CheckpointError(f"{folder}: {TENSORS} cannot be read ({first}).") from error
     state = facts.pop("state", None)
-    if not isinstance(state, dict) or not _are_facts(facts):
-        raise CheckpointError(f"{folder}: {FACTS} lacks its state, config or frames; expected what a training wrote.")
+    refuse_if(
+        not isinstance(state, dict) or not _are_facts(facts),
+        f"{folder}: {FACTS} lacks its state, config or frames; expected what a training wrote.",
+        CheckpointError,
+    )
     try:
         state = unflatten(tensors, state)
     except ValueError as error:
         raise CheckpointError(f"{folder}: {FACTS} and {TENSORS} do not fit each other ({error}).") from error
-    if not isinstance(state.get("policy"), dict):
-        raise CheckpointError(f"{folder}: {TENSORS} has no policy; expected what a training wrote.")
+    refuse_if(
+        not isinstance(state.get("policy"), dict),
+        f"{folder}: {TENSORS} has no policy; expected what a training wrote.",
+        CheckpointError,
+    )
     return state, facts
 
 

@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.errors import sentence
 from pickplace.common.files import read_file, replaced_file
+from pickplace.common.validate import refuse_if
 from pickplace.config.allowlist import REFERENCE, walk
 
 LOCK = ".lock"  # held by the process that trains in the folder
@@ -77,10 +78,11 @@ def refuse_occupied(run_dir: Path) -> None:
     if saved.is_dir() and any(not entry.name.endswith(".new") for entry in saved.iterdir()):
         raise occupied(run_dir)
     for name, content in ((EVALUATION, "an evaluation"), (REPORT, "a report of a training")):
-        if (run_dir / name).exists():
-            raise OccupiedError(
-                f"{run_dir}: there is {content} already; expected another folder, hydra.run.dir=<folder>."
-            )
+        refuse_if(
+            (run_dir / name).exists(),
+            f"{run_dir}: there is {content} already; expected another folder, hydra.run.dir=<folder>.",
+            OccupiedError,
+        )
 
 
 def occupied(run_dir: Path) -> OccupiedError:
@@ -98,8 +100,11 @@ def refuse_parts(run_dir: Path) -> None:
     for part in (folder, *folder.parents[:2]):
         names = {"checkpoints": CHECKPOINTS, ".hydra": ("hydra.yaml",)}.get(part.name, ())
         is_checkpoint = part == folder and (part / "state.json").exists()
-        if is_checkpoint or any((part / name).exists() for name in names):
-            raise OccupiedError(f"{run_dir}: a part of another run; expected another folder, hydra.run.dir=<folder>.")
+        refuse_if(
+            is_checkpoint or any((part / name).exists() for name in names),
+            f"{run_dir}: a part of another run; expected another folder, hydra.run.dir=<folder>.",
+            OccupiedError,
+        )
 
 
 def refuse_links(run_dir: Path) -> None:
@@ -139,13 +144,15 @@ def _refuse_link(path: Path) -> None:
         found = path.lstat()
     except FileNotFoundError:  # or removed, by the process that works there
         return
-    if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
-        raise ValueError(f"{path}: a link or no regular file; expected only files and folders in a run.")
-    if stat.S_ISREG(found.st_mode) and found.st_nlink > 1:
-        raise ValueError(
-            f"{path}: a hard link, a file with another name elsewhere; expected a run folder of its own, such as a "
-            "copy (cp -r)."
-        )
+    refuse_if(
+        not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)),
+        f"{path}: a link or no regular file; expected only files and folders in a run.",
+    )
+    refuse_if(
+        stat.S_ISREG(found.st_mode) and found.st_nlink > 1,
+        f"{path}: a hard link, a file with another name elsewhere; expected a run folder of its own, such as a "
+        "copy (cp -r).",
+    )
 
 
 def note_failure(run_dir: Path, error: Exception) -> None:

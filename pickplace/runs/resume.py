@@ -12,7 +12,7 @@ from loky import cpu_count
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.errors import WorkerDied, sentence
-from pickplace.common.validate import MAX_COUNT, excerpt, is_name, is_whole, number, whole_number
+from pickplace.common.validate import MAX_COUNT, excerpt, is_name, is_whole, number, refuse_if, whole_number
 from pickplace.config.allowlist import modules_to_trust, own_modules, saved_form, trusted_config
 from pickplace.config.composition import apply_overrides, compose_plain, parse, refuse_unknown_keys
 from pickplace.runs import checkpoint
@@ -81,27 +81,27 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
         raise ValueError(f"resume={place}: in the checkpoint's config, {error}") from error
     repeated = {word.key_or_group for word in given}
     for key, value in _remote_values(saved):
-        if key not in repeated:
-            raise ValueError(
-                f"{key}={value}: the checkpoint would write outside this run's folder or this machine; expected "
-                f"{key}={value} again on the command line, or {key}={LOCAL_VALUES[key][0]}."
-            )
+        refuse_if(
+            key not in repeated,
+            f"{key}={value}: the checkpoint would write outside this run's folder or this machine; expected "
+            f"{key}={value} again on the command line, or {key}={LOCAL_VALUES[key][0]}.",
+        )
     if "threads" not in repeated and is_whole(saved.get("threads")) and saved.threads > cpu_count():
         log.warning("threads=%s of the checkpoint: going on with %d, all of this machine", saved.threads, cpu_count())
         saved["threads"] = cpu_count()
     cfg = apply_overrides(saved, [str(word.input_line) for word in given if word.key_or_group != "trust"])
     for key in (*FIXED_KEYS, *(f"env.{key}" for key in saved.env)):
         before, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
-        if before != now:
-            raise ValueError(
-                f"{key}={now}: the run began with {before}, and a resumed run cannot change it; expected a new run, "
-                f"such as one with warm_start.weights={place}."
-            )
-    whole_number("total_frames", cfg.total_frames)
-    if cfg.total_frames != saved.total_frames and cfg.total_frames < facts["frames"]:
-        raise ValueError(
-            f"total_frames={cfg.total_frames}: the run has trained {facts['frames']} frames already; expected more."
+        refuse_if(
+            before != now,
+            f"{key}={now}: the run began with {before}, and a resumed run cannot change it; expected a new run, "
+            f"such as one with warm_start.weights={place}.",
         )
+    whole_number("total_frames", cfg.total_frames)
+    refuse_if(
+        cfg.total_frames != saved.total_frames and cfg.total_frames < facts["frames"],
+        f"total_frames={cfg.total_frames}: the run has trained {facts['frames']} frames already; expected more.",
+    )
     return cfg
 
 
@@ -114,8 +114,10 @@ def _check_facts(place: str, facts: dict) -> None:
     latest, frames = facts["latest"], facts["frames"]
     whole_number(f"{saved}iteration", facts["iteration"], 0, frames)
     number(f"{saved}best", facts["best"], -1, 1)
-    if len(latest) > 100 or not all(map(is_name, latest)):
-        raise ValueError(f"{saved}latest is {excerpt(latest)}; expected a validation that a training wrote.")
+    refuse_if(
+        len(latest) > 100 or not all(map(is_name, latest)),
+        f"{saved}latest is {excerpt(latest)}; expected a validation that a training wrote.",
+    )
     for key, value in latest.items():
         shares = key in ("occupancy", "ci95_low", "ci95_high")
         number(f"{saved}{key}", value, 0 if shares else -MAX_COUNT, 1 if shares else MAX_COUNT)

@@ -19,7 +19,7 @@ import numpy as np
 
 from pickplace.common.errors import one_sentence, sentence
 from pickplace.common.files import read_text, replaced_file
-from pickplace.common.validate import expect
+from pickplace.common.validate import expect, refuse_if
 from pickplace.runs.checkpoint import read_facts
 from pickplace.runs.folder import FAILURE, is_claimed, read_note
 from pickplace.runs.loggers import read_csv
@@ -257,6 +257,7 @@ def draw(settings: list[Setting], path: Path) -> None:
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     with one_sentence():
-        if len(sys.argv) != 2:
-            raise ValueError("expected the folder of a sweep: python -m pickplace.training.sweep outputs/sweep/...")
+        refuse_if(
+            len(sys.argv) != 2, "expected the folder of a sweep: python -m pickplace.training.sweep outputs/sweep/..."
+        )
         summarize(Path(sys.argv[1]))

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 
 from pickplace.common.errors import one_sentence
-from pickplace.common.validate import expect
+from pickplace.common.validate import expect, refuse_if
 from pickplace.config.hydra_app import Command
 from pickplace.runs import checkpoint, folder
 from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config
@@ -112,8 +112,10 @@ def main() -> None:
     overrides = [item for item in sys.argv[1:] if not item.startswith("-")]
     if any(item.startswith("resume=") and item not in ("resume=", "resume=null") for item in overrides):
         with one_sentence():
-            if len(overrides) < len(sys.argv) - 1:
-                raise ValueError("resume=...: expected only key=value overrides beside it, no flags such as -m.")
+            refuse_if(
+                len(overrides) < len(sys.argv) - 1,
+                "resume=...: expected only key=value overrides beside it, no flags such as -m.",
+            )
             resume_run(overrides)
     else:
         Command("train", train, folder, after_sweep=summarize)()
