@@ -33,7 +33,7 @@ def test_a_benchmark_is_trained_on(name, tmp_path):
 
 
 @pytest.mark.parametrize("masked", [True, False])
-@pytest.mark.parametrize("name", options("effector"))
+@pytest.mark.parametrize("name", options("gripper"))
 def test_every_effector_trains(name, masked, tmp_path):
     kinds = ["items.kinds=[[5,4,1],[4,4,2]]", "env.bin_size=[9,9,1]", "env.tote_size=[11,10,2]"]
     words = [f"gripper={name}", f"model.mask_infeasible={masked}", "curriculum=none", "logger=none", *TINY]
