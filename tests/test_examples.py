@@ -267,6 +267,12 @@ def test_own_items(example):
     assert ours["items"]["run"] == 3 and ours["env"]["tote_size"] == [4, 4, 2]
 
 
+def test_own_benchmark(example):
+    ours = example("evaluate", "own_benchmark", "benchmark=small_boxes", "planner=joint_dbl", *EVALUATION)
+    assert ours["env"]["tote_size"] == [8, 8, 8] and ours["items"]["height"] == [1, 3]
+    assert ours["occupancy"]["mean"] > 0.5
+
+
 def test_recorded_items(example):
     ours = example("evaluate", "recorded_items", "items=morning", "planner=joint_dbl", *EVALUATION)
     assert ours["items"]["loop"] is True and ours["occupancy"]["mean"] > 0.8

@@ -161,7 +161,8 @@ class Policy(TensorDictModuleBase, ABC):
         Returns:
             A sentence for each condition that is not met; the policy can be trained all the same.
         """
-        field, side = getattr(self.network, "receptive_field", 0), self.cell.longest_side or self.cell.max_side
+        field = getattr(getattr(self, "network", None), "receptive_field", 0)
+        side = self.cell.longest_side or self.cell.max_side
         found = [
             f"env.{key}={list(size)}: expected sides of at least {field} (receptive field {field}, eq. 3)."
             for key, size in (("bin_size", self.cell.bin_size), ("tote_size", self.cell.tote_size))

@@ -42,9 +42,8 @@ class Gripper(ABC):
     """A gripper: body and cup, in a rectangle of cells, and a grip rule.
 
     A grip rule of your own is a subclass with :attr:`least_cells`, and a config file: ``gripper: {_target_:
-    my_module.MyRule, size: [3, 3]}``, for which the command needs ``trust=my_module``. Where the number of the cup's
-    cells on the item does not decide alone, override :meth:`is_gripped`, too. Further fields of the dataclass are
-    settings; they must be numbers, texts or tuples.
+    my_module.MyRule, size: [3, 3]}``. Where the number of the cup's cells on the item does not decide alone, override
+    :meth:`is_gripped`, too. Further fields of the dataclass are settings; they must be numbers, texts or tuples.
 
     Args:
         size: ``(W_E, D_E)`` of the rectangle around the gripper.
