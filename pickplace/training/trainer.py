@@ -18,7 +18,7 @@ from pickplace.algorithms.base import Algorithm, At, Task
 from pickplace.algorithms.imitation import WarmStart, with_warm_start
 from pickplace.common.files import replaced_file
 from pickplace.common.machine import use_machine
-from pickplace.common.validate import expect
+from pickplace.common.validate import expect, refuse_if
 from pickplace.config.registry import build
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.evaluation.play import Episodes, play
@@ -219,7 +219,10 @@ class Trainer:
             push_level(self.collector, self.curriculum.level)
             log.info("%s frames: tote height %d -> %d", f"{self.frames:,}", level, self.curriculum.level)
             callbacks.call(self.callbacks, "on_level_change", self, level, self.curriculum.level)
-        return metrics | self.algorithm.learn(batch, at)
+        learnt = self.algorithm.learn(batch, at)
+        taken = ", ".join(sorted(metrics.keys() & learnt.keys()))
+        refuse_if(taken, f"algo: it logs {taken}, which the training logs itself; expected other names.")
+        return metrics | learnt
 
     def validate(self, record=()) -> Episodes:
         """Play the validation stream at full height, and record the episodes of these numbers."""

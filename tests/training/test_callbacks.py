@@ -184,6 +184,12 @@ def test_a_callback_that_breaks_a_training_is_named(smoke, tmp_path, settings, e
         smoke(tmp_path / "run", f"+callbacks.mine={{_target_: test_callbacks.Broken, {settings}}}")
 
 
+def test_an_algorithm_that_logs_what_the_training_logs_is_refused(smoke, tmp_path, monkeypatch):
+    monkeypatch.setattr("pickplace.algorithms.ppo.PPO.learn", lambda self, batch, at: {"train/episodes": 1.0})
+    with pytest.raises(ValueError, match=r"^algo: it logs train/episodes"):
+        smoke(tmp_path / "run")
+
+
 def test_own_callback(run, monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(str(EXAMPLE))
     mine = ["--config-dir", str(EXAMPLE), "callbacks=[worst_episode,early_stopping]"]
