@@ -8,7 +8,7 @@ import signal
 import sys
 from contextlib import contextmanager, suppress
 from difflib import get_close_matches
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -21,7 +21,17 @@ class WorkerDied(Exception):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser of command lines that raises its errors as ``ValueError``."""
+    """A parser of command lines that raises its errors as ``ValueError``.
+
+    Args:
+        options: the arguments of ``add_argument``, by name.
+        **settings: of the base class.
+    """
+
+    def __init__(self, options: dict[str, dict[str, Any]] | None = None, **settings):
+        super().__init__(**settings)
+        for name, arguments in (options or {}).items():
+            self.add_argument(name, **arguments)
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; expected the arguments that --help shows.")

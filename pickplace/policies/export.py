@@ -21,20 +21,23 @@ def main() -> None:
 
 
 def parser() -> argparse.ArgumentParser:
-    options = Parser(
+    return Parser(
         prog="pickplace-export",
         description="Export the scoring network of a checkpoint to ONNX, for batches, bins and totes of any size, and "
         "check it with onnxruntime at three tote sizes that the export has not seen.",
         epilog="Inputs, outputs and metadata of the file: docs/robot.md",
-    )
-    options.add_argument("checkpoint", help="a run folder, a checkpoint, or pretrained/<name>")
-    options.add_argument("file", help="the ONNX file to write")
-    options.add_argument("--rotations", type=int, metavar="R", help="quarter turns to choose from; default: as trained")
-    options.add_argument(
-        "--trust", action="append", metavar="MODULE", default=[],
-        help="your own module whose classes the checkpoint's config may name; may be repeated",
+        options={
+            "checkpoint": {"help": "a run folder, a checkpoint, or pretrained/<name>"},
+            "file": {"help": "the ONNX file to write"},
+            "--rotations": {
+                "type": int, "metavar": "R", "help": "quarter turns to choose from; default: as trained",
+            },
+            "--trust": {
+                "action": "append", "metavar": "MODULE", "default": [],
+                "help": "your own module whose classes the checkpoint's config may name; may be repeated",
+            },
+        },
     )  # fmt: skip
-    return options
 
 
 if __name__ == "__main__":

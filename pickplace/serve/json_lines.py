@@ -31,37 +31,32 @@ def main() -> None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    options = Parser(
+    return Parser(
         prog="pickplace-plan",
         description="Plan one pick and one place. With --bin and --tote: one plan, as JSON. Without them: read one "
         'request a line from standard input, {"bin_depth": [[...]], "tote_depth": [[...]]}, and answer each with a '
         'plan in one line; "items": [{"x": .., "y": .., "w": .., "d": .., "h": .., "yaw": ..}, ...] may stand '
         "for bin_depth. A bad request is answered with an error, and the process goes on.",
         epilog="Maps, frames of reference and errors: docs/robot.md",
-    )
-    add_options(options, {
-        "--bin": {"metavar": "NPY", "help": "depth map [W_B, D_B] or finer: height above the bin's floor"},
-        "--bin-labels": {
-            "metavar": "NPY", "help": "map in the shape of --bin: a number for each of several items, else 0",
+        options={
+            "--bin": {"metavar": "NPY", "help": "depth map [W_B, D_B] or finer: height above the bin's floor"},
+            "--bin-labels": {
+                "metavar": "NPY", "help": "map in the shape of --bin: a number for each of several items, else 0",
+            },
+            "--tote": {
+                "metavar": "NPY", "help": "depth map [W_T, D_T] or finer: remaining height, from surface to rim",
+            },
+            "--tote-bearing": {
+                "metavar": "NPY", "help": "map [W_T, D_T]: tote_bearing of the plan before; default: all 1",
+            },
+            "--time": {"action": "store_true", "help": "print the latency of each plan on standard error"},
+            **planner_options(),
         },
-        "--tote": {"metavar": "NPY", "help": "depth map [W_T, D_T] or finer: remaining height, from surface to rim"},
-        "--tote-bearing": {
-            "metavar": "NPY", "help": "map [W_T, D_T]: tote_bearing of the plan before; default: all 1",
-        },
-        "--time": {"action": "store_true", "help": "print the latency of each plan on standard error"},
-        **planner_options(),
-    })  # fmt: skip
-    return options
-
-
-def add_options(parser: argparse.ArgumentParser, options: dict[str, dict[str, Any]]) -> None:
-    """Add options to a parser: the arguments of ``add_argument``, by name."""
-    for name, settings in options.items():
-        parser.add_argument(name, **settings)
+    )  # fmt: skip
 
 
 def planner_options() -> dict[str, dict[str, Any]]:
-    """Return the options that say how to plan, which :func:`load_planner` reads; see :func:`add_options`."""
+    """Return the options that say how to plan, which :func:`load_planner` reads; see :class:`Parser`."""
     of_requests = {
         f"--{key.name.replace('_', '-')}": {
             "type": key.metadata["option"], "metavar": "N", "default": key.default,

@@ -7,7 +7,7 @@ import socket
 
 from pickplace.common.errors import Parser, one_sentence, write_output
 from pickplace.common.validate import excerpt, number, refuse_if, short_text, whole_number
-from pickplace.serve.json_lines import add_options, load_planner, planner_options
+from pickplace.serve.json_lines import load_planner, planner_options
 
 TOKEN = "PICKPLACE_TOKEN"  # the environment variable; a command line can be read by every user of the machine
 LEAST_TOKEN = 16  # letters
@@ -21,31 +21,32 @@ def main() -> None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    options = Parser(
+    return Parser(
         prog="pickplace-serve",
         description="Answer requests over HTTP: POST /plan takes what pickplace-plan reads as a line, and / shows the "
         "last plans in 3D. Without a token it serves this machine only.",
         epilog=f"The environment variable {TOKEN} holds the token. Requests, errors and limits: docs/robot.md",
-    )
-    add_options(options, {
-        **planner_options(),
-        "--host": {"default": "127.0.0.1", "help": "address to listen at (default %(default)s); others need a token"},
-        "--port": {
-            "type": int, "default": 8000, "help": "port to listen at, or 0 for a free one (default %(default)s)",
+        options={
+            **planner_options(),
+            "--host": {
+                "default": "127.0.0.1", "help": "address to listen at (default %(default)s); others need a token",
+            },
+            "--port": {
+                "type": int, "default": 8000, "help": "port to listen at, or 0 for a free one (default %(default)s)",
+            },
+            "--allow-host": {
+                "action": "append", "metavar": "NAME", "default": [],
+                "help": "a further name by which clients call this machine; may be repeated",
+            },
+            "--rate": {
+                "type": float, "metavar": "N", "default": 600,
+                "help": "most plans a minute, of all clients (default %(default)s)",
+            },
+            "--history": {
+                "type": int, "metavar": "N", "default": 20, "help": "plans that the page shows (default %(default)s)",
+            },
         },
-        "--allow-host": {
-            "action": "append", "metavar": "NAME", "default": [],
-            "help": "a further name by which clients call this machine; may be repeated",
-        },
-        "--rate": {
-            "type": float, "metavar": "N", "default": 600,
-            "help": "most plans a minute, of all clients (default %(default)s)",
-        },
-        "--history": {
-            "type": int, "metavar": "N", "default": 20, "help": "plans that the page shows (default %(default)s)",
-        },
-    })  # fmt: skip
-    return options
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> None:
