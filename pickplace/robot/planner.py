@@ -24,19 +24,35 @@ from pickplace.planners.policy import PolicyPlanner
 from pickplace.planners.use import decide
 from pickplace.policies.base import Policy, ScoresActions, ScoresFootprints
 from pickplace.policies.restore import load_critic, load_policy
-from pickplace.robot.alternatives import MAX_ALTERNATIVES, Alternative, list_alternatives
 from pickplace.robot.box import Box, DepthMapError
 from pickplace.robot.measured_problem import read_metric
 from pickplace.robot.problem import Pose, Problem, read_grid
 from pickplace.robot.scene import Scene
 from pickplace.robot.training_envelope import TrainingEnvelope
 from pickplace.rules.cell import CellSpec
+from pickplace.rules.grasps import split_action
 from pickplace.rules.item import Observation
-from pickplace.rules.masks import footprint_mask
+from pickplace.rules.masks import action_footprints, action_mask, footprint_mask
 from pickplace.rules.observation import Term, check_terms, observe
 from pickplace.rules.state import Failure
 
+MAX_ALTERNATIVES = 100_000  # greatest number of choices that a plan may report
 CHOOSERS = "expected one item, or a checkpoint of model=fcn_grasp or corners that was trained with a mask"
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """One of the most probable choices, and whether it succeeds in a forward simulation."""
+
+    action: int  #: flat index
+    pick_cell: tuple[int, int]
+    place_cell: tuple[int, int]
+    rotation_degrees: int  #: turn of the end effector's pose in the tote, in quarter turns
+    #: of the action, or of the item with its footprint if the policy chooses footprints; without a mask
+    probability: float
+    rejected: str | None  #: the reason why it would fail; None if it would succeed
+    chosen: bool
+    item_number: int = 0  #: of the item that it takes, see :attr:`Plan.item_number`; 0 if it grips none
 
 
 @dataclass(frozen=True)
@@ -108,10 +124,10 @@ class Planner:
         if planner is None or isinstance(planner, str):
             self._name = planner or "policy"
             planner = self._make(cell, policy, self.terms)
-        if not isinstance(planner, MapPlanner):
-            raise ValueError(
-                f"planner={excerpt(planner)}: it does not choose among feasible actions; expected another."
-            )
+        refuse_if(
+            not isinstance(planner, MapPlanner),
+            f"planner={excerpt(planner)}: it does not choose among feasible actions; expected another.",
+        )
         self._planners: dict[int, MapPlanner] = {cell.bin_items: planner}  # by the number of items in the bin
 
     @classmethod
@@ -128,10 +144,10 @@ class Planner:
         """
         trained = load_policy(path, device, trust, **sizes)
         items = build("items", trained.config["items"])
-        critic = load_critic(path, trained) if planner == "lookahead" else None
+        needs = getattr(find("planner", planner or "policy"), "needs", ())
         return cls(
             trained.cell, trained.policy, candidates, trained.terms, planner, items,
-            TrainingEnvelope.of(trained.config, items), critic,
+            TrainingEnvelope.of(trained.config, items), load_critic(path, trained) if "critic" in needs else None,
         )  # fmt: skip
 
     @torch.inference_mode()
@@ -176,7 +192,7 @@ class Planner:
             action=None if action is None else int(action),
             occupancy_before=before,
             occupancy_after=before if action is None else before + gained,
-            alternatives=list_alternatives(planner, problem, observation, action, alternatives),
+            alternatives=_list_alternatives(planner, problem, observation, action, alternatives),
             reasons=_reasons(problem) if status in ("stuck", "impossible") else None,
             tote_bearing=bearing.int().tolist() if self.cell.support.marks_bearing else None,
             warnings=[] if self.training is None else self.training.warnings(self.cell, problem.seen.items),
@@ -245,9 +261,8 @@ def _decide(planner: MapPlanner, problem: Problem, observation: Observation) -> 
     """Return the status, and the action if one was found that succeeds."""
     if not footprint_mask(problem.cell, problem.maps).any():
         return "stuck" if problem.is_feasible_in_an_empty_tote() else "impossible", None
-
-    choose = partial(planner.choose, problem.cell, problem.state, problem.maps)
-    action = decide(planner, problem.cell, observation, choose)
+    cell = problem.cell
+    action = decide(planner, cell, observation, partial(planner.choose, cell, problem.state, problem.maps))
     return ("ok", action) if int(problem.failures(action)) == 0 else ("rejected", None)
 
 
@@ -256,3 +271,69 @@ def _reasons(problem: Problem) -> dict[str, int]:
     codes = problem.failures(torch.arange(problem.cell.num_actions, device=problem.state.surface.device))
     counts = codes.bincount(minlength=len(Failure)).tolist()
     return {failure.name.lower(): count for failure, count in zip(Failure, counts, strict=True) if count}
+
+
+def _list_alternatives(
+    planner: MapPlanner, problem: Problem, observation: Observation, chosen: Tensor | None, count: int
+) -> list[Alternative]:
+    """Return the most probable choices, in the order in which its policy prefers them."""
+    if count == 0 or not isinstance(planner, PolicyPlanner):
+        return []
+    cell, candidates = problem.cell, planner.candidates
+    policy = planner.policy.with_cell(cell)
+    if candidates == "all" and isinstance(policy, ScoresFootprints):
+        actions, probability = _probable_footprints(policy, observation, problem, chosen, count)
+    else:
+        log_probs = policy.action_log_probs(observation)[0]
+        tried = cell.num_actions if candidates == "all" else min(candidates, cell.num_actions)
+        # The same call as the planner's, so that ties agree.
+        actions = _with_chosen(log_probs.topk(tried).indices[:count], chosen)
+        probability = log_probs[actions].exp()
+    if not len(actions):
+        return []
+    places, failures, numbers = split_action(cell, actions), problem.failures(actions), problem.taken_items(actions)
+    columns = actions, *places, probability, failures, numbers
+    return [
+        Alternative(
+            action=action,
+            pick_cell=(x_bin, y_bin),
+            place_cell=(x_tote, y_tote),
+            rotation_degrees=90 * rotation,
+            probability=share,
+            rejected=Failure(code).name.lower() if code else None,
+            chosen=chosen is not None and action == int(chosen),
+            item_number=number,
+        )
+        for action, x_bin, y_bin, x_tote, y_tote, rotation, share, code, number in zip(
+            *(column.tolist() for column in columns), strict=True
+        )
+    ]
+
+
+def _with_chosen(listed: Tensor, chosen: Tensor | None) -> Tensor:
+    return listed if chosen is None or (listed == chosen).any() else torch.cat([listed, chosen])
+
+
+def _probable_footprints(
+    policy: Policy, observation: Observation, problem: Problem, chosen: Tensor | None, count: int
+) -> tuple[Tensor, Tensor]:
+    """Return an action for each of the most probable footprints, and the footprint's probability.
+
+    Many actions leave the same footprint, and the policy does not tell them apart. The action returned is the
+    chosen one, else the first feasible one, else the first one. Of several items in the bin each has its footprints.
+    """
+    cell = problem.cell
+    footprint = action_footprints(cell, problem.state.items, problem.maps.blocked)[0]  # [N_a]
+    lands = footprint >= 0
+    reachable = footprint.new_zeros(cell.num_choices, dtype=torch.bool).index_fill_(0, footprint[lands], True)
+    if problem.maps.bin_items == 1:
+        log_probs = policy.action_log_probs(observation)[0]
+        total = log_probs.new_zeros(cell.num_choices).scatter_add_(0, footprint[lands], log_probs[lands].exp())
+    else:  # measured items are on grids of their own: what the policy sees does not tell which picks lift them
+        total = torch.where(reachable, policy.unmasked_scores(observation)[0], -torch.inf).softmax(0).nan_to_num(0)
+    ranked = torch.where(reachable, total, -1).argsort(descending=True, stable=True)[: int(reachable.sum())][:count]
+    preference = action_mask(cell, problem.maps)[0].int()
+    if chosen is not None:
+        ranked, preference[chosen] = _with_chosen(ranked, footprint[chosen]), 2
+    shown = [int(torch.where(footprint == wanted, preference, -1).argmax()) for wanted in ranked]
+    return ranked.new_tensor(shown), total[ranked]
