@@ -24,14 +24,14 @@ class Parser(argparse.ArgumentParser):
     """A parser of command lines that raises its errors as ``ValueError``.
 
     Args:
-        options: the arguments of ``add_argument``, by name.
+        options: the arguments of ``add_argument``, by the names of an option, such as ``"--cfg/-c"``.
         **settings: of the base class.
     """
 
     def __init__(self, options: dict[str, dict[str, Any]] | None = None, **settings):
         super().__init__(**settings)
-        for name, arguments in (options or {}).items():
-            self.add_argument(name, **arguments)
+        for names, arguments in (options or {}).items():
+            self.add_argument(*names.split("/"), **arguments)
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; expected the arguments that --help shows.")

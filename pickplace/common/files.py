@@ -6,7 +6,7 @@ import stat
 from contextlib import contextmanager
 from pathlib import Path
 
-from pickplace.common.validate import at_most, excerpt, refuse_if
+from pickplace.common.validate import at_most, excerpt, refuse_if, reworded
 
 #: Greatest size of a file that is read, in bytes, unless a reader sets its own: more would fill the memory.
 MAX_BYTES = 2**30
@@ -40,10 +40,8 @@ def read_file(path, most: int = MAX_BYTES, links: bool = True, empty: bool = Tru
 
 def read_text(path, most: int = MAX_BYTES, encoding: str = "utf-8", empty: bool = True) -> str:
     """Return the text of a regular file; arguments and errors as of :func:`read_file`."""
-    try:
+    with reworded(UnicodeDecodeError, lambda error: ValueError(f"{path}: {error}; expected a text in UTF-8.")):
         return read_file(path, most, empty=empty).decode(encoding)
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: {error}; expected a text in UTF-8.") from error
 
 
 def read_table(key: str, path, *headers: str) -> tuple[str, list[tuple[int, list[str]]]]:
@@ -61,11 +59,9 @@ def read_table(key: str, path, *headers: str) -> tuple[str, list[tuple[int, list
         not Path(path).exists(),
         f"{key}={str(path)!r}: no such file; expected a CSV with columns {' or '.join(headers)}.",
     )
-    try:
+    with reworded(csv.Error, lambda error: ValueError(f"{path}: {error}; expected a CSV in UTF-8.")):
         reader = csv.reader(io.StringIO(read_text(path, MAX_TABLE_BYTES, "utf-8-sig", empty=False), newline=""))
         table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
-    except csv.Error as error:
-        raise ValueError(f"{path}: {error}; expected a CSV in UTF-8.") from error
     header = ",".join(table[0][1]) if table else ""
     rows = [(line, fields) for line, fields in table[1:] if any(fields)]
     refuse_if(
@@ -88,10 +84,9 @@ def replaced_file(path):
     path = Path(path)
     new = path.with_name(f".{path.stem}.new{path.suffix}")
     try:
-        new.unlink(missing_ok=True)  # a link, perhaps
-        yield new
-        new.replace(path)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+        with reworded(OSError, lambda error: OSError(error.errno, error.strerror or str(error), str(path))):
+            new.unlink(missing_ok=True)  # a link, perhaps
+            yield new
+            new.replace(path)
     finally:
         new.unlink(missing_ok=True)

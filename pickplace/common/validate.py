@@ -2,7 +2,8 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from numbers import Integral, Real
 from reprlib import Repr
 from typing import Any
@@ -51,6 +52,15 @@ def refuse_if(bad: Any, message: str, error: type[ValueError] = ValueError) -> N
     """Raise an error with a message if something is bad."""
     if bad:
         raise error(message)
+
+
+@contextmanager
+def reworded(errors, new: Callable[[Any], Exception]) -> Iterator[None]:
+    """Raise ``new(error)`` instead of an error of these types in the block."""
+    try:
+        yield
+    except errors as error:
+        raise new(error) from error
 
 
 def at_most(words: str, count: int, what: str, most: int) -> None:
@@ -163,10 +173,10 @@ def check_bytes(setting: str, needed: int, device="cpu") -> None:
 
     device, given = torch.device(device), os.environ.get(MEMORY_VARIABLE)
     most = torch.cuda.get_device_properties(device).total_memory / 2e9 if device.type == "cuda" else CPU_GIGABYTES
-    try:
+    with reworded(
+        ValueError, lambda _: ValueError(f"{MEMORY_VARIABLE}={excerpt(given)}: expected a number of gigabytes.")
+    ):
         most = most if given is None else number(MEMORY_VARIABLE, float(given))
-    except ValueError as error:
-        raise ValueError(f"{MEMORY_VARIABLE}={excerpt(given)}: expected a number of gigabytes.") from error
     if needed > most * 1e9:
         raise ValueError(
             f"{setting}: it would take {needed / 1e9:,.2f} GB; expected at most {most:.4g} GB, or a greater limit in "

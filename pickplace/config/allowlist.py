@@ -15,7 +15,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.common.validate import at_most, excerpt, expect, short_text
+from pickplace.common.validate import at_most, excerpt, expect, reworded, short_text
 from pickplace.config.registry import names_at, qualified_names
 
 #: Modules that are never a user's own: with their functions a config could do anything.
@@ -131,10 +131,11 @@ def _is_defined_by(target, trust: Collection[str]) -> bool:
     """Return whether a trusted module, or a part of it, defines that class or function, and not merely imports it."""
     if (module := _module(target)) not in trust or not re.fullmatch(r"[A-Za-z]\w*", target[len(module) + 1 :]):
         return False
-    try:
+    with reworded(
+        ImportError,
+        lambda error: ValueError(f"trust={module}: it cannot be imported ({error}); expected it on PYTHONPATH."),
+    ):
         found = getattr(importlib.import_module(module), target[len(module) + 1 :], None)
-    except ImportError as error:
-        raise ValueError(f"trust={module}: it cannot be imported ({error}); expected it on PYTHONPATH.") from error
     home = getattr(found, "__module__", None) or ""
     return (inspect.isclass(found) or inspect.isfunction(found)) and f"{home}.".startswith(f"{module}.")
 

@@ -17,7 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.errors import Parser, one_sentence, sentence, write_output
-from pickplace.common.validate import refuse_if
+from pickplace.common.validate import refuse_if, reworded
 from pickplace.config import composition
 
 log = logging.getLogger(__name__)
@@ -74,10 +74,8 @@ class Command:
 
     def _start(self, words: list[str], flags: list[str], app: Callable[[DictConfig], Any] = lambda cfg: None) -> None:
         sys.argv[1:] = [*words, *flags]
-        try:
+        with reworded(HydraException, lambda error: composition.clearer_error(error, self.config_name, words)):
             hydra.main(version_base="1.3", config_path=str(composition.conf_dir()), config_name=self.config_name)(app)()
-        except HydraException as error:
-            raise composition.clearer_error(error, self.config_name, words) from error
 
     def _run(self, merged: DictConfig, words: list[str], flags: list[str], is_sweep: bool) -> None:
         """Run the task once, or for each job of a sweep, in a folder that is not in use.
@@ -137,28 +135,20 @@ def read_command_line(arguments: list[str]) -> tuple[list[str], list[str], argpa
     Folders of ``--config-dir``, which may be given several times, are among the overrides, as Hydra's search path.
     A ``ValueError`` names an unknown flag, or a folder that does not exist.
     """
-    parser = Parser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--config-dir", "-cd", action="append", default=[])
-    folders, rest = parser.parse_known_args(arguments)
+    settings: dict = {"add_help": False, "allow_abbrev": False}
+    first = Parser({"--config-dir/-cd": {"action": "append", "default": []}}, **settings)
+    folders, rest = first.parse_known_args(arguments)
     for folder in folders.config_dir:
         refuse_if(not Path(folder).is_dir(), f"--config-dir {folder}: no such folder; expected one with config files.")
-    parser = Parser(add_help=False, allow_abbrev=False)
-    parser.add_argument("words", nargs="*")
-    parser.add_argument("--cfg", "-c", choices=["job", "hydra", "all"])
-    parser.add_argument("--package", "-p")
-    parser.add_argument("--info", "-i", nargs="?", const="all")
-    names = (
-        "--help/-h",
-        "--multirun/-m",
-        "--run/-r",
-        "--resolve",
-        "--hydra-help",
-        "--version",
-        "--shell-completion/-sc",
-    )
-    for flags in names:
-        parser.add_argument(*flags.split("/"), action="store_true")
-    options = parser.parse_intermixed_args(rest)
+    switches = ["--help/-h", "--multirun/-m", "--run/-r", "--resolve", "--hydra-help", "--version"]
+    others = {
+        "words": {"nargs": "*"},
+        "--cfg/-c": {"choices": ["job", "hydra", "all"]},
+        "--package/-p": {},
+        "--info/-i": {"nargs": "?", "const": "all"},
+        **dict.fromkeys([*switches, "--shell-completion/-sc"], {"action": "store_true"}),
+    }
+    options = Parser(others, **settings).parse_intermixed_args(rest)
     flags_of_hydra = [word for word in rest if word not in options.words]
     return composition.merge_search_path(options.words, folders.config_dir), flags_of_hydra, options
 

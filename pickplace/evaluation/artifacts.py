@@ -9,7 +9,7 @@ from typing import Any
 
 from pickplace.common.errors import sentence
 from pickplace.common.files import replaced_file
-from pickplace.common.validate import flag, whole_number
+from pickplace.common.validate import flag, reworded, whole_number
 from pickplace.physics.plans import PLANS, EpisodePlan, to_lines
 from pickplace.rules.cell import CellSpec
 from pickplace.runs.folder import EVALUATION
@@ -64,7 +64,10 @@ class Artifacts:
             texts["replay.html"] = page(recordings[: self.replay], cell, title)
         if self.plans:
             texts[PLANS] = to_lines(plans)
-        try:
+        with reworded(
+            OSError,
+            lambda error: ValueError(f"{sentence(error)} The table above and the files that are there are whole."),
+        ):
             for name, text in texts.items():
                 with replaced_file(run_dir / name) as new:
                     new.write_text(text, encoding="utf-8")
@@ -73,8 +76,6 @@ class Artifacts:
             if self.gif:
                 with replaced_file(run_dir / "replay.gif") as new:
                     animation(recordings[0], cell, new)
-        except OSError as error:
-            raise ValueError(f"{sentence(error)} The table above and the files that are there are whole.") from error
 
 
 def to_json(value: Any) -> Any:

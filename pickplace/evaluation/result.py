@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from pickplace.common.files import read_file
-from pickplace.common.validate import excerpt, is_name, is_number, refuse_if
+from pickplace.common.validate import excerpt, is_name, is_number, refuse_if, reworded
 from pickplace.config.allowlist import refuse_foreign_targets
 from pickplace.config.registry import build, node_of, with_defaults
 from pickplace.evaluation.play import Episodes
@@ -160,11 +160,11 @@ def read_comparison(path: Path, expected: dict, trust: Collection[str] = ()) -> 
         ValueError: for a file that cannot be read, or that is about other episodes.
     """
     refused = f"compare={excerpt(str(path))}: expected an evaluation.json"
-    try:
+    with reworded(
+        (OSError, ValueError, KeyError, TypeError, RecursionError), lambda error: ValueError(f"{refused} ({error}).")
+    ):
         other = json.loads(read_file(path, MAX_EVALUATION, empty=False))
         env, values, name = dict(other["env"]), other["occupancy"]["per_episode"], other.get("planner")
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{refused} ({error}).") from error
     items = other.get("items")
     if isinstance(items, dict) and items.get("_target_") == expected["items"]["_target_"]:
         expected, other = ({**each, "items": with_defaults("items", each["items"])} for each in (expected, other))
@@ -174,11 +174,9 @@ def read_comparison(path: Path, expected: dict, trust: Collection[str] = ()) -> 
             f"compare={excerpt(str(path))}: its {key} is {excerpt(theirs)}, expected {excerpt(ours)}.",
         )
     cell = build_cell(expected["env"], reach=None)
-    try:
+    with reworded(ValueError, lambda error: ValueError(f"{refused} ({error})")):
         refuse_foreign_targets(env, trust, "env")
         other_cell = build_cell(env, reach=None)  # what is missing has its default
-    except ValueError as error:
-        raise ValueError(f"{refused} ({error})") from error
     reaches = ("env.reach", expected["env"].get("reach"), env.get("reach"))
     for key, ours, theirs in (*differences(cell_settings(cell), cell_settings(other_cell), "env"), reaches):
         refuse_if(

@@ -21,7 +21,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from pickplace.common.files import read_file
-from pickplace.common.validate import excerpt, is_whole, refuse_if
+from pickplace.common.validate import excerpt, is_whole, refuse_if, reworded
 
 SCHEMA = 1
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"  # weights that the package ships
@@ -199,11 +199,12 @@ def _identity(folder: Path) -> list[tuple[int, int]] | None:
 
 def _read(folder: Path) -> tuple[dict, dict]:
     """Read a checkpoint's two files, and compare schema and checksum."""
-    try:
+    with reworded(
+        (OSError, ValueError, RecursionError),  # a RecursionError from deeply nested JSON
+        lambda error: CheckpointError(f"{folder}: the checkpoint cannot be read ({error})."),
+    ):
         content, blob = (read_file(folder / name, MAX_BYTES[name], links=False) for name in (FACTS, TENSORS))
         facts = json.loads(content)
-    except (OSError, ValueError, RecursionError) as error:  # a RecursionError from deeply nested JSON
-        raise CheckpointError(f"{folder}: the checkpoint cannot be read ({error}).") from error
     found = facts.get("schema") if isinstance(facts, dict) else None
     refuse_if(
         found != SCHEMA,
@@ -226,10 +227,11 @@ def _read(folder: Path) -> tuple[dict, dict]:
         f"{folder}: {FACTS} lacks its state, config or frames; expected what a training wrote.",
         CheckpointError,
     )
-    try:
+    with reworded(
+        ValueError,
+        lambda error: CheckpointError(f"{folder}: {FACTS} and {TENSORS} do not fit each other ({error})."),
+    ):
         state = unflatten(tensors, state)
-    except ValueError as error:
-        raise CheckpointError(f"{folder}: {FACTS} and {TENSORS} do not fit each other ({error}).") from error
     refuse_if(
         not isinstance(state.get("policy"), dict),
         f"{folder}: {TENSORS} has no policy; expected what a training wrote.",

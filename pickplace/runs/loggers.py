@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from pickplace.common.errors import needs_extra
 from pickplace.common.files import read_text, replaced_file
-from pickplace.common.validate import excerpt
+from pickplace.common.validate import excerpt, reworded
 
 if TYPE_CHECKING:
     from torchrl.record.loggers.common import Logger
@@ -54,15 +54,13 @@ class CsvLogger:
             OSError: naming the file, if it cannot be written.
         """
         row = {"frames": frames, **metrics}
-        try:
+        with reworded(OSError, lambda error: OSError(error.errno, error.strerror, str(self.path))):
             self._restore()
             if set(row) <= set(self._columns):
                 self._writer.writerow(row)
                 self._file.flush()
             else:
                 self._rewrite([*self._closed_rows(), row])
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def _closed_rows(self) -> list[dict[str, float]]:
         with self._file as file:

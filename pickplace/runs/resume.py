@@ -12,7 +12,7 @@ from loky import cpu_count
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.errors import WorkerDied, sentence
-from pickplace.common.validate import MAX_COUNT, excerpt, is_name, is_whole, number, refuse_if, whole_number
+from pickplace.common.validate import MAX_COUNT, excerpt, is_name, is_whole, number, refuse_if, reworded, whole_number
 from pickplace.config.allowlist import modules_to_trust, own_modules, saved_form, trusted_config
 from pickplace.config.composition import apply_overrides, compose_plain, parse, refuse_unknown_keys
 from pickplace.runs import checkpoint
@@ -75,10 +75,8 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     trust = own_modules(next((word.value() for word in reversed(given) if word.key_or_group == "trust"), None))
     saved = trusted_config(facts["config"], trust, groups=None)
     saved["trust"] = list(trust)  # only the user says what to trust, never the checkpoint
-    try:
+    with reworded(ValueError, lambda error: ValueError(f"resume={place}: in the checkpoint's config, {error}")):
         refuse_unknown_keys(saved, compose_plain("train"))
-    except ValueError as error:
-        raise ValueError(f"resume={place}: in the checkpoint's config, {error}") from error
     repeated = {word.key_or_group for word in given}
     for key, value in _remote_values(saved):
         refuse_if(

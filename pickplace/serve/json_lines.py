@@ -13,7 +13,7 @@ import numpy as np
 
 from pickplace.common.errors import Parser, one_sentence, write_output
 from pickplace.common.files import read_file, read_text
-from pickplace.common.validate import refuse_if, whole_number
+from pickplace.common.validate import refuse_if, reworded, whole_number
 from pickplace.robot.box import DepthMapError
 from pickplace.serve.request import MAX_REQUEST, PLAN_OPTIONS, PlanRequest, answer
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 MAX_MAP = 2**26  # greatest size of a .npy file, in bytes
 
 
+@one_sentence()
 def main() -> None:
     """Entry point of ``pickplace-plan``."""
-    with one_sentence():
-        run(parser().parse_args())
+    run(parser().parse_args())
 
 
 def parser() -> argparse.ArgumentParser:
@@ -189,10 +189,11 @@ def read_reach(path: str):
     from pickplace.config.registry import build
 
     expected = "expected a file with the key reach, such as conf/reach/annulus.yaml."
-    try:
+    with reworded(
+        (OSError, ValueError, YAMLError),
+        lambda error: ValueError(f"--reach={path}: {str(error).splitlines()[0]}; {expected}"),
+    ):
         content = safe_load(read_text(path, MAX_REQUEST))
-    except (OSError, ValueError, YAMLError) as error:
-        raise ValueError(f"--reach={path}: {str(error).splitlines()[0]}; {expected}") from error
     refuse_if(not isinstance(content, dict) or [*content] != ["reach"], f"--reach={path}: {expected}")
     return build("env", content)["reach"]
 
@@ -205,9 +206,10 @@ def read_map(path: str) -> np.ndarray:
         OSError: if there is none, or it cannot be read.
     """
     content = read_file(path, MAX_MAP, empty=False)
-    try:
+    with reworded(
+        Exception,  # of any type: numpy evaluates the header
+        lambda _: ValueError(f"{path}: cannot be read; expected a .npy file with one array of numbers."),
+    ):
         values = np.load(io.BytesIO(content), allow_pickle=False)
-    except Exception as error:  # of any type: numpy evaluates the header
-        raise ValueError(f"{path}: cannot be read; expected a .npy file with one array of numbers.") from error
     refuse_if(not isinstance(values, np.ndarray), f"{path}: expected a .npy file with one array, got an archive.")
     return values

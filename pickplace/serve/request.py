@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Self
 
 from pickplace.common.errors import sentence
-from pickplace.common.validate import refuse_if
+from pickplace.common.validate import refuse_if, reworded
 from pickplace.robot.box import ACCURACY, CLEARANCE, Box
 
 if TYPE_CHECKING:
@@ -106,10 +106,11 @@ def parse_json(text: bytes) -> dict:
         ValueError: for a text that is too long, or is no object in JSON.
     """
     refuse_if(len(text) > MAX_REQUEST, f"the request has more than {MAX_REQUEST:,} bytes; expected a shorter one.")
-    try:
+    with reworded(
+        (json.JSONDecodeError, UnicodeDecodeError, RecursionError),
+        lambda error: ValueError(f"the request is not JSON: {error}."),
+    ):
         given = json.loads(text.decode(), parse_constant=finite_float, parse_float=finite_float)
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"the request is not JSON: {error}.") from error
     refuse_if(
         not isinstance(given, dict), f"got {type(given).__name__}, expected an object with bin_depth and tote_depth."
     )

@@ -13,10 +13,10 @@ TOKEN = "PICKPLACE_TOKEN"  # the environment variable; a command line can be rea
 LEAST_TOKEN = 16  # letters
 
 
+@one_sentence()
 def main() -> None:
     """Entry point of ``pickplace-serve``."""
-    with one_sentence():
-        run(parser().parse_args())
+    run(parser().parse_args())
 
 
 def parser() -> argparse.ArgumentParser:

@@ -13,7 +13,7 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 
 from pickplace.common.errors import WorkerDied, needs_extra
-from pickplace.common.validate import expect, whole_number
+from pickplace.common.validate import expect, reworded, whole_number
 from pickplace.config.registry import names_at
 from pickplace.runs.checkpoint import CheckpointError
 from pickplace.runs.resume import STOP_SIGNALS
@@ -78,10 +78,8 @@ class ResumableCollector(Collector):
 def _ray_errors():
     from ray.exceptions import RayActorError
 
-    try:
+    with reworded(RayActorError, lambda _: WorkerDied("a Ray worker of the collector has died.")):
         yield
-    except RayActorError as error:
-        raise WorkerDied("a Ray worker of the collector has died.") from error
 
 
 class ResumableRayCollector(RayCollector):
@@ -130,12 +128,13 @@ def set_rng_state(state: dict, device: torch.device) -> None:
     Raises:
         CheckpointError: if the state is not valid.
     """
-    try:
+    with reworded(
+        RuntimeError,
+        lambda _: CheckpointError("The checkpoint's random generator is of no use: its state is not valid."),
+    ):
         torch.set_rng_state(state["rng"].cpu())
         if device.type == "cuda" and "cuda_rng" in state:
             torch.cuda.set_rng_state(state["cuda_rng"].cpu(), device)
-    except RuntimeError as error:
-        raise CheckpointError("The checkpoint's random generator is of no use: its state is not valid.") from error
 
 
 def ignore_signals() -> None:
