@@ -25,7 +25,6 @@ from pickplace.rules.masks import placing_maps
 from pickplace.rules.state import State
 from pickplace.runs import checkpoint
 from pickplace.training import trainer
-from pickplace.training.collectors import refuse_other_workers
 from pickplace.training.settings import check_settings
 from pickplace.training.trainer import Trainer
 
@@ -320,13 +319,13 @@ def test_loading_a_run_with_a_teacher_of_ones_own_needs_no_trust(tmp_path):
     Planner.load(tmp_path / "own")
 
 
-def test_another_number_of_workers_starts_none(smoke_run, tmp_path):
+def test_another_number_of_workers_is_refused(smoke_run, tmp_path):
     folder = checkpoint.locate(smoke_run, "last")
     state, facts = checkpoint.read(folder)
-    cfg = OmegaConf.create(facts["config"] | {"collector": {"_target_": "multi_sync", "workers": 8}})
-    with pytest.raises(ValueError, match="collector.workers=8: expected 0, as many as the checkpoint has"):
-        Trainer(cfg, tmp_path, (state, facts, folder))
-    refuse_other_workers({"_target_": "multi_sync"}, {"worker0": {}, "worker1": {}})  # the default number
+    cfg = OmegaConf.create(facts["config"] | {"collector": {"_target_": "multi_sync", "workers": 2}})
+    lacking = "checkpoint's collector does not fit these settings: worker0.* is missing"
+    with pytest.raises(ValueError, match=lacking), Trainer(cfg, tmp_path, (state, facts, folder)).running():
+        pass
     cfg.collector = {"_target_": "single", "workers": 0}
     with pytest.raises(ValueError, match="collector.workers: there is no key 'workers'"):
         Trainer(cfg, tmp_path, (state, facts, folder))

@@ -3,7 +3,6 @@
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,29 +16,21 @@ from pickplace.views.recording import Recording
 from pickplace.views.replay import animation, page, picture
 
 
-@dataclass(frozen=True)
 class Artifacts:
-    """Files to write beside the result.
+    """Files to write beside the result, as the config group ``evaluation`` asks for; a key that it lacks is off.
 
     Attributes:
         replay: number of episodes on the replay page; 0: no page.
         gif: whether to write an animation of the first episode.
         plans: whether to write the plans of all episodes.
+
+    Raises:
+        ValueError: naming the key, its value, and what was expected.
     """
 
-    replay: int
-    gif: bool
-    plans: bool
-
-    @classmethod
-    def asked(cls, evaluation: Mapping) -> "Artifacts":
-        """Return what the config group ``evaluation`` asks for; a key that it lacks is as good as off.
-
-        Raises:
-            ValueError: naming the key, its value, and what was expected.
-        """
-        flags = {key: flag(f"evaluation.{key}", evaluation.get(key, False)) for key in ("gif", "plans")}
-        return cls(whole_number("evaluation.replay", evaluation.get("replay", 0), 0, 1_000), **flags)
+    def __init__(self, evaluation: Mapping):
+        self.gif, self.plans = (flag(f"evaluation.{key}", evaluation.get(key, False)) for key in ("gif", "plans"))
+        self.replay = whole_number("evaluation.replay", evaluation.get("replay", 0), 0, 1_000)
 
     def write(
         self, run_dir: Path, result: dict, cell: CellSpec, recordings: list[Recording], plans: list[EpisodePlan],

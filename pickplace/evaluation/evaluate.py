@@ -54,33 +54,31 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
     """
     with claim(run_dir):
         refuse_occupied(run_dir)
-        return _evaluate(cfg, run_dir)
+        ev, artifacts = cfg.evaluation, Artifacts(cfg.evaluation)
+        engine = build_engine(cfg.physics) if cfg.physics else None
+        make_env, planner, facts = prepare(cfg)
+        cell, settings = make_env(0, 1).cell, episode_settings(cfg)
+        other = (
+            None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), settings, own_modules(cfg.trust))
+        )
 
+        log.info("%s episodes to play with %s", f"{ev.episodes:,}", planner.name)
+        recorded = ev.episodes if artifacts.plans or engine else max(artifacts.replay, 1)
+        episodes = play(make_env, planner, ev.episodes, ev.batch_size, range(recorded), range(artifacts.replay))
+        result = describe(planner, facts | settings, episodes)
+        result["latency_ms"] = decision_latency(make_env, planner, ev.latency_decisions)
+        plans = [plan_of(each, cell, engine.cell_size if engine else CELL_SIZE) for each in episodes.recordings]
+        if engine:
+            outcomes = carry_out(engine, plans, episodes.recordings[: artifacts.replay])
+            result["physics"] = summarise_physics(engine, resolved(cfg.physics), outcomes)
+        if other:
+            result["paired_difference"] = paired_difference(result, other)
+        log.info("\n%s", evaluation_table(result))  # before anything is written: the disk may be full
 
-def _evaluate(cfg: DictConfig, run_dir: Path) -> float:
-    ev, artifacts = cfg.evaluation, Artifacts.asked(cfg.evaluation)
-    engine = build_engine(cfg.physics) if cfg.physics else None
-    make_env, planner, facts = prepare(cfg)
-    cell, settings = make_env(0, 1).cell, episode_settings(cfg)
-    other = None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), settings, own_modules(cfg.trust))
-
-    log.info("%s episodes to play with %s", f"{ev.episodes:,}", planner.name)
-    recorded = ev.episodes if artifacts.plans or engine else max(artifacts.replay, 1)
-    episodes = play(make_env, planner, ev.episodes, ev.batch_size, range(recorded), range(artifacts.replay))
-    result = describe(planner, facts | settings, episodes)
-    result["latency_ms"] = decision_latency(make_env, planner, ev.latency_decisions)
-    plans = [plan_of(each, cell, engine.cell_size if engine else CELL_SIZE) for each in episodes.recordings]
-    if engine:
-        outcomes = carry_out(engine, plans, episodes.recordings[: artifacts.replay])
-        result["physics"] = summarise_physics(engine, resolved(cfg.physics), outcomes)
-    if other:
-        result["paired_difference"] = paired_difference(result, other)
-    log.info("\n%s", evaluation_table(result))  # before anything is written: the disk may be full
-
-    title = f"{cfg.checkpoint or planner.name}, {ev.stream} stream, seed {ev.seed}"
-    artifacts.write(run_dir, result, cell, episodes.recordings, plans, title)
-    log.info("run folder: %s", run_dir)
-    return result["occupancy"]["mean"]
+        title = f"{cfg.checkpoint or planner.name}, {ev.stream} stream, seed {ev.seed}"
+        artifacts.write(run_dir, result, cell, episodes.recordings, plans, title)
+        log.info("run folder: %s", run_dir)
+        return result["occupancy"]["mean"]
 
 
 def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:

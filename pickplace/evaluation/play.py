@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
@@ -92,19 +91,15 @@ class _Batch:
 
         A slot whose episode has ended plays on, uncounted, until all have ended.
         """
-        after = self.env.step(self.observation.set("action", action))["next"]
-        done = after["done"][:, 0]
-        self._keep_results(self.running & done, after)
-        self.running = self.running & ~done
-        self.observation = step_mdp(self.observation)
-        if done.any() and self.running.any():
-            self.observation = self.env.reset(self.observation.set("_reset", after["done"]))
-
-    def _keep_results(self, ended: Tensor, after: TensorDictBase) -> None:
-        """Keep the results of the slots in ``ended``, bool ``[N]``, from the observation after their last step."""
-        env, failure = self.env, after["failure"][:, 0]
-        now = {"occupancy": env.exact_occupancy, "items_placed": env.steps, "failure": failure}
-        now["final_heights"] = env.state.heights
+        env, after = self.env, self.env.step(self.observation.set("action", action))["next"]
+        done, failure = after["done"][:, 0], after["failure"][:, 0]
+        ended = self.running & done
+        now = {
+            "occupancy": env.exact_occupancy,
+            "items_placed": env.steps,
+            "failure": failure,
+            "final_heights": env.state.heights,
+        }
         for name, values in now.items():
             where = ended.view(-1, *[1] * (values.ndim - 1))
             self.results[name] = torch.where(where, values, self.results.get(name, values))
@@ -113,6 +108,10 @@ class _Batch:
                 recording.ending, recording.occupancy = Failure(int(failure[slot])), float(now["occupancy"][slot])
                 if recording.ending == Failure.STUCK:
                     recording.waiting = items_in_bin(env.state.items, slot)
+        self.running = self.running & ~done
+        self.observation = step_mdp(self.observation)
+        if done.any() and self.running.any():
+            self.observation = env.reset(self.observation.set("_reset", after["done"]))
 
 
 def check_episode_settings(evaluation: Mapping) -> None:

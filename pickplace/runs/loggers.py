@@ -9,14 +9,11 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 from pickplace.common.errors import needs_extra
 from pickplace.common.files import read_text, replaced_file
 from pickplace.common.validate import excerpt, reworded
-
-if TYPE_CHECKING:
-    from torchrl.record.loggers.common import Logger
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +62,7 @@ class CsvLogger:
     def _closed_rows(self) -> list[dict[str, float]]:
         with self._file as file:
             file.seek(0)
-            return parse_csv(file.read(), self.path)
+            return read_csv(self.path, file.read())
 
     def _restore(self) -> None:
         """Write the table again, with a warning, if its path no longer leads to the open file, or if that was cut."""
@@ -85,7 +82,34 @@ class CsvLogger:
             self._file.close()
 
 
-class TensorboardLogger(CsvLogger):
+class BackendLogger(CsvLogger):
+    """A backend beside the table; subclasses state how to send metrics as ``_send``, to end a run as ``_end_run``.
+
+    A resumed run continues under the run's id, if the backend has ids; the run folder keeps it in a file.
+
+    Args:
+        folder, frames: as in `CsvLogger`.
+        id_file: the name of that file.
+    """
+
+    _send: Callable[[dict[str, float], int], Any]
+    _end_run: Callable[[], Any]
+
+    def __init__(self, folder, frames: int, id_file: str = "run_id"):
+        super().__init__(folder, frames)
+        self._id_file = Path(folder).absolute() / id_file
+        self._run_id = self._id_file.read_text() if frames and self._id_file.is_file() else None
+
+    def log(self, metrics: dict[str, float], frames: int) -> None:
+        super().log(metrics, frames)
+        self._send(metrics, frames)
+
+    def close(self) -> None:
+        super().close()
+        self._end_run()
+
+
+class TensorboardLogger(BackendLogger):
     """TensorBoard event files in the run folder; needs the extra ``pickplace[tensorboard]``. Args as `CsvLogger`."""
 
     def __init__(self, folder, frames: int = 0, settings: dict | None = None):
@@ -93,43 +117,9 @@ class TensorboardLogger(CsvLogger):
             from torch.utils.tensorboard import SummaryWriter
         super().__init__(folder, frames)
         # purge_step: TensorBoard hides events after the checkpoint of a resumed run.
-        self._events = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
-
-    def log(self, metrics: dict[str, float], frames: int) -> None:
-        super().log(metrics, frames)
-        for key, value in metrics.items():
-            self._events.add_scalar(key, value, frames)
-
-    def close(self) -> None:
-        super().close()
-        self._events.close()
-
-
-class BackendLogger(CsvLogger):
-    """A TorchRL logger beside the table; subclasses make it as ``_backend``, and state how a run ends as ``_end_run``.
-
-    A resumed run continues under the run's id, which the run folder keeps in a file.
-
-    Args:
-        folder, frames: as in `CsvLogger`.
-        id_file: the name of that file.
-    """
-
-    _backend: "Logger"
-    _end_run: Callable[[], Any]
-
-    def __init__(self, folder, frames: int, id_file: str):
-        super().__init__(folder, frames)
-        self._id_file = Path(folder).absolute() / id_file
-        self._run_id = self._id_file.read_text() if frames and self._id_file.is_file() else None
-
-    def log(self, metrics: dict[str, float], frames: int) -> None:
-        super().log(metrics, frames)
-        self._backend.log_metrics(metrics, step=frames)
-
-    def close(self) -> None:
-        super().close()
-        self._end_run()
+        events = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
+        self._send = lambda metrics, frames: [events.add_scalar(key, metrics[key], frames) for key in metrics]
+        self._end_run = events.close
 
 
 class WandbLogger(BackendLogger):
@@ -154,7 +144,7 @@ class WandbLogger(BackendLogger):
         from torchrl.record.loggers.wandb import WandbLogger as Backend
 
         super().__init__(folder, frames, "wandb_run_id")
-        self._backend = Backend(
+        backend = Backend(
             Path(folder).name,
             offline=offline,
             save_dir=str(folder),
@@ -163,10 +153,10 @@ class WandbLogger(BackendLogger):
             log_env_packages=False,  # they hold paths of this machine; checkpoints hold the versions
             settings={"silent": offline, "console": "off"},
         )
-        self._id_file.write_text(self._backend.experiment.id)
-        self._end_run = self._backend.experiment.finish
+        self._id_file.write_text(backend.experiment.id)
+        self._send, self._end_run = backend.log_metrics, backend.experiment.finish
         if settings:
-            self._backend.log_hparams(settings)
+            backend.log_hparams(settings)
 
 
 class MlflowLogger(BackendLogger):
@@ -197,17 +187,17 @@ class MlflowLogger(BackendLogger):
         if self._run_id:
             os.environ["MLFLOW_RUN_ID"] = self._run_id  # MLflow reads it; TorchRL's logger has no argument for it
         try:
-            self._backend = Backend(experiment, uri or f"sqlite:///{folder / 'mlflow.db'}", **local)
+            backend = Backend(experiment, uri or f"sqlite:///{folder / 'mlflow.db'}", **local)
         finally:
             os.environ.pop("MLFLOW_RUN_ID", None)
             if before is not None:
                 os.environ["MLFLOW_RUN_ID"] = before
-        self._id_file.write_text(self._backend.experiment.info.run_id)
-        self._end_run = mlflow.end_run
+        self._id_file.write_text(backend.experiment.info.run_id)
+        self._send, self._end_run = backend.log_metrics, mlflow.end_run
         if not self._run_id:
             mlflow.set_tag("mlflow.runName", folder.name)
             if settings:  # in a new run only: MLflow refuses changed values, which a resumed run may have
-                self._backend.log_hparams(settings)
+                backend.log_hparams(settings)
 
 
 class NoLogger:
@@ -223,25 +213,25 @@ class NoLogger:
         """Nothing to close."""
 
 
-def read_csv(path) -> list[dict[str, float]]:
+def read_csv(path, text: str | None = None) -> list[dict[str, float]]:
     """Return the complete rows of a ``metrics.csv``; empty cells are left out.
+
+    Args:
+        path: the file.
+        text: its content, if it is read already.
 
     Raises:
         ValueError: naming file and line, for a cell that is no number.
     """
-    return parse_csv(read_text(path), path)
-
-
-def parse_csv(text: str, path) -> list[dict[str, float]]:
-    """Return the rows of a table's text, as :func:`read_csv` does of a file; ``path`` is for errors."""
+    text = read_text(path) if text is None else text
     lines = text[: text.rfind("\n") + 1].splitlines()  # a killed run may leave an incomplete last line
     rows, table = [], csv.DictReader(lines or [text])
     if table.fieldnames and "frames" not in table.fieldnames:
         raise ValueError(f"{path}, line 1: expected a column frames, got {excerpt(','.join(table.fieldnames))}.")
     for number, row in enumerate(table, start=2):
         try:
-            rows.append({key: float(value) for key, value in row.items() if value})
-            rows[-1]["frames"] = int(rows[-1]["frames"])
+            cells = {key: float(value) for key, value in row.items() if value}
+            rows.append(cells | {"frames": int(cells["frames"])})
         except (TypeError, ValueError, KeyError, OverflowError) as error:
             raise ValueError(f"{path}, line {number}: expected a number in each column ({error}).") from error
     return rows

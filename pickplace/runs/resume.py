@@ -175,21 +175,19 @@ class StopRequest:
 
     Attributes:
         signal: number of the first signal; None: there was none.
-        requested: whether a signal came.
     """
 
     def __init__(self):
         self.signal: int | None = None
-        self.requested = False
         ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
         numbers = [number for number in STOP_SIGNALS if number != signal.SIGHUP or not ignored]
         self._previous = {number: signal.signal(number, self._request) for number in numbers}
 
     def _request(self, number, frame):
-        if self.requested and number == signal.SIGINT:
+        if self.signal and number == signal.SIGINT:
             os._exit(130)
-        if not self.requested:  # a terminal sends several
-            self.signal, self.requested = number, True
+        if not self.signal:  # a terminal sends several
+            self.signal = number
             log.info("stopping after this batch; press Ctrl-C again to stop at once")
 
     def restore(self) -> None:

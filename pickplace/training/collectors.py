@@ -3,7 +3,7 @@
 import signal
 import sys
 import threading
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import contextmanager
 from functools import partial
 
@@ -14,7 +14,6 @@ from torchrl.collectors.distributed import RayCollector
 
 from pickplace.common.errors import WorkerDied, needs_extra
 from pickplace.common.validate import expect, reworded, whole_number
-from pickplace.config.registry import names_at
 from pickplace.runs.checkpoint import CheckpointError
 from pickplace.runs.resume import STOP_SIGNALS
 
@@ -307,22 +306,6 @@ def _shares(make_env, num_envs: int, workers: int, most: int) -> list[partial]:
     expect(num_envs % workers == 0, "collector.workers", workers, f"a divisor of env.num_envs={num_envs}")
     share = num_envs // workers
     return [partial(make_env, worker * share, share) for worker in range(workers)]
-
-
-def refuse_other_workers(settings: Mapping, state: object) -> None:
-    """Refuse to resume with more or fewer workers than a checkpoint has states of, before any of them starts.
-
-    Args:
-        settings: the config of one of pickplace's collectors; one of the user's own is not judged.
-        state: the checkpoint's state of the collector.
-
-    Raises:
-        ValueError: naming both numbers.
-    """
-    saved = sum(str(key).startswith("worker") for key in state) if isinstance(state, dict) else 0
-    workers = settings.get("workers", saved)
-    if settings["_target_"] in names_at("collector"):
-        expect(workers == saved, "collector.workers", workers, f"{saved}, as many as the checkpoint has")
 
 
 def _seeds(seed: int, workers: int) -> list[tuple[int, int]]:

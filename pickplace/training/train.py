@@ -54,7 +54,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     trainer = Trainer(cfg, run_dir, resume)
     with trainer.running() as stop:
         batches = iter(trainer.collector)
-        while not (trainer.is_complete or stop.requested):
+        while not (trainer.is_complete or stop.signal):
             # Collect a batch, [num_envs, rollout_length], with the newest weights.
             trainer.collector.update_policy_weights_(TensorDict.from_module(trainer.acting).data)
             started = time.perf_counter()
@@ -76,9 +76,9 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
             trainer.save("last")
 
     with checkpoint_hint(lambda: trainer.safe_folder, trainer.resume_overrides):
-        trainer.report(stop.requested)
+        trainer.report(stop.signal is not None)
     log.info("run folder: %s", run_dir)
-    if stop.requested:
+    if stop.signal:
         raise KeyboardInterrupt(stop.signal)  # ends a whole sweep, not only this run
     return float(trainer.latest.get("occupancy", float("nan")))
 

@@ -22,7 +22,9 @@ from pickplace.common.validate import expect, refuse_if
 from pickplace.config.registry import build
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.evaluation.play import Episodes, play
+from pickplace.evaluation.result import confidence95
 from pickplace.policies.base import EstimatesValue, Policy, as_critic, refuse_large_network
+from pickplace.rules.state import Failure
 from pickplace.runs import checkpoint, folder, provenance
 from pickplace.runs.resume import (
     StopRequest,
@@ -34,7 +36,6 @@ from pickplace.runs.resume import (
 from pickplace.training import callbacks, collectors, settings
 from pickplace.training.curriculum.levels import Curriculum
 from pickplace.training.curriculum.transform import ToteHeightCurriculum, push_level
-from pickplace.training.metrics import episode_metrics, has_passed, validation_metrics
 from pickplace.training.report import write_report
 from pickplace.views.figures import learning_curve
 
@@ -92,8 +93,6 @@ class Trainer:
         if shortage := self.curriculum.check_budget(cfg.total_frames, self.task.batch_frames):
             log.warning(shortage)
         self.acting = self.algorithm.acting_policy()
-        if self.resumed:
-            collectors.refuse_other_workers(cfg.collector, self.state.get("collector"))
         base_env = partial(self.build_env, masks=self.policy.masks, episode_stride=cfg.env.num_envs)
         self.collector = build(
             "collector",
@@ -321,3 +320,26 @@ def training_env(base_env, curriculum: Curriculum, first_episode: int, num_envs:
     """Make the environment of one collector process: slots ``first_episode ..``, under the curriculum."""
     heights = ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.start)
     return TransformedEnv(base_env(first_episode=first_episode, num_envs=num_envs), Compose(heights))
+
+
+def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
+    """Mean reward, and of the episodes that ended in the batch: number, mean occupancy and shares of failures."""
+    done = batch["next", "done"]
+    metrics = {"train/reward": batch["next", "reward"].mean().item(), "train/episodes": int(done.sum())}
+    if done.any():
+        metrics["train/occupancy"] = batch["next", "occupancy"][done].mean().item()
+        reasons = batch["next", "failure"][done]
+        for failure in Failure:
+            metrics[f"train/failure_{failure.name.lower()}"] = (reasons == failure).float().mean().item()
+    return metrics
+
+
+def validation_metrics(episodes: Episodes) -> dict[str, float]:
+    """Mean occupancy of a validation and its 95% interval."""
+    low, high = confidence95(episodes.occupancy)
+    return {"occupancy": float(episodes.occupancy.mean()), "ci95_low": low, "ci95_high": high}
+
+
+def has_passed(before: int, now: int, interval: int) -> bool:
+    """Return whether a multiple of ``interval`` lies in ``(before, now]``; it works for any batch size."""
+    return before // interval != now // interval

@@ -27,8 +27,7 @@ from pickplace.training.collectors import ResumableCollector
 from pickplace.training.curriculum.advance import NoAdvance
 from pickplace.training.curriculum.levels import Curriculum
 from pickplace.training.curriculum.sample import Current
-from pickplace.training.metrics import episode_metrics, has_passed
-from pickplace.training.trainer import Trainer, training_env
+from pickplace.training.trainer import Trainer, episode_metrics, has_passed, training_env
 
 OBSERVED = ["bin_depth", "tote_depth"]  # by a critic
 AT = At(0, 48, 1, 1000)
