@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from pickplace.common.validate import excerpt, refuse_if
+from pickplace.common.validate import excerpt, refuse_any, refuse_if
 from pickplace.rules.observation import Term
 from pickplace.runs.checkpoint import CheckpointError, matching_state
 
@@ -145,12 +145,20 @@ def load_optimizer(optimizer: torch.optim.Optimizer, state: Any) -> None:
             parameter.grad = torch.zeros_like(parameter)
     twin.step()
     own = twin.state_dict()["state"]
-    if unknown := [key for key in state if key not in own]:
-        raise CheckpointError(
-            f"The checkpoint's optimizer has {excerpt(unknown[0])}; expected numbers below {len(own)}."
-        )
+    refuse_any(
+        (key for key in state if key not in own),
+        lambda key: f"The checkpoint's optimizer has {excerpt(key)}; expected numbers below {len(own)}.",
+        CheckpointError,
+    )
     saved = matching_state(state, {number: own[number] for number in state}, "optimizer")
-    for number, entries in saved.items():
-        if bad := [key for key in NOT_NEGATIVE if key in entries and (torch.as_tensor(entries[key]) < 0).any()]:
-            raise CheckpointError(f"The checkpoint's optimizer is of no use: {number}|{bad[0]} is negative.")
+    refuse_any(
+        (
+            f"{number}|{key}"
+            for number, entries in saved.items()
+            for key in NOT_NEGATIVE
+            if key in entries and (torch.as_tensor(entries[key]) < 0).any()
+        ),
+        lambda place: f"The checkpoint's optimizer is of no use: {place} is negative.",
+        CheckpointError,
+    )
     optimizer.load_state_dict({**optimizer.state_dict(), "state": saved})

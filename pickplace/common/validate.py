@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from numbers import Integral, Real
 from reprlib import Repr
@@ -48,10 +48,16 @@ def expect(good: Any, key: str, value: Any, expected: str) -> Any:
     return value
 
 
-def refuse_if(bad: Any, message: str, error: type[ValueError] = ValueError) -> None:
+def refuse_if(bad: Any, message: str, error: type[Exception] = ValueError) -> None:
     """Raise an error with a message if something is bad."""
     if bad:
         raise error(message)
+
+
+def refuse_any(found: Iterable, message: Callable[[Any], str], error: type[Exception] = ValueError) -> None:
+    """Raise an error about the first of the things found, if there is any."""
+    for first in found:
+        raise error(message(first))
 
 
 @contextmanager
@@ -177,8 +183,8 @@ def check_bytes(setting: str, needed: int, device="cpu") -> None:
         ValueError, lambda _: ValueError(f"{MEMORY_VARIABLE}={excerpt(given)}: expected a number of gigabytes.")
     ):
         most = most if given is None else number(MEMORY_VARIABLE, float(given))
-    if needed > most * 1e9:
-        raise ValueError(
-            f"{setting}: it would take {needed / 1e9:,.2f} GB; expected at most {most:.4g} GB, or a greater limit in "
-            f"the environment variable {MEMORY_VARIABLE}."
-        )
+    refuse_if(
+        needed > most * 1e9,
+        f"{setting}: it would take {needed / 1e9:,.2f} GB; expected at most {most:.4g} GB, or a greater limit in "
+        f"the environment variable {MEMORY_VARIABLE}.",
+    )

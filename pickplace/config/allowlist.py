@@ -15,7 +15,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.common.validate import at_most, excerpt, expect, reworded, short_text
+from pickplace.common.validate import at_most, excerpt, expect, refuse_any, reworded, short_text
 from pickplace.config.registry import names_at, qualified_names
 
 #: Modules that are never a user's own: with their functions a config could do anything.
@@ -60,8 +60,7 @@ def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POL
     except (OmegaConfBaseException, RecursionError, AttributeError, TypeError) as error:
         first = next(iter(str(error).splitlines()), type(error).__name__)
         raise ValueError(f"The checkpoint's config cannot be read ({first}).") from error
-    if missing:
-        raise ValueError(f"The checkpoint's config has no {missing[0]}; expected the config of a training.")
+    refuse_any(missing, lambda key: f"The checkpoint's config has no {key}; expected the config of a training.")
     if type(cfg.seed) is not int:
         raise refusal("seed", cfg.seed, "a whole number")
     return cfg
@@ -192,12 +191,11 @@ def _is_reference(text, path: tuple, root) -> bool:
         with suppress(KeyError, TypeError):  # a TypeError from a key of a list or of a value
             found = reduce(getitem, _target_path(text, path), root)
             values = found if isinstance(found, list) else [found]
-            return len(values) <= 100 and all(map(_is_plain, values))
+            return len(values) <= 100 and all(
+                not isinstance(value, (dict, list)) and "${" not in str(value) and len(str(value)) <= 1000
+                for value in values
+            )
     return False
-
-
-def _is_plain(value) -> bool:
-    return not isinstance(value, (dict, list)) and "${" not in str(value) and len(str(value)) <= 1000
 
 
 def _put(root, path: tuple, value) -> None:

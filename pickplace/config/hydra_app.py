@@ -17,7 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.errors import Parser, one_sentence, sentence, write_output
-from pickplace.common.validate import refuse_if, reworded
+from pickplace.common.validate import refuse_any, refuse_if, reworded
 from pickplace.config import composition
 
 log = logging.getLogger(__name__)
@@ -67,8 +67,7 @@ class Command:
             return self._run(merged, words, flags, options.multirun or merged.hydra.mode == RunMode.MULTIRUN)
 
     def _check(self, cfg: DictConfig) -> None:
-        if missing := OmegaConf.missing_keys(cfg):
-            raise ValueError(f"{min(missing)}: no value; expected {min(missing)}=<value>.")
+        refuse_any(sorted(OmegaConf.missing_keys(cfg)), lambda key: f"{key}: no value; expected {key}=<value>.")
         keys = [str(key) for key in cfg if key not in self.from_checkpoint]
         composition.refuse_unknown_keys(OmegaConf.masked_copy(cfg, keys), hydra.compose(self.config_name))
 

@@ -17,7 +17,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.errors import unknown_key
-from pickplace.common.validate import short_text
+from pickplace.common.validate import refuse_any, short_text
 
 
 def _classes(module: str, **names: str) -> dict[str, str]:
@@ -96,8 +96,10 @@ def build(place: str, node: DictConfig | dict, **kwargs):
     function = find(place, content["_target_"])
     known = accepted_arguments(function)
     free = dict.fromkeys(key for key in known or () if key not in kwargs)
-    if refused := [key for key in settings if key in kwargs or (known is not None and key not in free)]:
-        raise ValueError(unknown_key(f"{place}.{refused[0]}", free, f"{place}."))
+    refuse_any(
+        (key for key in settings if key in kwargs or (known is not None and key not in free)),
+        lambda key: unknown_key(f"{place}.{key}", free, f"{place}."),
+    )
     try:
         return function(**settings, **kwargs)
     except TypeError as error:

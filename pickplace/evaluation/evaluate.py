@@ -116,8 +116,10 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
     probe = make_env(0, 1)
     check_play(ev, probe.cell, cfg.device)
     planner = build("planner", cfg.planner, **planner_parts(cfg.planner, probe.cell, items, probe.terms, trained))
-    if not isinstance(planner, BatchPlanner) or not isinstance(planner.name, str):  # now, not after all episodes
-        raise ValueError(f"planner: {type(planner).__name__} has no name; expected an attribute name, a string.")
+    refuse_if(  # now, not after all episodes
+        not isinstance(planner, BatchPlanner) or not isinstance(planner.name, str),
+        f"planner: {type(planner).__name__} has no name; expected an attribute name, a string.",
+    )
     if hasattr(planner, "evaluation_facts"):
         facts |= planner.evaluation_facts()
     return make_env, planner, facts

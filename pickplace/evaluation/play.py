@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
-from pickplace.common.validate import check_bytes, one_of, whole_number
+from pickplace.common.validate import check_bytes, one_of, refuse_if, whole_number
 from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.distributions import check_seed
@@ -213,6 +213,8 @@ def carry_out(engine: Engine, plans: Sequence[EpisodePlan], recordings: Sequence
             shown[outcome.episode].carried_out = outcome
         if len(outcomes) % 10 == 0 or len(outcomes) == len(plans):
             log.info("physics=%s: %s of %s episodes", engine.name, f"{len(outcomes):,}", f"{len(plans):,}")
-    if (found := [outcome.episode for outcome in outcomes]) != (wanted := [plan.episode for plan in plans]):
-        raise ValueError(f"physics={engine.name}: outcomes of the episodes {found}, expected {wanted}.")
+    refuse_if(
+        (found := [outcome.episode for outcome in outcomes]) != (wanted := [plan.episode for plan in plans]),
+        f"physics={engine.name}: outcomes of the episodes {found}, expected {wanted}.",
+    )
     return outcomes

@@ -21,7 +21,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from pickplace.common.files import read_file
-from pickplace.common.validate import excerpt, is_whole, refuse_if, reworded
+from pickplace.common.validate import excerpt, is_whole, refuse_any, refuse_if, reworded
 
 SCHEMA = 1
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"  # weights that the package ships
@@ -251,8 +251,11 @@ def restore(make: Callable[[], Module], state: dict, what: str) -> Module:
     with torch.device("meta"):
         own = make().state_dict()
     weights = matching_state(state, own, what)
-    if unknown := sorted(map(str, set(state) - set(own))):
-        raise CheckpointError(f"The checkpoint's {what} does not fit these settings: {unknown[0]} is not expected.")
+    refuse_any(
+        sorted(map(str, set(state) - set(own))),
+        lambda key: f"The checkpoint's {what} does not fit these settings: {key} is not expected.",
+        CheckpointError,
+    )
     module = make()
     module.load_state_dict(weights)
     return module

@@ -75,8 +75,7 @@ def refuse_occupied(run_dir: Path) -> None:
         OccupiedError: naming the folder.
     """
     saved = run_dir / "checkpoints"
-    if saved.is_dir() and any(not entry.name.endswith(".new") for entry in saved.iterdir()):
-        raise occupied(run_dir)
+    refuse_training(saved.is_dir() and any(not entry.name.endswith(".new") for entry in saved.iterdir()), run_dir)
     for name, content in ((EVALUATION, "an evaluation"), (REPORT, "a report of a training")):
         refuse_if(
             (run_dir / name).exists(),
@@ -85,9 +84,13 @@ def refuse_occupied(run_dir: Path) -> None:
         )
 
 
-def occupied(run_dir: Path) -> OccupiedError:
-    """Return the error for a folder that holds another training."""
-    return OccupiedError(f"{run_dir}: there is a training already; expected another run folder, or resume={run_dir}.")
+def refuse_training(is_there: bool, run_dir: Path) -> None:
+    """Refuse a folder that holds another training, if it does."""
+    refuse_if(
+        is_there,
+        f"{run_dir}: there is a training already; expected another run folder, or resume={run_dir}.",
+        OccupiedError,
+    )
 
 
 def refuse_parts(run_dir: Path) -> None:

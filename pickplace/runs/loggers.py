@@ -13,7 +13,7 @@ from typing import IO, Any
 
 from pickplace.common.errors import needs_extra
 from pickplace.common.files import read_text, replaced_file
-from pickplace.common.validate import excerpt, reworded
+from pickplace.common.validate import excerpt, refuse_if, reworded
 
 log = logging.getLogger(__name__)
 
@@ -226,8 +226,10 @@ def read_csv(path, text: str | None = None) -> list[dict[str, float]]:
     text = read_text(path) if text is None else text
     lines = text[: text.rfind("\n") + 1].splitlines()  # a killed run may leave an incomplete last line
     rows, table = [], csv.DictReader(lines or [text])
-    if table.fieldnames and "frames" not in table.fieldnames:
-        raise ValueError(f"{path}, line 1: expected a column frames, got {excerpt(','.join(table.fieldnames))}.")
+    refuse_if(
+        "frames" not in (columns := table.fieldnames or ["frames"]),
+        f"{path}, line 1: expected a column frames, got {excerpt(','.join(columns))}.",
+    )
     for number, row in enumerate(table, start=2):
         try:
             cells = {key: float(value) for key, value in row.items() if value}

@@ -16,7 +16,7 @@ from pickplace.common.validate import MAX_COUNT, excerpt, is_name, is_whole, num
 from pickplace.config.allowlist import modules_to_trust, own_modules, saved_form, trusted_config
 from pickplace.config.composition import apply_overrides, compose_plain, parse, refuse_unknown_keys
 from pickplace.runs import checkpoint
-from pickplace.runs.folder import occupied, refuse_occupied
+from pickplace.runs.folder import refuse_occupied, refuse_training
 
 log = logging.getLogger(__name__)
 
@@ -139,8 +139,7 @@ def interrupted_run(cfg: DictConfig, run_dir: Path) -> tuple[dict, dict, Path] |
     except checkpoint.CheckpointError:
         refuse_occupied(run_dir)
         return None
-    if not has_config(facts, saved_form(cfg)) or "curriculum" not in facts:
-        raise occupied(run_dir)
+    refuse_training(not has_config(facts, saved_form(cfg)) or "curriculum" not in facts, run_dir)
     log.info("going on with %s at %s frames", run_dir, f"{facts['frames']:,}")
     return state, facts, folder
 

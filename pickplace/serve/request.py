@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Self
 
 from pickplace.common.errors import sentence
-from pickplace.common.validate import refuse_if, reworded
+from pickplace.common.validate import refuse_any, refuse_if, reworded
 from pickplace.robot.box import ACCURACY, CLEARANCE, Box
 
 if TYPE_CHECKING:
@@ -52,13 +52,17 @@ class PlanRequest:
             ValueError: naming the first key that is unknown or missing, or the first box with other keys.
         """
         known = [key.name for key in fields(cls)]
-        if unknown := sorted(set(given) - set(known)):
-            raise ValueError(f"{unknown[0][:40]}: there is no such key; expected any of {', '.join(known)}.")
+        refuse_any(
+            sorted(set(given) - set(known)),
+            lambda key: f"{key[:40]}: there is no such key; expected any of {', '.join(known)}.",
+        )
         given = {key: value for key, value in given.items() if value is not None}
         if "items" in given:
             given["items"] = read_boxes(given["items"])
-            if both := [key for key in ("bin_depth", "bin_labels") if key in given]:
-                raise ValueError(f"{both[0]}, items: got both, expected one of the two.")
+            refuse_any(
+                (key for key in ("bin_depth", "bin_labels") if key in given),
+                lambda key: f"{key}, items: got both, expected one of the two.",
+            )
         for key in ("tote_depth",) if "items" in given else ("bin_depth", "tote_depth"):
             refuse_if(key not in given, f"{key}: missing; expected a depth map as a list of rows.")
         return cls(**{**defaults, **given})

@@ -152,8 +152,7 @@ def summarize(folder: Path) -> list[Setting]:
         (path.parent.parent for path in Path(folder).glob("*/.hydra/overrides.yaml")),
         key=lambda path: [part.zfill(9) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)],
     )
-    if not found:
-        raise FileNotFoundError(f"{folder}: no run in it; expected the folder of a sweep.")
+    refuse_if(not found, f"{folder}: no run in it; expected the folder of a sweep.", FileNotFoundError)
     runs = [read_run(path) for path in found]
     settings = group_by_setting(runs)
     keys = list(dict.fromkeys(key for run in runs for key in run.overrides))
