@@ -140,7 +140,7 @@ def read_command_line(arguments: list[str]) -> tuple[list[str], list[str], argpa
     for folder in folders.config_dir:
         refuse_if(not Path(folder).is_dir(), f"--config-dir {folder}: no such folder; expected one with config files.")
     switches = ["--help/-h", "--multirun/-m", "--run/-r", "--resolve", "--hydra-help", "--version"]
-    others = {
+    others: dict[str, dict[str, Any]] = {
         "words": {"nargs": "*"},
         "--cfg/-c": {"choices": ["job", "hydra", "all"]},
         "--package/-p": {},

@@ -118,8 +118,12 @@ class TensorboardLogger(BackendLogger):
         super().__init__(folder, frames)
         # purge_step: TensorBoard hides events after the checkpoint of a resumed run.
         events = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
-        self._send = lambda metrics, frames: [events.add_scalar(key, metrics[key], frames) for key in metrics]
-        self._end_run = events.close
+
+        def send(metrics: dict[str, float], frames: int) -> None:
+            for key, value in metrics.items():
+                events.add_scalar(key, value, frames)
+
+        self._send, self._end_run = send, events.close
 
 
 class WandbLogger(BackendLogger):
