@@ -1,7 +1,6 @@
 """Warm start: a policy imitates a planner before it learns from reward."""
 
 import re
-from contextlib import contextmanager
 from typing import Any, cast
 
 import torch
@@ -11,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from pickplace.algorithms.base import Algorithm, At, Imitable
-from pickplace.common.validate import expect
+from pickplace.common.validate import expect, reworded
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import accepted_arguments, build, find
 from pickplace.envs.torchrl import PickPlaceEnv
@@ -21,15 +20,13 @@ from pickplace.rules.state import State
 from pickplace.rules.step import apply
 from pickplace.runs import checkpoint
 
-
-@contextmanager
-def _named_keys():
-    """Name a teacher's settings in the errors of planners, which call them ``planner`` and ``checkpoint``."""
-    try:
-        yield
-    except ValueError as error:
-        words = re.sub(r"^checkpoint\b", "warm_start.checkpoint", str(error))
-        raise ValueError(re.sub(r"^planner\b", "warm_start.teacher", words)) from error
+#: Names the settings of a teacher in the errors of planners, which call them ``planner`` and ``checkpoint``.
+_named_keys = reworded(
+    ValueError,
+    lambda error: ValueError(
+        re.sub(r"^planner\b", "warm_start.teacher", re.sub(r"^checkpoint\b", "warm_start.checkpoint", str(error)))
+    ),
+)
 
 
 class WarmStart:
@@ -46,7 +43,7 @@ class WarmStart:
         ValueError: naming the key, for a teacher that is missing or cannot be made.
     """
 
-    @_named_keys()
+    @_named_keys
     def __init__(
         self,
         cfg: DictConfig,
@@ -76,7 +73,7 @@ class WarmStart:
         return build("warm_start.teacher", {**self._settings, **seed}, **self._parts)
 
     @torch.no_grad()
-    @_named_keys()
+    @_named_keys
     def ask(self, data: TensorDictBase, iteration: int) -> Tensor:
         """Return the teacher's choices, int64 ``[B]``; -1 where its action fails or this policy cannot choose it.
 

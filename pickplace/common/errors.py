@@ -6,14 +6,14 @@ import os
 import re
 import signal
 import sys
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from difflib import get_close_matches
 from typing import Any, NoReturn
 
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.common.validate import excerpt, short_text
+from pickplace.common.validate import excerpt, reworded, short_text
 
 
 class WorkerDied(Exception):
@@ -111,13 +111,11 @@ def _sentence(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())} (HYDRA_FULL_ERROR=1 shows where)"
 
 
-@contextmanager
-def needs_extra(group: str, extra: str):
+def needs_extra(group: str, extra: str) -> AbstractContextManager:
     """Name the optional extra of an option of a config group, if an import in the block fails."""
-    try:
-        yield
-    except ImportError as error:
-        raise ValueError(f"{group}={extra}: {extra} is missing; pip install 'pickplace[{extra}]'.") from error
+    return reworded(
+        ImportError, lambda _: ValueError(f"{group}={extra}: {extra} is missing; pip install 'pickplace[{extra}]'.")
+    )
 
 
 def unknown_key(key: str, node: DictConfig | dict, prefix: str = "") -> str:

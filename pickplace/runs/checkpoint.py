@@ -280,12 +280,17 @@ def matching_state(saved, own: dict, what: str, path: str = "") -> dict:
             continue
         if isinstance(expected, dict):
             value = matching_state(value, expected, what, f"{name}|")
-        elif (kind := _kind(value)) != (wanted := _kind(expected)):
-            raise CheckpointError(
-                f"The checkpoint's {what} does not fit these settings: {name} is {kind}, expected {wanted}."
+        else:
+            refuse_if(
+                (kind := _kind(value)) != (wanted := _kind(expected)),
+                f"The checkpoint's {what} does not fit these settings: {name} is {kind}, expected {wanted}.",
+                CheckpointError,
             )
-        elif isinstance(value, Tensor) and not value.isfinite().all():
-            raise CheckpointError(f"The checkpoint's {what} is of no use: {name} holds values that are not finite.")
+            refuse_if(
+                isinstance(value, Tensor) and not value.isfinite().all(),
+                f"The checkpoint's {what} is of no use: {name} holds values that are not finite.",
+                CheckpointError,
+            )
         found[key] = value
     return found
 

@@ -5,7 +5,7 @@ import logging
 import os
 import signal
 from collections.abc import Callable
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from loky import cpu_count
@@ -195,8 +195,9 @@ class StopRequest:
             signal.signal(each, handler)
 
 
-@contextmanager
-def checkpoint_hint(latest: Callable[[], Path | None], arguments: str = "", errors: type[Exception] = Exception):
+def checkpoint_hint(
+    latest: Callable[[], Path | None], arguments: str = "", errors: type[Exception] = Exception
+) -> AbstractContextManager:
     """Add to an error that ends a training the command that resumes it.
 
     Args:
@@ -204,14 +205,11 @@ def checkpoint_hint(latest: Callable[[], Path | None], arguments: str = "", erro
         arguments: further words of that command, such as `` trust=[my_models]``.
         errors: the type of errors to which it is added.
     """
-    try:
-        yield
-    except errors as error:
-        whole = (
-            f"What was saved before is whole: pickplace-train resume={folder}{arguments}"
-            if (folder := latest())
-            else ""
-        )
+
+    def hinted(error: Exception) -> Exception:
         is_kept = isinstance(error, (FloatingPointError, WorkerDied, checkpoint.CheckpointError))
-        kind = type(error) if is_kept else ValueError
-        raise kind(f"{sentence(error).rstrip('.')}. {whole or 'Nothing had been saved before.'}") from error
+        kind, folder = type(error) if is_kept else ValueError, latest()
+        whole = f"What was saved before is whole: pickplace-train resume={folder}{arguments}"
+        return kind(f"{sentence(error).rstrip('.')}. {whole if folder else 'Nothing had been saved before.'}")
+
+    return reworded(errors, hinted)

@@ -110,11 +110,14 @@ def load_planner(args: argparse.Namespace) -> tuple["Planner", dict]:
     candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates
     if args.checkpoint is not None:
         planner = Planner.load(args.checkpoint, candidates, args.device, args.trust, args.planner, **sizes)
-    elif args.planner is None:
-        raise ValueError("checkpoint: missing; expected a checkpoint, or --planner joint_dbl or the like.")
-    elif candidates != "all":
-        raise ValueError(f"--candidates={args.candidates}: only a policy has candidates; expected a checkpoint.")
     else:
+        refuse_if(
+            args.planner is None, "checkpoint: missing; expected a checkpoint, or --planner joint_dbl or the like."
+        )
+        refuse_if(
+            candidates != "all",
+            f"--candidates={args.candidates}: only a policy has candidates; expected a checkpoint.",
+        )
         planner = Planner(CellSpec(**sizes), planner=args.planner)
     defaults = {key.name: getattr(args, key.name) for key in PLAN_OPTIONS}
     PlanRequest(**defaults).scene()  # refuses settings now, not in the answer to each request

@@ -156,28 +156,26 @@ def summarize(folder: Path) -> list[Setting]:
     runs = [read_run(path) for path in found]
     settings = group_by_setting(runs)
     keys = list(dict.fromkeys(key for run in runs for key in run.overrides))
-    rows = [
-        [run.name, run.status, *map(run.overrides.get, keys), run.frames]
-        + [max((row["eval/occupancy"] for row in run.validations), default=None)]
-        + [*map(run.last.get, ("eval/occupancy", "eval/ci95_low", "eval/ci95_high")), run.error]
-        for run in runs
-    ]
     _write_table(
         folder / TABLE,
         ["run", "status", *keys]
         + ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "error"],
-        rows,
+        [
+            [run.name, run.status, *map(run.overrides.get, keys), run.frames]
+            + [max((row["eval/occupancy"] for row in run.validations), default=None)]
+            + [*map(run.last.get, ("eval/occupancy", "eval/ci95_low", "eval/ci95_high")), run.error]
+            for run in runs
+        ],
     )
     keys = [key for key in keys if key != "seed"]
-    rows = [
-        [*map(each.overrides.get, keys), len(each.runs), len(each.finished), each.mean]
-        + [each.interquartile_mean, *each.interval]
-        for each in settings
-    ]
     _write_table(
         folder / SETTINGS_TABLE,
         [*keys, "runs", "finished", "mean_occupancy", "interquartile_mean", "mean_ci95_low", "mean_ci95_high"],
-        rows,
+        [
+            [*map(each.overrides.get, keys), len(each.runs), len(each.finished), each.mean]
+            + [each.interquartile_mean, *each.interval]
+            for each in settings
+        ],
     )
     # The best mean first; those without a finished run are last.
     ranked = sorted(settings, key=lambda setting: -1.0 if setting.mean is None else setting.mean, reverse=True)
