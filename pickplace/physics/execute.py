@@ -94,9 +94,9 @@ class Execute(Simulation):
         lying = (d, w, height) if placement.rotation % 180 else placement.size
         gantry.take((*placement.item, *lying), placement.centre)
         low = placement.corner[2] + height + self.lip + self.release_height
-        pick, place = gantry.bin + placement.pick, placement.place + error
         turn = ((placement.rotation + 90) % 360 - 90) / 180 * pi  # the short way round
-        if loss := gantry.bring((*pick, height + self.lip, 0.0), (*place, low, turn), height):
+        pick, place = (*(gantry.bin + placement.pick), height + self.lip, 0.0), (*(placement.place + error), low, turn)
+        if loss := gantry.bring(pick, place, height):
             return loss
         expected = placement.centre + np.array((*error, self.release_height))
         if np.linalg.norm(gantry.centre - expected) > self.tolerance:
@@ -160,11 +160,10 @@ class Gantry(Scene):
             drive.set_to_position(kp=STIFFNESS[joint.name == "turn"], dampratio=1.0)
 
     def compile(self) -> None:
-        if self.boxes and self.weld is None:
-            self.weld = self.spec.add_equality(
+        if self.boxes:
+            self.weld = self.weld or self.spec.add_equality(
                 type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="plate", active=False, **STIFF
             )
-        if self.boxes:
             self.weld.name2 = self.boxes[-1].name
         super().compile()
         self.data.ctrl[:] = self.goal
@@ -182,8 +181,7 @@ class Gantry(Scene):
 
     def take(self, box: Point, planned: Point) -> None:
         """Choose the item that is carried next, ``box`` as of :meth:`fill`; ``planned`` is its centre in the tote."""
-        known = self._find(box)
-        if known is None:
+        if (known := self._find(box)) is None:
             self.add((*(self.bin + box[:2]), 0.0), box[2:], planned)
         else:
             self.boxes.append(self.waiting.pop(known))
@@ -277,27 +275,23 @@ class Gantry(Scene):
 
     def _is_reached(self, body, below: bool = False) -> bool:
         """Return whether the lip reaches an item; with ``below`` only one below the plate, not beside it."""
-        for geom in self._plate_geoms:
+        for geom in self.plate.geoms:
             ends = np.zeros(6)  # of the shortest line between the two
-            distance = mujoco.mj_geomDistance(self.model, self.data, geom, body.geoms[0].id, 0.1, ends)
+            distance = mujoco.mj_geomDistance(self.model, self.data, geom.id, body.geoms[0].id, 0.1, ends)
             if distance <= self.options.lip + REACH and not (below and np.hypot(*(ends[3:5] - ends[:2])) > TOLERANCE):
                 return True
         return False
 
-    @property
-    def _plate_geoms(self) -> list[int]:
-        return [geom.id for geom in self.plate.geoms]
-
     def _step(self) -> Loss | None:
         """Let a little time pass; return what was lost in it."""
-        start = self.model.body_dofadr[self.boxes[-1].id]
-        velocity = self.data.qvel[start : start + 3]
+        item = self.boxes[-1]
+        velocity = self.data.qvel[self.model.body_dofadr[item.id] :][:3]
         before = velocity.copy()
         self.step(STEPS_PER_LOOK)
         if self.diverged:
             return self.loss("diverged")
-        item, pairs, force, total = self.boxes[-1], self.data.contact.geom, np.zeros(6), 0.0
-        for index in np.nonzero(np.isin(pairs, self._plate_geoms).any(1))[0]:
+        pairs, force, total = self.data.contact.geom, np.zeros(6), 0.0
+        for index in np.nonzero(np.isin(pairs, [geom.id for geom in self.plate.geoms]).any(1))[0]:
             if not self.holding or item.geoms[0].id not in pairs[index]:
                 mujoco.mj_contactForce(self.model, self.data, index, force)
                 total += abs(force[0])

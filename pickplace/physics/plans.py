@@ -160,7 +160,6 @@ def read_plans(path: str | Path) -> list[EpisodePlan]:
 
 
 def _read_line(line: str) -> dict:
-    """Return the values of a line."""
     try:
         given = json.loads(line)
     except (ValueError, RecursionError) as error:
@@ -180,8 +179,10 @@ def _read_line(line: str) -> dict:
     for key, outer in (("body", "effector"), ("neighbours", "bin")):
         for x, y, w, d, *_ in values.get(key, ()):
             wide, deep, *_ = values[outer]
-            if min(x, y) < -TOLERANCE or x + w > wide + TOLERANCE or y + d > deep + TOLERANCE:
-                raise ValueError(f"{key}: {[x, y, w, d]} leaves the {outer} of {wide:g} x {deep:g} m.")
+            refuse_if(
+                min(x, y) < -TOLERANCE or x + w > wide + TOLERANCE or y + d > deep + TOLERANCE,
+                f"{key}: {[x, y, w, d]} leaves the {outer} of {wide:g} x {deep:g} m.",
+            )
     if "neighbours" in values:
         w, d, _ = values["size"]
         item = *values["item"], *((d, w) if values["rotation"] % 180 else (w, d))

@@ -9,9 +9,8 @@ def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePl
     """Return the plan of a recorded episode; ``cell_size`` is the side of a cell in metres."""
 
     def metres(*values: float) -> Point:
-        """Lengths in cells, of which a third one is a height, in metres."""
+        # Of lengths in cells a third one is a height. Nanometres: 0.15000000000000002 would only be harder to read.
         scales = (cell_size, cell_size, cell_size * cell.height_unit)
-        # Rounded to nanometres: 0.15000000000000002 would only be harder to read.
         return tuple(round(value * scale, 9) for value, scale in zip(values, scales, strict=False))
 
     def middle(corner, sides) -> Point:

@@ -103,9 +103,11 @@ class Scene:
         self.record()
 
     def _add_body(self, corner: Vector, size: Vector, yaw: float = 0.0):
-        """Add the body of a box, see :meth:`add`."""
-        pose = {"pos": np.add(corner, np.divide(size, 2)), "quat": (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))}
-        body = self.spec.worldbody.add_body(name=f"item{len(self.bodies)}", **pose)
+        body = self.spec.worldbody.add_body(
+            name=f"item{len(self.bodies)}",
+            pos=np.add(corner, np.divide(size, 2)),
+            quat=(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)),
+        )
         body.add_freejoint()
         self.add_geom(body, np.subtract(size, (self.gap, self.gap, 0)))
         self.bodies.append(body)
@@ -113,8 +115,7 @@ class Scene:
 
     def add_geom(self, body, size: Vector, centre: Vector = (0.0, 0.0, 0.0)):
         """Add a box-shaped surface to a body."""
-        box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": np.divide(size, 2), "pos": centre}
-        return body.add_geom(**box, **self._surface)
+        return body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=np.divide(size, 2), pos=centre, **self._surface)
 
     def run(self, seconds: float) -> None:
         """Let time pass."""
@@ -136,8 +137,8 @@ class Scene:
             return
         mujoco.mj_kinematics(self.model, self.data)  # of what was added since the last step, too
         poses = np.hstack([self.data.xpos, self.data.xquat])
-        boxes = poses[[body.id for body in self.bodies]]
-        self.motion.add(boxes, None if self.plate is None else poses[self.plate.id])
+        plate = None if self.plate is None else poses[self.plate.id]
+        self.motion.add(poses[[body.id for body in self.bodies]], plate)
         self._next_picture = self.data.time + INTERVAL
 
     def finish_motion(self) -> None:

@@ -134,15 +134,15 @@ class Simulation(ABC):
         else:
             scene.run(FINAL_WAIT)
             loss = self.find_loss(scene)
-        kept = [number for number in range(placed) if loss is None or number != loss.item]
-        ending = loss.reason if loss else "done"
+        ending, lost, during = (loss.reason, loss.item, placed) if loss else ("done", None, None)
+        kept = [number for number in range(placed) if number != lost]
         words = self.endings.get(ending, (f"Item {{}}: {ending}.", ending))
-        sentence, label = (text.format(loss.item + 1 if loss else "") for text in words)
+        sentence, label = (text.format("" if lost is None else lost + 1) for text in words)
         outcome = Outcome(
             episode=plan.episode,
             ending=ending,
-            lost=loss.item if loss else None,
-            during=placed if loss else None,
+            lost=lost,
+            during=during,
             placed=placed,
             occupancy=min(1.0, sum(placement.volume for placement in plan.placements[:placed]) / prod(plan.tote)),
             drift=float(scene.shifts[kept].max(initial=0.0)),
@@ -178,7 +178,6 @@ def wait(scene: Scene) -> None:
     """Let time pass until all items are at rest, or :data:`MAX_WAIT`."""
     scene.run(MIN_WAIT)
     for _ in range(round((MAX_WAIT - MIN_WAIT) / LOOK)):
-        speeds = scene.data.qvel[-6 * len(scene.bodies) :].reshape(-1, 6)  # of each body
-        if (np.abs(speeds) < REST_SPEEDS).all():
+        if (np.abs(scene.data.qvel[-6 * len(scene.bodies) :].reshape(-1, 6)) < REST_SPEEDS).all():  # of each body
             return
         scene.run(LOOK)

@@ -95,15 +95,16 @@ class Camera:
             f"depth: got shape {list(image.shape)} of {image.dtype}, expected an image of distances, [rows, columns].",
             DepthMapError,
         )
-        image = np.where(image > 0, image, np.nan).astype(np.float64)  # NaN is not above 0
-        image[~np.isfinite(image)] = np.nan
+        image = np.where((image > 0) & np.isfinite(image), image, np.nan).astype(np.float64)
         refuse_if(
             np.isnan(image).all(),
             "depth: got no distance above 0; expected metres, and 0 or NaN where nothing is known.",
             DepthMapError,
         )
-        if (far := np.nanmedian(image)) > 20:
-            raise DepthMapError(f"depth: got distances of {far:g}, expected metres; divide millimetres by 1000.")
+        far = np.nanmedian(image)
+        refuse_if(
+            far > 20, f"depth: got distances of {far:g}, expected metres; divide millimetres by 1000.", DepthMapError
+        )
         return self.rays(image.shape) * image[..., None] + self.pose[:3, 3]
 
     def rays(self, shape: Sequence[int]) -> np.ndarray:
@@ -160,8 +161,7 @@ class Camera:
         edge = math.ceil(self._wall() * along / cell_size)
         border[edge:-edge, edge:-edge] = False
         holes, count = ndimage.label(unseen & ~border, np.ones((3, 3)))
-        for number in range(1, count + 1):
-            hole = holes == number
+        for hole in (holes == number for number in range(1, count + 1)):
             around = ndimage.binary_dilation(hole, np.ones((3, 3))) & ~unseen
             highest[hole], lowest[hole] = highest[around].max(initial=rim if not around.any() else 0.0), 0.0
         at_wall = np.isinf(highest)

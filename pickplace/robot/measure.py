@@ -185,10 +185,12 @@ def touches(centres: np.ndarray, sides: Sequence[float], yaw: float, box: Box) -
     Args:
         sides, yaw: of the rectangle; m, degrees.
     """
-    rectangles = ((sides, yaw), ((box.w, box.d), box.yaw))
     # The vectors from a centre to the middles of two sides, of each rectangle.
     halves = np.concatenate(
-        [np.divide(each, 2)[:, None] * turned_axes(math.radians(turn)) for each, turn in rectangles]
+        [
+            np.divide(each, 2)[:, None] * turned_axes(math.radians(turn))
+            for each, turn in ((sides, yaw), ((box.w, box.d), box.yaw))
+        ]
     )
     axes = halves / np.linalg.norm(halves, axis=1, keepdims=True)
     reach = np.abs(axes @ halves.T).sum(1)

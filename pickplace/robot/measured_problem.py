@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -101,14 +101,12 @@ class MeasuredProblem(Problem):
         """Return the part of the item that an action takes, the item, and the footprint that it leaves."""
         part = self.parts[int(self.taken_items(action))]
         _, rotation, _, (x, y, *_) = carry(part.cell, part.measured.maps.item, action)
-        footprint = footprint_index(self.cell.tote_size, rotation % 2, x, y)
-        return part, part.measured.maps.item, int(footprint)
+        return part, part.measured.maps.item, int(footprint_index(self.cell.tote_size, rotation % 2, x, y))
 
 
 def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
     """Return the problem of a scene in metres; errors as of :meth:`Planner.plan`."""
-    cell_size = scene.cell_size
-    assert cell_size is not None
+    cell_size = cast(float, scene.cell_size)
     boxes, clearance = _read_boxes(cell, scene, cell_size)
     tote = _read_tote(cell, scene, cell_size * cell.height_unit, device)
     each = [_on_grid(cell, box, cell_size, clearance, f"items[{index}]", device) for index, box in enumerate(boxes)]
@@ -254,10 +252,8 @@ def _on_grid(cell: CellSpec, box: Box, cell_size: float, clearance: float, name:
         min(max(0, round(at / cell_size - size / 2)), most_cells - size)
         for at, size, most_cells in zip((box.x, box.y), whole, cell.bin_size[:2], strict=True)
     )
-    h = int(whole_units(box.h, MILLIMETRE, up=True))
-    item = Item(*(torch.tensor([part], device=device) for part in (x, y, *whole, h)))
-    check_longest(cell, item, name)
-    return item
+    sides = *whole, int(whole_units(box.h, MILLIMETRE, up=True))
+    return check_longest(cell, Item(*(torch.tensor([part], device=device) for part in (x, y, *sides))), name)
 
 
 def _clear_picks(

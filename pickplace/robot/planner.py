@@ -268,8 +268,8 @@ def _decide(planner: MapPlanner, problem: Problem, observation: Observation) -> 
 
 def _reasons(problem: Problem) -> dict[str, int]:
     """Return how many of all flat actions fail for each reason, each with the item that its pick takes."""
-    codes = problem.failures(torch.arange(problem.cell.num_actions, device=problem.state.surface.device))
-    counts = codes.bincount(minlength=len(Failure)).tolist()
+    actions = torch.arange(problem.cell.num_actions, device=problem.state.surface.device)
+    counts = problem.failures(actions).bincount(minlength=len(Failure)).tolist()
     return {failure.name.lower(): count for failure, count in zip(Failure, counts, strict=True) if count}
 
 

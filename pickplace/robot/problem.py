@@ -104,14 +104,11 @@ def read_grid(cell: CellSpec, scene: Scene, device) -> Problem:
     bin_map = whole_map("bin_depth", scene.items.depth, cell.bin_size[:2], FAR, unit)
     tote_map = torch.from_numpy(whole_map("tote_depth", scene.tote, cell.tote_size[:2], height, unit))
     items = [
-        _read_cuboid(bin_map, segment, unit, name)
+        check_longest(cell, _read_cuboid(bin_map, segment, unit, name), "bin_depth")
         for name, segment in segments_of_map(scene.items.labels, bin_map, 0).items()
     ]
-    for item in items:
-        check_longest(cell, item, "bin_depth")
-    bearing = read_bearing(cell, scene.tote_bearing, tote_map == height)
     state = State(
-        surface_from(height - tote_map, bearing)[None].to(device),
+        surface_from(height - tote_map, read_bearing(cell, scene.tote_bearing, tote_map == height))[None].to(device),
         torch.tensor([height], device=device),
         join_items(items).map(lambda part: part.to(device)),
     )
@@ -135,14 +132,15 @@ def _read_cuboid(bin_map: np.ndarray, segment: np.ndarray, unit: str, name: str)
     return Item(*(torch.tensor([int(value)]) for value in (x, y, w, d, h)))
 
 
-def check_longest(cell: CellSpec, item: Item, key: str) -> None:
-    """Refuse an item that is longer than the tables of grasps hold."""
+def check_longest(cell: CellSpec, item: Item, key: str) -> Item:
+    """Return an item; refuse one that is longer than the tables of grasps hold."""
     longest = max(int(item.w), int(item.d))
     refuse_if(
         cell.gripper.largest_item is None and longest > cell.max_side,
         f"{key}: the item is {longest} cells long, longer than any in training; expected at most {cell.max_side}.",
         DepthMapError,
     )
+    return item
 
 
 def read_bearing(cell: CellSpec, tote_bearing, on_floor: Tensor) -> Tensor:

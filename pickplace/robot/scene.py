@@ -64,10 +64,10 @@ class Scene:
             return
         are_boxes = isinstance(self.items, (list, tuple)) and all(isinstance(item, Box) for item in self.items)
         refuse_if(not are_boxes, f"items={excerpt(self.items)}: expected a list of Box.", DepthMapError)
-        found = "too many" if self.items else "an empty bin"
         refuse_if(
             not 1 <= len(self.items) <= MAX_BIN_ITEMS,
-            f"items: got {len(self.items)} boxes, expected 1 to {MAX_BIN_ITEMS}: {found}.",
+            f"items: got {len(self.items)} boxes, expected 1 to {MAX_BIN_ITEMS}: "
+            f"{'too many' if self.items else 'an empty bin'}.",
             DepthMapError,
         )
         for at, box in enumerate(self.items):

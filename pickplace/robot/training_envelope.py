@@ -41,12 +41,13 @@ class TrainingEnvelope:
             items: all in the bin, ``[1, M]``, as the policy sees them.
         """
         known, longest = self.cell, [max(kind[axis] for kind in self.kinds) for axis in range(3)]
-        new = {
-            f"item of {w}x{d}x{h} cells: the policy met other sizes, up to {_sides(longest)}."
-            for w, d, h in items.cuboids[0, :, 2:].tolist()
-            if not {(w, d, h), (d, w, h)} & self.kinds
-        }
-        found = sorted(new)
+        found = sorted(
+            {
+                f"item of {w}x{d}x{h} cells: the policy met other sizes, up to {_sides(longest)}."
+                for w, d, h in items.cuboids[0, :, 2:].tolist()
+                if not {(w, d, h), (d, w, h)} & self.kinds
+            }
+        )
         if (count := items.x.shape[1]) > known.bin_items:
             found.append(f"{count} items in the bin: the policy met at most {known.bin_items}.")
         if known.tote_size[:2] != cell.tote_size[:2] or cell.tote_size[2] > known.tote_size[2]:

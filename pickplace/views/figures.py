@@ -126,8 +126,7 @@ def failure_mix(metrics: Path, path) -> None:
     axes = figure.subplots()
     if names:
         weights = np.array([row.get("train/episodes", 1.0) for row in rows])
-        shares = (np.array([row.get(prefix + name, 0.0) for row in rows]) for name in names)
-        stack = [_running_mean(share, weights) for share in shares]
+        stack = [_running_mean(np.array([row.get(prefix + name, 0.0) for row in rows]), weights) for name in names]
         axes.stackplot(
             [row["frames"] for row in rows[-len(stack[0]):]], stack,
             labels=[name.replace("_", " ") for name in names], colors=[FAILURES[name] for name in names],

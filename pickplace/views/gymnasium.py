@@ -31,8 +31,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 4}
 
     def __init__(self, items=None, render_mode: str | None = None, **settings):
-        known = render_mode in (None, *self.metadata["render_modes"])
-        expect(known, "render_mode", render_mode, "'rgb_array', 'human' or None")
+        expect(render_mode in (None, "rgb_array", "human"), "render_mode", render_mode, "'rgb_array', 'human' or None")
         super().__init__(items, **settings)
         self.render_mode = render_mode
         self._recording: Recording | None = None  # of the running episode
@@ -46,14 +45,15 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         return result
 
     def step(self, action):
+        env, moves = self._env, []
         if self._recording is not None and self.action_space.contains(action):
-            env, actions = self._env, torch.as_tensor([int(action)], device=self._env.device)
-            self._recording.moves += record_moves(env.cell, None, None, env.state, actions)
-        *result, terminated, truncated, info = super().step(action)
-        if self._recording is not None and (terminated or truncated):
-            self._recording.ending = Failure[info["failure"].upper()]
-            if self._recording.ending == Failure.STUCK:
-                self._recording.waiting = items_in_bin(self._env.current_items, 0)
+            moves = record_moves(env.cell, None, None, env.state, torch.as_tensor([int(action)], device=env.device))
+        *result, terminated, truncated, info = super().step(action)  # may refuse it, and changes the state in place
+        if self._recording is not None:
+            self._recording.moves += moves
+            if terminated or truncated:
+                self._recording.ending = Failure[info["failure"].upper()]
+                self._recording.waiting = items_in_bin(env.current_items, 0)
         self._update_window()
         return *result, terminated, truncated, info
 
@@ -69,8 +69,8 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         cell, items = self._env.cell, self._env.current_items
         scene = draw_scene(self._recording, cell, self._colours)
         inset = scene.add_axes((0.01, 0.04, 0.09, 0.18))
-        bin_depth = bin_depth_from_items(items, cell.bin_size)
-        inset.imshow(bin_depth[0].cpu().numpy().T, origin="lower", cmap="YlOrBr", vmin=0)
+        bin_depth = bin_depth_from_items(items, cell.bin_size)[0].cpu().numpy()
+        inset.imshow(bin_depth.T, origin="lower", cmap="YlOrBr", vmin=0)
         for x, y, w, d, _ in items_in_bin(items, 0):  # so that items side by side are told apart
             inset.add_patch(Rectangle((x - 0.5, y - 0.5), w, d, fill=False, edgecolor=INK, linewidth=1))
         inset.set_title("bin", fontsize="medium")

@@ -16,7 +16,6 @@ from pickplace.rules.step import apply
 from pickplace.views.motion import Outcome
 
 FULL = "The tote is full."
-NONE_FITS = "None of these items fits anywhere any more."
 
 #: An item in the bin: its minimum corner and its size, x, y, w, d, h; in cells and height units.
 InBin = tuple[int, int, int, int, int]
@@ -68,8 +67,11 @@ class Recording:
     @property
     def boxes(self) -> list[PlacedItem]:
         """The items placed, in order."""
-        placed = [(*move.footprint, move) for move in self.moves if not move.failure]
-        return [PlacedItem(x, y, move.z, w, d, move.item[4]) for x, y, w, d, move in placed]
+        return [
+            PlacedItem(*move.footprint[:2], move.z, *move.footprint[2:], move.item[4])
+            for move in self.moves
+            if not move.failure
+        ]
 
     def describe_ending(self, num_places: int) -> str:
         """Return why the episode ended, in a sentence; empty while it goes on."""
@@ -77,7 +79,7 @@ class Recording:
             if sum(box.volume for box in self.boxes) == num_places * self.tote_height:
                 return FULL
             if len(self.waiting) > 1:
-                return NONE_FITS
+                return "None of these items fits anywhere any more."
         return "" if self.ending is None else self.ending.sentence
 
 

@@ -162,10 +162,9 @@ def animation(
     from PIL import Image  # comes with matplotlib
 
     count = len(recording.moves)
-    shown = sorted({round(index) for index in np.linspace(0, count, min(frames, count + 1))})
     colours = item_colours(recording.boxes)
     images = []
-    for moves in shown:
+    for moves in sorted({round(index) for index in np.linspace(0, count, min(frames, count + 1))}):
         buffer = io.BytesIO()
         draw_scene(recording, cell, colours, moves).savefig(buffer, format="png", dpi=dpi)
         images.append(Image.open(buffer).convert("RGB").quantize(128, dither=Image.Dither.NONE))

@@ -57,9 +57,8 @@ def item_colours(items: Iterable[Sequence[int]]) -> dict[Kind, str]:
     from matplotlib import colormaps, colors
 
     kinds = sorted(set(map(kind_of, items)), key=lambda kind: (np.prod(kind), kind))
-    few = len(kinds) <= len(COLOURS)
-    colours = COLOURS if few else [colors.to_hex(c) for c in colormaps["Spectral"](np.linspace(0, 1, len(kinds)))]
-    return dict(zip(kinds, colours, strict=False))
+    spectrum = colormaps["Spectral"](np.linspace(0, 1, len(kinds)))
+    return dict(zip(kinds, COLOURS if len(kinds) <= len(COLOURS) else map(colors.to_hex, spectrum), strict=False))
 
 
 #: Faces of a unit cube that the viewer sees: outward normal, share of the light, corners as a cycle.
@@ -175,6 +174,7 @@ def _draw_plan(axes, heights: np.ndarray, limit: int, cell: CellSpec) -> None:
     axes.set(title="height map from above", xlabel="x (cells)", ylabel="y (cells)")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(ticker.MaxNLocator(12, integer=True, min_n_ticks=1))
-    every = limit // 12 + 1
     unit = "cells" if cell.height_unit == 1 else f"units of {cell.height_unit:g} cells"
-    axes.figure.colorbar(image, ax=axes, label=f"height ({unit})", shrink=0.8, ticks=range(0, limit + 1, every))
+    axes.figure.colorbar(
+        image, ax=axes, label=f"height ({unit})", shrink=0.8, ticks=range(0, limit + 1, limit // 12 + 1)
+    )

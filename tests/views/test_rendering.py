@@ -91,3 +91,13 @@ def test_human_mode_without_a_display_warns(monkeypatch):
 def test_a_picture_before_reset_is_refused():
     with pytest.raises(gymnasium.error.ResetNeeded, match="before reset"):
         make()[0].unwrapped.render()
+
+
+def test_a_refused_step_is_not_drawn():
+    env, place = make()
+    _, info = env.reset(seed=0)
+    *_, info = env.step(int(np.flatnonzero(info["action_mask"] == 0)[0]))  # ends the episode
+    last = env.render()
+    with pytest.raises(gymnasium.error.ResetNeeded, match="have ended"):
+        place(info)
+    assert (env.render() == last).all()
