@@ -98,8 +98,7 @@ class Execute(Simulation):
         pick, place = (*(gantry.bin + placement.pick), height + self.lip, 0.0), (*(placement.place + error), low, turn)
         if loss := gantry.bring(pick, place, height):
             return loss
-        expected = placement.centre + np.array((*error, self.release_height))
-        if np.linalg.norm(gantry.centre - expected) > self.tolerance:
+        if np.linalg.norm(gantry.centre - np.add(placement.centre, (*error, self.release_height))) > self.tolerance:
             return gantry.loss("wedged")
         return gantry.leave(height)
 

@@ -119,7 +119,6 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
         )
         for axis in (0, 1)
     )
-    longest = max(int(side) for item in each for side in item[2:4])
     free = replace(
         cell,
         bin_size=(*cell.bin_size[:2], 1),
@@ -127,7 +126,8 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
         height_unit=MILLIMETRE / cell_size,
         bin_items=1,
         item_inset=(inset_x, inset_y),
-        longest_side=cell.longest_side or (None if cell.has_known_offsets else longest),
+        longest_side=cell.longest_side
+        or (None if cell.has_known_offsets else max(int(side) for item in each for side in item[2:4])),
     )
     # Each item has a grid of its own. A pick cell that grips several stands for the highest, as on the grid.
     pick = torch.arange(free.num_picks, device=device)

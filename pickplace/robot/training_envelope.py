@@ -30,8 +30,8 @@ class TrainingEnvelope:
     def of(cls, config: DictConfig, items: ItemDistribution) -> "TrainingEnvelope":
         """Return what a checkpoint's config says."""
         kinds = frozenset((int(w), int(d), int(h)) for w, d, h in items.sizes.tolist())
-        env = cast(dict, OmegaConf.to_container(config.env, resolve=True))
-        return cls(kinds, build_cell(env, reach=None))  # a table of reach may be elsewhere
+        # Without a table of reach, which may be elsewhere.
+        return cls(kinds, build_cell(cast(dict, OmegaConf.to_container(config.env, resolve=True)), reach=None))
 
     def warnings(self, cell: CellSpec, items: Item) -> list[str]:
         """Return a sentence for each thing that the policy never met: an item, the tote, the effector, the rule.

@@ -85,8 +85,9 @@ def draw_tote(axes, size: tuple[float, float, float]) -> None:
 
     floor, rim = ([corner(x, y, z) for x, y in ((0, 0), (wide, 0), (wide, deep), (0, deep))] for z in (0, high))
     far_walls = [[floor[near], floor[3], rim[3], rim[near]] for near in (0, 2)]
-    tints = ["#e4e8eb", "#f4f6f7", "#eceff1"]
-    axes.add_collection(PolyCollection([floor, *far_walls], facecolors=tints, edgecolors=WALL, zorder=1))
+    axes.add_collection(
+        PolyCollection([floor, *far_walls], facecolors=["#e4e8eb", "#f4f6f7", "#eceff1"], edgecolors=WALL, zorder=1)
+    )
     near_edges = zip(floor[:3], rim, strict=False)
     axes.add_collection(LineCollection([[*rim, rim[0]], *near_edges], colors=WALL, linewidths=1.2, zorder=4))
     gap = 0.05 * (wide + deep)
