@@ -17,7 +17,7 @@ from pickplace.planners.heuristics import RandomFeasible
 from pickplace.rules.cell import CELL_SETTINGS
 from pickplace.rules.reach.base import Limits
 from pickplace.rules.state import surface_from
-from pickplace.rules.support import RULES, Support, read_support
+from pickplace.rules.support.rules import RULES, Support, read_support
 
 SIDES, NEVER = st.integers(1, 4), st.just(False)
 

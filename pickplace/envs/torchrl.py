@@ -17,9 +17,8 @@ from pickplace.items.arrival import refill
 from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.rules.bin import remove_item
 from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
-from pickplace.rules.corners import corner_mask
 from pickplace.rules.item import Item
-from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, placing_maps
+from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, corner_mask, placing_maps
 from pickplace.rules.observation import Term, check_terms, observe
 from pickplace.rules.state import EMPTY, Failure, State
 from pickplace.rules.step import apply
@@ -172,11 +171,6 @@ class PickPlaceEnv(EnvBase):
         """``N``, the number of problems that advance together."""
         return self.batch_size[0]
 
-    @property
-    def observation_bytes(self) -> int:
-        """Bytes of what the environment emits for one problem, masks included."""
-        return sum(spec.shape[1:].numel() * spec.dtype.itemsize for spec in self.observation_spec.values())
-
     # ------------------------------------------------------------------ EnvBase
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         """Reset all problems, or those of ``_reset``; the others come back as they are.
@@ -216,7 +210,7 @@ class PickPlaceEnv(EnvBase):
         self.item.masked_fill_(rows[:, None, None], 0)
         for count in (self.arrived, self.volume, self.steps):
             count.masked_fill_(rows, 0)
-        self._refill(rows, self.current_items)
+        self._refill(rows, self.state.items)
         self._update_masks(rows, empty=True)
         if (jammed := rows & ~self.feasible).any():  # the first one alone always has a feasible action
             self.item[:, 1:] *= ~jammed[:, None, None]
@@ -256,14 +250,9 @@ class PickPlaceEnv(EnvBase):
         super()._load_from_state_dict(*args, **kwargs)
 
     @property
-    def current_items(self) -> Item:
-        """The items that lie in each bin, ``[N, M]``."""
-        return Item.from_table(self.item)
-
-    @property
     def state(self) -> State:
         """The state of all problems."""
-        return State(self.surface, self.tote_height, self.current_items)
+        return State(self.surface, self.tote_height, Item.from_table(self.item))
 
     @property
     def exact_occupancy(self) -> Tensor:

@@ -20,7 +20,7 @@ from pickplace.physics.engine import Engine
 from pickplace.planners.base import BatchPlanner
 from pickplace.policies.restore import build_cell, cell_settings, differences
 from pickplace.rules.state import Failure
-from pickplace.rules.support import read_support
+from pickplace.rules.support.rules import read_support
 from pickplace.runs.provenance import commit, versions
 from pickplace.views.motion import Outcome
 

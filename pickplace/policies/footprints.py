@@ -22,9 +22,10 @@ from pickplace.rules.masks import (
     action_footprints,
     actions_reaching,
     first_action_reaching,
-    unchecked_maps,
+    placing_maps,
 )
 from pickplace.rules.observation import item_keys
+from pickplace.rules.placing import unchecked_top
 from pickplace.rules.state import State
 from pickplace.rules.step import apply
 
@@ -130,7 +131,7 @@ class FootprintPolicy(FootprintScorer):
         return self.footprint_logits(observation, observation[f"{self.mask}_mask"])
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        maps = unchecked_maps(self.cell, State.from_observation(observation))  # the mask has looked
+        maps = placing_maps(self.cell, State.from_observation(observation), unchecked_top)  # the mask has looked
         return pick_one(actions_reaching(self.cell, maps, choice))
 
     def action_log_probs(self, observation: Observation) -> Tensor:

@@ -19,7 +19,7 @@ from pickplace.rules.gripper.base import EffectorShape, Gripper
 from pickplace.rules.gripper.rules import Contain, changed_gripper
 from pickplace.rules.gripper.shapes import Mask
 from pickplace.rules.reach.base import Limits, Reach
-from pickplace.rules.support import Bearing, Support, read_support
+from pickplace.rules.support.rules import Bearing, Support, read_support
 
 MAX_BIN_ITEMS = 100
 
@@ -40,8 +40,8 @@ class CellSpec:
         tote_size: ``(W_T, D_T, H_T)``; an episode's tote height may be lower than ``H_T``.
         gripper: body, cup and grip rule, such as :class:`~pickplace.rules.gripper.rules.Seal`.
         rotations: ``R``, the number of quarter turns to choose from, 1 to 4.
-        support: the stability rule, an object of :mod:`pickplace.rules.support`; or a short form of it, the name of one
-            of :data:`~pickplace.rules.support.RULES` or the least share of the footprint.
+        support: the stability rule, an object of :mod:`pickplace.rules.support.rules`; or a short form of it, the name
+            of one of :data:`~pickplace.rules.support.rules.RULES` or the least share of the footprint.
         height_unit: length of a height unit, in sides of a cell. The rules only count units; what converts heights to
             lengths (the robot's planner, the replay page) multiplies by it.
         reach: of the robot, such as an :class:`~pickplace.rules.reach.annulus.Annulus` or tables of

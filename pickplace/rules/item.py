@@ -19,8 +19,7 @@ NO_LIMIT = 2**31 - 1  # grams
 
 @lru_cache(maxsize=8)
 def _defaults(device: torch.device) -> tuple[Tensor, ...]:
-    """Return the defaults of the columns kind, turns, grams and max_load."""
-    return torch.tensor([-1, ALL_TURNS, 0, NO_LIMIT], device=device).unbind()
+    return torch.tensor([-1, ALL_TURNS, 0, NO_LIMIT], device=device).unbind()  # kind, turns, grams, max_load
 
 
 class _Columns(NamedTuple):

@@ -60,11 +60,6 @@ def square_cells(grid: Sequence[int], x: Tensor, y: Tensor, side: int) -> Tensor
     return ((column * deep)[:, None] + row).flatten(0, 1)
 
 
-def squares(surface: Tensor, x: Tensor, y: Tensor, side: int) -> Tensor:
-    """Return a square of cells of each surface ``[N, W, D]``, ``[side * side, N]``; arguments of `square_cells`."""
-    return surface.flatten(1).t().gather(0, square_cells(surface.shape[1:], x, y, side))
-
-
 def is_under(w: Tensor, d: Tensor, side: int) -> Tensor:
     """Return for each cell of a square, row by row, whether a ``w x d`` rectangle at its minimum corner covers it.
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from pickplace.common.validate import expect, refuse_if, short_text
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import bin_depth_from_items, bin_labels_from_items
-from pickplace.rules.state import State, depth_from_heights
+from pickplace.rules.state import State
 
 
 class Bounds(NamedTuple):
@@ -86,7 +86,7 @@ class ToteDepth(Term):
         return Bounds(0, cell.tote_size[2], cell.tote_size[:2])
 
     def value(self, cell, state):
-        return depth_from_heights(state.heights, state.tote_height)
+        return (state.tote_height[:, None, None] - state.heights).float()
 
 
 class ToteBearing(Term):

@@ -93,8 +93,3 @@ def surface_from(heights: Tensor, bearing: Tensor | int = 1) -> Tensor:
         bearing: bool, or 0 and 1, of that shape; by default every cell bears weight.
     """
     return 2 * heights.int() + (bearing if isinstance(bearing, int) else bearing.int())
-
-
-def depth_from_heights(heights: Tensor, tote_height: Tensor) -> Tensor:
-    """Return the remaining depth ``H_T - height`` of each cell, float32 ``[N, W_T, D_T]``."""
-    return (tote_height[:, None, None] - heights).float()

@@ -18,7 +18,7 @@ from pickplace.rules.grasps import (
 )
 from pickplace.rules.gripper.base import EffectorShape
 from pickplace.rules.item import Item
-from pickplace.rules.maps import NEVER, is_under, rectangle, square_cells, squares
+from pickplace.rules.maps import NEVER, is_under, rectangle, square_cells
 from pickplace.rules.state import State, surface_from
 from pickplace.rules.support.contact import Contact
 
@@ -49,15 +49,14 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     covered = body_cells(cell.effectors, reach, action.device)  # [reach * reach, B]
     if len(cell.effectors) > 1:
         covered = covered[:, rotation % len(cell.effectors)]
-    highest = torch.where(covered, squares(surface, left, front, reach), 0).amax(0) >> 1
-    item_leaves = is_outside(x, w, tote_w) | is_outside(y, d, tote_d)
-    effector_leaves = is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d)
-
-    over = Over(effector_leaves, tote_height, highest)
+    under = surface.flatten(1).t().gather(0, square_cells(surface.shape[1:], left, front, reach))
+    highest = torch.where(covered, under, 0).amax(0) >> 1
+    over = Over(is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d), tote_height, highest)
     if cell.limits is not None:
         limits, place = cell.limits.on(action.device), (rotation, *split_action(cell, action)[2:4])
         over = over._replace(lowest=limits.lowest_top[place], highest=limits.highest_top[place])
-    resting = Resting(~item_leaves, top, tote_height, cell.support.stable(contact))
+    inside = ~(is_outside(x, w, tote_w) | is_outside(y, d, tote_d))
+    resting = Resting(inside, top, tote_height, cell.support.stable(contact))
     failure = first_failure(picked, resting, over)
     after = _add_item(cell, surface, x, y, contact, index, torch.where(failure == 0, item.h, 0))
     return Step(after, failure, top, torch.stack([x, y, w, d], -1), item, taken)

@@ -73,8 +73,9 @@ def check_memory(cfg: DictConfig, env: PickPlaceEnv, policy: Policy, algorithm: 
         ValueError: naming the keys, their values, and the memory.
     """
     cell, masks, slots, steps = env.cell, policy.masks, cfg.env.num_envs, cfg.rollout_length
+    emitted = sum(spec.shape[1:].numel() * spec.dtype.itemsize for spec in env.observation_spec.values())
     # The last 20 bytes are choice, log-probability and action.
-    frame = 2 * env.observation_bytes + sum(MASKS[name].size(cell) for name in masks) + 200 * cell.num_places + 20
+    frame = 2 * emitted + sum(MASKS[name].size(cell) for name in masks) + 200 * cell.num_places + 20
     check_bytes(f"env.num_envs={slots}, rollout_length={steps}", slots * steps * frame, env.device)
     for setting, needed in algorithm.memory(frame).items():
         check_bytes(setting, needed, env.device)

@@ -53,7 +53,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
             self._recording.moves += moves
             if terminated or truncated:
                 self._recording.ending = Failure[info["failure"].upper()]
-                self._recording.waiting = items_in_bin(env.current_items, 0)
+                self._recording.waiting = items_in_bin(env.state.items, 0)
         self._update_window()
         return *result, terminated, truncated, info
 
@@ -66,7 +66,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
 
         if self._recording is None:
             raise gymnasium.error.ResetNeeded("render() before reset().")
-        cell, items = self._env.cell, self._env.current_items
+        cell, items = self._env.cell, self._env.state.items
         scene = draw_scene(self._recording, cell, self._colours)
         inset = scene.add_axes((0.01, 0.04, 0.09, 0.18))
         bin_depth = bin_depth_from_items(items, cell.bin_size)[0].cpu().numpy()

@@ -13,7 +13,7 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.items.distributions import PAPER_KINDS, Kinds
 from pickplace.rules.masks import action_mask, footprint_mask, placing_maps
-from pickplace.rules.support import Hull
+from pickplace.rules.support.rules import Hull
 
 OBSERVATION = ("bin_depth", "tote_depth", "tote_height", "action_mask")
 

@@ -229,7 +229,7 @@ def test_a_perfect_packing_is_feasible_in_the_benchmark_s_environment(order):
     observation, done = env.reset(), torch.zeros(count, dtype=torch.bool)
     for step in range(max(map(len, boxes))):
         here = torch.tensor([each[min(step, len(each) - 1)] for each in boxes])
-        item = env.current_items.rows((slice(None), 0))
+        item = env.state.items.rows((slice(None), 0))
         playing = ~done
         assert torch.equal(item.cuboids[playing, 2:], here[playing, 3:])
         # The effector's only cell is on the item's first one, and goes to where that one belongs.

@@ -21,7 +21,7 @@ def prepared(individual, masked, **settings):
     policy = individual(env.cell, mask_infeasible=masked, filters=6, head_std=1.0)
     joint = NETWORKS[individual](env.cell, mask_infeasible=masked, filters=6)
     joint.load_state_dict(policy.state_dict())
-    return env, observation, policy, joint, heuristic_pick(env.cell, env.current_items.rows((slice(None), 0)))
+    return env, observation, policy, joint, heuristic_pick(env.cell, env.state.items.rows((slice(None), 0)))
 
 
 @pytest.mark.parametrize("rotations", [1, 3, 4])

@@ -10,7 +10,7 @@ from pickplace import CellSpec, Planner, Scene, load_policy
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import as_collection_policy
 from pickplace.rules.observation import STANDARD_TERMS
-from pickplace.rules.support import Bearing, Half
+from pickplace.rules.support.rules import Bearing, Half
 
 SIZES = {"env.tote_size": (4, 4, 2), "env.bin_size": (4, 4, 1)}
 

@@ -42,7 +42,7 @@ def at_pick(kind, env, mask):
     if kind not in INDIVIDUAL:
         return mask
     pick = torch.nn.functional.one_hot(
-        heuristic_pick(env.cell, env.current_items.rows((slice(None), 0))), env.cell.num_picks
+        heuristic_pick(env.cell, env.state.items.rows((slice(None), 0))), env.cell.num_picks
     ).bool()
     return (mask.unflatten(1, (env.cell.num_picks, -1)) & pick[..., None]).flatten(1)
 
@@ -74,7 +74,7 @@ def test_the_distribution_over_flat_actions_is_one_and_its_best_is_played(kind, 
         if isinstance(
             policy, ScoresFootprints
         ):  # which never lists the actions: the best feasible footprint, by any way to it
-            reached = action_footprints(env.cell, env.current_items).gather(1, action[:, None])[:, 0]
+            reached = action_footprints(env.cell, env.state.items).gather(1, action[:, None])[:, 0]
             assert torch.equal(reached, policy.logits(observation).argmax(1))
         elif kind is not IndividualGrasp:
             best = log_probs.masked_fill(~mask, -torch.inf).argmax(1)
@@ -116,7 +116,7 @@ def test_to_miss_the_item_is_one_choice_of_the_unmasked_policy(exploration):
     assert ((actions >= 0) & (actions < env.cell.num_actions)).all()
     x, y, *_ = split_action(env.cell, actions)
     pick = x * env.cell.bin_size[1] + y
-    assert not all_grasps(env.cell, env.current_items.rows((slice(None), 0)))[0].gather(1, pick[:, None]).any()
+    assert not all_grasps(env.cell, env.state.items.rows((slice(None), 0)))[0].gather(1, pick[:, None]).any()
     assert torch.equal(policy.to_choice(actions, observation), missing)
 
 
@@ -134,7 +134,7 @@ def test_sampled_actions_follow_the_distribution_over_flat_actions(kind):
         mask = observation["action_mask"][0]
         assert not count[~mask].any()
         # A footprint's probability is spread over all actions that lead there, of which the feasible ones are played.
-        flat = action_footprints(env.cell, env.current_items)[0]
+        flat = action_footprints(env.cell, env.state.items)[0]
         total, ways = share.new_zeros(env.cell.num_footprints), torch.bincount(flat[mask], minlength=share.numel())
         total.scatter_add_(0, flat.clamp(min=0), torch.where(flat >= 0, share, 0.0))
         share = torch.where(mask, total[flat.clamp(min=0)] / ways[flat.clamp(min=0)].clamp(min=1), 0.0)

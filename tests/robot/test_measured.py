@@ -12,7 +12,7 @@ from pickplace import CellSpec, DepthMapError, Planner
 from pickplace.robot.measure import box_of_map
 from pickplace.robot.planner import Box
 from pickplace.rules.reach.base import Limits
-from pickplace.rules.support import Hull
+from pickplace.rules.support.rules import Hull
 
 CELL, TOTE = 0.05, (0.3, 0.3, 0.25)
 SIZES = {"tote_size": (6, 6, 5)}

@@ -9,7 +9,7 @@ from pickplace import CellSpec, PickPlaceEnv
 from pickplace.rules.cell import CELL_SETTINGS, cell_from_settings
 from pickplace.rules.gripper.rules import Overlap, Seal
 from pickplace.rules.reach.annulus import Annulus
-from pickplace.rules.support import Hull
+from pickplace.rules.support.rules import Hull
 
 
 @pytest.mark.parametrize(

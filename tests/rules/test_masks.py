@@ -36,8 +36,8 @@ from pickplace.rules.placing import resting_top
 from pickplace.rules.reach.base import Limits
 from pickplace.rules.state import EMPTY, surface_from
 from pickplace.rules.step import apply, put_down
-from pickplace.rules.support import Hull
 from pickplace.rules.support.contact import Contact
+from pickplace.rules.support.rules import Hull
 
 
 @settings(max_examples=150)

@@ -14,7 +14,7 @@ from pickplace.rules.gripper.rules import Contain
 from pickplace.rules.maps import FAR
 from pickplace.rules.placing import LargeItems, OnFootprints
 from pickplace.rules.state import surface_from
-from pickplace.rules.support import RULES, Bearing, Hull, Share, Support, read_support
+from pickplace.rules.support.rules import RULES, Bearing, Hull, Share, Support, read_support
 
 
 def test_the_registry_has_every_rule():

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from pickplace.rules.support import Support
+from pickplace.rules.support.base import Support
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintPolicy
 
 
 class Corners(FootprintPolicy):
-    """``corners``: as ``fcn_grasp`` with a mask, but among some dozens of footprints (:mod:`pickplace.rules.corners`).
+    """``corners``: as ``fcn_grasp`` with a mask, but among some dozens of footprints, see
+    :func:`~pickplace.rules.masks.corner_mask`.
 
     Args:
         cell: the sizes.

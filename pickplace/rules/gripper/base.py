@@ -112,7 +112,11 @@ class Gripper(ABC):
 
     def shared_sides(self, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return how many cells an item shares with each rectangle of the cup along x and y; negative beside it."""
-        return [(_shared(near_x, w, box.x, box.width), _shared(near_y, d, box.y, box.depth)) for box in self.cup_boxes]
+
+        def shared(near: Tensor, side: Tensor, begin: int, length: int) -> Tensor:
+            return (near + side).clamp_(max=begin + length) - near.clamp(min=begin)
+
+        return [(shared(near_x, w, box.x, box.width), shared(near_y, d, box.y, box.depth)) for box in self.cup_boxes]
 
     @staticmethod
     def count_cells(shared: list[tuple[Tensor, Tensor]]) -> Tensor:
@@ -166,8 +170,3 @@ class Gripper(ABC):
             EffectorShape(width, depth, reference_cell(width), reference_cell(depth), boxes(mask))
             for (width, depth), mask in zip(sides, masks, strict=False)
         )
-
-
-def _shared(near: Tensor, side: Tensor, begin: int, length: int) -> Tensor:
-    """Return how many cells an item and a part of the cup share along an axis; negative if there are cells between."""
-    return (near + side).clamp_(max=begin + length) - near.clamp(min=begin)

@@ -1,11 +1,12 @@
-"""The stability rules that have a short name."""
+"""The stability rules that have a short name, one class each, and the short form that names them."""
 
 from dataclasses import dataclass, field
 from math import nextafter
+from typing import Any
 
 from torch import Tensor
 
-from pickplace.common.validate import number
+from pickplace.common.validate import is_number, number, one_of
 from pickplace.rules.support.base import Support
 from pickplace.rules.support.contact import Contact, Patches
 
@@ -105,3 +106,28 @@ class Bearing(Hull):
 
     def bearing(self, contact: Contact) -> Tensor:
         return contact.in_hull()
+
+
+#: The rules that a short form names; a number is the least share.
+RULES: dict[str, type[Support]] = {
+    "half": Half,
+    "more_than_half": MoreThanHalf,
+    "hull": Hull,
+    "bearing": Bearing,
+    "half_or_hull": HalfOrHull,
+    "corners": Corners,
+    "full": Full,
+}
+
+
+def read_support(value: Any) -> Support:
+    """Return a stability rule as it is, or the one of a short form: of a name or, for :class:`Share`, a number.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if isinstance(value, Support):
+        return value
+    if is_number(value) and 0 <= value <= 1:
+        return Share(value)
+    return RULES[one_of("support", value, RULES, "a number between 0 and 1, or an object of a rule's class")]()
