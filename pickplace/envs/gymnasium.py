@@ -89,8 +89,7 @@ class PickPlaceGymEnv(gymnasium.Env):
         return _first(observations, self._env.terms), _first(infos, INFO)
 
     def step(self, action):
-        good = self.action_space.contains(action)
-        expect(good, "action", action, f"a whole number in [0, {self.action_space.n})")
+        expect(self.action_space.contains(action), "action", action, f"a whole number in [0, {self.action_space.n})")
         observations, *results, infos = self._vector.step(np.array([action]))
         return _first(observations, self._env.terms), *(part[0].item() for part in results), _first(infos, INFO)
 
@@ -100,7 +99,6 @@ class PickPlaceGymEnv(gymnasium.Env):
 
 
 def _first(arrays: dict[str, np.ndarray], keys: Iterable[str]) -> dict[str, Any]:
-    """Return the entries of the first problem."""
     return {key: arrays[key][0] for key in keys}
 
 

@@ -220,9 +220,8 @@ class PickPlaceEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         most, state = self.cell.num_actions - 1, self.state
-        given = tensordict["action"].reshape(self.num_envs)
-        action = _checked("action", given, 0, most, f"between 0 and {most} (N_a - 1)")
-        step = apply(self.cell, state, action)
+        action = tensordict["action"].reshape(self.num_envs)
+        step = apply(self.cell, state, _checked("action", action, 0, most, f"between 0 and {most} (N_a - 1)"))
         placed = step.failure == 0
         gained = torch.where(placed, step.item.volume, 0)
         self.surface.copy_(step.surface)

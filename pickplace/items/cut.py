@@ -81,8 +81,12 @@ class Cut(ItemDistribution):
         _, across, along = hashed_uniform(stream, seed, episode, step, 3)
         rows = [part.tolist() for part in torch.broadcast_tensors(seed, episode, step)]
         keys = [(stream, *key) for key in zip(*rows[:2], strict=True)]
-        if unseen := list(dict.fromkeys(key for key in keys if key not in self._kept)):
-            self._keep(stream, unseen)
+        # Cut the episodes that are new, and keep the sizes of their items.
+        unseen = list(dict.fromkeys(key for key in keys if key not in self._kept))
+        for start in range(0, len(unseen), self._at_once):
+            some = unseen[start : start + self._at_once]
+            boxes = self.boxes(stream, *torch.tensor([key[1:] for key in some]).unbind(1))
+            self._kept.update(zip(some, (each[:, 3:].tolist() for each in boxes), strict=True))
         # With a slice, since the item after the last one is none.
         size = [[*self._kept[key][at : at + 1], [0, 0, 0]][0] for key, at in zip(keys, rows[2], strict=True)]
         sizes = torch.tensor(size, dtype=torch.int64, device=step.device).view(-1, 3)
@@ -90,13 +94,6 @@ class Cut(ItemDistribution):
         if len(self._kept) > max(KEPT_EPISODES, 2 * len(keys)):
             self._kept = {key: self._kept[key] for key in keys}
         return item.map(lambda part: torch.where(item.exists, part, 0))
-
-    def _keep(self, stream: str, keys: list[tuple[str, int, int]]) -> None:
-        """Cut the episodes of these keys, ``(stream, seed, episode)``, and keep the sizes of their items."""
-        for start in range(0, len(keys), self._at_once):
-            some = keys[start : start + self._at_once]
-            boxes = self.boxes(stream, *torch.tensor([key[1:] for key in some]).unbind(1))
-            self._kept.update(zip(some, (each[:, 3:].tolist() for each in boxes), strict=True))
 
     def boxes(self, stream: str, seed: Tensor, episode: Tensor) -> list[Tensor]:
         """Return the items of whole episodes where they were cut: they tile the container.

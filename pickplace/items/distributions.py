@@ -39,7 +39,6 @@ def _mix(x: Tensor) -> Tensor:
 
 
 def _shifted(x: Tensor) -> Tensor:
-    """Return ``x`` xor its upper bits."""
     return (x >> 33).bitwise_and_(0x7FFFFFFF).bitwise_xor_(x)
 
 
@@ -62,7 +61,6 @@ def place_at_random(size: Tensor, across: Tensor, along: Tensor, bin_size, kind:
 
 
 def _are_lengths(values, count: int) -> bool:
-    """Return whether there are so many positive whole numbers that fit the tensors."""
     is_list = isinstance(values, (list, tuple)) and len(values) == count
     return is_list and all(is_whole(value) and 1 <= value <= MAX_LENGTH for value in values)
 
@@ -125,14 +123,13 @@ class Kinds(ItemDistribution):
     """
 
     def __init__(self, kinds, weights=None):
-        is_list = isinstance(kinds, (list, tuple)) and kinds
-        expect(is_list, "items.kinds", kinds, "a list of at least one (w, d, h)")
+        expect(isinstance(kinds, (list, tuple)) and kinds, "items.kinds", kinds, "a list of at least one (w, d, h)")
         at_most("items.kinds: the list has", len(kinds), "kinds of items", MAX_KINDS)
         if bad := [kind for kind in kinds if not _are_lengths(kind, 3)]:
             raise ValueError(f"items.kinds: got {excerpt(bad[0])}, expected (w, d, h) in positive whole cells.")
         weights = [1.0] * len(kinds) if weights is None else weights
-        fits = isinstance(weights, (list, tuple)) and len(weights) == len(kinds)
-        expect(fits, "items.weights", weights, f"{len(kinds)} numbers, one for each kind")
+        is_list = isinstance(weights, (list, tuple)) and len(weights) == len(kinds)
+        expect(is_list, "items.weights", weights, f"{len(kinds)} numbers, one for each kind")
         good = all(is_number(v) and v >= 0 for v in weights) and is_number(total := sum(weights)) and total > 0
         expect(good, "items.weights", weights, "finite numbers >= 0 that are not all 0")
         used = [i for i, v in enumerate(weights) if v > 0]

@@ -98,6 +98,5 @@ def pick_first(cell: CellSpec, maps: PlacingMaps, rule: str) -> tuple[Tensor, Te
         int64, and whether it succeeds, bool.
     """
     pick = PICKS[rule](cell, maps.item, maps.blocked)
-    alone = maps.item.rows((slice(None), None))
-    footprint = select_pick(cell, action_footprints(cell, alone, maps.blocked), pick)
-    return pick, footprint, select_pick(cell, action_mask(cell, maps), pick)
+    footprint = action_footprints(cell, maps.item.rows((slice(None), None)), maps.blocked)
+    return pick, select_pick(cell, footprint, pick), select_pick(cell, action_mask(cell, maps), pick)

@@ -5,7 +5,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import check_bytes, number, refuse_if, whole_number
+from pickplace.common.validate import check_bytes, number, or_null, refuse_if, whole_number
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner
@@ -66,18 +66,13 @@ class Lookahead(MapPlanner):
         self.samples = whole_number("planner.samples", samples, 2, 10_000)
         self.rounds = whole_number("planner.rounds", rounds, most=10)
         self.confidence = number("planner.confidence", confidence)
-        if horizon is not None:
-            whole_number("planner.horizon", horizon)
+        or_null(whole_number, "planner.horizon", horizon)
         refuse_if(
             not isinstance(policy, ScoresFootprints),
             "planner=lookahead: expected a checkpoint of model=fcn_grasp, corners or afterstate, with a mask.",
         )
-        self.cell, self.policy, self.items, self.terms = (
-            cell,
-            policy,
-            search_items(items),
-            check_terms(terms, cell.bin_items),
-        )
+        self.cell, self.policy, self.items = cell, policy, search_items(items)
+        self.terms = check_terms(terms, cell.bin_items)
         self.critic, self.horizon = critic, None if critic is None else horizon
         self.seed, self._decisions = check_seed(seed, "planner.seed"), 0
 
@@ -142,8 +137,7 @@ class Lookahead(MapPlanner):
         both = row.repeat_interleave(2)  # the policy's own choice and the candidate, on the same items
         column = torch.stack([torch.zeros_like(row), best[row]], 1).flatten()
         volume = self._returns(state, both, choice[both, column], self.samples, None).mean(1)
-        gain = volume[1::2] - volume[::2]
-        return best.index_put((row,), torch.where(gain > 0, best[row], 0))
+        return best.index_put((row,), torch.where(volume[1::2] > volume[::2], best[row], 0))
 
     def _returns(self, state: State, row: Tensor, choice: Tensor, streams: int, horizon) -> Tensor:
         """Return the volume that choices place, and the policy after them, float64 ``[M, streams]``.

@@ -96,8 +96,7 @@ class MCTS(MapPlanner):
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         maps = maps.map(Tensor.cpu)
         chosen = self._search(_on_cpu(observation), (choice_mask if self.mask else action_mask)(cell, maps))
-        action = first_action_reaching(cell, maps, chosen) if self.mask else chosen
-        return action.to(observation["tote_depth"].device)
+        return (first_action_reaching(cell, maps, chosen) if self.mask else chosen).to(observation["tote_depth"].device)
 
     def _search(self, state: State, mask: Tensor | None) -> Tensor:
         """Return the most visited choice of each problem, int64 ``[N]``, of those of a mask or of all flat actions."""
@@ -190,8 +189,11 @@ class MCTS(MapPlanner):
         if self.mask:
             return *put_down(self.cell, state, action), torch.ones_like(action, dtype=torch.bool)
         step = apply(self.cell, state, action)
-        items = remove_item(state.items, step.taken)
-        return State(step.surface, state.tote_height, items), step.item, step.failure == 0
+        return (
+            State(step.surface, state.tote_height, remove_item(state.items, step.taken)),
+            step.item,
+            step.failure == 0,
+        )
 
     def _nodes(self, state: State, mask: Tensor | None = None) -> list[_Node]:
         """Return new nodes, with the actions to try: those of a mask, or that the rules allow."""
@@ -233,6 +235,5 @@ def _on_cpu(observation: Observation) -> State:
 
 
 def _stack(parts: list[tuple[Tensor, Tensor]], tote_height: Tensor) -> State:
-    """Return the state of totes of these heights, from the surface and the table of items of each."""
     surface, items = map(torch.stack, zip(*parts, strict=True))
     return State(surface, tote_height, Item.from_table(items))

@@ -9,7 +9,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from pickplace.common.validate import expect, is_whole, one_of
 from pickplace.planners.base import ITEM_RULES, MapPlanner, pick_first, restrict_items
 from pickplace.policies.base import Policy, ScoresFootprints
-from pickplace.policies.footprints import FootprintPolicy, count_ways
+from pickplace.policies.footprints import count_ways
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, join_pick, select_pick
 from pickplace.rules.item import Observation
@@ -58,7 +58,12 @@ class PolicyPlanner(MapPlanner):
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         policy = self.policy.with_cell(cell)
         if self.pick != "any":
-            return self._pick_first(policy, maps, observation)
+            pick, footprint, succeeds = pick_first(cell, maps, self.pick)
+            reached = count_ways(cell.num_footprints, footprint, succeeds) > 0
+            ranked = policy.ranked(maps) & reached
+            mask = torch.where(ranked.any(1, keepdim=True), ranked, reached)
+            choice = policy.footprint_logits(observation, mask).argmax(1, keepdim=True)
+            return join_pick(cell, pick, (succeeds & (footprint == choice)).int().argmax(1))
         if self.item != "any":
             mask = restrict_items(self.item, state, policy.ranked(maps))
             return first_action_reaching(cell, maps, policy.footprint_logits(observation, mask).argmax(1))
@@ -68,16 +73,6 @@ class PolicyPlanner(MapPlanner):
         score, tried = policy.action_log_probs(observation).topk(min(self.candidates, cell.num_actions), dim=1)
         succeeds = action_mask(cell, maps).gather(1, tried) & (score > -torch.inf)
         return tried.gather(1, succeeds.int().argmax(1, keepdim=True))[:, 0]
-
-    def _pick_first(self, policy: FootprintPolicy, maps: PlacingMaps, observation: Observation) -> Tensor:
-        """Return the actions with a pick that does not look at the tote, int64 ``[N]``."""
-        cell = policy.cell
-        pick, footprint, succeeds = pick_first(cell, maps, self.pick)
-        reached = count_ways(cell.num_footprints, footprint, succeeds) > 0
-        ranked = policy.ranked(maps) & reached
-        mask = torch.where(ranked.any(1, keepdim=True), ranked, reached)
-        choice = policy.footprint_logits(observation, mask).argmax(1, keepdim=True)
-        return join_pick(cell, pick, (succeeds & (footprint == choice)).int().argmax(1))
 
     def evaluation_facts(self) -> dict:
         mask = self.candidates == "all" or self.policy.excludes or False

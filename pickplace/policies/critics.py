@@ -145,8 +145,9 @@ class Conv4d(nn.Module):
 
     @staticmethod
     def _map_layers(filters: int) -> nn.Sequential:
-        convolutions = nn.Conv2d(1, filters, 3), nn.ReLU(), nn.Conv2d(filters, filters, 3), nn.ReLU()
-        return nn.Sequential(*convolutions, nn.Flatten())
+        return nn.Sequential(
+            nn.Conv2d(1, filters, 3), nn.ReLU(), nn.Conv2d(filters, filters, 3), nn.ReLU(), nn.Flatten()
+        )
 
     def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
         """Return values ``[..., 1]`` of bin depth ``[..., W_B, D_B]`` and tote depth ``[..., W_T, D_T]``."""

@@ -43,8 +43,7 @@ def count_ways(choices: int, footprint: Tensor, allowed: Tensor) -> Tensor:
         choices: the number of footprints, over all items in a bin.
         footprint: int64 ``[N, A]``, the footprint that each action leaves, or -1.
     """
-    ways = footprint.new_zeros(len(footprint), choices + 1)
-    return ways.scatter_add_(1, footprint + 1, allowed.long())[:, 1:]
+    return footprint.new_zeros(len(footprint), choices + 1).scatter_add_(1, footprint + 1, allowed.long())[:, 1:]
 
 
 def every_footprint(tote_depth: Tensor, parities: int) -> tuple[Tensor, Tensor]:

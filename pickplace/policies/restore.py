@@ -162,8 +162,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
     cell = build_cell(env, **sizes)
     if not (cell.has_known_offsets or cfg.model.mask_infeasible):  # the policy chooses among grasps: so many are there
-        longest = int(build("items", cfg["items"]).sizes[:, :2].max())
-        cell = replace(cell, longest_side=longest)
+        cell = replace(cell, longest_side=int(build("items", cfg["items"]).sizes[:, :2].max()))
     policy = restore_policy(cfg, cell, state["policy"], env).to(usable_device(device))
     nodes = (cfg.env.get("observation") or {}).items()
     return TrainedPolicy(

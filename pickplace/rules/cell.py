@@ -101,9 +101,8 @@ class CellSpec:
         at_most(f"{tote_size}: the tote has", self.num_places, "cells", MAX_CELLS)
         at_most(f"{bin_size}, {tote_size}: the cell has", self.num_actions, "actions", MAX_ACTIONS)
         if self.has_known_offsets:  # else the items will say how many
-            table = self.rotations * self.num_offsets**2 * self.num_places
             words = f"gripper.size={[*self.gripper.size]}, {tote_size}: the table of offsets has"
-            at_most(words, table, "entries", MAX_TABLE)
+            at_most(words, self.rotations * self.num_offsets**2 * self.num_places, "entries", MAX_TABLE)
         if self.limits is not None:
             self.limits.check(self)
 
@@ -183,8 +182,9 @@ class CellSpec:
 
     def describe(self) -> str:
         """Return the sizes in one short line, for messages."""
-        sizes = self.bin_size, self.tote_size, self.gripper.size
-        bin_size, tote_size, size = ("x".join(map(str, sides)) for sides in sizes)
+        bin_size, tote_size, size = (
+            "x".join(map(str, sides)) for sides in (self.bin_size, self.tote_size, self.gripper.size)
+        )
         return f"bin {bin_size}, tote {tote_size}, gripper {type(self.gripper).__name__} {size}, R={self.rotations}"
 
 

@@ -128,9 +128,7 @@ def read_items(bin_depth: Tensor, table: Tensor | None = None) -> Item:
         bin_depth: ``[N, W_B, D_B]``.
         table: int64 ``[N, M, 5]``, as the observation has it where a bin holds several items.
     """
-    if table is None:
-        return item_from_depth(bin_depth).rows((slice(None), None))
-    return Item.from_table(table)
+    return item_from_depth(bin_depth).rows((slice(None), None)) if table is None else Item.from_table(table)
 
 
 def items_from_observation(observation: Observation) -> Item:

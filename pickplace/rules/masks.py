@@ -255,9 +255,8 @@ def _neighbours(maps: Tensor, axis: int, step: int, beyond) -> Tensor:
 
 
 def _reference_cells(cell: CellSpec, device) -> Tensor:
-    """Return the reference cell of the end effector in each rotation, int64 ``[R, 2]``."""
-    shapes = [cell.effector(rotation) for rotation in range(cell.rotations)]
-    return torch.tensor([(shape.ref_x, shape.ref_y) for shape in shapes], device=device)
+    shapes = map(cell.effector, range(cell.rotations))
+    return torch.tensor([(shape.ref_x, shape.ref_y) for shape in shapes], device=device)  # [R, 2]
 
 
 def _footprint_margins(cell: CellSpec, parity: int) -> tuple[int, int, int, int]:
@@ -364,8 +363,7 @@ def action_footprints(cell: CellSpec, items: Item, blocked: Tensor | None = None
     corner = (offset - _reference_cells(cell, device))[:, :, None, None]  # [N * M, P, 1, 1, R, 2]
     x = corner[..., 0] + torch.arange(tote_w, device=device)[:, None, None]
     y = corner[..., 1] + torch.arange(tote_d, device=device)[:, None]
-    sizes = turned_size(item.rows((slice(None), None)), turned == 1)  # [N * M, R] each
-    w, d = (size[:, None, None, None] for size in sizes)
+    w, d = (size[:, None, None, None] for size in turned_size(item.rows((slice(None), None)), turned == 1))
     inside = ~is_outside(x, w, tote_w) & ~is_outside(y, d, tote_d)
     parity = (turned * (item.w != item.d)[:, None])[:, None, None, None]
     number = (torch.arange(len(lifted), device=device) % count)[:, None, None, None, None]

@@ -64,10 +64,9 @@ class ToteValue(nn.Module):
         wide, deep, steps = self.grid
         planes = steps + 3
         check_inputs(f"model.actor.receptive_field={receptive_field}", planes * receptive_field**2)
-        halved = (wide + 1) // 2 * ((deep + 1) // 2)
         self.around = nn.Conv2d(planes, filters, receptive_field, padding=receptive_field // 2)
         self.wider = nn.Conv2d(filters, filters, 3, stride=2, padding=1)
-        self.hidden = nn.Linear(filters * halved, hidden)
+        self.hidden = nn.Linear(filters * ((wide + 1) // 2) * ((deep + 1) // 2), hidden)
         self.head = nn.Linear(hidden, 1)
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.bias, 0.5)
@@ -90,13 +89,12 @@ class ToteValue(nn.Module):
 
     def _values(self, depth: Tensor, height: Tensor) -> Tensor:
         """Return the value of totes ``[N, W_T, D_T]`` of heights ``[N]``, ``[N]``."""
-        empty = depth.sum((1, 2))
         dtype = matrix_dtype(self.compute_dtype, depth.device.type)
         with torch.autocast(depth.device.type, dtype, enabled=dtype != torch.float32):
             planes = self._picture(depth, height).to(dtype, memory_format=torch.channels_last)
             x = F.relu(self.wider(F.relu(self.around(planes))))
             x = F.relu(self.hidden(x.flatten(1)))
-        return self.reward_scale * empty * torch.sigmoid(self.head(x.float())[:, 0])
+        return self.reward_scale * depth.sum((1, 2)) * torch.sigmoid(self.head(x.float())[:, 0])
 
     @torch.no_grad()
     def _picture(self, depth: Tensor, height: Tensor) -> Tensor:

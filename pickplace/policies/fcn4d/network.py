@@ -235,8 +235,7 @@ class Conv4dNet(nn.Module):
         hidden = (from_bin.flatten(1, 2)[:, None, None] + from_tote[:, :, :, None]).relu_().flatten(3)
         kernel = self.second.weight.to(hidden.dtype).permute(0, 2, 3, 1, 4, 5).flatten(1, 3)
         kernel, bias = kernel.contiguous(memory_format=torch.channels_last), self.second.bias.to(hidden.dtype)
-        out = F.conv2d(hidden.permute(0, 3, 1, 2), kernel, bias)
-        return out.relu_().permute(0, 2, 3, 1)[None, :, None]
+        return F.conv2d(hidden.permute(0, 3, 1, 2), kernel, bias).relu_().permute(0, 2, 3, 1)[None, :, None]
 
     def _logits(self, bins: Tensor, totes: Tensor) -> Tensor:
         """Return ``[N, W_B, D_B, W_T, D_T, rotations]`` of padded maps."""

@@ -78,8 +78,7 @@ class Gripper(ABC):
             even = f"sides that differ from size={[*self.size]} by an even number of cells"
             expect(centred, "gripper.cup_size", sides, f"{even}, so that the cup is centred in the body")
         columns = enumerate(zip(self.body_mask, self.cup_mask, strict=True))
-        outside = [(x, y) for x, (body, cup) in columns for y in range(len(body)) if cup[y] > body[y]]
-        if outside:
+        if outside := [(x, y) for x, (body, cup) in columns for y in range(len(body)) if cup[y] > body[y]]:
             raise ValueError(
                 f"gripper.cup={excerpt(self.cup)}, cup_size={excerpt(self.cup_size)}: cell {outside[0]} of the cup is "
                 f"not in body={excerpt(self.body)}; expected a cup that is part of the body."

@@ -58,8 +58,7 @@ class Annulus(Reach):
             x, y = (effector_centre(torch.arange(count), side) for count, side in zip(grid, sides, strict=False))
             return x.double()[:, None], y.double()
 
-        picks = self.picks(cell, *centres(cell.bin_size, cell.gripper.size))
-        lowest_pick, highest_pick = (part.flatten() for part in picks)
+        lowest_pick, highest_pick = map(torch.flatten, self.picks(cell, *centres(cell.bin_size, cell.gripper.size)))
         turned = [cell.gripper.size[:: -1 if rotation % 2 else 1] for rotation in range(cell.rotations)]
         places = [self._range(cell, self.tote, *centres(cell.tote_size, sides)) for sides in turned]
         lowest, highest = (torch.stack(parts) for parts in zip(*places, strict=True))
