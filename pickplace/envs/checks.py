@@ -69,9 +69,8 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
         for key, number in zip(keys, numbers.tolist(), strict=True):
             distinct.setdefault(key.tobytes(), number)
     for chunk in rows[list(distinct.values())].split(max(1, min(1024, 2**24 // cell.num_footprints))):
-        lying = Item.from_table(chunk[:, None, :5])
         empty = torch.full((len(chunk), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
-        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), lying))
+        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), Item.from_table(chunk[:, None, :5])))
         feasible = footprint_mask(cell, maps).flatten(1).any(1)
         if not feasible.all():
             x, y, *_, kind = chunk[~feasible][0].tolist()

@@ -189,11 +189,8 @@ class MCTS(MapPlanner):
         if self.mask:
             return *put_down(self.cell, state, action), torch.ones_like(action, dtype=torch.bool)
         step = apply(self.cell, state, action)
-        return (
-            State(step.surface, state.tote_height, remove_item(state.items, step.taken)),
-            step.item,
-            step.failure == 0,
-        )
+        after = State(step.surface, state.tote_height, remove_item(state.items, step.taken))
+        return after, step.item, step.failure == 0
 
     def _nodes(self, state: State, mask: Tensor | None = None) -> list[_Node]:
         """Return new nodes, with the actions to try: those of a mask, or that the rules allow."""

@@ -152,9 +152,9 @@ class Conv4d(nn.Module):
     def forward(self, bin_depth: Tensor, tote_depth: Tensor) -> Tensor:
         """Return values ``[..., 1]`` of bin depth ``[..., W_B, D_B]`` and tote depth ``[..., W_T, D_T]``."""
         for name, depth, size in (("bin", bin_depth, self.bin_size), ("tote", tote_depth, self.tote_size)):
-            got = tuple(depth.shape[-2:])
             refuse_if(
-                got != size, f"{name}_depth: got {list(got)}, expected {list(size)}, for which the critic was made."
+                depth.shape[-2:] != size,
+                f"{name}_depth: got {[*depth.shape[-2:]]}, expected {list(size)}, for which the critic was made.",
             )
         batch, dtype = tote_depth.shape[:-2], next(self.parameters()).dtype
         bins = bin_depth.to(dtype).reshape(-1, 1, *self.bin_size)

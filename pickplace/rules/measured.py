@@ -50,8 +50,8 @@ class MeasuredTote(NamedTuple):
         patches = self.highest.shape[0] // cell.tote_size[0]
         heights = self.highest.unflatten(0, (-1, patches)).unflatten(2, (-1, patches)).amax((1, 3))
         height = torch.tensor([self.height - slack], device=heights.device)
-        items = item.rows((slice(None), None))
-        return State(surface_from((heights - slack).clamp(min=0), self.bears)[None], height, items)
+        surface = surface_from((heights - slack).clamp(min=0), self.bears)
+        return State(surface[None], height, item.rows((slice(None), None)))
 
 
 class MeasuredMaps(NamedTuple):

@@ -126,10 +126,11 @@ class LargeItems(OnFootprints):
 def leaving_places(shapes: tuple[EffectorShape, ...], grid: tuple[int, int], device: torch.device) -> Tensor:
     """Return the place cells at which the end effector leaves the tote, bool ``[B, W_T, D_T, 1]``, for each shape."""
     x, y = torch.arange(grid[0], device=device)[:, None], torch.arange(grid[1], device=device)
-    return torch.stack([
+    leaves = [
         is_outside(x - shape.ref_x, shape.width, grid[0]) | is_outside(y - shape.ref_y, shape.depth, grid[1])
         for shape in shapes
-    ])[..., None]  # fmt: skip
+    ]
+    return torch.stack(leaves)[..., None]
 
 
 def over_tote(cell: CellSpec, surface: Tensor, rim: Tensor) -> Over:

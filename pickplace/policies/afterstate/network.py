@@ -106,9 +106,11 @@ class ToteValue(nn.Module):
         raised = steps * (height[:, None, None] - depth)  # in parts of the tote's height, so that it stays exact
         least = torch.arange(steps, device=depth.device)[:, None] * height
         above = raised[:, None] > least.t()[:, :, None, None]
-        along_x = F.pad(depth.diff(dim=1) != 0, (0, 0, 1, 0), value=True)
-        along_y = F.pad(depth.diff(dim=2) != 0, (1, 0), value=True)
-        return torch.cat([above, torch.ones_like(above[:, :1]), torch.stack([along_x, along_y], 1)], 1)
+        edges = [
+            F.pad(depth.diff(dim=1) != 0, (0, 0, 1, 0), value=True),
+            F.pad(depth.diff(dim=2) != 0, (1, 0), value=True),
+        ]
+        return torch.cat([above, torch.ones_like(above[:, :1]), torch.stack(edges, 1)], 1)
 
     def _mirror(self, depth: Tensor) -> Tensor:
         """Return the totes in one of the views under which their value is the same, drawn at random."""

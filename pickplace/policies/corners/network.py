@@ -95,8 +95,13 @@ class CornerNet(nn.Module):
         maps = (tote_depth, 1.0 - bearing, torch.ones_like(tote_depth))
         depth, weak, inside = (F.pad(each, (1, 1, 1, 1)).flatten()[cells] for each in maps)
 
-        longest = torch.sym_max(*bin_depth.shape[1:])
-        rest = self._rest(tote_depth, longest, row, x, y, turned, w, d)  # depth of what the item rests on, [M, 1]
+        # The cells of a square that holds any item; those beyond the footprint stand for its last row or column.
+        step = torch.arange(torch.sym_max(*bin_depth.shape[1:]), device=row.device)
+        wx, wy = torch.where(turned, d, w), torch.where(turned, w, d)
+        column = (x + torch.minimum(step, wx - 1)).clamp(max=wide - 1)
+        line = (y + torch.minimum(step, wy - 1)).clamp(max=deep - 1)
+        under = (row[:, None] * wide + column)[:, :, None] * deep + line[:, None]
+        rest = tote_depth.flatten()[under].amin((1, 2))[:, None]  # depth of what the item rests on, [M, 1]
         above = (rest[..., None] - depth) / h[..., None]  # of the surface, in heights of the item
         levels = [above.clamp(-1.5, 1.5), above > 1, above == 1, (above == 0) * (1 - weak)]
         planes = [*(level * inside for level in levels), weak, 1 - inside]
@@ -114,17 +119,3 @@ class CornerNet(nn.Module):
         beyond = torch.cat([near, self.near + (side + 1) // 2], 1)
         within = (2 * torch.arange(self.inside, device=side.device) + 1) * side // (2 * self.inside)
         return torch.cat([-beyond.flip(1), within, side - 1 + beyond], 1)
-
-    @staticmethod
-    def _rest(
-        tote_depth: Tensor, longest: int, row: Tensor, x: Tensor, y: Tensor, turned: Tensor, w: Tensor, d: Tensor
-    ) -> Tensor:
-        """Return the least depth under each footprint, ``[M, 1]`` as all arguments; none is longer than ``longest``."""
-        _, wide, deep = tote_depth.shape
-        step = torch.arange(longest, device=row.device)
-        # The cells of a square; those beyond the footprint stand for its last row or column.
-        wx, wy = torch.where(turned, d, w), torch.where(turned, w, d)
-        column = (x + torch.minimum(step, wx - 1)).clamp(max=wide - 1)
-        line = (y + torch.minimum(step, wy - 1)).clamp(max=deep - 1)
-        cells = (row[:, None] * wide + column)[:, :, None] * deep + line[:, None]
-        return tote_depth.flatten()[cells].amin((1, 2))[:, None]

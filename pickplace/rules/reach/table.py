@@ -80,8 +80,10 @@ def _row(place: str, texts: list[str]) -> tuple[str, int, int, int, float, float
     check("where", row["where"] in ("bin", "tote"), "bin or tote")
     for column in ("x", "y"):
         check(column, row[column].isdecimal() and len(row[column]) <= 6, "a cell, a whole number >= 0")
-    in_tote = ["0", "1", "2", "3"], "0, 1, 2 or 3 quarter turns"
-    turns, expected = in_tote if row["where"] == "tote" else ([""], "nothing in the bin")
+    turns, expected = {
+        "bin": ([""], "nothing in the bin"),
+        "tote": (["0", "1", "2", "3"], "0, 1, 2 or 3 quarter turns"),
+    }[row["where"]]
     check("rotation", row["rotation"] in turns, expected)
     heights = []
     for column, unlimited in (("lowest", 0.0), ("highest", math.inf)):
@@ -89,7 +91,6 @@ def _row(place: str, texts: list[str]) -> tuple[str, int, int, int, float, float
             heights.append(float(row[column]) if row[column] else unlimited)
         except ValueError:
             heights.append(math.nan)
-        good = not row[column] or abs(heights[-1]) <= MAX_COORDINATE
-        check(column, good, "a height in sides of a cell, or nothing")
+        check(column, not row[column] or abs(heights[-1]) <= MAX_COORDINATE, "a height in sides of a cell, or nothing")
     check("highest", heights[0] <= heights[1], f"at least lowest={row['lowest'] or 0}")
     return row["where"], int(row["x"]), int(row["y"]), int(row["rotation"] or 0), heights[0], heights[1]
