@@ -195,8 +195,10 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         self._ended = terminated | truncated
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
             final = self._observations(state)
-            slots = enumerate(self._ended)
-            each = [{key: value[slot] for key, value in final.items()} if over else None for slot, over in slots]
+            each = [
+                {key: value[slot] for key, value in final.items()} if over else None
+                for slot, over in enumerate(self._ended)
+            ]
             infos["final_obs"] = np.array(each, dtype=object)
             infos["final_info"] = self._infos(state, self._ended)
             infos["_final_obs"] = infos["_final_info"] = self._ended.copy()
@@ -213,9 +215,12 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         """Return ``options["tote_height"]``, a number or one per problem, as int64 ``[N, 1]``; None: full height."""
         low, high, count = self._env.min_tote_height, self._env.cell.tote_size[2], self.num_envs
         heights = np.asarray(high if given is None else given)
-        fits = heights.dtype.kind in "iu" and heights.shape in ((), (count,))
         expected = f"a whole number between {low} (the tallest item) and {high} (tote_size[2])"
-        good = fits and low <= heights.min() <= heights.max() <= high
+        good = (
+            heights.dtype.kind in "iu"
+            and heights.shape in ((), (count,))
+            and low <= heights.min() <= heights.max() <= high
+        )
         expect(good, "options['tote_height']", given, expected + f", or {count} of them" * (count > 1))
         return torch.as_tensor(np.broadcast_to(heights, count).astype(np.int64))[:, None]
 

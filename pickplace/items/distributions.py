@@ -61,8 +61,11 @@ def place_at_random(size: Tensor, across: Tensor, along: Tensor, bin_size, kind:
 
 
 def _are_lengths(values, count: int) -> bool:
-    is_list = isinstance(values, (list, tuple)) and len(values) == count
-    return is_list and all(is_whole(value) and 1 <= value <= MAX_LENGTH for value in values)
+    return (
+        isinstance(values, (list, tuple))
+        and len(values) == count
+        and all(is_whole(value) and 1 <= value <= MAX_LENGTH for value in values)
+    )
 
 
 def check_range(key: str, limits) -> tuple[int, int]:

@@ -79,11 +79,12 @@ class CellSpec:
 
     def __post_init__(self, effector_size, body, cup, cup_size, pick_rule, min_seal):
         expect(isinstance(self.gripper, Gripper), "gripper", self.gripper, "a Gripper, such as Contain(size=(3, 3))")
-        short = {"size": effector_size, "body": body, "cup": cup, "cup_size": cup_size, "min_seal": min_seal}
         read = {
             "bin_size": size_tuple("bin_size", self.bin_size, 3, MAX_SIDE),
             "tote_size": size_tuple("tote_size", self.tote_size, 3, MAX_SIDE),
-            "gripper": changed_gripper(self.gripper, pick_rule, **short),
+            "gripper": changed_gripper(
+                self.gripper, pick_rule, size=effector_size, body=body, cup=cup, cup_size=cup_size, min_seal=min_seal
+            ),
             "support": read_support(self.support),
             "height_unit": float(number("height_unit", self.height_unit, 1e-3, 1e3)),
         }

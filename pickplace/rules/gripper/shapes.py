@@ -38,8 +38,9 @@ def read_shape(key: str, value: Any, size: tuple[int, int]) -> str | Mask:
         columns = [] if isinstance(value, str) else [list(column) for column in value]
     except TypeError:
         columns = []
-    fits = [len(column) for column in columns] == [size[1]] * size[0]
-    good = fits and not any(isinstance(cell, bool) or cell not in (0, 1) for column in columns for cell in column)
+    good = [len(column) for column in columns] == [size[1]] * size[0] and not any(
+        isinstance(cell, bool) or cell not in (0, 1) for column in columns for cell in column
+    )
     mask = f"a mask of size={[*size]}: {size[0]} lists of {size[1]} times 0 or 1"
     expect(good, key, value, f"'rectangle', 'disc', or {mask}")
     expect(any(map(any, columns)), key, value, "a mask with a 1")

@@ -44,8 +44,12 @@ class Annulus(Reach):
             ("tote", 3, "[x, y, z]"),
         ):
             value = getattr(self, key)
-            good = isinstance(value, (list, tuple)) and len(value) == count and all(map(is_number, value))
-            good = good and max(map(abs, value)) <= MAX_COORDINATE
+            good = (
+                isinstance(value, (list, tuple))
+                and len(value) == count
+                and all(map(is_number, value))
+                and max(map(abs, value)) <= MAX_COORDINATE
+            )
             expect(good, f"reach.{key}", value, f"{expected}, up to {MAX_COORDINATE:,.0f} sides of a cell")
             value = [*map(float, value)]
             ordered = count == 3 or (value[0] <= value[1] and (key != "radii" or value[0] >= 0))
