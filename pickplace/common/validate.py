@@ -41,6 +41,11 @@ def short_text(name) -> str:
     return excerpt(str(name))[1:-1]
 
 
+def first_line(error: Exception) -> str:
+    """Return the first line of an error's text, or its type if it has none."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
 def expect(good: Any, key: str, value: Any, expected: str) -> Any:
     """Return a value that is good, or refuse it; the message says what was expected."""
     if not good:

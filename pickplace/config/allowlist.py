@@ -15,7 +15,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.common.validate import at_most, excerpt, expect, refuse_any, reworded, short_text
+from pickplace.common.validate import at_most, excerpt, expect, first_line, refuse_any, reworded, short_text
 from pickplace.config.registry import names_at, qualified_names
 
 #: Modules that are never a user's own: with their functions a config could do anything.
@@ -51,15 +51,15 @@ def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POL
     own, groups = own_modules(trust), tuple(content) if groups is None else groups
     refuse_large_config({key: content[key] for key in groups if key in content})
     content = select_groups(content, groups)
-    try:
+    with reworded(
+        (OmegaConfBaseException, RecursionError, AttributeError, TypeError),
+        lambda error: ValueError(f"The checkpoint's config cannot be read ({first_line(error)})."),
+    ):
         refuse_interpolations(content)
         refuse_foreign_targets(content, own)
         cfg = OmegaConf.create(content)
         refuse_foreign_targets(OmegaConf.to_container(cfg, resolve=True), own)
         missing = [key for key in REQUIRED_KEYS if OmegaConf.select(cfg, key) is None]
-    except (OmegaConfBaseException, RecursionError, AttributeError, TypeError) as error:
-        first = next(iter(str(error).splitlines()), type(error).__name__)
-        raise ValueError(f"The checkpoint's config cannot be read ({first}).") from error
     refuse_any(missing, lambda key: f"The checkpoint's config has no {key}; expected the config of a training.")
     if type(cfg.seed) is not int:
         raise refusal("seed", cfg.seed, "a whole number")

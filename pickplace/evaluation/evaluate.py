@@ -27,9 +27,7 @@ from pickplace.physics.plans import CELL_SIZE
 from pickplace.physics.recorded import plan_of
 from pickplace.planners.base import BatchPlanner
 from pickplace.planners.use import planner_parts
-from pickplace.runs import checkpoint
-from pickplace.runs import folder as run_folders
-from pickplace.runs.folder import claim, refuse_occupied
+from pickplace.runs import checkpoint, folder
 from pickplace.runs.provenance import first_steps
 
 log = logging.getLogger(__name__)
@@ -40,7 +38,7 @@ TRAINED = ("env", "items", "model")
 
 def main() -> None:
     """Entry point of ``pickplace-evaluate``."""
-    Command("evaluate", run, run_folders, from_checkpoint=TRAINED)()
+    Command("evaluate", run, folder, from_checkpoint=TRAINED)()
 
 
 def run(cfg: DictConfig, run_dir: Path) -> float:
@@ -52,8 +50,8 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
         ValueError: for settings that make no sense, a checkpoint that does not fit them, or a folder that holds a
             training or another evaluation.
     """
-    with claim(run_dir):
-        refuse_occupied(run_dir)
+    with folder.claim(run_dir):
+        folder.refuse_occupied(run_dir)
         ev, artifacts = cfg.evaluation, Artifacts(cfg.evaluation)
         engine = build_engine(cfg.physics) if cfg.physics else None
         make_env, planner, facts = prepare(cfg)
@@ -133,8 +131,8 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
     Raises:
         ValueError: for a checkpoint that cannot be read, or overrides that do not fit it.
     """
-    folder = checkpoint.locate(str(cfg.checkpoint))
-    state, saved = checkpoint.read(folder)
+    place = checkpoint.locate(str(cfg.checkpoint))
+    state, saved = checkpoint.read(place)
     trained = trusted_config(saved["config"], cfg.trust)
     groups = OmegaConf.create({key: resolved(cfg[key]) for key in ("env", "items")})
     ours, changed = [], trained.copy()
@@ -143,8 +141,8 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
         if key == "benchmark":
             ours += ["env=benchmark", "items=benchmark"] if option not in ("", "null") else []
         elif places := places_in_other_groups(word):
-            for place in places:  # such as env.reach
-                OmegaConf.update(changed, place, OmegaConf.select(groups, place), merge=False, force_add=True)
+            for part in places:  # such as env.reach
+                OmegaConf.update(changed, part, OmegaConf.select(groups, part), merge=False, force_add=True)
         elif key.split(".")[0] in TRAINED:
             ours.append(word)
     merged = apply_overrides(changed, ours, groups)
@@ -153,7 +151,7 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
             cfg[group] = resolved(merged[group])
         cfg.reward_scale = merged.reward_scale  # the scale of the critic's values
     facts = {
-        "checkpoint": str(folder),
+        "checkpoint": str(place),
         "trained": {"frames": saved["frames"], "seed": merged.seed, "commit": saved["commit"]},
         "mask_in_training": merged.model.mask_infeasible,
         **first_steps(saved["config"]),

@@ -21,7 +21,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from pickplace.common.files import read_file
-from pickplace.common.validate import excerpt, is_whole, refuse_any, refuse_if, reworded
+from pickplace.common.validate import excerpt, first_line, is_whole, refuse_any, refuse_if, reworded
 
 SCHEMA = 1
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"  # weights that the package ships
@@ -216,11 +216,11 @@ def _read(folder: Path) -> tuple[dict, dict]:
         f"{folder}: {TENSORS} is truncated or altered, its checksum does not match {FACTS}.",
         CheckpointError,
     )
-    try:
+    with reworded(
+        (SafetensorError, KeyError, TypeError, ValueError, RuntimeError),  # unknown types, absurd sizes
+        lambda error: CheckpointError(f"{folder}: {TENSORS} cannot be read ({first_line(error)})."),
+    ):
         tensors = load(blob)
-    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:  # unknown types, absurd sizes
-        first = next(iter(str(error).splitlines()), type(error).__name__)
-        raise CheckpointError(f"{folder}: {TENSORS} cannot be read ({first}).") from error
     state = facts.pop("state", None)
     refuse_if(
         not isinstance(state, dict) or not _are_facts(facts),

@@ -106,9 +106,11 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
 def _check_facts(place: str, facts: dict) -> None:
     saved = f"resume={place}: the checkpoint's "
     for key, kind in FACT_TYPES.items():
-        if key not in facts or not isinstance(facts[key], kind):
-            found = f"is {excerpt(facts[key])}" if key in facts else "is missing"
-            raise ValueError(f"{saved}{key} {found}; expected what a training wrote.")
+        found = f"is {excerpt(facts[key])}" if key in facts else "is missing"
+        refuse_if(
+            key not in facts or not isinstance(facts[key], kind),
+            f"{saved}{key} {found}; expected what a training wrote.",
+        )
     latest, frames = facts["latest"], facts["frames"]
     whole_number(f"{saved}iteration", facts["iteration"], 0, frames)
     number(f"{saved}best", facts["best"], -1, 1)

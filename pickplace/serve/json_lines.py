@@ -13,7 +13,7 @@ import numpy as np
 
 from pickplace.common.errors import Parser, one_sentence, write_output
 from pickplace.common.files import read_file, read_text
-from pickplace.common.validate import refuse_if, reworded, whole_number
+from pickplace.common.validate import first_line, refuse_if, reworded, whole_number
 from pickplace.robot.box import DepthMapError
 from pickplace.serve.request import MAX_REQUEST, PLAN_OPTIONS, PlanRequest, answer
 
@@ -131,10 +131,10 @@ def run(args: argparse.Namespace) -> None:
     Raises:
         ValueError: for arguments, a checkpoint or maps that cannot be used.
     """
-    missing = "--bin" if args.bin is None else "--tote"
     refuse_if(
         (args.bin is None) != (args.tote is None),
-        f"{missing}: no file; expected both --bin and --tote, or neither to read JSON lines.",
+        f"--{'bin' if args.bin is None else 'tote'}: no file; expected both --bin and --tote, or neither to read JSON "
+        "lines.",
     )
     for option, path in (("--bin-labels", args.bin_labels), ("--tote-bearing", args.tote_bearing)):
         refuse_if(path is not None and args.tote is None, f"{option}={path}: expected --bin and --tote, too.")
@@ -194,7 +194,7 @@ def read_reach(path: str):
     expected = "expected a file with the key reach, such as conf/reach/annulus.yaml."
     with reworded(
         (OSError, ValueError, YAMLError),
-        lambda error: ValueError(f"--reach={path}: {str(error).splitlines()[0]}; {expected}"),
+        lambda error: ValueError(f"--reach={path}: {first_line(error)}; {expected}"),
     ):
         content = safe_load(read_text(path, MAX_REQUEST))
     refuse_if(not isinstance(content, dict) or [*content] != ["reach"], f"--reach={path}: {expected}")

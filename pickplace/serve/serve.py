@@ -114,9 +114,9 @@ def checked_token(host: str) -> str | None:
         f"--host={short_text(host)}: other machines can reach it; expected a token in the environment variable "
         f"{TOKEN}, or --host 127.0.0.1.",
     )
-    if token is not None:
-        refuse_if(
-            len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable() or " " in token,
-            f"{TOKEN}: got {len(token)} letters; expected at least {LEAST_TOKEN}, of ASCII without spaces.",
-        )
+    refuse_if(
+        token is not None
+        and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable() or " " in token),
+        f"{TOKEN}: got {len(token or '')} letters; expected at least {LEAST_TOKEN}, of ASCII without spaces.",
+    )
     return token

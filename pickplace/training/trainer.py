@@ -329,8 +329,9 @@ def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
     if done.any():
         metrics["train/occupancy"] = batch["next", "occupancy"][done].mean().item()
         reasons = batch["next", "failure"][done]
-        for failure in Failure:
-            metrics[f"train/failure_{failure.name.lower()}"] = (reasons == failure).float().mean().item()
+        metrics |= {
+            f"train/failure_{failure.name.lower()}": (reasons == failure).float().mean().item() for failure in Failure
+        }
     return metrics
 
 
