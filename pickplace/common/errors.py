@@ -137,6 +137,6 @@ def unknown_key(key: str, node: DictConfig | dict, prefix: str = "") -> str:
         prefix, node = f"{prefix}{parent}.", child
     known = [str(name) for name in node if name not in ("_target_", "hydra")]
     close = get_close_matches(leaf, known, 1)
-    hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}."
-    hint = hint if known else "expected no key."
+    others = f"expected one of {', '.join(known)}." if known else "expected no key."
+    hint = f"did you mean {close[0]!r}?" if close else others
     return f"{short_text(key)}: there is no key {short_text(leaf)!r} in {prefix[:-1] or 'the config'}; {hint}"

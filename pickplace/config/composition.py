@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from contextlib import nullcontext
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -175,8 +175,7 @@ def own_values(cfg: DictConfig) -> DictConfig:
 
 def task_overrides(hydra_cfg: Any = None) -> list[str]:
     """Return the words of the command line; references in them stay, which lead elsewhere from there."""
-    words: Any = OmegaConf.to_container((hydra_cfg or HydraConfig.get()).overrides.task, resolve=False)
-    return words
+    return cast(list, OmegaConf.to_container((hydra_cfg or HydraConfig.get()).overrides.task, resolve=False))
 
 
 def places_in_other_groups(word: str) -> list[str]:

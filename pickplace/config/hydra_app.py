@@ -148,8 +148,11 @@ def read_command_line(arguments: list[str]) -> tuple[list[str], list[str], argpa
         **dict.fromkeys([*switches, "--shell-completion/-sc"], {"action": "store_true"}),
     }
     options = Parser(others, **settings).parse_intermixed_args(rest)
-    flags_of_hydra = [word for word in rest if word not in options.words]
-    return composition.merge_search_path(options.words, folders.config_dir), flags_of_hydra, options
+    return (
+        composition.merge_search_path(options.words, folders.config_dir),
+        [word for word in rest if word not in options.words],
+        options,
+    )
 
 
 def show(cfg: DictConfig, options: argparse.Namespace) -> None:

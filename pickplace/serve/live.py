@@ -31,9 +31,8 @@ def page(cell: CellSpec) -> str:
 
 def content_policy(html: str) -> str:
     """Return the ``Content-Security-Policy`` of a page: its own scripts run, and nothing else does."""
-    scripts = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
-    digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts)
-    allowed = " ".join(f"'sha256-{digest}'" for digest in digests)
+    digests = [hashlib.sha256(script.encode()).digest() for script in re.findall(r"(?s)<script>(.*?)</script>", html)]
+    allowed = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     return (
         f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; connect-src 'self'; img-src data:; "
         "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
