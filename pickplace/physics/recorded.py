@@ -25,8 +25,10 @@ def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePl
         for move in recording.moves
         if not move.failure
     ]  # fmt: skip
-    sizes = metres(*cell.tote_size[:2], recording.tote_height), metres(*cell.bin_size), metres(*cell.gripper.size)
-    return EpisodePlan(recording.episode, *sizes, placements, body_of(cell, cell_size))
+    return EpisodePlan(
+        recording.episode, metres(*cell.tote_size[:2], recording.tote_height), metres(*cell.bin_size),
+        metres(*cell.gripper.size), placements, body_of(cell, cell_size),
+    )  # fmt: skip
 
 
 def body_of(cell: CellSpec, cell_size: float) -> tuple[Point, ...]:

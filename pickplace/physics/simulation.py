@@ -107,9 +107,10 @@ class Simulation(ABC):
         if self.workers == 1:
             yield from map(self.carry_out_one, plans, recorded)
         else:
-            # Ctrl-C reaches all processes; this one ends the others.
-            ignore = signal.SIGINT, signal.SIG_IGN
-            with ProcessPoolExecutor(self.workers, get_context("spawn"), signal.signal, ignore) as pool:
+            # Ctrl-C reaches all processes; this one ends the others, which ignore it.
+            with ProcessPoolExecutor(
+                self.workers, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
+            ) as pool:
                 yield from pool.map(self.carry_out_one, plans, recorded)
 
     def carry_out_one(self, plan: EpisodePlan, record: bool = False) -> Outcome:

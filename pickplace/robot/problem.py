@@ -127,8 +127,10 @@ def _read_cuboid(bin_map: np.ndarray, segment: np.ndarray, unit: str, name: str)
     (x, y), (w, d), h = filled.min(0), np.ptp(filled, 0) + 1, heights.max()
     bad = np.zeros_like(segment)
     bad[x : x + w, y : y + d] = heights[x : x + w, y : y + d] != h
-    expected = f"{h}: one cuboid that fills its bounding box, {w}x{d} cells from [{x}, {y}]{'' if name else LABEL_HINT}"
-    refuse("bin_depth", bad, heights, unit + name, expected)
+    refuse(
+        "bin_depth", bad, heights, unit + name,
+        f"{h}: one cuboid that fills its bounding box, {w}x{d} cells from [{x}, {y}]{'' if name else LABEL_HINT}",
+    )  # fmt: skip
     return Item(*(torch.tensor([int(value)]) for value in (x, y, w, d, h)))
 
 

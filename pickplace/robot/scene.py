@@ -62,8 +62,11 @@ class Scene:
             integral_number("tote_height", self.tote_height, 1, FAR - 1)
         if isinstance(self.items, BinMap):
             return
-        are_boxes = isinstance(self.items, (list, tuple)) and all(isinstance(item, Box) for item in self.items)
-        refuse_if(not are_boxes, f"items={excerpt(self.items)}: expected a list of Box.", DepthMapError)
+        refuse_if(
+            not isinstance(self.items, (list, tuple)) or not all(isinstance(item, Box) for item in self.items),
+            f"items={excerpt(self.items)}: expected a list of Box.",
+            DepthMapError,
+        )
         refuse_if(
             not 1 <= len(self.items) <= MAX_BIN_ITEMS,
             f"items: got {len(self.items)} boxes, expected 1 to {MAX_BIN_ITEMS}: "
