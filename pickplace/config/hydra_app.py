@@ -61,35 +61,37 @@ class Command:
                 if options.cfg == "job":
                     return show(cfg, options)
                 if not (options.help or options.cfg):
-                    self._check(cfg)
+                    self._checked(cfg)
             if options.help or options.cfg:
                 return self._start(words, flags)
-            return self._run(merged, words, flags, options.multirun or merged.hydra.mode == RunMode.MULTIRUN)
+            is_sweep = options.multirun or merged.hydra.mode == RunMode.MULTIRUN
+            return self._run(merged, None if is_sweep else cfg, words, flags)
 
-    def _check(self, cfg: DictConfig) -> None:
+    def _checked(self, cfg: DictConfig) -> DictConfig:
         refuse_any(sorted(OmegaConf.missing_keys(cfg)), lambda key: f"{key}: no value; expected {key}=<value>.")
         keys = [str(key) for key in cfg if key not in self.from_checkpoint]
         composition.refuse_unknown_keys(OmegaConf.masked_copy(cfg, keys), hydra.compose(self.config_name))
+        return cfg
 
     def _start(self, words: list[str], flags: list[str], app: Callable[[DictConfig], Any] = lambda cfg: None) -> None:
         sys.argv[1:] = [*words, *flags]
         with reworded(HydraException, lambda error: composition.clearer_error(error, self.config_name, words)):
             hydra.main(version_base="1.3", config_path=str(composition.conf_dir()), config_name=self.config_name)(app)()
 
-    def _run(self, merged: DictConfig, words: list[str], flags: list[str], is_sweep: bool) -> None:
-        """Run the task once, or for each job of a sweep, in a folder that is not in use.
+    def _run(self, merged: DictConfig, checked: DictConfig | None, words: list[str], flags: list[str]) -> None:
+        """Run the task with a checked config; without one for each job of a sweep. The folder must not be in use.
 
         If one job fails, the others go on. A folder in which nothing was written is removed.
         """
         errors: list[Exception] = []
+        is_sweep = checked is None
 
         def app(hydras: DictConfig) -> Any:
             running = HydraConfig.get()
             run_dir = Path(running.runtime.output_dir)
             try:
                 self.folders.refuse_for_job(run_dir)
-                cfg = composition.own_values(hydras)
-                self._check(cfg)
+                cfg = checked or self._checked(composition.own_values(hydras))
                 if running.output_subdir is not None and cfg != hydras:  # correct Hydra's note on its merge
                     OmegaConf.save(cfg, run_dir / running.output_subdir / "config.yaml")
                 return self.task(cfg, run_dir)
