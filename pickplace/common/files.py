@@ -83,10 +83,10 @@ def replaced_file(path):
     """
     path = Path(path)
     new = path.with_name(f".{path.stem}.new{path.suffix}")
-    try:
-        with reworded(OSError, lambda error: OSError(error.errno, error.strerror or str(error), str(path))):
+    with reworded(OSError, lambda error: OSError(error.errno, error.strerror or str(error), str(path))):
+        try:
             new.unlink(missing_ok=True)  # a link, perhaps
             yield new
             new.replace(path)
-    finally:
-        new.unlink(missing_ok=True)
+        finally:
+            new.unlink(missing_ok=True)

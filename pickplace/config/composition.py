@@ -41,8 +41,11 @@ def config_files():
 
 def parse(words: Iterable[str]) -> list[Override]:
     """Return the overrides that are words of a command line; a ``ValueError`` names a word that is none."""
+    words = list(words)
     try:
-        return OverridesParser.create().parse_overrides(list(words))
+        return OverridesParser.create().parse_overrides(words)
+    except (ValueError, TypeError) as error:  # such as a number of too many digits
+        raise ValueError(f"{' '.join(words)}: {error}.") from error
     except OverrideParseException as error:
         reasons = [line for line in error.message.splitlines() if not line.startswith(("Error parsing", "See https"))]
         raise ValueError(f"{error.override!r}: expected <key>=<value> ({' '.join(reasons)}).") from error
@@ -129,7 +132,7 @@ def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> N
     """
     if f"{path}*" in REGISTRY:  # a dict of parts with names of the user's choice
         return
-    for key, node in ((str(key), node) for key, node in cfg.items()):
+    for key, node in cfg.items():
         if key not in known:
             raise ValueError(unknown_key(f"{path}{key}", known, path))
         if OmegaConf.is_dict(node) and OmegaConf.is_dict(known[key]) and "_target_" not in node:
@@ -147,8 +150,11 @@ def own_values(cfg: DictConfig) -> DictConfig:
     running = HydraConfig.get()
     search = _search_words(running.overrides.hydra)
     given = [(override, *_package_and_places(override, search)) for override in parse(task_overrides())]
-    pairs = [(place, choice) for choice, package, places in given for place in places if package and place not in KEPT]
+    choices = [(each, places) for each, package, places in given if package and not each.is_delete()]
+    pairs = [(place, choice) for choice, places in choices for place in places if place not in KEPT]
     for place, choice in sorted(pairs, key=lambda pair: pair[0].count(".")):  # an outer part before its own parts
+        if OmegaConf.select(cfg, place) is None:
+            continue
         words, others = [], []  # what is changed at that place, and the other choices
         for each, package, places in given:
             if each is choice:
@@ -212,8 +218,8 @@ def _package_and_places(override: Override, search: list[str]) -> tuple[str | No
     package: Any = override.package or next((file.header for file in files), {}).get("package") or own
     if package == "_global_" or override.value() is None:
         return package, []
-    if package == own:
-        return package, [own]
+    if package == own or override.is_delete():
+        return package, [own if package == own else f"{package}.{own}"]
     part = _part_at(hydra.compose(None, [*search, _line(override, "+")]), package)
     return package, [f"{package}.{key}" for key in part or ()]
 

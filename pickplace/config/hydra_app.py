@@ -58,6 +58,7 @@ class Command:
                 HydraConfig.instance().set_config(merged)
                 keys = [str(key) for key in merged if key != "hydra"]
                 cfg = composition.own_values(OmegaConf.masked_copy(merged, keys))
+                OmegaConf.set_struct(cfg, True)
                 if options.cfg == "job":
                     return show(cfg, options)
                 if not (options.help or options.cfg):

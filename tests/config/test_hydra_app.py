@@ -318,3 +318,21 @@ def test_notes_of_a_run_are_read_unresolved(tmp_path, monkeypatch):
 
 def test_errors_hold_nothing_that_controls_a_terminal():
     assert sentence(ValueError("bad \x1b[31m key\x07")) == "bad \\x1b[31m key\\x07"
+
+
+def test_a_preset_in_a_group_of_ones_own(run, tmp_path):
+    (tmp_path / "mine" / "study").mkdir(parents=True)
+    (tmp_path / "mine" / "study" / "a.yaml").write_text("# @package _global_\nseed: 7\n")
+    code, out, err = run("train", "--config-dir", "mine", "+study=a", "--cfg", "job")
+    assert code == 0 and "seed: 7" in out and "study" not in out, err
+
+
+@pytest.mark.parametrize("word", ["~logger=csv", "~logger", "~callbacks=none"])
+def test_a_group_may_be_removed(run, word):
+    code, out, err = run("train", word, "--cfg", "job")
+    assert code == 0 and "algo:" in out and f"\n{word[1:].partition('=')[0]}:" not in out, err
+
+
+def test_a_number_that_python_cannot_read_is_named(run):
+    code, _, err = run("train", f"seed={'9' * 5000}")
+    assert code == 2 and "seed=999" in err and err.count("\n") == 1

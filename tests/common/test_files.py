@@ -1,0 +1,22 @@
+"""Files are replaced as a whole."""
+
+import pytest
+
+from pickplace.common.files import replaced_file
+
+
+def test_an_error_names_the_file_that_was_asked_for(tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(OSError, match="Not a directory") as caught, replaced_file(tmp_path / "file" / "x.csv") as new:
+        new.write_text("1")
+    assert caught.value.filename == str(tmp_path / "file" / "x.csv")
+    assert (tmp_path / "file").read_text() == "no folder" and len([*tmp_path.iterdir()]) == 1
+
+
+def test_a_block_that_fails_leaves_the_old_file(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("old")
+    with pytest.raises(ValueError, match="half"), replaced_file(path) as new:
+        new.write_text("half")
+        raise ValueError("half")
+    assert path.read_text() == "old" and [*tmp_path.iterdir()] == [path]
