@@ -132,7 +132,7 @@ def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> N
     """
     if f"{path}*" in REGISTRY:  # a dict of parts with names of the user's choice
         return
-    for key, node in cfg.items():
+    for key, node in cast(dict, cfg).items():
         if key not in known:
             raise ValueError(unknown_key(f"{path}{key}", known, path))
         if OmegaConf.is_dict(node) and OmegaConf.is_dict(known[key]) and "_target_" not in node:

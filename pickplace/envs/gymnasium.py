@@ -84,8 +84,9 @@ class PickPlaceGymEnv(gymnasium.Env):
         self.observation_space = self._vector.single_observation_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        expect("reset_mask" not in (options or {}), "options", options, "tote_height alone")
         observations, infos = self._vector.reset(seed=seed, options=options)
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else int(seed))
         return _first(observations, self._env.terms), _first(infos, INFO)
 
     def step(self, action):
@@ -128,7 +129,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
     ):
         expect(render_mode is None, "render_mode", render_mode, "None; render a single environment")
         modes = {mode.value: mode for mode in AutoresetMode}
-        known = isinstance(autoreset_mode, AutoresetMode) or autoreset_mode in modes
+        known = autoreset_mode in [*AutoresetMode, *modes]
         expect(known, "autoreset_mode", autoreset_mode, f"one of {', '.join(map(repr, modes))}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         for key, why in (("masks", "the action mask always comes along"), ("seed", "reset(seed=...) begins a stream")):

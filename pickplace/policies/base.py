@@ -73,8 +73,12 @@ class Policy(TensorDictModuleBase, ABC):
     def __init__(self, cell: CellSpec, masks: Sequence[str] = ()):
         super().__init__()
         self.check_cell(cell)
-        self.cell, self.masks = cell, tuple(masks)
+        self.cell = cell
         self.in_keys, self.out_keys = [*self.map_keys, *(f"{mask}_mask" for mask in masks)], ["logits"]
+
+    @property
+    def masks(self) -> tuple[str, ...]:
+        return tuple(key.removesuffix("_mask") for key in self.in_keys if key.endswith("_mask"))
 
     def check_cell(self, cell: CellSpec) -> None:
         """Refuse a cell that the policy does not serve, with a ``ValueError``."""
@@ -161,7 +165,7 @@ class Policy(TensorDictModuleBase, ABC):
         Returns:
             A sentence for each condition that is not met; the policy can be trained all the same.
         """
-        field = getattr(getattr(self, "network", None), "receptive_field", 0)
+        field = getattr(getattr(self, "network", None), "receptive_field", None) or 0
         side = self.cell.longest_side or self.cell.max_side
         found = [
             f"env.{key}={list(size)}: expected sides of at least {field} (receptive field {field}, eq. 3)."

@@ -63,7 +63,7 @@ class FootprintScorer(Policy):
 
     Attributes:
         mask: the mask that it needs in training.
-        network_class: makes the network.
+        network_class: makes the network; None: a subclass sets ``network`` itself.
 
     Raises:
         ValueError: without a mask.
@@ -72,14 +72,15 @@ class FootprintScorer(Policy):
     choice_key = "footprint"
     map_keys = MAP_KEYS
     mask: str
-    network_class: Callable[..., torch.nn.Module]
+    network_class: Callable[..., torch.nn.Module] | None = None
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = True, **network):
         expected = f"true with {type(self).__name__}; its choices are feasible ones"
         expect(mask_infeasible, "model.mask_infeasible", mask_infeasible, expected)
         super().__init__(cell, masks=(self.mask,))
         self.in_keys += item_keys(cell.bin_items)
-        self.network = self.network_class(**network)
+        if self.network_class is not None:
+            self.network = self.network_class(**network)
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
         """Return the scores of some footprints, float32 ``[M]``; a subclass may add what further terms tell.

@@ -210,8 +210,13 @@ def restore_critic(cfg: DictConfig, policy: Policy, state: dict, trained_env: di
         return RestoredCritic(critic.module, list(critic.in_keys), cfg.reward_scale)
     if "critic" not in state or cfg.model.critic is None:
         return None
-    sizes: dict[str, Any] = {key: tuple(trained_env[key]) for key in ("bin_size", "tote_size")}
-    make = partial(build, "model.critic", cfg.model.critic, cell=replace(policy.cell, reach=None, **sizes))
-    critic = checkpoint.restore(lambda: as_critic(make()), state["critic"], "critic").to(cfg.device).eval()
-    serves = sizes["tote_size"][:2] == policy.cell.tote_size[:2] or getattr(critic.module, "any_size", False)
-    return RestoredCritic(critic.module, list(critic.in_keys), cfg.reward_scale) if serves else None
+
+    def make():
+        return as_critic(build("model.critic", cfg.model.critic, cell=policy.cell))
+
+    with torch.device("meta"):
+        any_size = getattr(make().module, "any_size", False)
+    if tuple(trained_env["tote_size"][:2]) != policy.cell.tote_size[:2] and not any_size:
+        return None
+    critic = checkpoint.restore(make, state["critic"], "critic").to(cfg.device).eval()
+    return RestoredCritic(critic.module, list(critic.in_keys), cfg.reward_scale)

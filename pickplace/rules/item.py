@@ -1,7 +1,6 @@
 """Items in bins: their columns, and how an observation shows them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import torch
@@ -17,9 +16,7 @@ ALL_TURNS = 0b1111  # a bit for each quarter turn
 NO_LIMIT = 2**31 - 1  # grams
 
 
-@lru_cache(maxsize=8)
-def _defaults(device: torch.device) -> tuple[Tensor, ...]:
-    return torch.tensor([-1, ALL_TURNS, 0, NO_LIMIT], device=device).unbind()  # kind, turns, grams, max_load
+DEFAULTS = (-1, ALL_TURNS, 0, NO_LIMIT)  # of the columns kind, turns, grams and max_load
 
 
 class _Columns(NamedTuple):
@@ -55,8 +52,8 @@ class Item(_Columns):
     _table: Tensor | None = None  # of which the columns are views
 
     def __new__(cls, x, y, w, d, h, kind=None, turns=None, grams=None, max_load=None):
-        given = zip((kind, turns, grams, max_load), _defaults(x.device), strict=True)
-        rest = (default.expand_as(x) if part is None else part for part, default in given)
+        given = zip((kind, turns, grams, max_load), DEFAULTS, strict=True)
+        rest = (torch.full_like(x, default) if part is None else part for part, default in given)
         return super().__new__(cls, x, y, w, d, h, *rest)
 
     @classmethod

@@ -3,7 +3,7 @@
 Surfaces, see :func:`~pickplace.rules.state.surface_from`, are halved where heights are needed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cached_property, lru_cache, reduce
 
 import torch
@@ -32,11 +32,11 @@ def resting_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item
     """
     w, d = footprint_sizes(cell, item)
     if cell.max_side < LEAST_SIDE:
-        contacts: list[OnFootprints] = [OnFootprints(cell, surface, w, d)]
+        contacts: Iterable[OnFootprints] = [OnFootprints(cell, surface, w, d)]
     else:
         at_once = max(1, MAX_ENTRIES // (len(surface.unique()) * cell.num_places))
         parts = zip(surface.split(at_once), w.split(at_once, -1), d.split(at_once, -1), strict=True)
-        contacts = [LargeItems(cell, *part) for part in parts]
+        contacts = (LargeItems(cell, *part) for part in parts)  # one at a time, for the memory
     found = [(on.z, cell.support.stable(on)) for on in contacts]
     z, stable = found[0] if len(found) == 1 else (torch.cat(each, -1) for each in zip(*found, strict=True))
     top = z + item.h.to(z.dtype)

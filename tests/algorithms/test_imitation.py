@@ -114,6 +114,12 @@ def test_an_own_teacher_that_draws_gets_a_seed_of_each_batch(settings, states, m
     assert not torch.equal(ask(states[1], 3), ask(states[1], 4))
 
 
+def test_references_in_the_settings_of_a_teacher_are_followed(states, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "docs/examples/own_planner"))
+    start, _ = warm_start(config("own_planner.SoftDBL", temperature="${frames}"), env=states[0])
+    assert start._make_teacher(0).temperature == 100
+
+
 def test_imitation_learns_the_teachers_choices(states):
     env, td = states[0], states[1].clone()
     start, policy = warm_start(config(), env=env)

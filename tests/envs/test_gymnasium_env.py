@@ -232,6 +232,7 @@ def step(env, action):
         (lambda: make().reset(options={"tote_height": 1.5}), r"options\['tote_height'\]=1.5"),
         (lambda: vector().reset(options={"tote_height": [1, 2, 2]}), r"\[1, 2, 2\]"),
         (lambda: make().reset(options={"height": 1}), r"options\['height'\]: there is no such option"),
+        (lambda: make().reset(options={"reset_mask": [True]}), "expected tote_height alone"),
         (lambda: vector().reset(options={"reset_mask": [True]}), "reset_mask"),
         (
             lambda: vector().reset(options={"reset_mask": np.array([True, False])}),

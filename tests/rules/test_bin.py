@@ -206,3 +206,11 @@ def test_a_bin_for_one_item_takes_a_shorter_path_to_the_same_result(support):
     )
     assert same(placed, placed_two) and same(after[:2], after_two[:2]) and not after_two.items.exists.any()
     assert same(after.items, after_two.items.rows(first))
+
+
+def test_what_is_written_to_an_item_changes_no_other():
+    sides = torch.ones(3, dtype=torch.int64)
+    item = Item(sides, sides, sides, sides, sides)
+    item.turns[0], item.grams[:] = 1, 500
+    other = Item(sides, sides, sides, sides, sides)
+    assert other.turns.tolist() == [15, 15, 15] and other.grams.tolist() == [0, 0, 0]
