@@ -20,8 +20,8 @@ from pickplace.common.errors import unknown_key
 from pickplace.common.validate import refuse_if
 from pickplace.config.registry import REGISTRY, names_at
 
-#: Groups of which a preset's settings belong to the experiment, whichever option the command line chooses: all of
-#: them, and the plain ones that the option has, too, such as ``algo.lr``.
+#: Groups whose settings in a preset belong to the experiment, so another option on the command line keeps them. Of
+#: ``KEPT`` it keeps all, of ``SHARED`` the plain values that it has itself, such as ``algo.lr``.
 KEPT, SHARED = ("env", "evaluation"), ("algo", "model")
 
 #: Sweepers and launchers of Hydra that are optional extras.
@@ -73,7 +73,7 @@ def quoted(value) -> str:
 
 
 def compose_first_job(config_name: str, words: list[str]) -> DictConfig:
-    """Return Hydra's merge of a command line, ``hydra`` included; of a sweep, that of the first values."""
+    """Return Hydra's merge of a command line, with the node ``hydra``; for a sweep, the merge of its first job."""
     parse(words)  # an error of these names the word
     try:
         return hydra.compose(config_name, _first_of_sweep(words), return_hydra_config=True)
@@ -206,8 +206,9 @@ def _package_and_places(override: Override, search: list[str]) -> tuple[str | No
     """Return where an override changes the config.
 
     Returns:
-        The package of the group of which it chooses an option, ``_global_`` for presets; None if it sets a value. And
-        the places: the key of a value, and of an option its package, or its keys there if that is another group's.
+        The package of the group if it chooses an option, ``_global_`` for presets; None if it sets a value. Then the
+        places that it changes. For a value that is its key. For an option it is the group's package, or the option's
+        keys there if the package is another group's.
     """
     group, sources = override.key_or_group, GlobalHydra.instance().config_loader().get_sources()
     paths = [f"{group}/{name}" for name in _options(group, search)]  # all have the same package

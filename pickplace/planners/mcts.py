@@ -99,7 +99,7 @@ class MCTS(MapPlanner):
         return (first_action_reaching(cell, maps, chosen) if self.mask else chosen).to(observation["tote_depth"].device)
 
     def _search(self, state: State, mask: Tensor | None) -> Tensor:
-        """Return the most visited choice of each problem, int64 ``[N]``, of those of a mask or of all flat actions."""
+        """Return the most visited choice of each problem, int64 ``[N]``; without a mask it is a flat action."""
         roots = self._nodes(state, mask)
         refuse_if(
             self.simulations * len(roots) > MAX_NODES,

@@ -57,8 +57,8 @@ class MeasuredItem(NamedTuple):
 class MeasuredProblem(Problem):
     """Items and one tote, in metres; heights are counted in millimetres.
 
-    The pick cells are those of a grid along each item; no two items share an action. Where other items lie in the bin,
-    the robot's limits forbid the picks at which the end effector would touch one that may be as high.
+    Each item has a grid along it, with pick cells of its own, so that no two items share an action. The robot's limits
+    forbid picks at which the end effector would touch another item in the bin that may be as high.
     """
 
     parts: list[MeasuredItem]

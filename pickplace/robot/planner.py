@@ -286,7 +286,7 @@ def _list_alternatives(
     else:
         log_probs = policy.action_log_probs(observation)[0]
         tried = cell.num_actions if candidates == "all" else min(candidates, cell.num_actions)
-        # The same call as the planner's, so that ties agree.
+        # The planner makes the same call, so both break ties alike.
         actions = _with_chosen(log_probs.topk(tried).indices[:count], chosen)
         probability = log_probs[actions].exp()
     if not len(actions):

@@ -96,7 +96,7 @@ class CellSpec:
         one_of("refill", self.refill, ("each", "batch"))
         or_null(whole_number, "longest_side", self.longest_side)
         expect(isinstance(self.reach, Reach | None), "reach", self.reach, "a Reach, such as an Annulus, or None")
-        # Sizes each of which is possible, but whose products would fill the memory.
+        # Each size is possible alone, but these products would fill the memory.
         bin_size, tote_size = f"bin_size={[*self.bin_size]}", f"tote_size={[*self.tote_size]}"
         at_most(f"{bin_size}: the bin has", self.num_picks, "cells", MAX_CELLS)
         at_most(f"{tote_size}: the tote has", self.num_places, "cells", MAX_CELLS)

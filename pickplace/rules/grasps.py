@@ -88,7 +88,7 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | No
 def carry(
     cell: CellSpec, item: Item, action: Tensor, blocked: Tensor | None = None
 ) -> tuple[Grasp, Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Return where flat actions ``[A]`` bring items, of which there are ``[A]``, before anything is checked.
+    """Return where flat actions ``[A]`` bring the items ``[A]``, before anything is checked.
 
     ``blocked`` is as of :func:`grasp`.
 

@@ -49,7 +49,7 @@ class Item(_Columns):
         max_load: greatest mass that may rest on the item, grams.
     """
 
-    _table: Tensor | None = None  # of which the columns are views
+    _table: Tensor | None = None  # the columns are views of it, if there is one
 
     def __new__(cls, x, y, w, d, h, kind=None, turns=None, grams=None, max_load=None):
         given = zip((kind, turns, grams, max_load), DEFAULTS, strict=True)
@@ -58,7 +58,7 @@ class Item(_Columns):
 
     @classmethod
     def from_table(cls, table: Tensor) -> "Item":
-        """Return the items of a table ``[..., 9]``, of which they are views, or ``[..., 5]``: x, y, w, d and h only."""
+        """Return the items of a table ``[..., 9]``, as views of it, or ``[..., 5]`` with x, y, w, d and h alone."""
         columns = table.unbind(-1)
         if len(columns) < len(cls._fields):
             return cls(*columns)
@@ -68,7 +68,7 @@ class Item(_Columns):
 
     @property
     def table(self) -> Tensor:
-        """All columns, int64 ``[..., 9]``: the table of which the items were made, if there is one."""
+        """All columns, int64 ``[..., 9]``; no copy if the items were made from a table."""
         return torch.stack(self, -1) if self._table is None else self._table
 
     @property

@@ -17,7 +17,8 @@ class Contact:
     """The supporting cells of many items; each quantity is computed when a rule asks for it.
 
     Args:
-        surfaces: of each cell of a square at the footprint's minimum corner, row by row, int32 ``[S * S, ...]``.
+        surfaces: of each cell of a square at the footprint's minimum corner, row by row, int32: one tensor
+            ``[S * S, ...]``, or one for each cell.
         under: whether the item covers these cells, bool, broadcastable.
         z: the height on which the item rests, int32.
         w, d: the footprint's sides, broadcastable; 0 for no item.
@@ -114,7 +115,10 @@ class Contact:
         return (left + right >= 0) & (near_left + near_right >= 0)
 
     def in_hull(self) -> Tensor:
-        """Return which cells under the items lie inside the hull of the supporting cells, bool ``[S * S, N]``."""
+        """Return which cells under the items lie inside the hull of the supporting cells, bool ``[S * S, N]``.
+
+        Only for one footprint of each problem, with ``surfaces`` in one tensor.
+        """
         inside, supporting = self.under.clone(), (self.surfaces == self.supporting) & self.under
         for along in extents(self.side, inside.device):
             reached = torch.where(supporting, along[:, :, None], along.min() - 1).amax(1, keepdim=True)
