@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, settings
 
 from pickplace.evaluation import evaluate
 from pickplace.training import train
+from pickplace.training.trainer import Trainer
 
 # A busy machine is no fault of the code.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -60,6 +61,12 @@ def smoke_run(smoke, tmp_path_factory):
     smoke(run_dir, "evaluation_interval=512")
     assert sorted(path.name for path in (run_dir / "checkpoints").iterdir()) == ["best", "last", "previous"]
     return run_dir
+
+
+@pytest.fixture
+def no_report(monkeypatch):
+    """Trainings in this process draw no figures and write no report, which is more than half of a small one."""
+    monkeypatch.setattr(Trainer, "report", lambda trainer, stopped: None)
 
 
 @pytest.fixture(scope="module")

@@ -12,14 +12,12 @@ from pickplace.planners.lookahead import Lookahead
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.restore import restore_policy
 from pickplace.runs import checkpoint
-from pickplace.training.trainer import Trainer
 
 
-def test_the_same_training_twice(smoke, tmp_path, monkeypatch):
+def test_the_same_training_twice(smoke, tmp_path, no_report):
     """For PPO see test_resume: a run that is killed equals one that is not."""
     settings = ["algo=a2c", "curriculum=mixture", "warm_start=imitate", "planner@warm_start.teacher=random"]
     quick = ["total_frames=384", "warm_start.frames=128", "evaluation.episodes=2", "seed=3"]
-    monkeypatch.setattr(Trainer, "report", lambda self, stopped: None)
     for name in "ab":
         smoke(tmp_path / name, *quick, *settings)
     assert_same(tmp_path / "a", tmp_path / "b")

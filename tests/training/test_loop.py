@@ -152,12 +152,11 @@ def test_intervals_fire_for_any_batch_size():
     assert fired == [120, 210, 300]
 
 
-def test_a_run_counts_logs_scales_and_saves(smoke, tmp_path, monkeypatch):
+def test_a_run_counts_logs_scales_and_saves(smoke, tmp_path, monkeypatch, no_report):
     """The curriculum counts the batch at hand, ``best`` is the best validation, only the learner's rewards scale."""
     occupancies, rows, pushed = iter([0.5, 0.8, 0.6, 0.7, 0.1]), [], []
     interval = {"ci95_low": 0.0, "ci95_high": 1.0}
     monkeypatch.setattr(trainer, "validation_metrics", lambda _: {"occupancy": next(occupancies), **interval})
-    monkeypatch.setattr(Trainer, "report", lambda self, stopped: None)
     push = "update_policy_weights_"
     monkeypatch.setattr(ResumableCollector, push, lambda collector, weights: pushed.append(collector._frames))
     levels = ["curriculum=paper", "curriculum.advance.frames_per_level=256", "env.tote_size=[4,4,3]"]
