@@ -1,5 +1,7 @@
 """Commands and configs for tests: composed configs, trainings that are disturbed, and trainings in other processes."""
 
+import copy
+import functools
 import multiprocessing
 import os
 import sys
@@ -56,6 +58,11 @@ FORKSERVER.set_forkserver_preload(["pickplace.training.train", "pickplace.traini
 
 def composed(*overrides, name="train"):
     """Return the config that a command line makes."""
+    return copy.deepcopy(_composed(name, overrides))
+
+
+@functools.cache
+def _composed(name, overrides):
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return compose(name, list(overrides))
 

@@ -6,7 +6,10 @@ import shutil
 import sys
 
 import pytest
+import yaml
 from commands import composed
+from hydra._internal.hydra import Hydra
+from hydra.core.hydra_config import HydraConfig
 from hypothesis import HealthCheck, settings
 
 from pickplace.evaluation import evaluate
@@ -20,6 +23,9 @@ settings.load_profile("busy")
 # Workers of a collector are forked from a process that has imported torch, see commands.FORKSERVER.
 multiprocessing.set_start_method("forkserver", force=True)
 
+# Hydra's config files are read faster in C.
+yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
 MAINS = {"train": train.main, "evaluate": evaluate.main}
 
 
@@ -27,6 +33,8 @@ MAINS = {"train": train.main, "evaluate": evaluate.main}
 def run(monkeypatch, tmp_path, capsys):
     """Run a command in this process, in an empty folder; returns exit code, standard output and standard error."""
     monkeypatch.chdir(tmp_path)
+    # Hydra composes the whole config once more to know its mode, which the command has composed before.
+    monkeypatch.setattr(Hydra, "get_mode", lambda hydra, **given: HydraConfig.get().mode)
 
     def call(command, *arguments):
         monkeypatch.setattr(sys, "argv", [f"pickplace-{command}", *arguments])

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable
 from contextlib import nullcontext
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, cast
@@ -51,9 +52,10 @@ def parse(words: Iterable[str]) -> list[Override]:
         raise ValueError(f"{error.override!r}: expected <key>=<value> ({' '.join(reasons)}).") from error
 
 
+@cache
 def compose_plain(config_name: str) -> DictConfig:
-    """Return the config of a file in ``conf/``, outside a Hydra application too."""
-    with config_files():
+    """Return the config of a file in ``conf/``, outside a Hydra application too. It is shared: do not change it."""
+    with nullcontext() if GlobalHydra().is_initialized() else config_files():
         return hydra.compose(config_name)
 
 

@@ -71,7 +71,7 @@ class Command:
     def _checked(self, cfg: DictConfig) -> DictConfig:
         refuse_any(sorted(OmegaConf.missing_keys(cfg)), lambda key: f"{key}: no value; expected {key}=<value>.")
         keys = [str(key) for key in cfg if key not in self.from_checkpoint]
-        composition.refuse_unknown_keys(OmegaConf.masked_copy(cfg, keys), hydra.compose(self.config_name))
+        composition.refuse_unknown_keys(OmegaConf.masked_copy(cfg, keys), composition.compose_plain(self.config_name))
         return cfg
 
     def _start(self, words: list[str], flags: list[str], app: Callable[[DictConfig], Any] = lambda cfg: None) -> None:
