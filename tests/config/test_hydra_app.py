@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 import pickplace
 from pickplace.common.errors import sentence
 from pickplace.config.composition import apply_overrides
+from pickplace.evaluation import evaluate
 from pickplace.runs.folder import noted_command
 from pickplace.training import train
 
@@ -53,6 +54,7 @@ advance: {frames_per_level: 50_000}
 
 #: Command, its words, and parts of the sentence: a sample of each kind; tests of the parts hold the others.
 BAD = [
+    ("train", "algo.gamma=1.5", ["algo.gamma=1.5", "between 0 and 1"]),
     # keys and values that Hydra or the config does not know
     ("train", "algo.gama=0.9", ["algo.gama", "'gamma'"]),
     ("train", "+env.foo=1", ["env.foo", "no key 'foo'"]),
@@ -71,36 +73,17 @@ BAD = [
     ("train", "seed=1,2", ["seed=1,2", "--multirun"]),
     ("train", "curriculum=null", ["curriculum=null", "adaptive", "paper"]),
     ("train", "curriculum.advance=foo", ["curriculum.advance='foo'", "curriculum/advance=threshold"]),
-    ("train", "model.actor._target_=fcn", ["model.actor._target_=fcn", "'fcn4d'"]),
-    ("train", "model.actor._target_=os.system", ["model.actor", "command"]),
-    ("train", "trust=[os]", ["trust='os'", "modules of your own"]),
     ("train", "planner=random", ["planner._target_='random'", "expected policy"]),
     # sweeps, before their first run
     ("train", "-m algo.gama=0.9,1", ["algo.gama", "'gamma'"]),
     ("train", "-m curriculum=none,mien", ["curriculum/mien", "adaptive"]),
-    # cells, items, models and curricula
-    ("train", "env.tote_size=[6,6,-5]", ["tote_size=[6, 6, -5]", "3 whole numbers >= 1"]),
-    ("train", "env.tote_size=[5,5,3000000000]", ["3000000000", "<= 2,000"]),
-    ("train", "items.kinds=[[1,1,9]]", ["item 1x1x9", "tote_size[2]=5"]),
-    ("train", "items=recorded items.path=nowhere.csv", ["items.path='nowhere.csv'", "no such file"]),
+    # cells and items
     ("train", "items=recorded", ["items.path", "no value"]),
     ("train", "reach=table", ["env.reach.path", "no value"]),
-    ("train", "reach=table env.reach.path=nowhere.csv", ["reach.path='nowhere.csv'", "no such file"]),
     ("train", "env.reach.radii=[1,2]", ["env.reach.radii: env.reach is null", "an option that"]),
     ("train", "reach=annulus env.reach.radi=[1,2]", ["env.reach.radi", "'radii'"]),
-    ("train", "reach=annulus env.reach.radii=[0,4]", ["item 1x1x1 at x=0, y=0", "reach=Annulus(radii=(0.0, 4.0)"]),
-    ("train", "reach=annulus env.reach.radii=[4,0]", ["reach.radii=[4.0, 0.0]", "least <= greatest"]),
     ("train", "env.reach=far", ["reach='far'", "expected a Reach"]),
     ("evaluate", "planner=joint_dbl env.reach.radii=[1,2]", ["reach={'radii': [1, 2]}", "expected a Reach"]),
-    ("train", "model=fcn4d env.tote_size=[4,4,1]", ["tote_size=[4, 4, 1]", "eq. 3"]),
-    ("train", "curriculum.start_height=9", ["start_height=9"]),
-    (
-        "train",
-        "experiment=smoke warm_start=imitate planner@warm_start.teacher=mcts warm_start.teacher.simulations=100000000",
-        ["warm_start.teacher.simulations=100000000", "<= "],
-    ),
-    ("train", "collector=multi_sync collector.workers=3", ["collector.workers=3", "divisor"]),
-    ("train", "algo=a2c env.num_envs=1 rollout_length=1", ["algo.normalize_advantage=True", "one frame"]),
     # resume
     ("train", "resume=nowhere", ["nowhere'", "run folder"]),
     ("train", "resume=nowhere -m", ["resume", "flags"]),
@@ -112,83 +95,121 @@ BAD = [
     ("evaluate", "planner=joint_dbl compare=nowhere.json", ["compare='nowhere.json'", "evaluation.json"]),
     ("evaluate", "planner=joint_dbl items.widht=1", ["items.widht", "no key 'widht'", "'weights'"]),
     ("evaluate", "checkpoint=pretrained/mixed items.kinds=[[1,1,1]]", ["items.kinds", "width, depth, height"]),
+]
+
+#: The same for values that the command hands on; for those of every setting see test_bad_settings.
+BAD_VALUES = [
+    ("train", "model.actor._target_=fcn", ["model.actor._target_=fcn", "'fcn4d'"]),
+    ("train", "model.actor._target_=os.system", ["model.actor", "command"]),
+    ("train", "trust=[os]", ["trust='os'", "modules of your own"]),
+    ("train", "env.tote_size=[6,6,-5]", ["tote_size=[6, 6, -5]", "3 whole numbers >= 1"]),
+    ("train", "env.tote_size=[5,5,3000000000]", ["3000000000", "<= 2,000"]),
+    ("train", "items.kinds=[[1,1,9]]", ["item 1x1x9", "tote_size[2]=5"]),
+    ("train", "items=recorded items.path=nowhere.csv", ["items.path='nowhere.csv'", "no such file"]),
+    ("train", "reach=table env.reach.path=nowhere.csv", ["reach.path='nowhere.csv'", "no such file"]),
+    ("train", "reach=annulus env.reach.radii=[0,4]", ["item 1x1x1 at x=0, y=0", "reach=Annulus(radii=(0.0, 4.0)"]),
+    ("train", "reach=annulus env.reach.radii=[4,0]", ["reach.radii=[4.0, 0.0]", "least <= greatest"]),
+    ("train", "model=fcn4d env.tote_size=[4,4,1]", ["tote_size=[4, 4, 1]", "eq. 3"]),
+    ("train", "curriculum.start_height=9", ["start_height=9"]),
+    (
+        "train",
+        "experiment=smoke warm_start=imitate planner@warm_start.teacher=mcts warm_start.teacher.simulations=100000000",
+        ["warm_start.teacher.simulations=100000000", "<= "],
+    ),
+    ("train", "collector=multi_sync collector.workers=3", ["collector.workers=3", "divisor"]),
+    ("train", "algo=a2c env.num_envs=1 rollout_length=1", ["algo.normalize_advantage=True", "one frame"]),
     ("evaluate", "planner=joint_dbl evaluation.stream=exam", ["evaluation.stream='exam'", "'validation'"]),
     ("evaluate", "planner=joint_dbl evaluation.latency_decisions=x", ["latency_decisions='x'", ">= 0"]),
-    # values; for those of every setting see test_bad_settings
     ("train", "threads=10000000000", ["threads=10000000000", "<= 1"]),
-    ("train", "algo.gamma=1.5", ["algo.gamma=1.5", "between 0 and 1"]),
     ("train", "device=tpu", ["device=tpu", "cpu"]),
     ("train", "algo._target_=dqn", ["algo._target_=dqn", "expected one of ppo, a2c, sampled_ppo, td"]),
     ("train", "evaluation.stream=test", ["evaluation.stream='test'", "validation"]),
 ]
 
 
-#: Words of the command line, and of the resulting config: a part, and what it is.
+#: Words of the command line, and parts of the resulting config by their keys.
 OWN_VALUES = [
     # a config file of the user's, written for threshold
-    ("curriculum=careful curriculum/advance=plateau", "curriculum.advance", PLATEAU),
-    ("curriculum=careful curriculum/advance=plateau curriculum.advance.window=9", "curriculum.advance.window", 9),
-    ("curriculum=careful curriculum/advance=plateau", "curriculum.sample.share", 0.33),
-    ("curriculum=careful curriculum/advance=threshold", "curriculum.advance.window", 200),
-    ("curriculum=careful", "curriculum.advance.window", 200),
+    ("curriculum=careful curriculum/advance=plateau", {"curriculum.advance": PLATEAU, "curriculum.sample.share": 0.33}),
+    ("curriculum=careful curriculum/advance=plateau curriculum.advance.window=9", {"curriculum.advance.window": 9}),
+    ("curriculum=careful curriculum/advance=threshold", {"curriculum.advance.window": 200}),
+    ("curriculum=careful", {"curriculum.advance.window": 200}),
     # presets
-    ("experiment=smoke model=fcn4d", "model.actor.filters", 64),
-    ("experiment=smoke model=fcn4d model.actor={filters:4}", "model.actor.filters", 4),
-    ("experiment=smoke model=fcn4d", "model.critic.hidden", 256),
-    ("experiment=smoke model=fcn_grasp", "model.actor.filters", 8),
-    ("experiment=smoke env=deep_bin", "env.tote_size", [4, 4, 1]),
-    ("experiment=mixed warm_start=none", "warm_start.frames", 0),
-    ("experiment=mixed planner@warm_start.teacher=mcts", "warm_start.frames", 100_000),
-    ("experiment=mine", "curriculum.advance.window", 7),
+    ("experiment=smoke model=fcn4d", {"model.actor.filters": 64, "model.critic.hidden": 256}),
+    ("experiment=smoke model=fcn4d model.actor={filters:4}", {"model.actor.filters": 4}),
+    ("experiment=smoke model=fcn_grasp", {"model.actor.filters": 8}),
+    ("experiment=smoke env=deep_bin", {"env.tote_size": [4, 4, 1]}),
+    ("experiment=mixed warm_start=none", {"warm_start.frames": 0}),
+    ("experiment=mixed planner@warm_start.teacher=mcts", {"warm_start.frames": 100_000}),
+    ("experiment=mine", {"curriculum.advance.window": 7}),
     # other options with the same _target_
-    ("experiment=mine curriculum=mixture", "curriculum.advance.window", 400),
-    ("experiment=mine curriculum=mixture curriculum.advance.window=9", "curriculum.advance.window", 9),
-    ("curriculum=slow curriculum/advance=paper", "curriculum.advance.frames_per_level", 5_000_000),
-    ("curriculum=slow curriculum/advance=frames", "curriculum.advance.frames_per_level", 50_000),
-    ("experiment=smoke model=individual_grasp", "model.critic.filters", 32),
-    ("experiment=wide model=fcn4d_noclip", "model.actor.filters", 64),
-    ("experiment=wide model=fcn4d", "model.actor.filters", 7),
-    ("experiment=wide items=tall", "items.width", [1, 2]),
-    ("experiment=wide items=mixed", "items.width", [1, 1]),
-    ("experiment=wide callbacks=[early_stopping]", "callbacks.early_stopping.patience", 5),
-    ("curriculum=careful curriculum.sample.share='${..advance.occupancy}'", "curriculum.sample.share", 0.85),
-    ("experiment=mine curriculum/advance=plateau", "curriculum.advance", PLATEAU),
-    ("experiment=mine curriculum=paper", "curriculum.advance", {"_target_": "frames", "frames_per_level": 5_000_000}),
-    ("experiment=mine curriculum=careful curriculum/advance=plateau", "curriculum.advance", PLATEAU),
-    ("experiment=mine items=tall", "items.kinds", None),
-    ("experiment=mine algo=a2c", "algo.lr", 0.5),
-    ("experiment=mine callbacks=early_stopping", "callbacks.early_stopping.patience", 3),
-    ("experiment=mine callbacks=none", "callbacks", {}),
+    ("experiment=mine curriculum=mixture", {"curriculum.advance.window": 400}),
+    ("experiment=mine curriculum=mixture curriculum.advance.window=9", {"curriculum.advance.window": 9}),
+    ("curriculum=slow curriculum/advance=paper", {"curriculum.advance.frames_per_level": 5_000_000}),
+    ("curriculum=slow curriculum/advance=frames", {"curriculum.advance.frames_per_level": 50_000}),
+    ("experiment=smoke model=individual_grasp", {"model.critic.filters": 32}),
+    ("experiment=wide model=fcn4d_noclip", {"model.actor.filters": 64}),
+    ("experiment=wide model=fcn4d", {"model.actor.filters": 7}),
+    ("experiment=wide items=tall", {"items.width": [1, 2]}),
+    ("experiment=wide items=mixed", {"items.width": [1, 1]}),
+    ("experiment=wide callbacks=[early_stopping]", {"callbacks.early_stopping.patience": 5}),
+    ("curriculum=careful curriculum.sample.share='${..advance.occupancy}'", {"curriculum.sample.share": 0.85}),
+    ("experiment=mine curriculum/advance=plateau", {"curriculum.advance": PLATEAU}),
+    ("experiment=mine curriculum=paper", {"curriculum.advance": {"_target_": "frames", "frames_per_level": 5_000_000}}),
+    ("experiment=mine curriculum=careful curriculum/advance=plateau", {"curriculum.advance": PLATEAU}),
+    ("experiment=mine items=tall", {"items.kinds": None}),
+    ("experiment=mine algo=a2c", {"algo.lr": 0.5}),
+    ("experiment=mine callbacks=early_stopping", {"callbacks.early_stopping.patience": 3}),
+    ("experiment=mine callbacks=none", {"callbacks": {}}),
     # groups that set a part of env
-    ("experiment=smoke", "env.reach", None),
-    ("experiment=far", "env.reach.radii", [0, 50]),
-    ("experiment=far reach=annulus", "env.reach.radii", [0, 50]),
-    ("experiment=far reach=annulus env.reach.radii=[1,2]", "env.reach.radii", [1, 2]),
-    ("experiment=far reach=everywhere", "env.reach", None),
-    ("experiment=far reach=table env.reach.path=a.csv", "env.reach", {"_target_": "table", "path": "a.csv"}),
-    ("env=own_cell", "env.reach.radii", [0, 20]),
-    ("env=own_cell env.reach.radii=[1,2]", "env.reach.radii", [1, 2]),
-    ("env=own_cell reach=everywhere", "env.reach", None),
-    ("env=own_cell reach=annulus", "env.reach.radii", [4.6, 9.6]),
-    ("reach=annulus env.reach.radii=[1,2] env.tote_size=[7,7,5]", "env.reach.radii", [1, 2]),
-    ("experiment=mine ~curriculum.advance.window curriculum/advance=plateau", "curriculum.advance.window", None),
+    ("experiment=smoke", {"env.reach": None}),
+    ("experiment=far", {"env.reach.radii": [0, 50]}),
+    ("experiment=far reach=annulus", {"env.reach.radii": [0, 50]}),
+    ("experiment=far reach=annulus env.reach.radii=[1,2]", {"env.reach.radii": [1, 2]}),
+    ("experiment=far reach=everywhere", {"env.reach": None}),
+    ("experiment=far reach=table env.reach.path=a.csv", {"env.reach": {"_target_": "table", "path": "a.csv"}}),
+    ("env=own_cell", {"env.reach.radii": [0, 20]}),
+    ("env=own_cell env.reach.radii=[1,2]", {"env.reach.radii": [1, 2]}),
+    ("env=own_cell reach=everywhere", {"env.reach": None}),
+    ("env=own_cell reach=annulus", {"env.reach.radii": [4.6, 9.6]}),
+    ("reach=annulus env.reach.radii=[1,2] env.tote_size=[7,7,5]", {"env.reach.radii": [1, 2]}),
+    ("experiment=mine ~curriculum.advance.window curriculum/advance=plateau", {"curriculum.advance.window": None}),
 ]
 
 
-@pytest.mark.parametrize(("words", "key", "expected"), OWN_VALUES)
-def test_an_option_chosen_on_the_command_line_has_its_own_values(run, tmp_path, monkeypatch, words, key, expected):
-    """In the config that the training gets, in Hydra's note on it, and in what ``--cfg job`` prints."""
+@pytest.fixture
+def search(tmp_path):
+    """Returns the override that adds folders with config files of the user's."""
     files = {"experiment/mine": MINE, "experiment/wide": WIDE, "experiment/far": FAR}
     for name, text in {**files, "env/own_cell": OWN_CELL, "curriculum/slow": SLOW}.items():
         (tmp_path / "conf" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "conf" / f"{name}.yaml").write_text(text)
-    search = f"hydra.searchpath=[file://{tmp_path}/conf,file://{CURRICULA}]"
+    return f"hydra.searchpath=[file://{tmp_path}/conf,file://{CURRICULA}]"
+
+
+@pytest.mark.parametrize(("words", "expected"), OWN_VALUES)
+def test_an_option_chosen_on_the_command_line_has_its_own_values(run, search, words, expected):
+    code, out, err = run("train", search, *words.split(), "--cfg", "job")
+    assert code == 0, err
+    cfg = OmegaConf.create(out)
+    assert {key: OmegaConf.select(cfg, key) for key in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("words", "key", "expected"),
+    [
+        ("curriculum=careful curriculum/advance=plateau", "curriculum.advance", PLATEAU),
+        ("experiment=mine callbacks=none", "callbacks", {}),
+        ("experiment=far reach=everywhere env.tote_size=[7,7,5]", "env.reach", None),
+    ],
+)
+def test_own_values_are_trained_with_and_noted(run, search, monkeypatch, words, key, expected):
+    """In the config that the training gets, and in Hydra's note on it."""
     given = []
     monkeypatch.setattr(train, "train", lambda cfg, run_dir: given.append(cfg))
     code, _, err = run("train", search, *words.split(), "hydra.run.dir=run")
     assert code == 0, err
-    _, out, _ = run("train", search, *words.split(), "--cfg", "job")
-    for cfg in (given[0], OmegaConf.load("run/.hydra/config.yaml"), OmegaConf.create(out)):
+    for cfg in (given[0], OmegaConf.load("run/.hydra/config.yaml")):
         assert OmegaConf.select(cfg, key) == expected
 
 
@@ -234,6 +255,17 @@ def test_bad_input_is_one_sentence(run, tmp_path, command, words, expected):
         assert part in lines[0]
     folders = {"outputs", "outputs/train", "outputs/evaluate", "outputs/sweep"}
     assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} <= folders
+
+
+@pytest.mark.parametrize(("command", "words", "expected"), BAD_VALUES)
+def test_a_bad_value_is_one_sentence(tmp_path, command, words, expected):
+    task = {"train": train.train, "evaluate": evaluate.run}[command]
+    with pytest.raises(ValueError) as caught:
+        task(composed(*words.split(), name=command), tmp_path)
+    assert "\n" not in str(caught.value)
+    for part in expected:
+        assert part in str(caught.value)
+    assert {path.name for path in tmp_path.iterdir()} <= {".lock"}
 
 
 def test_bad_files_are_named(run, tmp_path):
