@@ -119,10 +119,15 @@ class Training:
         self.process.join()
 
 
-def _train(overrides, output):
+def write_to(folder):
+    """Let this process write its standard output and error to files ``stdout`` and ``stderr``."""
     for number, name in ((1, "stdout"), (2, "stderr")):
-        os.dup2(os.open(output / name, os.O_WRONLY | os.O_CREAT), number)
+        os.dup2(os.open(folder / name, os.O_WRONLY | os.O_CREAT), number)
     sys.stdout, sys.stderr = (os.fdopen(number, "w", buffering=1) for number in (1, 2))
+
+
+def _train(overrides, output):
+    write_to(output)
     multiprocessing.set_start_method("spawn", force=True)  # as in a process that nobody forked
     from pickplace.training import train
 

@@ -4,6 +4,7 @@ import http.client
 import json
 import logging
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -17,8 +18,9 @@ from pathlib import Path
 
 import pytest
 from browser import errors, wait_until
+from commands import FORKSERVER, write_to
 
-from pickplace import Planner, Scene, __version__
+from pickplace import Planner, Scene, __version__, cli
 from pickplace.serve import serve
 
 pytest.importorskip("fastapi")
@@ -114,25 +116,28 @@ def test_a_plan_is_that_of_the_planner(client):
     assert status == 200 and reply["status"] == "ok" and reply["box"]["yaw"] == pytest.approx(20)
 
 
-def test_the_command_listens_until_ctrl_c():
-    """In a process of its own, with a token from its environment."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", serve.TOKEN: TOKEN}
-    code = (
-        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "from pickplace.cli import serve; sys.argv[0] = 'pickplace-serve'; serve()"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, "--planner", "joint_dbl", "--port", "0", "--threads", "1"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
-    )  # fmt: skip
+def serve_forever(output):
+    """Run the command in this process, with a token."""
+    write_to(output)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.environ[serve.TOKEN] = TOKEN
+    sys.argv = ["pickplace-serve", "--planner", "joint_dbl", "--port", "0", "--threads", "1"]
+    cli.serve()
+
+
+def test_the_command_listens_until_ctrl_c(tmp_path):
+    process, out = FORKSERVER.Process(target=serve_forever, args=(tmp_path,)), tmp_path / "stdout"
+    process.start()
     try:
-        line = process.stdout.readline()
-        assert line.startswith("Listening at http://"), line + process.stderr.read()
-        client = Client(int(line.partition("; ")[0].rpartition(":")[2]))
+        wait_for(lambda: out.exists() and out.read_text().endswith("Ctrl-C ends it.\n"), seconds=60)
+        client = Client(
+            int(re.fullmatch(r"Listening at http://127\.0\.0\.1:(\d+); Ctrl-C ends it\.\n", out.read_text())[1])
+        )
         assert client.plan(GRID)[0] == 401
         assert client.plan(GRID, Authorization=f"Bearer {TOKEN}")[2]["status"] == "ok"
-        process.send_signal(signal.SIGINT)
-        assert (*process.communicate(timeout=30), process.returncode) == ("", "", 130)
+        os.kill(process.pid, signal.SIGINT)
+        process.join(30)
+        assert (process.exitcode, (tmp_path / "stderr").read_text()) == (130, "")
     finally:
         process.kill()
 
