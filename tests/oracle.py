@@ -6,8 +6,10 @@ and a flat action is `(((x_bin * D_B + y_bin) * W_T + x_tote) * D_T + y_tote) * 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import cached_property
 from itertools import chain, combinations_with_replacement, product
 from math import dist
 
@@ -45,6 +47,18 @@ class Rules:
     def num_actions(self) -> int:
         (bin_w, bin_d, _), (tote_w, tote_d, _) = self.bin_size, self.tote_size
         return bin_w * bin_d * tote_w * tote_d * self.rotations
+
+    @cached_property
+    def cup_cells(self) -> list[Pair]:
+        """The cells of the cup, from the effector's minimum corner."""
+        return shape_cells(self.cup, self.effector_size, self.cup_size or self.effector_size)
+
+    @cached_property
+    def body_cells(self) -> list[list[Pair]]:
+        """The cells of the body for each rotation, from the turned effector's minimum corner."""
+        size = self.effector_size
+        body = shape_cells(self.body, size, size)
+        return [[rotate(r, size, cell, (1, 1))[1] for cell in body] for r in range(self.rotations)]
 
     def split(self, action: int) -> tuple[Pair, Pair, int]:
         """The pick cell, the place cell and the rotation of a flat action."""
@@ -166,6 +180,7 @@ class Oracle:
     volume: int = 0
     bearing: Grid = field(default_factory=list)
     others: list[tuple[Triple, Pair]] = field(default_factory=list)
+    picks: dict[Pair, tuple[int, int | None]] = field(default_factory=dict)  # those that were tried: they come up often
 
     def __post_init__(self):
         wide, deep, _ = self.rules.tote_size
@@ -187,10 +202,19 @@ class Oracle:
 
     def taken(self, action: int) -> int | None:
         """The number of the item that an action's pick takes: the highest that the cup grips; of equals the first."""
+        return self.try_pick(self.rules.split(action)[0])[1]
+
+    def try_pick(self, pick: Pair) -> tuple[int, int | None]:
+        """The failure code of a pick, and the number of the item that it takes."""
+        if pick not in self.picks:
+            number = self._gripped(pick)
+            self.picks[pick] = PICK_MISS if number is None else self._lift(pick, number), number
+        return self.picks[pick]
+
+    def _gripped(self, pick: Pair) -> int | None:
         rules = self.rules
-        size = rules.effector_size
-        corner = corner_for(rules.split(action)[0], size)
-        cup = [(corner[0] + x, corner[1] + y) for x, y in shape_cells(rules.cup, size, rules.cup_size or size)]
+        corner = corner_for(pick, rules.effector_size)
+        cup = [(corner[0] + x, corner[1] + y) for x, y in rules.cup_cells]
         best = None
         for number, (item, position) in enumerate(self.contents):
             under = cells(position, item[:2])
@@ -204,6 +228,18 @@ class Oracle:
                 best = number
         return best
 
+    def _lift(self, pick: Pair, number: int) -> int:
+        """The failure code of taking an item that is gripped."""
+        (w, d, h), position = self.contents[number]
+        corner, grid, item = corner_for(pick, self.rules.effector_size), self.bin_depth(), cells(position, (w, d))
+        for x, y in ((corner[0] + x, corner[1] + y) for x, y in self.rules.body_cells[0]):
+            if not inside((x, y), grid):
+                if self.rules.bin_size[2] > h:
+                    return BIN_COLLISION
+            elif (x, y) not in item and grid[x][y] >= h:  # another item that is as high
+                return BIN_COLLISION
+        return SUCCESS
+
     def tote_depth(self) -> Grid:
         """Remaining height, `[W_T][D_T]`."""
         return [[self.tote_height - height for height in column] for column in self.heights]
@@ -216,28 +252,16 @@ class Oracle:
         """The failure code of an action and, on success only, the heights it leaves."""
         rules, heights = self.rules, self.heights
         pick, place, r = rules.split(action)
-        number = self.taken(action)
-        if number is None:
-            return PICK_MISS, None
+        failure, number = self.try_pick(pick)
+        if failure != SUCCESS:
+            return failure, None
         (w, d, h), position = self.contents[number]
 
-        size = rules.effector_size
-        body = shape_cells(rules.body, size, size)
-        effector_corner = corner_for(pick, size)
-        effector = [(effector_corner[0] + x, effector_corner[1] + y) for x, y in body]
-        grid, item = self.bin_depth(), cells(position, (w, d))
-        for x, y in effector:
-            if not inside((x, y), grid):
-                if rules.bin_size[2] > h:
-                    return BIN_COLLISION, None
-            elif (x, y) not in item and grid[x][y] >= h:  # another item that is as high
-                return BIN_COLLISION, None
-
+        effector_corner = corner_for(pick, rules.effector_size)
         offset = position[0] - effector_corner[0], position[1] - effector_corner[1]
         effector_size, offset, size = rotate(r, rules.effector_size, offset, (w, d))
         effector_corner = corner_for(place, effector_size)
-        turned = [rotate(r, rules.effector_size, cell, (1, 1))[1] for cell in body]
-        effector = [(effector_corner[0] + x, effector_corner[1] + y) for x, y in turned]
+        effector = [(effector_corner[0] + x, effector_corner[1] + y) for x, y in rules.body_cells[r]]
         footprint = cells((effector_corner[0] + offset[0], effector_corner[1] + offset[1]), size)
         if not all(inside(cell, heights) for cell in footprint):
             return TOTE_COLLISION, None
@@ -291,7 +315,15 @@ class Oracle:
 
     def has_feasible_action(self, try_first=()) -> bool:
         """Whether any action succeeds; `try_first` only saves time."""
-        return any(self.try_action(action)[0] == SUCCESS for action in chain(try_first, range(self.rules.num_actions)))
+        return any(self.try_action(action)[0] == SUCCESS for action in chain(try_first, self.lifting_actions()))
+
+    def lifting_actions(self) -> Iterator[int]:
+        """The actions of which the pick succeeds."""
+        picks = self.rules.bin_size[0] * self.rules.bin_size[1]
+        each = self.rules.num_actions // picks
+        for number in range(picks):
+            if self.try_pick(divmod(number, self.rules.bin_size[1]))[0] == SUCCESS:
+                yield from range(number * each, (number + 1) * each)
 
     def step(
         self, action: int, next_item: Triple, next_position: Pair, try_first=(), others=()
@@ -308,7 +340,7 @@ class Oracle:
         reward = w * d * h
         self.bearing = self.bearing_after(action)
         self.heights, self.volume = after, self.volume + reward
-        self.item, self.position, self.others = next_item, next_position, list(others)
+        self.item, self.position, self.others, self.picks = next_item, next_position, list(others), {}
         stuck = not self.has_feasible_action(try_first)
         return reward, stuck, STUCK if stuck else SUCCESS
 
