@@ -22,11 +22,13 @@ from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
 from pickplace.training.trainer import Trainer
 
-ITERATION = 8 * 16  # frames: env.num_envs * rollout_length of experiment=smoke
+ITERATION = 8 * 8  # frames of a batch of SETTINGS: env.num_envs * rollout_length
 
 #: A small training that draws in all its parts, and saves and validates at intervals that do not meet.
 SETTINGS = [
     "experiment=smoke",
+    "rollout_length=8",
+    "algo.minibatch_size=32",
     "env.tote_size=[5,5,3]",
     "algo=sampled_ppo",
     "algo.samples=2",
@@ -51,9 +53,12 @@ TINY = [
     "env.tote_size=[6,6,2]", "model.actor.filters=8", "model.critic.filters=8", "model.critic.hidden=8", "threads=1",
 ]  # fmt: skip
 
-#: Processes are forked from one that has imported torch and has not used it, which saves seconds for each.
+#: Processes are forked from one that has imported torch and more and has not used it, which saves seconds for each.
 FORKSERVER = multiprocessing.get_context("forkserver")
-FORKSERVER.set_forkserver_preload(["pickplace.training.train", "pickplace.training.report"])
+FORKSERVER.set_forkserver_preload([
+    "pickplace.training.train", "scipy.stats", "matplotlib.figure", "matplotlib.backends.backend_agg",
+    "torchrl.objectives.value",
+])  # fmt: skip
 
 
 def composed(*overrides, name="train"):

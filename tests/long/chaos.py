@@ -69,10 +69,13 @@ def kill_once(run_dir: Path, settings: list[str], draw: random.Random) -> str:
     return "saving" if is_saving() else "starting" if aim == "starting" else "learning"
 
 
-def compare(folder: Path, kills: int, collector: str, seed: int) -> dict[str, int]:
-    """Check that a run that is killed equals one that is not; return how often it was doing what when killed."""
+def compare(folder: Path, kills: int, collector: str, seed: int, settings: list[str] = SETTINGS) -> dict[str, int]:
+    """Check that a run that is killed equals one that is not; return how often it was doing what when killed.
+
+    Batches of ``settings`` have as many frames as those of ``SETTINGS``.
+    """
     replaced = ("total_frames", "checkpoint_interval", "evaluation_interval")
-    settings = [word for word in SETTINGS if not word.startswith(replaced)]
+    settings = [word for word in settings if not word.startswith(replaced)]
     settings += [f"collector={collector}", f"total_frames={(3 * kills + 10) * ITERATION}"]
     settings += [f"checkpoint_interval={ITERATION}", f"evaluation_interval={30 * ITERATION}"]
     quiet, killed = folder / "quiet", folder / "killed"

@@ -19,7 +19,7 @@ from pickplace import PickPlaceEnv
 from pickplace.config.allowlist import saved_form
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.runs import checkpoint
-from pickplace.runs.folder import claim
+from pickplace.runs.folder import OccupiedError, claim, note_failure
 from pickplace.runs.loggers import read_csv
 from pickplace.runs.resume import checkpoint_config, resumed_config
 from pickplace.training.train import resume_run, train
@@ -56,8 +56,7 @@ def undisturbed(tmp_path_factory):
 
 
 @pytest.mark.parametrize("collector", ["single", "multi_sync"])
-def test_a_run_that_is_killed_and_stopped_equals_an_undisturbed_one(collector, undisturbed, tmp_path, caplog):
-    caplog.set_level(logging.INFO)
+def test_a_run_that_is_killed_and_stopped_equals_an_undisturbed_one(collector, undisturbed, tmp_path, no_report):
     whole, killed = undisturbed(collector)
     run_dir = shutil.copytree(killed, tmp_path / "run")
     assert saved_frames(run_dir) == 3 * ITERATION  # two more iterations are lost
@@ -69,7 +68,6 @@ def test_a_run_that_is_killed_and_stopped_equals_an_undisturbed_one(collector, u
 
     with after_batch(7, stop), pytest.raises(KeyboardInterrupt, match="15"):
         resume_run([f"resume={run_dir}"])
-    assert f"continue with: pickplace-train resume={run_dir}" in caplog.text
     assert read_csv(run_dir / "metrics.csv")[-1]["frames"] == saved_frames(run_dir) == 7 * ITERATION
     resume_run([f"resume={run_dir}"])
     assert_same(whole, run_dir)
@@ -80,17 +78,18 @@ def test_a_run_that_is_killed_and_stopped_equals_an_undisturbed_one(collector, u
 
 
 @pytest.mark.parametrize("refill", ["each", "batch"])
-def test_several_items_in_the_bin_are_resumed_exactly(refill, tmp_path):
+def test_several_items_in_the_bin_are_resumed_exactly(refill, tmp_path, no_report):
     several = ["env.bin_items=3", "env.bin_size=[5,5,1]", f"env.refill={refill}", "algo.advantages=gae"]
+    several += [f"warm_start.frames={2 * ITERATION}", f"warm_start.critic_frames={ITERATION}"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     whole.mkdir()
-    with after_batch(5, lambda _: shutil.copytree(whole, killed)):
-        train(composed(*SETTINGS, *several), whole)
+    with after_batch(4, lambda _: shutil.copytree(whole, killed)):
+        train(composed(*SETTINGS, *several, f"total_frames={6 * ITERATION}"), whole)
     resume_run([f"resume={killed}"])
     assert_same(whole, killed)
 
 
-def test_a_run_killed_before_its_first_last_resumes_from_best(undisturbed, tmp_path):
+def test_a_run_killed_before_its_first_last_resumes_from_best(undisturbed, tmp_path, no_report):
     whole, killed = undisturbed("single")
     run_dir = shutil.copytree(killed, tmp_path / "run")
     shutil.rmtree(run_dir / "checkpoints/last")
@@ -99,23 +98,28 @@ def test_a_run_killed_before_its_first_last_resumes_from_best(undisturbed, tmp_p
 
 
 def test_chaos_in_short(tmp_path):
-    """``make chaos`` kills it a hundred times, with either collector."""
-    assert sum(chaos.compare(tmp_path, 4, "single", 0).values()) == 4
+    """While it starts and while it saves; ``make chaos`` kills it a hundred times, with either collector."""
+    settings = ["experiment=smoke", "rollout_length=8", "evaluation.episodes=2", "threads=1"]
+    assert sum(chaos.compare(tmp_path, 2, "single", 2, settings).values()) == 2
 
 
-def test_a_new_run_in_a_used_folder_is_refused(run, undisturbed):
+def test_a_new_run_in_a_used_folder_is_refused(run, smoke_run, tmp_path):
     """Before anything in the folder is changed, Hydra's notes included."""
-    whole, _ = undisturbed("single")
+    whole = shutil.copytree(smoke_run, tmp_path / "run")
+    (whole / ".hydra").mkdir()
+    (whole / ".hydra" / "config.yaml").write_text("seed: 0")
     before = content(whole)
-    code, _, err = run("train", *SETTINGS, "seed=7", f"hydra.run.dir={whole}")
+    code, _, err = run("train", "experiment=smoke", "seed=7", f"hydra.run.dir={whole}")
     sentence = f"error: {whole}: there is a training already; expected another run folder, or resume={whole}."
     assert code == 2 and err.strip().splitlines()[-1] == sentence
     assert content(whole) == before
 
 
-def test_a_second_process_is_refused(run, undisturbed, tmp_path):
-    whole, _ = undisturbed("single")
-    for run_dir, command in ((tmp_path / "new", "hydra.run.dir"), (shutil.copytree(whole, tmp_path / "run"), "resume")):
+def test_a_second_process_is_refused(run, smoke_run, tmp_path):
+    for run_dir, command in (
+        (tmp_path / "new", "hydra.run.dir"),
+        (shutil.copytree(smoke_run, tmp_path / "run"), "resume"),
+    ):
         run_dir.mkdir(exist_ok=True)
         with claim(run_dir):
             code, _, err = run("train", f"{command}={run_dir}")
@@ -123,36 +127,40 @@ def test_a_second_process_is_refused(run, undisturbed, tmp_path):
         assert (code, err) == (2, f"error: {taken}\n")
 
 
-def test_a_job_of_a_sweep_that_is_started_again_goes_on(run, undisturbed, tmp_path):
+def test_a_job_of_a_sweep_that_is_started_again_goes_on(undisturbed, tmp_path, caplog, no_report):
     """A job goes on after a preemption; with another config it is refused, which is no failure of the run there."""
+    caplog.set_level(logging.INFO)
     whole, killed = undisturbed("single")
-    job = shutil.copytree(killed, tmp_path / "sweep" / "seed-0")
-    sweep = ["-m", *SETTINGS, "hydra.sweep.dir=sweep", "seed=0"]
-    code, out, err = run("train", *sweep)
-    assert code == 0 and "sweep/seed-0 at 384 frames" in out, out + err
+    job, cfg = shutil.copytree(killed, tmp_path / "seed-0"), composed(*SETTINGS, "collector=single")
+    train(cfg, job)
+    assert f"going on with {job} at {3 * ITERATION} frames" in caplog.text
     assert_same(whole, job)
-    code, _, err = run("train", *sweep, "algo.lr=1e-4")
-    assert code == 2 and "there is a training already" in err
+    cfg.algo.lr = 1e-4
+    with pytest.raises(OccupiedError, match="there is a training already") as refused:
+        train(cfg, job)
+    note_failure(job, refused.value)
     assert not (job / "failure.txt").exists()
     assert_same(whole, job)
 
 
-@pytest.mark.parametrize(("number", "expected"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_a_stopped_training_has_the_exit_code_of_its_signal(run, tmp_path, number, expected):
-    with after_batch(1, lambda _: os.kill(os.getpid(), number)):
-        code, out, _ = run("train", "experiment=smoke", "threads=1", "hydra.run.dir=run")
-    assert code == expected and "continue with: pickplace-train resume=" in out
-    with after_batch(2, lambda _: os.kill(os.getpid(), number)):
-        assert run("train", "resume=run")[0] == expected
-    assert saved_frames(tmp_path / "run") == 2 * ITERATION and (tmp_path / "run" / "learning_curve.png").is_file()
-    assert run("train", "resume=run")[0] == 0
+def test_a_stopped_training_has_the_exit_code_of_its_signal(run, tmp_path):
+    """By the command, and twice when it is resumed."""
+    run_dir = tmp_path / "run"
+    commands = (["experiment=smoke", "threads=1", f"hydra.run.dir={run_dir}"], *2 * [[f"resume={run_dir}"]])
+    for batch, (number, words) in enumerate(zip((signal.SIGTERM, signal.SIGINT, signal.SIGHUP), commands, strict=True)):
+        with after_batch(batch + 1, lambda _, number=number: os.kill(os.getpid(), number)):
+            code, out, _ = run("train", *words)
+        assert code == 128 + number and f"continue with: pickplace-train resume={run_dir}\n" in out
+        assert saved_frames(run_dir) == (batch + 1) * 128
+    assert (run_dir / "learning_curve.png").is_file() and not (run_dir / "report.html").exists()
+    assert run("train", f"resume={run_dir}")[0] == 0 and (run_dir / "report.html").is_file()
 
 
-def test_a_stop_request_ends_a_sweep(run, tmp_path):
+def test_a_stop_request_ends_a_sweep(run, tmp_path, no_report):
     with after_batch(1, lambda _: os.kill(os.getpid(), signal.SIGINT)):
         code, _, err = run("train", "-m", "seed=0,1", "experiment=smoke", "threads=1", "hydra.sweep.dir=sweep")
     assert code == 130, err
-    assert saved_frames(tmp_path / "sweep" / "seed-0") == ITERATION and not (tmp_path / "sweep" / "seed-1").exists()
+    assert saved_frames(tmp_path / "sweep" / "seed-0") == 128 and not (tmp_path / "sweep" / "seed-1").exists()
 
 
 def test_a_missing_report_is_written_on_resume(smoke_run, tmp_path):
@@ -166,7 +174,7 @@ def test_a_missing_report_is_written_on_resume(smoke_run, tmp_path):
 
 
 @pytest.mark.parametrize("changed", [["algo.lr=0"], []])
-def test_a_stale_best_is_replaced_if_the_config_has_changed(changed, smoke_run, tmp_path, monkeypatch):
+def test_a_stale_best_is_replaced_if_the_config_has_changed(changed, smoke_run, tmp_path, monkeypatch, no_report):
     """At the next validation, and not before. With the same config the run comes to that best again."""
     run_dir, before = shutil.copytree(smoke_run, tmp_path / "run"), []
     saved, validate = run_dir / "checkpoints", Trainer.validate
