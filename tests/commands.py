@@ -50,7 +50,7 @@ SETTINGS = [
 TINY = [
     "env.num_envs=4", "rollout_length=4", "algo.minibatch_size=8", "algo.epochs=1", "total_frames=16",
     "evaluation.episodes=1", "evaluation_interval=16", "checkpoint_interval=16", "progress_interval=16",
-    "env.tote_size=[6,6,2]", "model.actor.filters=8", "model.critic.filters=8", "model.critic.hidden=8", "threads=1",
+    "env.tote_size=[5,5,2]", "model.actor.filters=8", "model.critic.filters=8", "model.critic.hidden=8", "threads=1",
 ]  # fmt: skip
 
 #: Processes are forked from one that has imported torch and more and has not used it, which saves seconds for each.

@@ -1,7 +1,6 @@
 """Every preset, every model and every teacher trains."""
 
 import logging
-from itertools import product
 
 import pytest
 from commands import TINY, composed, options
@@ -31,7 +30,7 @@ def test_every_preset_runs(name, tmp_path, monkeypatch):
     assert {path.name for path in tmp_path.iterdir()} == files
 
 
-@pytest.mark.parametrize("name", sorted({*options("benchmark")} - {"gopt_100"}))  # gopt_50 with another unit
+@pytest.mark.parametrize("name", sorted({*options("benchmark")} - {"gopt_50", "gopt_100"}))
 def test_a_benchmark_is_trained_on(name, tmp_path, no_report):
     unit = composed(f"benchmark={name}")["items"].get("unit", 1)
     tiny = ["model=afterstate", "algo=td", *ONE_NETWORK] if unit > 1 else TINY
@@ -39,8 +38,17 @@ def test_a_benchmark_is_trained_on(name, tmp_path, no_report):
     assert 0 <= train(composed(*words), tmp_path) <= 1
 
 
-@pytest.mark.parametrize("masked", [True, False])
-@pytest.mark.parametrize("name", options("gripper"))
+@pytest.mark.parametrize("unit", [3, 5, 10])
+def test_a_larger_benchmark_is_a_scaled_one(unit):
+    plain, cfg = composed("benchmark=gopt_rs"), composed(f"benchmark=gopt_{10 * unit}")
+    assert cfg["items"] == {**plain["items"], "unit": unit}
+    sizes = {"bin_size": [5 * unit, 5 * unit, 1], "tote_size": [10 * unit] * 3}
+    assert cfg.env == {**plain.env, **sizes}
+
+
+@pytest.mark.parametrize(("name", "masked"), [
+    *((name, True) for name in options("gripper")), ("paper", False), ("cup_round", False),
+])  # fmt: skip
 def test_every_effector_trains(name, masked, tmp_path):
     kinds = ["items.kinds=[[5,4,1],[4,4,2]]", "env.bin_size=[9,9,1]", "env.tote_size=[11,10,2]"]
     words = [f"gripper={name}", f"model.mask_infeasible={masked}", "curriculum=none", "logger=none", *TINY]
@@ -54,22 +62,22 @@ def test_the_paper_s_effector_is_the_default(env):
 
 @pytest.mark.parametrize("model", options("model"))
 def test_every_model_trains_with_and_without_a_mask(model, tmp_path):
-    """By its usual algorithm, and by samples."""
-    tiny = ["curriculum=none", "logger=none", "env.rotations=2", *(ONE_NETWORK if model == "afterstate" else TINY)]
-    cfg = composed(f"model={model}", *tiny)
-    for masked, by_samples in product((True, False), (False, True)):
-        algo = "td" if model == "afterstate" else "a2c" if model == "fcn_grasp" and masked else "ppo"
-        if by_samples and model == "afterstate":
-            continue
-        algo = ["algo=sampled_ppo", "algo.samples=2"] if by_samples else [f"algo={algo}"]
+    """By its usual algorithm, and by ``sampled_ppo``, without a mask for one model only."""
+    algorithms = {"afterstate": "algo=td", "fcn_grasp": "algo=a2c"}
+    samples = ["algo=sampled_ppo", "algo.samples=2"]
+    cases = [(True, [algorithms.get(model, "algo=ppo")]), (False, ["algo=ppo"])]
+    cases += [(True, samples)] * (model != "afterstate") + [(False, samples)] * (model == "fcn_grasp")
+    overrides = [f"model={model}", "curriculum=none", "logger=none", "env.rotations=2"]
+    cfg = composed(*overrides, *(ONE_NETWORK if model == "afterstate" else TINY))
+    for number, (masked, algo) in enumerate(cases):
         cfg.model.mask_infeasible, cfg.algo = masked, composed(*algo, *TINY).algo
         if model in ("corners", "afterstate") and not masked:
             with pytest.raises(ValueError, match=r"^model.mask_infeasible=False: expected true"):
-                train(cfg, tmp_path / "bad")
-            continue
-        run_dir = tmp_path / f"{masked}_{by_samples}"
-        run_dir.mkdir()
-        assert 0 <= train(cfg, run_dir) <= 1
+                train(cfg, tmp_path)
+        else:
+            run_dir = tmp_path / str(number)
+            run_dir.mkdir()
+            assert 0 <= train(cfg, run_dir) <= 1
 
 
 @pytest.mark.parametrize("name", options("planner"))
@@ -83,11 +91,13 @@ def test_any_planner_can_be_imitated(name, tmp_path, no_report):
     assert ["train/agreement" in row for row in read_csv(tmp_path / "metrics.csv")] == [True, False, False]
 
 
-@pytest.mark.parametrize(("needed", "told"), [(1.0, True), (0.0, False)])
-def test_the_console_tells_of_a_tote_that_did_not_grow(smoke, caplog, tmp_path, needed, told):
+@pytest.mark.parametrize(("height", "told"), [(1, True), (2, False)])
+def test_the_console_tells_of_a_tote_that_did_not_grow(caplog, tmp_path, height, told):
     caplog.set_level(logging.INFO)
-    settings = ["env.tote_size=[4,4,2]", "curriculum=adaptive", "curriculum.start_height=1", "total_frames=256"]
-    smoke(tmp_path, *settings, "curriculum.advance.window=4", f"curriculum.advance.occupancy={needed}")
+    settings = ["env.tote_size=[4,4,2]", "curriculum=adaptive", f"curriculum.start_height={height}", "threads=1"]
+    training = trainer.Trainer(composed("experiment=smoke", *settings), tmp_path)
+    training.report(stopped=False)
+    training.collector.shutdown()
     assert ("the tote grew to height 1 of 2 only" in caplog.text) == told
 
 
