@@ -1,9 +1,11 @@
 """Bad values of every setting: each is legal and works, or is refused in one short sentence that names its key."""
 
-import copy
 import math
 import time
-from functools import partial
+from contextlib import contextmanager
+from functools import reduce
+from itertools import product
+from operator import getitem
 
 import pytest
 import torch
@@ -24,6 +26,7 @@ from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.rules.masks import placing_maps
 from pickplace.rules.state import State
 from pickplace.runs import checkpoint
+from pickplace.runs.resume import checkpoint_config
 from pickplace.training import trainer
 from pickplace.training.settings import check_settings
 from pickplace.training.trainer import Trainer
@@ -54,29 +57,50 @@ TRAININGS = {
 }
 
 
+def resolved_config(*words, name="train"):
+    """The config of a command line, without references."""
+    return OmegaConf.create(OmegaConf.to_container(composed(*words, name=name), resolve=True))
+
+
 def leaves(node, path=()):
     """The paths of all values, and of all parts that hold values."""
     if path:
         yield path
-    for key, value in node.items() if isinstance(node, dict) else ():
+    for key, value in node.items() if OmegaConf.is_dict(node) else ():
         yield from leaves(value, (*path, key))
 
 
-def changed(plain, path, value):
-    content = copy.deepcopy(plain)
-    node = content
-    for key in path[:-1]:
-        node = node[key]
-    node[path[-1]] = value
-    return OmegaConf.create(content)
+@contextmanager
+def changed(cfg, path, value):
+    """Put a value into a config for a while."""
+    *parents, key = path
+    node = reduce(getitem, parents, cfg)
+    before = node[key]
+    node[key] = value
+    yield
+    node[key] = before
 
 
-def make_no_collector(monkeypatch):
-    """Make trainers without a collector, which takes long and reads no other settings."""
-    made = {"collector": lambda *args, **given: None}
-    monkeypatch.setattr(
-        trainer, "build", lambda place, *args, **given: made.get(place, partial(build, place))(*args, **given)
-    )
+def share_parts(monkeypatch, tested):
+    """Let trainers share what no setting of the tested groups changes, and make no collector, which takes long."""
+    envs, networks, restored = {}, {}, Trainer._restored
+
+    def build_once(place, node, **given):
+        if place == "env" and not {"env", "items"} & set(tested):
+            if given["masks"] not in envs:
+                envs[given["masks"]] = build(place, node, **given)
+            return envs[given["masks"]]
+        return None if place == "collector" else build(place, node, **given)
+
+    def restored_once(self, key, *given):
+        if key not in networks or {"env", "items", "model"} & set(tested):
+            networks[key] = restored(self, key, *given)
+        return networks[key]
+
+    monkeypatch.setattr(trainer, "build", build_once)
+    monkeypatch.setattr(Trainer, "_restored", restored_once)
+    saved = lambda cfg: checkpoint_config(OmegaConf.masked_copy(cfg, tested))  # noqa: E731
+    monkeypatch.setattr(trainer, "checkpoint_config", saved)
 
 
 def check_sentence(error, key):
@@ -87,37 +111,37 @@ def check_sentence(error, key):
 
 @pytest.mark.parametrize("name", TRAININGS)
 def test_every_leaf_of_a_training(name, tmp_path, monkeypatch):
-    make_no_collector(monkeypatch)
     torch.set_num_threads(1)
-    plain = OmegaConf.to_container(composed("experiment=smoke", "threads=1", *TRAININGS[name]), resolve=True)
-    for path in leaves({key: plain[key] for key in plain if key in name.split()}):
-        for value in VALUES:
-            started = time.perf_counter()
+    cfg = resolved_config("experiment=smoke", "threads=1", *TRAININGS[name])
+    tested = [key for key in cfg if key in name.split()]
+    share_parts(monkeypatch, tested)
+    for path, value in product(leaves(OmegaConf.masked_copy(cfg, tested)), VALUES):
+        started = time.perf_counter()
+        with changed(cfg, path, value):
             try:
-                cfg = changed(plain, path, value)
                 if path[0] == "curriculum":
                     check_settings(cfg)
                     build("curriculum", cfg.curriculum).setup(1, 3, 512)
                     continue
-                trainer = Trainer(cfg, tmp_path)
+                Trainer(cfg, tmp_path)
                 if path[0] == "logger":
-                    build("logger", trainer.cfg.logger, folder=tmp_path, frames=0, settings={}).close()
+                    build("logger", cfg.logger, folder=tmp_path, frames=0, settings={}).close()
             except ValueError as error:
                 check_sentence(error, str(path[-1]))
             except Exception as error:
                 raise AssertionError(f"{'.'.join(path)}={excerpt(value)}: {error!r}") from error
-            assert time.perf_counter() - started < 20
+        assert time.perf_counter() - started < 20
 
 
 @pytest.mark.parametrize("name", ["corner", "individual_heuristic", "joint_dbl", "mcts", "random", "uniform"])
 def test_every_leaf_of_an_evaluation(name):
-    plain = OmegaConf.to_container(composed(f"planner={name}", "device=cpu", name="evaluate"), resolve=True)
-    for path in leaves({key: plain[key] for key in ("planner", "evaluation")}):
-        for value in VALUES:
-            if path in (("planner",), ("evaluation",)) or path[-1] in ("replay", "gif"):  # checked by the command
-                continue
+    cfg = resolved_config(f"planner={name}", "device=cpu", name="evaluate")
+    for path, value in product(leaves(OmegaConf.masked_copy(cfg, ["planner", "evaluation"])), VALUES):
+        if path in (("planner",), ("evaluation",)) or path[-1] in ("replay", "gif"):  # checked by the command
+            continue
+        with changed(cfg, path, value):
             try:
-                prepare(changed(plain, path, value))
+                prepare(cfg)
             except ValueError as error:
                 check_sentence(error, path[-1])
 
@@ -199,7 +223,7 @@ def test_a_real_cell_and_a_large_batch_are_accepted(tmp_path, monkeypatch):
     env = PickPlaceEnv(items=Kinds([(4, 3, 2)]), num_envs=2, masks=("footprint",), **sizes)
     assert env.reset()["footprint_mask"].any(1).all()
     large = composed("experiment=quick", "env.num_envs=4096", "rollout_length=32", "threads=1")
-    make_no_collector(monkeypatch)
+    share_parts(monkeypatch, ["env"])
     with pytest.raises(ValueError, match="GB; expected at most 0.8 GB"):
         Trainer(large, tmp_path)
     Trainer(composed("experiment=afterstate", "benchmark=gopt_30", "env.num_envs=128"), tmp_path)
