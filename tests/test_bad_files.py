@@ -1,9 +1,11 @@
 """Files, folders and streams that are damaged, endless, taken or full: one sentence, and nothing is lost."""
 
+import copy
 import csv
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -20,20 +22,43 @@ import pickplace
 from pickplace.algorithms.base import load_optimizer
 from pickplace.common.errors import one_sentence
 from pickplace.common.files import read_file, replaced_file
+from pickplace.envs.saved_state import check_saved_states
 from pickplace.evaluation import artifacts, evaluate
 from pickplace.evaluation.result import episode_settings, read_comparison
 from pickplace.items.distributions import Recorded
 from pickplace.rules.observation import ToteDepth
 from pickplace.runs import checkpoint
-from pickplace.runs.folder import changed_values, is_claimed, noted_command, refuse_links
+from pickplace.runs.folder import (
+    OccupiedError,
+    changed_values,
+    is_claimed,
+    noted_command,
+    refuse_for_job,
+    refuse_for_run,
+    refuse_for_sweep,
+    refuse_links,
+)  # fmt: skip
 from pickplace.runs.resume import StopRequest
 from pickplace.serve import json_lines, request
 from pickplace.training import trainer
-from pickplace.training.train import resume_run
+from pickplace.training.train import resume_run, train
 
 TOTE = "env.tote_size=[4,4,2]"
-SHORT = ["planner=joint_dbl", TOTE, "evaluation.episodes=2", "evaluation.latency_decisions=0"]
+SHORT = ["planner=joint_dbl", TOTE, "evaluation.episodes=2", "evaluation.latency_decisions=0", "evaluation.replay=0"]
 FULL = OSError(28, "No space left on device")
+
+
+@pytest.fixture
+def told(capsys):
+    """Call a function, which must fail; return what a command prints then."""
+
+    def call(function, *arguments):
+        with pytest.raises(SystemExit) as end, one_sentence():
+            function(*arguments)
+        assert end.value.code == 2
+        return capsys.readouterr().err
+
+    return call
 
 
 def make(kind: str, path: Path) -> Path:
@@ -71,7 +96,7 @@ def test_an_endless_file_of_size_0_is_empty():
 
 BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{f'*{a}, ' * 9}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
 NOTES = {
-    "alias bomb": BOMB, "broken": "a: [", "deep": "[" * 100_000, "no date": "2001-13-45", "no time": "!!timestamp x",
+    "alias bomb": BOMB, "broken": "a: [", "deep": "[" * 5_000, "no date": "2001-13-45", "no time": "!!timestamp x",
     "numbers": "hydra: {runtime: {config_sources: [{path: 3, provider: command-line}]}, overrides: {hydra: [5]}}",
     "class": "!!python/object/apply:os.getcwd []", "interpolation": "seed: ${oc.env:HOME}\nalgo: {lr: '${no.such}'}",
     "list": "[[1], 2]", "large": "a: " + "x" * 2**21,
@@ -120,7 +145,7 @@ def test_a_report_does_without_notes_that_cannot_be_read(smoke_run, tmp_path):
         ({"env": 3}, "expected an evaluation.json"),
     ],
 )  # fmt: skip
-def test_a_comparison_is_checked_before_playing(run, tmp_path, monkeypatch, change, words):
+def test_a_comparison_is_checked(told, tmp_path, change, words):
     ours = episode_settings(composed("evaluation.episodes=3", "env.tote_size=[4,4,2]", name="evaluate"))
     content = {**ours, "planner": "a", "occupancy": {"per_episode": [0.5] * 3}}
     path = tmp_path / "evaluation.json"
@@ -131,37 +156,51 @@ def test_a_comparison_is_checked_before_playing(run, tmp_path, monkeypatch, chan
     if isinstance(change.get("env"), dict) and change["env"]:  # a key that an older file lacks
         change = {"env": {key: value for key, value in ours["env"].items() if key not in change["env"]}}
     path.write_text(json.dumps({**content, **change}))
+    err = told(read_comparison, path, ours)
+    assert words in err and len(err) < 1000 and err.count("\n") == 1
+
+
+def test_a_comparison_is_checked_before_playing(run, tmp_path, monkeypatch):
+    (tmp_path / "digits.json").write_text("9" * 10_000)
     monkeypatch.setattr(evaluate, "play", lambda *_: pytest.fail("it played"))
-    code, _, err = run("evaluate", "planner=joint_dbl", TOTE, "evaluation.episodes=3", f"compare={path}")
-    assert code == 2 and words in err and len(err) < 1000
+    code, _, err = run("evaluate", "planner=joint_dbl", "compare=digits.json")
+    words = "(Exceeds the limit (4300 digits) for integer string conversion: value has 10000 digits)."
+    assert (code, err) == (2, f"error: compare='digits.json': expected an evaluation.json {words}\n")
 
 
-@pytest.mark.parametrize("key", ["compare", "checkpoint", "items.path"])
+@pytest.mark.parametrize("read", [lambda value: read_comparison(Path(value), {}), checkpoint.locate, Recorded])
 @pytest.mark.parametrize("value", ["x" * 5000, "x/" * 2500], ids=["name", "path"])
-def test_a_long_path_is_shortened(run, key, value):
-    items = ["items=recorded"] if key == "items.path" else []
-    code, _, err = run("evaluate", "planner=joint_dbl", *items, f"{key}={value}")
-    assert code == 2 and err.startswith("error: ") and len(err) < 500
+def test_a_long_path_is_shortened(told, read, value):
+    err = told(read, value)
+    assert err.startswith("error: ") and len(err) < 500
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("read", "path", "expected"),
     [
-        ("items=recorded items.path=/dev/zero", "/dev/zero: a folder, link, pipe or device; expected a regular file"),
-        ("items=recorded items.path=.", ".: a folder, link, pipe or device"),
-        ("items=recorded items.path=/proc/kmsg", "/proc/kmsg: 0 bytes; expected a file with content"),
-        ("compare=/proc/kmsg", "/proc/kmsg: 0 bytes"),
-        ("compare=digits.json", "expected an evaluation.json (Exceeds the limit (4300 digits) for integer string "
-         "conversion: value has 10000 digits)."),
-        ("hydra.run.dir=/proc/x", "/proc/x: No such file or directory; expected another path."),
-        ("hydra.run.dir=digits.json", "digits.json: File exists; expected another path"),
-        ("hydra.run.dir=digits.json/x", "digits.json/x: Not a directory; expected another path"),
+        (Recorded, "/dev/zero", "/dev/zero: a folder, link, pipe or device; expected a regular file"),
+        (Recorded, ".", ".: a folder, link, pipe or device"),
+        (Recorded, "/proc/kmsg", "/proc/kmsg: 0 bytes; expected a file with content"),
+        (lambda path: read_comparison(Path(path), {}), "/proc/kmsg", "/proc/kmsg: 0 bytes"),
     ],
-)  # fmt: skip
-def test_a_path_that_cannot_be_used_is_named_with_the_reason(run, tmp_path, words, expected):
-    (tmp_path / "digits.json").write_text("9" * 10_000)
-    code, _, err = run("evaluate", "planner=joint_dbl", *words.split())
-    assert code == 2 and expected in err and err.count("\n") == 1
+)
+def test_a_file_that_cannot_be_read_is_named_with_the_reason(told, read, path, expected):
+    err = told(read, path)
+    assert expected in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "reason"),
+    [
+        ("/proc/x", "No such file or directory; expected another path."),
+        ("digits.json", "File exists; expected another path"),
+        ("digits.json/x", "Not a directory; expected another path"),
+    ],
+)
+def test_a_run_folder_that_cannot_be_made_is_named_with_the_reason(run, tmp_path, path, reason):
+    (tmp_path / "digits.json").touch()
+    code, _, err = run("evaluate", "planner=joint_dbl", f"hydra.run.dir={path}")
+    assert code == 2 and f"{path}: {reason}" in err and err.count("\n") == 1
 
 
 def test_an_echoed_value_of_a_checkpoint_is_shortened(tmp_path):
@@ -177,36 +216,54 @@ def files(folder):
 
 
 def test_an_evaluation_overwrites_no_other_run(run, smoke_run, tmp_path):
-    words = [*SHORT, "evaluation.replay=0"]
-    evaluation, one, trained = ["evaluate", *words], tmp_path / "one", shutil.copytree(smoke_run, tmp_path / "trained")
+    evaluation, one, trained = ["evaluate", *SHORT], tmp_path / "one", shutil.copytree(smoke_run, tmp_path / "trained")
     assert run(*evaluation, f"hydra.run.dir={one}")[0] == 0
     for folder, command in ((one, evaluation), (trained, evaluation), (one, ["train"])):
         before = files(folder)
         code, _, err = run(*command, f"hydra.run.dir={folder}")
         assert code == 2 and err.startswith(f"error: {folder}: there is a") and err.count("\n") == 1
         assert files(folder) == before
-    code, _, err = run("evaluate", "-m", *words, f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=one")
-    assert code == 2 and "there is an evaluation already" in err
-    (trained / "evaluation").mkdir()
-    assert run(*evaluation, f"hydra.run.dir={trained}/evaluation")[0] == 0
+    with pytest.raises(OccupiedError, match="there is an evaluation already"):  # a job of a sweep
+        evaluate.run(composed(*SHORT, name="evaluate"), one)
+    refuse_for_run(trained / "evaluation")  # not refused
 
 
-@pytest.mark.parametrize("part", ["checkpoints", "checkpoints/best", "checkpoints/new", ".hydra", ".hydra/new", "."])
-def test_a_part_of_a_run_is_no_run_folder(run, smoke_run, tmp_path, part):
+@pytest.fixture
+def noted_run(smoke_run, tmp_path):
+    """A run folder with a note of Hydra's."""
     run_dir = shutil.copytree(smoke_run, tmp_path / "run")
-    (run_dir / ".hydra").mkdir(exist_ok=True)
+    (run_dir / ".hydra").mkdir()
     (run_dir / ".hydra" / "hydra.yaml").touch()
-    words = "a part of another run"
-    if part == ".":  # the checkpoints were deleted to save space
-        shutil.rmtree(run_dir / "checkpoints")
-        words = "there is a report of a training already"
-    before = files(run_dir)
+    return run_dir
+
+
+@pytest.mark.parametrize("part", ["checkpoints", "checkpoints/best", "checkpoints/new", ".hydra", ".hydra/new"])
+def test_a_part_of_a_run_is_no_run_folder(noted_run, part):
+    for refuse in (refuse_for_run, refuse_for_job):
+        with pytest.raises(OccupiedError, match=f"^{noted_run / part}: a part of another run"):
+            refuse(noted_run / part)
+
+
+def test_no_command_runs_in_a_part_of_a_run(run, noted_run):
+    before = files(noted_run)
     for command in (["evaluate", *SHORT], ["train", "experiment=smoke"]):
-        code, _, err = run(*command, f"hydra.run.dir={run_dir / part}")
-        assert code == 2 and f"{run_dir / part}: {words}" in err
-    code, _, err = run("train", "-m", "experiment=smoke", f"hydra.sweep.dir={run_dir}", f"hydra.sweep.subdir={part}")
-    assert code == 2 and words in err and before.keys() <= files(run_dir).keys()
-    assert not (run_dir / part / "metrics.csv").exists() or part == "."
+        code, _, err = run(*command, f"hydra.run.dir={noted_run}/checkpoints/best")
+        assert code == 2 and f"{noted_run}/checkpoints/best: a part of another run" in err
+    sweep = [f"hydra.sweep.dir={noted_run}", "hydra.sweep.subdir=checkpoints/best"]
+    code, _, err = run("train", "-m", "experiment=smoke", *sweep)
+    assert code == 2 and "a part of another run" in err and before.keys() <= files(noted_run).keys()
+    assert not (noted_run / "checkpoints" / "best" / "metrics.csv").exists()
+
+
+def test_a_run_whose_checkpoints_were_deleted_is_not_overwritten(noted_run):
+    """Such as to save space."""
+    shutil.rmtree(noted_run / "checkpoints")
+    before = files(noted_run)
+    with pytest.raises(OccupiedError, match=f"^{noted_run}: there is a report of a training already"):
+        refuse_for_run(noted_run)
+    with pytest.raises(OccupiedError, match=f"^{noted_run}: there is a report of a training already"):
+        train(composed("experiment=smoke"), noted_run)  # a job of a sweep
+    assert files(noted_run) == before
 
 
 @pytest.mark.parametrize("name", ["train.log", "metrics.csv", ".lock", "checkpoints/note", ".hydra/config.yaml"])
@@ -229,35 +286,59 @@ def test_a_run_folder_with_links_is_not_resumed(tmp_path, name, make_link, words
         refuse_links(run_dir)
 
 
-@pytest.mark.parametrize(
-    ("make_link", "words"),
-    [
-        (lambda path, other: os.link(other, path), "a hard link"),
-        (lambda path, other: path.symlink_to(other), "a link or no regular file"),
-        (lambda path, other: path.symlink_to(path), "a link or no regular file"),
-    ],
-    ids=["hard", "symbolic", "to itself"],
-)
-@pytest.mark.parametrize(
-    "flags", [["hydra.run.dir=runs/one"], ["-m", "hydra.sweep.dir=runs", "hydra.sweep.subdir=one"]]
-)
-@pytest.mark.parametrize("command", ["train", "evaluate"])
-def test_a_new_run_writes_through_no_link(run, tmp_path, command, flags, make_link, words):
-    """In a folder prepared by others, which may be reached by a link of the user's."""
+LINKS = {  # makers, and the words for each kind
+    "hard": (lambda path, other: os.link(other, path), "a hard link"),
+    "symbolic": (lambda path, other: path.symlink_to(other), "a link or no regular file"),
+    "to itself": (lambda path, other: path.symlink_to(path), "a link or no regular file"),
+}
+
+
+@pytest.fixture
+def prepared(tmp_path):
+    """A folder prepared by others for a run, which is reached by a link of the user's, and a file of the user's."""
     (tmp_path / "disk" / "one" / ".hydra").mkdir(parents=True)
     (tmp_path / "runs").symlink_to("disk")
-    other = tmp_path / "mine.txt"
-    other.write_text("mine")
+    (tmp_path / "mine.txt").write_text("mine")
+    return tmp_path / "runs" / "one", tmp_path / "mine.txt"
+
+
+@pytest.mark.parametrize("kind", LINKS)
+@pytest.mark.parametrize("name", ["train.log", "evaluate.log", ".hydra/config.yaml", ".lock"])
+def test_a_new_run_is_refused_where_a_link_is(prepared, kind, name):
+    """By itself, as a job of a sweep, and before the sweep begins."""
+    folder, other = prepared
+    (make_link, words), notes = LINKS[kind], [".hydra", "train.log"]
+    ways = [
+        (refuse_for_run, folder),
+        (refuse_for_job, folder),
+        (lambda sweep: refuse_for_sweep(sweep, notes), folder.parent),
+    ]
+    for refuse, place in ways:
+        refuse(place)
+    make_link(folder / name, other)
+    for refuse, place in ways:
+        with pytest.raises(ValueError, match=f"^{folder / name}: {words}"):
+            refuse(place)
+    assert other.read_text() == "mine"
+
+
+@pytest.mark.parametrize("flags", [["hydra.run.dir={}/one"], ["-m", "hydra.sweep.dir={}", "hydra.sweep.subdir=one"]])
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+def test_a_new_run_writes_through_no_link(run, tmp_path, prepared, command, flags):
+    folder, other = prepared
     settings = ["experiment=smoke"] if command == "train" else SHORT
-    for name in (f"{command}.log", ".hydra/config.yaml", ".lock"):
-        path = tmp_path / "disk" / "one" / name
+    command = [command, *(word.format(folder.parent) for word in flags), *settings]
+    paths = [folder / name for name in (f"{command[0]}.log", ".hydra/config.yaml", ".lock")]
+    for path, (make_link, _) in zip(paths, LINKS.values(), strict=True):
         make_link(path, other)
-        before = sorted(tmp_path.rglob("*"))
-        code, _, err = run(command, *flags, *settings)
-        assert code == 2 and err.startswith(f"error: runs/one/{name}: {words}") and err.count("\n") == 1
-        assert other.read_text() == "mine" and sorted(tmp_path.rglob("*")) == before
-        path.unlink()
-    assert command == "train" or run(command, *flags, *settings)[0] == 0
+    before = sorted(tmp_path.rglob("*"))
+    code, _, err = run(*command)
+    assert code == 2 and re.match(f"error: {folder}/.*link.*", err) and err.count("\n") == 1
+    assert other.read_text() == "mine" and sorted(tmp_path.rglob("*")) == before
+    if command[0] == "evaluate":
+        for path in paths:
+            path.unlink()
+        assert run(*command)[0] == 0
 
 
 def test_a_job_writes_through_no_link(run, tmp_path):
@@ -304,7 +385,6 @@ def full(*_, **__):
     ("command", "owner", "function", "words"),
     [
         ("evaluate", artifacts, "picture", "run/tote.png: {} The table above and the files that are there are whole."),
-        ("evaluate", "hydra.core.utils", "_save_config", "run: {}"),
         ("train", "hydra.core.utils", "_save_config", "run: {}"),
         ("train", csv.DictWriter, "writeheader", "run/metrics.csv: {} Nothing had been saved before."),
         ("train", trainer, "learning_curve", "run/learning_curve.png: {} What was saved before is whole: "),
@@ -320,6 +400,17 @@ def test_a_full_disk_is_named(run, tmp_path, monkeypatch, command, owner, functi
     assert not [path for path in tmp_path.rglob(".*") if ".new" in path.name]
 
 
+@pytest.fixture(scope="module")
+def smoke_training(smoke_run):
+    """The environment of experiment=smoke, and the saved states of its collector."""
+    training = trainer.Trainer(composed("experiment=smoke", "threads=1"), smoke_run)
+    training.collector.shutdown()
+    state, _ = checkpoint.read(smoke_run / "checkpoints" / "last")
+    saved = state["collector"]
+    check_saved_states(training.env, saved)
+    return training.env, saved
+
+
 @pytest.mark.parametrize(
     ("part", "index", "value", "words"),
     [
@@ -332,15 +423,23 @@ def test_a_full_disk_is_named(run, tmp_path, monkeypatch, command, owner, functi
         ("occupancy", 0, 7.0, "the carried occupancy: expected what the state shows"),
     ],
 )  # fmt: skip
-def test_an_impossible_environment_is_not_resumed(smoke_run, tmp_path, part, index, value, words):
+def test_an_impossible_environment_is_refused(smoke_training, part, index, value, words):
+    env, saved = smoke_training
+    saved = copy.deepcopy(saved)
+    environment = saved["environment"]
+    (environment if part in environment else saved["carried"])[part][index] = value
+    with pytest.raises(checkpoint.CheckpointError, match=f"environment is of no use: {words}"):
+        check_saved_states(env, saved)
+
+
+def test_an_impossible_environment_is_not_resumed(smoke_run, tmp_path):
     run_dir = shutil.copytree(smoke_run, tmp_path / "run")
     folder = run_dir / "checkpoints" / "last"
     state, facts = checkpoint.read(folder)
-    environment = state["collector"]["environment"]
-    (environment if part in environment else state["collector"]["carried"])[part][index] = value
+    state["collector"]["environment"]["surface"][0] = -1
     del facts["schema"], facts["sha256"]
     checkpoint.write(folder, state, facts)
-    with pytest.raises(ValueError, match=f"environment is of no use: {words}"):
+    with pytest.raises(ValueError, match="environment is of no use: surface: expected heights of 0 to tote_height"):
         resume_run([f"resume={run_dir}", "total_frames=1280"])
 
 
@@ -351,7 +450,7 @@ class Noise(ToteDepth):
         return torch.rand_like(super().value(cell, state))
 
 
-def test_a_term_that_draws_can_be_resumed(smoke, tmp_path):
+def test_a_term_that_draws_can_be_resumed(smoke, tmp_path, no_report):
     run_dir = tmp_path / "run"
     smoke(run_dir, "+env.observation.noise={_target_: test_bad_files.Noise}", "total_frames=128")
     resume_run([f"resume={run_dir}", "total_frames=256", "trust=test_bad_files"])
