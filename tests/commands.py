@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import json
 import multiprocessing
 import os
 import sys
@@ -12,11 +13,14 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from pickplace.algorithms.base import Task
 from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
+from pickplace.evaluation import artifacts, evaluate
 from pickplace.rules.observation import STANDARD_TERMS
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
@@ -70,6 +74,31 @@ def composed(*overrides, name="train"):
 def _composed(name, overrides):
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return compose(name, list(overrides))
+
+
+@contextmanager
+def evaluation_config(*words):
+    """Compose the config of an evaluation once, with what Hydra knows of the command line while it runs."""
+    words = [f"++{word}" if word.partition(".")[0] in evaluate.TRAINED else word for word in words]
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        merged = compose("evaluate", words, return_hydra_config=True)
+        HydraConfig.instance().set_config(merged)
+        cfg = OmegaConf.masked_copy(merged, [key for key in merged if key != "hydra"])
+        OmegaConf.set_struct(cfg, True)
+        yield cfg
+
+
+def evaluated(folder, *words):
+    """Evaluate as a command line says, without Hydra's application and without the picture.
+
+    Returns the content of ``evaluation.json``, with its ``path`` and the table, ``out``.
+    """
+    folder.mkdir()
+    with evaluation_config(*words) as cfg, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(artifacts, "picture", lambda recording, cell, path: path.touch())
+        evaluate.run(cfg, folder)
+    path = folder / "evaluation.json"
+    return {**json.loads(path.read_text()), "path": path, "out": (folder / "evaluation.md").read_text()}
 
 
 def algorithm_of(policy, critic, *overrides):

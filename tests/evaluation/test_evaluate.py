@@ -9,13 +9,13 @@ from itertools import product
 import numpy
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from commands import composed, evaluated, evaluation_config
 from untrained import write_checkpoint
 
 from pickplace import CellSpec, PickPlaceEnv
-from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
 from pickplace.evaluation.artifacts import evaluation_table
+from pickplace.evaluation.evaluate import prepare
 from pickplace.evaluation.play import play
 from pickplace.evaluation.result import episode_settings, read_comparison
 from pickplace.physics.plans import read_plans
@@ -23,27 +23,36 @@ from pickplace.physics.settle import Settle
 from pickplace.planners.heuristics import JointDBL
 from pickplace.views.motion import Outcome
 
-
-def compose_evaluation(*words):
-    """Return the config of an evaluation."""
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("evaluate", list(words))
-
-
 SMALL = ["env.tote_size=[4,4,2]", "evaluation.latency_decisions=0", "evaluation.replay=0"]
 JOINT = ["planner=joint_dbl", *SMALL]
 
 
 @pytest.fixture
-def evaluation(run, tmp_path):
-    """Evaluate in this process, in an empty folder; return ``evaluation.json``, with the printed table."""
+def evaluation(tmp_path):
+    """Evaluate in an empty folder; return ``evaluation.json``, with the table."""
 
     def call(*arguments, refused=None):
         folder = tmp_path / f"result{len(list(tmp_path.iterdir()))}"
+        if refused is None:
+            return evaluated(folder, *arguments)
+        with pytest.raises(ValueError) as caught:
+            evaluated(folder, *arguments)
+        assert refused in str(caught.value)
+        return None
+
+    return call
+
+
+@pytest.fixture
+def command(run, tmp_path):
+    """Evaluate by the command line; return ``evaluation.json``, with the printed table."""
+
+    def call(*arguments):
+        folder = tmp_path / "command"
         code, out, err = run("evaluate", *arguments, f"hydra.run.dir={folder}")
-        assert (code == 2 and refused in err) if refused else code == 0, err
+        assert code == 0, err
         path = folder / "evaluation.json"
-        return {**json.loads(path.read_text()), "out": out, "path": path} if path.is_file() else None
+        return {**json.loads(path.read_text()), "out": out, "path": path}
 
     return call
 
@@ -63,7 +72,7 @@ def test_shipped_weights_play_with_several_items(evaluation):
 
 @pytest.mark.parametrize(("side", "episodes"), [(30, 1000), (50, 1000), (100, 100)])
 def test_larger_benchmarks_are_gopt_rs_on_a_finer_grid(side, episodes):
-    small, cfg = compose_evaluation("benchmark=gopt_rs"), compose_evaluation(f"benchmark=gopt_{side}")
+    small, cfg = (composed(f"benchmark={name}", name="evaluate") for name in ("gopt_rs", f"gopt_{side}"))
     scale = side // 10
     sizes = [build("items", each["items"]).sizes for each in (small, cfg)]
     assert torch.equal(sizes[1], scale * sizes[0])
@@ -81,7 +90,7 @@ def test_larger_benchmarks_are_gopt_rs_on_a_finer_grid(side, episodes):
     ],
 )
 def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, support, episodes):
-    cfg = compose_evaluation(f"benchmark={name}")
+    cfg = composed(f"benchmark={name}", name="evaluate")
     sizes = build("items", cfg["items"]).sizes.tolist()
     assert sorted(sizes) == [list(size) for size in product(range(least, 6), repeat=3)]
     assert cfg["items"].get("order") == {"cut1": "z", "cut2": "stacking"}.get(name)
@@ -92,17 +101,19 @@ def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, 
     short = [f"benchmark={name}", "evaluation.episodes=2", *SMALL[1:]]
     first = evaluation("planner=joint_dbl", *short)
     assert first["failures"] == {"stuck": 2} and first["env"]["support"]["_target_"] == support
-    second = evaluation("checkpoint=pretrained/mixed", *short, "env.tote_size=[10,10,6]")
+    with evaluation_config("checkpoint=pretrained/mixed", *short, "env.tote_size=[10,10,6]") as cfg:
+        prepare(cfg)
+    second = episode_settings(cfg)
     container = {"container": [10, 10, 6]} if "container" in first["items"] else {}  # the tote's size
     assert second["items"] == {**first["items"], **container}
     assert second["env"] == {**first["env"], "tote_size": [10, 10, 6]}
 
 
 @pytest.mark.parametrize(("group", "stream", "seed"), [("default", "test", 7), ("validation", "validation", 3)])
-def test_evaluation_json(evaluation, group, stream, seed):
+def test_evaluation_json(command, group, stream, seed):
     settings = [f"evaluation={group}", f"evaluation.seed={seed}", "evaluation.episodes=5"]
     settings += ["evaluation.latency_decisions=3", "env.tote_size=[4,5,2]", "evaluation.batch_size=2"]
-    result = evaluation("planner=joint_dbl", *settings)
+    result = command("planner=joint_dbl", *settings)
     assert (result["planner"], result["episodes"], result["seed"], result["stream"]) == ("joint_dbl", 5, seed, stream)
     assert result["env"]["tote_size"] == [4, 5, 2] and result["env"]["rotations"] == 4
     occupancy, latency = result["occupancy"], result["latency_ms"]
@@ -165,10 +176,10 @@ def test_physics_and_plans(evaluation, tmp_path):
     evaluation(*settings, "physics=settle", "physics.gap=1", refused="physics.gap=1: ")
 
 
-def test_items_of_a_checkpoint_and_other_ones(evaluation):
+def test_items_of_a_checkpoint_and_other_ones(command, evaluation):
     """A key of the checkpoint's items is not one of the command's own items."""
     arguments = ["checkpoint=pretrained/mixed", *SMALL, "env.tote_size=[6,6,1]", "evaluation.episodes=2"]
-    result = evaluation(*arguments, "items.height=[1,1]")
+    result = command(*arguments, "items.height=[1,1]")
     assert (result["items"]["width"], result["items"]["height"]) == ([1, 3], [1, 1])
     assert evaluation(*arguments, "items=kinds", "items.kinds=[[1,1,1]]")["items"]["kinds"] == [[1, 1, 1]]
 
@@ -189,8 +200,7 @@ def test_paired_difference(evaluation):
     "evaluation.seed=1", "evaluation.episodes=3", "evaluation.stream=validation", "items=mixed",
 ])  # fmt: skip
 def test_only_the_same_episodes_are_compared(word, tmp_path):
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        ours, theirs = (episode_settings(compose("evaluate", words)) for words in ([], [word]))
+    ours, theirs = (episode_settings(composed(*words, name="evaluate")) for words in ([], [word]))
     path = tmp_path / "evaluation.json"
     path.write_text(json.dumps({**ours, "planner": "a", "occupancy": {"per_episode": [0.5] * 100}}))
     read_comparison(path, ours)
@@ -252,10 +262,10 @@ class Clumsy:
             yield Outcome(plan.episode, "slipped", 1, 1, 1, volume)
 
 
-def test_a_physics_engine_of_ones_own(evaluation):
+def test_a_physics_engine_of_ones_own(command, evaluation):
     """One class; it needs no MuJoCo, and its config may be a file."""
     words = [*SMALL[:2], "planner=joint_dbl", "evaluation.episodes=3", "evaluation.plans=true", "evaluation.replay=2"]
-    result = evaluation(*words, "+physics._target_=test_evaluate.Clumsy", "+physics.cell_size=0.2")
+    result = command(*words, "+physics._target_=test_evaluate.Clumsy", "+physics.cell_size=0.2")
     found, plans = result["physics"], read_plans(result["path"].parent / "plans.jsonl")
     assert (found["method"], found["settings"], found["endings"]) == ("clumsy", {"cell_size": 0.2}, {"slipped": 3})
     assert plans[0].tote == (0.8, 0.8, 0.4) and found["carried_out"]["mean"] == 0

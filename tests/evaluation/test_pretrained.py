@@ -5,28 +5,27 @@ import sys
 
 import pytest
 import ship_weights as export
+from commands import evaluated
 from safetensors import safe_open
 
 from pickplace.config.allowlist import trusted_config
 from pickplace.runs import checkpoint
 
 CARDS = sorted(checkpoint.PRETRAINED.glob(f"*/{export.CARD}"))
-EPISODES = 8
+EPISODES = 4
 POLICY_ALONE = ("fcn4d", "gopt_rs", "cdrl_rs", "cut1", "cut2")
 each_card = pytest.mark.parametrize("path", CARDS, ids=lambda path: path.parent.name)
 
 
 @each_card
-def test_card_is_reproduced(path, run, tmp_path):
+def test_card_is_reproduced(path, tmp_path):
     card = json.loads(path.read_text())
     claimed = card["evaluations"][0]
     settings = [f"env.{key}={claimed['env'][key]}".replace(" ", "") for key in ("tote_size", "rotations")]
     settings += [f"evaluation.{key}={claimed[key]}" for key in ("seed", "stream")]
     settings += [f"planner.candidates={claimed['candidates']}", f"evaluation.episodes={EPISODES}", "threads=1"]
-    settings += ["evaluation.latency_decisions=0", "evaluation.replay=0", f"hydra.run.dir={tmp_path}"]
-    code, _, err = run("evaluate", f"checkpoint={card['name']}", *settings)
-    assert code == 0, err
-    result = json.loads((tmp_path / "evaluation.json").read_text())
+    settings += ["evaluation.latency_decisions=0", "evaluation.replay=0"]
+    result = evaluated(tmp_path / "result", f"checkpoint={card['name']}", *settings)
     for key in ("planner", "trained", "mask_in_training", "mask_at_decision", "warm_start", "env", "items"):
         assert result[key] == claimed[key]
     found, expected = (r["occupancy"]["per_episode"][:EPISODES] for r in (result, claimed))
