@@ -12,7 +12,7 @@ from pickplace.config.allowlist import trusted_config
 from pickplace.runs import checkpoint
 
 CARDS = sorted(checkpoint.PRETRAINED.glob(f"*/{export.CARD}"))
-EPISODES = 4
+EPISODES = 8
 POLICY_ALONE = ("fcn4d", "gopt_rs", "cdrl_rs", "cut1", "cut2")
 each_card = pytest.mark.parametrize("path", CARDS, ids=lambda path: path.parent.name)
 

@@ -4,7 +4,7 @@ import json
 from math import hypot
 
 import pytest
-from commands import composed
+from commands import composed, evaluated
 from untrained import write_checkpoint
 
 from pickplace import CellSpec, Planner, load_policy
@@ -18,54 +18,56 @@ from pickplace.training.train import resume_run
 TINY = ["env.tote_size=[6,6,2]", "total_frames=128", "reach=annulus", "env.reach.radii=[4.6,9.7]"]
 WIDE_REACH = ([3, 30], [0, 9], [-12, -4, 0], [4, -4, 0])
 WIDE = [f"env.reach.{key}={value}" for key, value in zip(("radii", "heights", "bin", "tote"), WIDE_REACH, strict=True)]
-EVALUATION = ["evaluation.episodes=2", "evaluation.latency_decisions=0", "evaluation.replay=1"]
+EVALUATION = ["evaluation.episodes=2", "evaluation.latency_decisions=0", "evaluation.replay=0", "threads=1"]
 
 
 @pytest.fixture(scope="module")
-def trained(smoke, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("reach") / "run"
-    smoke(folder, *TINY)
-    return folder
+def begun(tmp_path_factory):
+    """A checkpoint of a run that has not learnt anything yet."""
+    return write_checkpoint(tmp_path_factory.mktemp("reach") / "run", CellSpec(), *TINY)
 
 
 @pytest.fixture
-def evaluation(run, tmp_path):
-    """Evaluate in this process; return ``evaluation.json`` with the folder, or the error."""
+def evaluation(tmp_path):
+    """Evaluate in this process; return ``evaluation.json`` with its path, or the error."""
 
     def call(*words):
-        folder = tmp_path / f"result{len(list(tmp_path.iterdir()))}"
-        code, _, err = run("evaluate", *EVALUATION, *words, f"hydra.run.dir={folder}")
-        return {**json.loads((folder / "evaluation.json").read_text()), "folder": folder} if code == 0 else err
+        try:
+            return evaluated(tmp_path / f"result{len(list(tmp_path.iterdir()))}", *EVALUATION, *words)
+        except ValueError as error:
+            return str(error)
 
     return call
 
 
-def test_a_checkpoint_brings_its_reach(trained, evaluation):
+def test_a_checkpoint_brings_its_reach(begun, evaluation, run, tmp_path):
     """And ``load_policy`` and ``Planner.load`` know it too."""
-    _, facts = checkpoint.read(checkpoint.locate(trained))
+    _, facts = checkpoint.read(checkpoint.locate(begun))
     assert facts["config"]["env"]["reach"]["radii"] == [4.6, 9.7]
-    policy = load_policy(trained)
+    policy = load_policy(begun)
     reach = Annulus([4.6, 9.7], [0, 10], [-9, -2.5, 0], [4, -3, 0])
-    assert policy.cell.reach == policy.make_env().cell.reach == Planner.load(trained).cell.reach == reach
-    assert policy.cell.limits is not None and load_policy(trained, reach=None).cell.limits is None
+    assert policy.cell.reach == policy.make_env().cell.reach == Planner.load(begun).cell.reach == reach
+    assert policy.cell.limits is not None and load_policy(begun, reach=None).cell.limits is None
     other = Annulus([0, 99], [0, 9], [0, 0, 0], [0, 0, 0])
-    assert Planner.load(trained, reach=other, tote_size=(7, 5, 4)).cell.reach == other
+    assert Planner.load(begun, reach=other, tote_size=(7, 5, 4)).cell.reach == other
 
-    plain = evaluation(f"checkpoint={trained}")
+    plain = evaluation(f"checkpoint={begun}")
     assert plain["env"]["reach"]["radii"] == [4.6, 9.7] and plain["failures"] == {"stuck": 2}
-    assert evaluation(f"checkpoint={trained}", "env.reach.heights=[0,1]")["occupancy"]["mean"] <= 0.5
-    swapped = evaluation(f"checkpoint={trained}", "env.reach.radii=[5,9.8]", "reach=annulus", "env.tote_size=[6,6,1]")
+    assert evaluation(f"checkpoint={begun}", "env.reach.heights=[0,1]")["occupancy"]["mean"] <= 0.5
+    swapped = ["env.reach.radii=[5,9.8]", "reach=annulus", "env.tote_size=[6,6,1]"]
+    run("evaluate", *EVALUATION, f"checkpoint={begun}", *swapped, f"hydra.run.dir={tmp_path}/swapped")
+    swapped = json.loads((tmp_path / "swapped" / "evaluation.json").read_text())
     assert swapped["env"]["reach"]["radii"] == [5, 9.8] and swapped["env"]["tote_size"] == [6, 6, 1]
-    same = evaluation(f"checkpoint={trained}", f"compare={plain['folder']}/evaluation.json")
+    same = evaluation(f"checkpoint={begun}", f"compare={plain['path']}")
     assert same["paired_difference"]["mean"] == 0
-    everywhere = evaluation(f"checkpoint={trained}", "reach=everywhere")
+    everywhere = evaluation(f"checkpoint={begun}", "reach=everywhere")
     assert everywhere["env"]["reach"] is None
-    error = evaluation(f"checkpoint={trained}", "reach=everywhere", f"compare={plain['folder']}/evaluation.json")
+    error = evaluation(f"checkpoint={begun}", "reach=everywhere", f"compare={plain['path']}")
     assert "env.reach={" in error and "expected None" in error
     for word, expected in (("~reach", "reach="), ("~gripper", "gripper="), ("~reach=null", "reach=")):
-        error = evaluation(f"checkpoint={trained}", word)
-        assert f"error: {word}: " in error and f"expected {expected}" in error and error.count("\n") == 1
-    assert "env.reach.radi:" in evaluation(f"checkpoint={trained}", "env.reach.radi=[1,2]")
+        code, _, error = run("evaluate", *EVALUATION, f"checkpoint={begun}", word)
+        assert code == 2 and f"error: {word}: " in error and f"expected {expected}" in error and error.count("\n") == 1
+    assert "env.reach.radi:" in evaluation(f"checkpoint={begun}", "env.reach.radi=[1,2]")
 
 
 def test_shipped_weights_are_evaluated_with_a_reach_and_another_gripper(evaluation):
@@ -74,7 +76,7 @@ def test_shipped_weights_are_evaluated_with_a_reach_and_another_gripper(evaluati
     assert plain["env"]["reach"] is None
     cup = evaluation(*words, "gripper=point")["env"]["gripper"]
     assert (cup["_target_"], cup["size"]) == ("overlap", [1, 1])
-    compare = f"compare={plain['folder']}/evaluation.json"
+    compare = f"compare={plain['path']}"
     assert evaluation(*words, compare)["paired_difference"]["mean"] == 0
     everywhere = evaluation(*words, "reach=everywhere", compare)
     assert everywhere["paired_difference"]["mean"] == 0 and everywhere["env"]["reach"] is None
@@ -92,7 +94,7 @@ def test_tables_are_compared_by_content(evaluation, tmp_path):
         (tmp_path / f"{name}.csv").write_text("\n".join(["where,x,y,rotation,lowest,highest", *text]))
     words = ["planner=joint_dbl", "env.tote_size=[6,6,2]", "reach=table"]
     first = evaluation(*words, f"env.reach.path={tmp_path}/a.csv")
-    compare = f"compare={first['folder']}/evaluation.json"
+    compare = f"compare={first['path']}"
     second = evaluation(*words, f"env.reach.path={tmp_path}/b.csv", compare)
     assert second["paired_difference"]["mean"] == 0
     assert "env.reach=" in evaluation(*words, f"env.reach.path={tmp_path}/c.csv", compare)
@@ -105,7 +107,7 @@ def test_physics_carries_out_poses_in_reach(evaluation):
     words += ["env.reach.heights=[0.5,2.5]", "env.reach.tote=[4,-3,0.5]", "env.reach.radii=[5.2,9.6]"]
     result = evaluation(*words, "physics=execute", "evaluation.plans=true", "items.height=[1,2]")
     assert set(result["physics"]["endings"]) == {"done"}
-    plans = [json.loads(line) for line in (result["folder"] / "plans.jsonl").read_text().splitlines()]
+    plans = [json.loads(line) for line in (result["path"].parent / "plans.jsonl").read_text().splitlines()]
     assert len(plans) > 10
     for plan in plans:
         picked, placed = plan["size"][2], plan["corner"][2] + plan["size"][2] + 0.025
@@ -114,12 +116,12 @@ def test_physics_carries_out_poses_in_reach(evaluation):
             assert 0.26 - 1e-6 <= hypot(x, y) <= 0.48 + 1e-6 and 0.025 - 1e-6 <= face <= 0.125 + 1e-6
 
 
-def test_a_resumed_run_keeps_its_cell(trained, smoke, tmp_path):
+def test_a_resumed_run_keeps_its_cell(smoke, tmp_path):
     """Options of ``reach`` and ``gripper`` are refused, as other settings of the cell are."""
     run_dir = tmp_path / "run"
     smoke(run_dir, *TINY, "gripper=cup_round", "env.gripper.size=[3,3]", "items.kinds=[[3,3,1],[4,3,1]]", *WIDE)
-    begun = load_policy(run_dir).cell
-    assert begun.gripper == Seal((3, 3), "disc", "disc", (3, 3)) and begun.reach == Annulus(*WIDE_REACH)
+    cell = load_policy(run_dir).cell
+    assert cell.gripper == Seal((3, 3), "disc", "disc", (3, 3)) and cell.reach == Annulus(*WIDE_REACH)
     before = checkpoint.read(checkpoint.locate(run_dir, prefer="last"))[1]
     resume_run([f"resume={run_dir}", "total_frames=256"])
     after = checkpoint.read(checkpoint.locate(run_dir, prefer="last"))[1]
@@ -128,12 +130,11 @@ def test_a_resumed_run_keeps_its_cell(trained, smoke, tmp_path):
         with pytest.raises(ValueError, match=f"'{word}': .*'(reach|gripper)' cannot be exchanged"):
             resume_run([f"resume={run_dir}", word, "total_frames=384"])
 
-    _, facts = checkpoint.read(checkpoint.locate(trained, prefer="last"))
-    assert resumed_config("run", facts, ["total_frames=256"]).env.reach == composed(*TINY).env.reach
+    assert resumed_config("run", before, ["total_frames=256"]).env.reach == composed(*TINY, *WIDE).env.reach
     with pytest.raises(
         ValueError, match=r"env.reach=\{.*\}: the run began with .*, and a resumed run cannot change it"
     ):
-        resumed_config("run", facts, ["env.reach.radii=[1,20]"])
+        resumed_config("run", before, ["env.reach.radii=[1,20]"])
 
 
 def test_a_robot_does_without_the_table_of_the_training(tmp_path):

@@ -51,54 +51,44 @@ def test_reference_figures(planner, items, tote, rotations, mean, error, episode
     assert abs(float(occupancy.mean()) - mean) < 2 * (variance / episodes + theirs) ** 0.5
 
 
-def corner_cost(height_weight):
-    """Return what ``Corner`` minimises, of an action, its footprint and ``(top, y, x, w, d)``."""
-    return lambda action, footprint, found: (height_weight * found[0] + found[1] + found[2], footprint, action)
+def least_total(height_weight):
+    """Return what ``Corner`` minimises: of the weighted top and the corner."""
+    return lambda top, y, x, raised: height_weight * top + y + x
 
 
-def raised_by(env, n, found):
-    """Return the sum of all heights after an entry of :func:`results_by_hand`, less the sum before."""
-    top, y, x, w, d, _ = found
-    heights = env.state.heights[n].tolist()
-    return sum(top - heights[a][b] for a in range(x, x + w) for b in range(y, y + d))
+def least_raised(weight):
+    """Return what ``HeightmapMinimisation`` minimises."""
+    return lambda top, y, x, raised: raised + weight * (y + x)
+
+
+#: Planners, and what they minimise: of top, y, x, and the sum of all heights after the action less that before it.
+COSTS = [
+    (JointDBL, lambda top, y, x, raised: (top, y, x)),
+    (Corner, least_total(10)),
+    (lambda cell: Corner(cell, height_weight=0.5), least_total(0.5)),
+    *(
+        (lambda cell, weight=weight: HeightmapMinimisation(cell, weight), least_raised(weight))
+        for weight in (0.01, 0, 3)
+    ),
+]
 
 
 @pytest.mark.parametrize("options", SETTINGS)
-@pytest.mark.parametrize("weight", [0.01, 0, 3])
-def test_heightmap_minimisation_raises_the_heights_least(weight, options):
+def test_the_least_cost_over_all_feasible_actions_is_played(options):
+    """Of equal cost: the lowest footprint, then the lowest action; ``JointDBL`` does not look at footprints."""
     for env, observation in random_states(**options):
-        chosen = HeightmapMinimisation(env.cell, weight).decide(observation)
+        chosen = [make(env.cell).decide(observation).tolist() for make, _ in COSTS]
+        assert chosen == [make(env.cell).decide(observation.exclude("action_mask")).tolist() for make, _ in COSTS]
         for n in range(env.num_envs):
-            items = env.state.items.cuboids[n].tolist()
-            costs = {
-                action: (
-                    raised_by(env, n, found) + weight * (found[1] + found[2]),
-                    choice_by_hand(env.cell, items, found), action,
-                )
-                for action, found in results_by_hand(env, observation, n).items()
-            }  # fmt: skip
-            assert int(chosen[n]) == min(costs, key=costs.get)
-
-
-@pytest.mark.parametrize(
-    ("make", "cost"),
-    [
-        (JointDBL, lambda action, footprint, found: (*found[:3], action)),
-        (Corner, corner_cost(10)),
-        (lambda cell: Corner(cell, height_weight=0.5), corner_cost(0.5)),
-    ],
-)
-@pytest.mark.parametrize("options", SETTINGS)
-def test_the_least_cost_over_all_feasible_actions_is_played(make, cost, options):
-    for env, observation in random_states(**options):
-        chosen = make(env.cell).decide(observation)
-        assert torch.equal(make(env.cell).decide(observation.exclude("action_mask")), chosen)
-        for n in range(env.num_envs):
-            costs = {
-                action: cost(action, choice_by_hand(env.cell, env.state.items.cuboids[n].tolist(), found), found)
-                for action, found in results_by_hand(env, observation, n).items()
-            }
-            assert int(chosen[n]) == min(costs, key=costs.get)
+            items, heights = env.state.items.cuboids[n].tolist(), env.state.heights[n]
+            costs = [{} for _ in COSTS]
+            for action, found in results_by_hand(env, observation, n).items():
+                top, y, x, w, d, _ = found
+                raised = int((top - heights[x : x + w, y : y + d]).sum())
+                rest = choice_by_hand(env.cell, items, found), action
+                for (make, cost), each in zip(COSTS, costs, strict=True):
+                    each[action] = cost(top, y, x, raised), *rest[make is JointDBL :]
+            assert [each[n] for each in chosen] == [min(each, key=each.get) for each in costs]
 
 
 def test_corner_packs_about_as_well_as_joint_dbl():
