@@ -167,7 +167,8 @@ class Lookahead(MapPlanner):
         seed = problem * 1_000_003 + self._decisions * 7_919 + self.seed
         volume = torch.zeros(len(problem), dtype=torch.float64, device=problem.device)
         arrived, row = torch.zeros_like(problem), torch.arange(len(problem), device=problem.device)
-        source = _Imagined(self.items, streams)
+        # Spread items are worth it where the next item is the only one: there it decides how the tote goes on.
+        source = _Imagined(self.items, streams) if cell.bin_items == 1 else self.items
         for step in itertools.count():
             if step == horizon and not sees_items:
                 volume[row] += self.critic(observe(self.terms, cell, state, critic_keys))[:, 0].double()

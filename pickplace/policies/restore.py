@@ -134,8 +134,12 @@ def cell_settings(cell: CellSpec, keys: Collection[str] = CELL_SETTINGS) -> dict
 
 
 def differences(ours: Any, theirs: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield the keys in which two parts of configs differ, with both values."""
-    if isinstance(ours, dict) and isinstance(theirs, dict) and ours.get("_target_") == theirs.get("_target_"):
+    """Yield the keys in which two parts of configs differ, with both values; of parts of other classes the names."""
+    if isinstance(ours, dict) and isinstance(theirs, dict):
+        names = ours.get("_target_"), theirs.get("_target_")
+        if names[0] != names[1]:
+            yield place, *names
+            return
         for key in {**ours, **theirs}:
             yield from differences(ours.get(key), theirs.get(key), f"{place}.{key}".lstrip("."))
     elif ours != theirs:

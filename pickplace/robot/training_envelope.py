@@ -53,7 +53,7 @@ class TrainingEnvelope:
         if known.tote_size[:2] != cell.tote_size[:2] or cell.tote_size[2] > known.tote_size[2]:
             found.append(f"tote of {_sides(cell.tote_size)} cells: the policy met {_sides(known.tote_size)}.")
         return found + [
-            f"{key}={ours}: the policy met {theirs}."
+            f"{key}={ours}: the policy met {key}={theirs}."
             for key, ours, theirs in differences(cell_settings(cell, RULES), cell_settings(known, RULES))
             if key != "gripper.size" or sorted(ours) != sorted(theirs)
         ]

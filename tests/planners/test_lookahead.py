@@ -56,6 +56,15 @@ def test_with_as_many_streams_as_kinds_the_mean_over_the_next_item_is_exact():
     assert volume.sort().values.tolist() == 3 * [[1, 2, 4, 9]]
 
 
+@pytest.mark.parametrize("bin_items", [1, 2])
+def test_imagined_items_are_spread_where_the_next_one_lies_alone(bin_items, monkeypatch):
+    calls, spread = [], Kinds.spread
+    monkeypatch.setattr(Kinds, "spread", lambda *args: calls.append(args) or spread(*args))
+    env = make_env(2, bin_items=bin_items)
+    search_of(env, samples=2, rounds=1).decide(env.reset())
+    assert bool(calls) == (bin_items == 1)
+
+
 def test_the_horizon_adds_the_critics_value():
     seen = []
 

@@ -260,11 +260,13 @@ def test_warnings_name_what_lies_outside_the_training():
     planner = Planner.load("pretrained/r4", tote_size=(7, 6, 5), effector_size=(4, 4))
     plan = plan_for(planner, items=[Box(0.1, 0.1, 0.12, 0.08, 0.06)], tote_depth=np.full((7, 6), 0.25), **flat)
     assert [warning.partition(" cells")[0] for warning in plan.warnings] == [
-        "item of 3x2x1", "tote of 7x6x5", "gripper.size=[4, 4]: the policy met [3, 3].",
+        "item of 3x2x1", "tote of 7x6x5", "gripper.size=[4, 4]: the policy met gripper.size=[3, 3].",
     ]  # fmt: skip
-    known = plan_for(
-        Planner.load("pretrained/r4"), items=[Box(0.1, 0.1, 0.09, 0.04, 0.05)], tote_depth=np.full((6, 6), 0.25), **flat
-    )
+    hull = Planner.load("pretrained/r4", planner="corner", support="hull")
+    box = Box(0.1, 0.1, 0.09, 0.04, 0.05)
+    plan = plan_for(hull, items=[box], tote_depth=np.full((6, 6), 0.25), **flat)
+    assert plan.warnings == ["support=hull: the policy met support=bearing."]
+    known = plan_for(Planner.load("pretrained/r4"), items=[box], tote_depth=np.full((6, 6), 0.25), **flat)
     assert known.warnings == []
     with pytest.raises(ValueError, match="planner='uniform': it does not choose among|does not choose among feasible"):
         Planner(CellSpec(), planner="uniform")
