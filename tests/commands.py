@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import sys
 import tempfile
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -129,11 +129,11 @@ def after_batch(iteration, act):
 
 
 class Training:
-    """``pickplace-train`` with these overrides in a process of its own."""
+    """``pickplace-train`` with these overrides in a process of its own, in a context that a function makes there."""
 
-    def __init__(self, *overrides):
+    def __init__(self, *overrides, context=nullcontext):
         self.output = Path(tempfile.mkdtemp())
-        self.process = FORKSERVER.Process(target=_train, args=(overrides, self.output))
+        self.process = FORKSERVER.Process(target=_train, args=(overrides, self.output, context))
         self.process.start()
 
     def end(self):
@@ -160,13 +160,14 @@ def write_to(folder):
     sys.stdout, sys.stderr = (os.fdopen(number, "w", buffering=1) for number in (1, 2))
 
 
-def _train(overrides, output):
+def _train(overrides, output, context):
     write_to(output)
     multiprocessing.set_start_method("spawn", force=True)  # as in a process that nobody forked
     from pickplace.training import train
 
     sys.argv = ["pickplace-train", *overrides]
-    train.main()
+    with context():
+        train.main()
 
 
 def assert_same(run_a, run_b):

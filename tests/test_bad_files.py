@@ -37,7 +37,7 @@ from pickplace.runs.folder import (
     refuse_for_run,
     refuse_for_sweep,
     refuse_links,
-)  # fmt: skip
+)
 from pickplace.runs.resume import StopRequest
 from pickplace.serve import json_lines, request
 from pickplace.training import trainer
@@ -96,7 +96,7 @@ def test_an_endless_file_of_size_0_is_empty():
 
 BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{f'*{a}, ' * 9}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
 NOTES = {
-    "alias bomb": BOMB, "broken": "a: [", "deep": "[" * 5_000, "no date": "2001-13-45", "no time": "!!timestamp x",
+    "alias bomb": BOMB, "broken": "a: [", "deep": "[" * 100_000, "no date": "2001-13-45", "no time": "!!timestamp x",
     "numbers": "hydra: {runtime: {config_sources: [{path: 3, provider: command-line}]}, overrides: {hydra: [5]}}",
     "class": "!!python/object/apply:os.getcwd []", "interpolation": "seed: ${oc.env:HOME}\nalgo: {lr: '${no.such}'}",
     "list": "[[1], 2]", "large": "a: " + "x" * 2**21,

@@ -6,13 +6,13 @@ import shutil
 from pathlib import Path
 
 import pytest
-from commands import ITERATION, SETTINGS, after_batch, assert_same, composed
+from commands import after_batch, assert_same
 
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
 from pickplace.training.callbacks import Callback, EarlyStopping, make_callbacks
 from pickplace.training.sweep import read_run
-from pickplace.training.train import resume_run, train
+from pickplace.training.train import resume_run
 
 EXAMPLE = Path(__file__).parents[2] / "docs/examples/own_callback"
 CALLED: list[tuple] = []
@@ -69,7 +69,7 @@ def words(**settings):
     )
 
 
-def test_callbacks_are_called_at_batches_validations_and_levels(smoke, tmp_path):
+def test_callbacks_are_called_at_batches_validations_and_levels(smoke, tmp_path, no_report):
     levels = ["curriculum=paper", "curriculum.advance.frames_per_level=256", "env.tote_size=[4,4,3]"]
     smoke(tmp_path / "run", words(), *levels, "total_frames=512", "evaluation_interval=384")
     assert CALLED == [
@@ -81,7 +81,7 @@ def test_callbacks_are_called_at_batches_validations_and_levels(smoke, tmp_path)
     assert [row["train/recorded"] for row in read_csv(tmp_path / "run/metrics.csv")] == [1, 2, 3, 4]
 
 
-def test_a_training_that_a_callback_ends_is_a_complete_one(smoke, tmp_path, caplog):
+def test_a_training_that_a_callback_ends_is_a_complete_one(smoke, tmp_path, caplog, monkeypatch):
     """It is validated, saved and reported, and only other settings continue it."""
     caplog.set_level(logging.INFO)
     run_dir = tmp_path / "run"
@@ -89,6 +89,7 @@ def test_a_training_that_a_callback_ends_is_a_complete_one(smoke, tmp_path, capl
     rows = read_csv(run_dir / "metrics.csv")
     assert [row["frames"] for row in rows] == [128, 256] and "eval/occupancy" in rows[-1]
     assert (run_dir / "report.html").is_file() and "256 frames: enough" in caplog.text
+    monkeypatch.setattr("pickplace.training.trainer.learning_curve", lambda metrics, path: path.touch())
     (run_dir / ".hydra").mkdir()
     (run_dir / ".hydra" / "config.yaml").write_text("total_frames: 1024\n")
     (run_dir / ".hydra" / "overrides.yaml").write_text("[]\n")
@@ -101,15 +102,14 @@ def test_a_training_that_a_callback_ends_is_a_complete_one(smoke, tmp_path, capl
     assert [(row["frames"], row["train/recorded"]) for row in rows[2:]] == [(384, 3), (512, 4)]
 
 
-def test_a_resume_goes_on_with_the_state_of_the_callbacks(tmp_path):
+def test_a_resume_goes_on_with_the_state_of_the_callbacks(smoke, tmp_path, no_report):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    whole.mkdir()
-    with after_batch(5, lambda _: shutil.copytree(whole, killed)):
-        train(composed(*SETTINGS, words(last=8)), whole)
+    with after_batch(3, lambda _: shutil.copytree(whole, killed)):
+        smoke(whole, words(last=4), "total_frames=1024", "rollout_length=8", "checkpoint_interval=128")
     resume_run([f"resume={killed}", "trust=test_callbacks"])
     assert_same(whole, killed)
     facts = checkpoint.read(killed / "checkpoints" / "last")[1]
-    assert (facts["frames"], facts["callbacks"]) == (8 * ITERATION, {"mine": {"batches": 8}})
+    assert (facts["frames"], facts["callbacks"]) == (256, {"mine": {"batches": 4}})
 
 
 class Trainer:
@@ -140,7 +140,7 @@ def test_early_stopping(settings, occupancies, ends):
     assert found == ends
 
 
-def test_early_stopping_by_the_command(run, tmp_path):
+def test_early_stopping_by_the_command(run, no_report):
     stop = ["callbacks=early_stopping", "callbacks.early_stopping.occupancy=0.1", "total_frames=4096"]
     code, out, err = run("train", "experiment=smoke", "threads=1", *stop, "hydra.run.dir=run")
     assert code == 0 and "256 frames: early stopping: the validation occupancy has reached 0.1" in out, err
@@ -190,7 +190,7 @@ def test_an_algorithm_that_logs_what_the_training_logs_is_refused(smoke, tmp_pat
         smoke(tmp_path / "run")
 
 
-def test_own_callback(run, monkeypatch, tmp_path):
+def test_own_callback(run, monkeypatch, tmp_path, no_report):
     monkeypatch.syspath_prepend(str(EXAMPLE))
     mine = ["--config-dir", str(EXAMPLE), "callbacks=[worst_episode,early_stopping]"]
     mine.append("callbacks.worst_episode.occupancy=0")

@@ -4,17 +4,18 @@ import csv
 import multiprocessing
 import os
 import queue
+import re
 import shutil
 import sys
 import tempfile
 import time
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
-from commands import FORKSERVER, after_batch
+from commands import FORKSERVER, Training, after_batch
 from torchrl._utils import _check_for_faulty_process
 from torchrl.collectors import RandomPolicy
 from torchrl.envs import TransformedEnv
@@ -29,17 +30,24 @@ from pickplace.training.collectors import ignore_signals, watch_workers
 from pickplace.training.train import main as train_main
 
 
-def test_a_dead_worker_ends_the_run_in_one_sentence(smoke, tmp_path):
-    run_dir = tmp_path / "run"
-    words = rf"^collector worker 2 of 2 has died \(exit code -9\). .* is whole: .* resume={run_dir}/checkpoints/last$"
-    multiprocessing.set_start_method("spawn", force=True)  # this process hears of the death of its own children only
+@contextmanager
+def killed_worker():
+    """Kill the second worker after the third batch; no worker may be left at the end."""
+    multiprocessing.set_start_method("fork", force=True)  # a process hears of the death of its own children only
     try:
-        with after_batch(3, lambda trainer: trainer.collector.procs[1].kill()), pytest.raises(WorkerDied, match=words):
-            smoke(run_dir, "collector=multi_sync", "total_frames=2048")
+        with after_batch(3, lambda trainer: trainer.collector.procs[1].kill()):
+            yield
     finally:
-        multiprocessing.set_start_method("forkserver", force=True)
-    assert checkpoint.read(run_dir / "checkpoints" / "last")[1]["frames"] == 256
-    assert not multiprocessing.active_children()
+        assert not multiprocessing.active_children()
+
+
+def test_a_dead_worker_ends_the_run_in_one_sentence(tmp_path):
+    settings = ["experiment=smoke", "collector=multi_sync", "total_frames=2048", "threads=1"]
+    code, _, err = Training(*settings, f"hydra.run.dir={tmp_path}/run", context=killed_worker).end()
+    last = tmp_path / "run" / "checkpoints" / "last"
+    words = rf"error: collector worker 2 of 2 has died \(exit code -9\)\. .* is whole: .* resume={last}"
+    assert code == 2 and re.fullmatch(words, err.splitlines()[-1]), err
+    assert checkpoint.read(last)[1]["frames"] == 256
 
 
 def slots(first: int, count: int) -> TransformedEnv:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import TINY
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -128,12 +129,10 @@ def test_a_curve_is_the_mean_of_runs_that_end_at_different_frames(tmp_path):
     assert frames.tolist() == [100, 200, 300] and values.mean(1) == pytest.approx([0.3, 0.5, 0.7])
 
 
-def test_a_sweep_over_seeds_ends_in_a_row_for_each_setting(run, tmp_path):
+def test_a_sweep_over_seeds_ends_in_a_row_for_each_setting(run, tmp_path, no_report):
     """And its folders are named by overrides, seed last; started again, it has nothing to do."""
-    quick = ["total_frames=128", "evaluation.episodes=4", "logger=none", "env.tote_size=[5,5,1]"]
-    sampled = ["curriculum=adaptive", "curriculum/sample=current,recent"]
-    command = ["train", "-m", *SMOKE, *quick, "seed=0,1,2", *sampled, "hydra.sweep.dir=sweep"]
-    code, _, err = run(*command)
+    command = ["train", "-m", *TINY, "curriculum/sample=current,recent", "hydra.sweep.dir=sweep"]
+    code, _, err = run(*command, "seed=0,1")
     assert code == 0, err
     runs, settings = table(tmp_path / "sweep"), table(tmp_path / "sweep", "sweep_settings.csv")
     assert [row["curriculum/sample"] for row in settings] == ["current", "recent"]
@@ -141,14 +140,12 @@ def test_a_sweep_over_seeds_ends_in_a_row_for_each_setting(run, tmp_path):
         finals = [
             float(row["final_occupancy"]) for row in runs if row["curriculum/sample"] == setting["curriculum/sample"]
         ]
-        assert len(finals) == 3 and float(setting["mean_occupancy"]) == pytest.approx(sum(finals) / 3)
+        assert len(finals) == 2 and float(setting["mean_occupancy"]) == pytest.approx(sum(finals) / 2)
         assert min(finals) <= float(setting["mean_ci95_low"]) <= float(setting["mean_ci95_high"]) <= max(finals)
     names = [row["run"] for row in runs]
-    assert names == [
-        f"curriculum.sample-{sample}+seed-{seed}" for sample in ("current", "recent") for seed in (0, 1, 2)
-    ]
+    assert names == [f"curriculum.sample-{sample}+seed-{seed}" for sample in ("current", "recent") for seed in (0, 1)]
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "sweep").glob("*/checkpoints/last/*")}
-    assert run(*command)[0] == 0 and len(before) == 12
+    assert run(*command, "seed=1")[0] == 0 and len(before) == 8
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "sweep").glob("*/checkpoints/last/*")} == before
 
 
@@ -204,7 +201,7 @@ def test_a_run_without_metrics_is_known_by_its_checkpoint(smoke_run, tmp_path):
     assert read_run(tmp_path / "0").status == "stopped"
 
 
-def test_a_run_that_fails_leaves_the_others_alone(run, tmp_path):
+def test_a_run_that_fails_leaves_the_others_alone(run, tmp_path, no_report):
     quick = ["total_frames=128", "evaluation.episodes=2"]
     code, _, err = run("train", "-m", *SMOKE, *quick, "reward_scale=1e38,1", "hydra.sweep.dir=sweep")
     assert code == 2 and "error: run reward_scale-1e+38: the loss or its gradient is not finite" in err
