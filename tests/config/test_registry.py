@@ -103,10 +103,10 @@ def test_every_env_and_item_distribution(tmp_path):
     (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
     for name in options("items"):
         words = [f"items.path={tmp_path}/items.csv"] if name == "recorded" else []
-        assert isinstance(build("items", composed(f"items={name}", *words)["items"]), ItemDistribution)
+        assert isinstance(build("items", composed(f"+items={name}", *words, name=None)["items"]), ItemDistribution)
+    items = build("items", composed()["items"])
     for name in options("env"):
-        cfg = composed(f"env={name}")
-        env = build("env", {**OmegaConf.to_container(cfg.env), "num_envs": 2}, items=build("items", cfg["items"]))
+        env = build("env", {**composed(f"+env={name}", name=None).env, "num_envs": 2}, items=items)
         assert isinstance(env, PickPlaceEnv) and env.reset()["action_mask"].any(1).all()
 
 
@@ -115,7 +115,7 @@ def test_every_curriculum_and_every_exchange_of_its_parts():
     parts = [options("curriculum/advance"), options("curriculum/sample"), options("curriculum")]
     longest = max(map(len, parts))
     for advance, sample, name in itertools.islice(zip(*map(itertools.cycle, parts), strict=True), longest):
-        cfg = composed(f"curriculum={name}", f"curriculum/advance={advance}", f"curriculum/sample={sample}")
-        build("curriculum", cfg.curriculum).setup(1, 5, 10**9)
+        words = [f"+curriculum={name}", f"curriculum/advance={advance}", f"curriculum/sample={sample}"]
+        build("curriculum", composed(*words, name=None).curriculum).setup(1, 5, 10**9)
     for name in options("curriculum"):
-        assert isinstance(build("curriculum", composed(f"curriculum={name}").curriculum), Curriculum)
+        assert isinstance(build("curriculum", composed(f"+curriculum={name}", name=None).curriculum), Curriculum)
