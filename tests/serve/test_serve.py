@@ -347,6 +347,18 @@ def test_a_client_may_wait_and_begin_anew(monkeypatch, impatient):
         one.close()
 
 
+def test_a_client_may_ask_again_and_again(impatient):
+    with served("--planner", "joint_dbl") as client:
+        (one,) = open_sockets(client, 1, b"")
+        for _ in range(12):
+            time.sleep(0.05)
+            one.sendall(FIRST)
+            reply = http.client.HTTPResponse(one)
+            reply.begin()
+            assert reply.status == 200 and reply.read()
+        one.close()
+
+
 def test_slow_bodies_take_up_places():
     head = b"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 99\r\n\r\n{"
     with served("--planner", "joint_dbl", "--rate", 1e6) as client:
