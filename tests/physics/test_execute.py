@@ -106,6 +106,7 @@ def test_plans_without_a_bin_are_refused():
         Execute().carry_out_one(EpisodePlan(3, (0.3, 0.3, 0.3), placements=[Placement((0, 0, 0), (0.1, 0.1, 0.1))]))
 
 
+@pytest.mark.parametrize("count", [2, pytest.param(12, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("settings", [
     {}, {"effector_size": (3, 2), "bin_size": (4, 5, 2)}, {"effector_size": (6, 5), "tote_size": (6, 6, 1)},
     {"pick_rule": "overlap", "bin_size": (5, 5, 3), "effector_size": (2, 2)},
@@ -115,7 +116,7 @@ def test_plans_without_a_bin_are_refused():
      "effector_size": (2, 3)},
     {"bin_items": 3, "bin_size": (6, 5, 1), "items": Uniform((1, 2), (1, 3), (1, 2))},
 ])  # fmt: skip
-def test_what_the_rules_call_feasible_is_carried_out(settings):
+def test_what_the_rules_call_feasible_is_carried_out(settings, count):
     """Random play with every rotation and grasp: each item comes to lie where the rules say."""
 
     def make_env(first, count):
@@ -124,7 +125,7 @@ def test_what_the_rules_call_feasible_is_carried_out(settings):
         )
 
     cell = make_env(0, 1).cell
-    episodes = play(make_env, RandomFeasible(cell, seed=1), 6, 6, record=range(6))
+    episodes = play(make_env, RandomFeasible(cell, seed=1), count, count, record=range(count))
     plans = [plan_of(recording, cell, 0.05) for recording in episodes.recordings]
     assert {placement.rotation for plan in plans for placement in plan.placements} == {0, 90, 180, 270}
     for outcome, plan, occupancy in zip(

@@ -130,7 +130,7 @@ def test_several_items_are_measured_or_known_to_be_hidden_in_part():
     """Boxes anywhere in a bin, in the shadow of others too: a plan for what the camera sees has no fault."""
     room, cell, draw, counts = (0.4, 0.4, 0.05), CellSpec(bin_size=(8, 8, 1)), np.random.default_rng(2), Counter()
     planner, eye = Planner(cell, planner="joint_dbl"), camera(room)
-    for seed in range(50):
+    for seed in range(30):
         scene = World(room, TOTE, (0.15, 0.15), (0.09, 0.07, 0.12), (0.285, 0.2), float(draw.uniform(-5, 5)))
         scene.add_others(draw, 3, (0.1, 0.1, 0.12))
         size = (0.06, 0.05, 0.03)  # a low one, close behind the first
@@ -159,7 +159,7 @@ def test_several_items_are_measured_or_known_to_be_hidden_in_part():
             item = {"item": (box.w, box.d, seen.item[2]), "centre": (box.x, box.y), "yaw": box.yaw}  # nearly
             assert type(box) is Box and fault(replace(seen, **item), plan, 0.003) is None
         counts[plan.status] += 1
-    assert counts["HiddenBox"] > 5 and counts["Box"] > 40 and counts["ok"] > 15, counts
+    assert counts["HiddenBox"] > 5 and counts["Box"] > 24 and counts["ok"] > 9, counts
 
 
 def test_what_is_no_image_of_the_tote_is_refused():

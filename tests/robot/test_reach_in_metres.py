@@ -40,7 +40,7 @@ def test_no_plan_that_is_ok_is_out_of_the_annulus(effector, unit, rotations):
     sizes = {"effector_size": effector, "height_unit": unit, "rotations": rotations}
     planners = [Planner(CellSpec(**sizes, reach=reach), planner="joint_dbl") for reach in (ANNULUS, None)]
     draw, found = np.random.default_rng(sum(effector)), Counter()
-    for _ in range(120):
+    for _ in range(80):
         scene = random_scene(draw, TOTE)
         scene.bin, scene.effector = (0.25, 0.25, CELL * unit), tuple(CELL * side for side in effector)
         limited, free = (plan_of(planner, scene, np.random.default_rng(0)) for planner in planners)

