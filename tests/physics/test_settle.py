@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from commands import FORKSERVER
 
 from pickplace.physics import simulation
 from pickplace.physics.execute import Execute
@@ -81,8 +82,9 @@ def test_an_item_that_tilts_slowly_does_not_fall_asleep(sleep):
     assert Settle(gap=0.0, sleep=sleep).carry_out_one(bricks(0.1, length=0.2, height=0.2)).ending == "collapsed"
 
 
-def test_sleep_changes_no_result_and_processes_neither():
+def test_sleep_changes_no_result_and_processes_neither(monkeypatch):
     """Columns of bricks with random overhangs, some of which fall."""
+    monkeypatch.setattr(simulation, "get_context", lambda method: FORKSERVER)  # new processes take seconds to import
     random, plans = np.random.default_rng(0), []
     for episode in range(6):
         plans.append(replace(bricks(*random.uniform(-0.045, 0.045, 5)), episode=episode))

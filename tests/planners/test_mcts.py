@@ -26,10 +26,10 @@ def search_of(env, simulations, **settings):
 def test_more_simulations_come_closer_to_the_optimum():
     few, many = (search_of(make_env(), simulations) for simulations in (16, 200))
     for search, low, high in ((few, 1, 1.5), (many, 1.5, 16)):
-        search.decide(make_env(32).reset())
+        search.decide(make_env(16).reset())
         assert low <= search.statistics()["mean_tree_depth"] < high
-    worse, better = (occupancies(search, make_env(32)) for search in (few, many))
-    noise = float(better.std() / 32**0.5)
+    worse, better = (occupancies(search, make_env(16)) for search in (few, many))
+    noise = float(better.std() / 16**0.5)
     assert worse.mean() < better.mean() - 0.02
     assert OPTIMUM - 0.02 - 2 * noise < better.mean() < OPTIMUM + 3 * noise
 
@@ -80,7 +80,7 @@ def test_a_return_is_what_the_walk_places_and_its_rollout(mask):
 @pytest.mark.parametrize("mask", [True, False])
 def test_what_is_not_taken_stays_in_the_bin(mask):
     env = make_env(tote_size=(4, 4, 2), bin_items=3)
-    root, looked = searched(mask, 1500, bin_items=3), set()
+    root, looked = searched(mask, 300, bin_items=3), set()
     before = root.items.tolist()
     for edge in root.edges.values():
         taken = edge.action // env.cell.num_footprints
