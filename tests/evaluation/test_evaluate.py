@@ -110,10 +110,10 @@ def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, 
 
 
 @pytest.mark.parametrize(("group", "stream", "seed"), [("default", "test", 7), ("validation", "validation", 3)])
-def test_evaluation_json(command, group, stream, seed):
+def test_evaluation_json(command, evaluation, group, stream, seed):
     settings = [f"evaluation={group}", f"evaluation.seed={seed}", "evaluation.episodes=5"]
     settings += ["evaluation.latency_decisions=3", "env.tote_size=[4,5,2]", "evaluation.batch_size=2"]
-    result = command("planner=joint_dbl", *settings)
+    result = (command if group == "default" else evaluation)("planner=joint_dbl", *settings)
     assert (result["planner"], result["episodes"], result["seed"], result["stream"]) == ("joint_dbl", 5, seed, stream)
     assert result["env"]["tote_size"] == [4, 5, 2] and result["env"]["rotations"] == 4
     occupancy, latency = result["occupancy"], result["latency_ms"]

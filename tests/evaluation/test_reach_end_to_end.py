@@ -65,8 +65,10 @@ def test_a_checkpoint_brings_its_reach(begun, evaluation, run, tmp_path):
     error = evaluation(f"checkpoint={begun}", "reach=everywhere", f"compare={plain['path']}")
     assert "env.reach={" in error and "expected None" in error
     for word, expected in (("~reach", "reach="), ("~gripper", "gripper="), ("~reach=null", "reach=")):
-        code, _, error = run("evaluate", *EVALUATION, f"checkpoint={begun}", word)
-        assert code == 2 and f"error: {word}: " in error and f"expected {expected}" in error and error.count("\n") == 1
+        error = evaluation(f"checkpoint={begun}", word)
+        assert error.startswith(f"{word}: ") and f"expected {expected}" in error and "\n" not in error
+    code, _, printed = run("evaluate", f"checkpoint={begun}", word)
+    assert code == 2 and error in printed and printed.count("\n") == 1
     assert "env.reach.radi:" in evaluation(f"checkpoint={begun}", "env.reach.radi=[1,2]")
 
 

@@ -83,7 +83,12 @@ def test_a_pick_may_be_chosen_first(rule, make, effector, rotations):
     """Of the actions with this pick that succeed the one whose footprint the policy likes best; else one that fails."""
     stuck = others = 0
     for env, observation in random_states(
-        effector_size=effector, cup_size=(1, 1), pick_rule="overlap", rotations=rotations, tote_size=(5, 5, 4)
+        effector_size=effector,
+        cup_size=(1, 1),
+        pick_rule="overlap",
+        rotations=rotations,
+        tote_size=(5, 5, 4),
+        num_envs=8,
     ):
         cell, policy = env.cell, make(env.cell)
         policy.network.compute_dtype = "float32"
