@@ -130,6 +130,7 @@ BAD_VALUES = [
 OWN_VALUES = [
     # a config file of the user's, written for threshold
     ("curriculum=careful curriculum/advance=plateau curriculum.advance.window=9", {"curriculum.advance.window": 9}),
+    ("curriculum=careful curriculum/advance=threshold", {"curriculum.advance.window": 200}),
     ("curriculum=careful", {"curriculum.advance.window": 200}),
     # presets
     ("experiment=smoke model=fcn4d", {"model.actor.filters": 64, "model.critic.hidden": 256}),
@@ -211,12 +212,11 @@ def test_own_values_are_trained_with_and_noted(run, search, monkeypatch, words, 
         assert {key: OmegaConf.select(cfg, key) for key in expected} == expected
 
 
-def test_own_values_in_a_sweep(run, monkeypatch):
+def test_own_values_in_a_sweep(run, search, monkeypatch):
     given = []
     monkeypatch.setattr(train, "train", lambda cfg, run_dir: given.append(cfg.curriculum.advance))
-    words = ["-m", "--config-dir", str(CURRICULA), "curriculum=careful", "curriculum/advance=plateau,threshold"]
-    run("train", *words, "hydra.sweep.dir=sweep")
-    assert given[0] == PLATEAU and (given[1].window, given[1].occupancy) == (200, 0.85)
+    run("train", "-m", search, "experiment=mine", "curriculum/advance=plateau,threshold", "hydra.sweep.dir=sweep")
+    assert given[0] == PLATEAU and (given[1].window, given[1].occupancy) == (7, 0.5)
 
 
 @pytest.mark.parametrize(
