@@ -45,7 +45,7 @@ def test_no_planner_exceeds_the_optimum(planner, rotations):
 def test_fcn_grasp_comes_within_1_percent(tmp_path):
     """``joint_dbl`` reaches 93% on this tote."""
     networks = [f"model.{part}.{size}=16" for part in ("actor", "critic") for size in ("filters", "hidden")]
-    quick = ["total_frames=16_384", "algo.minibatch_size=128", "env.num_envs=64", "evaluation.episodes=1"]
+    quick = ["total_frames=8192", "algo.minibatch_size=128", "env.num_envs=64", "evaluation.episodes=1"]
     tote = ["env.tote_size=[3,3,1]", "env.rotations=2", "curriculum=none", "logger=none", "threads=1"]
     cfg = composed("experiment=quick", *tote, *quick, *networks)
     train(cfg, tmp_path)
