@@ -80,11 +80,12 @@ def test_a_run_that_is_killed_and_stopped_equals_an_undisturbed_one(collector, u
 @pytest.mark.parametrize("refill", ["each", "batch"])
 def test_several_items_in_the_bin_are_resumed_exactly(refill, tmp_path, no_report):
     several = ["env.bin_items=3", "env.bin_size=[5,5,1]", f"env.refill={refill}", "algo.advantages=gae"]
-    several += [f"warm_start.frames={2 * ITERATION}", f"warm_start.critic_frames={ITERATION}"]
+    several += [f"warm_start.{key}={ITERATION}" for key in ("frames", "critic_frames")]
+    several += [f"checkpoint_interval={2 * ITERATION}", f"total_frames={4 * ITERATION}"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     whole.mkdir()
-    with after_batch(4, lambda _: shutil.copytree(whole, killed)):
-        train(composed(*SETTINGS, *several, f"total_frames={6 * ITERATION}"), whole)
+    with after_batch(3, lambda _: shutil.copytree(whole, killed)):
+        train(composed(*SETTINGS, *several), whole)
     resume_run([f"resume={killed}"])
     assert_same(whole, killed)
 
