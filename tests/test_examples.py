@@ -303,10 +303,11 @@ def test_own_curriculum(name, levels):
     assert seen == levels
 
 
-def test_torchrl_ppo(monkeypatch):
+@pytest.mark.parametrize(("total_frames", "gain"), [(1_024, -1), pytest.param(6_144, 0.03, marks=pytest.mark.slow)])
+def test_torchrl_ppo(monkeypatch, total_frames, gain):
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    before, after = importlib.import_module("torchrl_ppo").train(total_frames=6_144)
-    assert 0.7 < before < before + 0.03 < after < 1
+    before, after = importlib.import_module("torchrl_ppo").train(total_frames=total_frames)
+    assert 0.7 < before < 1 and before + gain < after < 1
 
 
 class FakeNode:

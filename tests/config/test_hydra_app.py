@@ -289,8 +289,16 @@ def test_full_error_shows_the_traceback(run, monkeypatch):
         run("train", "env.rotations=5")
 
 
-@pytest.mark.parametrize("name", ["train", "evaluate"])
-@pytest.mark.parametrize("words", ["--cfg job", "--cfg all", "--help", "--cfg job -p env --resolve", "--version"])
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("train", "--cfg job"),
+        ("evaluate", "--cfg all"),
+        ("train", "--help"),
+        ("evaluate", "--cfg job -p env --resolve"),
+        ("train", "--version"),
+    ],
+)
 def test_hydra_s_flags_with_its_debugging_output(run, tmp_path, name, words):
     code, out, err = run(name, "hydra.verbose=true", *words.split())
     assert code == 0, err

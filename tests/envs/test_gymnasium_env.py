@@ -204,7 +204,10 @@ def test_a_step_that_resets_hides_what_its_action_would_have_done(tmp_path):
 
 
 def test_async_vectorisation():
-    env = gymnasium.make_vec(ID, num_envs=1, vectorization_mode="async", **SMALL)
+    # Not the default "fork" or "spawn": a process that has imported torch already.
+    env = gymnasium.make_vec(
+        ID, num_envs=1, vectorization_mode="async", vector_kwargs={"context": "forkserver"}, **SMALL
+    )
     _, info = env.reset(seed=1)
     observation, reward, *_ = env.step(feasible(info["action_mask"], np.random.default_rng(0)))
     assert observation["bin_depth"].shape == (1, 5, 5) and reward > 0

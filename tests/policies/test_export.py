@@ -8,8 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_footprint_fcn import by_hand, random_maps
+from torch.export import Dim
 
-from pickplace import CellSpec, __version__, load_policy
+from pickplace import CellSpec, PickPlaceEnv, __version__, load_policy
 from pickplace.policies import export, onnx_model
 from pickplace.policies.base import MASKED
 from pickplace.policies.corners.policy import Corners
@@ -85,6 +86,21 @@ def test_the_check_is_at_three_sizes_that_the_export_has_not_seen(exported):
     }  # fmt: skip
 
 
+def test_torch_export_takes_any_number_of_items():
+    seen = [PickPlaceEnv(num_envs=3, bin_items=count, **sizes).reset() for count, sizes in (
+        (2, {"bin_size": (5, 6, 1), "tote_size": (7, 9, 5)}), (4, {"bin_size": (6, 4, 1), "tote_size": (5, 8, 5)}),
+    )]  # fmt: skip
+    torch.manual_seed(0)
+    policy = FcnGrasp(CellSpec(bin_items=2), head_std=1.0, compute_dtype="float32")
+    scores = Scores(policy, [key for key in policy.in_keys if not key.endswith("_mask")])
+    examples = [tuple(each[key] for key in scores.keys) for each in seen]
+    shapes = tuple(dict(enumerate(SHAPES.get(key, ("N", Dim.AUTO, Dim.AUTO)))) for key in scores.keys)
+    program = torch.export.export(scores, examples[0], dynamic_shapes=(shapes,)).module()
+    for example in examples:
+        torch.testing.assert_close(program(*example), scores(*example), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.slow
 def test_several_items_are_an_input(tmp_path):
     """Each item's part of the scores; with more or fewer items than in training, too."""
     runtime = pytest.importorskip("onnxruntime")
@@ -178,6 +194,17 @@ def test_the_command_replaces_a_file_when_the_check_has_passed(converted, comman
     assert [*tmp_path.iterdir()] == [path] and path.stat().st_size > 10**5
 
 
+def test_the_scores_of_flat_actions_are_those_of_the_policy():
+    torch.manual_seed(0)
+    policy = MAKERS["fcn4d"]()
+    seen = PickPlaceEnv(num_envs=3, tote_size=(8, 7, 5), rotations=3).reset()
+    policy = policy.with_cell(CellSpec(tote_size=(8, 7, 5), rotations=3))
+    with torch.no_grad():
+        scores = Scores(policy, policy.map_keys)(*(seen[key] for key in policy.map_keys))
+        torch.testing.assert_close(scores.log_softmax(1), policy.action_log_probs(seen))
+
+
+@pytest.mark.slow
 def test_fcn4d_scores_every_flat_action(tmp_path):
     runtime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")

@@ -98,6 +98,7 @@ def test_a_run_killed_before_its_first_last_resumes_from_best(undisturbed, tmp_p
     assert_same(whole, run_dir)
 
 
+@pytest.mark.slow
 def test_chaos_in_short(tmp_path):
     """While it starts and while it saves; ``make chaos`` kills it a hundred times, with either collector."""
     settings = ["experiment=smoke", "rollout_length=8", "evaluation.episodes=2", "threads=1"]
