@@ -21,7 +21,7 @@ from pickplace.envs.saved_state import check_saved_states
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import OccupiedError, claim, note_failure
 from pickplace.runs.loggers import read_csv
-from pickplace.runs.resume import checkpoint_config, resumed_config
+from pickplace.runs.resume import STOP_SIGNALS, checkpoint_config, resumed_config
 from pickplace.training.train import resume_run, train
 from pickplace.training.trainer import Trainer
 
@@ -146,14 +146,15 @@ def test_a_job_of_a_sweep_that_is_started_again_goes_on(undisturbed, tmp_path, c
 
 
 def test_a_stopped_training_has_the_exit_code_of_its_signal(run, tmp_path):
-    """By the command, and twice when it is resumed."""
-    run_dir = tmp_path / "run"
+    """By the command, and twice when it is resumed; later signals do what they did before."""
+    run_dir, handlers = tmp_path / "run", [signal.getsignal(number) for number in STOP_SIGNALS]
     commands = (["experiment=smoke", "threads=1", f"hydra.run.dir={run_dir}"], *2 * [[f"resume={run_dir}"]])
     for batch, (number, words) in enumerate(zip((signal.SIGTERM, signal.SIGINT, signal.SIGHUP), commands, strict=True)):
         with after_batch(batch + 1, lambda _, number=number: os.kill(os.getpid(), number)):
             code, out, _ = run("train", *words)
         assert code == 128 + number and f"continue with: pickplace-train resume={run_dir}\n" in out
         assert saved_frames(run_dir) == (batch + 1) * 128
+        assert [signal.getsignal(number) for number in STOP_SIGNALS] == handlers
     assert (run_dir / "learning_curve.png").is_file() and not (run_dir / "report.html").exists()
     assert run("train", f"resume={run_dir}")[0] == 0 and (run_dir / "report.html").is_file()
 
