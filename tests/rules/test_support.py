@@ -1,11 +1,13 @@
 """Stability rules as objects: their short and long forms, and rules of a user's own on the grid and in metres."""
 
 from dataclasses import dataclass
+from random import Random
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracle import Rules, is_stable
 from problems import SUPPORTS, support_of
 
 from pickplace import Box, CellSpec, Planner, Scene
@@ -65,6 +67,24 @@ def test_large_items_touch_what_small_ones_do(side, seed):
         assert torch.equal(getattr(small, quantity)[inside], getattr(large, quantity)[inside]), quantity
     for name in RULES:
         assert torch.equal(RULES[name]().stable(small)[inside], RULES[name]().stable(large)[inside]), name
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.25])
+def test_the_hull_under_larger_items_is_that_of_the_oracle(margin):
+    """A few supporting cells of footprints up to 7 x 7, whose hulls have edges in many directions."""
+    rng, side, count = Random(0), 7, 3_000
+    cell = CellSpec((side, side, 1), (side, side, 9), Contain((side, side)), rotations=1, longest_side=side)
+    heights, sizes, expected = torch.zeros(count, side, side, dtype=torch.int64), [], []
+    for row in range(count):
+        w, d = size = rng.randint(3, side), rng.randint(3, side)
+        cells = rng.sample([(x, y) for x in range(w) for y in range(d)], rng.randint(2, 4))
+        x, y = zip(*cells, strict=True)
+        heights[row, x, y] = 1
+        sizes.append(size)
+        expected.append(is_stable(Rules(support="hull", support_margin=margin), cells, size))
+    w, d = torch.tensor(sizes).t().reshape(2, 1, 1, 1, count)
+    contact = OnFootprints(cell, surface_from(heights), w, d)
+    assert Hull(margin).stable(contact)[0, 0, 0].tolist() == expected and 0.2 < sum(expected) / count < 0.8
 
 
 @dataclass(frozen=True)
