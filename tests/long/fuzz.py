@@ -227,8 +227,11 @@ def plan_maps(draw: random.Random, folder: Path, place: str, flags: list[str], r
 
 def json_line(draw: random.Random, folder: Path) -> None:
     """Answer a damaged line, and check the answer."""
-    sizes = draw.choice((((5, 5, 1),), ((4, 6, 2), (5, 7, 6), (2, 3), 2), ((3, 3, 1), (4, 4, 3), (1, 1), 1, "overlap")))
-    cell = CellSpec(*sizes)
+    cell = draw.choice((
+        CellSpec(),
+        CellSpec((4, 6, 2), (5, 7, 6), effector_size=(2, 3), rotations=2),
+        CellSpec((3, 3, 1), (4, 4, 3), effector_size=(1, 1), rotations=1, pick_rule="overlap"),
+    ))  # fmt: skip
     policy = FcnGrasp(cell, filters=8, hidden=8).eval()
     planner = Planner(policy.cell, policy, draw.choice(("all", 5)))
     line = line_of(draw, damage(draw, good_request(draw, cell)))
