@@ -85,9 +85,7 @@ def draw_candidates(logits: Tensor, samples: int, temperature: float) -> tuple[T
     taken = _add_noise(every).argmax(1, keepdim=True)
     others = (every / temperature).scatter(1, taken, -torch.inf)
     scale = others.logsumexp(1, keepdim=True)
-    # The one that is left out, if none is, has no chance.
-    noisy = torch.nn.functional.pad(_add_noise(others - scale), (0, 1), value=-torch.inf)
-    score, order = noisy.topk(1 + samples)
+    score, order = _add_noise(others - scale).topk(1 + samples)  # the taken one, without a chance, comes last
     candidates = torch.cat([taken, order[:, :-1]], 1)
     log_prob = every.gather(1, candidates)
     among_others = -(-(log_prob / temperature - scale - score[:, -1:]).exp()).expm1()
