@@ -318,7 +318,7 @@ class Oracle:
         return any(self.try_action(action)[0] == SUCCESS for action in chain(try_first, self.lifting_actions()))
 
     def lifting_actions(self) -> Iterator[int]:
-        """The actions of which the pick succeeds."""
+        """The actions whose pick succeeds."""
         picks = self.rules.bin_size[0] * self.rules.bin_size[1]
         each = self.rules.num_actions // picks
         for number in range(picks):

@@ -35,7 +35,7 @@ from pickplace.training.trainer import Trainer
 
 VALUES = [None, True, "x", -1, 0, 1.5, math.inf, math.nan, 10**20, [], {}, [1, 2], "y" * 100_000]
 
-#: Groups whose form in a checkpoint is that of the smaller groups, and is checked with these.
+#: Large groups. Their form in a checkpoint is not checked here, but with the smaller groups, which have the same.
 LARGE_GROUPS = ("algo", "env", "items", "model")
 
 #: Trainings that between them have most leaves of ``conf/``, by the groups that each is asked about.

@@ -85,7 +85,7 @@ def draw_candidates(logits: Tensor, samples: int, temperature: float) -> tuple[T
     taken = _add_noise(every).argmax(1, keepdim=True)
     others = (every / temperature).scatter(1, taken, -torch.inf)
     scale = others.logsumexp(1, keepdim=True)
-    score, order = _add_noise(others - scale).topk(1 + samples)  # the taken one, without a chance, comes last
+    score, order = _add_noise(others - scale).topk(1 + samples)  # the taken one has no chance
     candidates = torch.cat([taken, order[:, :-1]], 1)
     log_prob = every.gather(1, candidates)
     among_others = -(-(log_prob / temperature - scale - score[:, -1:]).exp()).expm1()

@@ -121,7 +121,7 @@ def test_several_items_are_an_input(tmp_path):
 
 
 def test_a_robot_with_a_reach_has_the_same_scores(converted, tmp_path):
-    """As the network that was converted without one."""
+    """The network that was converted without a reach has these scores."""
     reach = Annulus((0, 99), (0, 9), (0, 0, 0), (0, 0, 0))
     assert max(onnx_model.export_onnx("pretrained/mixed", tmp_path / "reach.onnx", reach=reach).values()) <= 1e-5
 
