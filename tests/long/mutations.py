@@ -40,6 +40,8 @@ SAME_RESULT = (
     ("packed, slots =", ""),  # how many flags are copied at once
     ("max_side < LEAST_SIDE", ""),  # which of two ways is taken
     ("advantage > 0", "Gt_GtE"),  # either weight of zero
+    ("Resting(z < FAR,", ""),  # what is outside is too high, too
+    ("min(margins) < 0", "Lt_LtE"),  # nothing is cut then
     ("DIRECTIONS = ", ""),  # the margin makes up for what lies between two of them
 )
 #: Operators that change what any run sees at once, or that most often change nothing.

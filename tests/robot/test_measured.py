@@ -166,6 +166,19 @@ def test_a_low_box_is_no_floor_and_a_patch_that_is_covered_in_part_is_not_whole(
         assert plan.status != "ok" or fault(wide, plan) is None
 
 
+@pytest.mark.parametrize("along", [5, 10])
+def test_the_share_of_an_item_that_is_carried_decides(along):
+    """The item spans two boxes, so that its centre is over their hull: of its 8 cm they carry 2, or 6."""
+    statuses = []
+    for carried in (0.01, 0.03):
+        scene = World((0.25, 0.25, 0.05), (0.1, 0.1, 0.25), (0.1, 0.1), (0.08, 0.08, 0.06), (0.125, 0.125), 0.0)
+        scene.boxes += [(0, 0, 0.01 + carried, 0.1, 0.1), (0.09 - carried, 0, 0.1, 0.1, 0.1)]
+        planner = Planner(CellSpec(tote_size=(2, 2, 5), effector_size=(2, 2), support="half"), planner="joint_dbl")
+        seen = {"tote_depth": scene.tote_map(20 * along, 0), "cell_size": CELL}
+        statuses.append(plan_for(planner, items=[Box(*scene.centre, *scene.item)], **seen).status)
+    assert statuses == ["stuck", "ok"]
+
+
 def test_limits_of_the_robot_hold_for_the_pose_and_the_release():
     open_limits = Limits(torch.ones(25, dtype=torch.bool), torch.zeros(4, 6, 6).int(), torch.full((4, 6, 6), 9))
     boxes = [Box(0.11, 0.125, 0.06, 0.06, 0.06, yaw) for yaw in (0, 20, 40)]
