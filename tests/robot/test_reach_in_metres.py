@@ -52,6 +52,7 @@ def test_no_plan_that_is_ok_is_out_of_the_annulus(effector, unit, rotations):
         else:
             found["refused"] += free.status == "ok"
             found["names reach"] += "out_of_reach" in limited.reasons
+            assert "none" not in limited.reasons  # each action that fails has its reason
     assert min(found[key] for key in ("another plan", "free is out of reach", "refused", "names reach")) > 3, found
 
 
