@@ -42,6 +42,7 @@ SAME_RESULT = (
     ("advantage > 0", "Gt_GtE"),  # either weight of zero
     ("Resting(z < FAR,", ""),  # what is outside is too high, too
     ("min(margins) < 0", "Lt_LtE"),  # nothing is cut then
+    ('row["rotation"] or 0', "NumberReplacer"),  # a bin has one turn, the first and the last
     ("DIRECTIONS = ", ""),  # the margin makes up for what lies between two of them
 )
 #: Operators that change what any run sees at once, or that most often change nothing.
