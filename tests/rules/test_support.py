@@ -42,6 +42,7 @@ def test_short_forms():
         ({"_target_": "hull", "margin": -1}, "support.margin=-1: expected a number between 0 and 100"),
         ({"_target_": "share", "least": 1.5}, "support.least=1.5: expected a number between 0 and 1"),
         ({"_target_": "half", "margin": 0.1}, "env.support.margin: there is no key 'margin'"),
+        *(({"_target_": name, "least": 0.3}, "env.support.least: there is no key 'least'") for name in RULES),
         ({"_target_": "hul"}, "env.support._target_=hul: .* did you mean 'hull'"),
     ],
 )
