@@ -8,6 +8,7 @@ out: texts of errors, types, and sizes of caches.
 """
 
 import argparse
+import hashlib
 import os
 import random
 import shutil
@@ -78,14 +79,18 @@ def places(path: Path) -> Iterator[Mutation]:
 
 
 def draw(count: int, seed: int) -> list[Mutation]:
-    """Return changes, each of another line, drawn evenly over the lines."""
-    by_line: dict[tuple[str, int], list[Mutation]] = {}
+    """Return changes, each of another line, drawn evenly over the lines.
+
+    A line's text decides, so that the draw of a seed stays nearly the same when other lines change.
+    """
+    by_line: dict[str, list[Mutation]] = {}
     for target in TARGETS:
         for path in sorted((ROOT / target).rglob("*.py")) if (ROOT / target).is_dir() else [ROOT / target]:
+            lines = path.read_text().splitlines()
             for mutation in places(path):
-                by_line.setdefault((mutation.path, mutation.line), []).append(mutation)
-    generator = random.Random(seed)
-    return [generator.choice(by_line[line]) for line in generator.sample(sorted(by_line), min(count, len(by_line)))]
+                by_line.setdefault(f"{seed} {mutation.path} {lines[mutation.line - 1]}", []).append(mutation)
+    drawn = sorted(by_line, key=lambda line: hashlib.sha256(line.encode()).digest())[:count]
+    return [random.Random(line).choice(by_line[line]) for line in drawn]
 
 
 def run_tests(copy: Path, words: list[str]) -> bool:
