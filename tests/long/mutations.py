@@ -36,6 +36,7 @@ LEFT_OUT = ("raise ", 'f"', "lru_cache", "->", "import ", "@", "TypeVar", "Liter
 #: Changes that no result shows: pieces of a line, and of the operator's name.
 SAME_RESULT = (
     ("", "BitAnd_Mul"),  # of masks
+    ("", "BitOr_Add"),  # of masks
     ("cell.parities == 2", "Eq_GtE"),  # it is 1 or 2
     ("== 1", "Eq_LtE"),  # of counts, which are at least 1
     ("packed, slots =", ""),  # how many flags are copied at once
