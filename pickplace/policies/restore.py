@@ -168,10 +168,10 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     if not (cell.has_known_offsets or cfg.model.mask_infeasible):  # the policy chooses among grasps: so many are there
         cell = replace(cell, longest_side=int(build("items", cfg["items"]).sizes[:, :2].max()))
     policy = restore_policy(cfg, cell, state["policy"], env).to(usable_device(device))
-    nodes = (cfg.env.get("observation") or {}).items()
-    return TrainedPolicy(
-        policy, check_terms({str(key): build(f"env.observation.{key}", node) for key, node in nodes}), cfg
-    )
+    given = env.get("observation") or {}
+    expect(isinstance(given, dict), "env.observation", given, "terms by their keys")
+    terms = {str(key): build(f"env.observation.{key}", node) for key, node in given.items()}
+    return TrainedPolicy(policy, check_terms(terms), cfg)
 
 
 def load_critic(path, trained: TrainedPolicy) -> "RestoredCritic | None":

@@ -11,6 +11,7 @@ from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.base import as_collection_policy
 from pickplace.rules.observation import STANDARD_TERMS
 from pickplace.rules.support.rules import Bearing, Half
+from pickplace.runs import checkpoint
 
 SIZES = {"env.tote_size": (4, 4, 2), "env.bin_size": (4, 4, 1)}
 
@@ -78,3 +79,12 @@ def test_another_stability_rule_than_that_of_the_training(tmp_path):
 def test_bad_arguments_are_refused(path, settings, message):
     with pytest.raises(ValueError, match=message):
         load_policy(path, **settings)
+
+
+@pytest.mark.parametrize("value", [0.25, "x", ["x"]])
+def test_a_checkpoint_whose_observation_is_no_mapping_is_refused(smoke_run, tmp_path, value):
+    state, facts = checkpoint.read(smoke_run / "checkpoints" / "best")
+    facts = {**facts, "config": {**facts["config"], "env": {**facts["config"]["env"], "observation": value}}}
+    checkpoint.write(tmp_path / "damaged", state, facts)
+    with pytest.raises(ValueError, match=r"env.observation=.*: expected terms by their keys"):
+        load_policy(tmp_path / "damaged")
