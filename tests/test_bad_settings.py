@@ -105,8 +105,11 @@ def share_parts(monkeypatch, tested):
     monkeypatch.setattr(trainer, "build", build_once)
     monkeypatch.setattr(Trainer, "_restored", restored_once)
     saved_part = [key for key in tested if key not in LARGE_GROUPS]
-    saved = lambda cfg: checkpoint_config(OmegaConf.masked_copy(cfg, saved_part))  # noqa: E731
-    monkeypatch.setattr(trainer, "checkpoint_config", saved if saved_part else lambda cfg: ({}, ""))
+
+    def saved(cfg):
+        return checkpoint_config(OmegaConf.masked_copy(cfg, saved_part)) if saved_part else ({}, "")
+
+    monkeypatch.setattr(trainer, "checkpoint_config", saved)
 
 
 def check_sentence(error, key):

@@ -167,7 +167,7 @@ class Lookahead(MapPlanner):
         seed = problem * 1_000_003 + self._decisions * 7_919 + self.seed
         volume = torch.zeros(len(problem), dtype=torch.float64, device=problem.device)
         arrived, row = torch.zeros_like(problem), torch.arange(len(problem), device=problem.device)
-        # Spread the items if the next one lies alone in the bin; with several items this was not measured.
+        # Items are spread only where the next one lies alone in the bin: with several, nobody has measured it.
         source = _Imagined(self.items, streams) if cell.bin_items == 1 else self.items
         for step in itertools.count():
             if step == horizon and not sees_items:

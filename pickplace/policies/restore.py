@@ -134,7 +134,7 @@ def cell_settings(cell: CellSpec, keys: Collection[str] = CELL_SETTINGS) -> dict
 
 
 def differences(ours: Any, theirs: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield the keys in which two parts of configs differ, with both values; of parts of other classes the names."""
+    """Yield the keys in which two parts of configs differ, with both values; if the classes differ, their names."""
     if isinstance(ours, dict) and isinstance(theirs, dict):
         names = ours.get("_target_"), theirs.get("_target_")
         if names[0] != names[1]:

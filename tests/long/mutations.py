@@ -41,9 +41,9 @@ SAME_RESULT = (
     ("== 1", "Eq_LtE"),  # of counts, which are at least 1
     ("packed, slots =", ""),  # how many flags are copied at once
     ("max_side < LEAST_SIDE", ""),  # which of two ways is taken
-    ("self.side <= 64", ""),  # both types are exact about there
+    ("self.side <= 64", "NumberReplacer"),  # both types are exact about there
     ("advantage > 0", "Gt_GtE"),  # either weight of zero
-    ("Resting(z < FAR,", ""),  # what is outside is too high, too
+    *(("Resting(z < FAR,", change) for change in ("Lt_IsNot", "Lt_LtE", "Lt_NotEq")),  # outside, it is too high, too
     ("min(margins) < 0", "Lt_LtE"),  # nothing is cut then
     ('row["rotation"] or 0', "NumberReplacer"),  # a bin has one turn, the first and the last
     ("DIRECTIONS = ", ""),  # the margin makes up for what lies between two of them
