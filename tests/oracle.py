@@ -14,6 +14,7 @@ from itertools import chain, combinations_with_replacement, product
 from math import dist
 
 SUCCESS, PICK_MISS, BIN_COLLISION, TOTE_COLLISION, OVERFLOW, ITEM_COLLISION, UNSTABLE, STUCK, OUT_OF_REACH = range(9)
+FORBIDDEN_TURN = 9
 
 Pair = tuple[int, int]
 Triple = tuple[int, int, int]
@@ -42,6 +43,7 @@ class Rules:
     highest_top: list[Grid] | None = None
     lowest_pick: list[int] | None = None  # for each pick cell, of the item's height; None: any height
     highest_pick: list[int] | None = None
+    turns: tuple[int, ...] | None = None  # rotations that are allowed; None: all
 
     @property
     def num_actions(self) -> int:
@@ -288,6 +290,9 @@ class Oracle:
                 return OUT_OF_REACH, None
             if rules.lowest_pick is not None and not rules.lowest_pick[number] <= h <= rules.highest_pick[number]:
                 return OUT_OF_REACH, None
+
+        if rules.turns is not None and r not in rules.turns:
+            return FORBIDDEN_TURN, None
 
         after = [column[:] for column in heights]
         for x, y in footprint:

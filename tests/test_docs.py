@@ -81,7 +81,8 @@ def check_command(command, search, words, is_new):
         cfg = compose(command, [*search, *words])
     if command == "train" and is_new:
         items, curriculum = build("items", cfg["items"]), build("curriculum", cfg.curriculum)
-        curriculum.setup(int(items.sizes[:, 2].max()), cfg.env.tote_size[2], cfg.total_frames)
+        env = build("env", cfg.env, items=items) if curriculum.given else None
+        curriculum.setup(int(items.sizes[:, 2].max()), cfg.env.tote_size[2], cfg.total_frames, env)
         assert curriculum.check_budget(cfg.total_frames, 2048) is None, words
 
 

@@ -107,7 +107,7 @@ class SampledPPO(PPO):
         state = State.from_observation(frames).rows(row)
         seen = frames.select(*self.policy.act_keys)[row]
         step = apply(cell, state, self.policy.to_action(candidates.flatten(), seen))
-        after = State(step.surface, state.tote_height, items.rows(row))
+        after = state._replace(surface=step.surface, items=items.rows(row))
         placed = step.failure == 0
         goes_on = placed & footprint_mask(cell, placing_maps(cell, after)).flatten(1).any(1)
         value = placed * step.item.volume * self.task.reward_scale
@@ -134,11 +134,21 @@ def of_taken_choice(advantage: Tensor, candidates: int, normalize: bool) -> Tens
 
 
 def _arrivals(frames: TensorDictBase) -> Item:
-    """Return an item for each frame, ``[B, 1]``: one that arrived after some success; without any, the frame's own."""
+    """Return an item for each frame, ``[B, 1]``: one that arrived after some success of its kind of episode.
+
+    Without any, and where the drawn one came in an episode with other items or rotations, it is the frame's own.
+    """
     after = frames["next"]
     placed = (after["failure"] == Failure.NONE) | (after["failure"] == Failure.STUCK)
     rows = (placed & (after["bin_depth"].flatten(1) > 0).any(1, keepdim=True)).nonzero()[:, 0]
+    own = State.from_observation(frames)
     if not len(rows):
-        return State.from_observation(frames).items
+        return own.items
     draw = torch.randint(len(rows), (len(frames),), device=rows.device)
-    return State.from_observation(after[rows[draw]]).items
+    drawn = State.from_observation(after[rows[draw]])
+    keep = torch.ones_like(draw, dtype=torch.bool)
+    for key in ("item_mix", "turns"):
+        mine, theirs = getattr(own.episode, key), getattr(drawn.episode, key)
+        if mine is not None:
+            keep &= mine == theirs
+    return Item.from_table(torch.where(keep[:, None, None], drawn.items.table, own.items.table))

@@ -55,10 +55,10 @@ REGISTRY: dict[str, dict[str, str]] = {
         individual_rl="individual.policy.IndividualRl", individual_grasp="individual.policy.individual_grasp",
     ),
     "model.critic": _classes("policies.critics", pooled="Pooled", conv4d="Conv4d"),
-    "curriculum": _classes("training.curriculum.levels", curriculum="Curriculum"),
+    "curriculum": _classes("training.curriculum.curriculum", curriculum="Curriculum"),
     "curriculum.advance": _classes(
-        "training.curriculum.advance", none="NoAdvance", frames="Frames", threshold="Threshold", plateau="Plateau",
-        staged="Staged",
+        "training.curriculum", none="advance.NoAdvance", frames="advance.Frames", threshold="advance.Threshold",
+        plateau="advance.Plateau", staged="advance.Staged", learning_progress="learning_progress.LearningProgress",
     ),
     "curriculum.sample": _classes("training.curriculum.sample", current="Current", uniform="Uniform", recent="Recent"),
     "collector": _classes("training.collectors", single="single", multi_sync="multi_sync", ray="ray"),

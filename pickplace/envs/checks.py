@@ -10,7 +10,7 @@ from pickplace.common.validate import at_most
 from pickplace.items.distributions import ItemDistribution
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import available_offsets
-from pickplace.rules.item import Item
+from pickplace.rules.item import ALL_TURNS, Item
 from pickplace.rules.masks import footprint_mask, placing_maps
 from pickplace.rules.state import EMPTY, State
 
@@ -24,11 +24,17 @@ def problem_bytes(cell: CellSpec, masks: Collection[str]) -> int:
     return cell.bin_items * (count + ("action" in masks) * (4 * cell.num_actions + 8 * offsets * cell.num_places))
 
 
-def check_items(cell: CellSpec, items: ItemDistribution) -> None:
+def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: int = ALL_TURNS) -> None:
     """Refuse items that could make a fresh episode impossible.
 
     Every kind needs a feasible action on the empty tote for every position in the bin. The full tote height decides:
     a lower rim is only easier to clear, as long as it is not below the item's top.
+
+    Args:
+        cell: the sizes.
+        items: the item distribution.
+        mix: which of its mixes.
+        turns: bit mask of the rotations that are allowed.
 
     Raises:
         ValueError: naming the kind, the position and the tote height.
@@ -39,7 +45,9 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
     widest: dict[str, tuple[int, ...]] = {"bin_size": (w_b, d_b)}
     if largest := cell.gripper.largest_item:
         widest["gripper.size" if largest == cell.gripper.size else "the cup"] = largest
-    for kind, (w, d, h) in enumerate(items.sizes.tolist()):
+    sizes_of_kinds = items.sizes.tolist()
+    for kind in items.arrives(mix).nonzero()[:, 0].tolist():
+        w, d, h = sizes_of_kinds[kind]
         for what, (grid_w, grid_d) in widest.items():
             if w > grid_w or d > grid_d:
                 raise ValueError(f"{items.label(kind)} does not fit {what}: expected at most {grid_w}x{grid_d} cells.")
@@ -70,7 +78,8 @@ def check_items(cell: CellSpec, items: ItemDistribution) -> None:
             distinct.setdefault(key.tobytes(), number)
     for chunk in rows[list(distinct.values())].split(max(1, min(1024, 2**24 // cell.num_footprints))):
         empty = torch.full((len(chunk), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
-        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), Item.from_table(chunk[:, None, :5])))
+        item = Item.from_table(chunk[:, None, :5])._replace(turns=torch.full((len(chunk), 1), turns))
+        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), item))
         feasible = footprint_mask(cell, maps).flatten(1).any(1)
         if not feasible.all():
             x, y, *_, kind = chunk[~feasible][0].tolist()

@@ -1,6 +1,7 @@
 """Gymnasium environments over :class:`~pickplace.envs.torchrl.PickPlaceEnv`: one problem, or many side by side."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import gymnasium
@@ -12,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from tensordict import TensorDict
 
 from pickplace.common.validate import expect
+from pickplace.envs.episode import SETTINGS
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.distributions import Kinds, check_seed
 from pickplace.rules.state import Failure
@@ -56,7 +58,9 @@ class PickPlaceGymEnv(gymnasium.Env):
 
     ## Starting State
     An empty tote, and a bin with the first item of an episode. `reset(seed=s)` begins the item stream `s`; later resets
-    without a seed go on to its next episode. `options={"tote_height": h}` sets the height of this episode's tote.
+    without a seed go on to its next episode. `options={"tote_height": h}` sets the height of this episode's tote; with
+    `varies=("rotations", ...)` an option sets each of these, too: `rotations` (a number, or a list of those that are
+    allowed), `bin_items`, `refill`, `item_mix` (a number, see `ItemDistribution.mixed`) and `level`.
 
     ## Episode End
     Termination: the action fails, or nothing can be done with any item in the bin. Truncation: the item stream has
@@ -84,7 +88,7 @@ class PickPlaceGymEnv(gymnasium.Env):
         self.observation_space = self._vector.single_observation_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        expect("reset_mask" not in (options or {}), "options", options, "tote_height alone")
+        expect("reset_mask" not in (options or {}), "options", options, "no reset_mask")
         observations, infos = self._vector.reset(seed=seed, options=options)
         super().reset(seed=None if seed is None else int(seed))
         return _first(observations, self._env.terms), _first(infos, INFO)
@@ -108,7 +112,8 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
 
     Spaces, rewards and information are those of :class:`PickPlaceGymEnv`. ``reset(seed=s)`` begins the item stream
     ``s``: slot ``i`` plays its episodes ``i``, ``i + N``, ``i + 2 N``, ... ``options``: ``tote_height`` (a number, or
-    one for each slot) and ``reset_mask`` (bool ``[N]``, the slots to reset). What resets itself has full height.
+    one for each slot), other settings of the episodes (one value, or a list with one for each slot), and ``reset_mask``
+    (bool ``[N]``, the slots to reset). What resets itself plays the full task.
 
     Args:
         num_envs: ``N``.
@@ -138,10 +143,9 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         self._env = env = PickPlaceEnv(items=items, num_envs=num_envs, **settings)
         self.num_envs = num_envs
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
-        bounds = {key: term.bounds(env.cell, env.min_tote_height) for key, term in env.terms.items()}
         boxes: dict[str, spaces.Space] = {
             key: spaces.Box(low, high, shape, torch.empty(0, dtype=dtype).numpy().dtype.type)
-            for key, (low, high, shape, dtype) in bounds.items()
+            for key, (low, high, shape, dtype) in env.bounds.items()
         }
         self.single_observation_space = spaces.Dict(boxes)
         self.single_action_space = spaces.Discrete(env.cell.num_actions)
@@ -156,9 +160,12 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         seed = None if seed is None else check_seed(seed)
         super().reset(seed=seed)
         options = dict(options or {})
-        if unknown := sorted(set(options) - {"tote_height", "reset_mask"}):
-            raise ValueError(f"options[{unknown[0]!r}]: there is no such option; expected tote_height or reset_mask.")
-        heights = self._tote_heights(options.get("tote_height"))
+        known = ("tote_height", *self._env.cell.varies, "reset_mask")
+        if unknown := sorted(set(options) - {*known}):
+            expected = " or ".join(", ".join(known).rsplit(", ", 1))
+            raise ValueError(f"options[{unknown[0]!r}]: there is no such option; expected {expected}.")
+        settings = {"tote_height": self._tote_heights(options.get("tote_height"))}
+        settings |= {key: self._episode_setting(key, options[key]) for key in self._env.cell.varies if key in options}
         rows = np.asarray(options.get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         good = rows.shape == (self.num_envs,) and rows.dtype == bool and rows.any()
         expect(good, "options['reset_mask']", rows, f"bool of shape ({self.num_envs},), at least one True")
@@ -167,7 +174,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
             expect(rows.all(), "options['reset_mask']", rows, expected)
             self._env.set_seed(int(self.np_random.integers(2**31)) if seed is None else seed)
             self._started = True
-        self._reset_rows(rows, heights)
+        self._reset_rows(rows, settings)
         self._ended = self._ended & ~rows
         state = self._env._observation()
         return self._observations(state), self._infos(state, rows)
@@ -189,7 +196,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         reward = reward.astype(np.float64)
         infos: dict[str, Any] = {}
         if waiting.any():  # their action did not count: this step is their reset
-            self._reset_rows(waiting, self._tote_heights())
+            self._reset_rows(waiting)
             reward[waiting] = terminated[waiting] = truncated[waiting] = 0
             failure = state["failure"].masked_fill(torch.as_tensor(waiting, device=self._env.device)[:, None], 0)
             state = self._env._observation().set("failure", failure)
@@ -203,7 +210,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
             infos["final_obs"] = np.array(each, dtype=object)
             infos["final_info"] = self._infos(state, self._ended)
             infos["_final_obs"] = infos["_final_info"] = self._ended.copy()
-            self._reset_rows(self._ended, self._tote_heights())
+            self._reset_rows(self._ended)
             state, self._ended = self._env._observation(), np.zeros(self.num_envs, dtype=bool)
         infos |= self._infos(state, np.ones(self.num_envs, dtype=bool))
         return self._observations(state), reward, terminated, truncated, infos
@@ -225,8 +232,19 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         expect(good, "options['tote_height']", given, expected + f", or {count} of them" * (count > 1))
         return torch.as_tensor(np.broadcast_to(heights, count).astype(np.int64))[:, None]
 
-    def _reset_rows(self, rows: np.ndarray, heights: torch.Tensor) -> None:
-        entries = {"_reset": torch.as_tensor(rows.copy())[:, None], "tote_height": heights}
+    def _episode_setting(self, key: str, given: Any) -> torch.Tensor:
+        """Return an option as the entry of an observation, ``[N, ...]``: a value, or one for each problem in a list."""
+        setting, place, cell = SETTINGS[key], f"options[{key!r}]", self._env.cell
+        try:
+            numbers = [setting.read(place, given, cell)] * self.num_envs
+        except ValueError:
+            if not isinstance(given, (list, tuple)) or len(given) != self.num_envs:
+                raise
+            numbers = [setting.read(place, value, cell) for value in given]
+        return setting.decode(torch.tensor(numbers), cell)
+
+    def _reset_rows(self, rows: np.ndarray, settings: Mapping[str, torch.Tensor] = MappingProxyType({})) -> None:
+        entries = {"_reset": torch.as_tensor(rows.copy())[:, None], **settings}
         self._env.reset(TensorDict(entries, [self.num_envs], device=self._env.device))
 
     def _observations(self, state) -> dict[str, np.ndarray]:

@@ -6,12 +6,13 @@ import torch
 from torch import Tensor
 
 from pickplace.common.validate import refuse_if
+from pickplace.envs.episode import SETTINGS
 from pickplace.envs.torchrl import PickPlaceEnv
-from pickplace.items.distributions import MAX_SEED
+from pickplace.items.distributions import MAX_SEED, of_mix
 from pickplace.rules.bin import select_item
 from pickplace.rules.item import Item, bin_labels_from_items
 from pickplace.rules.observation import observe, standard_terms
-from pickplace.rules.state import State
+from pickplace.rules.state import Episode, State
 from pickplace.runs.checkpoint import CheckpointError
 
 
@@ -51,7 +52,13 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     surface, tote_height, volume, steps, episode, seed = (saved[key] for key in keys)
     low, high = env.min_tote_height, cell.tote_size[2]
     check("tote_height", (tote_height >= low) & (tote_height <= high), f"{low} to {high}")
-    state = State(surface, tote_height, Item.from_table(saved["item"]))
+    episode_settings = {SETTINGS[key].field: saved[SETTINGS[key].field] for key in cell.varies}
+    for key in cell.varies:
+        low, high = SETTINGS[key].limits(cell, env.items)
+        value = saved[SETTINGS[key].field]
+        check(key, (value >= low) & (value <= high), f"{low} to {high}")
+    state = State(surface, tote_height, Item.from_table(saved["item"]), Episode(**episode_settings))
+    kinds = of_mix(state.episode.item_mix)
     heights = state.heights
     check("surface", (heights >= 0) & (heights <= tote_height[:, None, None]), "heights of 0 to tote_height")
     check("surface", state.bearing | ((heights > 0) & cell.support.marks_bearing), "cells that bear weight")
@@ -69,10 +76,14 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     count = items.exists.sum(1)
     check("arrived", saved["arrived"] == steps + count, "the items placed and those in the bin")
     newest = select_item(items, (count - 1).clamp(min=0)).table
-    arrival = env.items.sample(env.stream, seed.expand_as(episode), episode, saved["arrived"] - 1, cell.bin_size)
+    arrival = env.items.sample(
+        env.stream, seed.expand_as(episode), episode, saved["arrived"] - 1, cell.bin_size, **kinds
+    )
+    if state.episode.turns is not None:
+        arrival = arrival._replace(turns=arrival.turns & state.episode.turns)
     same = (newest == arrival.table)[:, 2:].all(1)  # wherever it lies
     check("item", same | (count < cell.bin_items), "the newest item of this episode")  # it may have been taken
-    seen = observe(standard_terms(cell.bin_items), cell, state)
+    seen = observe(standard_terms(cell), cell, state)
     seen["occupancy"] = (volume / cell.tote_volume(tote_height))[:, None]
     seen |= {key: torch.zeros(len(steps), 1) for key in ("failure", "done", "terminated", "truncated")}
     for key, value in seen.items():

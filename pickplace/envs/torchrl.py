@@ -1,6 +1,6 @@
 """The environment: one TorchRL ``EnvBase`` that simulates a batch of bins and totes as tensors."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 from pickplace.common.machine import usable_device
 from pickplace.common.validate import check_bytes, expect, one_of, or_null, whole_number
 from pickplace.envs.checks import check_items, problem_bytes
+from pickplace.envs.episode import SETTINGS
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.rules.bin import remove_item
@@ -20,7 +21,7 @@ from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.rules.item import Item
 from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, corner_mask, placing_maps
 from pickplace.rules.observation import Term, check_terms, observe
-from pickplace.rules.state import EMPTY, Failure, State
+from pickplace.rules.state import EMPTY, Episode, Failure, State
 from pickplace.rules.step import apply
 
 DONE_KEYS = ("done", "terminated", "truncated")
@@ -57,6 +58,8 @@ class PickPlaceEnv(EnvBase):
         * ``tote_depth``, float32 ``[N, W_T, D_T]``: remaining height, ``H_T - height``.
         * ``tote_bearing``, float32 ``[N, W_T, D_T]``: 1 where the cell bears weight; all 1 unless ``support=bearing``.
         * ``tote_height``, int64 ``[N, 1]``: ``H_T`` of the running episode.
+        * with ``varies``: ``rotations``, bool ``[N, R]``; ``item_mix``, ``bin_items``, ``refill`` and ``level``, int64
+          ``[N, 1]``.
         * further terms, see ``observation``.
         * ``action_mask``, bool ``[N, N_a]``: True where and only where the action would succeed.
         * ``footprint_mask``, bool ``[N, M * Q * W_T * D_T]``, only with ``masks`` naming it: the distinct
@@ -68,8 +71,9 @@ class PickPlaceEnv(EnvBase):
 
     Starting state:
         An empty tote of the height given as ``tote_height`` (int64 ``[N, 1]``) in the TensorDict handed to ``reset``,
-        by default ``tote_size[2]``, and a bin with the episode's first items: as many of ``bin_items`` as have room,
-        or the first alone if nothing is feasible then.
+        by default ``tote_size[2]``; with the settings of :data:`~pickplace.envs.episode.SETTINGS` that are given
+        there, if ``varies`` names them, else with those of the full task. And a bin with the episode's first items: as
+        many of ``bin_items`` as have room, or the first alone if nothing is feasible then.
 
     Episode end:
         ``terminated`` after a failed action, or when nothing can be done with any item in the bin (``stuck``);
@@ -86,6 +90,8 @@ class PickPlaceEnv(EnvBase):
             terms above, which are always among them.
         first_episode: number of the episode that slot 0 plays first; slot ``i`` plays ``first_episode + i``.
         episode_stride: after an episode a slot plays the one that comes this much later; by default ``num_envs``.
+        varies: what episodes may differ in beside the height of the tote, names of
+            :data:`~pickplace.envs.episode.SETTINGS`.
         **settings: sizes and options of the robot cell, see :class:`~pickplace.rules.cell.CellSpec`.
 
     Raises:
@@ -107,9 +113,12 @@ class PickPlaceEnv(EnvBase):
         observation: Mapping[str, Term] | None = None,
         first_episode: int = 0,
         episode_stride: int | None = None,
+        varies: Collection[str] = (),
         **settings,
     ):
-        cell = cell_from_settings(settings)
+        unknown = [key for key in varies if key not in SETTINGS]
+        expect(not unknown, "varies", varies, f"any of {', '.join(SETTINGS)}")
+        cell = replace(cell_from_settings(settings), varies=tuple(varies))
         whole_number("num_envs", num_envs)
         check_seed(seed)
         one_of("stream", stream, STREAMS)
@@ -120,26 +129,33 @@ class PickPlaceEnv(EnvBase):
         items = Kinds(PAPER_KINDS) if items is None else items
         kind = "an ItemDistribution, such as pickplace.items.distributions.Kinds"
         expect(isinstance(items, ItemDistribution), "items", items, kind)
-        check_items(cell, items)
-        self.terms = check_terms(observation, cell.bin_items)
+        self._full = {key: SETTINGS[key].full(cell) for key in cell.varies}
+        self._possible: set[tuple[int, int]] = set()  # see `check_start`
+        self.items, self.cell, self.terms = items, cell, check_terms(observation, cell)
+        self.check_start(0, 2**cell.rotations - 1)
         self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
         device = usable_device(device)
         check_bytes(f"num_envs={num_envs}", num_envs * problem_bytes(self.cell, masks), device)
         super().__init__(device=device, batch_size=[num_envs])
-        self.items, self.stream, self.masks = items, stream, tuple(masks)
-        self.min_tote_height = int(items.sizes[:, 2].max())
+        self.stream, self.masks = stream, tuple(masks)
+        mixes = range(items.mixes if "item_mix" in varies else 1)
+        tallest = [int(items.sizes[items.arrives(mix), 2].max()) for mix in mixes]
+        self.min_tote_height = min(tallest)  # of any episode
         self.first_episode, self.episode_stride = first_episode, episode_stride or num_envs
-        specs: dict = {}
-        for key, term in self.terms.items():
-            low, high, shape, dtype = term.bounds(self.cell, self.min_tote_height)
-            specs[key] = Bounded(low, high, (num_envs, *shape), dtype=dtype, device=device)
+        self.bounds = {key: term.bounds(self.cell, max(tallest)) for key, term in self.terms.items()}
+        self.bounds["tote_height"] = self.bounds["tote_height"]._replace(low=self.min_tote_height)
+        specs: dict = {
+            key: Bounded(low, high, (num_envs, *shape), dtype=dtype, device=device)
+            for key, (low, high, shape, dtype) in self.bounds.items()
+        }
         specs["occupancy"] = Bounded(0, 1, (num_envs, 1), dtype=torch.float32, device=device)
         specs["failure"] = Categorical(len(Failure), (num_envs, 1), dtype=torch.int64, device=device)
         sizes = {f"{name}_mask": MASKS[name].size(self.cell) for name in self.masks}
         specs |= {name: Binary(size, (num_envs, size), device, torch.bool) for name, size in sizes.items()}
         self.observation_spec = Composite(specs, shape=(num_envs,), device=device)
-        # Declared as state too, so that reset() is handed the height that a curriculum writes.
-        self.state_spec = Composite({"tote_height": specs["tote_height"].clone()}, shape=(num_envs,), device=device)
+        # Declared as state too, so that reset() is handed what a curriculum writes.
+        given = {key: specs[key].clone() for key in ("tote_height", *self.cell.varies)}
+        self.state_spec = Composite(given, shape=(num_envs,), device=device)
         self.action_spec = Categorical(self.cell.num_actions, (num_envs,), dtype=torch.int64, device=device)
         self.reward_spec = Unbounded((num_envs, 1), dtype=torch.float32, device=device)
         flags = {key: Categorical(2, (num_envs, 1), dtype=torch.bool, device=device) for key in DONE_KEYS}
@@ -159,10 +175,12 @@ class PickPlaceEnv(EnvBase):
             "episode": zeros(),
             "item_seed": torch.tensor(0, device=self.device),
             "feasible": zeros(dtype=torch.bool),
+            **{SETTINGS[key].field: zeros() + value for key, value in self._full.items()},
             **{name: zeros(size, dtype=torch.bool) for name, size in sizes.items()},
         }
         for name, value in buffers.items():
             self.register_buffer(name, value)
+        self.register_buffer("tallest", torch.tensor(tallest, device=self.device), persistent=False)  # of each mix
         self._starts: dict[tuple, tuple[Tensor, ...]] = {}  # the masks of empty totes, see `_masks_of_empty_totes`
         self.set_seed(seed)
 
@@ -199,12 +217,9 @@ class PickPlaceEnv(EnvBase):
         if kwargs:
             name, value = next(iter(kwargs.items()))
             raise TypeError(f"reset({name}={value!r}): expected a TensorDict only; set_seed(seed) begins a stream.")
-        given, high = {} if tensordict is None else tensordict, self.cell.tote_size[2]
+        given = {} if tensordict is None else tensordict
         rows = given.get("_reset", torch.ones_like(self.feasible)).reshape(self.num_envs)
-        height = given.get("tote_height", torch.full_like(self.tote_height, high)).reshape(self.num_envs)
-        expected = f"between {self.min_tote_height} (the tallest item) and {high} (tote_size[2])"
-        height = torch.where(rows, height, self.tote_height)
-        self.tote_height.copy_(_checked("tote_height", height, self.min_tote_height, high, expected))
+        self._read_settings(given, rows)
         self.episode.add_(rows * self.episode_stride)
         self.surface.masked_fill_(rows[:, None, None], EMPTY)
         self.item.masked_fill_(rows[:, None, None], 0)
@@ -217,6 +232,36 @@ class PickPlaceEnv(EnvBase):
             self.arrived.masked_fill_(jammed, 1)
             self._update_masks(jammed, empty=True)
         return self._observation().update({key: torch.zeros_like(rows)[:, None] for key in DONE_KEYS})
+
+    def _read_settings(self, given, rows: Tensor) -> None:
+        """Set what the episodes that begin in ``rows``, bool ``[N]``, differ in, by the entries of a TensorDict."""
+        for key, full in self._full.items():
+            setting, values = SETTINGS[key], self.get_buffer(SETTINGS[key].field)
+            wanted = values.masked_fill(rows, full)
+            if key in given:
+                wanted = torch.where(rows, setting.encode(given[key]), values)
+            low, high = setting.limits(self.cell, self.items)
+            values.copy_(_checked(key, wanted, low, high, f"between {low} and {high}"))
+        high, least = self.cell.tote_size[2], self.min_tote_height
+        height = given.get("tote_height", torch.full_like(self.tote_height, high)).reshape(self.num_envs)
+        expected = f"between {least} (the tallest item) and {high} (tote_size[2])"
+        height = _checked("tote_height", torch.where(rows, height, self.tote_height), least, high, expected)
+        if self.cell.varies:
+            episode = self._differs
+            mix = torch.zeros_like(height) if episode.item_mix is None else episode.item_mix
+            turns = torch.full_like(height, 2**self.cell.rotations - 1) if episode.turns is None else episode.turns
+            for pair in set(zip(mix[rows].tolist(), turns[rows].tolist(), strict=True)):
+                self.check_start(*pair)
+            if (low := height < self.tallest[mix]).any():
+                expected = f"at least {int(self.tallest[mix][low][0])}, the tallest item of that mix"
+                raise ValueError(f"tote_height={int(height[low][0])}: expected {expected}.")
+        self.tote_height.copy_(height)
+
+    def check_start(self, mix: int, turns: int) -> None:
+        """Refuse a mix of items and rotations with which a fresh episode may be impossible, with a ``ValueError``."""
+        if (mix, turns) not in self._possible:
+            check_items(self.cell, self.items, mix, turns)
+            self._possible.add((mix, turns))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         most, state = self.cell.num_actions - 1, self.state
@@ -251,7 +296,12 @@ class PickPlaceEnv(EnvBase):
     @property
     def state(self) -> State:
         """The state of all problems."""
-        return State(self.surface, self.tote_height, Item.from_table(self.item))
+        return State(self.surface, self.tote_height, Item.from_table(self.item), self._differs)
+
+    @property
+    def _differs(self) -> Episode:
+        fields = [SETTINGS[key].field for key in self._full]
+        return Episode(**{name: self.get_buffer(name) for name in fields})
 
     @property
     def exact_occupancy(self) -> Tensor:
@@ -261,7 +311,7 @@ class PickPlaceEnv(EnvBase):
     def _refill(self, rows: Tensor, left: Item) -> Item:
         """Let items arrive in the bins in ``rows``, bool ``[N]``; ``left`` and the result are all items, ``[N, M]``."""
         address = self.item_seed.expand_as(self.episode), self.episode, self.arrived
-        items, arrived = refill(self.cell, self.items, self.stream, *address, left, rows)
+        items, arrived = refill(self.cell, self.items, self.stream, *address, left, rows, self._differs)
         self.item.copy_(items.table)
         self.arrived.copy_(arrived)
         return items

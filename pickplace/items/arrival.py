@@ -5,36 +5,46 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from pickplace.items.distributions import ItemDistribution, hashed_uniform
+from pickplace.items.distributions import ItemDistribution, hashed_uniform, of_mix
 from pickplace.rules.bin import add_item, must_share
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item
+from pickplace.rules.state import FULL_TASK, REFILLS, Episode
 
 
 def refill(
     cell: CellSpec, source: ItemDistribution, stream: str, seed: Tensor, episode: Tensor, arrived: Tensor, items: Item,
-    rows: Tensor,
+    rows: Tensor, differs: Episode = FULL_TASK,
 ) -> tuple[Item, Tensor]:  # fmt: skip
     """Return the bins after new items arrived, ``[N, M]``, and how many have arrived in all, int64 ``[N]``.
 
     Items arrive in the order of the stream. Into an empty bin an item comes at its own place; else at a uniformly
     random place where it overlaps no other. One that has no room waits, and those after it wait, too. With
-    ``cell.refill="batch"`` only empty bins are filled.
+    ``refill="batch"`` only empty bins are filled.
 
     Args:
-        cell: has the refill rule.
+        cell: has the refill rule, unless episodes differ in it.
         source: the item distribution.
         stream, seed, episode: as of :meth:`~pickplace.items.distributions.ItemDistribution.sample`.
         arrived: int64 ``[N]``, number of items that have arrived so far.
         items: ``[N, M]``, the first ones filled.
         rows: bool ``[N]``, the bins in which items may arrive.
+        differs: what the episodes differ in.
     """
-    open_ = rows & ~items.exists[:, 0] if cell.refill == "batch" else rows
+    kinds = of_mix(differs.item_mix)
+    if differs.refill is None:
+        open_ = rows & ~items.exists[:, 0] if cell.refill == "batch" else rows
+    else:
+        open_ = rows & ~(items.exists[:, 0] & (differs.refill == REFILLS.index("batch")))
     for number in range(items.x.shape[1]):
         open_ = open_ & ~items.exists[:, -1]
+        if differs.bin_items is not None:
+            open_ = open_ & (items.exists.sum(1) < differs.bin_items)
         if number and not open_.any():
             break
-        item = source.sample(stream, seed, episode, arrived, cell.bin_size)
+        item = source.sample(stream, seed, episode, arrived, cell.bin_size, **kinds)
+        if differs.turns is not None:
+            item = item._replace(turns=item.turns & differs.turns)
         if must_share(items, open_):
             uniform = hashed_uniform(stream, seed, episode, arrived, 4)[3]
             item = _find_room(cell, item, items, ~items.exists[:, 0] | source.has_corners, uniform)

@@ -77,7 +77,7 @@ class Cut(ItemDistribution):
         self._at_once = max(1, 2**22 // count**2)  # episodes, for the memory of `_arrival`
         self._kept: dict[tuple[str, int, int], list[list[int]]] = {}
 
-    def sample(self, stream, seed, episode, step, bin_size):
+    def sample(self, stream, seed, episode, step, bin_size, mix=None):
         _, across, along = hashed_uniform(stream, seed, episode, step, 3)
         rows = [part.tolist() for part in torch.broadcast_tensors(seed, episode, step)]
         keys = [(stream, *key) for key in zip(*rows[:2], strict=True)]

@@ -5,13 +5,16 @@ depend on the batch size, and every method that plays an episode meets the same 
 """
 
 import math
+from collections.abc import Mapping, Sequence
+from copy import copy
 from itertools import product
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from pickplace.common.files import read_table
-from pickplace.common.validate import at_most, excerpt, expect, flag, is_number, is_whole, whole_number
+from pickplace.common.validate import at_most, excerpt, expect, flag, is_number, is_whole, refuse_if, whole_number
 from pickplace.rules.item import Item
 
 #: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
@@ -75,6 +78,11 @@ def check_range(key: str, limits) -> tuple[int, int]:
     return int(limits[0]), int(limits[1])
 
 
+def of_mix(mix: Tensor | None) -> dict[str, Tensor]:
+    """Return the argument of :meth:`ItemDistribution.sample` that names a mix; a class without mixes needs none."""
+    return {} if mix is None else {"mix": mix}
+
+
 class ItemDistribution:
     """Base class of item distributions.
 
@@ -83,26 +91,52 @@ class ItemDistribution:
         varies: whether episodes differ at all.
         sequential: whether an episode is a sequence whose order a search must not know: it samples from ``sizes``.
         has_corners: whether each item has one place in the bin, so that of several items one waits for its place.
+        mixes: number of mixes of the sizes among which episodes may choose, see :meth:`mixed`; 1: there is one.
     """
 
     sizes: Tensor
     varies: bool = True
     sequential: bool = False
     has_corners: bool = False
+    mixes: int = 1
 
-    def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size) -> Item:
-        """Return the ``step``-th item (from 0) of each ``episode``, int64 ``[N]``; size 0 after the last one."""
+    def sample(
+        self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size, mix: Tensor | None = None
+    ) -> Item:
+        """Return the ``step``-th item (from 0) of each ``episode``, int64 ``[N]``; size 0 after the last one.
+
+        Args:
+            stream: family of item streams.
+            seed, episode, step: int64 ``[N]``.
+            bin_size: ``(W_B, D_B, ...)``.
+            mix: int64 ``[N]``, the mix of each episode; None: mix 0. Given only where :attr:`mixes` is above 1.
+        """
         uniform, across, along = hashed_uniform(stream, seed, episode, step, 3)
-        kind = self._index(uniform, step)
+        kind = self._index(uniform, step, mix)
         return place_at_random(self.sizes.to(step.device)[kind], across, along, bin_size, kind)
 
-    def _index(self, uniform: Tensor, step: Tensor) -> Tensor:
+    def _index(self, uniform: Tensor, step: Tensor, mix: Tensor | None = None) -> Tensor:
         """Return which row of ``sizes`` arrives, int64 ``[N]``."""
         raise NotImplementedError
 
-    def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size) -> Item:
+    def mixed(self, changes: Sequence[Mapping]) -> Self:
+        """Return this distribution with further mixes of its sizes, numbered from 1; mix 0 is itself.
+
+        Args:
+            changes: settings of each mix.
+
+        Raises:
+            ValueError: for a bad setting, or a distribution whose episodes cannot differ in their mix.
+        """
+        raise ValueError(f"items: {type(self).__name__} has no mixes; expected items=kinds or items=uniform.")
+
+    def arrives(self, mix: int = 0) -> Tensor:
+        """Return which rows of ``sizes`` may arrive in a mix, bool ``[K]``."""
+        return torch.ones(len(self.sizes), dtype=torch.bool)
+
+    def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size, mix: Tensor | None = None) -> Item:
         """Return the ``rank``-th of ``count`` items for each seed, int64 ``[N]``; here simply independent ones."""
-        return self.sample("train", seed, rank, torch.zeros_like(rank), bin_size)
+        return self.sample("train", seed, rank, torch.zeros_like(rank), bin_size, **of_mix(mix))
 
     def corners(self, kind: int, bin_size) -> list[tuple[int, int]]:
         """Return every bin position ``(x, y)`` at which kind number ``kind`` may arrive."""
@@ -135,15 +169,68 @@ class Kinds(ItemDistribution):
         expect(is_list, "items.weights", weights, f"{len(kinds)} numbers, one for each kind")
         good = all(is_number(v) and v >= 0 for v in weights) and is_number(total := sum(weights)) and total > 0
         expect(good, "items.weights", weights, "finite numbers >= 0 that are not all 0")
-        used = [i for i, v in enumerate(weights) if v > 0]
-        self.sizes = torch.tensor([list(kinds[i]) for i in used], dtype=torch.int64)
-        share = torch.tensor([weights[i] for i in used], dtype=torch.float64)
-        self._edges = (share.cumsum(0) / share.sum())[:-1]
+        self._listed, self._used = len(weights), [i for i, v in enumerate(weights) if v > 0]
+        self.sizes = torch.tensor([list(kinds[i]) for i in self._used], dtype=torch.int64)
+        self._share = torch.tensor([[weights[i] for i in self._used]], dtype=torch.float64)  # [mixes, K]
+        self._edges = self._edges_of(self._share)
 
-    def _index(self, uniform, step):
-        return torch.searchsorted(self._edges.to(uniform.device), uniform, right=True)
+    @staticmethod
+    def _edges_of(share: Tensor) -> Tensor:
+        """Return where the kinds of mix ``m`` meet in ``[m, m + 1)``, for all mixes ``[mixes * (K - 1)]``."""
+        edges = (share.cumsum(1) / share.sum(1, keepdim=True))[:, :-1]
+        return (edges + torch.arange(len(edges))[:, None]).flatten()
 
-    def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size) -> Item:
+    def _index(self, uniform, step, mix=None):
+        edges = self._edges.to(uniform.device)
+        if mix is None:
+            return torch.searchsorted(edges[: len(self.sizes) - 1], uniform, right=True)
+        # Below the next mix in spite of rounding.
+        place = torch.searchsorted(edges, uniform.clamp(max=1 - 2**-32) + mix, right=True)
+        return place - mix * (len(self.sizes) - 1)
+
+    @property
+    def mixes(self) -> int:  # type: ignore[override]
+        return len(self._share)
+
+    def mixed(self, changes: Sequence[Mapping]) -> Self:
+        """Return this distribution with further mixes of its kinds, numbered from 1; mix 0 is itself.
+
+        Args:
+            changes: of each mix, ``weights``, a relative frequency for each kind; or any of ``width``, ``depth`` and
+                ``height``, ``[least, greatest]``: the kinds of such sizes, as frequent among themselves as in mix 0.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        share = torch.stack([self._share[0], *(self._share_of(change) for change in changes)])
+        other = copy(self)
+        other._share, other._edges = share, self._edges_of(share)
+        return other
+
+    def _share_of(self, change: Mapping) -> Tensor:
+        ranges = {"width": 0, "depth": 1, "height": 2}
+        good = isinstance(change, Mapping) and (set(change) == {"weights"} or (change and set(change) <= set(ranges)))
+        expect(
+            good, "items", change, "{weights: [...]}, or some of {width: [least, greatest], depth: ..., height: ...}"
+        )
+        if "weights" in change:
+            given = Kinds([(1, 1, 1)] * self._listed, change["weights"])  # checks them
+            weights = torch.zeros(self._listed, dtype=torch.float64)
+            weights[given._used] = given._share[0]
+            unused = [i for i in given._used if i not in set(self._used)]
+            refuse_if(bool(unused), f"items.weights: kind {unused and unused[0]} never arrives in the full task.")
+            return weights[self._used]
+        share = self._share[0].clone()
+        for key, limits in change.items():
+            low, high = check_range(f"items.{key}", limits)
+            share *= (self.sizes[:, ranges[key]] >= low) & (self.sizes[:, ranges[key]] <= high)
+        expect(bool(share.any()), "items", dict(change), "sizes that some kind of the full task has")
+        return share
+
+    def arrives(self, mix: int = 0) -> Tensor:
+        return self._share[mix] > 0
+
+    def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size, mix: Tensor | None = None) -> Item:
         """Return the ``rank``-th of ``count`` items for each seed, int64 ``[N]``: a systematic sample of the kinds.
 
         Each kind is there in proportion to its frequency, up to a whole number. So with as many items as there are
@@ -152,7 +239,7 @@ class Kinds(ItemDistribution):
         first = torch.zeros_like(rank)
         start = hashed_uniform("train", seed, torch.full_like(rank, count), first, 1)[0]
         across, along = hashed_uniform("train", seed, rank, first, 2)
-        kind = self._index((start + rank / count) % 1, first)
+        kind = self._index((start + rank / count) % 1, first, mix)
         return place_at_random(self.sizes.to(rank.device)[kind], across, along, bin_size, kind)
 
 
@@ -205,14 +292,14 @@ class Recorded(ItemDistribution):
         self.has_corners = self._corner.numel() > 0
         self.varies = not self.has_corners  # else not even where the items lie
 
-    def sample(self, stream, seed, episode, step, bin_size):
-        item = super().sample(stream, seed, episode, step, bin_size)
+    def sample(self, stream, seed, episode, step, bin_size, mix=None):
+        item = super().sample(stream, seed, episode, step, bin_size, mix)
         if self.has_corners:
             x, y = self._corner.to(step.device)[item.kind].unbind(-1)
             item = item._replace(x=x, y=y)
         return item if self._loop else item.map(lambda part: torch.where(step < len(self.sizes), part, 0))
 
-    def _index(self, uniform, step):
+    def _index(self, uniform, step, mix=None):
         return step % len(self.sizes)
 
     def corners(self, kind, bin_size):

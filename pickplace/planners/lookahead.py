@@ -7,7 +7,7 @@ from torch import Tensor
 
 from pickplace.common.validate import check_bytes, number, or_null, refuse_if, whole_number
 from pickplace.items.arrival import refill
-from pickplace.items.distributions import ItemDistribution, check_seed, search_items
+from pickplace.items.distributions import ItemDistribution, check_seed, of_mix, search_items
 from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import MASKED, EstimatesValue, Policy, ScoresFootprints
 from pickplace.rules.cell import CellSpec
@@ -72,7 +72,7 @@ class Lookahead(MapPlanner):
             "planner=lookahead: expected a checkpoint of model=fcn_grasp, corners or afterstate, with a mask.",
         )
         self.cell, self.policy, self.items = cell, policy, search_items(items)
-        self.terms = check_terms(terms, cell.bin_items)
+        self.terms = check_terms(terms, cell)
         self.critic, self.horizon = critic, None if critic is None else horizon
         self.seed, self._decisions = check_seed(seed, "planner.seed"), 0
 
@@ -173,7 +173,8 @@ class Lookahead(MapPlanner):
             if step == horizon and not sees_items:
                 volume[row] += self.critic(observe(self.terms, cell, state, critic_keys))[:, 0].double()
                 break
-            items, arrived = refill(cell, source, "train", seed[row], stream[row], arrived, state.items, row >= 0)
+            address = seed[row], stream[row], arrived
+            items, arrived = refill(cell, source, "train", *address, state.items, row >= 0, state.episode)
             state = state._replace(items=items)
             mask = policy.ranked(placing_maps(cell, state))
             going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]
@@ -203,7 +204,7 @@ class _Imagined(ItemDistribution):
         self.items, self.count = items, count
         self.has_corners = items.has_corners
 
-    def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size) -> Item:
-        item = self.items.sample(stream, seed, episode, step, bin_size)
-        first = self.items.spread(seed, episode, self.count, bin_size)
+    def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size, mix=None) -> Item:
+        item = self.items.sample(stream, seed, episode, step, bin_size, **of_mix(mix))
+        first = self.items.spread(seed, episode, self.count, bin_size, mix)
         return Item(*(torch.where(step == 0, *parts) for parts in zip(first, item, strict=True)))

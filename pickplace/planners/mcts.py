@@ -113,7 +113,7 @@ class MCTS(MapPlanner):
                 for problem, root in enumerate(roots)
                 for _ in range(min(each, self.simulations - done))
             ]
-            self._simulate(walks, state.tote_height)
+            self._simulate(walks, state)
         best = [max(root.edges.values(), key=lambda edge: (edge.visits, edge.total), default=None) for root in roots]
         return torch.tensor([0 if edge is None else edge.action for edge in best])
 
@@ -154,18 +154,18 @@ class MCTS(MapPlanner):
         bonus = self.exploration * np.sqrt(np.log(visits.sum()) / visits)
         return edges[int((total / visits + bonus).argmax())]
 
-    def _simulate(self, walks: list[tuple[int, list[_Edge], bool]], tote_height: Tensor) -> None:
+    def _simulate(self, walks: list[tuple[int, list[_Edge], bool]], roots: State) -> None:
         """Carry out the last actions, sample the bins after them, play out, and add the returns to the edges.
 
         Args:
             walks: the problem's number, and the result of :meth:`_walk_down`.
-            tote_height: int64 ``[N]``, of the problems.
+            roots: the states of the problems, ``[N]``.
         """
         walks = [walk for walk in walks if walk[1]]
         last = [(number, problem, path[-1]) for number, (problem, path, over) in enumerate(walks) if not over]
         if tried := [(problem, edge) for _, problem, edge in last if edge.left is None and not edge.failed]:
             totes = [(edge.node.surface, edge.node.items) for _, edge in tried]
-            before = _stack(totes, tote_height[[problem for problem, _ in tried]])
+            before = _stack(totes, roots.rows([problem for problem, _ in tried]))
             after, placed, good = self._move(before, torch.tensor([edge.action for _, edge in tried]))
             parts = zip(after.surface, after.items.table, placed.volume.tolist(), good.tolist(), strict=True)
             for (_, edge), (surface, items, volume, succeeds) in zip(tried, parts, strict=True):
@@ -175,21 +175,21 @@ class MCTS(MapPlanner):
         returns = torch.zeros(len(walks), dtype=torch.float64)
         if going := [(number, problem, edge) for number, problem, edge in last if edge.left is not None]:
             numbers, problems, edges = map(list, zip(*going, strict=True))
-            arrived = self._arrive(_stack([edge.left for edge in edges], tote_height[problems]))
+            arrived = self._arrive(_stack([edge.left for edge in edges], roots.rows(problems)))
             for edge, node in zip(edges, self._nodes(arrived), strict=True):
                 edge.bins.append(node)
             returns[numbers] = self._play_out(arrived)
         for (problem, path, _), volume in zip(walks, returns.tolist(), strict=True):
             for edge in reversed(path):
                 volume += edge.volume
-                edge.total += volume / float(self.cell.tote_volume(tote_height[problem]))
+                edge.total += volume / float(self.cell.tote_volume(roots.tote_height[problem]))
 
     def _move(self, state: State, action: Tensor) -> tuple[State, Item, Tensor]:
         """Return the states after the search's actions, the items placed, and which actions succeed, bool ``[N]``."""
         if self.mask:
             return *put_down(self.cell, state, action), torch.ones_like(action, dtype=torch.bool)
         step = apply(self.cell, state, action)
-        after = State(step.surface, state.tote_height, remove_item(state.items, step.taken))
+        after = state._replace(surface=step.surface, items=remove_item(state.items, step.taken))
         return after, step.item, step.failure == 0
 
     def _nodes(self, state: State, mask: Tensor | None = None) -> list[_Node]:
@@ -205,7 +205,8 @@ class MCTS(MapPlanner):
         number = torch.arange(self._sampled, self._sampled + len(state.surface))
         self._sampled += len(number)
         seed, first, rows = torch.full_like(number, self.seed), torch.zeros_like(number), number >= 0
-        return state._replace(items=refill(self.cell, self.items, "train", seed, number, first, state.items, rows)[0])
+        items, _ = refill(self.cell, self.items, "train", seed, number, first, state.items, rows, state.episode)
+        return state._replace(items=items)
 
     def _play_out(self, state: State) -> Tensor:
         """Return the volume that uniformly random actions place until the episode ends, float64 ``[M]``."""
@@ -231,6 +232,6 @@ def _on_cpu(observation: Observation) -> State:
     return State.from_observation({key: entry.cpu() for key, entry in observation.items()})
 
 
-def _stack(parts: list[tuple[Tensor, Tensor]], tote_height: Tensor) -> State:
+def _stack(parts: list[tuple[Tensor, Tensor]], problems: State) -> State:
     surface, items = map(torch.stack, zip(*parts, strict=True))
-    return State(surface, tote_height, Item.from_table(items))
+    return problems._replace(surface=surface, items=Item.from_table(items))

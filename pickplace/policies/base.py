@@ -144,7 +144,7 @@ class Policy(TensorDictModuleBase, ABC):
     @property
     def act_keys(self) -> list[str]:
         """Entries of the observation that :meth:`to_action` may read."""
-        return list(dict.fromkeys([*standard_terms(self.cell.bin_items), *self.in_keys]))
+        return list(dict.fromkeys([*standard_terms(self.cell), *self.in_keys]))
 
     def learning_bytes(self, samples: int | None = None) -> int:
         """Return about how many bytes a frame takes in a gradient step; with ``fcn_grasp`` 90 kB at the paper's cell.

@@ -119,7 +119,7 @@ class Planner:
         critic=None,
     ):
         self.cell, self.policy, self.training = cell, policy, training
-        self.terms = check_terms(terms, cell.bin_items)
+        self.terms = check_terms(terms, cell)
         self._name, self._parts = None, {"items": items, "critic": critic, "candidates": candidates}
         if planner is None or isinstance(planner, str):
             self._name = planner or "policy"
@@ -205,7 +205,7 @@ class Planner:
         Raises:
             DepthMapError: for a planner that cannot.
         """
-        terms = check_terms(self.terms, max(count, self.cell.bin_items))
+        terms = check_terms(self.terms, replace(self.cell, bin_items=max(count, self.cell.bin_items)))
         if self._name is not None and count not in self._planners:
             cell, policy = replace(self.cell, bin_items=count), self.policy
             try:

@@ -19,6 +19,7 @@ from pickplace.rules.gripper.base import EffectorShape, Gripper
 from pickplace.rules.gripper.rules import Contain, changed_gripper
 from pickplace.rules.gripper.shapes import Mask
 from pickplace.rules.reach.base import Limits, Reach
+from pickplace.rules.state import REFILLS
 from pickplace.rules.support.rules import Bearing, Support, read_support
 
 MAX_BIN_ITEMS = 100
@@ -50,6 +51,8 @@ class CellSpec:
         refill: of several items: a new one arrives after ``"each"`` pick, or a ``"batch"`` when the bin is empty.
         longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and unless the
             gripper limits the items it also sets the number of offsets.
+        varies: what episodes may differ in, beside the height of the tote: names of
+            :data:`~pickplace.rules.observation.EPISODE_TERMS`. The observation has an entry for each.
         item_inset: cells at each edge of the item, along x and y, that a measured item may cover in part only; see
             :meth:`Gripper.is_gripped <pickplace.rules.gripper.base.Gripper.is_gripped>`.
         effector_size, body, cup, cup_size, pick_rule, min_seal: a short form that makes the gripper, or changes the one
@@ -69,6 +72,7 @@ class CellSpec:
     bin_items: int = 1
     refill: str = "each"
     longest_side: int | None = field(default=None, metadata={"derived": True})
+    varies: tuple[str, ...] = field(default=(), metadata={"derived": True})
     item_inset: tuple[int, int] = field(default=(0, 0), metadata={"derived": True})
     effector_size: InitVar[tuple[int, int] | None] = None
     body: InitVar[str | Mask | None] = None
@@ -93,7 +97,7 @@ class CellSpec:
         good = is_whole(self.rotations) and 1 <= self.rotations <= 4
         expect(good, "rotations", self.rotations, "1, 2, 3 or 4 (quarter turns to choose from)")
         whole_number("bin_items", self.bin_items, most=MAX_BIN_ITEMS)
-        one_of("refill", self.refill, ("each", "batch"))
+        one_of("refill", self.refill, REFILLS)
         or_null(whole_number, "longest_side", self.longest_side)
         expect(isinstance(self.reach, Reach | None), "reach", self.reach, "a Reach, such as an Annulus, or None")
         # Each size is possible alone, but these products would fill the memory.
@@ -140,6 +144,11 @@ class CellSpec:
     def num_choices(self) -> int:
         """The number of pairs of an item in the bin and a footprint, ``item * num_footprints + footprint``."""
         return self.bin_items * self.num_footprints
+
+    @property
+    def forbids_turns(self) -> bool:
+        """Whether some rotations may be forbidden; see ``turns`` of an :class:`~pickplace.rules.item.Item`."""
+        return "rotations" in self.varies
 
     @cached_property
     def limits(self) -> Limits | None:

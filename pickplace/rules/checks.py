@@ -1,8 +1,8 @@
 """The checks of an action, in the order of the rules: one list, which the single step, masks and measured totes read.
 
 A check looks at the facts of a scope: of a pick (a :class:`~pickplace.rules.grasps.Grasp`), of an item at rest on a
-footprint, or of the end effector over the tote. The single step looks at all facts of one action. Masks combine the
-checks of each scope for all picks, all footprints, and all places of the end effector.
+footprint, of the end effector over the tote, or of a rotation. The single step looks at all facts of one action. Masks
+combine the checks of each scope for all picks, all footprints, all places of the end effector, and all rotations.
 """
 
 from collections.abc import Callable
@@ -17,10 +17,11 @@ from pickplace.rules.maps import NEVER
 from pickplace.rules.state import Failure
 
 #: The scopes. A check of a pick or a footprint is passed or not. One of a place of the end effector says which height
-#: its suction face, which is that of the item's top, must have at least, or at most.
-PICK, FOOTPRINT, LEAST_TOP, GREATEST_TOP = range(4)
+#: its suction face, which is that of the item's top, must have at least, or at most. The facts of a rotation are
+#: whether it is allowed.
+PICK, FOOTPRINT, LEAST_TOP, GREATEST_TOP, TURN = range(5)
 _COMPARE = {LEAST_TOP: torch.ge, GREATEST_TOP: torch.le}
-_COMBINE = {PICK: and_, FOOTPRINT: and_, LEAST_TOP: torch.maximum, GREATEST_TOP: torch.minimum}
+_COMBINE = {PICK: and_, FOOTPRINT: and_, LEAST_TOP: torch.maximum, GREATEST_TOP: torch.minimum, TURN: and_}
 
 
 class Resting(NamedTuple):
@@ -60,6 +61,7 @@ CHECKS: tuple[tuple[Failure, int, Callable[[Any], Tensor | None]], ...] = (
     (Failure.OUT_OF_REACH, PICK, lambda pick: pick.reachable),
     (Failure.OUT_OF_REACH, LEAST_TOP, lambda over: over.lowest),
     (Failure.OUT_OF_REACH, GREATEST_TOP, lambda over: over.highest),
+    (Failure.FORBIDDEN_TURN, TURN, lambda allowed: allowed),
 )
 
 _FINDS = {scope: [find for _, where, find in CHECKS if where == scope] for scope in _COMBINE}
@@ -71,10 +73,13 @@ def combine(scope: int, facts: Any) -> Any:
     return reduce(_COMBINE[scope], values) if values else None
 
 
-def first_failure(pick: Any, resting: Resting, over: Over) -> Tensor:
-    """Return the failure code of each action by the first check that is not passed, int64; 0 if all are."""
+def first_failure(pick: Any, resting: Resting, over: Over, turn: Tensor | None = None) -> Tensor:
+    """Return the failure code of each action by the first check that is not passed, int64; 0 if all are.
+
+    ``turn`` says whether its rotation is allowed; None: all are.
+    """
     failure = torch.zeros_like(resting.top)
-    facts = {PICK: pick, FOOTPRINT: resting, LEAST_TOP: over, GREATEST_TOP: over}
+    facts = {PICK: pick, FOOTPRINT: resting, LEAST_TOP: over, GREATEST_TOP: over, TURN: turn}
     for kind, scope, find in reversed(CHECKS):  # the first has the last word
         if (value := find(facts[scope])) is not None:
             passed = _COMPARE[scope](resting.top, value) if scope in _COMPARE else value

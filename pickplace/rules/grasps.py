@@ -2,8 +2,8 @@
 
 The bin matters for the tote only through the *grasp class*: the turn and the item's offset under the end effector. Many
 pick cells and rotations share one, which keeps the masks over all actions cheap. ``O`` offsets are possible along one
-axis, ``K = O * O`` in all. A turn is a parity, if neither the end effector nor limits on the robot tell rotations apart
-that differ by 180 degrees; else it is a rotation.
+axis, ``K = O * O`` in all. A turn is a parity, if neither the end effector, nor limits on the robot, nor the item tell
+rotations apart that differ by 180 degrees; else it is a rotation.
 """
 
 from collections.abc import Sequence
@@ -201,9 +201,9 @@ def select_pick(cell: CellSpec, actions: Tensor, pick: Tensor) -> Tensor:
 def num_turns(cell: CellSpec) -> int:
     """Return how many turns are told apart; a rotation's turn is its remainder.
 
-    They are parities; or rotations, where limits may forbid one and not its like, or a half turn changes the body.
+    They are parities; or rotations, where one may be forbidden and not its like, or a half turn changes the body.
     """
-    return num_grasp_turns(cell) if cell.limits is None else cell.rotations
+    return num_grasp_turns(cell) if cell.limits is None and not cell.forbids_turns else cell.rotations
 
 
 def num_grasp_turns(cell: CellSpec) -> int:

@@ -118,19 +118,33 @@ def _bin_map(items: Item, value: Tensor, bin_size: Sequence[int]) -> Tensor:
     return maps.permute(2, 0, 1).contiguous()
 
 
-def read_items(bin_depth: Tensor, table: Tensor | None = None) -> Item:
+def read_items(bin_depth: Tensor, table: Tensor | None = None, rotations: Tensor | None = None) -> Item:
     """Return what lies in the bins, ``[N, M]``: the items of a table, or the one that the depth map shows.
 
     Args:
         bin_depth: ``[N, W_B, D_B]``.
         table: int64 ``[N, M, 5]``, as the observation has it where a bin holds several items.
+        rotations: bool ``[N, R]``, those that are allowed, as the observation has it where episodes forbid some.
     """
-    return item_from_depth(bin_depth).rows((slice(None), None)) if table is None else Item.from_table(table)
+    items = item_from_depth(bin_depth).rows((slice(None), None)) if table is None else Item.from_table(table)
+    if rotations is None:
+        return items
+    return Item(*items[:6], turns_from_flags(rotations)[:, None].expand_as(items.x))
 
 
 def items_from_observation(observation: Observation) -> Item:
     """Return what lies in the bins, ``[N, M]``; see :func:`read_items`."""
-    return read_items(observation["bin_depth"], observation.get("items", None))
+    return read_items(observation["bin_depth"], observation.get("items", None), observation.get("rotations", None))
+
+
+def turns_from_flags(flags: Tensor) -> Tensor:
+    """Return bool ``[..., R]``, whether each rotation is allowed, as bit masks: int64 ``[...]``."""
+    return (flags.long() << torch.arange(flags.shape[-1], device=flags.device)).sum(-1)
+
+
+def flags_from_turns(turns: Tensor, rotations: int) -> Tensor:
+    """Return whether bit masks allow each rotation, bool ``[..., R]``: the inverse of :func:`turns_from_flags`."""
+    return (turns[..., None] >> torch.arange(rotations, device=turns.device) & 1).bool()
 
 
 def item_from_depth(bin_depth: Tensor) -> Item:

@@ -19,7 +19,7 @@ from torch import Tensor
 from pickplace.common.validate import check_bytes
 from pickplace.rules.bin import blocked_picks
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.checks import GREATEST_TOP, LEAST_TOP, Over, combine
+from pickplace.rules.checks import GREATEST_TOP, LEAST_TOP, TURN, Over, combine
 from pickplace.rules.grasps import (
     all_grasps,
     available_offsets,
@@ -31,7 +31,7 @@ from pickplace.rules.grasps import (
     split_footprint,
     turned_size,
 )
-from pickplace.rules.item import Item
+from pickplace.rules.item import Item, flags_from_turns
 from pickplace.rules.maps import FAR, NEVER, surround, windows
 from pickplace.rules.placing import over_tote, resting_top
 from pickplace.rules.state import State
@@ -65,6 +65,12 @@ class PlacingMaps(NamedTuple):
                 bound = bound.permute(3, 0, 1, 2).expand(bins, -1, -1, -1)
             bounds.append(bound if count == 1 or bound is None else bound.repeat_interleave(count, 0))
         return cls(top, bounds[0], item, rest, blocked, count, bounds[1])
+
+    def within_turns(self, cell: CellSpec) -> "PlacingMaps":
+        """Return the maps with nothing clear enough in the rotations that the items forbid."""
+        allowed = combine(TURN, flags_from_turns(self.item.turns, cell.rotations))[..., None, None]
+        each = self.clearance[:, [turn % self.clearance.shape[1] for turn in range(cell.rotations)]]
+        return self._replace(clearance=torch.where(allowed, each, FAR))
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "PlacingMaps":
         """Return the maps with a function applied to each tensor."""
@@ -112,7 +118,8 @@ def placing_maps(
     surface, tote_height, item = state.each_item()
     over = over_tote(cell, state.surface, state.tote_height)
     top, rest = find_top(cell, surface, tote_height, item)
-    return PlacingMaps.of(top, rest, over, item, blocked_picks(cell, state.items))
+    maps = PlacingMaps.of(top, rest, over, item, blocked_picks(cell, state.items))
+    return maps.within_turns(cell) if cell.forbids_turns else maps
 
 
 def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:

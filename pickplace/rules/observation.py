@@ -13,8 +13,11 @@ from torch import Tensor
 
 from pickplace.common.validate import expect, refuse_if, short_text
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.item import bin_depth_from_items, bin_labels_from_items
+from pickplace.rules.item import bin_depth_from_items, bin_labels_from_items, flags_from_turns
 from pickplace.rules.state import State
+
+PAPER_CELL = CellSpec()
+MAX_NUMBER = 2**31 - 1  # of a whole number in which episodes differ
 
 
 class Bounds(NamedTuple):
@@ -109,6 +112,39 @@ class ToteHeight(Term):
         return state.tote_height[:, None].clone()
 
 
+class Rotations(Term):
+    """Which rotations the episode allows, bool ``[N, R]``."""
+
+    def bounds(self, cell, tallest):
+        return Bounds(0, 1, (cell.rotations,), torch.bool)
+
+    def value(self, cell, state):
+        return flags_from_turns(state.episode.turns, cell.rotations)
+
+
+class EpisodeNumber(Term):
+    """A whole number in which episodes differ, int64 ``[N, 1]``.
+
+    Args:
+        key: the field of :class:`~pickplace.rules.state.Episode`.
+    """
+
+    def __init__(self, key: str):
+        self.key = key
+
+    def bounds(self, cell, tallest):
+        return Bounds(0, MAX_NUMBER, (1,), torch.int64)
+
+    def value(self, cell, state):
+        return getattr(state.episode, self.key)[:, None].clone()
+
+
+#: Entries for what episodes may differ in, in environments that let it vary.
+EPISODE_TERMS: Mapping[str, Term] = {
+    "rotations": Rotations(),
+    **{key: EpisodeNumber(key) for key in ("item_mix", "bin_items", "refill", "level")},
+}
+
 #: What every observation holds; the whole state can be read from it, see :meth:`State.from_observation`.
 STANDARD_TERMS: Mapping[str, Term] = {
     "bin_depth": BinDepth(),
@@ -146,9 +182,10 @@ RESERVED = (
 )
 
 
-def standard_terms(bin_items: int) -> dict[str, Term]:
-    """Return the terms that an observation of a bin with that many items always has."""
-    return {**STANDARD_TERMS, **({"bin_labels": BinLabels(), "items": Items()} if bin_items > 1 else {})}
+def standard_terms(cell: CellSpec) -> dict[str, Term]:
+    """Return the terms that an observation of a cell always has."""
+    several: dict[str, Term] = {"bin_labels": BinLabels(), "items": Items()} if cell.bin_items > 1 else {}
+    return {**STANDARD_TERMS, **several, **{key: EPISODE_TERMS[key] for key in cell.varies}}
 
 
 def item_keys(bin_items: int) -> tuple[str, ...]:
@@ -156,18 +193,18 @@ def item_keys(bin_items: int) -> tuple[str, ...]:
     return ("items",) if bin_items > 1 else ()
 
 
-def check_terms(terms: Mapping[str, Term] | None, bin_items: int = 1) -> dict[str, Term]:
+def check_terms(terms: Mapping[str, Term] | None, cell: CellSpec = PAPER_CELL) -> dict[str, Term]:
     """Return the terms of an observation, the standard ones first; None gives those alone.
 
     Args:
         terms: by key.
-        bin_items: number of items that a bin holds.
+        cell: decides which are standard.
 
     Raises:
         ValueError: naming the key, for something else than a term, a key that is taken, or another term for a standard
             one.
     """
-    standard, given = standard_terms(bin_items), {} if terms is None else terms
+    standard, given = standard_terms(cell), {} if terms is None else terms
     expect(isinstance(given, Mapping), "observation", terms, "terms by their keys")
     for key, term in given.items():
         place = f"observation.{short_text(key)}"

@@ -6,13 +6,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.rules.item import Item, Observation, items_from_observation
+from pickplace.rules.item import Item, Observation, items_from_observation, turns_from_flags
 
 EMPTY = 1  # surface of an empty tote, see `surface_from`
+REFILLS = ("each", "batch")  # see :attr:`~pickplace.rules.cell.CellSpec.refill`
 
 
 class Failure(IntEnum):
-    """The reason why an episode ended; 1 to 6 in the order of the checks.
+    """The reason why an episode ended; see :data:`~pickplace.rules.checks.CHECKS` for the order of the checks.
 
     Attributes:
         sentence: the reason for a reader who does not know the rules.
@@ -31,11 +32,42 @@ class Failure(IntEnum):
     UNSTABLE = 6, "The item would not rest stably.", "unstable"
     STUCK = 7, "This item fits nowhere any more.", "no place left"
     OUT_OF_REACH = 8, "The robot does not reach this pick or this place.", "out of reach"  # judged after 1 to 6
+    FORBIDDEN_TURN = 9, "The item may not be turned like that.", "forbidden turn"  # judged last
 
     def __new__(cls, code: int, sentence: str = "", label: str = ""):
         failure = int.__new__(cls, code)
         failure._value_, failure.sentence, failure.label = code, sentence, label
         return failure
+
+
+class Episode(NamedTuple):
+    """What episodes may differ in beside the height of the tote, ``[N]`` each; None where all are alike.
+
+    See :attr:`~pickplace.rules.cell.CellSpec.varies`.
+    """
+
+    item_mix: Tensor | None = None  # int64: which of the item distribution's mixes of kinds
+    turns: Tensor | None = None  # int64: bit mask of the rotations that are allowed, as of an item
+    bin_items: Tensor | None = None  # int64: how many items the bin holds at most
+    refill: Tensor | None = None  # int64: index of the rule in REFILLS
+    level: Tensor | None = None  # int64: number of the curriculum's level
+
+    @classmethod
+    def from_observation(cls, observation: Observation) -> "Episode":
+        """Return what the entries of an observation say."""
+        read = {key: observation.get(key, None) for key in ("item_mix", "bin_items", "refill", "level")}
+        rotations = observation.get("rotations", None)
+        return cls(
+            turns=rotations if rotations is None else turns_from_flags(rotations),
+            **{key: entry if entry is None else entry.reshape(-1) for key, entry in read.items()},
+        )
+
+    def rows(self, index) -> "Episode":
+        """Return those of some problems, by their numbers."""
+        return Episode(*(part if part is None else part[index] for part in self))
+
+
+FULL_TASK = Episode()
 
 
 class State(NamedTuple):
@@ -44,13 +76,15 @@ class State(NamedTuple):
     surface: Tensor  # int32 [N, W_T, D_T]: of what the tote holds, see `surface_from`
     tote_height: Tensor  # int64 [N]: height of the episode's tote, H_T
     items: Item  # in the bin, [N, M]
+    episode: Episode = FULL_TASK  # what the running episodes may differ in
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "State":
         """Return the state that the standard terms of an observation ``[N]`` show."""
         tote_height = observation["tote_height"].reshape(-1)
         heights = tote_height[:, None, None] - observation["tote_depth"]
-        return cls(surface_from(heights, observation["tote_bearing"]), tote_height, items_from_observation(observation))
+        surface, items = surface_from(heights, observation["tote_bearing"]), items_from_observation(observation)
+        return cls(surface, tote_height, items, Episode.from_observation(observation))
 
     @property
     def heights(self) -> Tensor:
@@ -64,7 +98,8 @@ class State(NamedTuple):
 
     def rows(self, index) -> "State":
         """Return the state of some problems, by their numbers, which may come up more than once."""
-        return State(self.surface[index], self.tote_height[index], self.items.rows(index))
+        parts = self.surface[index], self.tote_height[index], self.items.rows(index)
+        return State(*parts, self.episode.rows(index))
 
     def each_item(self) -> tuple[Tensor, Tensor, Item]:
         """Return a problem for each item, those of a bin one after the other.

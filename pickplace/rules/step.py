@@ -17,7 +17,7 @@ from pickplace.rules.grasps import (
     turned_size,
 )
 from pickplace.rules.gripper.base import EffectorShape
-from pickplace.rules.item import Item
+from pickplace.rules.item import Item, flags_from_turns
 from pickplace.rules.maps import NEVER, is_under, rectangle, square_cells
 from pickplace.rules.state import State, surface_from
 from pickplace.rules.support.contact import Contact
@@ -40,7 +40,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     Args:
         action: int64 ``[N]``, the flat index, in ``[0, N_a)``.
     """
-    (surface, tote_height, items), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.gripper.size
+    (surface, tote_height, items, _), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.gripper.size
     taken, item, blocked = take_item(cell, items, action)
     picked, rotation, (left, front, wide, deep), (x, y, w, d) = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
@@ -57,7 +57,10 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
         over = over._replace(lowest=limits.lowest_top[place], highest=limits.highest_top[place])
     inside = ~(is_outside(x, w, tote_w) | is_outside(y, d, tote_d))
     resting = Resting(inside, top, tote_height, cell.support.stable(contact))
-    failure = first_failure(picked, resting, over)
+    turn = (
+        flags_from_turns(item.turns, cell.rotations).gather(1, rotation[:, None])[:, 0] if cell.forbids_turns else None
+    )
+    failure = first_failure(picked, resting, over, turn)
     after = _add_item(cell, surface, x, y, contact, index, torch.where(failure == 0, item.h, 0))
     return Step(after, failure, top, torch.stack([x, y, w, d], -1), item, taken)
 
@@ -84,7 +87,7 @@ def put_down(cell: CellSpec, state: State, choice: Tensor) -> tuple[State, Item]
     parity, x, y = split_footprint(cell.tote_size, choice - taken * cell.num_footprints)
     w, d = turned_size(item, parity == 1)
     surface = _add_item(cell, state.surface, x, y, *_contact(cell, state.surface, x, y, w, d), item.h)
-    return State(surface, state.tote_height, remove_item(state.items, taken)), item
+    return state._replace(surface=surface, items=remove_item(state.items, taken)), item
 
 
 def _contact(cell: CellSpec, surface: Tensor, x: Tensor, y: Tensor, w: Tensor, d: Tensor) -> tuple[Contact, Tensor]:

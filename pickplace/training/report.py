@@ -17,7 +17,9 @@ from pickplace.views.figures import failure_mix
 from pickplace.views.replay import ASSETS, page
 
 
-def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts: dict) -> None:
+def write_report(
+    run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts: dict, levels: tuple[str, int]
+) -> None:
     """Write ``report.html``: curves, tables, the worst and the best episode, and the command that repeats the run.
 
     Args:
@@ -26,6 +28,7 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
         episodes: the last validation, an :class:`pickplace.evaluation.play.Episodes` with recordings.
         cell: the sizes.
         facts: versions and commit.
+        levels: what a level of the curriculum is, and the number of the last one.
 
     Raises:
         OSError: naming the report, if it cannot be written.
@@ -42,7 +45,7 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
         (f"{best['eval/occupancy']:.4f}", f"best validation, after {best['frames']:,} frames (checkpoints/best)"),
         (f"{episodes.occupancy.mean():.4f}", f"last validation, {len(episodes.occupancy)} episodes at full height"),
         (f"{episodes.occupancy.min():.4f}", "its worst episode"),
-        (f"{int(rows[-1]['curriculum/level'])} of {cell.tote_size[2]}", "tote height reached"),
+        (f"{int(rows[-1]['curriculum/level'])} of {levels[1]}", f"{levels[0]} reached"),
     ]
     parts = {
         "title": escape(f"Training {policy} for a {sizes} tote"),
@@ -53,7 +56,7 @@ def write_report(run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts
         "tiles": "".join(f"<div><b>{value}</b><span>{text}</span></div>" for value, text in tiles),
         "curve": base64.b64encode((run_dir / "learning_curve.png").read_bytes()).decode(),
         "failures": base64.b64encode(failures.getvalue()).decode(),
-        "tables": validation_table(rows) + level_table(rows),
+        "tables": validation_table(rows, levels[0]) + level_table(rows, levels[0]),
         "command": escape(command),
         "config": escape(OmegaConf.to_yaml(cfg, resolve=True)),
         "versions": escape("\n".join(f"{name}: {value}" for name, value in facts.items())),
@@ -71,7 +74,7 @@ def _table(head: tuple, rows: list[tuple]) -> str:
     return f"<table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
 
-def validation_table(rows: list[dict]) -> str:
+def validation_table(rows: list[dict], level_name: str) -> str:
     """An HTML table of some 12 of the validations, and the last one."""
     found = [
         (
@@ -84,19 +87,19 @@ def validation_table(rows: list[dict]) -> str:
         if "eval/occupancy" in row
     ]
     return _table(
-        ("frames", "validation", "95% interval", "tote height in training"),
+        ("frames", "validation", "95% interval", f"{level_name} in training"),
         found[: -1 : max(1, len(found) // 12)] + found[-1:],
     )
 
 
-def level_table(rows: list[dict]) -> str:
-    """An HTML table of the training occupancy at each tote height, a mean over the last 20 batches in which an episode
-    of that height ended."""
-    heights = sorted({int(key.rpartition("_")[2]) for row in rows for key in row if "curriculum/occupancy_at_" in key})
+def level_table(rows: list[dict], level_name: str) -> str:
+    """An HTML table of the training occupancy at each level, a mean over the last 20 batches in which an episode of it
+    ended."""
+    levels = sorted({int(key.rpartition("_")[2]) for row in rows for key in row if "curriculum/occupancy_at_" in key})
     lines = []
-    for height in heights:
-        seen = [row for row in rows if f"curriculum/occupancy_at_{height}" in row]
-        values = [row[f"curriculum/occupancy_at_{height}"] for row in seen[-20:]]
-        lines.append((height, f"{sum(values) / len(values):.4f}", f"{seen[0]['frames']:,} to {seen[-1]['frames']:,}"))
-    head = ("tote height", "training occupancy when last trained", "frames")
+    for level in levels:
+        seen = [row for row in rows if f"curriculum/occupancy_at_{level}" in row]
+        values = [row[f"curriculum/occupancy_at_{level}"] for row in seen[-20:]]
+        lines.append((level, f"{sum(values) / len(values):.4f}", f"{seen[0]['frames']:,} to {seen[-1]['frames']:,}"))
+    head = (level_name, "training occupancy when last trained", "frames")
     return "<br>" + _table(head, lines) if lines else ""

@@ -34,7 +34,7 @@ from pickplace.runs.resume import (
     stale_best_frames,
 )
 from pickplace.training import callbacks, collectors, settings
-from pickplace.training.curriculum.levels import Curriculum
+from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.training.curriculum.transform import ToteHeightCurriculum, push_level
 from pickplace.training.report import write_report
 from pickplace.views.figures import learning_curve
@@ -79,9 +79,8 @@ class Trainer:
         self.ended = facts.get("ended") is True and has_config(facts, self.saved_config)
         self.callbacks = callbacks.make_callbacks(cfg.get("callbacks") or {}, facts.get("callbacks") or {})
         # The order of these fixes the random draws of a seed.
+        self._make_environments()
         self._make_networks()
-        self.curriculum: Curriculum = build("curriculum", cfg.curriculum)
-        self.curriculum.setup(self.env.min_tote_height, self.env.cell.tote_size[2], cfg.total_frames)
         if self.resumed:
             self.curriculum.load_state_dict(facts["curriculum"])
             if (stale := stale_best_frames(run_dir, self.frames, self.saved_config)) is not None:
@@ -93,7 +92,7 @@ class Trainer:
         if shortage := self.curriculum.check_budget(cfg.total_frames, self.task.batch_frames):
             log.warning(shortage)
         self.acting = self.algorithm.acting_policy()
-        base_env = partial(self.build_env, masks=self.policy.masks, episode_stride=cfg.env.num_envs)
+        base_env = partial(self.build_training_env, masks=self.policy.masks, episode_stride=cfg.env.num_envs)
         self.collector = build(
             "collector",
             cfg.collector,
@@ -105,32 +104,42 @@ class Trainer:
             next_keys=self.algorithm.next_keys,
         )
 
-    def _make_networks(self) -> None:
-        """Make the environment, the policy, the planner that validates it, the warm start, critic and algorithm."""
+    def _make_environments(self) -> None:
+        """Make the environment of the full task, the curriculum, and an environment that plays its levels."""
         cfg = self.cfg
         env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
         del env["num_envs"]  # given with each call
         self.build_env = partial(build, "env", env, items=build("items", cfg["items"]), device=cfg.device, masks=())
         self.env = self.build_env(num_envs=1)  # for its sizes, terms and items
-        weights = self.state
+        self.curriculum: Curriculum = build("curriculum", cfg.curriculum)
+        self.curriculum.setup(self.env.min_tote_height, self.env.cell.tote_size[2], cfg.total_frames, self.env)
+        levels = self.curriculum.levels
+        changes = {"items": levels.items, "varies": levels.varies} if levels.varies else {}
+        self.build_training_env = partial(self.build_env, **changes)
+        self.training_env = self.build_training_env(num_envs=1)
+
+    def _make_networks(self) -> None:
+        """Make the policy, the planner that validates it, the warm start, critic and algorithm."""
+        cfg, env, weights = self.cfg, self.training_env, self.state
         if not self.resumed and (path := cfg.warm_start.weights) is not None:
             weights, facts = checkpoint.read(checkpoint.locate(path, key="warm_start.weights"))
             log.info("beginning with the weights of %s, after %s frames", path, f"{facts['frames']:,}")
-        make = partial(build, cell=self.env.cell)
+        make = partial(build, cell=env.cell)
         make_actor = partial(make, "model.actor", cfg.model.actor, mask_infeasible=cfg.model.mask_infeasible)
         self.policy: Policy = self._restored("policy", make_actor, weights)
         for warning in self.policy.check_sizes():
             log.warning(warning)
-        self.planner = make("planner", cfg.planner, policy=self.policy)
-        self.warm_start = WarmStart(cfg.warm_start, self.policy, self.env, cfg.seed, cfg.trust)
+        full = self.env.cell
+        self.planner = build("planner", cfg.planner, cell=full, policy=self.policy.with_cell(full))
+        self.warm_start = WarmStart(cfg.warm_start, self.policy, env, cfg.seed, cfg.trust)
         self.critic = None
         if isinstance(self.policy, EstimatesValue):
             expect(cfg.model.critic is None, "model.critic", cfg.model.critic, "null; the actor is the critic")
             self.critic = as_critic(self.policy.value_network())
         elif cfg.model.critic is not None:
             self.critic = self._restored("critic", lambda: as_critic(make("model.critic", cfg.model.critic)), weights)
-        observation = self.build_env(num_envs=1, masks=self.policy.masks).observation_spec.zero()
-        self.task = Task(self.env.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
+        observation = self.build_training_env(num_envs=1, masks=self.policy.masks).observation_spec.zero()
+        self.task = Task(env.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
         algorithm = build("algo", cfg.algo, policy=self.policy, critic=self.critic, task=self.task)
         expect(isinstance(algorithm, Algorithm), "algo", algorithm, "an algorithm, such as algo=ppo")
         self.algorithm = with_warm_start(algorithm, self.warm_start)
@@ -179,9 +188,9 @@ class Trainer:
                     saved = checkpoint.matching_state(
                         self.state.get("collector"), self.collector.state_dict(), "collector"
                     )
-                    check_saved_states(self.env, saved)
+                    check_saved_states(self.training_env, saved)
                     self.collector.load_state_dict(saved)
-                    push_level(self.collector, self.curriculum.level)
+                    push_level(self.collector, self.curriculum.level, self.curriculum.weights)
                 # Last: everything above may have drawn.
                 random = checkpoint.matching_state(self.state, collectors.rng_state(self.device), "random generator")
                 collectors.set_rng_state(random, self.device)
@@ -198,8 +207,9 @@ class Trainer:
                 log.info("a callback ended this training at %s frames; other settings continue it", f"{self.frames:,}")
             else:
                 log.info(
-                    "%s frames to train, at tote height %d of %d",
+                    "%s frames to train, at %s %d of %d",
                     f"{max(self.cfg.total_frames - self.frames, 0):,}",
+                    self.curriculum.what,
                     self.curriculum.level,
                     self.curriculum.end,
                 )
@@ -212,11 +222,13 @@ class Trainer:
         at = At(self.frames, self.frames + batch.numel(), self.iteration + 1, self.cfg.total_frames)
         self.frames, self.iteration, level = at.frames, at.iteration, self.curriculum.level
         done = batch["next", "done"][..., 0]
-        heights, occupancy = (batch["next", key][done][:, 0] for key in ("tote_height", "occupancy"))
-        metrics = episode_metrics(batch) | self.curriculum.update(heights, occupancy, self.frames)
+        key, weights = self.curriculum.levels.key, self.curriculum.weights
+        levels, occupancy = (batch["next", entry][done][:, 0] for entry in (key, "occupancy"))
+        metrics = episode_metrics(batch) | self.curriculum.update(levels, occupancy, self.frames)
+        if (self.curriculum.level, self.curriculum.weights) != (level, weights):
+            push_level(self.collector, self.curriculum.level, self.curriculum.weights)
         if self.curriculum.level != level:
-            push_level(self.collector, self.curriculum.level)
-            log.info("%s frames: tote height %d -> %d", f"{self.frames:,}", level, self.curriculum.level)
+            log.info("%s frames: %s %d -> %d", f"{self.frames:,}", self.curriculum.what, level, self.curriculum.level)
             callbacks.call(self.callbacks, "on_level_change", self, level, self.curriculum.level)
         learnt = self.algorithm.learn(batch, at)
         taken = ", ".join(sorted(metrics.keys() & learnt.keys()))
@@ -224,7 +236,7 @@ class Trainer:
         return metrics | learnt
 
     def validate(self, record=()) -> Episodes:
-        """Play the validation stream at full height, and record the episodes of these numbers."""
+        """Play the full task on the validation stream, and record the episodes of these numbers."""
         evaluation = self.cfg.evaluation
         make_env = partial(self.build_env, stream=evaluation.stream, seed=evaluation.seed)
         return play(
@@ -257,7 +269,7 @@ class Trainer:
             left = int(max(cfg.total_frames - frames, 0) / speed)  # s; the last batch is collected whole
             log.info(
                 f"{frames / cfg.total_frames:4.0%} {frames:>11,} frames | {speed:6,.0f}/s | "
-                f"tote height {self.curriculum.level}/{self.curriculum.end} | "
+                f"{self.curriculum.what} {self.curriculum.level}/{self.curriculum.end} | "
                 f"occupancy {metrics.get('train/occupancy', float('nan')):.3f} | {left // 60}:{left % 60:02d} to go"
             )
 
@@ -296,30 +308,32 @@ class Trainer:
         if stopped:
             command = f"pickplace-train resume={shlex.quote(str(run_dir))}{self.resume_overrides}"
             log.info("stopped at %s frames; continue with: %s", f"{self.frames:,}", command)
-        elif level < end:
+        elif level < end and not self.curriculum.weights:
             log.info(
-                "the tote grew to height %d of %d only, so the policy was not trained above it; "
+                "the curriculum came to %s %d of %d only, so the policy was not trained above it; "
                 "train longer, or let a level end sooner (curriculum.advance, see docs/curriculum.md)",
+                self.curriculum.what,
                 level,
                 end,
             )
         if not (run_dir / "metrics.csv").is_file():
             return
         with replaced_file(run_dir / "learning_curve.png") as new:
-            learning_curve(run_dir / "metrics.csv", new)
+            learning_curve(run_dir / "metrics.csv", new, self.curriculum.what)
         # Without an episode of this process nothing was trained since the report was written.
         if self.is_complete and (self.episodes is not None or not (run_dir / folder.REPORT).is_file()):
             log.info("writing the report")
             occupancy = (self.episodes or self.validate()).occupancy
             replayed = self.validate(record={int(occupancy.argmin()), int(occupancy.argmax())})
             made_with = {**provenance.versions(), "commit": provenance.commit()}
-            write_report(run_dir, self.cfg, replayed, self.env.cell, made_with)
+            levels = self.curriculum.what, self.curriculum.end
+            write_report(run_dir, self.cfg, replayed, self.env.cell, made_with, levels)
 
 
 def training_env(base_env, curriculum: Curriculum, first_episode: int, num_envs: int) -> TransformedEnv:
     """Make the environment of one collector process: slots ``first_episode ..``, under the curriculum."""
-    heights = ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.start)
-    return TransformedEnv(base_env(first_episode=first_episode, num_envs=num_envs), Compose(heights))
+    levels = ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.levels, curriculum.weights)
+    return TransformedEnv(base_env(first_episode=first_episode, num_envs=num_envs), Compose(levels))
 
 
 def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
@@ -329,9 +343,10 @@ def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
     if done.any():
         metrics["train/occupancy"] = batch["next", "occupancy"][done].mean().item()
         reasons = batch["next", "failure"][done]
-        metrics |= {
-            f"train/failure_{failure.name.lower()}": (reasons == failure).float().mean().item() for failure in Failure
-        }
+        forbids = "rotations" in batch  # else no rotation is forbidden
+        for failure in Failure:
+            if forbids or failure != Failure.FORBIDDEN_TURN:
+                metrics[f"train/failure_{failure.name.lower()}"] = (reasons == failure).float().mean().item()
     return metrics
 
 

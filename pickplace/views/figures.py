@@ -27,8 +27,8 @@ def figure_of(width: float, height: float):
     return FigureCanvasAgg(Figure(figsize=(width, height), layout="constrained")).figure
 
 
-def learning_curve(metrics: Path, path: Path) -> None:
-    """Draw occupancy over frames, and below it the tote height that the curriculum had reached.
+def learning_curve(metrics: Path, path: Path, level_name: str = "tote height") -> None:
+    """Draw occupancy over frames, and below it the level that the curriculum had reached.
 
     What the table lacks is left out: a run that was stopped early has no validation, one batch may end no episode.
 
@@ -47,7 +47,7 @@ def learning_curve(metrics: Path, path: Path) -> None:
         for frame in frames[1:][np.diff(level) != 0]:
             upper.axvline(frame, color=WALL, lw=0.8, ls=":", zorder=0)
         axes.step(frames, level, _line(frames), where="post", color=INK)
-        axes.set(ylabel="tote height\n(cells)", ylim=(0, level.max() + 0.5))
+        axes.set(ylabel=level_name, ylim=(0, level.max() + 0.5))
         axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
         axes.grid(alpha=0.3)
     _draw_occupancy(upper, rows)
@@ -86,7 +86,7 @@ def _draw_occupancy(axes, rows: list[dict]) -> None:
         smooth = _running_mean(occupancy, np.ones(len(frames)))
         axes.plot(
             frames[-len(smooth) :], smooth, _line(smooth), color=LINE,
-            label="training episodes, at the curriculum's height, actions sampled",
+            label="training episodes, at the curriculum's level, actions sampled",
         )  # fmt: skip
     frames, mean = _columns(rows, "eval/occupancy")
     if len(frames):

@@ -10,7 +10,7 @@ from pickplace import PickPlaceEnv
 from pickplace.config.composition import conf_dir
 from pickplace.config.registry import REGISTRY, accepted_arguments, build, find, names_at
 from pickplace.items.distributions import ItemDistribution
-from pickplace.training.curriculum.levels import Curriculum
+from pickplace.training.curriculum.curriculum import Curriculum
 
 
 def test_every_name_leads_to_a_class_or_function():

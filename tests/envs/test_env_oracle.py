@@ -52,11 +52,12 @@ def draw_config(rng: Random, shaped=0.5):
 def make_env(rules, kinds, **settings):
     """Return the package's environment for the oracle's rules."""
     given = asdict(rules)
+    del given["turns"]  # not of the cell, but of an episode
     tables = {field.name: given.pop(field.name) for field in fields(Limits)}
     tables = {name: torch.tensor(table) for name, table in tables.items() if table is not None}
     limits = Limits(**tables) if tables else None
     given["support"] = support_of(given.pop("support"), given.pop("support_margin"))
-    return PickPlaceEnv(**given, reach=limits, items=Kinds(kinds), **settings)
+    return PickPlaceEnv(**given, reach=limits, **{"items": Kinds(kinds), **settings})
 
 
 def read_items(observation, row):

@@ -257,3 +257,24 @@ def test_bad_input_is_refused_in_a_sentence(act, message):
     with pytest.raises((ValueError, TypeError, gymnasium.error.Error), match=message) as caught:
         act()
     assert str(caught.value).count("\n") == 0
+
+
+def test_options_set_what_the_environment_lets_vary():
+    varies = ("rotations", "bin_items")
+    env = gymnasium.make("pickplace/PickPlace-v0", varies=varies, bin_items=2, bin_size=(6, 6, 1))
+    observation, info = env.reset(seed=1, options={"rotations": [0, 3], "bin_items": 1})
+    assert env.observation_space.contains(observation)
+    assert observation["rotations"].tolist() == [True, False, False, True]
+    assert observation["bin_items"].tolist() == [1] and not observation["items"][1].any()
+    assert set(np.flatnonzero(info["action_mask"]) % 4) == {0, 3}
+    many = gymnasium.make_vec("pickplace/PickPlace-v0", num_envs=2, varies=("rotations",))
+    observation, _ = many.reset(seed=1, options={"rotations": [1, [0, 3]], "tote_height": [2, 5]})
+    assert observation["rotations"].astype(int).tolist() == [[1, 0, 0, 0], [1, 0, 0, 1]]
+    for options, words in (
+        ({"rotations": 5}, r"options\['rotations'\]=5: expected a number of quarter turns, at most 4"),
+        ({"refill": "batch"}, r"options\['refill'\]: there is no such option; expected tote_height, rotations or"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            many.reset(options=options)
+    with pytest.raises(ValueError, match="varies=.*: expected any of rotations, bin_items"):
+        gymnasium.make("pickplace/PickPlace-v0", varies=("gripper",))

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from pickplace.config.registry import build
 from pickplace.training.curriculum.advance import Advance, Frames, NoAdvance, Plateau, Staged, Threshold
-from pickplace.training.curriculum.levels import Curriculum
+from pickplace.training.curriculum.curriculum import Curriculum
+from pickplace.training.curriculum.learning_progress import LearningProgress
 from pickplace.training.curriculum.sample import Current
 
 
@@ -132,8 +133,9 @@ RULES = {
     "frames": lambda: Frames(7), "even": Frames, "none": NoAdvance, "plateau": lambda: Plateau(2, 2, 0.05),
     "threshold": lambda: Threshold(0.6, 3, max_frames_per_level=40, demote_below=0.3),
     "staged": lambda: Staged([{"frames": 20, "height": 5}, {"frames": 60, "height": 2}]),
+    "learning progress": lambda: LearningProgress(window=4, explore=0.3),
 }  # fmt: skip
-EPISODES = st.lists(st.tuples(st.integers(1, 7), st.floats(0, 1, width=32)), max_size=6)  # heights, occupancies
+EPISODES = st.lists(st.tuples(st.integers(2, 5), st.floats(0, 1, width=32)), max_size=6)  # heights, occupancies
 BATCHES = st.lists(st.tuples(st.integers(1, 30), EPISODES), max_size=30)  # frames, episodes
 
 
@@ -163,7 +165,7 @@ def test_levels_stay_in_range_and_a_state_continues_exactly(rule, batches, more,
     assert run(resumed, more, frames)[0] == rest and resumed.state_dict() == straight.state_dict()
     levels += [logs["curriculum/level"] for logs in history + rest]
     assert all(low <= level <= high for level in levels)
-    if rule != "staged":
+    if rule not in ("staged", "learning progress"):
         assert all(abs(after - before) <= 1 for before, after in zip(levels, levels[1:], strict=False))
 
 
@@ -199,7 +201,7 @@ ERRORS = [
     (lambda: Staged([]), r"curriculum.advance.stages=\[\]: "),
     (lambda: Staged([{"frames": 1}]), r"curriculum.advance.stages=\[{'frames': 1}\]: "),
     (lambda: Staged([STAGE] * 2), "curriculum.advance.stages: frames=5: .* >= 6"),
-    (lambda: make(Staged([STAGE | {"height": 9}])), "curriculum.advance.stages: height=9: .* <= 5"),
+    (lambda: make(Staged([STAGE | {"height": 9}])), "curriculum.advance.stages: level=9: .* <= 5"),
     # States of another run; for damaged ones see test_resume.
     (lambda: make(Frames(1)).load_state_dict(make(Plateau(2, 2)).state_dict()), "advance='Frames': expected .*'best'"),
     (
@@ -210,7 +212,7 @@ ERRORS = [
     # A user's rule.
     (lambda: play(make(Own(1.5)), 10), "advance: Own: its level=1.5: expected a whole number"),
     (lambda: play(make(Own(1, logs={"mood": "good"})), 10), "Own: it logs mood='good': expected a number"),
-    (lambda: make(Own(1, torch.tensor(1))), r"Own: its state has seen=tensor\(1\): expected a finite Python number"),
+    (lambda: make(Own(1, torch.tensor(1))), r"Own: its state has seen=tensor\(1\): expected what JSON holds"),
     (lambda: make(Own(1, float("nan"))), "Own: its state has seen=nan"),
     (lambda: play(make(Own(1, logs=None)), 10), r"Own: its update=\(1, None\): expected \(level, "),
 ]
@@ -256,9 +258,35 @@ def test_a_budget_is_refused_if_the_last_height_is_not_reached(batch, rule, occu
 
 def test_budgets_without_a_last_height():
     assert make(Frames(), total_frames=1000).check_budget(1000) is None  # even shares always fit
-    assert "a stage of that height" in make(Staged([{"frames": 5, "height": 3}])).check_budget(10**9)
+    assert "a stage of that level" in make(Staged([{"frames": 5, "height": 3}])).check_budget(10**9)
     lower = make(NoAdvance(), end_height=3).check_budget(1000)
-    assert "curriculum.end_height=3: nothing is trained at the full height, 5" in lower
+    assert "curriculum.end_height=3: nothing is trained at the full task" in lower
+
+
+# --- learning progress
+
+
+def test_levels_are_drawn_by_how_much_their_occupancy_has_changed():
+    curriculum = make(LearningProgress(window=4, explore=0.5), low=1, high=3)
+    assert curriculum.weights == pytest.approx([1 / 3] * 3)  # nothing is known yet
+    play(curriculum, 10, [0.1, 0.1, 0.5, 0.7], height=1)  # +0.5
+    assert curriculum.weights == pytest.approx([1 / 3] * 3)  # the others may be as promising
+    play(curriculum, 20, [0.8] * 9, height=2)  # mastered
+    logs = play(curriculum, 30, [0.4, 0.4, 0.3, 0.3], height=3)  # -0.1: forgotten
+    assert logs["learning_progress"] == pytest.approx(0.5) and logs["level"] == 1
+    assert curriculum.weights == pytest.approx([1 / 6 + 0.5 * share for share in (5 / 6, 0, 1 / 6)])
+    play(curriculum, 40, [0.7, 0.7], height=1)  # of the latest four now +0.1
+    assert curriculum.weights == pytest.approx([1 / 6 + 0.5 * share for share in (0.5, 0, 0.5)])
+
+
+@pytest.mark.parametrize(
+    "histories", [[], [[0.5]], [[0.5], [2.0], [], [], []], [[], [], [], [], "x"], 1, [[0.1] * 5] * 5]
+)
+def test_a_damaged_history_is_refused(histories):
+    curriculum = make(LearningProgress(window=4))
+    state = curriculum.state_dict()
+    with pytest.raises(ValueError, match="curriculum histories of the checkpoint"):
+        curriculum.load_state_dict(state | {"advance": {"histories": histories}})
 
 
 # --- configs

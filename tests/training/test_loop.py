@@ -25,7 +25,7 @@ from pickplace.runs.loggers import read_csv
 from pickplace.training import trainer
 from pickplace.training.collectors import ResumableCollector
 from pickplace.training.curriculum.advance import NoAdvance
-from pickplace.training.curriculum.levels import Curriculum
+from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.training.curriculum.sample import Current
 from pickplace.training.trainer import Trainer, episode_metrics, has_passed, training_env
 

@@ -98,7 +98,7 @@ def test_the_console_tells_of_a_tote_that_did_not_grow(caplog, tmp_path, height,
     training = trainer.Trainer(composed("experiment=smoke", *settings), tmp_path)
     training.report(stopped=False)
     training.collector.shutdown()
-    assert ("the tote grew to height 1 of 2 only" in caplog.text) == told
+    assert ("the curriculum came to tote height 1 of 2 only" in caplog.text) == told
 
 
 def test_the_paper_preset_is_the_paper_s():

@@ -13,7 +13,7 @@ from torchrl.envs.utils import check_env_specs
 from pickplace import PickPlaceEnv
 from pickplace.training import collectors
 from pickplace.training.curriculum.advance import NoAdvance
-from pickplace.training.curriculum.levels import Curriculum
+from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.training.curriculum.sample import Current, Recent, Uniform
 from pickplace.training.curriculum.transform import ToteHeightCurriculum, push_level
 
@@ -37,7 +37,7 @@ def make_env(level=3, sampler=None, num_envs=6, **settings):
     curriculum = Curriculum(NoAdvance(), sampler or Current())
     curriculum.setup(1, level, 1000)
     env = PickPlaceEnv(tote_size=(4, 4, 5), num_envs=num_envs, **settings)
-    heights = ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.start)
+    heights = ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.start)  # any height from there on
     return TransformedEnv(env, Compose(heights, RewardSum(), StepCounter()))
 
 
@@ -47,7 +47,7 @@ def heights(td):
 
 @pytest.mark.parametrize("drawn", [torch.ones(5).long(), torch.ones(6), [1] * 6], ids=["few", "floats", "list"])
 def test_a_sampler_that_returns_something_else_is_named(drawn):
-    message = r"curriculum.sample: its heights=.*: expected whole numbers in a tensor \[6\]"
+    message = r"curriculum.sample: its levels=.*: expected whole numbers between 1 and 2000 in a tensor \[6\]"
     with pytest.raises(ValueError, match=message):
         make_env(sampler=lambda level, least, count: drawn).reset()
 

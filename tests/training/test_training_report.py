@@ -80,4 +80,4 @@ def test_the_bar_of_a_validation_is_its_interval(drawn):
 
 def test_the_occupancy_of_a_height_is_that_of_its_last_batches():
     rows = [{"frames": i, "curriculum/occupancy_at_2": i / 100} for i in range(1, 51)]
-    assert "<td>0.4050</td><td>1 to 50</td>" in level_table(rows)  # the mean of 0.31 to 0.50
+    assert "<td>0.4050</td><td>1 to 50</td>" in level_table(rows, "level")  # the mean of 0.31 to 0.50

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from pickplace.common.validate import expect, integral_number, number, or_null
 
+STAGE_KEYS = {"frames", "level"}, {"frames", "height"}
 TOLERANCE = 1e-6  # occupancies arrive as float32, in which 0.9 is slightly below 0.9
 
 
@@ -15,11 +16,12 @@ class Tally:
     """Input of an advance rule: the level, and counts since it began.
 
     Attributes:
-        level: the tote height trained at now, in cells.
+        level: number of the level trained at now.
         window: final occupancies of the latest episodes that were played at the level.
         frames: frames of the whole run.
         level_start: the run's frames when the level began.
         episodes: episodes finished at the level.
+        latest: level and final occupancy of each episode that the latest batch finished, at any level.
     """
 
     level: int
@@ -27,6 +29,7 @@ class Tally:
     frames: int = 0
     level_start: int = 0
     episodes: int = 0
+    latest: Sequence[tuple[int, float]] = ()
 
     @property
     def level_frames(self) -> int:
@@ -44,28 +47,36 @@ class Advance:
 
     Attributes:
         window: number of latest episodes at the level that the tally keeps.
-        state_keys: names of the attributes that are the rule's own state, saved in checkpoints; each is a finite
-            number after :meth:`setup`.
-        start, end: the first and the last height, set by :meth:`setup`.
+        state_keys: names of the attributes that are the rule's own state, saved in checkpoints; after :meth:`setup`
+            each is a value that JSON holds, with finite numbers.
+        start, end: the first and the last level, set by :meth:`setup`.
     """
 
     window = 100
     state_keys: tuple[str, ...] = ()
 
     def setup(self, start: int, end: int, total_frames: int) -> int:
-        """Store the first and the last height and use the run's budget in frames; return the first level."""
+        """Store the first and the last level and use the run's budget in frames; return the level to begin with."""
         self.start, self.end = start, end
         return start
 
     def update(self, tally: Tally) -> tuple[int, dict]:
         """Return the level from now on, and further numbers to log, by name; called after each batch.
 
-        A level beyond the first or the last height is replaced by that height.
+        A level beyond the first or the last is replaced by that.
         """
         raise NotImplementedError
 
+    def weights(self) -> list[float]:
+        """Return how often new episodes begin at each level, from the first to the last; empty: by the sampler."""
+        return []
+
+    def load_state(self, state: dict) -> None:
+        """Continue from saved values of the :attr:`state_keys`; ``ValueError`` for values that cannot be."""
+        vars(self).update(state)
+
     def least_frames(self, batch: int) -> float:
-        """Lower bound of the frames before the last height is reached; infinite if it never is.
+        """Lower bound of the frames before the last level is reached; infinite if it never is.
 
         Args:
             batch: frames between two decisions.
@@ -74,7 +85,7 @@ class Advance:
 
 
 class NoAdvance(Advance):
-    """No curriculum: the last height from the first frame on."""
+    """No curriculum: the last level from the first frame on."""
 
     def setup(self, start, end, total_frames):
         return super().setup(end, end, total_frames)
@@ -190,36 +201,36 @@ class Staged(Advance):
     """The level from a list of stages.
 
     Args:
-        stages: ``{frames, height}`` each: from that frame of the run on, the level is that height; None is the last
-            height. ``frames`` ascend. Before the first stage the level is the first height.
+        stages: ``{frames, level}`` each: from that frame of the run on, that level; None is the last one. ``frames``
+            ascend. Before the first stage it is the first level. Levels of heights may be called ``height``.
     """
 
     def __init__(self, stages):
         expect(
             isinstance(stages, Sequence)
             and stages
-            and all(isinstance(stage, Mapping) and set(stage) == {"frames", "height"} for stage in stages),
+            and all(isinstance(stage, Mapping) and set(stage) in STAGE_KEYS for stage in stages),
             "curriculum.advance.stages",
             stages,
-            "a list of {frames: F, height: H}",
+            "a list of {frames: F, level: L}; what a level sets stands in curriculum.levels",
         )
-        self.stages: dict[int, int | None] = {}  # heights by first frame
+        self.stages: dict[int, int | None] = {}  # levels by first frame
         for stage in stages:
             least = max(self.stages, default=-1) + 1
             frames = integral_number("curriculum.advance.stages: frames", stage["frames"], least)
-            self.stages[frames] = stage["height"]
+            self.stages[frames] = stage.get("level", stage.get("height"))
 
     def setup(self, start, end, total_frames):
         super().setup(start, end, total_frames)
-        key = "curriculum.advance.stages: height"
+        key = "curriculum.advance.stages: level"
         self.plan = {f: end if h is None else integral_number(key, h, start, end) for f, h in self.stages.items()}
-        return self._height_at(0)
+        return self._level_at(0)
 
-    def _height_at(self, frames: int) -> int:
-        return ([self.start] + [height for first, height in self.plan.items() if first <= frames])[-1]
+    def _level_at(self, frames: int) -> int:
+        return ([self.start] + [level for first, level in self.plan.items() if first <= frames])[-1]
 
     def update(self, tally):
-        return self._height_at(tally.frames), {}
+        return self._level_at(tally.frames), {}
 
     def least_frames(self, batch):
-        return min((f for f in (0, *self.plan) if self._height_at(f) == self.end), default=math.inf)
+        return min((f for f in (0, *self.plan) if self._level_at(f) == self.end), default=math.inf)

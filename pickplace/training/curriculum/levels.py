@@ -1,167 +1,132 @@
-"""The curriculum of a run: its level, its counts, and what a checkpoint stores of them."""
+"""Levels: what the episodes of a level set; and where a run has ladders of them."""
 
-import math
-from collections import deque
-from numbers import Real
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
-from pickplace.common.validate import expect, integral_number, is_number, is_whole, number
-from pickplace.training.curriculum.advance import Advance, Tally
+from pickplace.common.errors import unknown_key
+from pickplace.common.validate import at_most, expect, integral_number, reworded, short_text
+from pickplace.envs.checks import check_items
+from pickplace.envs.episode import SETTINGS
+from pickplace.envs.torchrl import PickPlaceEnv
+from pickplace.items.distributions import ItemDistribution
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.item import ALL_TURNS
+
+MAX_LEVELS = 1_000
+
+#: What a level may set, and what stands for it in the environment. A mix of ``items`` is numbered.
+KEYS = {"tote_height": "tote_height", "items": "item_mix"} | {
+    key: key for key in SETTINGS if key not in ("item_mix", "level")
+}
 
 
-class Curriculum:
-    """The level of a run, moved by an advance rule after each batch.
+class Levels(NamedTuple):
+    """The levels of a run, numbered one after the other.
 
-    Args:
-        advance: an :class:`Advance` rule.
-        sample: a height sampler, see :mod:`pickplace.training.curriculum.sample`.
-        start_height: the first level and the least height drawn, in cells; None is the greatest item height.
-        end_height: the last level, in cells; None is the tote's full height, ``tote_size[2]``.
+    Attributes:
+        first: number of the first level.
+        key: entry of an observation that has the number of the episode's level.
+        entries: what an episode of each level is given at its reset, by entry: ``[L, width]``.
+        items: the item distribution with the mixes of the levels; None: that of the run.
+        is_full: whether the last level is the full task.
     """
 
-    def __init__(self, advance: Advance, sample, start_height: int | None = None, end_height: int | None = None):
-        expect(
-            isinstance(advance, Advance),
-            "curriculum.advance",
-            advance,
-            "a rule, such as curriculum/advance=threshold",
-        )
-        expect(callable(sample), "curriculum.sample", sample, "a sampler, such as curriculum/sample=recent")
-        self.advance, self.sample, self._rule = advance, sample, f"curriculum.advance: {type(advance).__name__}"
-        self.start_height, self.end_height = start_height, end_height
-
-    def setup(self, min_height: int, max_height: int, total_frames: int) -> None:
-        """Set the heights and the budget of a run, and begin at the first level.
-
-        Args:
-            min_height: the greatest item height, in cells.
-            max_height: the tote's full height, in cells.
-            total_frames: the run's budget, in frames.
-
-        Raises:
-            ValueError: naming the setting that does not fit these numbers.
-        """
-        start = min_height if self.start_height is None else self.start_height
-        end = max_height if self.end_height is None else self.end_height
-        self.end = integral_number("curriculum.end_height", end, min_height, max_height)
-        self.start = integral_number("curriculum.start_height", start, min_height, self.end)
-        self.full_height = max_height
-        first = self.advance.setup(self.start, self.end, integral_number("total_frames", total_frames))
-        self.tally = Tally(self._clamped(first), deque(maxlen=self.advance.window))
-        self._rule_state()  # raises here, not at the first checkpoint
+    first: int
+    key: str
+    entries: dict[str, Tensor]
+    items: ItemDistribution | None = None
+    is_full: bool = True
 
     @property
-    def level(self) -> int:
-        """The tote height trained at now, in cells."""
-        return self.tally.level
+    def last(self) -> int:
+        """Number of the last level."""
+        return self.first + len(self.entries[self.key]) - 1
 
-    def check_budget(self, total_frames: int, batch: int = 1) -> str | None:
-        """Return a warning if full height cannot be trained within ``total_frames``, else None.
+    @property
+    def varies(self) -> tuple[str, ...]:
+        """What the environment must let vary, see :data:`~pickplace.envs.episode.SETTINGS`."""
+        return tuple(key for key in self.entries if key in SETTINGS)
 
-        Args:
-            total_frames: the run's budget.
-            batch: frames of a batch; the level moves only after a batch.
-        """
-        if self.end < self.full_height:
-            return (
-                f"curriculum.end_height={self.end}: nothing is trained at the full height, {self.full_height}, "
-                "at which validation and evaluation play."
-            )
-        least = self.advance.least_frames(batch)
-        if least < total_frames:
-            return None
-        expected = f"more than {least} frames" if least < math.inf else "a stage of that height"
+
+def heights(first: int, last: int, full: int) -> Levels:
+    """Return levels that set the height of the tote alone; their numbers are the heights, in height units."""
+    return Levels(first, "tote_height", {"tote_height": torch.arange(first, last + 1)[:, None]}, is_full=last == full)
+
+
+def read_levels(given: Sequence[Mapping], env: PickPlaceEnv) -> Levels:
+    """Return levels that are listed in a config, numbered from 1.
+
+    Args:
+        given: of each level what it sets, by a key of :data:`KEYS`; the rest is that of the full task.
+        env: an environment that plays the full task.
+
+    Raises:
+        ValueError: naming the level and the key.
+    """
+    good = isinstance(given, Sequence) and given and all(isinstance(level, Mapping) for level in given)
+    expect(good, "curriculum.levels", given, "a list of mappings, such as [{tote_height: 2}, {}]")
+    at_most("curriculum.levels: the list has", len(given), "levels", MAX_LEVELS)
+    for number, level in enumerate(given):
+        for key in level:
+            if key not in KEYS:
+                raise ValueError(_refusal(f"curriculum.levels[{number}].{short_text(key)}", key))
+    cell = env.cell
+    mixes: list[Mapping] = []
+    rows: list[dict[str, Any]] = []
+    for number, level in enumerate(given):
+        place = f"curriculum.levels[{number}]"
+        row = {"level": number + 1, "tote_height": level.get("tote_height", cell.tote_size[2])}
+        integral_number(f"{place}.tote_height", row["tote_height"], 1, cell.tote_size[2])
+        if items := level.get("items"):
+            mixes += [items] * (items not in mixes)
+            row["item_mix"] = mixes.index(items) + 1
+            with _at(place):
+                env.items.mixed([items])
+        named = {key: KEYS[key] for key in level if KEYS[key] in SETTINGS and key != "items"}
+        row |= {entry: SETTINGS[entry].read(f"{place}.{key}", level[key], cell) for key, entry in named.items()}
+        rows.append(row)
+    full = {"tote_height": cell.tote_size[2], **{key: setting.full(cell) for key, setting in SETTINGS.items()}}
+    varies = [key for key in full if any(key in row for row in rows)]
+    rows = [{key: row.get(key, full[key]) for key in varies} for row in rows]
+    items = env.items.mixed(mixes) if mixes else env.items
+    _check_starts(rows, replace(cell, varies=tuple(key for key in varies if key in SETTINGS)), items)
+    numbers = {key: torch.tensor([row[key] for row in rows]) for key in varies}
+    entries = {
+        key: SETTINGS[key].decode(column, cell) if key in SETTINGS else column[:, None]
+        for key, column in numbers.items()
+    }
+    is_full = all(rows[-1][key] == full[key] for key in varies if key != "level")
+    return Levels(1, "level", entries, items, is_full)
+
+
+def _at(place: str):
+    return reworded(ValueError, lambda error: ValueError(f"{place}: {error}"))
+
+
+def _check_starts(rows: list[dict[str, int]], cell: CellSpec, items: ItemDistribution) -> None:
+    """Refuse a level whose episodes could not begin."""
+    checked = set()
+    for row in rows:
+        place, mix = f"curriculum.levels[{row['level'] - 1}]", row.get("item_mix", 0)
+        tallest, height = int(items.sizes[items.arrives(mix), 2].max()), row["tote_height"]
+        expect(height >= tallest, f"{place}.tote_height", height, f"at least {tallest}, the height of its tallest item")
+        start = mix, row.get("rotations", ALL_TURNS)
+        if start not in checked:
+            with _at(place):
+                check_items(cell, items, *start)
+            checked.add(start)
+
+
+def _refusal(place: str, key: str) -> str:
+    """Return why a level cannot set a key."""
+    refused = f"{place}: a level sets {', '.join(KEYS)}"
+    if key in ("bin_size", "tote_size", "gripper", "support", "reach", "height_unit"):
         return (
-            f"total_frames={total_frames}: the curriculum ({type(self.advance).__name__}, from height "
-            f"{self.start}) cannot train at its last height {self.end}; expected {expected}."
+            f"{refused}. {key} stays the same in a run; for another one chain two runs: pickplace-train ... "
+            "hydra.run.dir=outputs/first, then pickplace-train ... warm_start.weights=outputs/first."
         )
-
-    def update(self, heights: Tensor, occupancy: Tensor, frames: int) -> dict:
-        """Count a batch's finished episodes and move the level.
-
-        Args:
-            heights: their tote heights, int ``[E]``; E may be 0.
-            occupancy: their final occupancies, float ``[E]``.
-            frames: frames of the whole run, this batch included.
-
-        Returns:
-            Metrics to log: ``curriculum/level`` (from now on), ``/progress`` (0 at the first height, 1 at the last),
-            ``/frames_at_level``, ``/episodes`` and ``/occupancy`` (number and windowed mean at the level; no mean
-            without an episode), ``/occupancy_at_<height>`` (means of this batch), and the rule's own. Counts are
-            those that the rule decided on; a change of level clears them afterwards.
-        """
-        tally, heights, occupancy = self.tally, heights.reshape(-1), occupancy.reshape(-1).double()
-        at_level = occupancy[heights == tally.level].tolist()
-        tally.frames, tally.episodes = frames, tally.episodes + len(at_level)
-        tally.window.extend(at_level)
-        answer = self.advance.update(tally)
-        expect(
-            isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], dict),
-            f"{self._rule}: its update",
-            answer,
-            "(level, {name: number})",
-        )
-        level, logs = self._clamped(answer[0]), {**answer[1]}
-        for name, value in logs.items():
-            expect(isinstance(value, Real), f"{self._rule}: it logs {name}", value, "a number")
-        self._rule_state()
-        means = {height: occupancy[heights == height].mean().item() for height in heights.unique().tolist()}
-        logs |= {
-            "level": level,
-            "frames_at_level": tally.level_frames,
-            "episodes": tally.episodes,
-            "progress": (level - self.start) / (self.end - self.start) if self.end > self.start else 1.0,
-            **({"occupancy": tally.mean} if tally.window else {}),
-            **{f"occupancy_at_{height}": mean for height, mean in means.items()},
-        }
-        if level != tally.level:
-            self.tally = Tally(level, deque(maxlen=self.advance.window), frames, level_start=frames)
-        return {f"curriculum/{key}": value for key, value in logs.items()}
-
-    def _clamped(self, level) -> int:
-        expect(is_whole(level), f"{self._rule}: its level", level, "a whole number")
-        return min(max(int(level), self.start), self.end)
-
-    def _rule_state(self) -> dict:
-        """Return the rule's own state; raise if a checkpoint could not store it."""
-        state = {key: getattr(self.advance, key, None) for key in self.advance.state_keys}
-        for key, value in state.items():
-            expect(
-                isinstance(value, int | float) and is_number(value),  # exact in JSON
-                f"{self._rule}: its state has {key}",
-                value,
-                "a finite Python number",
-            )
-        return state
-
-    def state_dict(self) -> dict:
-        """Return level, counts and the rule's own state as plain JSON types; JSON stores floats exactly."""
-        return vars(self.tally) | {"window": list(self.tally.window), "advance": self._rule_state()}
-
-    def load_state_dict(self, state: dict) -> None:
-        """Continue from a :meth:`state_dict`; call it after :meth:`setup`.
-
-        Raises:
-            ValueError: for the state of another advance rule, a level outside the heights, or no such state.
-        """
-        expect(
-            isinstance(state, dict)
-            and set(state) == {*vars(self.tally), "advance"}
-            and isinstance(state["advance"], dict),
-            "the checkpoint's curriculum",
-            state,
-            "the state that a training saved",
-        )
-        rule, name = state["advance"], type(self.advance).__name__
-        expect(set(rule) == {*self.advance.state_keys}, "curriculum.advance", name, f"the run's, with {sorted(rule)}")
-        key = "curriculum {} of the checkpoint".format
-        level = integral_number(key("level"), state["level"], self.start, self.end)
-        frames = integral_number(key("frames"), state["frames"], 0)
-        counts = {name: integral_number(key(name), state[name], 0, frames) for name in ("level_start", "episodes")}
-        expect(isinstance(state["window"], list), key("window"), state["window"], "a list of numbers between 0 and 1")
-        window = deque((number(key("window"), value, most=1) for value in state["window"]), self.advance.window)
-        for name, value in rule.items():
-            expect(is_number(value), key(name), value, "a number")
-        self.tally = Tally(level, window, frames, **counts)
-        vars(self.advance).update(rule)
+    return unknown_key(place, {f"{place.rpartition('.')[0]}": 0, **KEYS}, f"{place.rpartition('.')[0]}.")

@@ -1,6 +1,7 @@
-"""Height samplers: the tote heights of new episodes, given the level.
+"""Samplers: the levels of new episodes, given the level that the advance rule has reached.
 
-A sampler is called as ``sampler(level, min_height, count)`` and returns heights, int64 ``[count]``.
+A sampler is called as ``sampler(level, first, count)``, with the number of the first level, and returns level numbers,
+int64 ``[count]``. Levels that differ in the tote's height alone are numbered by their heights.
 """
 
 import torch
@@ -10,29 +11,29 @@ from pickplace.common.validate import number
 
 
 class Current:
-    """Height sampler: every episode plays at the level."""
+    """Sampler: every episode plays at the level."""
 
-    def __call__(self, level: int, min_height: int, count: int) -> Tensor:
+    def __call__(self, level: int, first: int, count: int) -> Tensor:
         return torch.full((count,), level, dtype=torch.int64)
 
 
 class Uniform:
-    """Height sampler: uniform from the least height to the level, drawn from torch's global generator."""
+    """Sampler: uniform from the first level to the one reached, drawn from torch's global generator."""
 
-    def __call__(self, level: int, min_height: int, count: int) -> Tensor:
-        return torch.randint(min_height, level + 1, (count,))
+    def __call__(self, level: int, first: int, count: int) -> Tensor:
+        return torch.randint(first, level + 1, (count,))
 
 
 class Recent:
-    """Height sampler: the level, and a share of episodes at earlier heights to prevent forgetting.
+    """Sampler: the level, and a share of episodes at earlier ones to prevent forgetting.
 
     Args:
-        share: probability in [0, 1] of an earlier height, drawn uniformly from torch's global generator.
+        share: probability in [0, 1] of an earlier level, drawn uniformly from torch's global generator.
     """
 
     def __init__(self, share: float = 0.25):
         self.share = number("curriculum.sample.share", share, most=1)
 
-    def __call__(self, level: int, min_height: int, count: int) -> Tensor:
-        earlier = torch.randint(min_height, max(level, min_height + 1), (count,))
+    def __call__(self, level: int, first: int, count: int) -> Tensor:
+        earlier = torch.randint(first, max(level, first + 1), (count,))
         return torch.where(torch.rand(count) < self.share, earlier, level)

@@ -1,4 +1,6 @@
-"""The TorchRL transform that writes tote heights into resets, and the way the level reaches it."""
+"""The TorchRL transform that writes episode settings into resets, and the way the level reaches it."""
+
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -6,53 +8,67 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 from pickplace.common.validate import expect, integral_number
+from pickplace.rules.cell import MAX_SIDE
+from pickplace.training.curriculum.levels import Levels, heights
 
 
 class ToteHeightCurriculum(Transform):
-    """Write ``tote_height``, int64 ``[N, 1]``, into full and partial resets; running episodes keep their height.
+    """Write what a level sets, such as ``tote_height``, int64 ``[N, 1]``, into full and partial resets.
 
-    It must be the first transform of the environment's ``Compose``, where :func:`push_level` finds it.
+    Running episodes keep theirs. It must be the first transform of the environment's ``Compose``, where
+    :func:`push_level` finds it.
 
     Args:
-        level: the first level.
-        sampler: returns heights for ``(level, min_height, count)``; see :mod:`pickplace.training.curriculum.sample`.
-        min_height: the least height the sampler may draw.
+        level: number of the first level.
+        sampler: returns level numbers for ``(level, first, count)``; see
+            :mod:`pickplace.training.curriculum.sample`.
+        levels: what each level sets; or the least height, for levels that are heights.
+        weights: how often episodes begin at each level; empty: as the sampler draws.
     """
 
-    def __init__(self, level: int, sampler, min_height: int):
+    def __init__(self, level: int, sampler, levels: Levels | int, weights: Sequence[float] = ()):
         super().__init__()
-        self.sampler, self.min_height = sampler, integral_number("min_height", min_height)
+        if not isinstance(levels, Levels):
+            levels = heights(integral_number("min_height", levels, most=MAX_SIDE), MAX_SIDE, MAX_SIDE)
+        self.sampler, self.levels, self.weights = sampler, levels, torch.tensor([*weights])
         # A buffer, so that it is in state_dict() and follows the environment to its device.
-        self.register_buffer("level", torch.tensor(integral_number("level", level, min_height)))
+        self.register_buffer("level", torch.tensor(integral_number("level", level, levels.first)))
 
-    def set_level(self, level: int) -> None:
-        """Draw the heights of later episodes at this level."""
-        self.level.fill_(integral_number("level", level, self.min_height))
+    def set_level(self, level: int, weights: Sequence[float] = ()) -> None:
+        """Draw the levels of later episodes at this level, or by these weights."""
+        self.level.fill_(integral_number("level", level, self.levels.first))
+        self.weights = torch.tensor([*weights])
+
+    def _draw(self, count: int) -> Tensor:
+        """Return level numbers of new episodes, int64 ``[count]``."""
+        first, last = self.levels.first, self.levels.last
+        if len(self.weights):
+            return first + torch.multinomial(self.weights, count, replacement=True)
+        drawn = self.sampler(int(self.level), first, count)
+        good = isinstance(drawn, Tensor) and drawn.numel() == count and not drawn.is_floating_point()
+        expected = f"whole numbers between {first} and {last} in a tensor [{count}]"
+        expect(good and first <= drawn.min() and drawn.max() <= last, "curriculum.sample: its levels", drawn, expected)
+        return drawn.reshape(-1).cpu()
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         if tensordict is None:  # a plain env.reset()
             tensordict = TensorDict(batch_size=self.parent.batch_size, device=self.parent.device)
         count = tensordict.numel()
-        height = self.sampler(int(self.level), self.min_height, count)
-        expect(
-            isinstance(height, Tensor) and height.numel() == count and not height.is_floating_point(),
-            "curriculum.sample: its heights",
-            height,
-            f"whole numbers in a tensor [{count}]",
-        )
-        height = height.to(self.level.device).reshape(*tensordict.batch_size, 1)
-        reset, running = tensordict.get("_reset", None), tensordict.get("tote_height", None)
-        # Collectors hide `tote_height` from a reset; running rows then get a drawn height too, which nothing reads.
-        if reset is not None and running is not None:
-            height = torch.where(reset.reshape(height.shape), height, running)
-        return tensordict.set("tote_height", height)
+        level, reset = self._draw(count), tensordict.get("_reset", None)
+        for key, entries in self.levels.entries.items():
+            value = entries[level - self.levels.first].to(self.level.device).reshape(*tensordict.batch_size, -1)
+            # Collectors hide these from a reset; running rows then get drawn values too, which nothing reads.
+            if reset is not None and (running := tensordict.get(key, None)) is not None:
+                value = torch.where(reset.reshape(*tensordict.batch_size, 1), value, running)
+            tensordict = tensordict.set(key, value)
+        return tensordict
 
 
-def push_level(collector, level: int) -> None:
-    """Set the level in every process of a collector, between two batches.
+def push_level(collector, level: int, weights: Sequence[float] = ()) -> None:
+    """Set the level, or the weights of the levels, in every process of a collector, between two batches.
 
     ``map_fn(path, list_of_args)`` calls the method at that path: a direct collector calls it once per entry of the
     list; a multi-process one calls it once in each worker and needs ``num_workers`` entries. Results travel back
     through a pipe, so the path ends at a method that returns nothing.
     """
-    collector.map_fn("env.transform[0].set_level", [(level,)] * getattr(collector, "num_workers", 1))
+    collector.map_fn("env.transform[0].set_level", [(level, [*weights])] * getattr(collector, "num_workers", 1))

@@ -1,0 +1,76 @@
+"""Episode settings: what episodes of one environment may differ in, beside the height of the tote.
+
+Each is a whole number for each problem. A curriculum, or ``options`` of Gymnasium, gives it with a reset; an episode
+keeps it to its end. What is not given is that of the full task.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from pickplace.common.validate import expect, is_whole, one_of, whole_number
+from pickplace.items.distributions import ItemDistribution
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.item import flags_from_turns, turns_from_flags
+from pickplace.rules.observation import MAX_NUMBER
+from pickplace.rules.state import REFILLS
+
+
+class Setting(NamedTuple):
+    """One setting.
+
+    Attributes:
+        field: its name in an :class:`~pickplace.rules.state.Episode`.
+        full: ``full(cell)``, its number in the full task.
+        limits: ``limits(cell, items)``, the least and the greatest number.
+        read: ``read(key, value, cell)``, the number that stands for a value in a config; ``ValueError`` for a bad one.
+        encode: from an entry of an observation, ``[N, ...]``, to numbers, int64 ``[N]``.
+        decode: ``decode(numbers, cell)``, the other way.
+    """
+
+    field: str
+    full: Callable[[CellSpec], int]
+    limits: Callable[[CellSpec, ItemDistribution], tuple[int, int]]
+    read: Callable[[str, Any, CellSpec], int]
+    encode: Callable[[Tensor], Tensor] = lambda entry: entry.reshape(-1)
+    decode: Callable[[Tensor, CellSpec], Tensor] = lambda numbers, cell: numbers[:, None]
+
+
+def _read_rotations(key: str, value: Any, cell: CellSpec) -> int:
+    rotations = range(value) if is_whole(value) and 1 <= value <= cell.rotations else value
+    good = isinstance(rotations, Sequence) and rotations and all(turn in range(cell.rotations) for turn in rotations)
+    expect(
+        good, key, value, f"a number of quarter turns, at most {cell.rotations}, or a list of those that are allowed"
+    )
+    return sum(1 << turn for turn in set(rotations))
+
+
+def _read_refill(key: str, value: Any, cell: CellSpec) -> int:
+    return REFILLS.index(one_of(key, value, REFILLS))
+
+
+def _read_number(most: Callable[[CellSpec], int]) -> Callable[[str, Any, CellSpec], int]:
+    return lambda key, value, cell: whole_number(key, value, most=most(cell))
+
+
+#: The settings, by the names of their entries in an observation.
+SETTINGS: dict[str, Setting] = {
+    "rotations": Setting(
+        "turns", lambda cell: 2**cell.rotations - 1, lambda cell, items: (1, 2**cell.rotations - 1), _read_rotations,
+        turns_from_flags, lambda numbers, cell: flags_from_turns(numbers, cell.rotations),
+    ),
+    "bin_items": Setting(
+        "bin_items", lambda cell: cell.bin_items, lambda cell, items: (1, cell.bin_items),
+        _read_number(lambda cell: cell.bin_items),
+    ),
+    "refill": Setting(
+        "refill", lambda cell: REFILLS.index(cell.refill), lambda cell, items: (0, len(REFILLS) - 1), _read_refill,
+    ),
+    "item_mix": Setting(
+        "item_mix", lambda cell: 0, lambda cell, items: (0, items.mixes - 1), _read_number(lambda cell: MAX_NUMBER),
+    ),
+    "level": Setting(
+        "level", lambda cell: 0, lambda cell, items: (0, MAX_NUMBER), _read_number(lambda cell: MAX_NUMBER)
+    ),
+}  # fmt: skip

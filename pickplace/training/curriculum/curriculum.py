@@ -1,0 +1,207 @@
+"""The curriculum of a run: its level, its counts, and what a checkpoint stores of them."""
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from numbers import Real
+
+from torch import Tensor
+
+from pickplace.common.validate import expect, integral_number, is_number, is_whole, number
+from pickplace.envs.torchrl import PickPlaceEnv
+from pickplace.training.curriculum.advance import Advance, Tally
+from pickplace.training.curriculum.levels import heights, read_levels
+
+
+class Curriculum:
+    """The level of a run, moved by an advance rule after each batch.
+
+    Args:
+        advance: an :class:`Advance` rule.
+        sample: a sampler of levels, see :mod:`pickplace.training.curriculum.sample`.
+        start_height, end_height: a short form of levels that differ in the height of the tote alone: the first and the
+            last height, in height units; None: that of the tallest item, and the tote's full height.
+        levels: what each level sets, see :func:`~pickplace.training.curriculum.levels.read_levels`; None: as the
+            heights say.
+    """
+
+    def __init__(
+        self,
+        advance: Advance,
+        sample,
+        start_height: int | None = None,
+        end_height: int | None = None,
+        levels: Sequence[Mapping] | None = None,
+    ):
+        expect(
+            isinstance(advance, Advance),
+            "curriculum.advance",
+            advance,
+            "a rule, such as curriculum/advance=threshold",
+        )
+        expect(callable(sample), "curriculum.sample", sample, "a sampler, such as curriculum/sample=recent")
+        self.advance, self.sample, self._rule = advance, sample, f"curriculum.advance: {type(advance).__name__}"
+        self.start_height, self.end_height, self.given = start_height, end_height, levels
+        if levels is not None:
+            for key, height in (("start_height", start_height), ("end_height", end_height)):
+                expect(height is None, f"curriculum.{key}", height, "null where curriculum.levels lists the levels")
+
+    def setup(self, min_height: int, max_height: int, total_frames: int, env: PickPlaceEnv | None = None) -> None:
+        """Set the levels and the budget of a run, and begin at the first level.
+
+        Args:
+            min_height: height of the tallest item, in height units.
+            max_height: the tote's full height.
+            total_frames: the run's budget, in frames.
+            env: plays the full task; needed where ``levels`` lists what the levels set.
+
+        Raises:
+            ValueError: naming the setting that does not fit these.
+        """
+        if self.given is None:
+            start = min_height if self.start_height is None else self.start_height
+            end = max_height if self.end_height is None else self.end_height
+            end = integral_number("curriculum.end_height", end, min_height, max_height)
+            start = integral_number("curriculum.start_height", start, min_height, end)
+            self.levels = heights(start, end, max_height)
+        else:
+            assert env is not None
+            self.levels = read_levels(self.given, env)
+        self.start, self.end = self.levels.first, self.levels.last
+        first = self.advance.setup(self.start, self.end, integral_number("total_frames", total_frames))
+        self.tally = Tally(self._clamped(first), deque(maxlen=self.advance.window))
+        self._rule_state()  # raises here, not at the first checkpoint
+
+    @property
+    def level(self) -> int:
+        """Number of the level trained at now; of levels of heights the height of the tote, in height units."""
+        return self.tally.level
+
+    @property
+    def what(self) -> str:
+        """What a level is, for a reader."""
+        return self.levels.key.replace("_", " ")
+
+    @property
+    def weights(self) -> list[float]:
+        """How often episodes begin at each level, as the rule says; empty: as the sampler draws."""
+        return self.advance.weights()
+
+    def check_budget(self, total_frames: int, batch: int = 1) -> str | None:
+        """Return a warning if the full task cannot be trained within ``total_frames``, else None.
+
+        Args:
+            total_frames: the run's budget.
+            batch: frames of a batch; the level moves only after a batch.
+        """
+        if not self.levels.is_full:
+            key = "end_height" if self.given is None else "levels: the last is number "
+            return (
+                f"curriculum.{key}={self.end}: nothing is trained at the full task, which validation and evaluation "
+                "play."
+            )
+        least = self.advance.least_frames(batch)
+        if least < total_frames:
+            return None
+        expected = f"more than {least} frames" if least < math.inf else "a stage of that level"
+        return (
+            f"total_frames={total_frames}: the curriculum ({type(self.advance).__name__}, from level "
+            f"{self.start}) cannot train at its last level {self.end}; expected {expected}."
+        )
+
+    def update(self, levels: Tensor, occupancy: Tensor, frames: int) -> dict:
+        """Count a batch's finished episodes and move the level.
+
+        Args:
+            levels: their levels, int ``[E]``; E may be 0.
+            occupancy: their final occupancies, float ``[E]``.
+            frames: frames of the whole run, this batch included.
+
+        Returns:
+            Metrics to log: ``curriculum/level`` (from now on), ``/progress`` (0 at the first level, 1 at the last),
+            ``/frames_at_level``, ``/episodes`` and ``/occupancy`` (number and windowed mean at the level; no mean
+            without an episode), ``/occupancy_at_<level>`` (means of this batch), and the rule's own. Counts are
+            those that the rule decided on; a change of level clears them afterwards.
+        """
+        tally, levels, occupancy = self.tally, levels.reshape(-1), occupancy.reshape(-1).double()
+        at_level = occupancy[levels == tally.level].tolist()
+        tally.latest = list(zip(levels.tolist(), occupancy.tolist(), strict=True))
+        tally.frames, tally.episodes = frames, tally.episodes + len(at_level)
+        tally.window.extend(at_level)
+        answer = self.advance.update(tally)
+        expect(
+            isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], dict),
+            f"{self._rule}: its update",
+            answer,
+            "(level, {name: number})",
+        )
+        level, logs = self._clamped(answer[0]), {**answer[1]}
+        for name, value in logs.items():
+            expect(isinstance(value, Real), f"{self._rule}: it logs {name}", value, "a number")
+        self._rule_state()
+        means = {number: occupancy[levels == number].mean().item() for number in levels.unique().tolist()}
+        logs |= {
+            "level": level,
+            "frames_at_level": tally.level_frames,
+            "episodes": tally.episodes,
+            "progress": (level - self.start) / (self.end - self.start) if self.end > self.start else 1.0,
+            **({"occupancy": tally.mean} if tally.window else {}),
+            **{f"occupancy_at_{number}": mean for number, mean in means.items()},
+        }
+        if level != tally.level:
+            self.tally = Tally(level, deque(maxlen=self.advance.window), frames, level_start=frames)
+        return {f"curriculum/{key}": value for key, value in logs.items()}
+
+    def _clamped(self, level) -> int:
+        expect(is_whole(level), f"{self._rule}: its level", level, "a whole number")
+        return min(max(int(level), self.start), self.end)
+
+    def _rule_state(self) -> dict:
+        """Return the rule's own state; raise if a checkpoint could not store it."""
+        state = {key: deepcopy(getattr(self.advance, key, None)) for key in self.advance.state_keys}
+        for key, value in state.items():
+            expect(_is_json(value), f"{self._rule}: its state has {key}", value, "what JSON holds, numbers finite")
+        return state
+
+    def state_dict(self) -> dict:
+        """Return level, counts and the rule's own state as plain JSON types; JSON stores floats exactly."""
+        counts = {key: value for key, value in vars(self.tally).items() if key != "latest"}
+        return counts | {"window": list(self.tally.window), "advance": self._rule_state()}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Continue from a :meth:`state_dict`; call it after :meth:`setup`.
+
+        Raises:
+            ValueError: for the state of another advance rule, a level that there is not, or no such state.
+        """
+        expect(
+            isinstance(state, dict)
+            and set(state) == {*vars(self.tally), "advance"} - {"latest"}
+            and isinstance(state["advance"], dict),
+            "the checkpoint's curriculum",
+            state,
+            "the state that a training saved",
+        )
+        rule, name = state["advance"], type(self.advance).__name__
+        expect(set(rule) == {*self.advance.state_keys}, "curriculum.advance", name, f"the run's, with {sorted(rule)}")
+        key = "curriculum {} of the checkpoint".format
+        level = integral_number(key("level"), state["level"], self.start, self.end)
+        frames = integral_number(key("frames"), state["frames"], 0)
+        counts = {name: integral_number(key(name), state[name], 0, frames) for name in ("level_start", "episodes")}
+        expect(isinstance(state["window"], list), key("window"), state["window"], "a list of numbers between 0 and 1")
+        window = deque((number(key("window"), value, most=1) for value in state["window"]), self.advance.window)
+        for name, value in rule.items():
+            kind = next(kind for kind in (Real, object) if isinstance(getattr(self.advance, name), kind))
+            expect(_is_json(value) and isinstance(value, kind), key(name), value, "a number")
+        self.tally = Tally(level, window, frames, counts["level_start"], counts["episodes"])
+        self.advance.load_state(deepcopy(rule))
+
+
+def _is_json(value) -> bool:
+    """Return whether JSON stores a value exactly."""
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _is_json(part) for key, part in value.items())
+    if isinstance(value, list):
+        return all(map(_is_json, value))
+    return value is None or isinstance(value, bool | str) or (isinstance(value, int | float) and is_number(value))
