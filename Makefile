@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
+# The run folder that ARGS names, else the default.
+run_dir = $(or $(patsubst hydra.run.dir=%,%,$(lastword $(filter hydra.run.dir=%,$(ARGS)))),$(1))
 RUN ?= outputs/quick_$(shell date +%Y-%m-%d_%H-%M-%S)
 DEMO ?= outputs/demo_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
@@ -19,12 +21,12 @@ $(STAMP): pyproject.toml $(LOCK)
 	$(BIN)/pip install --quiet --disable-pip-version-check $(if $(LOCK),-c $(LOCK)) -e '.[dev]'
 	@touch $@
 
-demo: RUN_DIR := $(DEMO)
+demo: RUN_DIR := $(call run_dir,$(DEMO))
 demo: $(STAMP)  ## pack totes with shipped weights, and write a replay page
 	$(BIN)/pickplace-evaluate checkpoint=pretrained/r4 evaluation.episodes=20 hydra.run.dir=$(RUN_DIR) $(ARGS)
 	@echo "Open $(RUN_DIR)/replay.html in a browser."
 
-train: RUN_DIR := $(RUN)
+train: RUN_DIR := $(call run_dir,$(RUN))
 train: $(STAMP)  ## train experiment=quick, and evaluate it (ARGS="key=value ..." adds overrides)
 	$(BIN)/pickplace-train experiment=quick hydra.run.dir=$(RUN_DIR) $(ARGS)
 	$(BIN)/pickplace-evaluate checkpoint=$(RUN_DIR) hydra.run.dir=$(RUN_DIR)/evaluation

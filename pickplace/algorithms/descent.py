@@ -11,6 +11,7 @@ from torch import Tensor
 from pickplace.algorithms.base import Algorithm, At, Objective, Task, load_optimizer
 from pickplace.common.validate import number, or_null, whole_number
 from pickplace.policies.base import Policy, as_collection_policy
+from pickplace.runs.checkpoint import matching_state
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +41,8 @@ class MinibatchDescent(Algorithm):
         epochs: passes over each batch.
         minibatch_size: frames of each gradient step.
         lr: Adam's step size.
-        lr_decay_start: share of the budget after which ``lr`` falls linearly to 0; None: constant.
+        lr_decay_start: share of the budget after which ``lr`` falls linearly to 0; None: constant. A resumed run with
+            another ``lr``, ``lr_decay_start`` or budget begins this schedule anew, over the frames that are left.
         max_grad_norm: gradient norm above which gradients are scaled down.
     """
 
@@ -60,6 +62,7 @@ class MinibatchDescent(Algorithm):
         self.lr = number("algo.lr", lr, most=MAX_WEIGHT)
         self.lr_decay_start = or_null(number, "algo.lr_decay_start", lr_decay_start, 0, 1)
         self.max_grad_norm = number("algo.max_grad_norm", max_grad_norm, 1e-9, MAX_WEIGHT)
+        self.schedule: dict = {"settings": "", "since": 0}  # of the learning rate, and its first frame
 
     def acting_policy(self) -> TensorDictModuleBase:
         return as_collection_policy(self.policy)
@@ -107,17 +110,28 @@ class MinibatchDescent(Algorithm):
         return {**means, "train/lr": rate}
 
     def learning_rate(self, at: At) -> float:
-        """Return the learning rate of a batch; if it falls, it is 0 in the last one."""
+        """Return the learning rate of a batch; if it falls, a new run's last batch has 0."""
+        before, now = self.schedule["settings"], f"lr={self.lr} lr_decay_start={self.lr_decay_start} of {at.total}"
+        if before != now:
+            self.schedule = {"settings": now, "since": at.before if before else 0}
+        if before and before != now:
+            start = at.before + (self.lr_decay_start or 0) * (at.total - at.before)
+            falls = f", and falls to 0 from {start:,.0f} to {at.total:,} frames" * (self.lr_decay_start is not None)
+            log.info("%s frames: the learning rate is now %g%s", f"{at.before:,}", self.lr, falls)
         if self.lr_decay_start is None:
             return self.lr
-        left = (1 - at.frames / at.total) / max(1 - self.lr_decay_start, 1e-9)
+        since = self.schedule["since"]
+        frames = at.before if since else at.frames  # a run that was resumed so learns from its last batch, too
+        left = (1 - (frames - since) / max(at.total - since, 1)) / max(1 - self.lr_decay_start, 1e-9)
         return self.lr * min(max(left, 0.0), 1.0)
 
     def state_dict(self) -> dict:
-        return {"optimizer": self.optimizer.state_dict()["state"]}
+        return {"optimizer": self.optimizer.state_dict()["state"], "schedule": self.schedule}
 
     def load_state_dict(self, state: object) -> None:
-        load_optimizer(self.optimizer, state.get("optimizer") if isinstance(state, dict) else None)
+        given = state if isinstance(state, dict) else {}
+        load_optimizer(self.optimizer, given.get("optimizer"))
+        self.schedule = matching_state(given.get("schedule"), self.schedule, "learning rate")
 
     def memory(self, frame: int) -> dict[str, int]:
         return self.learning_memory(self.policy.learning_bytes())

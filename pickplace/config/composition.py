@@ -242,13 +242,14 @@ def _part_at(cfg: DictConfig, place: str) -> Any:
     return OmegaConf.to_container(part, resolve=False) if OmegaConf.is_config(part) else part
 
 
-def apply_overrides(saved: DictConfig, overrides: list[str], groups: Any = None) -> DictConfig:
+def apply_overrides(saved: DictConfig, overrides: list[str], groups: Any = None, instead: str = "") -> DictConfig:
     """Return a saved config with command-line overrides on top.
 
     Args:
         saved: the config of a checkpoint.
         overrides: as on Hydra's command line, ``key=value``; a leading ``+`` changes nothing.
         groups: composed nodes of the config groups that may be exchanged as a whole.
+        instead: what a message suggests in place of exchanging another group.
 
     Raises:
         ValueError: for a group that cannot be exchanged, a key that the config does not have, or a bad value.
@@ -261,10 +262,9 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: Any = None)
         if groups and key in groups:
             cfg[key] = groups[key]
         elif (conf_dir() / key).is_dir() or (OmegaConf.is_dict(OmegaConf.select(cfg, key)) and not is_part):
-            new_run = "" if groups else ", or a new run with warm_start.weights=<run folder>"
             raise ValueError(
                 f"{line!r}: the checkpoint's config group {key!r} cannot be exchanged; expected overrides of its "
-                f"values, such as {key.replace('/', '.')}.<key>=<value>{new_run}."
+                f"values, such as {key.replace('/', '.')}.<key>=<value>{instead}."
             )
         elif override.is_delete() or override.is_sweep_override():
             raise ValueError(f"{line!r}: expected <key>=<value> with one value, on top of the checkpoint's config.")

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from pickplace.common.validate import expect
 from pickplace.envs.episode import SETTINGS
 from pickplace.envs.torchrl import PickPlaceEnv
-from pickplace.items.distributions import Kinds, check_seed
+from pickplace.items.distributions import check_seed
 from pickplace.rules.state import Failure
 
 INFO = ("occupancy", "failure", "action_mask")
@@ -68,7 +68,8 @@ class PickPlaceGymEnv(gymnasium.Env):
 
     ## Information
     `occupancy`: share of the tote's volume that is filled; `failure`: why the action or the episode failed (`"none"`,
-    `"pick_miss"`, ..., `"stuck"`); `action_mask`: as `action_masks()`.
+    `"pick_miss"`, ..., `"stuck"`); `action_mask`: as `action_masks()`. Once an episode has ended, it permits action 0
+    alone: the next step is a reset and ignores the action, but a learner that masks needs one.
 
     ## Arguments
     `items`: an item distribution, or a list of `(w, d, h)`; by default the paper's four kinds. The settings of
@@ -139,7 +140,6 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         for key, why in (("masks", "the action mask always comes along"), ("seed", "reset(seed=...) begins a stream")):
             expect(key not in settings, key, settings.get(key), f"no such argument; {why}")
-        items = Kinds(items) if isinstance(items, (list, tuple)) else items
         self._env = env = PickPlaceEnv(items=items, num_envs=num_envs, **settings)
         self.num_envs = num_envs
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
@@ -216,8 +216,13 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         return self._observations(state), reward, terminated, truncated, infos
 
     def action_masks(self) -> np.ndarray:
-        """Return which actions would succeed, bool ``[N, N_a]``."""
-        return self._env.action_mask.cpu().numpy().copy()
+        """Return which actions would succeed, bool ``[N, N_a]``; action 0 alone in a slot that waits for its reset."""
+        return self._permitted(self._env.action_mask)
+
+    def _permitted(self, mask: torch.Tensor) -> np.ndarray:
+        masks = mask.cpu().numpy().copy()
+        masks[self._ended] = np.arange(masks.shape[1]) == 0
+        return masks
 
     def _tote_heights(self, given=None) -> torch.Tensor:
         """Return ``options["tote_height"]``, a number or one per problem, as int64 ``[N, 1]``; None: full height."""
@@ -256,7 +261,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         infos = {
             "occupancy": state["occupancy"][:, 0].double().cpu().numpy().copy(),
             "failure": names[state["failure"][:, 0].cpu().numpy()],
-            "action_mask": state["action_mask"].cpu().numpy().copy(),
+            "action_mask": self._permitted(state["action_mask"]),
         }
         for value in infos.values():
             value[~rows] = None if value.dtype == object else 0

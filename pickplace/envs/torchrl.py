@@ -18,7 +18,7 @@ from pickplace.items.arrival import refill
 from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.rules.bin import remove_item
 from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
-from pickplace.rules.item import Item
+from pickplace.rules.item import ALL_TURNS, Item
 from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, corner_mask, placing_maps
 from pickplace.rules.observation import Term, check_terms, observe
 from pickplace.rules.state import EMPTY, Episode, Failure, State
@@ -80,7 +80,8 @@ class PickPlaceEnv(EnvBase):
         ``truncated`` when the item stream has ended. ``failure``, int64 ``[N, 1]``, is a :class:`Failure`.
 
     Args:
-        items: an :class:`~pickplace.items.distributions.ItemDistribution`; by default the paper's four kinds.
+        items: an :class:`~pickplace.items.distributions.ItemDistribution`, or a list of ``(w, d, h)``; by default the
+            paper's four kinds.
         num_envs: ``N``.
         seed: seed of the item stream.
         device: where the tensors live.
@@ -104,7 +105,7 @@ class PickPlaceEnv(EnvBase):
 
     def __init__(
         self,
-        items: ItemDistribution | None = None,
+        items: ItemDistribution | list | tuple | None = None,
         num_envs: int = 128,
         seed: int = 0,
         device="cpu",
@@ -127,12 +128,12 @@ class PickPlaceEnv(EnvBase):
         whole_number("first_episode", first_episode, 0, MAX_SEED)
         or_null(whole_number, "episode_stride", episode_stride, 1, MAX_SEED)
         items = Kinds(PAPER_KINDS) if items is None else items
-        kind = "an ItemDistribution, such as pickplace.items.distributions.Kinds"
+        items = Kinds(items) if isinstance(items, (list, tuple)) else items
+        kind = "a list of (w, d, h), or an ItemDistribution such as pickplace.items.distributions.Kinds"
         expect(isinstance(items, ItemDistribution), "items", items, kind)
         self._full = {key: SETTINGS[key].full(cell) for key in cell.varies}
-        self._possible: set[tuple[int, int]] = set()  # see `check_start`
         self.items, self.cell, self.terms = items, cell, check_terms(observation, cell)
-        self.check_start(0, 2**cell.rotations - 1)
+        check_items(cell, items)
         self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
         device = usable_device(device)
         check_bytes(f"num_envs={num_envs}", num_envs * problem_bytes(self.cell, masks), device)
@@ -249,19 +250,13 @@ class PickPlaceEnv(EnvBase):
         if self.cell.varies:
             episode = self._differs
             mix = torch.zeros_like(height) if episode.item_mix is None else episode.item_mix
-            turns = torch.full_like(height, 2**self.cell.rotations - 1) if episode.turns is None else episode.turns
+            turns = torch.full_like(height, ALL_TURNS) if episode.turns is None else episode.turns
             for pair in set(zip(mix[rows].tolist(), turns[rows].tolist(), strict=True)):
-                self.check_start(*pair)
+                check_items(self.cell, self.items, *pair)
             if (low := height < self.tallest[mix]).any():
                 expected = f"at least {int(self.tallest[mix][low][0])}, the tallest item of that mix"
                 raise ValueError(f"tote_height={int(height[low][0])}: expected {expected}.")
         self.tote_height.copy_(height)
-
-    def check_start(self, mix: int, turns: int) -> None:
-        """Refuse a mix of items and rotations with which a fresh episode may be impossible, with a ``ValueError``."""
-        if (mix, turns) not in self._possible:
-            check_items(self.cell, self.items, mix, turns)
-            self._possible.add((mix, turns))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         most, state = self.cell.num_actions - 1, self.state

@@ -87,13 +87,14 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     if "threads" not in repeated and is_whole(saved.get("threads")) and saved.threads > cpu_count():
         log.warning("threads=%s of the checkpoint: going on with %d, all of this machine", saved.threads, cpu_count())
         saved["threads"] = cpu_count()
-    cfg = apply_overrides(saved, [str(word.input_line) for word in given if word.key_or_group != "trust"])
+    words = [str(word.input_line) for word in given if word.key_or_group != "trust"]
+    new_run = f"a new run, such as one with warm_start.weights={place}"
+    cfg = apply_overrides(saved, words, instead=f", or {new_run}")
     for key in (*FIXED_KEYS, *(f"env.{key}" for key in saved.env)):
         before, now = OmegaConf.select(saved, key), OmegaConf.select(cfg, key)
         refuse_if(
             before != now,
-            f"{key}={now}: the run began with {before}, and a resumed run cannot change it; expected a new run, "
-            f"such as one with warm_start.weights={place}.",
+            f"{key}={now}: the run began with {before}, and a resumed run cannot change it; expected {new_run}.",
         )
     whole_number("total_frames", cfg.total_frames)
     refuse_if(
@@ -163,6 +164,12 @@ def stale_best_frames(run_dir: Path, frames: int, config: dict) -> int | None:
 def has_config(facts: dict, config: dict) -> bool:
     """Return whether a checkpoint is of this config, given in the form that checkpoints hold."""
     return facts["config"] == json.loads(json.dumps(config))
+
+
+def is_validated_alike(facts: dict, config: dict) -> bool:
+    """Return whether a checkpoint's best was measured as this config, in the form that checkpoints hold, says."""
+    now = json.loads(json.dumps(config))
+    return all(facts["config"].get(group) == now.get(group) for group in ("evaluation", "planner"))
 
 
 #: Signals after which a training saves and ends: Ctrl-C, a scheduler's, and that of a closed terminal.

@@ -163,8 +163,8 @@ def watch_workers(collector):
 
     def check(signum=None, _=None):
         if dead := [worker for worker in open_workers() if not worker.is_alive()]:
-            # Name a killed worker first: others may have ended because of it.
-            worker = min(dead, key=lambda worker: worker.exitcode == 0)
+            # Name a killed worker first, which has a negative code: others may have ended or failed because of it.
+            worker = min(dead, key=lambda worker: (worker.exitcode >= 0, worker.exitcode == 0))
             # Loggers and finalizers swallow an error raised while they run, so repeat it until this context ends.
             repeat = threading.Timer(0.5, signal.pthread_kill, (threading.main_thread().ident, signal.SIGCHLD))
             repeat.daemon = True

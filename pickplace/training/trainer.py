@@ -31,6 +31,7 @@ from pickplace.runs.resume import (
     checkpoint_config,
     checkpoint_hint,
     has_config,
+    is_validated_alike,
     stale_best_frames,
 )
 from pickplace.training import callbacks, collectors, settings
@@ -83,12 +84,7 @@ class Trainer:
         self._make_networks()
         if self.resumed:
             self.curriculum.load_state_dict(facts["curriculum"])
-            if (stale := stale_best_frames(run_dir, self.frames, self.saved_config)) is not None:
-                self.best = NEW["best"]
-                log.warning(
-                    "checkpoints/best is of frame %s and of other settings; the next validation replaces it",
-                    f"{stale:,}",
-                )
+            self.best = self._best_before(facts)
         if shortage := self.curriculum.check_budget(cfg.total_frames, self.task.batch_frames):
             log.warning(shortage)
         self.acting = self.algorithm.acting_policy()
@@ -156,6 +152,26 @@ class Trainer:
                 raise
             log.warning("the critic begins anew. %s", error)
             return make().to(self.device)
+
+    def _best_before(self, facts: dict) -> float:
+        """Return the best validation occupancy so far, on the episodes that are played from now on."""
+        if (stale := stale_best_frames(self.run_dir, self.frames, self.saved_config)) is not None:
+            log.warning(
+                "checkpoints/best is of frame %s and of other settings; the next validation replaces it", f"{stale:,}"
+            )
+            return NEW["best"]
+        if is_validated_alike(facts, self.saved_config):
+            return self.best
+        try:
+            best, _ = checkpoint.read(checkpoint.locate(self.run_dir))
+        except checkpoint.CheckpointError:
+            return NEW["best"]
+        now = {key: value.clone() for key, value in self.policy.state_dict().items()}
+        self.policy.load_state_dict(checkpoint.matching_state(best.get("policy"), now, "policy"))
+        occupancy = validation_metrics(self.validate())["occupancy"]
+        self.policy.load_state_dict(now)
+        log.info("validated otherwise from now on: checkpoints/best has %.4f instead of %.4f", occupancy, self.best)
+        return occupancy
 
     @property
     def is_complete(self) -> bool:

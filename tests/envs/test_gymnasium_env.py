@@ -63,7 +63,7 @@ def test_maskable_ppo_runs():
 @pytest.mark.parametrize(("seed", "height"), [(0, 1), (3, 2), (2**31, 2)])
 def test_a_single_environment_against_the_batched_one(seed, height):
     """It plays the episodes of a seed one after the other, and shows all that an agent gets."""
-    below = PickPlaceEnv(tote_size=(4, 5, 2), items=Kinds(SMALL["items"]), num_envs=1, seed=seed)
+    below = PickPlaceEnv(tote_size=(4, 5, 2), items=SMALL["items"], num_envs=1, seed=seed)
     env, generator = make(), np.random.default_rng(seed)
     for episode in range(3):
         state = below.reset(TensorDict({"tote_height": torch.tensor([[height]])}, [1]))
@@ -71,7 +71,10 @@ def test_a_single_environment_against_the_batched_one(seed, height):
         ended = False
         while True:
             assert_equal(observation, {key: state[key][0].numpy() for key in below.terms})
-            assert np.array_equal(info["action_mask"], state["action_mask"][0].numpy())
+            mask = state["action_mask"][0].numpy()
+            if ended:  # the next step is a reset and ignores the action, but a learner that masks needs one
+                mask = np.arange(len(mask)) == 0
+            assert np.array_equal(info["action_mask"], mask)
             assert np.array_equal(info["action_mask"], env.action_masks())
             assert info["occupancy"] == pytest.approx(float(state["occupancy"]))
             assert info["failure"] == Failure(int(state["failure"])).name.lower()
@@ -138,6 +141,7 @@ def test_vector_environment_against_gymnasiums_own(mode):
             assert np.array_equal(info[key], their_info[key]), key
         ended = rest[1] | rest[2]
         endings += ended.sum()
+        assert mode == AutoresetMode.SAME_STEP or (ours.action_masks()[ended].nonzero()[1] == 0).all()
         if mode == AutoresetMode.SAME_STEP and ended.any():
             assert np.array_equal(info["_final_obs"], their_info["_final_obs"])
             for i in np.flatnonzero(ended):
@@ -235,7 +239,7 @@ def step(env, action):
         (lambda: make().reset(options={"tote_height": 1.5}), r"options\['tote_height'\]=1.5"),
         (lambda: vector().reset(options={"tote_height": [1, 2, 2]}), r"\[1, 2, 2\]"),
         (lambda: make().reset(options={"height": 1}), r"options\['height'\]: there is no such option"),
-        (lambda: make().reset(options={"reset_mask": [True]}), "expected tote_height alone"),
+        (lambda: make().reset(options={"reset_mask": [True]}), "expected no reset_mask"),
         (lambda: vector().reset(options={"reset_mask": [True]}), "reset_mask"),
         (
             lambda: vector().reset(options={"reset_mask": np.array([True, False])}),

@@ -172,7 +172,7 @@ NO_TOP.highest_top.fill_(0)
         ({"kinds": [(1, 1, 1)], "bin_size": (2, 2, 2)}, "1x1x1 at x=0, y=0 in the bin has no feasible action"),
         # A tote smaller than the effector: only an item level with its rim can be placed.
         ({"kinds": [(1, 1, 1)], "tote_size": (2, 2, 3)}, "1x1x1 .* empty tote of height 3 .bin 5x5x1, tote 2x2x3"),
-        ({"items": [(1, 1, 1)]}, "items=.*expected an ItemDistribution"),
+        ({"items": "paper"}, "items='paper': expected a list of .w, d, h., or an ItemDistribution"),
         *(({"num_envs": value}, f"num_envs={value}: expected a whole number >= 1") for value in (0, 1.5, True)),
         ({"seed": -1}, "seed=-1: expected a whole number >= 0"),
         ({"stream": "dev"}, "stream='dev': expected 'train' or 'validation' or 'test'"),

@@ -196,6 +196,25 @@ def test_a_stale_best_is_replaced_if_the_config_has_changed(changed, smoke_run, 
     assert best == pytest.approx(read_csv(run_dir / "metrics.csv")[-1]["eval/occupancy"]) if changed else best == 0.995
 
 
+def test_a_best_is_compared_on_the_episodes_of_now(smoke_run, tmp_path, no_report):
+    """It is validated again if validation changes; training goes on with the weights of ``last``."""
+    run_dir = shutil.copytree(smoke_run, tmp_path / "run")
+    saved = run_dir / "checkpoints"
+    shutil.rmtree(saved / "best")
+    shutil.copytree(saved / "previous", saved / "best")
+    state, facts = checkpoint.read(saved / "last")
+
+    def resumed(*words):
+        return Trainer(resumed_config("x", facts, [*words]), run_dir, (state, {**facts, "best": 0.99}, saved / "last"))
+
+    assert resumed("evaluation_interval=1").best == 0.99
+    trainer = resumed("evaluation.episodes=3")
+    for key, value in trainer.policy.state_dict().items():
+        assert torch.equal(value, state["policy"][key]), key
+    trainer.policy.load_state_dict(checkpoint.read(saved / "best")[0]["policy"])
+    assert trainer.best == trainer.validate().occupancy.mean()
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -203,7 +222,8 @@ def test_a_stale_best_is_replaced_if_the_config_has_changed(changed, smoke_run, 
         ("env.observation.tote_depth._target_=bin_depth", "env.observation={"),
         ("env.tote_size=[5,5,1]", "the run began with [4, 4, 1]"), ("env.num_envs=4", "the run began with 8"),
         ("model.mask_infeasible=false", "the run began with True"), ("model.actor.filters=16", "does not fit"),
-        ("curriculum=paper", "cannot be exchanged"), ("+algo.gama=0.9", "did you mean 'gamma'?"),
+        ("curriculum=paper", "cannot be exchanged; expected overrides of its values, such as curriculum.<key>=<value>, "
+         "or a new run, such as one with warm_start.weights=/"), ("+algo.gama=0.9", "did you mean 'gamma'?"),
         ("algo.lr=1,2", "one value"), ("~algo.lr", "<key>=<value>"),
         ("total_frames=100", "total_frames=100: the run has trained 512 frames already; expected more"),
     ],

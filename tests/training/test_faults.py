@@ -82,6 +82,22 @@ def test_a_worker_s_death_is_told_until_it_is_heard():
     time.sleep(0.6)  # and not once we have left
 
 
+def test_the_worker_that_was_killed_is_named():
+    """Not one that failed for want of it, and that may be noticed before."""
+    context = multiprocessing.get_context("fork")
+    workers = [context.Process(target=os._exit, args=(1,)), context.Process(target=time.sleep, args=(60,))]
+    for worker in workers:
+        worker.start()
+    workers[1].kill()
+    for worker in workers:
+        worker.join()
+    with (
+        pytest.raises(WorkerDied, match=r"2 of 2 has died \(exit code -9\)"),
+        watch_workers(SimpleNamespace(procs=workers)),
+    ):
+        pass
+
+
 def work(deaf, ready):
     if deaf:
         ignore_signals()

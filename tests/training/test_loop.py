@@ -1,5 +1,6 @@
 """Training: advantages by hand, what each loss and step consists of, and the wiring of stream, slots and curriculum."""
 
+import logging
 from copy import deepcopy
 from functools import partial
 from types import SimpleNamespace
@@ -142,6 +143,29 @@ def test_the_learning_rate_falls_linearly_over_the_last_part(collected):
     assert rates == pytest.approx([0.2, 0.2, 0.1, 0, 0])
     constant = algorithm_of(collected[0], critic, "algo.lr=0.2", "algo.lr_decay_start=null")
     assert constant.learning_rate(At(0, 1000, 1, 1000)) == 0.2
+
+
+def test_a_changed_learning_rate_or_budget_begins_the_schedule_anew(collected, caplog):
+    """Over the frames that are left, with no batch at rate 0, and exactly in a later resume."""
+    critic = ValueOperator(MeanDepthCritic(), OBSERVED)
+    caplog.set_level(logging.INFO)
+
+    def resumed(before, lr):
+        made = algorithm_of(collected[0], critic, f"algo.lr={lr}", "algo.lr_decay_start=0.5")
+        made.load_state_dict(before.state_dict())
+        return made
+
+    first = algorithm_of(collected[0], critic, "algo.lr=0.2", "algo.lr_decay_start=0.5")
+    first.optimizer.step()
+    assert first.learning_rate(At(600, 700, 7, 1000)) == pytest.approx(0.12) and not caplog.messages
+    assert resumed(first, 0.2).learning_rate(At(700, 800, 8, 1000)) == pytest.approx(0.08) and not caplog.messages
+    second = resumed(first, 0.1)
+    rates = [second.learning_rate(At(frames, frames + 100, 0, 1000)) for frames in (600, 700, 800, 900)]
+    assert rates == pytest.approx([0.1, 0.1, 0.1, 0.05])
+    assert caplog.messages == ["600 frames: the learning rate is now 0.1, and falls to 0 from 800 to 1,000 frames"]
+    assert resumed(second, 0.1).learning_rate(At(900, 1000, 10, 1000)) == pytest.approx(0.05)
+    longer = resumed(second, 0.1).learning_rate
+    assert [longer(At(frames, frames + 1, 0, 2000)) for frames in (1000, 1750)] == pytest.approx([0.1, 0.05])
 
 
 # --- the loop
