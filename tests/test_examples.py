@@ -303,6 +303,22 @@ def test_own_curriculum(name, levels):
     assert seen == levels
 
 
+def test_own_advance(example, tmp_path):
+    """It draws the levels, and a resumed training equals one that was never stopped."""
+    words = ["curriculum/advance=worst_first", "curriculum.advance.keep=0.5", "algo.lr_decay_start=null", *TRAINING]
+    words += ["model.actor.filters=8", "logger=csv"]
+    whole = trained("own_advance", tmp_path / "whole", *words, "total_frames=256")
+    folder = trained("own_advance", tmp_path / "part", *words)
+    example("train", "own_advance", f"resume={folder}", "total_frames=256", "trust=own_advance")
+    ours, theirs = (checkpoint.read(checkpoint.locate(place, "last")) for place in (whole, folder))
+    assert all(torch.equal(value, theirs[0]["policy"][key]) for key, value in ours[0]["policy"].items())
+    assert ours[1]["curriculum"] == theirs[1]["curriculum"]
+    saved = ours[1]["curriculum"]["advance"]["occupancy"]
+    rows = read_csv(whole / "metrics.csv")
+    assert len(saved) == 5 and min(saved.values()) == rows[-1]["curriculum/worst"]
+    assert len({row["curriculum/level"] for row in rows}) > 1
+
+
 @pytest.mark.parametrize(("total_frames", "gain"), [(1_024, -0.1), pytest.param(6_144, 0.03, marks=pytest.mark.slow)])
 def test_torchrl_ppo(monkeypatch, total_frames, gain):
     monkeypatch.syspath_prepend(str(EXAMPLES))

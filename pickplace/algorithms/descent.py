@@ -111,13 +111,14 @@ class MinibatchDescent(Algorithm):
 
     def learning_rate(self, at: At) -> float:
         """Return the learning rate of a batch; if it falls, a new run's last batch has 0."""
-        before, now = self.schedule["settings"], f"lr={self.lr} lr_decay_start={self.lr_decay_start} of {at.total}"
+        falls = "" if self.lr_decay_start is None else f" lr_decay_start={self.lr_decay_start} total_frames={at.total}"
+        before, now = self.schedule["settings"], f"lr={self.lr}{falls}"
         if before != now:
             self.schedule = {"settings": now, "since": at.before if before else 0}
         if before and before != now:
             start = at.before + (self.lr_decay_start or 0) * (at.total - at.before)
-            falls = f", and falls to 0 from {start:,.0f} to {at.total:,} frames" * (self.lr_decay_start is not None)
-            log.info("%s frames: the learning rate is now %g%s", f"{at.before:,}", self.lr, falls)
+            until = f", and falls to 0 from {start:,.0f} to {at.total:,} frames" * bool(falls)
+            log.info("%s frames: the learning rate is now %g%s", f"{at.before:,}", self.lr, until)
         if self.lr_decay_start is None:
             return self.lr
         since = self.schedule["since"]

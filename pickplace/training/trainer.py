@@ -244,7 +244,8 @@ class Trainer:
         if (self.curriculum.level, self.curriculum.weights) != (level, weights):
             push_level(self.collector, self.curriculum.level, self.curriculum.weights)
         if self.curriculum.level != level:
-            log.info("%s frames: %s %d -> %d", f"{self.frames:,}", self.curriculum.what, level, self.curriculum.level)
+            tell = log.debug if self.curriculum.weights else log.info  # drawn levels change all the time
+            tell("%s frames: %s %d -> %d", f"{self.frames:,}", self.curriculum.what, level, self.curriculum.level)
             callbacks.call(self.callbacks, "on_level_change", self, level, self.curriculum.level)
         learnt = self.algorithm.learn(batch, at)
         taken = ", ".join(sorted(metrics.keys() & learnt.keys()))
