@@ -25,9 +25,9 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
 
     done = recording.moves[:moves]
     boxes = recording.boxes[: sum(not move.failure for move in done)]
-    heights = np.zeros(cell.tote_size[:2], dtype=int)
-    for x, y, z, w, d, h in boxes:
-        heights[x : x + w, y : y + d] = z + h
+    heights, highest = (np.zeros(cell.tote_size[:2], dtype=int) for _ in range(2))  # and the number of the item there
+    for number, (x, y, z, w, d, h) in enumerate(boxes, 1):
+        heights[x : x + w, y : y + d], highest[x : x + w, y : y + d] = z + h, number
     size = (*cell.tote_size[:2], recording.tote_height)
     figure = figure_of(12, 6)
     solid, plan = figure.subplots(1, 2, width_ratios=[1.2, 1])
@@ -37,7 +37,7 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
     if 0 < len(colours) <= 20:
         patches = [Patch(facecolor=c, edgecolor=INK, label=_sides(kind, cell)) for kind, c in colours.items()]
         figure.legend(handles=patches, title="items (cells)", loc="outside left upper", frameon=False, alignment="left")
-    _draw_plan(plan, heights, recording.tote_height, cell)
+    _draw_plan(plan, heights, highest, recording.tote_height, cell)
     share = np.floor(1000 * sum(box.volume for box in boxes) / np.prod(size) + 1e-9) / 10  # not rounded: 100% is full
     caption = f"{_sides(size, cell)} tote, {share:.1f}% full, {len(boxes)} items placed"
     if len(done) == len(recording.moves) and recording.ending is not None:
@@ -156,11 +156,14 @@ def _sides(size: tuple[int, ...], cell: CellSpec) -> str:
     return f"{size[0]}x{size[1]}x{size[2] * cell.height_unit:g}"
 
 
-def _draw_plan(axes, heights: np.ndarray, limit: int, cell: CellSpec) -> None:
-    """Draw a height map ``[W_T, D_T]`` from above, in one colour for each whole height up to ``limit``."""
-    from matplotlib import colormaps, colors, ticker
+def _draw_plan(axes, heights: np.ndarray, highest: np.ndarray, limit: int, cell: CellSpec) -> None:
+    """Draw a height map ``[W_T, D_T]`` from above, in one colour for each whole height up to ``limit``.
 
-    colours = colors.ListedColormap(colormaps["YlGnBu"](np.linspace(0, 0.75, limit + 1)))
+    Where the number of the ``highest`` item changes from one cell to the next, a line shows the items' sides.
+    """
+    from matplotlib import collections, colormaps, colors, ticker
+
+    colours = colors.ListedColormap(colormaps["YlGnBu"](np.linspace(0, 0.6, limit + 1)))
     norm = colors.BoundaryNorm(np.arange(limit + 2) - 0.5, colours.N)
     image = axes.imshow(heights.T, origin="lower", cmap=colours, norm=norm)
     if max(heights.shape) <= 12:
@@ -168,11 +171,10 @@ def _draw_plan(axes, heights: np.ndarray, limit: int, cell: CellSpec) -> None:
             red, green, blue, _ = colours(norm(height))
             dark = 0.299 * red + 0.587 * green + 0.114 * blue < 0.55
             axes.text(x, y, str(int(height)), ha="center", va="center", color="white" if dark else INK)
-        axes.set_xticks(np.arange(heights.shape[0] + 1) - 0.5, minor=True)
-        axes.set_yticks(np.arange(heights.shape[1] + 1) - 0.5, minor=True)
-        axes.grid(which="minor", color="white", lw=1)
-        axes.tick_params(which="minor", length=0)
-    axes.set(title="height map from above", xlabel="x (cells)", ylabel="y (cells)")
+    sides = [((x + 0.5, y - 0.5), (x + 0.5, y + 0.5)) for x, y in np.argwhere(highest[1:] != highest[:-1])]
+    sides += [((x - 0.5, y + 0.5), (x + 0.5, y + 0.5)) for x, y in np.argwhere(highest[:, 1:] != highest[:, :-1])]
+    axes.add_collection(collections.LineCollection(sides, colors=INK, linewidths=2, capstyle="projecting"))
+    axes.set(title="height map and items from above", xlabel="x (cells)", ylabel="y (cells)")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(ticker.MaxNLocator(12, integer=True, min_n_ticks=1))
     unit = "cells" if cell.height_unit == 1 else f"units of {cell.height_unit:g} cells"
