@@ -34,10 +34,10 @@ train: $(STAMP)  ## train experiment=quick, and evaluate it (ARGS="key=value ...
 	@printf '  %-32s%s\n' \
 	  checkpoints/best 'the policy, for pickplace-evaluate checkpoint=$(RUN_DIR)' \
 	  metrics.csv 'every metric over frames' \
-	  learning_curve.png 'occupancy and tote height over frames' \
-	  report.html 'the run on one page: curves, tables, best and worst episode' \
+	  learning_curve.png 'occupancy over frames, also of each tote height; .pdf and .svg for a paper' \
+	  report.html 'the run on one page: a full tote, curves, tables, best and worst episode' \
 	  evaluation/evaluation.md 'the table above; evaluation.json has every episode' \
-	  evaluation/tote.png 'a packed tote' \
+	  evaluation/tote.png 'a packed tote; also .pdf and .svg' \
 	  evaluation/replay.html 'a replay in 3D'
 
 test: export OMP_NUM_THREADS ?= 1

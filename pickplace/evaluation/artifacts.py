@@ -62,8 +62,7 @@ class Artifacts:
             for name, text in texts.items():
                 with replaced_file(run_dir / name) as new:
                     new.write_text(text, encoding="utf-8")
-            with replaced_file(run_dir / "tote.png") as new:
-                picture(recordings[0], cell, new)
+            picture(recordings[0], cell, run_dir / "tote.png")
             if self.gif:
                 with replaced_file(run_dir / "replay.gif") as new:
                     animation(recordings[0], cell, new)

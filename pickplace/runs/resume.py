@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 #: Types of the facts in the checkpoint of a training, beside the config and the frames.
 FACT_TYPES = {
-    "iteration": int, "best": int | float, "latest": dict, "curriculum": dict, "callbacks": dict, "ended": bool,
+    "iteration": int, "best": int | float, "latest": dict, "curriculum": dict, "callbacks": dict, "ended": str,
     "commit": str | None, "versions": dict,
 }  # fmt: skip
 

@@ -37,6 +37,9 @@ class Callback:
 class EarlyStopping(Callback):
     """End the training at a validation occupancy, or when validations no longer improve.
 
+    The reason that it gives says where the end rests on a single validation that may be luck: one whose 95% interval
+    begins below the occupancy, or a best one whose interval holds none of those since.
+
     Args:
         occupancy: mean validation occupancy, 0 to 1, that ends it; None: any.
         patience: validations in a row without a new best that end it; None: any number.
@@ -49,22 +52,31 @@ class EarlyStopping(Callback):
         )
         self.occupancy = or_null(number, f"{key}occupancy", occupancy, 0, 1)
         self.patience = or_null(whole_number, f"{key}patience", patience)
-        self.best, self.stale = -1.0, 0
+        # The best validation, those since, and the lower end of the best one's 95% interval.
+        self.since: list[float] = []
+        self.low = 0.0
 
     def on_validation(self, trainer, episodes, metrics):
         occupancy = metrics["eval/occupancy"]
-        self.stale = 0 if occupancy > self.best else self.stale + 1
-        self.best = max(self.best, occupancy)
+        if not self.since or occupancy > self.since[0]:
+            self.since, self.low = [], metrics["eval/ci95_low"]
+        self.since.append(occupancy)
+        best, *others = self.since
         if self.occupancy is not None and occupancy >= self.occupancy:
-            trainer.end(f"early stopping: the validation occupancy has reached {self.occupancy}")
-        elif self.patience is not None and self.stale >= self.patience:
-            trainer.end(f"early stopping: {self.stale} validations without one above {self.best:.4f}")
+            reason, doubtful = f"the validation occupancy has reached {self.occupancy}", self.low < self.occupancy
+        elif self.patience is not None and len(others) >= self.patience:
+            reason, doubtful = f"{len(others)} validations without one above {best:.4f}", max(others) < self.low
+        else:
+            return
+        luck = f"; perhaps luck: a single validation, whose 95% interval begins at {self.low:.4f}" if doubtful else ""
+        trainer.end(f"early stopping: {reason}{luck}")
 
     def state_dict(self):
-        return {"best": self.best, "stale": self.stale}
+        return {"since": self.since, "low": self.low}
 
     def load_state_dict(self, state):
-        self.best, self.stale = number("best", state["best"], -1, 1), whole_number("stale", state["stale"], 0)
+        self.since = [number("since", value, 0, 1) for value in state["since"]]
+        self.low = number("low", state["low"], 0, 1)
 
 
 def make_callbacks(cfg, states) -> dict[str, Callback]:

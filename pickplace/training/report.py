@@ -4,6 +4,7 @@ import base64
 import io
 import re
 import shlex
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
@@ -13,14 +14,17 @@ from pickplace.common.files import replaced_file
 from pickplace.rules.cell import CellSpec
 from pickplace.runs.folder import REPORT, changed_values, noted_command
 from pickplace.runs.loggers import read_csv
-from pickplace.views.figures import failure_mix
+from pickplace.training.curriculum.curriculum import Curriculum
+from pickplace.views.figures import failure_mix, played_levels
 from pickplace.views.replay import ASSETS, page
+from pickplace.views.scene import draw_scene, item_colours
 
 
 def write_report(
-    run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts: dict, levels: tuple[str, int]
+    run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts: dict, curriculum: Curriculum, ended: str
 ) -> None:
-    """Write ``report.html``: curves, tables, the worst and the best episode, and the command that repeats the run.
+    """Write ``report.html``: the fullest tote, curves, tables, the best and the worst episode, and the command that
+    repeats the run.
 
     Args:
         run_dir: the run folder, with ``metrics.csv`` and ``learning_curve.png``.
@@ -28,44 +32,56 @@ def write_report(
         episodes: the last validation, an :class:`pickplace.evaluation.play.Episodes` with recordings.
         cell: the sizes.
         facts: versions and commit.
-        levels: what a level of the curriculum is, and the number of the last one.
+        curriculum: the curriculum, for what its levels are.
+        ended: why a callback has ended the training, if one has.
 
     Raises:
         OSError: naming the report, if it cannot be written.
     """
-    rows, failures = read_csv(run_dir / "metrics.csv"), io.BytesIO()
-    failure_mix(run_dir / "metrics.csv", failures)
+    rows, level_name = read_csv(run_dir / "metrics.csv"), curriculum.what
+    tote, mix = io.BytesIO(), io.BytesIO()
     best = max((row for row in rows if "eval/occupancy" in row), key=lambda row: row["eval/occupancy"])
-    ordered = sorted(episodes.recordings, key=lambda recording: recording.occupancy)
+    ordered = sorted(episodes.recordings, key=lambda recording: -recording.occupancy)
+    draw_scene(ordered[0], cell, item_colours(ordered[0].boxes)).savefig(tote, dpi=100)
+    failures = ""
+    if failure_mix(rows, mix):
+        failures = "<h2>How training episodes ended</h2>" + _picture("Share of each over frames", mix.getvalue())
     policy, sizes = str(cfg.model.actor._target_).rpartition(".")[2], "x".join(map(str, cell.tote_size))
     command = shlex.join(["pickplace-train", *noted_command(run_dir)])
     if changed := changed_values(run_dir, cfg):
         command += f"\n\nChanged when it was resumed: {', '.join(changed)}"
     tiles = [
         (f"{best['eval/occupancy']:.4f}", f"best validation, after {best['frames']:,} frames (checkpoints/best)"),
-        (f"{episodes.occupancy.mean():.4f}", f"last validation, {len(episodes.occupancy)} episodes at full height"),
+        (f"{episodes.occupancy.mean():.4f}", f"last validation, {len(episodes.occupancy)} episodes of the full task"),
         (f"{episodes.occupancy.min():.4f}", "its worst episode"),
-        (f"{int(rows[-1]['curriculum/level'])} of {levels[1]}", f"{levels[0]} reached"),
+        (f"{max(int(row['curriculum/level']) for row in rows)} of {curriculum.end}", f"highest {level_name} reached"),
     ]
+    replay = f"{cfg.evaluation.stream} stream, seed {cfg.evaluation.seed}"
     parts = {
         "title": escape(f"Training {policy} for a {sizes} tote"),
         "subtitle": escape(
             f"R={cell.rotations}, {rows[-1]['frames']:,} frames, seed {cfg.seed}, "
             f"mask in training: {'yes' if cfg.model.mask_infeasible else 'no'}, K={cfg.planner.candidates}"
         ),
+        "ended": f"<p>Ended before {cfg.total_frames:,} frames: {escape(ended)}.</p>" if ended else "",
         "tiles": "".join(f"<div><b>{value}</b><span>{text}</span></div>" for value, text in tiles),
-        "curve": base64.b64encode((run_dir / "learning_curve.png").read_bytes()).decode(),
-        "failures": base64.b64encode(failures.getvalue()).decode(),
-        "tables": validation_table(rows, levels[0]) + level_table(rows, levels[0]),
+        "tote": _picture("The tote at its fullest, and its height map", tote.getvalue()),
+        "curve": _picture("Occupancy and levels over frames", (run_dir / "learning_curve.png").read_bytes()),
+        "failures": failures,
+        "tables": validation_table(rows, level_name) + level_table(rows, level_name, curriculum.given),
         "command": escape(command),
         "config": escape(OmegaConf.to_yaml(cfg, resolve=True)),
         "versions": escape("\n".join(f"{name}: {value}" for name, value in facts.items())),
-        "replay": escape(page(ordered, cell, f"{cfg.evaluation.stream} stream, seed {cfg.evaluation.seed}")),
+        "replay": escape(page(ordered, cell, replay, at_end=True)),
     }
     template = (ASSETS / "report.html").read_text(encoding="utf-8")
     with replaced_file(run_dir / REPORT) as new:
         # In one pass, so that no content is taken for a placeholder.
         new.write_text(re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], template), encoding="utf-8")
+
+
+def _picture(text: str, content: bytes) -> str:
+    return f'<img alt="{text}" src="data:image/png;base64,{base64.b64encode(content).decode()}">'
 
 
 def _table(head: tuple, rows: list[tuple]) -> str:
@@ -75,7 +91,7 @@ def _table(head: tuple, rows: list[tuple]) -> str:
 
 
 def validation_table(rows: list[dict], level_name: str) -> str:
-    """An HTML table of some 12 of the validations, and the last one."""
+    """An HTML table of up to 12 of the validations, at equal distances, and the last one."""
     found = [
         (
             f"{row['frames']:,}",
@@ -88,18 +104,26 @@ def validation_table(rows: list[dict], level_name: str) -> str:
     ]
     return _table(
         ("frames", "validation", "95% interval", f"{level_name} in training"),
-        found[: -1 : max(1, len(found) // 12)] + found[-1:],
+        found[: -1 : -(-len(found) // 12)] + found[-1:],
     )
 
 
-def level_table(rows: list[dict], level_name: str) -> str:
+def level_table(rows: list[dict], level_name: str, settings: Sequence[Mapping] | None = None) -> str:
     """An HTML table of the training occupancy at each level, a mean over the last 20 batches in which an episode of it
-    ended."""
-    levels = sorted({int(key.rpartition("_")[2]) for row in rows for key in row if "curriculum/occupancy_at_" in key})
-    lines = []
-    for level in levels:
+    ended.
+
+    Args:
+        rows: of ``metrics.csv``.
+        level_name: what a level is.
+        settings: what each of them sets, from number 1 on, if the config lists it.
+    """
+    lines: list[tuple] = []
+    for level in played_levels(rows):
         seen = [row for row in rows if f"curriculum/occupancy_at_{level}" in row]
         values = [row[f"curriculum/occupancy_at_{level}"] for row in seen[-20:]]
         lines.append((level, f"{sum(values) / len(values):.4f}", f"{seen[0]['frames']:,} to {seen[-1]['frames']:,}"))
-    head = (level_name, "training occupancy when last trained", "frames")
+        if settings:
+            words = [f"{key}: {value}" for key, value in settings[level - 1].items()]
+            lines[-1] += (escape(", ".join(words) or "the full task"),)
+    head = (level_name, "training occupancy when last trained", "frames", *["sets"][: bool(settings)])
     return "<br>" + _table(head, lines) if lines else ""

@@ -1,7 +1,7 @@
 """The tables and the figure of a sweep, for any sweeper and launcher.
 
-``sweep.csv`` has a row for each run, ``sweep_settings.csv`` a row for each setting, over its seeds, and ``sweep.png``
-the mean validation curve of each setting.
+``sweep.csv`` has a row for each run, ``sweep_settings.csv`` a row for each setting, over its seeds, and ``sweep.png``,
+with PDF and SVG beside it, the validation curves of each setting: their mean, and each seed.
 
 ``python -m pickplace.training.sweep outputs/sweep/...`` writes them again, for example after a run was resumed.
 """
@@ -23,7 +23,7 @@ from pickplace.common.validate import expect, refuse_if
 from pickplace.runs.checkpoint import read_facts
 from pickplace.runs.folder import FAILURE, is_claimed, read_note
 from pickplace.runs.loggers import read_csv
-from pickplace.views.figures import figure_of
+from pickplace.views.figures import figure_of, save
 
 log = logging.getLogger(__name__)
 
@@ -41,12 +41,19 @@ class SweepRun:
     status: str = "stopped"  # or finished, running, failed, unreadable
     frames: int = 0  # environment steps trained
     validations: list[dict[str, float]] = field(default_factory=list)  # rows of metrics.csv with a validation
+    ended: str = ""  # why a callback ended a finished run before its budget was spent
     error: str = ""  # of a failed or unreadable run, in one sentence
 
     @property
     def last(self) -> dict[str, float]:
         """The latest validation, by the names of its metrics; empty without one."""
         return self.validations[-1] if self.validations else {}
+
+    @property
+    def curve(self) -> np.ndarray:
+        """Frames, occupancies, and the lower and upper ends of their 95% intervals (or NaN), ``[4, V]``."""
+        keys = ("frames", "eval/occupancy", "eval/ci95_low", "eval/ci95_high")
+        return np.array([[row.get(key, np.nan) for row in self.validations] for key in keys])
 
 
 def read_run(folder: Path) -> SweepRun:
@@ -72,7 +79,8 @@ def read_run(folder: Path) -> SweepRun:
         else:  # the checkpoint's config first: a resumed run may have a larger budget
             config = facts.get("config") or read_note(folder, "config.yaml")
             budget = config.get("total_frames") if isinstance(config, dict) else None
-            if facts.get("ended") is True or (isinstance(budget, int) and run.frames >= budget):
+            run.ended = str(facts.get("ended") or "")
+            if run.ended or (isinstance(budget, int) and run.frames >= budget):
                 run.status = "finished"
     except Exception as error:  # of any type: the checkpoint's facts are unchecked
         run.status, run.error = "unreadable", sentence(error)
@@ -88,6 +96,7 @@ class Setting:
         mean: their mean final validation occupancy; None without any.
         interquartile_mean: the mean of their middle half; None with fewer than four, of which it would be the mean.
         interval: the 95% interval of their mean, see :func:`bootstrap95`; two times None with fewer than two.
+        frames: the least and the greatest number of frames that they trained; two times None without any.
     """
 
     def __init__(self, runs: list[SweepRun]):
@@ -100,6 +109,8 @@ class Setting:
         self.mean = float(finals.mean()) if count else None
         self.interquartile_mean = float(trim_mean(finals, 0.25)) if count >= 4 else None
         self.interval = tuple(map(float, bootstrap95(finals))) if count >= 2 else (None, None)
+        trained = [run.frames for run in self.finished]
+        self.frames = (min(trained), max(trained)) if count else (None, None)
 
     @property
     def curves(self) -> tuple[np.ndarray, np.ndarray]:
@@ -159,29 +170,30 @@ def summarize(folder: Path) -> list[Setting]:
     _write_table(
         folder / TABLE,
         ["run", "status", *keys]
-        + ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "error"],
+        + ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "ended", "error"],
         [
             [run.name, run.status, *map(run.overrides.get, keys), run.frames]
             + [max((row["eval/occupancy"] for row in run.validations), default=None)]
-            + [*map(run.last.get, ("eval/occupancy", "eval/ci95_low", "eval/ci95_high")), run.error]
+            + [*map(run.last.get, ("eval/occupancy", "eval/ci95_low", "eval/ci95_high")), run.ended, run.error]
             for run in runs
         ],
     )
     keys = [key for key in keys if key != "seed"]
     _write_table(
         folder / SETTINGS_TABLE,
-        [*keys, "runs", "finished", "mean_occupancy", "interquartile_mean", "mean_ci95_low", "mean_ci95_high"],
+        [*keys, "runs", "finished", "mean_occupancy", "interquartile_mean", "mean_ci95_low", "mean_ci95_high"]
+        + ["ended_early", "least_frames", "most_frames"],
         [
             [*map(each.overrides.get, keys), len(each.runs), len(each.finished), each.mean]
-            + [each.interquartile_mean, *each.interval]
+            + [each.interquartile_mean, *each.interval, sum(bool(run.ended) for run in each.finished), *each.frames]
             for each in settings
         ],
     )
     # The best mean first; those without a finished run are last.
     ranked = sorted(settings, key=lambda setting: -1.0 if setting.mean is None else setting.mean, reverse=True)
     draw(ranked, folder / FIGURE)
-    for setting in ranked[:LARGEST_LEGEND]:
-        log.info("%s  %s", result(setting), label(setting, settings))
+    for line in results(ranked)[:LARGEST_LEGEND]:
+        log.info(line)
     log.info("tables and figure of the sweep: %s, %s, %s", folder / SETTINGS_TABLE, folder / TABLE, folder / FIGURE)
     return settings
 
@@ -192,63 +204,74 @@ def _write_table(path: Path, columns: list[str], rows: list[list]) -> None:
 
 
 def label(setting: Setting, settings: list[Setting]) -> str:
-    """Label of a setting: the overrides in which the settings differ, and its runs that did not finish."""
+    """Label of a setting: the overrides in which the settings differ, and its runs that did not use their budget."""
     words = [
         f"{key}={value}"
         for key, value in setting.overrides.items()
         if any(other.overrides.get(key) != value for other in settings)
     ]
-    unfinished = Counter(run.status for run in setting.runs if run.status != "finished")
-    counts = ", ".join(f"{count} {status}" for status, count in unfinished.items())
+    ends = Counter("ended early" if run.ended else run.status for run in setting.runs)
+    counts = ", ".join(f"{count} {end}" for end, count in ends.items() if end != "finished")
     return (", ".join(words) or ("all runs" if len(settings) == 1 else "defaults")) + (f" ({counts})" if counts else "")
 
 
-def result(setting: Setting) -> str:
-    """Mean final occupancy of a setting, its interval and number of seeds, as text of equal width."""
-    if setting.mean is None:
-        return f"{'none finished':<34}"
-    count = len(setting.finished)
-    interval = "({:.4f} to {:.4f})".format(*setting.interval) if count > 1 else ""
-    return f"{setting.mean:.4f} {interval:<18} {f'{count} seed' + 's' * (count > 1):>8}"
+def results(settings: list[Setting]) -> list[str]:
+    """A line of text for each setting, in columns: mean final occupancy, its interval, seeds, frames, and the label."""
+    rows = []
+    for setting in settings:
+        count, (least, most), text = len(setting.finished), setting.frames, label(setting, settings)
+        row = ["none finished", "", "", ""]
+        if count:
+            interval = "({:.4f} to {:.4f})".format(*setting.interval) if count > 1 else ""
+            frames = f"{most:,}" if least == most else f"{least:,} to {most:,}"
+            row = [f"{setting.mean:.4f}", interval, f"{count} seed{'s' * (count > 1)}", f"{frames} frames"]
+        rows.append([*row, textwrap.shorten(text, 90, placeholder=" ...")])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    padded = [[text.ljust(width) for text, width in zip(row, widths, strict=True) if width] for row in rows]
+    return ["  ".join(row).rstrip() for row in padded]
 
 
 def draw(settings: list[Setting], path: Path) -> None:
     """Draw the mean validation curve of each setting over its finished runs, with its 95% interval, in this order.
 
-    Runs that did not finish are single dashed lines.
+    Thin lines are runs: their spread over the seeds, where each ended, and those that did not finish. The interval of
+    a single run is that of the episodes of each validation.
     """
     from matplotlib import colormaps
     from matplotlib.ticker import EngFormatter
 
-    figure = figure_of(8, max(4.5, 0.6 + 0.18 * min(len(settings), LARGEST_LEGEND)))
+    figure = figure_of(7, 4)
     axes = figure.subplots()
     shades = colormaps["viridis"](0.95 * np.arange(len(settings)) / max(len(settings), 1))
-    for rank, setting in enumerate(settings):
+    for rank, (setting, text) in enumerate(zip(settings, results(settings), strict=True)):
         colour = COLOURS[rank] if len(settings) <= len(COLOURS) else shades[rank]
         for run in setting.runs:
-            if run.status != "finished":
-                points = ([row[key] for row in run.validations] for key in ("frames", "eval/occupancy"))
-                axes.plot(*points, ".--", color=colour, lw=0.8)
+            frames, values, *interval = run.curve
+            axes.plot(frames, values, ".--" if run.status != "finished" else "-", color=colour, lw=0.7, alpha=0.7)
+            if len(frames) and run.ended:
+                axes.plot(frames[-1], values[-1], "X", color=colour, mec="white", ms=8, zorder=3)
+            if [run] == setting.finished:
+                axes.fill_between(frames, *interval, color=colour, alpha=0.2, lw=1)
         frames, values = setting.curves
-        text = f"{result(setting)}  {textwrap.shorten(label(setting, settings), 90, placeholder=' ...')}"
         means = values.mean(1) if len(frames) else frames
         axes.plot(frames, means, "o-", color=colour, ms=3.5, label=text if rank < LARGEST_LEGEND else None)
         if len(frames) and values.shape[1] > 1:
-            axes.fill_between(frames, *bootstrap95(values), color=colour, alpha=0.2, lw=0)
-    axes.set(
-        title="Validation at full height: mean over seeds and its 95% interval; dashed: not finished",
-        xlabel="frames (environment steps)",
-        ylabel="occupancy (0 to 1)",
-    )
+            axes.fill_between(frames, *bootstrap95(values), color=colour, alpha=0.2, lw=1)
+    runs = [run for setting in settings for run in setting.runs]
+    for style, text, is_drawn in (
+        ("-", "one seed", any(len(setting.finished) > 1 for setting in settings)),
+        ("X", "ended early, counted on with that value", any(run.ended for run in runs)),
+        (".--", "not finished", any(run.status != "finished" for run in runs)),
+    ):
+        axes.plot([], [], style, color="0.4", lw=0.7, label=text if is_drawn else None)
+    axes.set(xlim=(0, None), xlabel="frames (environment steps)", ylabel="validation occupancy (0 to 1)")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
-    legend = axes.legend(
-        title="final occupancy, mean over seeds (95% interval)", loc="upper left", bbox_to_anchor=(1.02, 1),
-        frameon=False, alignment="left", borderaxespad=0, prop={"family": "monospace", "size": 8},
+    axes.legend(
+        title="final occupancy: mean over seeds and its 95% interval; frames", loc="upper left",
+        bbox_to_anchor=(0, -0.15), frameon=False, alignment="left", prop={"family": "monospace", "size": 7},
     )  # fmt: skip
-    legend.set_in_layout(False)  # the picture grows by it; the axes keep their size
-    with replaced_file(path) as new:
-        figure.savefig(new, dpi=120, bbox_inches="tight", bbox_extra_artists=[legend])
+    save(figure, path)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from torchrl.envs import Compose, TransformedEnv
 
 from pickplace.algorithms.base import Algorithm, At, Task
 from pickplace.algorithms.imitation import WarmStart, with_warm_start
-from pickplace.common.files import replaced_file
 from pickplace.common.machine import use_machine
 from pickplace.common.validate import expect, refuse_if
 from pickplace.config.registry import build
@@ -42,6 +41,9 @@ from pickplace.views.figures import learning_curve
 
 log = logging.getLogger(__name__)
 
+#: Number of validations of a run whose interval is null.
+VALIDATIONS = 20
+
 #: Frames and batches trained, best validation occupancy, and the latest validation, in a new run.
 NEW: dict[str, Any] = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
 
@@ -60,7 +62,7 @@ class Trainer:
         best: best validation occupancy so far; -1 before the first validation.
         latest: metrics of the latest validation.
         episodes: episodes of the latest validation of this process, or None.
-        ended: whether a callback has ended the training.
+        ended: why a callback has ended the training; empty: none has.
         safe_folder: the checkpoint that was read or written last, or None.
 
     Raises:
@@ -77,7 +79,7 @@ class Trainer:
         self.frames, self.iteration, self.best, self.latest = ({**NEW, **facts}[key] for key in NEW)
         self.episodes: Episodes | None = None
         # With other settings, a training that a callback had ended goes on.
-        self.ended = facts.get("ended") is True and has_config(facts, self.saved_config)
+        self.ended = facts.get("ended", "") if self.resumed and has_config(facts, self.saved_config) else ""
         self.callbacks = callbacks.make_callbacks(cfg.get("callbacks") or {}, facts.get("callbacks") or {})
         # The order of these fixes the random draws of a seed.
         self._make_environments()
@@ -176,16 +178,16 @@ class Trainer:
     @property
     def is_complete(self) -> bool:
         """Whether nothing is left to train."""
-        return self.ended or self.frames >= self.cfg.total_frames
+        return bool(self.ended) or self.frames >= self.cfg.total_frames
 
     def end(self, reason: str) -> None:
         """End the training after this batch, for a callback; it is validated, saved and reported as a complete one.
 
         Args:
-            reason: a sentence for the log.
+            reason: a sentence for the log, the report and the learning curve.
         """
         log.info("%s frames: %s", f"{self.frames:,}", reason)
-        self.ended = True
+        self.ended = reason or "by a callback"
 
     @contextmanager
     def running(self) -> Iterator[StopRequest]:
@@ -268,7 +270,8 @@ class Trainer:
         """Validate, log, save and print progress where their intervals ended between ``before`` and now."""
         cfg, frames = self.cfg, self.frames
         callbacks.call(self.callbacks, "on_batch", self, metrics)
-        if self.is_complete or has_passed(before, frames, cfg.evaluation_interval):
+        interval = cfg.evaluation_interval or -(-cfg.total_frames // VALIDATIONS)
+        if self.is_complete or has_passed(before, frames, interval):
             self.episodes = self.validate()
             self.latest = validation_metrics(self.episodes)
             metrics |= {f"eval/{key}": value for key, value in self.latest.items()}
@@ -335,16 +338,15 @@ class Trainer:
             )
         if not (run_dir / "metrics.csv").is_file():
             return
-        with replaced_file(run_dir / "learning_curve.png") as new:
-            learning_curve(run_dir / "metrics.csv", new, self.curriculum.what)
+        levels = self.curriculum.what, end
+        learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png", levels, self.ended)
         # Without an episode of this process nothing was trained since the report was written.
         if self.is_complete and (self.episodes is not None or not (run_dir / folder.REPORT).is_file()):
             log.info("writing the report")
             occupancy = (self.episodes or self.validate()).occupancy
             replayed = self.validate(record={int(occupancy.argmin()), int(occupancy.argmax())})
             made_with = {**provenance.versions(), "commit": provenance.commit()}
-            levels = self.curriculum.what, self.curriculum.end
-            write_report(run_dir, self.cfg, replayed, self.env.cell, made_with, levels)
+            write_report(run_dir, self.cfg, replayed, self.env.cell, made_with, self.curriculum, self.ended)
 
 
 def training_env(base_env, curriculum: Curriculum, first_episode: int, num_envs: int) -> TransformedEnv:

@@ -13,6 +13,7 @@ import numpy as np
 
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.state import Failure
+from pickplace.views.figures import save
 from pickplace.views.motion import Outcome
 from pickplace.views.recording import FULL, InBin, Recording
 from pickplace.views.scene import draw_scene, item_colours
@@ -21,19 +22,21 @@ ASSETS = Path(__file__).resolve().parent / "assets"
 
 
 # ---------------------------------------------------------------------- the page
-def page(recordings: list[Recording], cell: CellSpec, title: str) -> str:
+def page(recordings: list[Recording], cell: CellSpec, title: str, at_end: bool = False) -> str:
     """Return a self-contained HTML page that replays episodes in 3D; it loads nothing from a network.
 
     Args:
         recordings: at least one episode.
         cell: the sizes.
         title: a short line, such as the planner's name and the stream.
+        at_end: whether it opens at the end of the first episode, not at its beginning.
     """
     items = [item for one in recordings for move in one.moves for item in (move.item, *move.others)]
     colours = item_colours(items + [item for one in recordings for item in one.waiting])
     motion = next((one.carried_out.motion for one in recordings if one.carried_out and one.carried_out.motion), None)
     data = {
         "title": title,
+        "step": len(recordings[0].moves) if at_end else 0,
         # In cells, from the tote's corner.
         "binAt": [round(at / motion.cell_size, 6) for at in motion.bin] if motion and motion.bin else None,
         "bin": [*cell.bin_size[:2], _cells(cell.bin_size[2], cell)],
@@ -137,14 +140,14 @@ def _item(item: InBin, cell: CellSpec) -> list[int | float]:
 
 # ---------------------------------------------------------------------- pictures
 def picture(recording: Recording, cell: CellSpec, path: Path, moves: int | None = None) -> None:
-    """Draw the tote after a number of moves, beside its height map, as PNG or SVG.
+    """Draw the tote after a number of moves, beside its height map, as PNG, and as PDF and SVG beside it.
 
     Args:
         recording, cell: the episode and the sizes.
-        path: the file to write.
+        path: the PNG to write.
         moves: how many moves have been made; None: all.
     """
-    draw_scene(recording, cell, item_colours(recording.boxes), moves).savefig(path, dpi=120)
+    save(draw_scene(recording, cell, item_colours(recording.boxes), moves), path)
 
 
 def animation(

@@ -127,7 +127,7 @@ def test_a_checkpoint_that_hides_a_pickle_runs_nothing(command, run, tmp_path):
     actor = {**facts["config"]["model"]["actor"], "filters": json.loads(EVIL) | {"f": str(tmp_path / "evil.pt")}}
     facts["config"] |= {"k": "oc.create", "s": json.dumps(actor)}
     facts["config"]["model"]["actor"] = "${${k}:${s}}"
-    facts |= {"curriculum": {}, "iteration": 1, "best": 0.5, "latest": {}, "callbacks": {}, "ended": False}
+    facts |= {"curriculum": {}, "iteration": 1, "best": 0.5, "latest": {}, "callbacks": {}, "ended": ""}
     (folder / checkpoint.FACTS).write_text(json.dumps(facts))
     if command == "load":
         with pytest.raises(ValueError, match="no interpolation"):

@@ -27,7 +27,7 @@ from pickplace.training.trainer import Trainer
 
 #: Facts of a checkpoint, beside its config.
 SAVED = {"curriculum": {}, "frames": 5, "iteration": 1, "best": 0.5, "latest": {}}
-SAVED |= {"callbacks": {}, "ended": False, "commit": None, "versions": {}}
+SAVED |= {"callbacks": {}, "ended": "", "commit": None, "versions": {}}
 
 
 def saved_frames(run_dir):
@@ -266,7 +266,7 @@ def test_a_damaged_checkpoint_is_refused_and_a_whole_one_is_named(smoke_run, tmp
         ("latest", {"occupancy": [1]}, "occupancy=[1]: expected a number"),
         ("latest", {str(n): 0 for n in range(300_000)}, "expected a validation that a training wrote"),
         ("latest", {"\x1b[31m": 0}, "expected a validation that a training wrote"),
-        ("callbacks", 7, "callbacks is 7; expected"), ("ended", "yes", "ended is 'yes'; expected"),
+        ("callbacks", 7, "callbacks is 7; expected"), ("ended", True, "ended is True; expected"),
         ("commit", {}, "commit is {}; expected"), ("versions", None, "versions is None; expected"),
         *(
             (f"config|{path}", {"x": 1}, f"in the checkpoint's config, {path.replace('|', '.')}: there is no key")

@@ -88,8 +88,10 @@ def test_a_training_that_a_callback_ends_is_a_complete_one(smoke, tmp_path, capl
     smoke(run_dir, words(last=2), "total_frames=1024", "evaluation_interval=1024")
     rows = read_csv(run_dir / "metrics.csv")
     assert [row["frames"] for row in rows] == [128, 256] and "eval/occupancy" in rows[-1]
-    assert (run_dir / "report.html").is_file() and "256 frames: enough" in caplog.text
-    monkeypatch.setattr("pickplace.training.trainer.learning_curve", lambda metrics, path: path.touch())
+    report = (run_dir / "report.html").read_text()
+    assert "Ended before 1,024 frames: enough." in report and "How training episodes ended" not in report
+    assert "256 frames: enough" in caplog.text
+    monkeypatch.setattr("pickplace.training.trainer.learning_curve", lambda metrics, path, *_: path.touch())
     (run_dir / ".hydra").mkdir()
     (run_dir / ".hydra" / "config.yaml").write_text("total_frames: 1024\n")
     (run_dir / ".hydra" / "overrides.yaml").write_text("[]\n")
@@ -113,31 +115,35 @@ def test_a_resume_goes_on_with_the_state_of_the_callbacks(smoke, tmp_path, no_re
 
 
 class Trainer:
-    ended = False
+    ended = ""
 
     def end(self, reason):
-        self.ended = True
+        self.ended = reason
 
 
 @pytest.mark.parametrize(
-    ("settings", "occupancies", "ends"),
+    ("settings", "occupancies", "ends", "luck"),
     [
-        ({"occupancy": 0.5}, [0.1, 0.49, 0.5], 2),
-        ({"occupancy": 0.9, "patience": 2}, [0.3, 0.2, 0.4, 0.4, 0.1], 4),
-        ({"patience": 1}, [0.0, 0.1, 0.1], 2),
-        ({"patience": 3}, [0.3, 0.2, 0.1], None),
+        ({"occupancy": 0.5}, [0.1, 0.49, 0.56], 2, False),
+        ({"occupancy": 0.5}, [0.1, 0.49, 0.54], 2, True),  # its interval begins at 0.49
+        ({"occupancy": 0.9, "patience": 2}, [0.3, 0.2, 0.4, 0.4, 0.1], 4, False),
+        ({"patience": 2}, [0.3, 0.4, 0.34, 0.33], 3, True),  # outside the interval of 0.4
+        ({"patience": 1}, [0.0, 0.1, 0.1], 2, False),
+        ({"patience": 3}, [0.3, 0.2, 0.1], None, False),
     ],
 )
-def test_early_stopping(settings, occupancies, ends):
+def test_early_stopping(settings, occupancies, ends, luck):
+    """At an occupancy, or without a better one; the reason says whether it may be luck. Intervals are +- 0.05."""
     trainer, callback = Trainer(), EarlyStopping(**settings)
     found = None
     for number, occupancy in enumerate(occupancies):
-        callback.on_validation(trainer, None, {"eval/occupancy": occupancy})
+        metrics = {"eval/occupancy": occupancy, "eval/ci95_low": max(0, occupancy - 0.05)}
+        callback.on_validation(trainer, None, metrics)
         found = number if trainer.ended and found is None else found
         state = json.loads(json.dumps(callback.state_dict()))
         callback = EarlyStopping(**settings)
         callback.load_state_dict(state)
-    assert found == ends
+    assert found == ends and ("perhaps luck: a single validation" in trainer.ended) == luck
 
 
 def test_early_stopping_by_the_command(run, no_report):
@@ -160,7 +166,11 @@ def test_early_stopping_by_the_command(run, no_report):
             {},
             "callbacks.mine=Kinds.*: expected the settings of a callback",
         ),
-        ({"_target_": "early_stopping", "patience": 1}, {"mine": {"best": 5}}, "callbacks.mine: its state cannot be"),
+        (
+            {"_target_": "early_stopping", "patience": 1},
+            {"mine": {"since": [5]}},
+            "callbacks.mine: its state cannot be",
+        ),
         ({"_target_": "early_stopping", "patience": 1}, {"mine": [1]}, "callbacks.mine: its state cannot be"),
         ({"_target_": "test_callbacks.Broken", "state": True}, {}, "callbacks.mine: its state .* set is not JSON"),
     ],

@@ -12,6 +12,7 @@ from pickplace.planners.lookahead import Lookahead
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.restore import restore_policy
 from pickplace.runs import checkpoint
+from pickplace.runs.loggers import read_csv
 
 
 def test_the_same_training_twice(smoke, tmp_path, no_report):
@@ -21,6 +22,26 @@ def test_the_same_training_twice(smoke, tmp_path, no_report):
     for name in "ab":
         smoke(tmp_path / name, *quick, *settings)
     assert_same(tmp_path / "a", tmp_path / "b")
+
+
+def test_the_number_of_validations_changes_nothing_that_is_trained(smoke, tmp_path, no_report):
+    """Without an interval there are 20."""
+    small = [
+        "env.num_envs=4",
+        "rollout_length=4",
+        "algo.minibatch_size=16",
+        "evaluation.episodes=1",
+        "curriculum=mixture",
+    ]
+    trained = {}
+    for name, interval in (("often", "null"), ("once", 400)):
+        smoke(tmp_path / name, *small, f"evaluation_interval={interval}", "total_frames=400", "checkpoint_interval=400")
+        tensors = checkpoint.flatten(checkpoint.read(tmp_path / name / "checkpoints/last")[0])[0]
+        rows = read_csv(tmp_path / name / "metrics.csv")
+        metrics = [{key: row[key] for key in row if key.partition("/")[0] not in ("eval", "time")} for row in rows]
+        trained[name] = {key: value.tolist() for key, value in tensors.items()}, metrics
+        assert sum("eval/occupancy" in row for row in rows) == {"often": 20, "once": 1}[name]
+    assert trained["often"] == trained["once"]
 
 
 def make_env(first, count):

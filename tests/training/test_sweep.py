@@ -7,6 +7,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commands import TINY
 from hydra import compose
@@ -18,7 +19,8 @@ from pickplace.config.composition import config_files
 from pickplace.config.hydra_app import constant_keys, folder_name, sweep_words
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import FAILURE
-from pickplace.training.sweep import group_by_setting, label, read_run, summarize
+from pickplace.training import sweep
+from pickplace.training.sweep import group_by_setting, label, read_run, results, summarize
 
 SMOKE = ["experiment=smoke", "threads=1"]
 
@@ -32,7 +34,7 @@ def is_png(path):
     return path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 10_000
 
 
-def make_run(folder, name, overrides, occupancies, total=1000, failure=None):
+def make_run(folder, name, overrides, occupancies, total=1000, failure=None, ended=""):
     """A run folder as a job of a sweep leaves it, validated every 100 frames."""
     run_dir = folder / name
     (run_dir / ".hydra").mkdir(parents=True)
@@ -42,6 +44,9 @@ def make_run(folder, name, overrides, occupancies, total=1000, failure=None):
     (run_dir / "metrics.csv").write_text("\n".join(["frames,eval/occupancy,eval/ci95_low,eval/ci95_high", *rows, ""]))
     if failure:
         (run_dir / FAILURE).write_text(failure)
+    if ended:
+        facts = {"ended": ended, "frames": 100 * len(occupancies), "config": {"total_frames": total}}
+        checkpoint.write(run_dir / "checkpoints/last", {}, facts)
 
 
 def test_the_table_shows_how_every_run_ended(tmp_path):
@@ -82,7 +87,7 @@ def test_settings_are_compared_over_their_seeds(tmp_path, caplog):
     assert 0.22 < low < 0.32 and 0.68 < high < 0.78  # 0.5 +- 1.96 * 0.261 / sqrt(5), roughly
     assert (rows[1]["mean_ci95_low"], rows[1]["mean_ci95_high"]) == ("", "")  # one seed
     assert [float(rows[2][f"mean_ci95_{end}"]) for end in ("low", "high")] == pytest.approx([0.5, 0.7])  # the range
-    assert "curriculum=none" in caplog.messages[0] and caplog.messages[0].startswith("0.6000 (0.5000 to 0.7000)")
+    assert "curriculum=none" in caplog.messages[0] and caplog.messages[0].startswith("0.6000  (0.5000 to 0.7000)")
     assert "seed" not in rows[0] and len(table(tmp_path)) == 10
 
 
@@ -127,6 +132,39 @@ def test_a_curve_is_the_mean_of_runs_that_end_at_different_frames(tmp_path):
     make_run(tmp_path, "1", ["seed=1"], [0.4, 0.6], total=200)  # as after early stopping
     frames, values = group_by_setting([read_run(tmp_path / "0"), read_run(tmp_path / "1")])[0].curves
     assert frames.tolist() == [100, 200, 300] and values.mean(1) == pytest.approx([0.3, 0.5, 0.7])
+
+
+def test_tables_and_figure_show_seeds_early_ends_and_frames(tmp_path, monkeypatch):
+    for seed, (occupancies, ended) in enumerate((([0.2, 0.4, 0.8], ""), ([0.4, 0.6], "perhaps luck"))):
+        make_run(tmp_path, str(seed), [f"seed={seed}"], occupancies, total=300, ended=ended)
+    make_run(tmp_path, "2", ["seed=2"], [0.5], total=300)
+    figures = []
+    monkeypatch.setattr(sweep, "save", lambda figure, path: figures.append(figure))
+    settings = summarize(tmp_path)
+    assert results(settings) == [
+        "0.7000  (0.6000 to 0.8000)  2 seeds  200 to 300 frames  all runs (1 ended early, 1 stopped)"
+    ]
+    assert [row["ended"] for row in table(tmp_path)] == ["", "perhaps luck", ""]
+    (row,) = table(tmp_path, "sweep_settings.csv")
+    assert [row[key] for key in ("ended_early", "least_frames", "most_frames")] == ["1", "200", "300"]
+    (axes,) = figures[0].axes
+    drawn = {(line.get_marker(), line.get_linestyle()): line.get_xydata().tolist() for line in axes.lines[:-3]}
+    assert drawn == {
+        ("None", "-"): [[100, 0.4], [200, 0.6]], ("X", "None"): [[200, 0.6]], (".", "--"): [[100, 0.5]],
+        ("o", "-"): pytest.approx(np.array([[100, 0.3], [200, 0.5], [300, 0.7]])),
+    }  # fmt: skip
+    figures[0].draw_without_rendering()
+    assert not axes.get_legend().get_window_extent().overlaps(axes.get_window_extent())
+
+
+def test_a_single_run_is_drawn_with_the_interval_of_its_episodes(tmp_path, monkeypatch):
+    make_run(tmp_path, "0", [], [0.2, 0.4], total=200)
+    figures = []
+    monkeypatch.setattr(sweep, "save", lambda figure, path: figures.append(figure))
+    summarize(tmp_path)
+    [band] = figures[0].axes[0].collections
+    corners = band.get_paths()[0].vertices
+    assert (corners[:, 1].min(), corners[:, 1].max()) == pytest.approx((0.19, 0.41))
 
 
 def test_a_sweep_over_seeds_ends_in_a_row_for_each_setting(run, tmp_path, no_report):

@@ -63,6 +63,14 @@ def test_the_height_map_lies_as_the_tote():
     assert (plan.get_xlabel(), plan.get_ylabel()) == ("x (cells)", "y (cells)")
 
 
+def test_the_height_map_of_a_full_tote_shows_the_items_on_top():
+    """The first one is covered; the lines are the sides of the other two."""
+    boxes, size = [(0, 0, 0, 3, 2, 1), (0, 0, 1, 1, 2, 1), (1, 0, 1, 2, 2, 1)], (3, 2, 2)
+    plan = draw_scene(recording_of(boxes, size), CellSpec(tote_size=size), item_colours(boxes)).axes[1]
+    [sides] = plan.collections
+    assert [path.vertices.tolist() for path in sides.get_paths()] == [[[0.5, y - 0.5], [0.5, y + 0.5]] for y in (0, 1)]
+
+
 @pytest.mark.parametrize(("x", "y"), [(2, 0), (0, 3)])
 def test_the_picture_in_3d_shows_items_where_they_lie(x, y):
     """The middle of a cube is half a cell above that of the floor below it."""
@@ -125,6 +133,7 @@ def test_learning_curve(rows, tmp_path):
     metrics.write_text(rows)
     learning_curve(metrics, path)
     assert path.read_bytes().startswith(b"\x89PNG")
+    assert path.with_suffix(".pdf").read_bytes().startswith(b"%PDF") and "<svg" in path.with_suffix(".svg").read_text()
 
 
 RESULT = {

@@ -156,9 +156,9 @@ def colours_on_canvas(browser):
     )
 
 
-def written(tmp_path, recordings, cell):
+def written(tmp_path, recordings, cell, at_end=False):
     path = tmp_path / "replay.html"
-    path.write_text(replay.page(recordings, cell, "title"), encoding="utf-8")
+    path.write_text(replay.page(recordings, cell, "title", at_end), encoding="utf-8")
     return path
 
 
@@ -193,6 +193,15 @@ def test_page_opens_steps_plays_and_changes_episodes(browser, tmp_path):
     assert errors(browser) == []
     fetched = browser.execute_script("return performance.getEntriesByType('resource').map(e => e.name)")
     assert [name for name in fetched if not name.startswith(("data:", "blob:"))] == []
+
+
+def test_page_opens_at_the_end(browser, tmp_path):
+    cell, result = record("paper", "policy")
+    state = open_page(browser, written(tmp_path, result.recordings[1:], cell, at_end=True))
+    moves = len(result.recordings[1].moves)
+    assert (state()["episode"], state()["at"]) == (1, moves) and not state()["playing"]
+    browser.find_element("id", "play").click()
+    wait_until(browser, f"replay.state().at < {moves}")
 
 
 def test_page_of_very_many_moves(browser, tmp_path):
