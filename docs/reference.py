@@ -5,6 +5,8 @@ from pathlib import Path
 
 import yaml
 
+from pickplace.config.help import GROUPS
+
 CONF = Path(__file__).resolve().parent.parent / "conf"
 PAGE = Path(__file__).with_suffix(".md")
 PRESETS = ("benchmark", "experiment")  # groups whose options set keys of others
@@ -155,7 +157,7 @@ def page() -> str:
         out += [*table(file, files), ""]
     groups = list(dict.fromkeys(group for group, _ in files if group not in ("", *PRESETS)))
     for group in [*groups, *PRESETS]:
-        out += [f"## `{group}`", ""]
+        out += [f"## `{group}`", "", f"Purpose: {GROUPS[group]}.", ""]
         for file in (file for file in files.values() if file.group == group):
             out += [f"### `{group}={file.name}`", "", file.text]
             bases = [f"`{group}={base}`" for base in file.bases]

@@ -20,7 +20,7 @@ from tensordict import TensorDict
 from pickplace.algorithms.base import Task
 from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
-from pickplace.evaluation import artifacts, evaluate
+from pickplace.evaluation import artifacts, command, evaluate
 from pickplace.rules.observation import STANDARD_TERMS
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
@@ -79,7 +79,7 @@ def _composed(name, overrides):
 @contextmanager
 def evaluation_config(*words):
     """Compose the config of an evaluation once, with what Hydra knows of the command line while it runs."""
-    words = [f"++{word}" if word.partition(".")[0] in evaluate.TRAINED else word for word in words]
+    words = [f"++{word}" if word.partition(".")[0] in command.TRAINED else word for word in words]
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         merged = compose("evaluate", words, return_hydra_config=True)
         HydraConfig.instance().set_config(merged)
@@ -163,11 +163,11 @@ def write_to(folder):
 def _train(overrides, output, context):
     write_to(output)
     multiprocessing.set_start_method("spawn", force=True)  # as in a process that nobody forked
-    from pickplace.training import train
+    from pickplace.training import command
 
     sys.argv = ["pickplace-train", *overrides]
     with context():
-        train.main()
+        command.main()
 
 
 def assert_same(run_a, run_b):

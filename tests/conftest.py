@@ -12,7 +12,8 @@ from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hypothesis import HealthCheck, settings
 
-from pickplace.evaluation import evaluate
+from pickplace.evaluation import command as evaluate
+from pickplace.training import command as train_command
 from pickplace.training import train
 from pickplace.training.trainer import Trainer
 
@@ -26,7 +27,7 @@ multiprocessing.set_start_method("forkserver", force=True)
 # Hydra's config files are read faster in C.
 yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
-MAINS = {"train": train.main, "evaluate": evaluate.main}
+MAINS = {"train": train_command.main, "evaluate": evaluate.main}
 
 
 @pytest.fixture

@@ -6,6 +6,8 @@ import os
 import re
 import signal
 import sys
+from collections import defaultdict
+from collections.abc import Collection
 from contextlib import AbstractContextManager, contextmanager, suppress
 from difflib import get_close_matches
 from typing import Any, NoReturn
@@ -34,7 +36,9 @@ class Parser(argparse.ArgumentParser):
             self.add_argument(*names.split("/"), **arguments)
 
     def error(self, message: str) -> NoReturn:
-        raise ValueError(f"{message}; expected the arguments that --help shows.")
+        unknown = re.match("unrecognized arguments: ([^ =]*)", message)
+        close = get_close_matches(unknown[1], self._option_string_actions, 1) if unknown else []
+        raise ValueError(f"{message}; expected {close[0] if close else 'the arguments that --help shows'}.")
 
 
 #: Errors caused by the user or the machine. Any other may be a fault of the program, and its type is printed too.
@@ -118,13 +122,14 @@ def needs_extra(group: str, extra: str) -> AbstractContextManager:
     )
 
 
-def unknown_key(key: str, node: DictConfig | dict, prefix: str = "") -> str:
+def unknown_key(key: str, node: DictConfig | dict, prefix: str = "", others: Collection[str] = ()) -> str:
     """Return a sentence on a key that is not in a config, with the keys that are.
 
     Args:
         key: the whole key, such as ``algo.gama``.
         node: the config, or the part of it at ``prefix``.
         prefix: place of the part, with a dot at its end.
+        others: whole names, of keys and groups, one of which may be meant.
     """
     *parents, leaf = key.removeprefix(prefix).split(".")
     for parent in parents:
@@ -136,7 +141,26 @@ def unknown_key(key: str, node: DictConfig | dict, prefix: str = "") -> str:
             return f"{short_text(key)}: {place} is {value}, without keys; expected an option that gives it some."
         prefix, node = f"{prefix}{parent}.", child
     known = [str(name) for name in node if name not in ("_target_", "hydra")]
-    close = get_close_matches(leaf, known, 1)
-    others = f"expected one of {', '.join(known)}." if known else "expected no key."
-    hint = f"did you mean {close[0]!r}?" if close else others
+    close = get_close_matches(leaf, known, 1) if prefix or not others else []
+    close = close or full_names(key, others)
+    expected = f"expected one of {', '.join(known)}." if known else "expected no key."
+    hint = f"did you mean {' or '.join(map(repr, close))}?" if close else expected
     return f"{short_text(key)}: there is no key {short_text(leaf)!r} in {prefix[:-1] or 'the config'}; {hint}"
+
+
+def full_names(key: str, names: Collection[str]) -> list[str]:
+    """Return the names of keys and groups that a misspelt name may mean, or one without its beginning; at most four.
+
+    ``rotations`` and ``env.rotation`` mean ``env.rotations``, and ``frames`` any name that ends so.
+    """
+    endings = defaultdict(list)
+    for name in names:
+        words = _words(name)
+        for start in range(len(words)):
+            endings["_".join(words[start:])].append(name)
+    close = get_close_matches("_".join(_words(key)), endings, 1, 0.7)
+    return [key] if key in names else endings[close[0]][:4] if close else []
+
+
+def _words(name: str) -> list[str]:
+    return re.findall("[^\\W_]+", name)

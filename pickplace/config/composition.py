@@ -18,12 +18,16 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pickplace.common.errors import unknown_key
-from pickplace.common.validate import refuse_if
+from pickplace.common.validate import excerpt, refuse_if
+from pickplace.config.allowlist import walk
 from pickplace.config.registry import REGISTRY, names_at
 
 #: Groups whose settings in a preset belong to the experiment, so another option on the command line keeps them. Of
 #: ``KEPT`` it keeps all, of ``SHARED`` the plain values that it has itself, such as ``algo.lr``.
 KEPT, SHARED = ("env", "evaluation"), ("algo", "model")
+
+#: Keys of Hydra's that users of the commands set.
+HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.searchpath", "hydra.verbose")
 
 #: Sweepers and launchers of Hydra that are optional extras.
 PLUGINS = ("optuna", "joblib", "submitit")
@@ -54,14 +58,14 @@ def parse(words: Iterable[str]) -> list[Override]:
 
 @cache
 def compose_plain(config_name: str) -> DictConfig:
-    """Return the config of a file in ``conf/``, outside a Hydra application too. It is shared: do not change it."""
+    """Return the config of a file in ``conf/``, with the node ``hydra``. It is shared: do not change it."""
     with nullcontext() if GlobalHydra().is_initialized() else config_files():
-        return hydra.compose(config_name)
+        return hydra.compose(config_name, return_hydra_config=True)
 
 
 def merge_search_path(words: list[str], folders: Iterable[str]) -> list[str]:
     """Return words of a command line with all the user's folders of config files in one override, if there are any."""
-    search = _search_words(words)
+    search = search_words(words)
     values: list = [override.value() for override in parse(search)]
     paths = [f"file://{Path(folder).absolute()}" for folder in folders]
     paths += [path for value in values for path in (value if isinstance(value, list) else [value])]
@@ -76,7 +80,7 @@ def quoted(value) -> str:
 
 def compose_first_job(config_name: str, words: list[str]) -> DictConfig:
     """Return Hydra's merge of a command line, with the node ``hydra``; for a sweep, the merge of its first job."""
-    parse(words)  # an error of these names the word
+    _refuse_options_as_values(words)
     try:
         return hydra.compose(config_name, _first_of_sweep(words), return_hydra_config=True)
     except HydraException as error:
@@ -84,13 +88,34 @@ def compose_first_job(config_name: str, words: list[str]) -> DictConfig:
     except (ValueError, TypeError) as error:  # Hydra's own, which names no key
         for word in words:  # a group without an option, allowed for presets only
             group, _, option = word.lstrip("+").partition("=")
-            if option in ("null", "") and (names := _options(group, _search_words(words))):
+            if option in ("null", "") and (names := group_options(group, search_words(words))):
                 raise ValueError(f"{word}: expected {group}=<one of {', '.join(sorted(names))}>.") from error
         raise ValueError(f"{' '.join(words)}: {error}.") from error
 
 
-def _options(group: str, search: list[str]) -> list[str]:
-    return GlobalHydra.instance().config_loader().get_group_options(group, overrides=search)
+def _refuse_options_as_values(words: list[str]) -> None:
+    """Refuse an option that is given to a place of the config, such as ``env.gripper=paper``, instead of its group."""
+    search = search_words(words)
+    for override in parse(words):
+        place, value = override.key_or_group.replace("/", "."), override.value()
+        for group in {place.replace(".", "/"), place.rpartition(".")[2]} - {override.key_or_group}:
+            options = group_options(group, search) if isinstance(value, str) else []
+            if options and place in (own := group.replace("/", "."), f"{_package(group, options)}.{own}"):
+                known = value if value in options else f"<one of {', '.join(options)}>"
+                raise ValueError(f"{override.key_or_group}={excerpt(value)}: expected {group}={known}.")
+
+
+def known_names(cfg: DictConfig) -> list[str]:
+    """Return the names that a command line may set: the groups of a config with its node ``hydra``, and its keys."""
+    own = OmegaConf.to_container(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]))
+    groups = [group for group in cfg.hydra.runtime.choices if not group.startswith("hydra/")]
+    keys = [path for path, value in walk(own) if not isinstance(value, dict) and path[-1] != "_target_"]
+    return [*groups, *HYDRA_KEYS, *(".".join(path) for path in keys if all(isinstance(key, str) for key in path))]
+
+
+def group_options(group: str, search: Iterable[str] = ()) -> list[str]:
+    """Return the names of a group's options, also those in folders of these overrides of the search path."""
+    return GlobalHydra.instance().config_loader().get_group_options(group, overrides=list(search))
 
 
 def _first_of_sweep(words: list[str]) -> list[str]:
@@ -112,18 +137,19 @@ def clearer_error(error: HydraException, config_name: str, words: list[str]) -> 
                 return ValueError(f"{missing}: {extra} is missing; pip install 'pickplace[{extra}]'.")
         if error.options:
             return ValueError(f"{missing}: there is no such config; expected one of {', '.join(error.options)}.")
-    if not (key := re.match("Could not override '(.*)'", str(error))):
+    if not (key := re.match("Could not (?:override|delete from config.) '([^']*)'", str(error))):
         return ValueError(str(error))
     others = [word for word in words if word.lstrip("+~").partition("=")[0] != key[1]]
     with nullcontext() if GlobalHydra().is_initialized() else config_files():
         try:
-            known = hydra.compose(config_name, _first_of_sweep(others))
+            known = hydra.compose(config_name, _first_of_sweep(others), return_hydra_config=True)
         except (HydraException, OmegaConfBaseException, ValueError):  # others are wrong, too
-            known = hydra.compose(config_name, _search_words(words))
-    return ValueError(unknown_key(key[1], known))
+            known = hydra.compose(config_name, search_words(words), return_hydra_config=True)
+    return ValueError(unknown_key(key[1], known, others=known_names(known)))
 
 
-def _search_words(words: Iterable[str]) -> list[str]:
+def search_words(words: Iterable[str]) -> list[str]:
+    """Return the words of a command line that set the folders with config files."""
     return [word for word in words if word.lstrip("+").startswith("hydra.searchpath=")]
 
 
@@ -136,7 +162,7 @@ def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> N
         return
     for key, node in cast(dict, cfg).items():
         if key not in known:
-            raise ValueError(unknown_key(f"{path}{key}", known, path))
+            raise ValueError(unknown_key(f"{path}{key}", known, path, () if path else known_names(known)))
         if OmegaConf.is_dict(node) and OmegaConf.is_dict(known[key]) and "_target_" not in node:
             refuse_unknown_keys(node, known[key], f"{path}{key}.")
 
@@ -150,7 +176,7 @@ def own_values(cfg: DictConfig) -> DictConfig:
     values on the command line, but for :data:`KEPT` and :data:`SHARED`.
     """
     running = HydraConfig.get()
-    search = _search_words(running.overrides.hydra)
+    search = search_words(running.overrides.hydra)
     given = [(override, *_package_and_places(override, search)) for override in parse(task_overrides())]
     choices = [(each, places) for each, package, places in given if package and not each.is_delete()]
     pairs = [(place, choice) for choice, places in choices for place in places if place not in KEPT]
@@ -194,7 +220,7 @@ def places_in_other_groups(word: str) -> list[str]:
     """
     (override,) = parse([word])
     group = override.key_or_group
-    package, places = _package_and_places(override, _search_words(HydraConfig.get().overrides.hydra))
+    package, places = _package_and_places(override, search_words(HydraConfig.get().overrides.hydra))
     if package is None or override.package or package in ("_global_", group.replace("/", ".")):
         return []
     refuse_if(
@@ -212,19 +238,25 @@ def _package_and_places(override: Override, search: list[str]) -> tuple[str | No
         places that it changes. For a value that is its key. For an option it is the group's package, or the option's
         keys there if the package is another group's.
     """
-    group, sources = override.key_or_group, GlobalHydra.instance().config_loader().get_sources()
-    paths = [f"{group}/{name}" for name in _options(group, search)]  # all have the same package
-    if not paths or isinstance(override.value(), (dict, list)):
+    group = override.key_or_group
+    options = group_options(group, search)
+    if not options or isinstance(override.value(), (dict, list)):
         return None, [group]
-    files = (source.load_config(path) for path in paths for source in sources if source.is_config(path))
     own = override.package or group.replace("/", ".")
-    package: Any = override.package or next((file.header for file in files), {}).get("package") or own
+    package: Any = override.package or _package(group, options)
     if package == "_global_" or override.value() is None:
         return package, []
     if package == own or override.is_delete():
         return package, [own if package == own else f"{package}.{own}"]
     part = _part_at(hydra.compose(None, [*search, _line(override, "+")]), package)
     return package, [f"{package}.{key}" for key in part or ()]
+
+
+def _package(group: str, options: list[str]) -> str:
+    """Return the package of a group's options, which is the same for all, such as ``env`` for ``gripper``."""
+    sources, paths = GlobalHydra.instance().config_loader().get_sources(), [f"{group}/{name}" for name in options]
+    files = (source.load_config(path) for path in paths for source in sources if source.is_config(path))
+    return next((file.header for file in files), {}).get("package") or group.replace("/", ".")
 
 
 def _is_in(place: str, outer: str) -> bool:

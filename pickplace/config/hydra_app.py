@@ -7,6 +7,8 @@ import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from difflib import get_close_matches
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,32 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from pickplace.common.errors import Parser, one_sentence, sentence, write_output
+from pickplace.common.errors import Parser, full_names, one_sentence, sentence, write_output
+from pickplace.common.interrupts import import_quietly
 from pickplace.common.validate import refuse_any, refuse_if, reworded
 from pickplace.config import composition
+from pickplace.config.help import help_text
 
 log = logging.getLogger(__name__)
+
+#: The flags for folders of config files, and the others, as arguments of :class:`Parser`.
+FOLDERS: dict[str, dict[str, Any]] = {"--config-dir/-cd": {"action": "append", "default": []}}
+SWITCHES = (
+    "--help/-h",
+    "--multirun/-m",
+    "--run/-r",
+    "--resolve",
+    "--hydra-help",
+    "--version",
+    "--shell-completion/-sc",
+)
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--cfg/-c": {"choices": ["job", "hydra", "all"]},
+    "--package/-p": {},
+    "--info/-i": {"nargs": "?", "const": "all"},
+    **dict.fromkeys([*SWITCHES, "--shell-completion/-sc"], {"action": "store_true"}),
+}
+FLAGS = [name for names in (*FOLDERS, *OPTIONS) for name in names.split("/")]
 
 LONGEST_NAME = 150  # letters of the name of a run folder; file systems allow 255 bytes
 
@@ -31,16 +54,18 @@ class Command:
 
     Args:
         config_name: the file in ``conf/``.
-        task: the function.
-        folders: refuses and cleans the folders of runs: :mod:`pickplace.runs.folder`; None: only help is asked for.
-        from_checkpoint: groups whose keys a checkpoint brings; overrides of them reach ``task`` unchecked.
+        task: dotted path of the function. Its module, which may take seconds, is imported after all checks.
+        folders: refuses and cleans the folders of runs: :mod:`pickplace.runs.folder`.
+        from_checkpoint: groups whose keys a checkpoint brings, which ``check`` and ``task`` check.
+        check: called with the config, to refuse it.
         after_sweep: called with the folder of a sweep, however it ends.
     """
 
     config_name: str
-    task: Callable[[DictConfig, Path], Any] = lambda cfg, run_dir: None
-    folders: Any = None
+    task: str
+    folders: Any
     from_checkpoint: tuple[str, ...] = ()
+    check: Callable[[DictConfig], Any] = lambda cfg: None
     after_sweep: Callable[[Path], Any] | None = None
 
     def __call__(self) -> None:
@@ -49,8 +74,9 @@ class Command:
         The config of the run, or of the first run of a sweep, is composed and checked before anything is written.
         """
         with one_sentence():
+            self._refuse_flags(sys.argv[1:])
             words, flags, options = read_command_line(sys.argv[1:])
-            words = [f"++{word}" if word.partition(".")[0] in self.from_checkpoint else word for word in words]
+            words = [f"++{word}" if self._is_of_checkpoint(word, words) else word for word in words]
             if options.info or options.hydra_help or options.version or options.shell_completion:
                 return self._start(words, flags)
             with composition.config_files():
@@ -59,14 +85,36 @@ class Command:
                 keys = [str(key) for key in merged if key != "hydra"]
                 cfg = composition.own_values(OmegaConf.masked_copy(merged, keys))
                 OmegaConf.set_struct(cfg, True)
+                if options.help:
+                    return write_output(help_text(self.config_name, merged))
                 if options.cfg == "job":
                     return show(cfg, options)
-                if not (options.help or options.cfg):
+                if not options.cfg:
                     self._checked(cfg)
-            if options.help or options.cfg:
+                    self.check(cfg)
+            if options.cfg:
                 return self._start(words, flags)
             is_sweep = options.multirun or merged.hydra.mode == RunMode.MULTIRUN
             return self._run(merged, None if is_sweep else cfg, words, flags)
+
+    def _is_of_checkpoint(self, word: str, words: list[str]) -> bool:
+        """Return whether a word of the command line overrides a key that a checkpoint brings."""
+        group = word.partition(".")[0]
+        is_given = any(re.fullmatch("[+]*checkpoint=(?!null$).+", each) for each in words)
+        return group in self.from_checkpoint and (is_given or group not in composition.compose_plain(self.config_name))
+
+    def _refuse_flags(self, arguments: list[str]) -> None:
+        """Refuse words that begin with a dash and are no flags; the message suggests the flag or key that is meant."""
+        for flag, following in zip(arguments, [*arguments[1:], ""], strict=False):
+            name, _, value = flag.partition("=")
+            if not name.startswith("-") or name in FLAGS:
+                continue
+            keys = full_names(name.lstrip("-"), composition.known_names(composition.compose_plain(self.config_name)))
+            close = get_close_matches(name, FLAGS, 1, 0.8)
+            if not value:
+                value = "<value>" if not following or following.startswith("-") or "=" in following else following
+            meant = close or [f"{key}={value}" for key in keys] or ["<key>=<value>"]
+            raise ValueError(f"{name}: there is no such flag, and keys have no dashes; expected {' or '.join(meant)}.")
 
     def _checked(self, cfg: DictConfig) -> DictConfig:
         refuse_any(sorted(OmegaConf.missing_keys(cfg)), lambda key: f"{key}: no value; expected {key}=<value>.")
@@ -95,7 +143,7 @@ class Command:
                 cfg = checked or self._checked(composition.own_values(hydras))
                 if running.output_subdir is not None and cfg != hydras:  # correct Hydra's note on its merge
                     OmegaConf.save(cfg, run_dir / running.output_subdir / "config.yaml")
-                return self.task(cfg, run_dir)
+                return getattr(import_module(module), name)(cfg, run_dir)
             except Exception as error:
                 if not is_sweep:  # raised when Hydra has ended, which would print lines of its own
                     return errors.append(error)
@@ -108,6 +156,8 @@ class Command:
         path = merged.hydra[kind].dir  # fixed from here on: it may hold the time
         folder, notes, is_done = Path(path), [".hydra", f"{merged.hydra.job.name}.log"], False
         (self.folders.refuse_for_sweep if is_sweep else self.folders.refuse_for_run)(folder, notes)
+        module, _, name = self.task.rpartition(".")
+        import_quietly(module)
         try:
             self._start([*settings, *words, f"hydra.{kind}.dir={composition.quoted(path)}"], flags, app)
             if errors:
@@ -135,22 +185,14 @@ def read_command_line(arguments: list[str]) -> tuple[list[str], list[str], argpa
     """Return the overrides of a command line, its flags for Hydra, and the values of these.
 
     Folders of ``--config-dir``, which may be given several times, are among the overrides, as Hydra's search path.
-    A ``ValueError`` names an unknown flag, or a folder that does not exist.
+    A ``ValueError`` names a flag with a bad value, or a folder that does not exist.
     """
     settings: dict = {"add_help": False, "allow_abbrev": False}
-    first = Parser({"--config-dir/-cd": {"action": "append", "default": []}}, **settings)
+    first = Parser(FOLDERS, **settings)
     folders, rest = first.parse_known_args(arguments)
     for folder in folders.config_dir:
         refuse_if(not Path(folder).is_dir(), f"--config-dir {folder}: no such folder; expected one with config files.")
-    switches = ["--help/-h", "--multirun/-m", "--run/-r", "--resolve", "--hydra-help", "--version"]
-    others: dict[str, dict[str, Any]] = {
-        "words": {"nargs": "*"},
-        "--cfg/-c": {"choices": ["job", "hydra", "all"]},
-        "--package/-p": {},
-        "--info/-i": {"nargs": "?", "const": "all"},
-        **dict.fromkeys([*switches, "--shell-completion/-sc"], {"action": "store_true"}),
-    }
-    options = Parser(others, **settings).parse_intermixed_args(rest)
+    options = Parser({"words": {"nargs": "*"}, **OPTIONS}, **settings).parse_intermixed_args(rest)
     return (
         composition.merge_search_path(options.words, folders.config_dir),
         [word for word in rest if word not in options.words],

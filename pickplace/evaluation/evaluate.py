@@ -1,18 +1,17 @@
-"""The ``pickplace-evaluate`` command: one code path for every planner, on fixed item streams."""
+"""An evaluation: one code path for every planner, on fixed item streams."""
 
 import logging
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 
 from pickplace.common.machine import use_machine
 from pickplace.common.validate import refuse_if
 from pickplace.config.allowlist import own_modules, trusted_config
-from pickplace.config.composition import apply_overrides, places_in_other_groups, task_overrides
-from pickplace.config.hydra_app import Command
 from pickplace.config.registry import build
 from pickplace.evaluation.artifacts import Artifacts, evaluation_table
+from pickplace.evaluation.command import TRAINED, merge_trained
 from pickplace.evaluation.play import MakeEnv, carry_out, check_episode_settings, check_play, decision_latency, play
 from pickplace.evaluation.result import (
     describe,
@@ -31,14 +30,6 @@ from pickplace.runs import checkpoint, folder
 from pickplace.runs.provenance import first_steps
 
 log = logging.getLogger(__name__)
-
-#: Config groups that an evaluation takes from the checkpoint.
-TRAINED = ("env", "items", "model")
-
-
-def main() -> None:
-    """Entry point of ``pickplace-evaluate``."""
-    Command("evaluate", run, folder, from_checkpoint=TRAINED)()
 
 
 def run(cfg: DictConfig, run_dir: Path) -> float:
@@ -89,10 +80,6 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
     """
     ev = cfg.evaluation
     check_episode_settings(ev)
-    refuse_if(
-        "model" in cfg and cfg.checkpoint is None,
-        "model: there are no settings of a model without checkpoint=<run folder>.",
-    )
     own_modules(cfg.trust)
     use_machine(cfg)
     settings = {key: value for key, value in resolved(cfg.planner).items() if key != "_target_"}
@@ -134,18 +121,7 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
     place = checkpoint.locate(str(cfg.checkpoint))
     state, saved = checkpoint.read(place)
     trained = trusted_config(saved["config"], cfg.trust)
-    groups = OmegaConf.create({key: resolved(cfg[key]) for key in ("env", "items")})
-    ours, changed = [], trained.copy()
-    for word in task_overrides():
-        key, _, option = word.lstrip("+~").partition("=")
-        if key == "benchmark":
-            ours += ["env=benchmark", "items=benchmark"] if option not in ("", "null") else []
-        elif places := places_in_other_groups(word):
-            for part in places:  # such as env.reach
-                OmegaConf.update(changed, part, OmegaConf.select(groups, part), merge=False, force_add=True)
-        elif key.split(".")[0] in TRAINED:
-            ours.append(word)
-    merged = apply_overrides(changed, ours, groups)
+    merged = merge_trained(cfg, trained)
     with open_dict(cfg):
         for group in TRAINED:  # resolved where they come from: here a reference could lead elsewhere
             cfg[group] = resolved(merged[group])

@@ -3,16 +3,16 @@
 import argparse
 
 from pickplace.common.errors import Parser, one_sentence, write_output
+from pickplace.common.interrupts import import_quietly
 
 
 def main() -> None:
     """Entry point of ``pickplace-export``."""
     with one_sentence():
         arguments = parser().parse_args()
-        from pickplace.policies.onnx_model import export_onnx  # not before help is answered
-
+        export = import_quietly("pickplace.policies.onnx_model").export_onnx
         sizes = {} if arguments.rotations is None else {"rotations": arguments.rotations}
-        differences = export_onnx(arguments.checkpoint, arguments.file, arguments.trust, **sizes)
+        differences = export(arguments.checkpoint, arguments.file, arguments.trust, **sizes)
         totes = ", ".join(f"{wide}x{deep}" for wide, deep in differences)
         write_output(
             f"{arguments.file}: onnxruntime agrees with torch at totes of {totes} cells; greatest difference "

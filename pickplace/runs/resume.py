@@ -15,8 +15,8 @@ from pickplace.common.errors import WorkerDied, sentence
 from pickplace.common.validate import MAX_COUNT, excerpt, is_name, is_whole, number, refuse_if, reworded, whole_number
 from pickplace.config.allowlist import modules_to_trust, own_modules, saved_form, trusted_config
 from pickplace.config.composition import apply_overrides, compose_plain, parse, refuse_unknown_keys
-from pickplace.runs import checkpoint
 from pickplace.runs.folder import refuse_occupied, refuse_training
+from pickplace.runs.locate import CheckpointError, locate, read_facts
 
 log = logging.getLogger(__name__)
 
@@ -136,10 +136,11 @@ def interrupted_run(cfg: DictConfig, run_dir: Path) -> tuple[dict, dict, Path] |
     Raises:
         OccupiedError: if the folder holds a run with another config.
     """
+    from pickplace.runs.checkpoint import read  # here, so that a resume is checked before torch is imported
+
     try:
-        folder = checkpoint.locate(run_dir, prefer="last")
-        state, facts = checkpoint.read(folder)
-    except checkpoint.CheckpointError:
+        state, facts = read(folder := locate(run_dir, prefer="last"))
+    except CheckpointError:
         refuse_occupied(run_dir)
         return None
     refuse_training(not has_config(facts, saved_form(cfg)) or "curriculum" not in facts, run_dir)
@@ -157,7 +158,7 @@ def stale_best_frames(run_dir: Path, frames: int, config: dict) -> int | None:
         frames: frames trained so far.
         config: the settings from now on, in the form that checkpoints hold.
     """
-    facts = checkpoint.read_facts(run_dir)
+    facts = read_facts(run_dir)
     return facts["frames"] if facts and facts["frames"] > frames and not has_config(facts, config) else None
 
 
@@ -216,7 +217,7 @@ def checkpoint_hint(
     """
 
     def hinted(error: Exception) -> Exception:
-        is_kept = isinstance(error, (FloatingPointError, WorkerDied, checkpoint.CheckpointError))
+        is_kept = isinstance(error, (FloatingPointError, WorkerDied, CheckpointError))
         kind, folder = type(error) if is_kept else ValueError, latest()
         whole = f"What was saved before is whole: pickplace-train resume={folder}{arguments}"
         return kind(f"{sentence(error).rstrip('.')}. {whole if folder else 'Nothing had been saved before.'}")

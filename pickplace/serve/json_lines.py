@@ -13,6 +13,7 @@ import numpy as np
 
 from pickplace.common.errors import Parser, one_sentence, write_output
 from pickplace.common.files import read_file, read_text
+from pickplace.common.interrupts import import_quietly
 from pickplace.common.validate import first_line, refuse_if, reworded, whole_number
 from pickplace.robot.box import DepthMapError
 from pickplace.serve.request import MAX_REQUEST, PLAN_OPTIONS, PlanRequest, answer
@@ -26,7 +27,9 @@ MAX_MAP = 2**26  # greatest size of a .npy file, in bytes
 @one_sentence()
 def main() -> None:
     """Entry point of ``pickplace-plan``."""
-    run(parser().parse_args())
+    options = parser().parse_args()
+    import_quietly("pickplace.robot.planner")
+    run(options)
 
 
 def parser() -> argparse.ArgumentParser:

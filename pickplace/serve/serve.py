@@ -6,6 +6,7 @@ import os
 import socket
 
 from pickplace.common.errors import Parser, one_sentence, write_output
+from pickplace.common.interrupts import import_quietly
 from pickplace.common.validate import excerpt, number, refuse_if, short_text, whole_number
 from pickplace.serve.json_lines import load_planner, planner_options
 
@@ -16,7 +17,9 @@ LEAST_TOKEN = 16  # letters
 @one_sentence()
 def main() -> None:
     """Entry point of ``pickplace-serve``."""
-    run(parser().parse_args())
+    options = parser().parse_args()
+    import_quietly("pickplace.robot.planner")
+    run(options)
 
 
 def parser() -> argparse.ArgumentParser:

@@ -20,8 +20,8 @@ import numpy as np
 from pickplace.common.errors import one_sentence, sentence
 from pickplace.common.files import read_text, replaced_file
 from pickplace.common.validate import expect, refuse_if
-from pickplace.runs.checkpoint import read_facts
 from pickplace.runs.folder import FAILURE, is_claimed, read_note
+from pickplace.runs.locate import read_facts
 from pickplace.runs.loggers import read_csv
 from pickplace.views.figures import figure_of, save
 

@@ -1,4 +1,4 @@
-"""The training loop, and the ``pickplace-train`` command."""
+"""The training loop, of a new run and of one that is resumed."""
 
 import logging
 import sys
@@ -8,12 +8,9 @@ from pathlib import Path
 from omegaconf import DictConfig
 from tensordict import TensorDict
 
-from pickplace.common.errors import one_sentence
-from pickplace.common.validate import expect, refuse_if
-from pickplace.config.hydra_app import Command
+from pickplace.common.validate import expect
 from pickplace.runs import checkpoint, folder
 from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config
-from pickplace.training.sweep import summarize
 from pickplace.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -83,8 +80,8 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     return float(trainer.latest.get("occupancy", float("nan")))
 
 
-def resume_run(overrides: list[str]) -> float:
-    """Continue a run in its own folder: ``resume=<run folder>`` and overrides of values of its saved config.
+def resume_run(place: str, overrides: list[str]) -> float:
+    """Continue a run in its own folder, with overrides of values of its saved config.
 
     Returns:
         As :func:`train`.
@@ -92,30 +89,15 @@ def resume_run(overrides: list[str]) -> float:
     Raises:
         ValueError: for a folder that is no run, or a change that a resumed run cannot follow.
     """
-    place = next(item for item in overrides if item.startswith("resume=")).partition("=")[2]
     saved = checkpoint.locate(place, prefer="last")
     run_dir, expected = saved.parent.parent, "a run folder, or one of its checkpoints: last, best or previous"
     expect(saved.parent.name == "checkpoints", "resume", place, expected)
     folder.refuse_links(run_dir)
     with folder.claim(run_dir):  # before reading what another process may be writing
         state, facts = checkpoint.read(saved)
-        cfg = resumed_config(place, facts, [item for item in overrides if not item.startswith("resume=")])
+        cfg = resumed_config(place, facts, overrides)
         handlers = (logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log"))
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
         (run_dir / folder.FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
         return run(cfg, run_dir, (state, facts, saved))
-
-
-def main() -> None:
-    """Entry point of ``pickplace-train``."""
-    overrides = [item for item in sys.argv[1:] if not item.startswith("-")]
-    if any(item.startswith("resume=") and item not in ("resume=", "resume=null") for item in overrides):
-        with one_sentence():
-            refuse_if(
-                len(overrides) < len(sys.argv) - 1,
-                "resume=...: expected only key=value overrides beside it, no flags such as -m.",
-            )
-            resume_run(overrides)
-    else:
-        Command("train", train, folder, after_sweep=summarize)()

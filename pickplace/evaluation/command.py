@@ -1,0 +1,50 @@
+"""The ``pickplace-evaluate`` command, which imports torch after its command line and the checkpoint's config fit."""
+
+from omegaconf import DictConfig, OmegaConf
+
+from pickplace.common.validate import refuse_if
+from pickplace.config.allowlist import trusted_config
+from pickplace.config.composition import apply_overrides, places_in_other_groups, task_overrides
+from pickplace.config.hydra_app import Command
+from pickplace.runs import folder
+from pickplace.runs.locate import locate, read_facts
+
+#: Config groups that an evaluation takes from the checkpoint.
+TRAINED = ("env", "items", "model")
+
+
+def main() -> None:
+    """Entry point of ``pickplace-evaluate``."""
+    Command("evaluate", "pickplace.evaluation.evaluate.run", folder, TRAINED, check=check)()
+
+
+def check(cfg: DictConfig) -> None:
+    """Refuse overrides that do not fit the checkpoint's config; whether all of it can be read is seen later."""
+    if cfg.checkpoint is None:
+        refuse_if("model" in cfg, "model: there are no settings of a model without checkpoint=<run folder>.")
+    elif facts := read_facts(locate(str(cfg.checkpoint))):
+        merge_trained(cfg, trusted_config(facts["config"], cfg.trust))
+
+
+def merge_trained(cfg: DictConfig, trained: DictConfig) -> DictConfig:
+    """Return a checkpoint's config with the command line's overrides of the groups :data:`TRAINED` on top.
+
+    Args:
+        cfg: the config that the command line makes.
+        trained: the config of the checkpoint.
+
+    Raises:
+        ValueError: for overrides that do not fit it.
+    """
+    groups = OmegaConf.create({key: OmegaConf.to_container(cfg[key], resolve=True) for key in ("env", "items")})
+    ours, changed = [], trained.copy()
+    for word in task_overrides():
+        key, _, option = word.lstrip("+~").partition("=")
+        if key == "benchmark":
+            ours += ["env=benchmark", "items=benchmark"] if option not in ("", "null") else []
+        elif places := places_in_other_groups(word):
+            for part in places:  # such as env.reach
+                OmegaConf.update(changed, part, OmegaConf.select(groups, part), merge=False, force_add=True)
+        elif key.split(".")[0] in TRAINED:
+            ours.append(word)
+    return apply_overrides(changed, ours, groups)

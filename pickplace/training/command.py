@@ -1,0 +1,44 @@
+"""The ``pickplace-train`` command, which imports torch after its command line fits."""
+
+import logging
+import sys
+
+from pickplace.common.errors import one_sentence
+from pickplace.common.interrupts import import_quietly
+from pickplace.common.validate import refuse_if
+from pickplace.config.hydra_app import Command
+from pickplace.runs import folder
+from pickplace.runs.locate import locate, read_facts
+from pickplace.runs.resume import resumed_config
+from pickplace.training.sweep import summarize
+
+
+def main() -> None:
+    """Entry point of ``pickplace-train``."""
+    overrides = [item for item in sys.argv[1:] if not item.startswith("-")]
+    if any(item.startswith("resume=") and item not in ("resume=", "resume=null") for item in overrides):
+        with one_sentence():
+            refuse_if(
+                len(overrides) < len(sys.argv) - 1,
+                "resume=...: expected only key=value overrides beside it, no flags such as -m.",
+            )
+            resume(overrides)
+    else:
+        Command("train", "pickplace.training.train.train", folder, after_sweep=summarize)()
+
+
+def resume(overrides: list[str]) -> float:
+    """Continue a run in its own folder, after its overrides fit the config of the run.
+
+    Returns, Raises:
+        As :func:`pickplace.training.train.resume_run`.
+    """
+    place = next(item for item in overrides if item.startswith("resume=")).partition("=")[2]
+    words = [item for item in overrides if not item.startswith("resume=")]
+    if facts := read_facts(locate(place, "last")):
+        logging.disable(logging.WARNING)  # the training itself warns
+        try:
+            resumed_config(place, facts, words)
+        finally:
+            logging.disable(logging.NOTSET)
+    return import_quietly("pickplace.training.train").resume_run(place, words)
