@@ -43,6 +43,7 @@ CHECKS: dict = {
         lambda value: value == "validation", "validation, on which training selects its best policy"
     ),
     "reward_scale": partial(number, least=1e-9, most=1e38),  # float32 ends there
+    "quiet": partial(or_null, flag),
     "seed": lambda key, value: check_seed(value, key),
 }
 

@@ -3,6 +3,7 @@
 import logging
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -11,6 +12,7 @@ from tensordict import TensorDict
 from pickplace.common.validate import expect
 from pickplace.runs import checkpoint, folder
 from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config
+from pickplace.training.progress import filtered_consoles, quiet_console, results
 from pickplace.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -48,6 +50,11 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     Raises:
         KeyboardInterrupt: with the number of the signal that asked to stop; the checkpoint ``last`` is saved.
     """
+    with filtered_consoles(quiet_console) if cfg.get("quiet") else nullcontext():
+        return _run(cfg, run_dir, resume)
+
+
+def _run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None) -> float:
     trainer = Trainer(cfg, run_dir, resume)
     with trainer.running() as stop:
         batches = iter(trainer.collector)
@@ -74,7 +81,10 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
 
     with checkpoint_hint(lambda: trainer.safe_folder, trainer.resume_overrides):
         trainer.report(stop.signal is not None)
-    log.info("run folder: %s", run_dir)
+    if trainer.latest:
+        words = "validation occupancy {occupancy:.4f} (95% interval {ci95_low:.4f} to {ci95_high:.4f})"
+        results.info(words.format(**trainer.latest))
+    results.info("run folder: %s", run_dir)
     if stop.signal:
         raise KeyboardInterrupt(stop.signal)  # ends a whole sweep, not only this run
     return float(trainer.latest.get("occupancy", float("nan")))

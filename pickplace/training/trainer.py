@@ -2,7 +2,6 @@
 
 import logging
 import shlex
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -36,6 +35,7 @@ from pickplace.runs.resume import (
 from pickplace.training import callbacks, collectors, settings
 from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.training.curriculum.transform import ToteHeightCurriculum, push_level
+from pickplace.training.progress import Progress, has_passed, results, terminal_bar
 from pickplace.training.report import write_report
 from pickplace.views.figures import learning_curve
 
@@ -216,7 +216,7 @@ class Trainer:
             with checkpoint_hint(lambda: self.safe_folder, self.resume_overrides, OSError):
                 shown = OmegaConf.to_container(self.cfg, resolve=True)
                 self.logger = build("logger", self.cfg.logger, folder=self.run_dir, frames=self.frames, settings=shown)
-            stop, self.start_time, self.start_frames = StopRequest(), time.perf_counter(), self.frames
+            stop = StopRequest()
             # Frames of checkpoints/last, or None.
             self.last_saved = self.frames if self.safe_folder is None or "last" in self.safe_folder.name else None
             cleanup.callback(stop.restore)
@@ -231,6 +231,8 @@ class Trainer:
                     self.curriculum.level,
                     self.curriculum.end,
                 )
+            bar = None if self.cfg.get("quiet") else cleanup.enter_context(terminal_bar())
+            self.progress = Progress(self.frames, self.cfg.total_frames, self.cfg.progress_interval, bar)
             cleanup.enter_context(checkpoint_hint(lambda: self.safe_folder, self.resume_overrides))
             cleanup.enter_context(collectors.watch_workers(self.collector))
             yield stop
@@ -284,14 +286,9 @@ class Trainer:
             self.save("best")
         if has_passed(before, frames, cfg.checkpoint_interval):
             self.save("last")
-        if has_passed(before, frames, cfg.progress_interval) and not self.ended:
-            speed = (frames - self.start_frames) / (time.perf_counter() - self.start_time)
-            left = int(max(cfg.total_frames - frames, 0) / speed)  # s; the last batch is collected whole
-            log.info(
-                f"{frames / cfg.total_frames:4.0%} {frames:>11,} frames | {speed:6,.0f}/s | "
-                f"{self.curriculum.what} {self.curriculum.level}/{self.curriculum.end} | "
-                f"occupancy {metrics.get('train/occupancy', float('nan')):.3f} | {left // 60}:{left % 60:02d} to go"
-            )
+        if not self.ended:
+            level = f"{self.curriculum.what} {self.curriculum.level}/{self.curriculum.end}"
+            self.progress.show(before, frames, metrics, level)
 
     def save(self, name: str) -> None:
         """Write the checkpoint ``checkpoints/<name>``; a ``last`` keeps the one before it as ``previous``."""
@@ -327,7 +324,7 @@ class Trainer:
         run_dir, level, end = self.run_dir, self.curriculum.level, self.curriculum.end
         if stopped:
             command = f"pickplace-train resume={shlex.quote(str(run_dir))}{self.resume_overrides}"
-            log.info("stopped at %s frames; continue with: %s", f"{self.frames:,}", command)
+            results.info("stopped at %s frames; continue with: %s", f"{self.frames:,}", command)
         elif level < end and not self.curriculum.weights:
             log.info(
                 "the curriculum came to %s %d of %d only, so the policy was not trained above it; "
@@ -373,8 +370,3 @@ def validation_metrics(episodes: Episodes) -> dict[str, float]:
     """Mean occupancy of a validation and its 95% interval."""
     low, high = confidence95(episodes.occupancy)
     return {"occupancy": float(episodes.occupancy.mean()), "ci95_low": low, "ci95_high": high}
-
-
-def has_passed(before: int, now: int, interval: int) -> bool:
-    """Return whether a multiple of ``interval`` lies in ``(before, now]``; it works for any batch size."""
-    return before // interval != now // interval

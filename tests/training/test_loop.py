@@ -28,7 +28,8 @@ from pickplace.training.collectors import ResumableCollector
 from pickplace.training.curriculum.advance import NoAdvance
 from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.training.curriculum.sample import Current
-from pickplace.training.trainer import Trainer, episode_metrics, has_passed, training_env
+from pickplace.training.progress import has_passed
+from pickplace.training.trainer import Trainer, episode_metrics, training_env
 
 OBSERVED = ["bin_depth", "tote_depth"]  # by a critic
 AT = At(0, 48, 1, 1000)

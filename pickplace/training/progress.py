@@ -1,0 +1,130 @@
+"""What a training shows while it runs: a bar on a terminal, lines elsewhere and in the log file."""
+
+import logging
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import timedelta
+from multiprocessing import current_process
+from typing import Any
+
+log = logging.getLogger(__name__)  # of the lines
+results = logging.getLogger("pickplace.results")  # of what is shown with quiet=true, too
+
+LEAST_LINES = 20  # of a whole run
+REFRESH = 0.1  # least time between two pictures of the bar; s
+
+#: What a line shows, as it stands there, and what of it the bar shows first where the terminal is narrow.
+PARTS = ("share", "frames", "speed", "level", "occupancy", "loss", "lr", "left")
+FIRST = ("share", "left", "occupancy", "loss", "lr", "level", "speed", "frames")
+
+
+class Progress:
+    """The progress of a training, in lines of the log and in a bar.
+
+    Args:
+        frames: frames trained before.
+        total: frames to train in all.
+        interval: frames between lines, if these are not more than a twentieth of all.
+        bar: see :func:`terminal_bar`; or None.
+    """
+
+    def __init__(self, frames: int, total: int, interval: int, bar: Any = None):
+        self.start, self.total, self.interval = frames, total, min(interval, max(total // LEAST_LINES, 1))
+        self.started = self.drawn = time.perf_counter()
+        self.bar, self.parts = bar, {}  # type: Any, dict[str, str]
+        self.task = bar and bar.add_task("", total=total, completed=frames)
+
+    def show(self, before: int, frames: int, metrics: dict, level: str) -> None:
+        """Show the state after a batch.
+
+        Args:
+            before, frames: frames trained before the batch, and after it.
+            metrics: of the batch; what they lack is shown as of an earlier one.
+            level: of the curriculum.
+        """
+        now = time.perf_counter()
+        speed = (frames - self.start) / (now - self.started)
+        left = timedelta(seconds=int(max(self.total - frames, 0) / speed))  # the last batch is collected whole
+        self.parts |= {"share": f"{frames / self.total:4.0%}", "frames": f"{frames:>11,} frames", "level": level}
+        self.parts |= {"speed": f"{speed:6,.0f}/s", "left": f"{left} to go"}
+        if "train/occupancy" in metrics:
+            self.parts["occupancy"] = f"occupancy {metrics['train/occupancy']:.3f}"
+        if losses := [value for key, value in metrics.items() if key.startswith("train/loss")]:
+            self.parts["loss"] = f"loss {sum(losses):.3f}"
+        if "train/lr" in metrics:
+            self.parts["lr"] = f"lr {metrics['train/lr']:.1e}"
+        if has_passed(before, frames, self.interval):
+            log.info(line(self.parts, PARTS, " | "))
+        if self.bar and (now - self.drawn > REFRESH or frames >= self.total):
+            self.drawn, room = now, self.bar.console.width - self.bar.columns[0].bar_width - 1
+            texts = [line(self.parts, FIRST[:count], "  ") for count in range(len(FIRST), 1, -1)]
+            text = next((each for each in texts if len(each) <= room), self.parts["share"])
+            with suppress(OSError):
+                self.bar.update(self.task, completed=frames, description=text, refresh=True)
+
+
+def line(parts: dict[str, str], keys: tuple[str, ...], between: str) -> str:
+    """Return the parts with these keys in one line."""
+    return between.join(parts[key] for key in PARTS if key in keys and key in parts)
+
+
+@contextmanager
+def terminal_bar() -> Iterator[Any]:
+    """Show a bar below what is logged, if standard output is a terminal, and this is no job of a parallel sweep.
+
+    Returns:
+        The bar, or None, as the value of the ``with`` statement.
+    """
+    is_terminal = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
+    if not is_terminal or current_process().name != "MainProcess":
+        yield None
+        return
+    from rich.progress import BarColumn, Console, TextColumn
+    from rich.progress import Progress as Bar
+
+    console, stdout = Console(), sys.stdout
+    column = BarColumn(console.width // 6, complete_style="green", finished_style="green")
+    bar = Bar(column, TextColumn("{task.description}", markup=False), console=console, auto_refresh=False)
+    with filtered_consoles(lambda record: record.name != log.name) as handlers:
+        bar.start()  # from now on sys.stdout writes above the bar
+        console.show_cursor()  # a process that is killed could not show it again
+        for handler in handlers:
+            handler.setStream(sys.stdout)
+        try:
+            yield bar
+        finally:
+            with suppress(OSError):  # a terminal that was closed
+                bar.stop()
+                for handler in handlers:
+                    handler.setStream(stdout)
+
+
+@contextmanager
+def filtered_consoles(is_shown: Callable[[logging.LogRecord], bool]) -> Iterator[list[logging.StreamHandler]]:
+    """Show only some records of the log on the console in this block; files of the log have all.
+
+    Returns:
+        The handlers of the console, as the value of the ``with`` statement.
+    """
+    streams = [each for each in logging.root.handlers if isinstance(each, logging.StreamHandler)]
+    handlers = [each for each in streams if each.stream is sys.stdout]
+    for handler in handlers:
+        handler.addFilter(is_shown)
+    try:
+        yield handlers
+    finally:
+        for handler in handlers:
+            handler.removeFilter(is_shown)
+
+
+def quiet_console(record: logging.LogRecord) -> bool:
+    """Return whether ``quiet=true`` shows a record: warnings, errors and results."""
+    return record.levelno >= logging.WARNING or record.name == results.name
+
+
+def has_passed(before: int, now: int, interval: int) -> bool:
+    """Return whether a multiple of ``interval`` lies in ``(before, now]``; it works for any batch size."""
+    return before // interval != now // interval
