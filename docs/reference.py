@@ -19,7 +19,7 @@ INTRODUCTION = """\
 
 Every setting of `pickplace-train` and `pickplace-evaluate`, with its default. A setting is changed on the command line
 as `key=value`, such as `algo.lr=1e-3`, and a group as `group=option`, such as `items=mixed`. Lengths are in cells.
-*Frames* are environment steps, summed over all slots.
+*Frames* are environment steps, summed over all slots. A whole number may also be written `100_000` or `1e5`.
 """
 
 

@@ -1,8 +1,10 @@
 """The examples in docs/examples/ train, evaluate and plan."""
 
 import ast
+import csv
 import importlib
 import json
+import math
 import shutil
 import signal
 import sys
@@ -324,6 +326,44 @@ def test_torchrl_ppo(monkeypatch, total_frames, gain):
     monkeypatch.syspath_prepend(str(EXAMPLES))
     before, after = importlib.import_module("torchrl_ppo").train(total_frames=total_frames)
     assert 0.7 < before < 1 and before + gain < after < 1
+
+
+class FakeStudy:
+    """Stands in for Optuna's study: proposes these learning rates, and keeps what it is told."""
+
+    def __init__(self, *rates):
+        self.rates, self.told = rates, []
+
+    def ask(self):
+        number = len(self.told)
+        return SimpleNamespace(
+            number=number,
+            suggest_float=lambda key, low, high, log: self.rates[number],
+            suggest_categorical=lambda key, choices: max(choices),
+        )
+
+    def tell(self, trial, value):
+        self.told.append(value)
+
+
+def test_a_search_with_optuna_leaves_the_tables_of_a_sweep(monkeypatch, tmp_path, no_report):
+    """With a stand-in for Optuna; the next test has Optuna itself."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    search, study = importlib.import_module("optuna_search").search, FakeStudy(1e-3, -1.0)
+    search(study, tmp_path, 2, [*TRAINING, "curriculum=none", "model.actor.filters=8"])
+    with open(tmp_path / "sweep.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows] == ["finished", "failed"] and rows[1]["algo.epochs"] == "4"
+    assert float(rows[0]["final_occupancy"]) == study.told[0] and math.isnan(study.told[1])
+    assert (tmp_path / "sweep.png").is_file() and "algo.lr=-1.0" in rows[1]["error"]
+
+
+def test_a_search_with_optuna(monkeypatch, tmp_path, no_report):
+    optuna = pytest.importorskip("optuna", "4")
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    study = optuna.create_study(direction="maximize")
+    importlib.import_module("optuna_search").search(study, tmp_path, 2, [*TRAINING, "model.actor.filters=8"])
+    assert len(study.trials) == 2 and study.best_params["algo.epochs"] in (1, 2, 4)
 
 
 class FakeNode:

@@ -3,8 +3,9 @@
 import re
 from collections.abc import Iterable
 from contextlib import nullcontext
-from functools import cache
+from functools import cache, reduce
 from itertools import islice
+from operator import getitem
 from pathlib import Path
 from typing import Any, cast
 
@@ -82,7 +83,7 @@ def compose_first_job(config_name: str, words: list[str]) -> DictConfig:
     """Return Hydra's merge of a command line, with the node ``hydra``; for a sweep, the merge of its first job."""
     _refuse_options_as_values(words)
     try:
-        return hydra.compose(config_name, _first_of_sweep(words), return_hydra_config=True)
+        cfg = hydra.compose(config_name, _first_of_sweep(words), return_hydra_config=True)
     except HydraException as error:
         raise clearer_error(error, config_name, words) from error
     except (ValueError, TypeError) as error:  # Hydra's own, which names no key
@@ -91,6 +92,20 @@ def compose_first_job(config_name: str, words: list[str]) -> DictConfig:
             if option in ("null", "") and (names := group_options(group, search_words(words))):
                 raise ValueError(f"{word}: expected {group}=<one of {', '.join(sorted(names))}>.") from error
         raise ValueError(f"{' '.join(words)}: {error}.") from error
+    _refuse_hidden_files(cfg)
+    return cfg
+
+
+def _refuse_hidden_files(cfg: DictConfig) -> None:
+    """Refuse an option with a file in several folders, of which Hydra takes the first without a word."""
+    folders = {Path(each.path).resolve() for each in cfg.hydra.runtime.config_sources if each.schema == "file"}
+    for group, choice in cfg.hydra.runtime.choices.items():
+        for option in choice if OmegaConf.is_list(choice) else [choice]:
+            files = [folder / group.partition("@")[0] / f"{option}.yaml" for folder in sorted(folders)]
+            found = [str(file) for file in files if file.is_file()]
+            refuse_if(
+                len(found) > 1, f"{group}={option}: it is in {' and '.join(found)}; expected one file of that name."
+            )
 
 
 def _refuse_options_as_values(words: list[str]) -> None:
@@ -259,6 +274,16 @@ def _package(group: str, options: list[str]) -> str:
     return next((file.header for file in files), {}).get("package") or group.replace("/", ".")
 
 
+def use_whole_numbers(cfg: DictConfig) -> None:
+    """Replace numbers such as 1e5, which are floats as Hydra and YAML read them, by whole numbers.
+
+    Those below 10 stay: nobody writes 1e0, and many settings are 1.0 or 2.0.
+    """
+    for path, value in walk(OmegaConf.to_container(cfg, resolve=False)):
+        if isinstance(value, float) and value.is_integer() and 10 <= abs(value) < 2**53:
+            reduce(getitem, path[:-1], cast(Any, cfg))[path[-1]] = int(value)
+
+
 def _is_in(place: str, outer: str) -> bool:
     return f"{place}.".startswith(f"{outer}.")
 
@@ -305,4 +330,5 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: Any = None,
                 OmegaConf.update(cfg, key, override.value(), merge=not is_part)
             except OmegaConfBaseException as error:
                 raise ValueError(unknown_key(key, cfg)) from error
+    use_whole_numbers(cfg)
     return cfg

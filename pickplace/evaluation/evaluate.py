@@ -9,6 +9,7 @@ from omegaconf import DictConfig, open_dict
 from pickplace.common.machine import use_machine
 from pickplace.common.validate import refuse_if
 from pickplace.config.allowlist import own_modules, trusted_config
+from pickplace.config.composition import use_whole_numbers
 from pickplace.config.registry import build
 from pickplace.evaluation.artifacts import Artifacts, evaluation_table
 from pickplace.evaluation.command import TRAINED, merge_trained
@@ -78,6 +79,7 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
     Raises:
         ValueError: for settings that make no sense, or a checkpoint that does not fit them.
     """
+    use_whole_numbers(cfg)
     ev = cfg.evaluation
     check_episode_settings(ev)
     own_modules(cfg.trust)

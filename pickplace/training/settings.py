@@ -7,6 +7,7 @@ from omegaconf import DictConfig, OmegaConf
 from pickplace.algorithms.base import Algorithm
 from pickplace.common.validate import check_bytes, expect, flag, number, or_null, whole_number
 from pickplace.config.allowlist import own_modules
+from pickplace.config.composition import use_whole_numbers
 from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
 from pickplace.evaluation.play import check_episode_settings, check_play
@@ -49,11 +50,12 @@ CHECKS: dict = {
 
 
 def check_settings(cfg: DictConfig) -> None:
-    """Check the config of a training before anything is built.
+    """Check the config of a training before anything is built; 1e5 becomes a whole number in it.
 
     Raises:
         ValueError: naming the key, its value, and what was expected.
     """
+    use_whole_numbers(cfg)
     for key, check in CHECKS.items():
         check(key, OmegaConf.select(cfg, key))
     check_episode_settings(cfg.evaluation)

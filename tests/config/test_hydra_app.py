@@ -1,5 +1,6 @@
 """The commands: bad input ends in one sentence, a code other than 0, and leaves nothing behind."""
 
+import json
 import os
 import subprocess
 import sys
@@ -14,8 +15,11 @@ from pickplace.common.errors import full_names, sentence
 from pickplace.config.composition import apply_overrides, compose_plain, conf_dir, known_names
 from pickplace.config.help import GROUPS
 from pickplace.evaluation import evaluate
+from pickplace.evaluation.evaluate import prepare
 from pickplace.runs.folder import noted_command
 from pickplace.training import train
+from pickplace.training.settings import check_settings
+from pickplace.training.trainer import Trainer
 
 EXAMPLES = Path(__file__).parents[2] / "docs/examples"
 CURRICULA = EXAMPLES / "own_curriculum"
@@ -334,6 +338,16 @@ def test_several_folders_of_config_files(run, monkeypatch):
     assert code == 0 and given[0].curriculum.advance.window == 200 and given[0].model.actor.hidden, err
 
 
+@pytest.mark.parametrize("option", ["careful", "paper"])  # of a folder of the user's, and of ours
+def test_an_option_in_two_folders_is_refused(run, tmp_path, option):
+    (tmp_path / "curriculum").mkdir()
+    (tmp_path / "curriculum" / f"{option}.yaml").write_text("defaults: [paper]\n")
+    folders = ["--config-dir", str(CURRICULA), f"hydra.searchpath=[file://{tmp_path}]"]
+    assert run("train", *folders, "--cfg", "job")[0] == 0
+    code, _, err = run("train", *folders, f"curriculum={option}", "--cfg", "job")
+    assert code == 2 and f"curriculum={option}: it is in {tmp_path}/" in err.replace(f"{CURRICULA}/", f"{tmp_path}/")
+
+
 @pytest.mark.parametrize(
     ("name", "words", "expected"),
     [
@@ -390,6 +404,26 @@ def test_overrides_on_a_saved_config():
     other = composed("items=tall")["items"]
     swapped = apply_overrides(saved, ["items=tall", "items.height=[1,2]"], {"items": other})
     assert swapped["items"].height == [1, 2]
+
+
+def test_a_whole_number_may_be_written_with_an_exponent(tmp_path):
+    words = ["total_frames=1e5", "algo.minibatch_size=6.4e1", "env.num_envs=16e0", "model.actor.filters=1e1"]
+    words += ["curriculum/advance=staged", "curriculum.advance.stages=[{frames: 2e3, height: 5}]"]
+    words += ["warm_start=imitate", "warm_start.frames=1e3"]
+    cfg = composed(*words, "items.weights=[1e1,20,0.5,1.0]", "threads=1", "rollout_length=1e1")
+    trainer = Trainer(cfg, tmp_path)
+    trainer.collector.shutdown()
+    assert json.dumps(trainer.saved_config["items"]["weights"]) == "[10, 20, 0.5, 1.0]"
+    found = (cfg.total_frames, cfg.env.num_envs, cfg.rollout_length, cfg.warm_start.frames)
+    assert found == (100_000, 16, 10, 1_000) and all(type(value) is int for value in found)
+    assert trainer.algorithm.inner.minibatch_size == 64 and trainer.policy.network.hidden.in_features == 10
+    with pytest.raises(ValueError, match=r"total_frames=100000\.5: expected a whole number"):
+        check_settings(composed("total_frames=100000.5"))
+    saved = apply_overrides(composed(), ["total_frames=2e6"])
+    assert type(saved.total_frames) is int
+    ours = composed("planner=joint_dbl", "evaluation.episodes=1e2", name="evaluate")
+    prepare(ours)
+    assert type(ours.evaluation.episodes) is int
 
 
 def test_notes_of_a_run_are_read_unresolved(tmp_path, monkeypatch):
