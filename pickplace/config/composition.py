@@ -169,14 +169,14 @@ def search_words(words: Iterable[str]) -> list[str]:
 
 
 def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> None:
-    """Refuse misspelt keys: Hydra adds any key of a preset, or after a ``+``.
+    """Refuse misspelt keys, by :func:`compose_plain`: Hydra adds any key of a preset, or after a ``+``.
 
     Nodes with a ``_target_`` are left to :func:`pickplace.config.registry.build`, which knows their arguments.
     """
     if f"{path}*" in REGISTRY:  # a dict of parts with names of the user's choice
         return
     for key, node in cast(dict, cfg).items():
-        if key not in known:
+        if key not in known or f"{path}{key}" == "hydra":  # which is the command line's
             raise ValueError(unknown_key(f"{path}{key}", known, path, () if path else known_names(known)))
         if OmegaConf.is_dict(node) and OmegaConf.is_dict(known[key]) and "_target_" not in node:
             refuse_unknown_keys(node, known[key], f"{path}{key}.")

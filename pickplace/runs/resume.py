@@ -59,6 +59,12 @@ def _remote_values(cfg: DictConfig) -> list[tuple]:
     return [(key, value) for key, local in LOCAL_VALUES.items() if (value := OmegaConf.select(cfg, key)) not in local]
 
 
+def resumed_place(overrides: list[str]) -> tuple[str, list[str]]:
+    """Return what ``resume=`` names among the words of a command line, and the other words."""
+    words = [word for word in overrides if not word.startswith("resume=")]
+    return next(word.partition("=")[2] for word in overrides if word not in words), words
+
+
 def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     """Return a checkpoint's config with overrides of values on top.
 

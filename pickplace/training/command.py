@@ -9,7 +9,7 @@ from pickplace.common.validate import refuse_if
 from pickplace.config.hydra_app import Command
 from pickplace.runs import folder
 from pickplace.runs.locate import locate, read_facts
-from pickplace.runs.resume import resumed_config
+from pickplace.runs.resume import resumed_config, resumed_place
 from pickplace.training.sweep import summarize
 
 
@@ -33,12 +33,11 @@ def resume(overrides: list[str]) -> float:
     Returns, Raises:
         As :func:`pickplace.training.train.resume_run`.
     """
-    place = next(item for item in overrides if item.startswith("resume=")).partition("=")[2]
-    words = [item for item in overrides if not item.startswith("resume=")]
+    place, words = resumed_place(overrides)
     if facts := read_facts(locate(place, "last")):
         logging.disable(logging.WARNING)  # the training itself warns
         try:
             resumed_config(place, facts, words)
         finally:
             logging.disable(logging.NOTSET)
-    return import_quietly("pickplace.training.train").resume_run(place, words)
+    return import_quietly("pickplace.training.train").resume_run(overrides)

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from pickplace.common.validate import expect
 from pickplace.runs import checkpoint, folder
-from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config
+from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config, resumed_place
 from pickplace.training.progress import filtered_consoles, quiet_console, results
 from pickplace.training.trainer import Trainer
 
@@ -90,8 +90,8 @@ def _run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None)
     return float(trainer.latest.get("occupancy", float("nan")))
 
 
-def resume_run(place: str, overrides: list[str]) -> float:
-    """Continue a run in its own folder, with overrides of values of its saved config.
+def resume_run(overrides: list[str]) -> float:
+    """Continue a run in its own folder: ``resume=<run folder>`` and overrides of values of its saved config.
 
     Returns:
         As :func:`train`.
@@ -99,13 +99,14 @@ def resume_run(place: str, overrides: list[str]) -> float:
     Raises:
         ValueError: for a folder that is no run, or a change that a resumed run cannot follow.
     """
+    place, words = resumed_place(overrides)
     saved = checkpoint.locate(place, prefer="last")
     run_dir, expected = saved.parent.parent, "a run folder, or one of its checkpoints: last, best or previous"
     expect(saved.parent.name == "checkpoints", "resume", place, expected)
     folder.refuse_links(run_dir)
     with folder.claim(run_dir):  # before reading what another process may be writing
         state, facts = checkpoint.read(saved)
-        cfg = resumed_config(place, facts, overrides)
+        cfg = resumed_config(place, facts, words)
         handlers = (logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log"))
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
         (run_dir / folder.FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep

@@ -23,11 +23,11 @@ from torchrl.envs import TransformedEnv
 from pickplace import PickPlaceEnv, Planner
 from pickplace.common.errors import WorkerDied
 from pickplace.config.composition import conf_dir
-from pickplace.evaluation.evaluate import main as evaluate_main
+from pickplace.evaluation.command import main as evaluate_main
 from pickplace.runs import checkpoint
 from pickplace.training import collectors
 from pickplace.training.collectors import ignore_signals, watch_workers
-from pickplace.training.train import main as train_main
+from pickplace.training.command import main as train_main
 
 
 @contextmanager
