@@ -47,6 +47,9 @@ EXPECTED = (ValueError, OSError, FloatingPointError, WorkerDied, OmegaConfBaseEx
 #: Greatest length of an error that is shown, and of a word in it; the middle of a longer one is left out.
 MAX_LENGTH, MAX_WORD = 1_000, 300
 
+#: A word in the name of a key.
+WORD = re.compile("[^\\W_]+")
+
 #: What an error of the operating system asks for; others ask for another path.
 REMEDIES = dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "a place where you may read and write")
 REMEDIES |= dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free space")
@@ -155,12 +158,8 @@ def full_names(key: str, names: Collection[str]) -> list[str]:
     """
     endings = defaultdict(list)
     for name in names:
-        words = _words(name)
+        words = WORD.findall(name)
         for start in range(len(words)):
             endings["_".join(words[start:])].append(name)
-    close = get_close_matches("_".join(_words(key)), endings, 1, 0.7)
+    close = get_close_matches("_".join(WORD.findall(key)), endings, 1, 0.7)
     return [key] if key in names else endings[close[0]][:4] if close else []
-
-
-def _words(name: str) -> list[str]:
-    return re.findall("[^\\W_]+", name)

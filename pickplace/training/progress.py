@@ -16,8 +16,11 @@ results = logging.getLogger("pickplace.results")  # of what is shown with quiet=
 LEAST_LINES = 20  # of a whole run
 REFRESH = 0.1  # least time between two pictures of the bar; s
 
-#: What a line shows, as it stands there, and what of it the bar shows first where the terminal is narrow.
-PARTS = ("share", "frames", "speed", "level", "occupancy", "loss", "lr", "left")
+#: The parts of a line, in their order; and what of it the bar shows first where the terminal is narrow.
+PARTS = {
+    "share": "{:4.0%}", "frames": "{:>11,} frames", "speed": "{:6,.0f}/s", "level": "{}",
+    "occupancy": "occupancy {:.3f}", "loss": "loss {:.3f}", "lr": "lr {:.1e}", "left": "{} to go",
+}  # fmt: skip
 FIRST = ("share", "left", "occupancy", "loss", "lr", "level", "speed", "frames")
 
 
@@ -34,8 +37,8 @@ class Progress:
     def __init__(self, frames: int, total: int, interval: int, bar: Any = None):
         self.start, self.total, self.interval = frames, total, min(interval, max(total // LEAST_LINES, 1))
         self.started = self.drawn = time.perf_counter()
-        self.bar, self.parts = bar, {}  # type: Any, dict[str, str]
-        self.task = bar and bar.add_task("", total=total, completed=frames)
+        self.parts: dict[str, str] = {}
+        self.bar, self.task = bar, bar and bar.add_task("", total=total, completed=frames)
 
     def show(self, before: int, frames: int, metrics: dict, level: str) -> None:
         """Show the state after a batch.
@@ -48,16 +51,13 @@ class Progress:
         now = time.perf_counter()
         speed = (frames - self.start) / (now - self.started)
         left = timedelta(seconds=int(max(self.total - frames, 0) / speed))  # the last batch is collected whole
-        self.parts |= {"share": f"{frames / self.total:4.0%}", "frames": f"{frames:>11,} frames", "level": level}
-        self.parts |= {"speed": f"{speed:6,.0f}/s", "left": f"{left} to go"}
-        if "train/occupancy" in metrics:
-            self.parts["occupancy"] = f"occupancy {metrics['train/occupancy']:.3f}"
-        if losses := [value for key, value in metrics.items() if key.startswith("train/loss")]:
-            self.parts["loss"] = f"loss {sum(losses):.3f}"
-        if "train/lr" in metrics:
-            self.parts["lr"] = f"lr {metrics['train/lr']:.1e}"
+        losses = [value for key, value in metrics.items() if key.startswith("train/loss")]
+        values = {"share": frames / self.total, "frames": frames, "speed": speed, "level": level, "left": left}
+        values |= {"occupancy": metrics.get("train/occupancy"), "lr": metrics.get("train/lr")}
+        values["loss"] = sum(losses) if losses else None
+        self.parts |= {key: PARTS[key].format(value) for key, value in values.items() if value is not None}
         if has_passed(before, frames, self.interval):
-            log.info(line(self.parts, PARTS, " | "))
+            log.info(line(self.parts, FIRST, " | "))
         if self.bar and (now - self.drawn > REFRESH or frames >= self.total):
             self.drawn, room = now, self.bar.console.width - self.bar.columns[0].bar_width - 1
             texts = [line(self.parts, FIRST[:count], "  ") for count in range(len(FIRST), 1, -1)]
