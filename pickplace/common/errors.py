@@ -144,8 +144,7 @@ def unknown_key(key: str, node: DictConfig | dict, prefix: str = "", others: Col
             return f"{short_text(key)}: {place} is {value}, without keys; expected an option that gives it some."
         prefix, node = f"{prefix}{parent}.", child
     known = [str(name) for name in node if name not in ("_target_", "hydra")]
-    close = get_close_matches(leaf, known, 1) if prefix or not others else []
-    close = close or full_names(key, others)
+    close = get_close_matches(leaf, known, 1) if prefix or not others else full_names(key, others)
     expected = f"expected one of {', '.join(known)}." if known else "expected no key."
     hint = f"did you mean {' or '.join(map(repr, close))}?" if close else expected
     return f"{short_text(key)}: there is no key {short_text(leaf)!r} in {prefix[:-1] or 'the config'}; {hint}"

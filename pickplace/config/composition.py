@@ -121,11 +121,16 @@ def _refuse_options_as_values(words: list[str]) -> None:
 
 
 def known_names(cfg: DictConfig) -> list[str]:
-    """Return the names that a command line may set: the groups of a config with its node ``hydra``, and its keys."""
+    """Return the names that a command line may set: the keys of a config, and if it has a node ``hydra`` its groups."""
     own = OmegaConf.to_container(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]))
-    groups = [group for group in cfg.hydra.runtime.choices if not group.startswith("hydra/")]
+    choices = OmegaConf.select(cfg, "hydra.runtime.choices") or {}
+    groups = [str(group) for group in choices if not str(group).startswith("hydra/")]
     keys = [path for path, value in walk(own) if not isinstance(value, dict) and path[-1] != "_target_"]
-    return [*groups, *HYDRA_KEYS, *(".".join(path) for path in keys if all(isinstance(key, str) for key in path))]
+    return [
+        *groups,
+        *(HYDRA_KEYS if groups else ()),
+        *(".".join(path) for path in keys if all(isinstance(key, str) for key in path)),
+    ]
 
 
 def group_options(group: str, search: Iterable[str] = ()) -> list[str]:
@@ -329,6 +334,6 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: Any = None,
             try:
                 OmegaConf.update(cfg, key, override.value(), merge=not is_part)
             except OmegaConfBaseException as error:
-                raise ValueError(unknown_key(key, cfg)) from error
+                raise ValueError(unknown_key(key, cfg, others=known_names(cfg))) from error
     use_whole_numbers(cfg)
     return cfg

@@ -354,7 +354,7 @@ def test_an_option_in_two_folders_is_refused(run, tmp_path, option):
         ("train", "--help", "afterstate, cpu, mixed"),
         ("evaluate", "--help", "best_fit, corner, "),
         ("train", "-m algo.gama=0.9,1", "'gamma'"),
-        ("train", "resume={run} algo.gama=1", "'gamma'"),
+        ("train", "resume={run} gama=1", "did you mean 'algo.gamma'?"),
         ("evaluate", "checkpoint=pretrained/r4 model.actor.filterz=8", "'filters'"),
         ("evaluate", "checkpoint=nowhere", "no checkpoint there"),
         ("plan", "pretrained/r4 --rotatoins 2", "expected --rotations."),
