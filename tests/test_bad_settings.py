@@ -130,7 +130,7 @@ def test_every_leaf_of_a_training(name, tmp_path, monkeypatch):
             try:
                 if path[0] == "curriculum":
                     check_settings(cfg)
-                    build("curriculum", cfg.curriculum).setup(1, 3, 512)
+                    build("curriculum", cfg.curriculum).setup(CellSpec(tote_size=(6, 6, 3)), Kinds([(1, 1, 1)]), 512)
                     continue
                 Trainer(cfg, tmp_path)
                 if path[0] == "logger":

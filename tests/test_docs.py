@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 import pickplace
 from pickplace import Planner, Scene
@@ -20,6 +21,7 @@ from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
 from pickplace.physics import command as physics
 from pickplace.policies import export
+from pickplace.policies.restore import build_cell
 from pickplace.serve import json_lines, serve
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -81,8 +83,7 @@ def check_command(command, search, words, is_new):
         cfg = compose(command, [*search, *words])
     if command == "train" and is_new:
         items, curriculum = build("items", cfg["items"]), build("curriculum", cfg.curriculum)
-        env = build("env", cfg.env, items=items) if curriculum.given else None
-        curriculum.setup(int(items.sizes[:, 2].max()), cfg.env.tote_size[2], cfg.total_frames, env)
+        curriculum.setup(build_cell(OmegaConf.to_container(cfg.env, resolve=True)), items, cfg.total_frames)
         assert curriculum.check_budget(cfg.total_frames, 2048) is None, words
 
 

@@ -20,10 +20,11 @@ import torch
 from commands import after_batch, assert_same, composed
 from hydra import compose, initialize_config_dir
 
-from pickplace import Box, PickPlaceEnv, Planner, Scene, load_policy
+from pickplace import Box, CellSpec, PickPlaceEnv, Planner, Scene, load_policy
 from pickplace.algorithms.base import At, Task
 from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
+from pickplace.items.distributions import Kinds
 from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.rules.observation import STANDARD_TERMS
@@ -295,7 +296,7 @@ def test_own_curriculum(name, levels):
     search = f"hydra.searchpath=[file://{EXAMPLES / 'own_curriculum'}]"
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         curriculum = build("curriculum", compose("train", [search, f"curriculum={name}"]).curriculum)
-    curriculum.setup(1, 4, 400_000)
+    curriculum.setup(CellSpec(tote_size=(6, 6, 4)), Kinds([(1, 1, 1)]), 400_000)
     assert (curriculum.level, curriculum.end) == (2, 4) and curriculum.check_budget(400_000) is None
     seen = []
     for frames in range(0, 200_001, 50_000):

@@ -140,7 +140,7 @@ class PickPlaceEnv(EnvBase):
         super().__init__(device=device, batch_size=[num_envs])
         self.stream, self.masks = stream, tuple(masks)
         mixes = range(items.mixes if "item_mix" in varies else 1)
-        tallest = [int(items.sizes[items.arrives(mix), 2].max()) for mix in mixes]
+        tallest = [items.tallest(mix) for mix in mixes]
         self.min_tote_height = min(tallest)  # of any episode
         self.first_episode, self.episode_stride = first_episode, episode_stride or num_envs
         self.bounds = {key: term.bounds(self.cell, max(tallest)) for key, term in self.terms.items()}

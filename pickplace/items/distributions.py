@@ -134,6 +134,10 @@ class ItemDistribution:
         """Return which rows of ``sizes`` may arrive in a mix, bool ``[K]``."""
         return torch.ones(len(self.sizes), dtype=torch.bool)
 
+    def tallest(self, mix: int = 0) -> int:
+        """Return the height of the tallest item of a mix."""
+        return int(self.sizes[self.arrives(mix), 2].max())
+
     def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size, mix: Tensor | None = None) -> Item:
         """Return the ``rank``-th of ``count`` items for each seed, int64 ``[N]``; here simply independent ones."""
         return self.sample("train", seed, rank, torch.zeros_like(rank), bin_size, **of_mix(mix))

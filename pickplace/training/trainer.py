@@ -110,7 +110,7 @@ class Trainer:
         self.build_env = partial(build, "env", env, items=build("items", cfg["items"]), device=cfg.device, masks=())
         self.env = self.build_env(num_envs=1)  # for its sizes, terms and items
         self.curriculum: Curriculum = build("curriculum", cfg.curriculum)
-        self.curriculum.setup(self.env.min_tote_height, self.env.cell.tote_size[2], cfg.total_frames, self.env)
+        self.curriculum.setup(self.env.cell, self.env.items, cfg.total_frames)
         levels = self.curriculum.levels
         changes = {"items": levels.items, "varies": levels.varies} if levels.varies else {}
         self.build_training_env = partial(self.build_env, **changes)

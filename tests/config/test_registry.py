@@ -6,10 +6,10 @@ import pytest
 from commands import composed, options
 from omegaconf import OmegaConf
 
-from pickplace import PickPlaceEnv
+from pickplace import CellSpec, PickPlaceEnv
 from pickplace.config.composition import conf_dir
 from pickplace.config.registry import REGISTRY, accepted_arguments, build, find, names_at
-from pickplace.items.distributions import ItemDistribution
+from pickplace.items.distributions import ItemDistribution, Kinds
 from pickplace.training.curriculum.curriculum import Curriculum
 
 
@@ -116,6 +116,6 @@ def test_every_curriculum_and_every_exchange_of_its_parts():
     longest = max(map(len, parts))
     for advance, sample, name in itertools.islice(zip(*map(itertools.cycle, parts), strict=True), longest):
         words = [f"+curriculum={name}", f"curriculum/advance={advance}", f"curriculum/sample={sample}"]
-        build("curriculum", composed(*words, name=None).curriculum).setup(1, 5, 10**9)
+        build("curriculum", composed(*words, name=None).curriculum).setup(CellSpec(), Kinds([(1, 1, 1)]), 10**9)
     for name in options("curriculum"):
         assert isinstance(build("curriculum", composed(f"+curriculum={name}", name=None).curriculum), Curriculum)

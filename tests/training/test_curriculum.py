@@ -9,7 +9,9 @@ from commands import composed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pickplace import CellSpec
 from pickplace.config.registry import build
+from pickplace.items.distributions import Kinds
 from pickplace.training.curriculum.advance import Advance, Frames, NoAdvance, Plateau, Staged, Threshold
 from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.training.curriculum.learning_progress import LearningProgress
@@ -19,7 +21,7 @@ from pickplace.training.curriculum.sample import Current
 def make(advance, sample=None, low=1, high=5, total_frames=1000, **heights):
     """A curriculum that is set up."""
     curriculum = Curriculum(advance, sample or Current(), **heights)
-    curriculum.setup(low, high, total_frames)
+    curriculum.setup(CellSpec(tote_size=(6, 6, high)), Kinds([(1, 1, low)]), total_frames)
     return curriculum
 
 
@@ -304,7 +306,7 @@ COMPOSITIONS = [  # first level, episodes until the last one
 def test_compositions_reach_full_height(name, first, episodes):
     """With an ideal policy, 20 episodes and 10,000 frames a batch: levels in order, none skipped."""
     curriculum = build("curriculum", composed(f"curriculum={name}").curriculum)
-    curriculum.setup(1, 5, 25_000_000)
+    curriculum.setup(CellSpec(), Kinds([(1, 1, 1)]), 25_000_000)
     assert curriculum.check_budget(25_000_000) is None
     torch.manual_seed(0)
     seen, frames = [curriculum.level], 0

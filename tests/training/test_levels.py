@@ -7,7 +7,7 @@ import torch
 from commands import SETTINGS, after_batch, assert_same, composed
 from torchrl.envs import Compose, TransformedEnv
 
-from pickplace import PickPlaceEnv
+from pickplace import CellSpec, PickPlaceEnv
 from pickplace.items.distributions import PAPER_KINDS, Kinds, Recorded, Uniform
 from pickplace.rules.state import REFILLS
 from pickplace.runs.loggers import read_csv
@@ -18,6 +18,7 @@ from pickplace.training.curriculum.sample import Uniform as AnyLevel
 from pickplace.training.curriculum.transform import ToteHeightCurriculum
 from pickplace.training.train import resume_run, train
 
+PAPER = Kinds(PAPER_KINDS)
 SIZES = {"bin_size": (6, 6, 1), "tote_size": (6, 6, 5), "bin_items": 3}
 LEVELS = [
     {"tote_height": 2, "items": {"weights": [1, 0, 0, 0]}, "rotations": 1, "bin_items": 1},
@@ -27,12 +28,12 @@ LEVELS = [
 ]
 
 
-def full_env(items=None, **changes):
-    return PickPlaceEnv(items, num_envs=1, **SIZES | changes)
+def levels_of(given, items=PAPER, **changes):
+    return read_levels(given, CellSpec(**SIZES | changes), items)
 
 
 def test_levels_are_numbered_from_1_and_what_they_leave_out_is_that_of_the_full_task():
-    levels = read_levels(LEVELS, full_env())
+    levels = levels_of(LEVELS)
     assert (levels.first, levels.last, levels.key, levels.is_full) == (1, 4, "level", True)
     numbers = {key: column[:, 0].tolist() for key, column in levels.entries.items() if key != "rotations"}
     assert numbers == {
@@ -41,15 +42,14 @@ def test_levels_are_numbered_from_1_and_what_they_leave_out_is_that_of_the_full_
     }  # fmt: skip
     assert levels.entries["rotations"].int().tolist() == [[1, 0, 0, 0], [1, 0, 0, 1], [1] * 4, [1] * 4]
     assert [levels.items.arrives(mix).int().tolist() for mix in range(3)] == [[1] * 4, [1, 0, 0, 0], [1, 1, 0, 0]]
-    assert not read_levels([{}, {"rotations": 2}], full_env()).is_full
-    assert read_levels([{"tote_height": 5}], full_env()).varies == ("level",)
+    assert not levels_of([{}, {"rotations": 2}]).is_full
+    assert levels_of([{"tote_height": 5}]).varies == ("level",)
 
 
 def test_episodes_play_what_their_level_sets():
     torch.manual_seed(0)
     curriculum = Curriculum(NoAdvance(), AnyLevel(), levels=LEVELS)
-    env = full_env()
-    curriculum.setup(env.min_tote_height, 5, 1000, env)
+    curriculum.setup(CellSpec(**SIZES), PAPER, 1000)
     levels = curriculum.levels
     base = PickPlaceEnv(levels.items, num_envs=64, varies=levels.varies, **SIZES)
     env = TransformedEnv(base, Compose(ToteHeightCurriculum(4, curriculum.sample, levels)))
@@ -97,20 +97,20 @@ ERRORS = [
 @pytest.mark.parametrize(("levels", "message"), ERRORS)
 def test_a_bad_level_is_named(levels, message):
     with pytest.raises(ValueError, match=message) as error:
-        read_levels(levels, full_env())
+        levels_of(levels)
     assert "\n" not in str(error.value)
 
 
 def test_a_level_at_which_no_episode_could_begin_is_named(tmp_path):
     tall = Uniform(height=(1, 3))
     with pytest.raises(ValueError, match=r"levels\[1\].tote_height=2: expected at least 3, the height of its tallest"):
-        read_levels([{"items": {"height": [1, 2]}, "tote_height": 2}, {"tote_height": 2}], full_env(tall))
-    long = full_env(Kinds([(1, 3, 1)]), tote_size=(4, 2, 5), effector_size=(1, 1), pick_rule="overlap")
+        levels_of([{"items": {"height": [1, 2]}, "tote_height": 2}, {"tote_height": 2}], tall)
+    long = {"tote_size": (4, 2, 5), "effector_size": (1, 1), "pick_rule": "overlap"}
     with pytest.raises(ValueError, match=r"levels\[0\]: item 1x3x1 at x=0, y=0 in the bin has no feasible action"):
-        read_levels([{"rotations": [0, 2]}], long)
+        levels_of([{"rotations": [0, 2]}], Kinds([(1, 3, 1)]), **long)
     (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n")
     with pytest.raises(ValueError, match=r"levels\[0\]: items: Recorded has no mixes; expected items=kinds"):
-        read_levels([{"items": SMALL}], full_env(Recorded(tmp_path / "items.csv", loop=True)))
+        levels_of([{"items": SMALL}], Recorded(tmp_path / "items.csv", loop=True))
     with pytest.raises(ValueError, match="curriculum.end_height=3: expected null where curriculum.levels lists"):
         Curriculum(NoAdvance(), AnyLevel(), end_height=3, levels=LEVELS)
 

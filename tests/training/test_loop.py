@@ -213,7 +213,7 @@ def test_metrics_are_of_the_episodes_that_ended(collected):
 def test_the_slots_of_all_workers_share_the_episodes_of_a_stream():
     """Each episode is played once, by one of them."""
     curriculum, cfg, played = Curriculum(NoAdvance(), Current()), composed("env.tote_size=[4,4,2]"), []
-    curriculum.setup(1, 2, 100)
+    curriculum.setup(CellSpec(tote_size=(4, 4, 2)), build("items", cfg["items"]), 100)
     base_env = partial(PickPlaceEnv, tote_size=(4, 4, 2), items=build("items", cfg["items"]), episode_stride=4)
     for first in (0, 2):
         env = training_env(base_env, curriculum, first_episode=first, num_envs=2)

@@ -10,7 +10,8 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from pickplace import PickPlaceEnv
+from pickplace import CellSpec, PickPlaceEnv
+from pickplace.items.distributions import Kinds
 from pickplace.training import collectors
 from pickplace.training.curriculum.advance import NoAdvance
 from pickplace.training.curriculum.curriculum import Curriculum
@@ -35,7 +36,7 @@ def test_samplers_draw_each_height_with_its_share(sampler, shares):
 
 def make_env(level=3, sampler=None, num_envs=6, **settings):
     curriculum = Curriculum(NoAdvance(), sampler or Current())
-    curriculum.setup(1, level, 1000)
+    curriculum.setup(CellSpec(tote_size=(4, 4, level)), Kinds([(1, 1, 1)]), 1000)
     env = PickPlaceEnv(tote_size=(4, 4, 5), num_envs=num_envs, **settings)
     heights = ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.start)  # any height from there on
     return TransformedEnv(env, Compose(heights, RewardSum(), StepCounter()))

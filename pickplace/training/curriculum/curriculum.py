@@ -9,7 +9,8 @@ from numbers import Real
 from torch import Tensor
 
 from pickplace.common.validate import expect, integral_number, is_number, is_whole, number
-from pickplace.envs.torchrl import PickPlaceEnv
+from pickplace.items.distributions import ItemDistribution
+from pickplace.rules.cell import CellSpec
 from pickplace.training.curriculum.advance import Advance, Tally
 from pickplace.training.curriculum.levels import heights, read_levels
 
@@ -47,27 +48,25 @@ class Curriculum:
             for key, height in (("start_height", start_height), ("end_height", end_height)):
                 expect(height is None, f"curriculum.{key}", height, "null where curriculum.levels lists the levels")
 
-    def setup(self, min_height: int, max_height: int, total_frames: int, env: PickPlaceEnv | None = None) -> None:
+    def setup(self, cell: CellSpec, items: ItemDistribution, total_frames: int) -> None:
         """Set the levels and the budget of a run, and begin at the first level.
 
         Args:
-            min_height: height of the tallest item, in height units.
-            max_height: the tote's full height.
+            cell, items: of the full task.
             total_frames: the run's budget, in frames.
-            env: plays the full task; needed where ``levels`` lists what the levels set.
 
         Raises:
             ValueError: naming the setting that does not fit these.
         """
         if self.given is None:
+            min_height, max_height = items.tallest(), cell.tote_size[2]
             start = min_height if self.start_height is None else self.start_height
             end = max_height if self.end_height is None else self.end_height
             end = integral_number("curriculum.end_height", end, min_height, max_height)
             start = integral_number("curriculum.start_height", start, min_height, end)
             self.levels = heights(start, end, max_height)
         else:
-            assert env is not None
-            self.levels = read_levels(self.given, env)
+            self.levels = read_levels(self.given, cell, items)
         self.start, self.end = self.levels.first, self.levels.last
         first = self.advance.setup(self.start, self.end, integral_number("total_frames", total_frames))
         self.tally = Tally(self._clamped(first), deque(maxlen=self.advance.window))

@@ -11,7 +11,6 @@ from pickplace.common.errors import unknown_key
 from pickplace.common.validate import at_most, expect, integral_number, reworded, short_text
 from pickplace.envs.checks import check_items
 from pickplace.envs.episode import SETTINGS
-from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.distributions import ItemDistribution
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import ALL_TURNS
@@ -57,12 +56,12 @@ def heights(first: int, last: int, full: int) -> Levels:
     return Levels(first, "tote_height", {"tote_height": torch.arange(first, last + 1)[:, None]}, is_full=last == full)
 
 
-def read_levels(given: Sequence[Mapping], env: PickPlaceEnv) -> Levels:
+def read_levels(given: Sequence[Mapping], cell: CellSpec, items: ItemDistribution) -> Levels:
     """Return levels that are listed in a config, numbered from 1.
 
     Args:
         given: of each level what it sets, by a key of :data:`KEYS`; the rest is that of the full task.
-        env: an environment that plays the full task.
+        cell, items: of the full task.
 
     Raises:
         ValueError: naming the level and the key.
@@ -74,25 +73,24 @@ def read_levels(given: Sequence[Mapping], env: PickPlaceEnv) -> Levels:
         for key in level:
             if key not in KEYS:
                 raise ValueError(_refusal(f"curriculum.levels[{number}].{short_text(key)}", key))
-    cell = env.cell
     mixes: list[Mapping] = []
     rows: list[dict[str, Any]] = []
     for number, level in enumerate(given):
         place = f"curriculum.levels[{number}]"
         row = {"level": number + 1, "tote_height": level.get("tote_height", cell.tote_size[2])}
         integral_number(f"{place}.tote_height", row["tote_height"], 1, cell.tote_size[2])
-        if items := level.get("items"):
-            mixes += [items] * (items not in mixes)
-            row["item_mix"] = mixes.index(items) + 1
+        if mix := level.get("items"):
+            mixes += [mix] * (mix not in mixes)
+            row["item_mix"] = mixes.index(mix) + 1
             with _at(place):
-                env.items.mixed([items])
+                items.mixed([mix])
         named = {key: KEYS[key] for key in level if KEYS[key] in SETTINGS and key != "items"}
         row |= {entry: SETTINGS[entry].read(f"{place}.{key}", level[key], cell) for key, entry in named.items()}
         rows.append(row)
     full = {"tote_height": cell.tote_size[2], **{key: setting.full(cell) for key, setting in SETTINGS.items()}}
     varies = [key for key in full if any(key in row for row in rows)]
     rows = [{key: row.get(key, full[key]) for key in varies} for row in rows]
-    items = env.items.mixed(mixes) if mixes else env.items
+    items = items.mixed(mixes) if mixes else items
     _check_starts(rows, replace(cell, varies=tuple(key for key in varies if key in SETTINGS)), items)
     numbers = {key: torch.tensor([row[key] for row in rows]) for key in varies}
     entries = {
@@ -111,7 +109,7 @@ def _check_starts(rows: list[dict[str, int]], cell: CellSpec, items: ItemDistrib
     """Refuse a level whose episodes could not begin."""
     for row in rows:
         place, mix = f"curriculum.levels[{row['level'] - 1}]", row.get("item_mix", 0)
-        tallest, height = int(items.sizes[items.arrives(mix), 2].max()), row["tote_height"]
+        tallest, height = items.tallest(mix), row["tote_height"]
         expect(height >= tallest, f"{place}.tote_height", height, f"at least {tallest}, the height of its tallest item")
         with _at(place):
             check_items(cell, items, mix, row.get("rotations", ALL_TURNS))
