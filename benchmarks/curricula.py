@@ -18,7 +18,7 @@ PROBLEMS = {
     "mixed": (0.95 * 0.8879, ["experiment=mixed", "evaluation_interval=50_000", "evaluation.episodes=256"]),
     "gopt_rs": (
         0.95 * 0.8053,
-        ["experiment=afterstate", "benchmark=gopt_rs", "total_frames=2_000_000", "evaluation_interval=25_000"],
+        ["experiment=afterstate", "benchmark=gopt_rs", "evaluation_interval=8_000"],
     ),
 }
 #: Small items first: the greatest side of each level, of the greatest side of all. The tote of each level, if it grows.

@@ -210,6 +210,15 @@ def test_only_the_same_episodes_are_compared(word, tmp_path):
         read_comparison(path, theirs)
 
 
+def test_a_default_that_one_config_lacks_is_compared(tmp_path):
+    ours = episode_settings(composed("items=mixed", name="evaluate"))
+    older = {**ours, "items": {key: value for key, value in ours["items"].items() if key != "unit"}}
+    for mine, theirs in ((ours, older), (older, ours)):
+        path = tmp_path / "evaluation.json"
+        path.write_text(json.dumps({**theirs, "planner": "a", "occupancy": {"per_episode": [0.5] * 100}}))
+        read_comparison(path, mine)
+
+
 def test_recorded_items_are_compared_by_content_and_not_by_path(evaluation, tmp_path):
     table, moved = tmp_path / "items.csv", tmp_path / "moved.csv"
     arguments = [*JOINT, "items=recorded", "evaluation.episodes=2"]
