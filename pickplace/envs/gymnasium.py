@@ -68,8 +68,7 @@ class PickPlaceGymEnv(gymnasium.Env):
 
     ## Information
     `occupancy`: share of the tote's volume that is filled; `failure`: why the action or the episode failed (`"none"`,
-    `"pick_miss"`, ..., `"stuck"`); `action_mask`: as `action_masks()`. Once an episode has ended, it permits action 0
-    alone: the next step is a reset and ignores the action, but a learner that masks needs one.
+    `"pick_miss"`, ..., `"stuck"`); `action_mask`: as `action_masks()`.
 
     ## Arguments
     `items`: an item distribution, or a list of `(w, d, h)`; by default the paper's four kinds. The settings of
@@ -216,12 +215,16 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         return self._observations(state), reward, terminated, truncated, infos
 
     def action_masks(self) -> np.ndarray:
-        """Return which actions would succeed, bool ``[N, N_a]``; action 0 alone in a slot that waits for its reset."""
+        """Return which actions would succeed, bool ``[N, N_a]``.
+
+        In a slot that resets itself in the next step, action 0 alone: ignored, but a learner that masks needs one.
+        """
         return self._permitted(self._env.action_mask)
 
     def _permitted(self, mask: torch.Tensor) -> np.ndarray:
         masks = mask.cpu().numpy().copy()
-        masks[self._ended] = np.arange(masks.shape[1]) == 0
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
+            masks[self._ended] = np.arange(masks.shape[1]) == 0
         return masks
 
     def _tote_heights(self, given=None) -> torch.Tensor:
