@@ -21,30 +21,32 @@ PROBLEMS = {
         ["experiment=afterstate", "benchmark=gopt_rs", "evaluation_interval=8_000"],
     ),
 }
-#: Small items first: the greatest side of each level, of the greatest side of all. The tote of each level, if it grows.
-SMALL = {"mixed": (2, None), "gopt_rs": (3, 4, None)}
+#: The greatest side of the items, and the height of the tote, on each level; None: those of the full task.
+SIDES = {"mixed": (2, None), "gopt_rs": (3, 4, None)}
 TOTES = {"mixed": (4, None), "gopt_rs": (6, 8, None)}
+#: Frames after which a staircase leaves a level that is not packed well yet: some share of what the full task takes.
+FRAMES = {"mixed": 50_000, "gopt_rs": 10_000}
 
 
-def levels(problem: str, grows: bool) -> str:
-    """Return ``curriculum.levels`` with items from small to large, and with a tote that grows along."""
+def levels(problem: str, items: bool = False, height: bool = False) -> str:
+    """Return ``curriculum.levels`` with items from small to large, a tote that grows, or both."""
     each = []
-    for side, height in zip(SMALL[problem], TOTES[problem], strict=True):
-        items = {"items": {key: [1, side] for key in ("width", "depth", "height")}} if side else {}
-        each.append(items | ({"tote_height": height} if grows and height else {}))
+    for side, top in zip(SIDES[problem], TOTES[problem], strict=True):
+        small = {"items": {key: [1, side] for key in ("width", "depth", "height")}} if items and side else {}
+        each.append(small | ({"tote_height": top} if height and top else {}))
     return f"curriculum.levels={json.dumps(each).replace(': ', ':')}".replace('"', "")
 
 
 def curricula(problem: str) -> dict[str, list[str]]:
-    """Return the words of each curriculum. A level ends when it is packed well, or after 50,000 frames."""
+    """Return the words of each curriculum. A level of a staircase ends when it is packed well, or after some frames."""
     staircase = ["curriculum=adaptive", "curriculum.advance.occupancy=0.75"]
-    staircase.append("curriculum.advance.max_frames_per_level=50_000")
+    staircase.append(f"curriculum.advance.max_frames_per_level={FRAMES[problem]}")
     return {
         "none": ["curriculum=none"],
-        "height": staircase,
-        "items": [*staircase, levels(problem, grows=False)],
-        "both": [*staircase, levels(problem, grows=True)],
-        "learning_progress": ["curriculum=learning_progress", levels(problem, grows=True)],
+        "height": [*staircase, levels(problem, height=True)],
+        "items": [*staircase, levels(problem, items=True)],
+        "both": [*staircase, levels(problem, items=True, height=True)],
+        "learning_progress": ["curriculum=learning_progress", levels(problem, items=True, height=True)],
     }
 
 
