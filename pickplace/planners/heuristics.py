@@ -16,9 +16,10 @@ from pickplace.rules.maps import FAR, rectangle_sums
 from pickplace.rules.masks import (
     PlacingMaps,
     action_mask,
-    actions_reaching,
     choice_mask,
     first_action_reaching,
+    first_choice,
+    narrow_first,
 )
 from pickplace.rules.placing import footprint_sizes
 from pickplace.rules.state import State
@@ -88,37 +89,12 @@ class RandomFeasible(MapPlanner):
         return torch.searchsorted(rank, wanted[:, None])[:, 0].clamp(max=mask.shape[1] - 1)
 
 
-class JointDBL(MapPlanner):
-    """Deepest-bottom-left over all feasible (pick, place, rotation) triples; not in the paper, and strong.
-
-    Minimises (height of the item's top, footprint y, footprint x); ties go to the lowest flat index.
-
-    Args:
-        cell: the sizes.
-        item: which of several items in the bin are considered, see
-            :func:`~pickplace.planners.base.restrict_items`.
-    """
-
-    name = "joint_dbl"
-
-    def __init__(self, cell: CellSpec, item: str = "any"):
-        self.cell, self.item = cell, one_of("planner.item", item, ITEM_RULES)
-
-    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        feasible = restrict_items(self.item, state, choice_mask(cell, maps))  # [N, M * Q * W_T * D_T]
-        order = torch.where(feasible, maps.join(dbl_order(cell, maps.top)), FAR**2)
-        best, place = order.unflatten(1, (-1, cell.num_places)).min(2)  # [N, M * Q]
-        # Items and parities that share the least order are tied.
-        tied, actions = best == best.amin(1, keepdim=True), []
-        for index in range(best.shape[1]):
-            reaching = actions_reaching(cell, maps, index * cell.num_places + place[:, index])
-            good = (reaching >= 0) & tied[:, index, None]
-            actions.append(torch.where(good, reaching, cell.num_actions - 1).amin(1))
-        return torch.stack(actions).amin(0)
-
-
 class _Cheapest(MapPlanner):
-    """Chooses the footprint of least cost over everything that is feasible; ties go to the lowest index."""
+    """Chooses the footprint of least cost over everything that is feasible.
+
+    Ties go to the first of several items, to its narrower side along x, to the least x, then y; then to the lowest flat
+    index. So it does not matter how an item lies in the bin.
+    """
 
     item: str
 
@@ -134,14 +110,34 @@ class _Cheapest(MapPlanner):
         feasible = restrict_items(self.item, state, choice_mask(cell, maps))
         x, y = (torch.arange(side, device=feasible.device) for side in cell.tote_size[:2])
         cost = self.cost(cell, state, maps, x[:, None] + y)
-        return first_action_reaching(cell, maps, torch.where(feasible, maps.join(cost), torch.inf).argmin(1))
+        order = torch.where(feasible, maps.join(cost), torch.inf)
+        return first_action_reaching(cell, maps, first_choice(cell, maps, order))
+
+
+class JointDBL(_Cheapest):
+    """Deepest-bottom-left over all feasible (pick, place, rotation) triples; not in the paper, and strong.
+
+    Minimises (height of the item's top, footprint y, footprint x).
+
+    Args:
+        cell: the sizes.
+        item: which of several items in the bin are considered, see
+            :func:`~pickplace.planners.base.restrict_items`.
+    """
+
+    name = "joint_dbl"
+
+    def __init__(self, cell: CellSpec, item: str = "any"):
+        self.cell, self.item = cell, one_of("planner.item", item, ITEM_RULES)
+
+    def cost(self, cell: CellSpec, state: State, maps: PlacingMaps, distance: Tensor) -> Tensor:
+        return dbl_order(cell, maps.top).double()
 
 
 class Corner(_Cheapest):
     """Keeps the item's top low and its footprint near the tote's origin; not in the paper.
 
-    Minimises ``height_weight * top + x + y`` of the footprint over everything that is feasible; ties go to the lowest
-    footprint index, then to the lowest flat index.
+    Minimises ``height_weight * top + x + y`` of the footprint.
 
     Args:
         cell: the sizes.
@@ -164,8 +160,7 @@ class HeightmapMinimisation(_Cheapest):
     """Raises the tote's height map least: the heuristic of Wang and Hauser, 2019, "Stable bin packing of non-convex 3D
     objects with a robot manipulator".
 
-    Minimises ``distance_weight * (x + y)`` of the footprint plus the sum of all heights in the tote after the
-    placement, over everything that is feasible; ties go to the lowest footprint index, then to the lowest flat index.
+    Minimises ``distance_weight * (x + y)`` of the footprint plus the sum of all heights in the tote after it.
 
     Args:
         cell: the sizes.
@@ -193,8 +188,8 @@ class IndividualHeuristic(MapPlanner):
 
     A candidate is a footprint in a corner of a maximal rectangle (MaxRects, Jylanki 2010) of the cells that are not
     higher than the level on which the item would rest; the first in the order (top, footprint y, footprint x) that
-    succeeds in a forward simulation is played, ties by the lowest flat index. If none does, the first is played, and
-    fails.
+    succeeds in a forward simulation is played; ties go to the item's narrower side along x, then to the lowest flat
+    index. If none does, the first is played, and fails.
 
     Of several items in the bin it takes the first that can be picked.
 
@@ -223,9 +218,13 @@ class IndividualHeuristic(MapPlanner):
         allowed, footprint = footprint >= 0, footprint.clamp(min=0)
         if self.candidates == "corners":
             allowed &= corner_footprints(cell, state.heights, maps).flatten(1).gather(1, footprint)
-        order = dbl_order(cell, maps.top).flatten(1).gather(1, footprint)
+        parity = (
+            torch.arange(cell.num_footprints, device=footprint.device).expand(len(footprint), -1) // cell.num_places
+        )
+        order = dbl_order(cell, maps.top).flatten(1) * cell.parities + narrow_first(cell, maps.item, parity)
+        order = order.gather(1, footprint)
         # Those that succeed, in order; then those that fail, in order; ties by the lowest flat index.
-        order = torch.where(allowed, order + FAR * ~(succeeds & allowed) * cell.num_places, FAR**2)
+        order = torch.where(allowed, order + FAR * ~(succeeds & allowed) * cell.num_footprints, FAR**2)
         return join_pick(cell, pick, order.argmin(1))
 
 

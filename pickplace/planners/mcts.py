@@ -1,5 +1,6 @@
 """Monte-Carlo tree search, with which the paper compares."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +14,14 @@ from pickplace.planners.base import MapPlanner
 from pickplace.rules.bin import remove_item
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, Observation
-from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, first_action_reaching, placing_maps
+from pickplace.rules.masks import (
+    PlacingMaps,
+    action_mask,
+    choice_mask,
+    first_action_reaching,
+    narrow_first,
+    placing_maps,
+)
 from pickplace.rules.state import State
 from pickplace.rules.step import apply, put_down
 
@@ -196,8 +204,13 @@ class MCTS(MapPlanner):
         """Return new nodes, with the actions to try: those of a mask, or that the rules allow."""
         if self.mask and mask is None:
             mask = choice_mask(self.cell, placing_maps(self.cell, state))
-        rows = [None] * len(state.surface) if mask is None else mask.numpy()
-        untried = (row if row is None else self._random.permutation(row.nonzero()[0]).tolist() for row in rows)
+        untried: Sequence = [None] * len(state.surface)
+        if mask is not None:
+            number = torch.arange(mask.shape[1]).expand(mask.shape)
+            if self.mask:  # of choices
+                mask, number = (narrow_first(self.cell, state.items.flatten(), part) for part in (mask, number))
+            rows = zip(number.numpy(), mask.numpy(), strict=True)
+            untried = [self._random.permutation(row[good]).tolist() for row, good in rows]
         return [_Node(*parts) for parts in zip(state.surface, state.items.table, untried, strict=True)]
 
     def _arrive(self, state: State) -> State:
@@ -216,6 +229,7 @@ class MCTS(MapPlanner):
             if self.mask:
                 mask = choice_mask(cell, placing_maps(cell, state))
                 draw = torch.from_numpy(self._random.random(mask.shape, dtype=np.float32))
+                draw = narrow_first(cell, state.items.flatten(), draw)
                 action, going = torch.where(mask, draw, -1.0).argmax(1), mask.view(torch.uint8).amax(1) > 0
                 state, placed, _ = self._move(state, action)
             else:

@@ -17,7 +17,7 @@ from pickplace.planners.heuristics import dbl_order
 from pickplace.rules.cell import MAX_SIDE, CellSpec
 from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
-from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, first_action_reaching
+from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, first_action_reaching, first_choice
 from pickplace.rules.state import State
 
 LAST = FAR**2  # order of a footprint at the origin of no space
@@ -77,8 +77,8 @@ def _counter(cells: Tensor, outside: int = 1):
 class SpacePlanner(MapPlanner):
     """Sets the item down at the origin of the empty space that comes first in an order of the planner's own.
 
-    Minimises (:meth:`space_order`, footprint y, footprint x, parity) over all feasible footprints that begin in the
-    origin of a maximal empty space; then the lowest flat index.
+    Minimises (:meth:`space_order`, footprint y, footprint x) over all feasible footprints that begin in the origin of a
+    maximal empty space. Ties go to the item's narrower side along x, then to the lowest flat index.
 
     Args:
         cell: the sizes.
@@ -108,14 +108,14 @@ class SpacePlanner(MapPlanner):
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         feasible = restrict_items(self.item, state, choice_mask(cell, maps))
-        parity = torch.arange(cell.parities, device=feasible.device)[:, None, None]
-        last = LAST * cell.num_footprints
+        last = LAST * cell.num_places
         at_origin, elsewhere = (
-            torch.where(feasible, maps.join(dbl_order(cell, order) * cell.parities + parity), last)
+            torch.where(feasible, maps.join(dbl_order(cell, order)), last)
             for order in (self._least_order(cell, state, maps), maps.top)
         )
         has_origin = (at_origin < last).any(1, keepdim=True)
-        action = first_action_reaching(cell, maps, torch.where(has_origin, at_origin, elsewhere).argmin(1))
+        choice = first_choice(cell, maps, torch.where(has_origin, at_origin, elsewhere))
+        action = first_action_reaching(cell, maps, choice)
         if self.dbl_fallback or has_origin.all():
             return action
         return torch.where(has_origin[:, 0], action, action_mask(cell, maps).int().argmin(1))
