@@ -196,15 +196,10 @@ def results_by_hand(env, observation, row: int) -> dict[int, tuple[int, int, int
     return found
 
 
-def choice_by_hand(cell: CellSpec, items, found) -> int:
-    """Return the index of item and footprint of an entry of :func:`results_by_hand`.
-
-    Args:
-        items: ``(x, y, w, d, h)`` of each item in the bin.
-    """
+def tie_by_hand(found) -> tuple:
+    """Return what decides between equal costs of an entry of :func:`results_by_hand`: item, narrower side, x, y."""
     _, y, x, w, d, number = found
-    turned = (w, d) != tuple(items[number][2:4])
-    return ((number * cell.parities + turned) * cell.tote_size[0] + x) * cell.tote_size[1] + y
+    return number, w > d, x, y
 
 
 @torch.no_grad()

@@ -2,12 +2,21 @@
 
 import pytest
 import torch
-from problems import SETTINGS, choice_by_hand, occupancies, random_states, results_by_hand
+from problems import SETTINGS, occupancies, random_states, results_by_hand, tie_by_hand
 from scipy.stats import chisquare
 
 from pickplace import PickPlaceEnv
 from pickplace.items.distributions import Uniform
-from pickplace.planners.heuristics import Corner, HeightmapMinimisation, JointDBL, RandomFeasible, UniformRandom
+from pickplace.planners.heuristics import (
+    Corner,
+    HeightmapMinimisation,
+    IndividualHeuristic,
+    JointDBL,
+    RandomFeasible,
+    UniformRandom,
+)
+from pickplace.planners.mcts import MCTS
+from pickplace.planners.spaces import BestFit, OnlineBPH
 
 # Planner and items; tote, R, occupancy and its standard error, from an independent prototype of the rules. Where no
 # error is known (None): that of 100 episodes, as those of joint_dbl with mixed items are, and of rounding to 0.01.
@@ -76,19 +85,18 @@ COSTS = [
 
 @pytest.mark.parametrize("options", SETTINGS)
 def test_the_least_cost_over_all_feasible_actions_is_played(options):
-    """Of equal cost: the lowest footprint, then the lowest action; ``JointDBL`` does not look at footprints."""
+    """Of equal cost: the first item, its narrower side along x, the least x, then y; then the lowest action."""
     for env, observation in random_states(**options):
         chosen = [make(env.cell).decide(observation).tolist() for make, _ in COSTS]
         assert chosen == [make(env.cell).decide(observation.exclude("action_mask")).tolist() for make, _ in COSTS]
         for n in range(env.num_envs):
-            items, heights = env.state.items.cuboids[n].tolist(), env.state.heights[n]
+            heights = env.state.heights[n]
             costs = [{} for _ in COSTS]
             for action, found in results_by_hand(env, observation, n).items():
                 top, y, x, w, d, _ = found
                 raised = int((top - heights[x : x + w, y : y + d]).sum())
-                rest = choice_by_hand(env.cell, items, found), action
-                for (make, cost), each in zip(COSTS, costs, strict=True):
-                    each[action] = cost(top, y, x, raised), *rest[make is JointDBL :]
+                for (_, cost), each in zip(COSTS, costs, strict=True):
+                    each[action] = cost(top, y, x, raised), *tie_by_hand(found), action
             assert [each[n] for each in chosen] == [min(each, key=each.get) for each in costs]
 
 
@@ -120,3 +128,16 @@ def test_random_feasible_plays_feasible_actions_only(options):
         assert observation["action_mask"].gather(1, action[:, None]).all()
         unmasked = observation.exclude("action_mask")  # as in an evaluation, where the planner makes its own mask
         assert torch.equal(RandomFeasible(env.cell, seed=7).decide(unmasked), action)
+
+
+PLANNERS = [JointDBL, Corner, HeightmapMinimisation, IndividualHeuristic, BestFit, OnlineBPH, MCTS]
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_it_does_not_matter_how_an_item_lies_in_the_bin(planner):
+    """Three items of 4x3x3 fill the tote, also if they are written as 3x4x3."""
+    for kind in ((4, 3, 3), (3, 4, 3)):
+        point = {"effector_size": (1, 1), "pick_rule": "overlap", "support": "half"}
+        env = PickPlaceEnv([kind], num_envs=4, tote_size=(9, 4, 3), rotations=2, **point)
+        settings = {"items": env.items, "simulations": 200, "mask": True} if planner is MCTS else {}
+        assert occupancies(planner(env.cell, **settings), env).tolist() == [1] * 4

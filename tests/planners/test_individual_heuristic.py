@@ -68,7 +68,7 @@ def test_every_cell_meets_the_reference(rotations, reference):
     [(1, (6, 6, 5), "least_offset"), (3, (5, 7, 3), "middle"), (4, (7, 5, 3), "least_offset")],
 )
 def test_the_first_candidate_that_succeeds_is_played(candidates, rotations, tote, pick):
-    """In the order (top, y, x, flat index); if all fail the first; and corners are fewer than cells."""
+    """In the order (top, y, x, narrower side along x, flat index); if all fail the first. Corners are fewer."""
     env, observation = late_state(7, rotations=rotations, tote_size=tote, num_envs=48, seed=1)
     cell, state = env.cell, env.state
     maps = placing_maps(cell, state)
@@ -85,7 +85,7 @@ def test_the_first_candidate_that_succeeds_is_played(candidates, rotations, tote
                 continue
             parity = n % rotations % 2
             if candidates == "cells" or corners[row, parity, x, y]:
-                found.append((failed[row, n].item() > 0, top[row, parity, x, y].item(), y, x, n))
+                found.append((failed[row, n].item() > 0, top[row, parity, x, y].item(), y, x, w > d, n))
         if found:
             assert chosen[row] == min(found)[-1]
             missed += min(found)[0]

@@ -3,7 +3,7 @@
 from itertools import combinations, product
 
 import pytest
-from problems import SETTINGS, choice_by_hand, occupancies, random_states, results_by_hand
+from problems import SETTINGS, occupancies, random_states, results_by_hand, tie_by_hand
 
 from pickplace import PickPlaceEnv
 from pickplace.planners.spaces import BestFit, OnlineBPH
@@ -49,9 +49,8 @@ def test_the_first_space_is_filled(options):
             for planner in (BestFit, OnlineBPH):
                 in_corner, elsewhere = {}, {}
                 for action, found in results.items():
-                    top, y, x, w, d, number = found
-                    turned = (w, d) != tuple(items[number][2:4])
-                    rest = y, x, turned, choice_by_hand(env.cell, items, found), action
+                    top, y, x, _, _, number = found
+                    rest = y, x, *tie_by_hand(found), action
                     elsewhere[action] = top, *rest
                     order = best_space(planner, spaces, found, items[number][4], int(env.tote_height[n]))
                     if order is not None:
