@@ -10,7 +10,6 @@ import csv
 import logging
 import re
 import sys
-import textwrap
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -225,7 +224,7 @@ def results(settings: list[Setting]) -> list[str]:
             interval = "({:.4f} to {:.4f})".format(*setting.interval) if count > 1 else ""
             frames = f"{most:,}" if least == most else f"{least:,} to {most:,}"
             row = [f"{setting.mean:.4f}", interval, f"{count} seed{'s' * (count > 1)}", f"{frames} frames"]
-        rows.append([*row, textwrap.shorten(text, 90, placeholder=" ...")])
+        rows.append([*row, text if len(text) <= 140 else f"{text[:90]} ... {text[-45:]}"])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     padded = [[text.ljust(width) for text, width in zip(row, widths, strict=True) if width] for row in rows]
     return ["  ".join(row).rstrip() for row in padded]

@@ -157,6 +157,15 @@ def test_tables_and_figure_show_seeds_early_ends_and_frames(tmp_path, monkeypatc
     assert not axes.get_legend().get_window_extent().overlaps(axes.get_window_extent())
 
 
+def test_long_overrides_are_told_apart(tmp_path):
+    """A list of levels is one word without spaces."""
+    for name in ("0", "1"):
+        make_run(tmp_path, name, [f"curriculum.levels=[{'{tote_height:2},' * 9}{{rotations:{name}}}]"], [0.5], total=100)
+    texts = results(group_by_setting([read_run(tmp_path / name) for name in ("0", "1")]))
+    for name, text in zip("01", texts, strict=True):
+        assert "curriculum.levels=[{tote_height:2}" in text and text.endswith(f"{{rotations:{name}}}]") and len(text) < 190
+
+
 def test_a_single_run_is_drawn_with_the_interval_of_its_episodes(tmp_path, monkeypatch):
     make_run(tmp_path, "0", [], [0.2, 0.4], total=200)
     figures = []
