@@ -14,6 +14,7 @@ log = logging.getLogger(__name__)  # of the lines
 results = logging.getLogger("pickplace.results")  # of what is shown with quiet=true, too
 
 LEAST_LINES = 20  # of a whole run
+LONGEST = 1e10  # greatest time to go that is shown; s
 REFRESH = 0.1  # least time between two pictures of the bar; s
 
 #: The parts of a line, in their order; and what of it the bar shows first where the terminal is narrow.
@@ -50,7 +51,8 @@ class Progress:
         """
         now = time.perf_counter()
         speed = (frames - self.start) / (now - self.started)
-        left = timedelta(seconds=int(max(self.total - frames, 0) / speed))  # the last batch is collected whole
+        seconds = max(self.total - frames, 0) / speed  # the last batch is collected whole
+        left = timedelta(seconds=int(min(seconds, LONGEST)))
         losses = [value for key, value in metrics.items() if key.startswith("train/loss")]
         values = {"share": frames / self.total, "frames": frames, "speed": speed, "level": level, "left": left}
         values |= {"occupancy": metrics.get("train/occupancy"), "lr": metrics.get("train/lr")}

@@ -48,6 +48,14 @@ def test_lines_come_at_least_every_twentieth_of_a_run(caplog):
     assert len(caplog.messages) == 50
 
 
+def test_a_budget_that_no_run_can_spend_is_shown(caplog):
+    caplog.set_level(logging.INFO)
+    progress = Progress(0, 2**63 - 1, 10)
+    progress.started -= 1  # 10 frames a second
+    progress.show(0, 10, {}, "level 1/1")
+    assert caplog.messages[0].startswith("  0% |") and "days" in caplog.messages[0]
+
+
 @pytest.mark.parametrize(
     ("columns", "shown", "left_out"),
     [
