@@ -164,7 +164,9 @@ def clearer_error(error: HydraException, config_name: str, words: list[str]) -> 
         try:
             known = hydra.compose(config_name, _first_of_sweep(others), return_hydra_config=True)
         except (HydraException, OmegaConfBaseException, ValueError):  # others are wrong, too
-            known = hydra.compose(config_name, search_words(words), return_hydra_config=True)
+            search = search_words(words)
+            choices = [_line(each) for each in parse(words) if group_options(each.key_or_group, search)]
+            known = hydra.compose(config_name, [*search, *_first_of_sweep(choices)], return_hydra_config=True)
     return ValueError(unknown_key(key[1], known, others=known_names(known)))
 
 

@@ -94,6 +94,7 @@ BAD = [
     ("train", "reach=table", ["env.reach.path", "no value"]),
     ("train", "env.reach.radii=[1,2]", ["env.reach.radii: env.reach is null", "an option that"]),
     ("train", "reach=annulus env.reach.radi=[1,2]", ["env.reach.radi", "'radii'"]),
+    ("train", "model=afterstate model.critic.filters=8 model.critic.hidden=8", ["model.critic is null, without keys"]),
     ("evaluate", "planner=joint_dbl env.reach.radii=[1,2]", ["env.reach.radii: env.reach is null", "an option that"]),
     # resume
     ("train", "resume=nowhere", ["nowhere'", "run folder"]),
