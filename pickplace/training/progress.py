@@ -11,13 +11,13 @@ from multiprocessing import current_process
 from typing import Any
 
 log = logging.getLogger(__name__)  # of the lines
-results = logging.getLogger("pickplace.results")  # of what is shown with quiet=true, too
+results = logging.getLogger("pickplace.results")  # of the lines that quiet=true shows, too
 
 LEAST_LINES = 20  # of a whole run
 LONGEST = 1e10  # greatest time to go that is shown; s
 REFRESH = 0.1  # least time between two pictures of the bar; s
 
-#: The parts of a line, in their order; and what of it the bar shows first where the terminal is narrow.
+#: The parts of a line, in their order. On a narrow terminal the bar leaves out the last ones of ``FIRST``.
 PARTS = {
     "share": "{:4.0%}", "frames": "{:>11,} frames", "speed": "{:6,.0f}/s", "level": "{}",
     "occupancy": "occupancy {:.3f}", "loss": "loss {:.3f}", "lr": "lr {:.1e}", "left": "{} to go",
@@ -46,17 +46,24 @@ class Progress:
 
         Args:
             before, frames: frames trained before the batch, and after it.
-            metrics: of the batch; what they lack is shown as of an earlier one.
-            level: of the curriculum.
+            metrics: of the batch; a part that they lack keeps its earlier value.
+            level: name and number of the curriculum's level.
         """
         now = time.perf_counter()
         speed = (frames - self.start) / (now - self.started)
         seconds = max(self.total - frames, 0) / speed  # the last batch is collected whole
         left = timedelta(seconds=int(min(seconds, LONGEST)))
         losses = [value for key, value in metrics.items() if key.startswith("train/loss")]
-        values = {"share": frames / self.total, "frames": frames, "speed": speed, "level": level, "left": left}
-        values |= {"occupancy": metrics.get("train/occupancy"), "lr": metrics.get("train/lr")}
-        values["loss"] = sum(losses) if losses else None
+        values = {
+            "share": frames / self.total,
+            "frames": frames,
+            "speed": speed,
+            "level": level,
+            "occupancy": metrics.get("train/occupancy"),
+            "loss": sum(losses) if losses else None,
+            "lr": metrics.get("train/lr"),
+            "left": left,
+        }
         self.parts |= {key: PARTS[key].format(value) for key, value in values.items() if value is not None}
         if has_passed(before, frames, self.interval):
             log.info(line(self.parts, FIRST, " | "))
@@ -75,21 +82,24 @@ def line(parts: dict[str, str], keys: tuple[str, ...], between: str) -> str:
 
 @contextmanager
 def terminal_bar() -> Iterator[Any]:
-    """Show a bar below what is logged, if standard output is a terminal, and this is no job of a parallel sweep.
+    """Show a bar below the lines of the log; not in a job of a parallel sweep, or if standard output is no terminal.
 
     Returns:
         The bar, or None, as the value of the ``with`` statement.
     """
-    is_terminal = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
+    is_terminal = sys.stdout is not None and sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     if not is_terminal or current_process().name != "MainProcess":
         yield None
         return
-    from rich.progress import BarColumn, Console, TextColumn
-    from rich.progress import Progress as Bar
+    from rich import progress
 
-    console, stdout = Console(), sys.stdout
-    column = BarColumn(console.width // 6, complete_style="green", finished_style="green")
-    bar = Bar(column, TextColumn("{task.description}", markup=False), console=console, auto_refresh=False)
+    console, stdout = progress.Console(), sys.stdout
+    bar = progress.Progress(
+        progress.BarColumn(console.width // 6, complete_style="green", finished_style="green"),
+        progress.TextColumn("{task.description}", markup=False),
+        console=console,
+        auto_refresh=False,
+    )
     with filtered_consoles(lambda record: record.name != log.name) as handlers:
         bar.start()  # from now on sys.stdout writes above the bar
         console.show_cursor()  # a process that is killed could not show it again

@@ -88,6 +88,12 @@ def test_a_terminal_that_cannot_move_its_cursor_gets_lines(monkeypatch):
         assert bar is None
 
 
+def test_closed_standard_output_gets_no_bar(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    with terminal_bar() as bar:
+        assert bar is None
+
+
 def test_an_error_ends_the_bar_and_goes_on(monkeypatch):
     stdout, handler = use_terminal(monkeypatch)
     with pytest.raises(OSError, match="disk"), terminal_bar():
