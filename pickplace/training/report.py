@@ -2,11 +2,11 @@
 
 import base64
 import io
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
+from statistics import fmean
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -16,7 +16,7 @@ from pickplace.runs.folder import REPORT, changed_values, noted_command
 from pickplace.runs.loggers import read_csv
 from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.views.figures import failure_mix, played_levels
-from pickplace.views.replay import ASSETS, page
+from pickplace.views.replay import filled, page
 from pickplace.views.scene import draw_scene, item_colours
 
 
@@ -38,14 +38,11 @@ def write_report(
     Raises:
         OSError: naming the report, if it cannot be written.
     """
-    rows, level_name = read_csv(run_dir / "metrics.csv"), curriculum.what
-    tote, mix = io.BytesIO(), io.BytesIO()
+    rows, level_name, tote = read_csv(run_dir / "metrics.csv"), curriculum.what, io.BytesIO()
     best = max((row for row in rows if "eval/occupancy" in row), key=lambda row: row["eval/occupancy"])
     ordered = sorted(episodes.recordings, key=lambda recording: -recording.occupancy)
     draw_scene(ordered[0], cell, item_colours(ordered[0].boxes)).savefig(tote, dpi=100)
-    failures = ""
-    if failure_mix(rows, mix):
-        failures = "<h2>How training episodes ended</h2>" + _picture("Share of each over frames", mix.getvalue())
+    mix = failure_mix(rows)
     policy, sizes = str(cfg.model.actor._target_).rpartition(".")[2], "x".join(map(str, cell.tote_size))
     command = shlex.join(["pickplace-train", *noted_command(run_dir)])
     if changed := changed_values(run_dir, cfg):
@@ -67,17 +64,15 @@ def write_report(
         "tiles": "".join(f"<div><b>{value}</b><span>{text}</span></div>" for value, text in tiles),
         "tote": _picture("The tote at its fullest, and its height map", tote.getvalue()),
         "curve": _picture("Occupancy and levels over frames", (run_dir / "learning_curve.png").read_bytes()),
-        "failures": failures,
-        "tables": validation_table(rows, level_name) + level_table(rows, level_name, curriculum.given),
+        "failures": f"<h2>How training episodes ended</h2>{_picture('Share of each over frames', mix)}" if mix else "",
+        "tables": validation_table(rows, level_name) + level_table(rows, level_name, curriculum.given or ()),
         "command": escape(command),
         "config": escape(OmegaConf.to_yaml(cfg, resolve=True)),
         "versions": escape("\n".join(f"{name}: {value}" for name, value in facts.items())),
         "replay": escape(page(ordered, cell, replay, at_end=True)),
     }
-    template = (ASSETS / "report.html").read_text(encoding="utf-8")
     with replaced_file(run_dir / REPORT) as new:
-        # In one pass, so that no content is taken for a placeholder.
-        new.write_text(re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], template), encoding="utf-8")
+        new.write_text(filled("report.html", **parts), encoding="utf-8")
 
 
 def _picture(text: str, content: bytes) -> str:
@@ -108,7 +103,7 @@ def validation_table(rows: list[dict], level_name: str) -> str:
     )
 
 
-def level_table(rows: list[dict], level_name: str, settings: Sequence[Mapping] | None = None) -> str:
+def level_table(rows: list[dict], level_name: str, settings: Sequence[Mapping] = ()) -> str:
     """An HTML table of the training occupancy at each level, a mean over the last 20 batches in which an episode of it
     ended.
 
@@ -118,12 +113,12 @@ def level_table(rows: list[dict], level_name: str, settings: Sequence[Mapping] |
         settings: what each of them sets, from number 1 on, if the config lists it.
     """
     lines: list[tuple] = []
+    words = [", ".join(f"{key}: {value}" for key, value in level.items()) or "the full task" for level in settings]
     for level in played_levels(rows):
-        seen = [row for row in rows if f"curriculum/occupancy_at_{level}" in row]
-        values = [row[f"curriculum/occupancy_at_{level}"] for row in seen[-20:]]
-        lines.append((level, f"{sum(values) / len(values):.4f}", f"{seen[0]['frames']:,} to {seen[-1]['frames']:,}"))
-        if settings:
-            words = [f"{key}: {value}" for key, value in settings[level - 1].items()]
-            lines[-1] += (escape(", ".join(words) or "the full task"),)
-    head = (level_name, "training occupancy when last trained", "frames", *["sets"][: bool(settings)])
+        key = f"curriculum/occupancy_at_{level}"
+        seen = [row for row in rows if key in row]
+        mean = fmean(row[key] for row in seen[-20:])
+        frames = f"{seen[0]['frames']:,} to {seen[-1]['frames']:,}"
+        lines.append((level, f"{mean:.4f}", frames, *map(escape, words[level - 1 : level])))
+    head = (level_name, "training occupancy when last trained", "frames", *["sets"][: len(words)])
     return "<br>" + _table(head, lines) if lines else ""

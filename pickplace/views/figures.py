@@ -1,9 +1,9 @@
 """Figures of a training run: the learning curve, and the reasons for which episodes ended."""
 
+import io
 import logging
 import textwrap
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
@@ -55,7 +55,7 @@ def save(figure, path: Path) -> None:
 
 
 def learning_curve(metrics: Path, path: Path, levels: tuple[str, int] = ("level", 1), ended: str = "") -> None:
-    """Draw occupancy over frames, and below it that of each level of the curriculum, unless only the last was played.
+    """Draw occupancy over frames, and below it the occupancy at each level, unless only the last level was played.
 
     What the table lacks is left out: a run that was stopped early has no validation, one batch may end no episode.
 
@@ -94,8 +94,8 @@ def _draw_levels(axes, rows: list[dict], levels: range) -> None:
     means = np.full((len(levels), len(edges) - 1), np.nan)
     for line, level in enumerate(levels):
         frames, occupancy = _columns(rows, f"curriculum/occupancy_at_{level}")
-        middles = frames - 0.5  # a batch belongs to the span that it ends
-        counts, sums = (np.histogram(middles, edges, weights=weights)[0] for weights in (None, occupancy))
+        # A batch belongs to the span that it ends.
+        counts, sums = (np.histogram(frames - 0.5, edges, weights=weights)[0] for weights in (None, occupancy))
         np.divide(sums, counts, out=means[line], where=counts > 0)
     image = axes.pcolormesh(edges, np.arange(len(levels) + 1) + levels[0] - 0.5, means, rasterized=True)
     axes.figure.colorbar(image, ax=axes, label="occupancy\nin training")
@@ -108,10 +108,6 @@ def _columns(rows: list[dict], *keys: str) -> np.ndarray:
     return np.array(table, dtype=float).reshape(-1, 1 + len(keys)).T
 
 
-def _line(values: np.ndarray) -> str:
-    return ".-" if len(values) < 20 else "-"
-
-
 def _running_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the weighted mean over the latest 1% of the batches, for each batch that has as many before it."""
     window = np.ones(max(1, len(values) // 100))
@@ -122,8 +118,7 @@ def _running_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def _show_frames(axes, rows: list[dict]) -> None:
     from matplotlib.ticker import EngFormatter
 
-    most = max([row["frames"] for row in rows], default=100)
-    axes.set(xlabel="frames (environment steps)", xlim=(0, 1.02 * most))
+    axes.set(xlabel="frames (environment steps)", xlim=(0, 1.02 * rows[-1]["frames"] if rows else 100))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
@@ -132,15 +127,17 @@ def _draw_occupancy(axes, rows: list[dict], ended: str) -> None:
     if len(frames):
         smooth = _running_mean(occupancy, np.ones(len(frames)))
         axes.plot(
-            frames[-len(smooth) :], smooth, _line(smooth), color=LINE,
+            frames[-len(smooth) :], smooth, ".-" if len(smooth) < 20 else "-", color=LINE,
             label="training episodes, at their levels, actions sampled",
         )  # fmt: skip
     frames, mean, low, high = _columns(rows, "eval/occupancy", "eval/ci95_low", "eval/ci95_high")
     if len(frames):
         # The mean of few episodes may lie outside its interval by rounding; a bar has no negative length.
         bars = np.maximum([mean - low, high - mean], 0)
-        label = "validation on the full task, 95% interval"
-        axes.errorbar(frames, mean, yerr=bars, fmt="o-", ms=4, capsize=2, color=POINT, label=label)
+        axes.errorbar(
+            frames, mean, yerr=bars, fmt="o-", ms=4, capsize=2, color=POINT,
+            label="validation on the full task, 95% interval",
+        )  # fmt: skip
     if ended:
         text = textwrap.fill(f"end: {textwrap.shorten(ended, 300, placeholder=' ...')}", 80)
         axes.axvline(rows[-1]["frames"], color=INK, ls="--", lw=1, label=text)
@@ -152,15 +149,11 @@ def _draw_occupancy(axes, rows: list[dict], ended: str) -> None:
         axes.text(0.5, 0.5, "no episode has ended yet", transform=axes.transAxes, ha="center", color=INK)
 
 
-def failure_mix(rows: list[dict], file: IO[bytes]) -> bool:
-    """Draw the share of training episodes that ended for each reason, over frames, if there is more than one reason.
+def failure_mix(rows: list[dict]) -> bytes:
+    """Return a PNG with the share of training episodes that ended for each reason, over frames; empty for one reason.
 
     Args:
         rows: of a ``metrics.csv``.
-        file: where the PNG is written.
-
-    Returns:
-        Whether it was drawn.
     """
     from matplotlib.ticker import PercentFormatter
 
@@ -168,7 +161,7 @@ def failure_mix(rows: list[dict], file: IO[bytes]) -> bool:
     rows = [row for row in rows if any(key.startswith(prefix) for key in row)]
     names = [name for name in FAILURES if any(row.get(prefix + name, 0) > 0 for row in rows)]
     if len(names) < 2:
-        return False
+        return b""
     figure = figure_of(8, 3.2)
     axes = figure.subplots()
     weights = np.array([row.get("train/episodes", 1.0) for row in rows])
@@ -181,5 +174,6 @@ def failure_mix(rows: list[dict], file: IO[bytes]) -> bool:
     axes.set(ylim=(0, 1), ylabel="training episodes")
     axes.yaxis.set_major_formatter(PercentFormatter(1))
     _show_frames(axes, rows)
+    file = io.BytesIO()
     figure.savefig(file, dpi=120)
-    return True
+    return file.getvalue()

@@ -68,6 +68,7 @@ def filled(template: str, **parts: str) -> str:
         "scene": asset("scene.js").rstrip(),
         "three": asset("three.min.js").replace("</script", "<\\/script"),  # it stands in a script element
     }
+    # In one pass, so that no content is taken for a placeholder.
     return re.sub(r"\{\{(\w+)\}\}", lambda mark: {**shared, **parts}[mark[1]], asset(template))
 
 

@@ -18,7 +18,7 @@ def test_every_preset_runs(name, tmp_path, monkeypatch):
     """And ends in a report. Its figures, which are the same for all presets, take most of the time."""
     if name != "smoke":
         monkeypatch.setattr(trainer, "learning_curve", lambda metrics, path, *_: path.touch())
-        monkeypatch.setattr(report, "failure_mix", lambda rows, file: False)
+        monkeypatch.setattr(report, "failure_mix", lambda rows: b"")
     sizes = {"smoke": [4, 4, 1], "mixed": [7, 7, 3], "mixed_bin3": [7, 7, 3], "warehouse": [16, 12, 60]}
     extra = [f"env.tote_size={sizes[name]}".replace(" ", "")] if name in sizes else []
     extra += ["items.depth=[9,10]"] * (name == "warehouse")  # fewer kinds
