@@ -60,8 +60,12 @@ def read_run(folder: Path) -> SweepRun:
     run = SweepRun(folder.name)
     try:
         words = read_note(folder, "overrides.yaml")
-        good = isinstance(words, list) and all(isinstance(word, str) for word in words)
-        expect(good, f"{folder}/.hydra/overrides.yaml", words, "the overrides of the run, as Hydra notes them")
+        expect(
+            isinstance(words, list) and all(isinstance(word, str) for word in words),
+            f"{folder}/.hydra/overrides.yaml",
+            words,
+            "the overrides of the run, as Hydra notes them",
+        )
         run.overrides = dict(word.lstrip("+").partition("=")[::2] for word in words)
         facts = read_facts(folder, "last")
         if (folder / "metrics.csv").is_file():
@@ -109,18 +113,16 @@ class Setting:
         self.interquartile_mean = float(trim_mean(finals, 0.25)) if count >= 4 else None
         self.interval = tuple(map(float, bootstrap95(finals))) if count >= 2 else (None, None)
         trained = [run.frames for run in self.finished]
-        self.frames = (min(trained), max(trained)) if count else (None, None)
+        self.frames = (min(trained), max(trained)) if trained else (None, None)
 
     @property
     def curves(self) -> tuple[np.ndarray, np.ndarray]:
         """Frames ``[V]`` and validation occupancies ``[V, S]`` of the finished runs; after an end, the last."""
-        frames = sorted({int(row["frames"]) for run in self.finished for row in run.validations})
-        values = np.full((len(frames), len(self.finished)), np.nan)
-        for column, run in enumerate(self.finished):
-            for row in run.validations:
-                values[frames.index(int(row["frames"])) :, column] = row["eval/occupancy"]
-        complete = ~np.isnan(values).any(1)
-        return np.array(frames)[complete], values[complete]
+        curves = [run.curve[:2] for run in self.finished]
+        first = max((frames[0] for frames, _ in curves), default=0)  # from here on each run has a validation
+        frames = np.unique([each for frames, _ in curves for each in frames if each >= first])
+        values = [occupancy[np.searchsorted(seen, frames, "right") - 1] for seen, occupancy in curves]
+        return frames, np.reshape(values, (len(curves), len(frames))).T
 
 
 def bootstrap95(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
