@@ -51,8 +51,10 @@ MAX_LENGTH, MAX_WORD = 1_000, 300
 WORD = re.compile("[^\\W_]+")
 
 #: What an error of the operating system asks for; others ask for another path.
-REMEDIES = dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "a place where you may read and write")
-REMEDIES |= dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free space")
+REMEDIES = {
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "a place where you may read and write"),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free space"),
+}
 
 
 @contextmanager

@@ -76,8 +76,7 @@ def reworded(errors, new: Callable[[Any], Exception]) -> Iterator[None]:
 
 def at_most(words: str, count: int, what: str, most: int) -> None:
     """Refuse a count that is too great; the message begins with ``words``."""
-    if count > most:
-        raise ValueError(f"{words} {count:,} {what}; expected at most {most:,}.")
+    refuse_if(count > most, f"{words} {count:,} {what}; expected at most {most:,}.")
 
 
 def is_whole(value) -> bool:
@@ -105,8 +104,7 @@ def whole_numbers(place: str, most: int, **values) -> None:
 
 def integral_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:
     """Return ``value`` as an int, as :func:`whole_number`; a float such as 5e6 is accepted."""
-    is_integral = isinstance(value, float) and value.is_integer()
-    return whole_number(key, int(value) if is_integral else value, least, most)
+    return whole_number(key, int(value) if isinstance(value, float) and value.is_integer() else value, least, most)
 
 
 def number(key: str, value, least: float = 0.0, most: float | None = None, what: str = "a number") -> float:

@@ -28,20 +28,14 @@ log = logging.getLogger(__name__)
 
 #: The flags for folders of config files, and the others, as arguments of :class:`Parser`.
 FOLDERS: dict[str, dict[str, Any]] = {"--config-dir/-cd": {"action": "append", "default": []}}
-SWITCHES = (
-    "--help/-h",
-    "--multirun/-m",
-    "--run/-r",
-    "--resolve",
-    "--hydra-help",
-    "--version",
-    "--shell-completion/-sc",
-)
 OPTIONS: dict[str, dict[str, Any]] = {
     "--cfg/-c": {"choices": ["job", "hydra", "all"]},
     "--package/-p": {},
     "--info/-i": {"nargs": "?", "const": "all"},
-    **dict.fromkeys([*SWITCHES, "--shell-completion/-sc"], {"action": "store_true"}),
+    **dict.fromkeys(
+        ("--help/-h", "--multirun/-m", "--run/-r", "--resolve", "--hydra-help", "--version", "--shell-completion/-sc"),
+        {"action": "store_true"},
+    ),
 }
 FLAGS = [name for names in (*FOLDERS, *OPTIONS) for name in names.split("/")]
 

@@ -85,9 +85,8 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
     own_modules(cfg.trust)
     use_machine(cfg)
     settings = {key: value for key, value in resolved(cfg.planner).items() if key != "_target_"}
-    facts: dict[str, Any] = {"planner_settings": settings, "checkpoint": None}
-    trained, about = load_trained(cfg) if cfg.checkpoint is not None else (None, {})
-    facts |= about
+    trained, about = load_trained(cfg) if cfg.checkpoint is not None else (None, {"checkpoint": None})
+    facts: dict[str, Any] = {"planner_settings": settings, **about}
     items = build("items", cfg["items"])
     if not items.varies:
         facts["same_items"] = True

@@ -195,8 +195,12 @@ def decision_latency(make_env: MakeEnv, planner: BatchPlanner, decisions: int) -
         times.append(((time.perf_counter() - start) * 1e3, (time.process_time() - cpu_start) * 1e3))
         _, observation = env.step_and_maybe_reset(observation.set("action", action))
     wall, cpu = torch.tensor(times, dtype=torch.float64).T
-    figures = {"p50": wall.quantile(0.5), "p95": wall.quantile(0.95), "cpu_p50": cpu.quantile(0.5)}
-    return {key: float(value) for key, value in {**figures, "cpu_mean": cpu.mean()}.items()}
+    return {
+        "p50": float(wall.quantile(0.5)),
+        "p95": float(wall.quantile(0.95)),
+        "cpu_p50": float(cpu.quantile(0.5)),
+        "cpu_mean": float(cpu.mean()),
+    }
 
 
 def carry_out(engine: Engine, plans: Sequence[EpisodePlan], recordings: Sequence[Recording]) -> list[Outcome]:

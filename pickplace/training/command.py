@@ -1,4 +1,4 @@
-"""The ``pickplace-train`` command, which imports torch after its command line fits."""
+"""The ``pickplace-train`` command: it checks its command line, then imports torch."""
 
 import logging
 import sys
@@ -22,22 +22,13 @@ def main() -> None:
                 len(overrides) < len(sys.argv) - 1,
                 "resume=...: expected only key=value overrides beside it, no flags such as -m.",
             )
-            resume(overrides)
+            place, words = resumed_place(overrides)
+            if facts := read_facts(locate(place, "last")):  # refuse bad overrides before torch is imported
+                logging.disable(logging.WARNING)  # the training itself warns
+                try:
+                    resumed_config(place, facts, words)
+                finally:
+                    logging.disable(logging.NOTSET)
+            import_quietly("pickplace.training.train").resume_run(overrides)
     else:
         Command("train", "pickplace.training.train.train", folder, after_sweep=summarize)()
-
-
-def resume(overrides: list[str]) -> float:
-    """Continue a run in its own folder, after its overrides fit the config of the run.
-
-    Returns, Raises:
-        As :func:`pickplace.training.train.resume_run`.
-    """
-    place, words = resumed_place(overrides)
-    if facts := read_facts(locate(place, "last")):
-        logging.disable(logging.WARNING)  # the training itself warns
-        try:
-            resumed_config(place, facts, words)
-        finally:
-            logging.disable(logging.NOTSET)
-    return import_quietly("pickplace.training.train").resume_run(overrides)
