@@ -1,4 +1,4 @@
-"""The ``pickplace-evaluate`` command, which imports torch after its command line and the checkpoint's config fit."""
+"""The ``pickplace-evaluate`` command: it checks its command line and the checkpoint's config, then imports torch."""
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -19,7 +19,7 @@ def main() -> None:
 
 
 def check(cfg: DictConfig) -> None:
-    """Refuse overrides that do not fit the checkpoint's config; whether all of it can be read is seen later."""
+    """Refuse overrides that do not fit the checkpoint's config; its weights are read and checked by the evaluation."""
     if cfg.checkpoint is None:
         refuse_if("model" in cfg, "model: there are no settings of a model without checkpoint=<run folder>.")
     elif facts := read_facts(locate(str(cfg.checkpoint))):

@@ -5,7 +5,7 @@ from numbers import Real
 from typing import Any
 
 from pickplace.common.errors import sentence
-from pickplace.common.validate import expect, number, or_null, whole_number
+from pickplace.common.validate import expect, number, or_null, refuse_if, whole_number
 from pickplace.config.registry import build
 from pickplace.evaluation.play import Episodes
 
@@ -24,7 +24,7 @@ class Callback:
         """Called after a validation, whose means are in ``metrics["eval/..."]``, and before ``best`` is saved."""
 
     def on_level_change(self, trainer: Any, old: int, new: int) -> None:
-        """Called when the curriculum has moved from one tote height to another, in height units."""
+        """Called when the curriculum has moved from one level to another, with their numbers."""
 
     def state_dict(self) -> dict:
         """Return what a checkpoint stores for a resume, as JSON: numbers, texts, lists and dicts."""
@@ -37,8 +37,8 @@ class Callback:
 class EarlyStopping(Callback):
     """End the training at a validation occupancy, or when validations no longer improve.
 
-    The reason that it gives says where the end rests on a single validation that may be luck: one whose 95% interval
-    begins below the occupancy, or a best one whose interval holds none of those since.
+    The reason says if the end may be luck. That is so if the 95% interval of the validation that reached the occupancy
+    begins below it, or if all validations since the best one are below the interval of the best one.
 
     Args:
         occupancy: mean validation occupancy, 0 to 1, that ends it; None: any.
@@ -131,7 +131,9 @@ def call(callbacks: dict[str, Callback], hook: str, trainer: Any, *arguments: An
     for name, callback in callbacks.items():
         before = list(metrics)
         getattr(callback, hook)(trainer, *arguments)
-        if removed := [key for key in before if key not in metrics]:
-            raise ValueError(f"callbacks.{name}: it removes {removed[0]} from the metrics; expected changed values.")
+        for key in before:
+            refuse_if(
+                key not in metrics, f"callbacks.{name}: it removes {key} from the metrics; expected changed values."
+            )
         for key, value in metrics.items():
             expect(isinstance(value, Real), f"callbacks.{name}: it logs {key}", value, "a number")
