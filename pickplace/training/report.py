@@ -39,7 +39,8 @@ def write_report(
         OSError: naming the report, if it cannot be written.
     """
     rows, level_name, tote = read_csv(run_dir / "metrics.csv"), curriculum.what, io.BytesIO()
-    best = max((row for row in rows if "eval/occupancy" in row), key=lambda row: row["eval/occupancy"])
+    validations = [row for row in rows if "eval/occupancy" in row]
+    best = max(validations, key=lambda row: row["eval/occupancy"])
     ordered = sorted(episodes.recordings, key=lambda recording: -recording.occupancy)
     draw_scene(ordered[0], cell, item_colours(ordered[0].boxes)).savefig(tote, dpi=100)
     mix = failure_mix(rows)
@@ -65,7 +66,7 @@ def write_report(
         "tote": _picture("The tote at its fullest, and its height map", tote.getvalue()),
         "curve": _picture("Occupancy and levels over frames", (run_dir / "learning_curve.png").read_bytes()),
         "failures": f"<h2>How training episodes ended</h2>{_picture('Share of each over frames', mix)}" if mix else "",
-        "tables": validation_table(rows, level_name) + level_table(rows, level_name, curriculum.given or ()),
+        "tables": validation_table(validations, level_name) + level_table(rows, level_name, curriculum.given or ()),
         "command": escape(command),
         "config": escape(OmegaConf.to_yaml(cfg, resolve=True)),
         "versions": escape("\n".join(f"{name}: {value}" for name, value in facts.items())),
@@ -86,21 +87,17 @@ def _table(head: tuple, rows: list[tuple]) -> str:
 
 
 def validation_table(rows: list[dict], level_name: str) -> str:
-    """An HTML table of up to 12 of the validations, at equal distances, and the last one."""
-    found = [
+    """An HTML table of up to 12 of the rows with a validation, at equal distances, and the last one."""
+    lines = [
         (
             f"{row['frames']:,}",
             f"{row['eval/occupancy']:.4f}",
             f"{row['eval/ci95_low']:.4f} to {row['eval/ci95_high']:.4f}",
             int(row["curriculum/level"]),
         )
-        for row in rows
-        if "eval/occupancy" in row
+        for row in rows[: -1 : -(-len(rows) // 12)] + rows[-1:]
     ]
-    return _table(
-        ("frames", "validation", "95% interval", f"{level_name} in training"),
-        found[: -1 : -(-len(found) // 12)] + found[-1:],
-    )
+    return _table(("frames", "validation", "95% interval", f"{level_name} in training"), lines)
 
 
 def level_table(rows: list[dict], level_name: str, settings: Sequence[Mapping] = ()) -> str:

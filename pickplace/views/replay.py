@@ -140,15 +140,14 @@ def _item(item: InBin, cell: CellSpec) -> list[int | float]:
 
 
 # ---------------------------------------------------------------------- pictures
-def picture(recording: Recording, cell: CellSpec, path: Path, moves: int | None = None) -> None:
-    """Draw the tote after a number of moves, beside its height map, as PNG, and as PDF and SVG beside it.
+def picture(recording: Recording, cell: CellSpec, path: Path) -> None:
+    """Draw the tote at the end of an episode, beside its height map, as PNG, and as PDF and SVG beside it.
 
     Args:
         recording, cell: the episode and the sizes.
         path: the PNG to write.
-        moves: how many moves have been made; None: all.
     """
-    save(draw_scene(recording, cell, item_colours(recording.boxes), moves), path)
+    save(draw_scene(recording, cell, item_colours(recording.boxes)), path)
 
 
 def animation(
