@@ -2,7 +2,6 @@
 
 from collections.abc import Collection
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -25,7 +24,6 @@ def problem_bytes(cell: CellSpec, masks: Collection[str]) -> int:
     return cell.bin_items * (count + ("action" in masks) * (4 * cell.num_actions + 8 * offsets * cell.num_places))
 
 
-@lru_cache(64)  # a training makes many environments that differ in their episodes only
 def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: int = ALL_TURNS) -> None:
     """Refuse items that could make a fresh episode impossible.
 

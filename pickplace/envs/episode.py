@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from pickplace.common.validate import expect, is_whole, one_of, whole_number
+from pickplace.common.validate import expect, integral_number, is_whole, one_of
 from pickplace.items.distributions import ItemDistribution
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import flags_from_turns, turns_from_flags
@@ -38,20 +38,13 @@ class Setting(NamedTuple):
 
 
 def _read_rotations(key: str, value: Any, cell: CellSpec) -> int:
-    rotations = range(value) if is_whole(value) and 1 <= value <= cell.rotations else value
-    good = isinstance(rotations, Sequence) and rotations and all(turn in range(cell.rotations) for turn in rotations)
-    expect(
-        good, key, value, f"a number of quarter turns, at most {cell.rotations}, or a list of those that are allowed"
+    turns = range(value) if is_whole(value) and 1 <= value <= cell.rotations else value
+    good = (
+        isinstance(turns, Sequence) and turns and all(is_whole(turn) and 0 <= turn < cell.rotations for turn in turns)
     )
-    return sum(1 << turn for turn in set(rotations))
-
-
-def _read_refill(key: str, value: Any, cell: CellSpec) -> int:
-    return REFILLS.index(one_of(key, value, REFILLS))
-
-
-def _read_number(most: Callable[[CellSpec], int]) -> Callable[[str, Any, CellSpec], int]:
-    return lambda key, value, cell: whole_number(key, value, most=most(cell))
+    expected = f"a number of quarter turns, at most {cell.rotations}, or a list of those that are allowed"
+    expect(good, key, value, expected)
+    return sum(1 << turn for turn in set(turns))
 
 
 #: The settings, by the names of their entries in an observation.
@@ -62,15 +55,27 @@ SETTINGS: dict[str, Setting] = {
     ),
     "bin_items": Setting(
         "bin_items", lambda cell: cell.bin_items, lambda cell, items: (1, cell.bin_items),
-        _read_number(lambda cell: cell.bin_items),
+        lambda key, value, cell: integral_number(key, value, most=cell.bin_items),
     ),
     "refill": Setting(
-        "refill", lambda cell: REFILLS.index(cell.refill), lambda cell, items: (0, len(REFILLS) - 1), _read_refill,
+        "refill", lambda cell: REFILLS.index(cell.refill), lambda cell, items: (0, len(REFILLS) - 1),
+        lambda key, value, cell: REFILLS.index(one_of(key, value, REFILLS)),
     ),
     "item_mix": Setting(
-        "item_mix", lambda cell: 0, lambda cell, items: (0, items.mixes - 1), _read_number(lambda cell: MAX_NUMBER),
+        "item_mix", lambda cell: 0, lambda cell, items: (0, items.mixes - 1),
+        lambda key, value, cell: integral_number(key, value, 0, MAX_NUMBER),
     ),
     "level": Setting(
-        "level", lambda cell: 0, lambda cell, items: (0, MAX_NUMBER), _read_number(lambda cell: MAX_NUMBER)
+        "level", lambda cell: 0, lambda cell, items: (0, MAX_NUMBER),
+        lambda key, value, cell: integral_number(key, value, 0, MAX_NUMBER),
     ),
+}  # fmt: skip
+
+#: What a reset may be given: the height of the tote, in which episodes may always differ, and the settings.
+RESET_ENTRIES: dict[str, Setting] = {
+    "tote_height": Setting(
+        "tote_height", lambda cell: cell.tote_size[2], lambda cell, items: (1, cell.tote_size[2]),
+        lambda key, value, cell: integral_number(key, value, most=cell.tote_size[2]),
+    ),
+    **SETTINGS,
 }  # fmt: skip

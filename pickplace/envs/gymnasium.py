@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from tensordict import TensorDict
 
 from pickplace.common.validate import expect
-from pickplace.envs.episode import SETTINGS
+from pickplace.envs.episode import RESET_ENTRIES
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.distributions import check_seed
 from pickplace.rules.state import Failure
@@ -113,7 +113,8 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
     Spaces, rewards and information are those of :class:`PickPlaceGymEnv`. ``reset(seed=s)`` begins the item stream
     ``s``: slot ``i`` plays its episodes ``i``, ``i + N``, ``i + 2 N``, ... ``options``: ``tote_height`` (a number, or
     one for each slot), other settings of the episodes (one value, or a list with one for each slot), and ``reset_mask``
-    (bool ``[N]``, the slots to reset). What resets itself plays the full task.
+    (bool ``[N]``, the slots to reset). A plain list of ``rotations`` is one value, those that every slot allows; with
+    one for each slot it is a list of lists. What resets itself plays the full task.
 
     Args:
         num_envs: ``N``.
@@ -163,9 +164,8 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         if unknown := sorted(set(options) - {*known}):
             expected = " or ".join(", ".join(known).rsplit(", ", 1))
             raise ValueError(f"options[{unknown[0]!r}]: there is no such option; expected {expected}.")
-        settings = {"tote_height": self._tote_heights(options.get("tote_height"))}
-        settings |= {key: self._episode_setting(key, options[key]) for key in self._env.cell.varies if key in options}
-        rows = np.asarray(options.get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        rows = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        settings = {key: self._entry(key, value) for key, value in options.items()}
         good = rows.shape == (self.num_envs,) and rows.dtype == bool and rows.any()
         expect(good, "options['reset_mask']", rows, f"bool of shape ({self.num_envs},), at least one True")
         if seed is not None or not self._started:
@@ -227,22 +227,10 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
             masks[self._ended] = np.arange(masks.shape[1]) == 0
         return masks
 
-    def _tote_heights(self, given=None) -> torch.Tensor:
-        """Return ``options["tote_height"]``, a number or one per problem, as int64 ``[N, 1]``; None: full height."""
-        low, high, count = self._env.min_tote_height, self._env.cell.tote_size[2], self.num_envs
-        heights = np.asarray(high if given is None else given)
-        expected = f"a whole number between {low} (the tallest item) and {high} (tote_size[2])"
-        good = (
-            heights.dtype.kind in "iu"
-            and heights.shape in ((), (count,))
-            and low <= heights.min() <= heights.max() <= high
-        )
-        expect(good, "options['tote_height']", given, expected + f", or {count} of them" * (count > 1))
-        return torch.as_tensor(np.broadcast_to(heights, count).astype(np.int64))[:, None]
-
-    def _episode_setting(self, key: str, given: Any) -> torch.Tensor:
+    def _entry(self, key: str, given: Any) -> torch.Tensor:
         """Return an option as the entry of an observation, ``[N, ...]``: a value, or one for each problem in a list."""
-        setting, place, cell = SETTINGS[key], f"options[{key!r}]", self._env.cell
+        setting, place, cell = RESET_ENTRIES[key], f"options[{key!r}]", self._env.cell
+        given = given.tolist() if isinstance(given, np.ndarray) else given
         try:
             numbers = [setting.read(place, given, cell)] * self.num_envs
         except ValueError:

@@ -8,7 +8,7 @@ from torch import Tensor
 from pickplace.common.validate import refuse_if
 from pickplace.envs.episode import SETTINGS
 from pickplace.envs.torchrl import PickPlaceEnv
-from pickplace.items.distributions import MAX_SEED, of_mix
+from pickplace.items.distributions import MAX_SEED
 from pickplace.rules.bin import select_item
 from pickplace.rules.item import Item, bin_labels_from_items
 from pickplace.rules.observation import observe, standard_terms
@@ -58,7 +58,6 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
         value = saved[SETTINGS[key].field]
         check(key, (value >= low) & (value <= high), f"{low} to {high}")
     state = State(surface, tote_height, Item.from_table(saved["item"]), Episode(**episode_settings))
-    kinds = of_mix(state.episode.item_mix)
     heights = state.heights
     check("surface", (heights >= 0) & (heights <= tote_height[:, None, None]), "heights of 0 to tote_height")
     check("surface", state.bearing | ((heights > 0) & cell.support.marks_bearing), "cells that bear weight")
@@ -77,7 +76,12 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     check("arrived", saved["arrived"] == steps + count, "the items placed and those in the bin")
     newest = select_item(items, (count - 1).clamp(min=0)).table
     arrival = env.items.sample(
-        env.stream, seed.expand_as(episode), episode, saved["arrived"] - 1, cell.bin_size, **kinds
+        env.stream,
+        seed.expand_as(episode),
+        episode,
+        saved["arrived"] - 1,
+        cell.bin_size,
+        **env.items.of_mix(state.episode.item_mix),
     )
     if state.episode.turns is not None:
         arrival = arrival._replace(turns=arrival.turns & state.episode.turns)

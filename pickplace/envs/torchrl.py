@@ -134,6 +134,8 @@ class PickPlaceEnv(EnvBase):
         self._full = {key: SETTINGS[key].full(cell) for key in cell.varies}
         self.items, self.cell, self.terms = items, cell, check_terms(observation, cell)
         check_items(cell, items)
+        # Mixes and rotations with which every item fits the empty tote.
+        self._checked_starts = {(0, self._full.get("rotations", ALL_TURNS))}
         self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
         device = usable_device(device)
         check_bytes(f"num_envs={num_envs}", num_envs * problem_bytes(self.cell, masks), device)
@@ -236,27 +238,29 @@ class PickPlaceEnv(EnvBase):
 
     def _read_settings(self, given, rows: Tensor) -> None:
         """Set what the episodes that begin in ``rows``, bool ``[N]``, differ in, by the entries of a TensorDict."""
+        found: dict[str, Tensor] = {}  # kept only once all of them are known to be good
         for key, full in self._full.items():
             setting, values = SETTINGS[key], self.get_buffer(SETTINGS[key].field)
             wanted = values.masked_fill(rows, full)
             if key in given:
                 wanted = torch.where(rows, setting.encode(given[key]), values)
             low, high = setting.limits(self.cell, self.items)
-            values.copy_(_checked(key, wanted, low, high, f"between {low} and {high}"))
+            found[setting.field] = _checked(key, wanted, low, high, f"between {low} and {high}")
         high, least = self.cell.tote_size[2], self.min_tote_height
         height = given.get("tote_height", torch.full_like(self.tote_height, high)).reshape(self.num_envs)
         expected = f"between {least} (the tallest item) and {high} (tote_size[2])"
         height = _checked("tote_height", torch.where(rows, height, self.tote_height), least, high, expected)
         if self.cell.varies:
-            episode = self._differs
-            mix = torch.zeros_like(height) if episode.item_mix is None else episode.item_mix
-            turns = torch.full_like(height, ALL_TURNS) if episode.turns is None else episode.turns
-            for pair in set(zip(mix[rows].tolist(), turns[rows].tolist(), strict=True)):
+            mix = found.get("item_mix", torch.zeros_like(height))
+            turns = found.get("turns", torch.full_like(height, ALL_TURNS))
+            for pair in {*zip(mix[rows].tolist(), turns[rows].tolist(), strict=True)} - self._checked_starts:
                 check_items(self.cell, self.items, *pair)
+                self._checked_starts.add(pair)
             if (low := height < self.tallest[mix]).any():
                 expected = f"at least {int(self.tallest[mix][low][0])}, the tallest item of that mix"
                 raise ValueError(f"tote_height={int(height[low][0])}: expected {expected}.")
-        self.tote_height.copy_(height)
+        for name, values in {**found, "tote_height": height}.items():
+            self.get_buffer(name).copy_(values)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         most, state = self.cell.num_actions - 1, self.state

@@ -5,7 +5,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from pickplace.items.distributions import ItemDistribution, hashed_uniform, of_mix
+from pickplace.items.distributions import ItemDistribution, hashed_uniform
 from pickplace.rules.bin import add_item, must_share
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item
@@ -31,7 +31,6 @@ def refill(
         rows: bool ``[N]``, the bins in which items may arrive.
         differs: what the episodes differ in.
     """
-    kinds = of_mix(differs.item_mix)
     if differs.refill is None:
         open_ = rows & ~items.exists[:, 0] if cell.refill == "batch" else rows
     else:
@@ -42,7 +41,7 @@ def refill(
             open_ = open_ & (items.exists.sum(1) < differs.bin_items)
         if number and not open_.any():
             break
-        item = source.sample(stream, seed, episode, arrived, cell.bin_size, **kinds)
+        item = source.sample(stream, seed, episode, arrived, cell.bin_size, **source.of_mix(differs.item_mix))
         if differs.turns is not None:
             item = item._replace(turns=item.turns & differs.turns)
         if must_share(items, open_):

@@ -78,11 +78,6 @@ def check_range(key: str, limits) -> tuple[int, int]:
     return int(limits[0]), int(limits[1])
 
 
-def of_mix(mix: Tensor | None) -> dict[str, Tensor]:
-    """Return the argument of :meth:`ItemDistribution.sample` that names a mix; a class without mixes needs none."""
-    return {} if mix is None else {"mix": mix}
-
-
 class ItemDistribution:
     """Base class of item distributions.
 
@@ -119,6 +114,10 @@ class ItemDistribution:
         """Return which row of ``sizes`` arrives, int64 ``[N]``."""
         raise NotImplementedError
 
+    def of_mix(self, mix: Tensor | None) -> dict[str, Tensor]:
+        """Return the argument of :meth:`sample` and :meth:`spread` that names a mix; without mixes there is none."""
+        return {} if mix is None or self.mixes == 1 else {"mix": mix}
+
     def mixed(self, changes: Sequence[Mapping]) -> Self:
         """Return this distribution with further mixes of its sizes, numbered from 1; mix 0 is itself.
 
@@ -140,7 +139,7 @@ class ItemDistribution:
 
     def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size, mix: Tensor | None = None) -> Item:
         """Return the ``rank``-th of ``count`` items for each seed, int64 ``[N]``; here simply independent ones."""
-        return self.sample("train", seed, rank, torch.zeros_like(rank), bin_size, **of_mix(mix))
+        return self.sample("train", seed, rank, torch.zeros_like(rank), bin_size, **self.of_mix(mix))
 
     def corners(self, kind: int, bin_size) -> list[tuple[int, int]]:
         """Return every bin position ``(x, y)`` at which kind number ``kind`` may arrive."""

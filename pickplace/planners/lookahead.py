@@ -7,7 +7,7 @@ from torch import Tensor
 
 from pickplace.common.validate import check_bytes, number, or_null, refuse_if, whole_number
 from pickplace.items.arrival import refill
-from pickplace.items.distributions import ItemDistribution, check_seed, of_mix, search_items
+from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import MASKED, EstimatesValue, Policy, ScoresFootprints
 from pickplace.rules.cell import CellSpec
@@ -202,9 +202,9 @@ class _Imagined(ItemDistribution):
 
     def __init__(self, items: ItemDistribution, count: int):
         self.items, self.count = items, count
-        self.has_corners = items.has_corners
+        self.has_corners, self.mixes = items.has_corners, items.mixes
 
     def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size, mix=None) -> Item:
-        item = self.items.sample(stream, seed, episode, step, bin_size, **of_mix(mix))
-        first = self.items.spread(seed, episode, self.count, bin_size, mix)
+        item = self.items.sample(stream, seed, episode, step, bin_size, **self.items.of_mix(mix))
+        first = self.items.spread(seed, episode, self.count, bin_size, **self.items.of_mix(mix))
         return Item(*(torch.where(step == 0, *parts) for parts in zip(first, item, strict=True)))

@@ -1,7 +1,7 @@
 """Episode settings: environments whose episodes differ in all of them, against the oracle; bad ones; and Gymnasium."""
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from random import Random
 
@@ -21,12 +21,14 @@ from test_env_oracle import (
 )
 
 from pickplace import PickPlaceEnv
+from pickplace.envs import torchrl
 from pickplace.envs.episode import SETTINGS
 from pickplace.items.arrival import refill
-from pickplace.items.distributions import PAPER_KINDS, Kinds
+from pickplace.items.distributions import PAPER_KINDS, ItemDistribution, Kinds, hashed_uniform, place_at_random
 from pickplace.planners import lookahead, mcts
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.rules.state import REFILLS
+from pickplace.rules.support.base import Support
 
 NUM_ENVS, STEPS = 8, 12
 
@@ -143,3 +145,54 @@ def test_a_search_imagines_what_may_arrive_in_the_episode(bin_items, monkeypatch
             small = differs.item_mix == 1
             assert (found.volume[small] <= 1).all() and (found.exists.sum(1) <= 1).all()
             assert (found.turns[found.exists] == differs.turns[:, None].expand_as(found.turns)[found.exists]).all()
+
+
+def test_a_reset_that_is_refused_changes_nothing():
+    items = Kinds([(1, 1, 1), (1, 1, 3)]).mixed([{"height": [1, 1]}])
+    env = PickPlaceEnv(items, num_envs=2, tote_size=(4, 4, 4), varies=("rotations", "item_mix"))
+    env.reset()
+    before = {key: value.clone() for key, value in env.state_dict().items()}
+    given = {"rotations": torch.tensor([[True, False, False, False]] * 2), "tote_height": torch.tensor([[2], [2]])}
+    with pytest.raises(ValueError, match="tote_height=2: expected at least 3, the tallest item of that mix"):
+        env.reset(TensorDict(given, [2]))
+    assert all(value.equal(before[key]) for key, value in env.state_dict().items())
+
+
+def test_what_fits_the_empty_tote_is_checked_once_for_each_mix(monkeypatch):
+    calls, check = [], torchrl.check_items
+    monkeypatch.setattr(torchrl, "check_items", lambda *args: calls.append(args) or check(*args))
+    items = Kinds(PAPER_KINDS).mixed([{"weights": [1, 0, 0, number]} for number in range(1, 101)])
+    env = PickPlaceEnv(items, num_envs=100, varies=("item_mix",))
+    for _ in range(2):
+        env.reset(TensorDict({"item_mix": torch.arange(1, 101)[:, None]}, [100]))
+    assert len(calls) == 101
+
+
+@dataclass
+class OwnSupport(Support):
+    """A stability rule that cannot be hashed, as a plain dataclass."""
+
+    share: float = 0.5
+
+    def stable(self, contact):
+        return contact.share >= self.share
+
+
+class OwnItems(ItemDistribution):
+    """A distribution without mixes, whose methods have no such argument."""
+
+    sizes = torch.tensor([[1, 1, 1]])
+
+    def sample(self, stream, seed, episode, step, bin_size):
+        return place_at_random(self.sizes[step * 0], *hashed_uniform(stream, seed, episode, step, 2), bin_size)
+
+    def spread(self, seed, rank, count, bin_size):
+        return self.sample("train", seed, rank, rank, bin_size)
+
+
+def test_parts_of_the_users_own_need_not_know_of_mixes_or_hashes():
+    env = PickPlaceEnv(OwnItems(), num_envs=2, tote_size=(3, 3, 1), support=OwnSupport(), varies=("item_mix",))
+    policy = FcnGrasp(env.cell, filters=8, hidden=8)
+    search = lookahead.Lookahead(env.cell, policy, env.items, samples=2, rounds=1)
+    td = env.reset()
+    assert env.step(td.set("action", search.decide(td)))["next", "reward"].eq(1).all()

@@ -278,5 +278,7 @@ def test_options_set_what_the_environment_lets_vary():
     ):
         with pytest.raises(ValueError, match=words):
             many.reset(options=options)
+    numbers, _ = many.reset(seed=1, options={"tote_height": np.array([2, 5]), "rotations": [1, 2]})
+    assert numbers["rotations"].astype(int).tolist() == [[0, 1, 1, 0]] * 2  # a plain list is one value
     with pytest.raises(ValueError, match="varies=.*: expected any of rotations, bin_items"):
         gymnasium.make("pickplace/PickPlace-v0", varies=("gripper",))

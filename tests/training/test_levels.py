@@ -44,6 +44,7 @@ def test_levels_are_numbered_from_1_and_what_they_leave_out_is_that_of_the_full_
     assert [levels.items.arrives(mix).int().tolist() for mix in range(3)] == [[1] * 4, [1, 0, 0, 0], [1, 1, 0, 0]]
     assert not levels_of([{}, {"rotations": 2}]).is_full
     assert levels_of([{"tote_height": 5}]).varies == ("level",)
+    assert levels_of([{"tote_height": 2.0}, {}]).entries["tote_height"].tolist() == [[2], [5]]  # 2.0 is a whole number
 
 
 def test_episodes_play_what_their_level_sets():
@@ -76,13 +77,16 @@ ERRORS = [
     ([3], r"curriculum.levels=\[3\]: "),
     ([{}] * 1001, "curriculum.levels: the list has 1,001 levels; expected at most 1,000"),
     ([{}, {"tote_heigth": 2}], r"curriculum.levels\[1\].tote_heigth: .*did you mean 'tote_height'"),
-    ([{"level": 2}], r"curriculum.levels\[0\].level: there is no key 'level'"),
+    ([{"level": 2}], r"curriculum.levels\[0\].level: there is no key 'level' .*; expected one of tote_height, items"),
     ([{"tote_size": [3, 3, 3]}], r"levels\[0\].tote_size: .* chain two runs: .* warm_start.weights=outputs/first"),
     ([{"gripper": "point"}], r"levels\[0\].gripper: a level sets tote_height, items, rotations, bin_items, refill\."),
     ([{"tote_height": 6}], r"levels\[0\].tote_height=6: .* <= 5"),
     ([{"tote_height": None}], r"levels\[0\].tote_height=None: expected a whole number"),
     ([{"rotations": 5}], r"levels\[0\].rotations=5: expected a number of quarter turns, at most 4"),
     ([{"rotations": []}], r"levels\[0\].rotations=\[\]"),
+    ([{"rotations": [1.0]}], r"levels\[0\].rotations=\[1.0\]"),
+    ([{"rotations": [True]}], r"levels\[0\].rotations=\[True\]"),
+    ([{"items": []}], r"levels\[0\]: items=\[\]: expected {weights: "),
     ([{"rotations": [4]}], r"levels\[0\].rotations=\[4\]"),
     ([{"bin_items": 4}], r"levels\[0\].bin_items=4: .* <= 3"),
     ([{"refill": "never"}], r"levels\[0\].refill='never': expected 'each' or 'batch'"),
