@@ -36,7 +36,7 @@ LOCAL_VALUES = {
 
 #: Settings that a resumed run cannot change, as all of ``env``, since the state of its episodes depends on them.
 FIXED_KEYS = (
-    "seed", "items", "model.mask_infeasible", "collector.workers", "warm_start.weights",
+    "seed", "items", "model.mask_infeasible", "collector.workers", "curriculum.levels", "warm_start.weights",
 )  # fmt: skip
 
 

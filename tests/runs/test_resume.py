@@ -359,6 +359,12 @@ def test_a_checkpoint_asks_for_no_more_threads_than_there_are(caplog):
     assert resumed_config("run", facts, ["threads=1024"]).threads == 1024
 
 
+def test_a_resumed_run_keeps_its_levels():
+    facts = {"config": saved_form(composed("experiment=quick", "curriculum.levels=[{tote_height: 2},{}]")), **SAVED}
+    with pytest.raises(ValueError, match=r"curriculum.levels=\[\{\}\]: the run began with .* expected a new run"):
+        resumed_config("run", facts, ["curriculum.levels=[{}]"])
+
+
 def test_only_the_user_says_what_to_trust():
     config = {**saved_form(composed("experiment=quick")), "trust": ["evil"]}
     facts = {"config": config, **SAVED}

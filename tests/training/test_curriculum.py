@@ -16,6 +16,7 @@ from pickplace.training.curriculum.advance import Advance, Frames, NoAdvance, Pl
 from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.training.curriculum.learning_progress import LearningProgress
 from pickplace.training.curriculum.sample import Current
+from pickplace.training.curriculum.transform import ToteHeightCurriculum
 
 
 def make(advance, sample=None, low=1, high=5, total_frames=1000, **heights):
@@ -186,6 +187,16 @@ class Own(Advance):
         return self.level, self.logs
 
 
+class Weighted(NoAdvance):
+    """A user's rule that draws by given weights."""
+
+    def __init__(self, *weights):
+        self.given = [*weights]
+
+    def weights(self):
+        return self.given
+
+
 NONE, STAGE = NoAdvance(), {"frames": 5, "height": 2}
 ERRORS = [
     (lambda: make(NONE, start_height=9), "curriculum.start_height=9: .* >= 1 and <= 5"),
@@ -217,6 +228,10 @@ ERRORS = [
     (lambda: make(Own(1, torch.tensor(1))), r"Own: its state has seen=tensor\(1\): expected what JSON holds"),
     (lambda: make(Own(1, float("nan"))), "Own: its state has seen=nan"),
     (lambda: play(make(Own(1, logs=None)), 10), r"Own: its update=\(1, None\): expected \(level, "),
+    *(
+        (lambda given=given: make(Weighted(*given)), "Weighted: its weights=.*: expected 5 numbers >= 0")
+        for given in ([1], [0] * 5, [1, 1, 1, 1, -1], [1, 1, 1, 1, "a"], [1, 1, 1, 1, float("nan")])
+    ),
 ]
 
 
@@ -265,7 +280,13 @@ def test_budgets_without_a_last_height():
     assert "curriculum.end_height=3: nothing is trained at the full task" in lower
 
 
-# --- learning progress
+# --- weights
+
+
+def test_weights_of_a_users_rule_may_be_whole_numbers():
+    curriculum = make(Weighted(0, 1, 0, 3, 0))
+    drawn = ToteHeightCurriculum(1, Current(), curriculum.levels, curriculum.weights)._draw(100)
+    assert drawn.unique().tolist() == [2, 4]
 
 
 def test_levels_are_drawn_by_how_much_their_occupancy_has_changed():
@@ -281,14 +302,19 @@ def test_levels_are_drawn_by_how_much_their_occupancy_has_changed():
     assert curriculum.weights == pytest.approx([1 / 6 + 0.5 * share for share in (0.5, 0, 0.5)])
 
 
-@pytest.mark.parametrize(
-    "histories", [[], [[0.5]], [[0.5], [2.0], [], [], []], [[], [], [], [], "x"], 1, [[0.1] * 5] * 5]
-)
+@pytest.mark.parametrize("histories", [[], [[0.5]], [[0.5], [2.0], [], [], []], [[], [], [], [], "x"], 1, [0.1] * 5])
 def test_a_damaged_history_is_refused(histories):
     curriculum = make(LearningProgress(window=4))
     state = curriculum.state_dict()
     with pytest.raises(ValueError, match="curriculum histories of the checkpoint"):
         curriculum.load_state_dict(state | {"advance": {"histories": histories}})
+
+
+def test_a_resumed_run_may_have_a_shorter_window():
+    before, after = make(LearningProgress(window=6), high=2), make(LearningProgress(window=4), high=2)
+    play(before, 10, [0.9, 0.9, 0.1, 0.2, 0.3, 0.4], height=1)
+    after.load_state_dict(before.state_dict())
+    assert after.state_dict()["advance"]["histories"] == [pytest.approx([0.1, 0.2, 0.3, 0.4]), []]
 
 
 # --- configs

@@ -70,7 +70,7 @@ class Curriculum:
         self.start, self.end = self.levels.first, self.levels.last
         first = self.advance.setup(self.start, self.end, integral_number("total_frames", total_frames))
         self.tally = Tally(self._clamped(first), deque(maxlen=self.advance.window))
-        self._rule_state()  # raises here, not at the first checkpoint
+        _ = self._rule_state(), self.weights  # raise here, not at the first checkpoint
 
     @property
     def level(self) -> int:
@@ -85,7 +85,13 @@ class Curriculum:
     @property
     def weights(self) -> list[float]:
         """How often episodes begin at each level, as the rule says; empty: as the sampler draws."""
-        return self.advance.weights()
+        weights, count = self.advance.weights(), self.end - self.start + 1
+        are_numbers = isinstance(weights, list) and all(is_number(weight) and weight >= 0 for weight in weights)
+        good = are_numbers and (not weights or len(weights) == count and sum(weights) > 0)
+        expect(
+            good, f"{self._rule}: its weights", weights, f"{count} numbers >= 0 that are not all 0, or none, in a list"
+        )
+        return [float(weight) for weight in weights]
 
     def check_budget(self, total_frames: int, batch: int = 1) -> str | None:
         """Return a warning if the full task cannot be trained within ``total_frames``, else None.

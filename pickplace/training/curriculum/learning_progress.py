@@ -51,10 +51,12 @@ class LearningProgress(Advance):
         return [self.explore / count + (1 - self.explore) * (each / total if total else 1 / count) for each in progress]
 
     def load_state(self, state):
-        histories = state["histories"]
-        good = isinstance(histories, list) and len(histories) == len(self.histories)
-        for history in histories if good else ():
-            good &= isinstance(history, list) and len(history) <= self.length
-            good = good and all(is_number(value) and 0 <= value <= 1 for value in history)
-        expect(good, "curriculum histories of the checkpoint", histories, "lists of occupancies, one for each level")
-        super().load_state(state)
+        histories, expected = state["histories"], "lists of occupancies, one for each level"
+        good = (
+            isinstance(histories, list)
+            and len(histories) == len(self.histories)
+            and all(isinstance(history, list) for history in histories)
+            and all(is_number(value) and 0 <= value <= 1 for history in histories for value in history)
+        )
+        expect(good, "curriculum histories of the checkpoint", histories, expected)
+        self.histories = [history[-self.length :] for history in histories]  # a resumed run's window may be shorter
