@@ -74,7 +74,8 @@ SETTINGS: dict[str, Setting] = {
 #: What a reset may be given: the height of the tote, in which episodes may always differ, and the settings.
 RESET_ENTRIES: dict[str, Setting] = {
     "tote_height": Setting(
-        "tote_height", lambda cell: cell.tote_size[2], lambda cell, items: (1, cell.tote_size[2]),
+        "tote_height", lambda cell: cell.tote_size[2],
+        lambda cell, items: (min(map(items.tallest, range(items.mixes))), cell.tote_size[2]),
         lambda key, value, cell: integral_number(key, value, most=cell.tote_size[2]),
     ),
     **SETTINGS,

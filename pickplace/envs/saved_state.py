@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from pickplace.common.validate import refuse_if
-from pickplace.envs.episode import SETTINGS
+from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.distributions import MAX_SEED
 from pickplace.rules.bin import select_item
@@ -49,21 +49,18 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
 
     cell = env.cell
     keys = ("surface", "tote_height", "volume", "steps", "episode", "item_seed")
-    surface, tote_height, volume, steps, episode, seed = (saved[key] for key in keys)
-    low, high = env.min_tote_height, cell.tote_size[2]
-    check("tote_height", (tote_height >= low) & (tote_height <= high), f"{low} to {high}")
-    episode_settings = {SETTINGS[key].field: saved[SETTINGS[key].field] for key in cell.varies}
-    for key in cell.varies:
-        low, high = SETTINGS[key].limits(cell, env.items)
-        value = saved[SETTINGS[key].field]
+    surface, tote_height, volume, steps, number, seed = (saved[key] for key in keys)
+    for key, (low, high) in env.limits.items():
+        value = saved[RESET_ENTRIES[key].field]
         check(key, (value >= low) & (value <= high), f"{low} to {high}")
-    state = State(surface, tote_height, Item.from_table(saved["item"]), Episode(**episode_settings))
+    episode = Episode(**{SETTINGS[key].field: saved[SETTINGS[key].field] for key in cell.varies})
+    state = State(surface, tote_height, Item.from_table(saved["item"]), episode)
     heights = state.heights
     check("surface", (heights >= 0) & (heights <= tote_height[:, None, None]), "heights of 0 to tote_height")
     check("surface", state.bearing | ((heights > 0) & cell.support.marks_bearing), "cells that bear weight")
     check("volume", (volume >= 0) & (volume <= heights.sum((1, 2))), "at most the volume below the surface")
     check("steps", (steps >= 0) & (steps <= volume), "at most one for each unit of volume")
-    check("episode", episode >= 0, "at least 0")
+    check("episode", number >= 0, "at least 0")
     check("item_seed", (seed >= 0) & (seed < MAX_SEED), "at least 0 and below 2**62")
     items, limits = state.items, torch.tensor(cell.bin_size[:2])
     corner, size, cuboids = saved["item"][..., :2], saved["item"][..., 2:4], items.cuboids
@@ -75,16 +72,10 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     count = items.exists.sum(1)
     check("arrived", saved["arrived"] == steps + count, "the items placed and those in the bin")
     newest = select_item(items, (count - 1).clamp(min=0)).table
-    arrival = env.items.sample(
-        env.stream,
-        seed.expand_as(episode),
-        episode,
-        saved["arrived"] - 1,
-        cell.bin_size,
-        **env.items.of_mix(state.episode.item_mix),
-    )
-    if state.episode.turns is not None:
-        arrival = arrival._replace(turns=arrival.turns & state.episode.turns)
+    address = seed.expand_as(number), number, saved["arrived"] - 1
+    arrival = env.items.sample(env.stream, *address, cell.bin_size, **env.items.of_mix(episode.item_mix))
+    if episode.turns is not None:
+        arrival = arrival._replace(turns=arrival.turns & episode.turns)
     same = (newest == arrival.table)[:, 2:].all(1)  # wherever it lies
     check("item", same | (count < cell.bin_items), "the newest item of this episode")  # it may have been taken
     seen = observe(standard_terms(cell), cell, state)

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from pickplace.common.machine import usable_device
 from pickplace.common.validate import check_bytes, expect, one_of, or_null, whole_number
 from pickplace.envs.checks import check_items, problem_bytes
-from pickplace.envs.episode import SETTINGS
+from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.rules.bin import remove_item
@@ -131,22 +131,20 @@ class PickPlaceEnv(EnvBase):
         items = Kinds(items) if isinstance(items, (list, tuple)) else items
         kind = "a list of (w, d, h), or an ItemDistribution such as pickplace.items.distributions.Kinds"
         expect(isinstance(items, ItemDistribution), "items", items, kind)
-        self._full = {key: SETTINGS[key].full(cell) for key in cell.varies}
         self.items, self.cell, self.terms = items, cell, check_terms(observation, cell)
         check_items(cell, items)
         # Mixes and rotations with which every item fits the empty tote.
-        self._checked_starts = {(0, self._full.get("rotations", ALL_TURNS))}
+        self._checked_starts = {(0, SETTINGS["rotations"].full(cell) if "rotations" in varies else ALL_TURNS)}
         self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
         device = usable_device(device)
         check_bytes(f"num_envs={num_envs}", num_envs * problem_bytes(self.cell, masks), device)
         super().__init__(device=device, batch_size=[num_envs])
         self.stream, self.masks = stream, tuple(masks)
-        mixes = range(items.mixes if "item_mix" in varies else 1)
-        tallest = [items.tallest(mix) for mix in mixes]
-        self.min_tote_height = min(tallest)  # of any episode
+        tallest = [*map(items.tallest, range(items.mixes))]
+        self.limits = {key: RESET_ENTRIES[key].limits(cell, items) for key in ("tote_height", *varies)}
         self.first_episode, self.episode_stride = first_episode, episode_stride or num_envs
         self.bounds = {key: term.bounds(self.cell, max(tallest)) for key, term in self.terms.items()}
-        self.bounds["tote_height"] = self.bounds["tote_height"]._replace(low=self.min_tote_height)
+        self.bounds["tote_height"] = self.bounds["tote_height"]._replace(low=min(tallest))
         specs: dict = {
             key: Bounded(low, high, (num_envs, *shape), dtype=dtype, device=device)
             for key, (low, high, shape, dtype) in self.bounds.items()
@@ -157,7 +155,7 @@ class PickPlaceEnv(EnvBase):
         specs |= {name: Binary(size, (num_envs, size), device, torch.bool) for name, size in sizes.items()}
         self.observation_spec = Composite(specs, shape=(num_envs,), device=device)
         # Declared as state too, so that reset() is handed what a curriculum writes.
-        given = {key: specs[key].clone() for key in ("tote_height", *self.cell.varies)}
+        given = {key: specs[key].clone() for key in self.limits}
         self.state_spec = Composite(given, shape=(num_envs,), device=device)
         self.action_spec = Categorical(self.cell.num_actions, (num_envs,), dtype=torch.int64, device=device)
         self.reward_spec = Unbounded((num_envs, 1), dtype=torch.float32, device=device)
@@ -170,7 +168,6 @@ class PickPlaceEnv(EnvBase):
         # All run-time state, in buffers, so that state_dict() has it.
         buffers = {
             "surface": zeros(*cell.tote_size[:2], dtype=torch.int32) + EMPTY,
-            "tote_height": zeros() + cell.tote_size[2],
             "item": zeros(cell.bin_items, len(Item._fields)),
             "arrived": zeros(),  # items of the episode so far
             "volume": zeros(),
@@ -178,7 +175,7 @@ class PickPlaceEnv(EnvBase):
             "episode": zeros(),
             "item_seed": torch.tensor(0, device=self.device),
             "feasible": zeros(dtype=torch.bool),
-            **{SETTINGS[key].field: zeros() + value for key, value in self._full.items()},
+            **{RESET_ENTRIES[key].field: zeros() + RESET_ENTRIES[key].full(cell) for key in self.limits},
             **{name: zeros(size, dtype=torch.bool) for name, size in sizes.items()},
         }
         for name, value in buffers.items():
@@ -239,27 +236,23 @@ class PickPlaceEnv(EnvBase):
     def _read_settings(self, given, rows: Tensor) -> None:
         """Set what the episodes that begin in ``rows``, bool ``[N]``, differ in, by the entries of a TensorDict."""
         found: dict[str, Tensor] = {}  # kept only once all of them are known to be good
-        for key, full in self._full.items():
-            setting, values = SETTINGS[key], self.get_buffer(SETTINGS[key].field)
-            wanted = values.masked_fill(rows, full)
+        for key, (low, high) in self.limits.items():
+            setting, values = RESET_ENTRIES[key], self.get_buffer(RESET_ENTRIES[key].field)
+            wanted = values.masked_fill(rows, setting.full(self.cell))
             if key in given:
                 wanted = torch.where(rows, setting.encode(given[key]), values)
-            low, high = setting.limits(self.cell, self.items)
             found[setting.field] = _checked(key, wanted, low, high, f"between {low} and {high}")
-        high, least = self.cell.tote_size[2], self.min_tote_height
-        height = given.get("tote_height", torch.full_like(self.tote_height, high)).reshape(self.num_envs)
-        expected = f"between {least} (the tallest item) and {high} (tote_size[2])"
-        height = _checked("tote_height", torch.where(rows, height, self.tote_height), least, high, expected)
+        height = found["tote_height"]
+        mix = found.get("item_mix", torch.zeros_like(height))
+        if (low_rows := height < self.tallest[mix]).any():
+            expected = f"at least {int(self.tallest[mix][low_rows][0])}, the height of the tallest item"
+            raise ValueError(f"tote_height={int(height[low_rows][0])}: expected {expected}.")
         if self.cell.varies:
-            mix = found.get("item_mix", torch.zeros_like(height))
             turns = found.get("turns", torch.full_like(height, ALL_TURNS))
             for pair in {*zip(mix[rows].tolist(), turns[rows].tolist(), strict=True)} - self._checked_starts:
                 check_items(self.cell, self.items, *pair)
                 self._checked_starts.add(pair)
-            if (low := height < self.tallest[mix]).any():
-                expected = f"at least {int(self.tallest[mix][low][0])}, the tallest item of that mix"
-                raise ValueError(f"tote_height={int(height[low][0])}: expected {expected}.")
-        for name, values in {**found, "tote_height": height}.items():
+        for name, values in found.items():
             self.get_buffer(name).copy_(values)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -299,8 +292,7 @@ class PickPlaceEnv(EnvBase):
 
     @property
     def _differs(self) -> Episode:
-        fields = [SETTINGS[key].field for key in self._full]
-        return Episode(**{name: self.get_buffer(name) for name in fields})
+        return Episode(**{SETTINGS[key].field: self.get_buffer(SETTINGS[key].field) for key in self.cell.varies})
 
     @property
     def exact_occupancy(self) -> Tensor:

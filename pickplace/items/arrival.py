@@ -31,10 +31,8 @@ def refill(
         rows: bool ``[N]``, the bins in which items may arrive.
         differs: what the episodes differ in.
     """
-    if differs.refill is None:
-        open_ = rows & ~items.exists[:, 0] if cell.refill == "batch" else rows
-    else:
-        open_ = rows & ~(items.exists[:, 0] & (differs.refill == REFILLS.index("batch")))
+    waits = cell.refill == "batch" if differs.refill is None else differs.refill == REFILLS.index("batch")
+    open_ = rows & ~(items.exists[:, 0] & waits)  # waits: for an empty bin
     for number in range(items.x.shape[1]):
         open_ = open_ & ~items.exists[:, -1]
         if differs.bin_items is not None:

@@ -191,10 +191,6 @@ class Kinds(ItemDistribution):
         place = torch.searchsorted(edges, uniform.clamp(max=1 - 2**-32) + mix, right=True)
         return place - mix * (len(self.sizes) - 1)
 
-    @property
-    def mixes(self) -> int:  # type: ignore[override]
-        return len(self._share)
-
     def mixed(self, changes: Sequence[Mapping]) -> Self:
         """Return this distribution with further mixes of its kinds, numbered from 1; mix 0 is itself.
 
@@ -207,7 +203,7 @@ class Kinds(ItemDistribution):
         """
         share = torch.stack([self._share[0], *(self._share_of(change) for change in changes)])
         other = copy(self)
-        other._share, other._edges = share, self._edges_of(share)
+        other.mixes, other._share, other._edges = len(share), share, self._edges_of(share)
         return other
 
     def _share_of(self, change: Mapping) -> Tensor:

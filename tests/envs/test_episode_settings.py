@@ -153,7 +153,7 @@ def test_a_reset_that_is_refused_changes_nothing():
     env.reset()
     before = {key: value.clone() for key, value in env.state_dict().items()}
     given = {"rotations": torch.tensor([[True, False, False, False]] * 2), "tote_height": torch.tensor([[2], [2]])}
-    with pytest.raises(ValueError, match="tote_height=2: expected at least 3, the tallest item of that mix"):
+    with pytest.raises(ValueError, match="tote_height=2: expected at least 3, the height of the tallest item"):
         env.reset(TensorDict(given, [2]))
     assert all(value.equal(before[key]) for key, value in env.state_dict().items())
 

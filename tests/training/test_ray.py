@@ -14,6 +14,7 @@ from pickplace.common.errors import WorkerDied
 from pickplace.runs import checkpoint
 from pickplace.runs.loggers import read_csv
 from pickplace.training import collectors
+from pickplace.training.curriculum.levels import heights
 from pickplace.training.curriculum.sample import Current
 from pickplace.training.curriculum.transform import ToteHeightCurriculum, push_level
 
@@ -46,7 +47,7 @@ def drawing_policy():
 def ray_collector():
     def build(first_episode, num_envs):
         env = PickPlaceEnv(tote_size=(4, 4, 5), num_envs=num_envs)
-        return TransformedEnv(env, Compose(ToteHeightCurriculum(3, Current(), 1)))
+        return TransformedEnv(env, Compose(ToteHeightCurriculum(3, Current(), heights(1, 5, 5))))
 
     return collectors.ray(build, drawing_policy(), num_envs=4, rollout_length=6, seed=0)
 

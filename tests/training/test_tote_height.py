@@ -13,6 +13,7 @@ from torchrl.envs.utils import check_env_specs
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.items.distributions import Kinds
 from pickplace.training import collectors
+from pickplace.training.curriculum import levels
 from pickplace.training.curriculum.advance import NoAdvance
 from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.training.curriculum.sample import Current, Recent, Uniform
@@ -38,8 +39,9 @@ def make_env(level=3, sampler=None, num_envs=6, **settings):
     curriculum = Curriculum(NoAdvance(), sampler or Current())
     curriculum.setup(CellSpec(tote_size=(4, 4, level)), Kinds([(1, 1, 1)]), 1000)
     env = PickPlaceEnv(tote_size=(4, 4, 5), num_envs=num_envs, **settings)
-    heights = ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.start)  # any height from there on
-    return TransformedEnv(env, Compose(heights, RewardSum(), StepCounter()))
+    any_height = levels.heights(curriculum.start, 5, 5)
+    transform = ToteHeightCurriculum(curriculum.level, curriculum.sample, any_height)
+    return TransformedEnv(env, Compose(transform, RewardSum(), StepCounter()))
 
 
 def heights(td):
@@ -48,7 +50,7 @@ def heights(td):
 
 @pytest.mark.parametrize("drawn", [torch.ones(5).long(), torch.ones(6), [1] * 6], ids=["few", "floats", "list"])
 def test_a_sampler_that_returns_something_else_is_named(drawn):
-    message = r"curriculum.sample: its levels=.*: expected whole numbers between 1 and 2000 in a tensor \[6\]"
+    message = r"curriculum.sample: its levels=.*: expected whole numbers between 1 and 5 in a tensor \[6\]"
     with pytest.raises(ValueError, match=message):
         make_env(sampler=lambda level, least, count: drawn).reset()
 

@@ -8,8 +8,7 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 from pickplace.common.validate import expect, integral_number
-from pickplace.rules.cell import MAX_SIDE
-from pickplace.training.curriculum.levels import Levels, heights
+from pickplace.training.curriculum.levels import Levels
 
 
 class ToteHeightCurriculum(Transform):
@@ -22,14 +21,12 @@ class ToteHeightCurriculum(Transform):
         level: number of the first level.
         sampler: returns level numbers for ``(level, first, count)``; see
             :mod:`pickplace.training.curriculum.sample`.
-        levels: what each level sets; or the least height, for levels that are heights.
+        levels: what each level sets.
         weights: how often episodes begin at each level; empty: as the sampler draws.
     """
 
-    def __init__(self, level: int, sampler, levels: Levels | int, weights: Sequence[float] = ()):
+    def __init__(self, level: int, sampler, levels: Levels, weights: Sequence[float] = ()):
         super().__init__()
-        if not isinstance(levels, Levels):
-            levels = heights(integral_number("min_height", levels, most=MAX_SIDE), MAX_SIDE, MAX_SIDE)
         self.sampler, self.levels, self.weights = sampler, levels, torch.tensor([*weights])
         # A buffer, so that it is in state_dict() and follows the environment to its device.
         self.register_buffer("level", torch.tensor(integral_number("level", level, levels.first)))
