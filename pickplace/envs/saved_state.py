@@ -8,6 +8,7 @@ from torch import Tensor
 from pickplace.common.validate import refuse_if
 from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
 from pickplace.envs.torchrl import PickPlaceEnv
+from pickplace.items.arrival import next_item
 from pickplace.items.distributions import MAX_SEED
 from pickplace.rules.bin import select_item
 from pickplace.rules.item import Item, bin_labels_from_items
@@ -73,9 +74,7 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     check("arrived", saved["arrived"] == steps + count, "the items placed and those in the bin")
     newest = select_item(items, (count - 1).clamp(min=0)).table
     address = seed.expand_as(number), number, saved["arrived"] - 1
-    arrival = env.items.sample(env.stream, *address, cell.bin_size, **env.items.of_mix(episode.item_mix))
-    if episode.turns is not None:
-        arrival = arrival._replace(turns=arrival.turns & episode.turns)
+    arrival = next_item(cell, env.items, env.stream, *address, episode)
     same = (newest == arrival.table)[:, 2:].all(1)  # wherever it lies
     check("item", same | (count < cell.bin_items), "the newest item of this episode")  # it may have been taken
     seen = observe(standard_terms(cell), cell, state)

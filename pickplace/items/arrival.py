@@ -39,15 +39,22 @@ def refill(
             open_ = open_ & (items.exists.sum(1) < differs.bin_items)
         if number and not open_.any():
             break
-        item = source.sample(stream, seed, episode, arrived, cell.bin_size, **source.of_mix(differs.item_mix))
-        if differs.turns is not None:
-            item = item._replace(turns=item.turns & differs.turns)
+        item = next_item(cell, source, stream, seed, episode, arrived, differs)
         if must_share(items, open_):
             uniform = hashed_uniform(stream, seed, episode, arrived, 4)[3]
             item = _find_room(cell, item, items, ~items.exists[:, 0] | source.has_corners, uniform)
         open_ = open_ & item.exists
         items, arrived = add_item(items, item, open_), arrived + open_
     return items, arrived
+
+
+def next_item(
+    cell: CellSpec, source: ItemDistribution, stream: str, seed: Tensor, episode: Tensor, arrived: Tensor,
+    differs: Episode,
+) -> Item:  # fmt: skip
+    """Return the item that arrives next in each episode, ``[N]``, at its own place; arguments as of :func:`refill`."""
+    item = source.sample(stream, seed, episode, arrived, cell.bin_size, **source.of_mix(differs.item_mix))
+    return item if differs.turns is None else item._replace(turns=item.turns & differs.turns)
 
 
 def _find_room(cell: CellSpec, item: Item, others: Item, keeps_place: Tensor, uniform: Tensor) -> Item:

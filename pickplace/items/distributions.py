@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pickplace.common.files import read_table
-from pickplace.common.validate import at_most, excerpt, expect, flag, is_number, is_whole, refuse_if, whole_number
+from pickplace.common.validate import at_most, excerpt, expect, flag, is_number, is_whole, refuse_any, whole_number
 from pickplace.rules.item import Item
 
 #: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
@@ -214,11 +214,9 @@ class Kinds(ItemDistribution):
         )
         if "weights" in change:
             given = Kinds([(1, 1, 1)] * self._listed, change["weights"])  # checks them
-            weights = torch.zeros(self._listed, dtype=torch.float64)
-            weights[given._used] = given._share[0]
-            unused = [i for i in given._used if i not in set(self._used)]
-            refuse_if(bool(unused), f"items.weights: kind {unused and unused[0]} never arrives in the full task.")
-            return weights[self._used]
+            unused = sorted({*given._used} - {*self._used})
+            refuse_any(unused, lambda kind: f"items.weights: kind {kind} never arrives in the full task.")
+            return torch.tensor([change["weights"][kind] for kind in self._used], dtype=torch.float64)
         share = self._share[0].clone()
         for key, limits in change.items():
             low, high = check_range(f"items.{key}", limits)

@@ -13,18 +13,14 @@ FAR = 1 << 20  # higher than any wall: stands for a cell that nothing may occupy
 NEVER = -1  # the "top" of a footprint on which the item cannot rest; no clearance is that low
 
 
-def surround(maps: Tensor, margins: tuple[int, int, int, int], value) -> Tensor:
-    """Return maps ``[W, D, N]`` with margins (before and after along x, then y) of a value, or of one per problem.
+def surround(maps: Tensor, margins: tuple[int, int, int, int], value: int) -> Tensor:
+    """Return maps ``[W, D, N]`` with margins (before and after along x, then y) of a value.
 
     A negative margin cuts the maps.
     """
     x0, x1, y0, y1 = margins
     wide, deep, batch = maps.shape
-    out = maps.new_empty(wide + x0 + x1, deep + y0 + y1, batch)
-    if isinstance(value, Tensor):
-        out.copy_(value.expand_as(out))
-    else:
-        out.fill_(value)
+    out = maps.new_full((wide + x0 + x1, deep + y0 + y1, batch), value)
     if min(margins) < 0:
         maps = maps[max(0, -x0) : max(0, wide + min(0, x1)), max(0, -y0) : max(0, deep + min(0, y1))]
         (wide, deep, _), x0, y0 = maps.shape, max(0, x0), max(0, y0)

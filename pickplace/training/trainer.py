@@ -359,10 +359,9 @@ def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
     if done.any():
         metrics["train/occupancy"] = batch["next", "occupancy"][done].mean().item()
         reasons = batch["next", "failure"][done]
-        forbids = "rotations" in batch  # else no rotation is forbidden
-        for failure in Failure:
-            if forbids or failure != Failure.FORBIDDEN_TURN:
-                metrics[f"train/failure_{failure.name.lower()}"] = (reasons == failure).float().mean().item()
+        # Without such an entry no rotation is forbidden.
+        possible = [each for each in Failure if each != Failure.FORBIDDEN_TURN or "rotations" in batch]
+        metrics |= {f"train/failure_{each.name.lower()}": (reasons == each).float().mean().item() for each in possible}
     return metrics
 
 

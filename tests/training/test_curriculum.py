@@ -277,7 +277,7 @@ def test_budgets_without_a_last_height():
     assert make(Frames(), total_frames=1000).check_budget(1000) is None  # even shares always fit
     assert "a stage of that level" in make(Staged([{"frames": 5, "height": 3}])).check_budget(10**9)
     lower = make(NoAdvance(), end_height=3).check_budget(1000)
-    assert "curriculum.end_height=3: nothing is trained at the full task" in lower
+    assert "curriculum.end_height=3: the last level is not the full task, which validation" in lower
 
 
 # --- weights

@@ -101,11 +101,8 @@ class Curriculum:
             batch: frames of a batch; the level moves only after a batch.
         """
         if not self.levels.is_full:
-            key = "end_height" if self.given is None else "levels: the last is number "
-            return (
-                f"curriculum.{key}={self.end}: nothing is trained at the full task, which validation and evaluation "
-                "play."
-            )
+            last = f"end_height={self.end}" if self.given is None else f"levels[{self.end - 1}]"
+            return f"curriculum.{last}: the last level is not the full task, which validation and evaluation play."
         least = self.advance.least_frames(batch)
         if least < total_frames:
             return None
