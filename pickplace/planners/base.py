@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, select_pick
-from pickplace.rules.item import Observation
+from pickplace.rules.item import Item, Observation
 from pickplace.rules.masks import PlacingMaps, action_footprints, action_mask, placing_maps
 from pickplace.rules.state import State
 
@@ -84,6 +84,33 @@ def restrict_items(rule: str, state: State, mask: Tensor) -> Tensor:
     order = distance * count + torch.arange(count, device=mask.device)
     order = torch.where(mask.any(2), order, torch.iinfo(order.dtype).max)
     return (mask & (order == order.amin(1, keepdim=True))[:, :, None]).flatten(1)
+
+
+def narrow_first(cell: CellSpec, item: Item, values: Tensor) -> Tensor:
+    """Return values of choices ``[N, M * Q * W_T * D_T]`` with each item's narrower side along x first.
+
+    So an order of choices does not depend on how the items lie in the bin. The function is its own inverse.
+
+    Args:
+        cell: the sizes.
+        item: all items, ``[N * M]``.
+        values: of the choices.
+    """
+    if cell.parities == 1:
+        return values
+    each = values.reshape(len(item.w), cell.parities, -1)
+    return torch.where((item.w > item.d)[:, None, None], each.flip(1), each).view(values.shape)
+
+
+def first_choice(cell: CellSpec, maps: PlacingMaps, order: Tensor) -> Tensor:
+    """Return the choice of least order, int64 ``[N]``; ties go to the first item, narrower side along x, then x and y.
+
+    Args:
+        order: of the choices, ``[N, M * Q * W_T * D_T]``.
+    """
+    number = torch.arange(order.shape[1], device=order.device).expand_as(order)
+    first = narrow_first(cell, maps.item, order).argmin(1, keepdim=True)
+    return narrow_first(cell, maps.item, number).gather(1, first)[:, 0]
 
 
 def pick_first(cell: CellSpec, maps: PlacingMaps, rule: str) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pickplace.common.validate import number, one_of
 from pickplace.items.distributions import check_seed
-from pickplace.planners.base import ITEM_RULES, MapPlanner, pick_first, restrict_items
+from pickplace.planners.base import ITEM_RULES, MapPlanner, first_choice, narrow_first, pick_first, restrict_items
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, all_grasps, join_pick
 from pickplace.rules.item import Observation
@@ -18,8 +18,6 @@ from pickplace.rules.masks import (
     action_mask,
     choice_mask,
     first_action_reaching,
-    first_choice,
-    narrow_first,
 )
 from pickplace.rules.placing import footprint_sizes
 from pickplace.rules.state import State

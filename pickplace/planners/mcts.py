@@ -10,7 +10,7 @@ from torch import Tensor
 from pickplace.common.validate import flag, number, refuse_if, whole_number
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
-from pickplace.planners.base import MapPlanner
+from pickplace.planners.base import MapPlanner, narrow_first
 from pickplace.rules.bin import remove_item
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, Observation
@@ -19,7 +19,6 @@ from pickplace.rules.masks import (
     action_mask,
     choice_mask,
     first_action_reaching,
-    narrow_first,
     placing_maps,
 )
 from pickplace.rules.state import State

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from pickplace.common.validate import check_bytes, flag, one_of
-from pickplace.planners.base import ITEM_RULES, MapPlanner, restrict_items
+from pickplace.planners.base import ITEM_RULES, MapPlanner, first_choice, restrict_items
 from pickplace.planners.heuristics import dbl_order
 from pickplace.rules.cell import MAX_SIDE, CellSpec
 from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
-from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, first_action_reaching, first_choice
+from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, first_action_reaching
 from pickplace.rules.state import State
 
 LAST = FAR**2  # order of a footprint at the origin of no space

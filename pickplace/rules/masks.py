@@ -106,33 +106,6 @@ class PlacingMaps(NamedTuple):
         return self.clearance[:, rotation % self.clearance.shape[1]].permute(1, 2, 0)
 
 
-def narrow_first(cell: CellSpec, item: Item, values: Tensor) -> Tensor:
-    """Return values of choices ``[N, M * Q * W_T * D_T]`` with each item's narrower side along x first.
-
-    So an order of choices does not depend on how the items lie in the bin. The function is its own inverse.
-
-    Args:
-        cell: the sizes.
-        item: all items, ``[N * M]``.
-        values: of the choices.
-    """
-    if cell.parities == 1:
-        return values
-    each = values.reshape(len(item.w), cell.parities, -1)
-    return torch.where((item.w > item.d)[:, None, None], each.flip(1), each).view(values.shape)
-
-
-def first_choice(cell: CellSpec, maps: PlacingMaps, order: Tensor) -> Tensor:
-    """Return the choice of least order, int64 ``[N]``; ties go to the first item, narrower side along x, then x and y.
-
-    Args:
-        order: of the choices, ``[N, M * Q * W_T * D_T]``.
-    """
-    number = torch.arange(order.shape[1], device=order.device).expand_as(order)
-    first = narrow_first(cell, maps.item, order).argmin(1, keepdim=True)
-    return narrow_first(cell, maps.item, number).gather(1, first)[:, 0]
-
-
 def placing_maps(
     cell: CellSpec, state: State, find_top: Callable[..., tuple[Tensor, Tensor]] = resting_top
 ) -> PlacingMaps:
