@@ -79,7 +79,7 @@ class Curriculum:
 
     @property
     def what(self) -> str:
-        """What a level is, for a reader."""
+        """Name of a level for a reader: ``tote height``, where levels are heights, or ``level``."""
         return self.levels.key.replace("_", " ")
 
     @property

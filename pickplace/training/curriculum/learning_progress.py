@@ -5,10 +5,10 @@ from pickplace.training.curriculum.advance import Advance
 
 
 class LearningProgress(Advance):
-    """Draw levels in proportion to their learning progress: a bandit over levels, not a staircase.
+    """Draw levels in proportion to their learning progress: a bandit over levels.
 
-    The progress of a level is how far the mean occupancy of the newer half of its latest episodes is from that of the
-    older half. So levels that are learnt now are played most; of those that are mastered, or still too hard, few are.
+    The progress of a level is the difference between the mean occupancies of the newer and the older half of its latest
+    episodes. So a level that is being learnt is played most. One that is mastered, or still too hard, is played rarely.
     A level whose occupancy falls is played again. It is the window algorithm of Matiisen et al., "Teacher-Student
     Curriculum Learning", 2017 (arXiv 1707.00183), with probabilities in proportion to the absolute progress, as
     ALP-GMM has them (Portelas et al. 2019, arXiv 1910.07224), for levels instead of a continuous space of tasks.

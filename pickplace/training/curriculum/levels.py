@@ -1,4 +1,4 @@
-"""Levels: what the episodes of a level set; and where a run has ladders of them."""
+"""Levels of a curriculum: what the episodes of each level set."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
