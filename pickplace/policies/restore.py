@@ -106,8 +106,15 @@ class TrainedPolicy(TensorDictModuleBase):
 
         Args:
             num_envs: ``N``.
-            **options: further arguments of :class:`PickPlaceEnv`, such as ``items`` or ``stream="test"``.
+            **options: further arguments of :class:`PickPlaceEnv`, such as ``items`` or ``stream="test"``; but no
+                ``varies``.
         """
+        expect(
+            "varies" not in options,
+            "varies",
+            options.get("varies"),
+            "no such argument; a loaded policy plays the full task",
+        )
         items = options.pop("items", None) or build("items", self.config["items"])
         cell = {item.name: getattr(self.cell, item.name) for item in fields(CellSpec)}
         device = next(self.parameters()).device

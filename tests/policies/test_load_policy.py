@@ -52,6 +52,8 @@ def test_a_collector_runs_it(policy):
 def test_other_sizes_and_shipped_weights():
     policy = load_policy("pretrained/r4", tote_size=(7, 8, 3), rotations=3)
     data = policy.make_env(num_envs=4, items=None, stream="test").rollout(60, policy)
+    with pytest.raises(ValueError, match="varies=.*: expected no such argument; a loaded policy plays the full task"):
+        policy.make_env(varies=("rotations",))
     assert policy.cell == CellSpec(tote_size=(7, 8, 3), rotations=3) and data["next", "occupancy"].max() > 0.7
 
 
