@@ -103,6 +103,9 @@ def build(place: str, node: DictConfig | dict, **kwargs):
     try:
         return function(**settings, **kwargs)
     except TypeError as error:
+        if missing := re.search("missing .* arguments?: (.*)", str(error)):
+            what = f"{place}._target_={short_text(content['_target_'])}: {missing[1]} missing"
+            raise ValueError(f"{what}; expected a value, or an option of that group in the file's defaults.") from error
         unknown = re.search("unexpected keyword argument '(.*)'", str(error))  # of what it hands its **keywords to
         if unknown and unknown[1] in settings:
             others = {key: value for key, value in settings.items() if key != unknown[1]}

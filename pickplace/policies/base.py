@@ -168,12 +168,12 @@ class Policy(TensorDictModuleBase, ABC):
         field = getattr(getattr(self, "network", None), "receptive_field", None) or 0
         side = self.cell.longest_side or self.cell.max_side
         found = [
-            f"env.{key}={list(size)}: expected sides of at least {field} (receptive field {field}, eq. 3)."
+            f"env.{key}={list(size)}: expected sides of at least {field} (receptive field {field}, the paper's eq. 3)."
             for key, size in (("bin_size", self.cell.bin_size), ("tote_size", self.cell.tote_size))
             if min(size[:2]) < field
         ]
         if field and side > (most := field / 2 + 1):
-            wanted = f"expected at most {most:g} (receptive field {field}, eq. 2)"
+            wanted = f"expected at most {most:g} (receptive field {field}, the paper's eq. 2)"
             found.insert(0, f"items: the longest side is {side}, {wanted}.")
         return found
 

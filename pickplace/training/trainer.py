@@ -16,12 +16,13 @@ from torchrl.envs import Compose, TransformedEnv
 from pickplace.algorithms.base import Algorithm, At, Task
 from pickplace.algorithms.imitation import WarmStart, with_warm_start
 from pickplace.common.machine import use_machine
-from pickplace.common.validate import expect, refuse_if
+from pickplace.common.validate import excerpt, expect, refuse_if
 from pickplace.config.registry import build
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.evaluation.play import Episodes, play
 from pickplace.evaluation.result import confidence95
 from pickplace.policies.base import EstimatesValue, Policy, as_critic, refuse_large_network
+from pickplace.policies.restore import differences
 from pickplace.rules.state import Failure
 from pickplace.runs import checkpoint, folder, provenance
 from pickplace.runs.resume import (
@@ -122,11 +123,14 @@ class Trainer:
         if not self.resumed and (path := cfg.warm_start.weights) is not None:
             weights, facts = checkpoint.read(checkpoint.locate(path, key="warm_start.weights"))
             log.info("beginning with the weights of %s, after %s frames", path, f"{facts['frames']:,}")
+            for group in ("env", "items"):
+                for key, now, before in differences(self.saved_config[group], facts["config"][group], group):
+                    log.info("%s is %s; those weights were trained with %s", key, excerpt(now), excerpt(before))
         make = partial(build, cell=env.cell)
         make_actor = partial(make, "model.actor", cfg.model.actor, mask_infeasible=cfg.model.mask_infeasible)
         self.policy: Policy = self._restored("policy", make_actor, weights)
         for warning in self.policy.check_sizes():
-            log.warning(warning)
+            log.warning("%s The training goes on all the same.", warning)
         full = self.env.cell
         self.planner = build("planner", cfg.planner, cell=full, policy=self.policy.with_cell(full))
         self.warm_start = WarmStart(cfg.warm_start, self.policy, env, cfg.seed, cfg.trust)
@@ -223,6 +227,8 @@ class Trainer:
             cleanup.callback(self.logger.close)
             if self.ended:
                 log.info("a callback ended this training at %s frames; other settings continue it", f"{self.frames:,}")
+            elif self.is_complete:
+                log.info("this training is complete; a greater total_frames=%s continues it", self.cfg.total_frames)
             else:
                 log.info(
                     "%s frames to train, at %s %d of %d",

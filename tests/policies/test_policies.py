@@ -181,9 +181,9 @@ def test_the_papers_conditions_on_sizes():
     for kind in (FcnGrasp, Fcn4d):
         assert small(kind, good).check_sizes() == []
     assert small(FcnGrasp, wide).check_sizes() == [
-        "items: the longest side is 4, expected at most 3.5 (receptive field 5, eq. 2)."
+        "items: the longest side is 4, expected at most 3.5 (receptive field 5, the paper's eq. 2)."
     ]
-    sentence = r"env.tote_size=\[6, 4, 5\]: expected sides of at least 5 \(receptive field 5, eq. 3\)."
+    sentence = r"env.tote_size=\[6, 4, 5\]: expected sides of at least 5 \(receptive field 5, the paper's eq. 3\)."
     assert len(small(UnmaskedFcnGrasp, low).check_sizes()) == 1
     with pytest.raises(ValueError, match=sentence):  # fcn4d cannot learn then
         small(Fcn4d, low).check_sizes()

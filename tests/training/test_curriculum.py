@@ -197,6 +197,10 @@ class Weighted(NoAdvance):
         return self.given
 
 
+class Misspelt(Own):
+    state_keys = ("sean",)
+
+
 NONE, STAGE = NoAdvance(), {"frames": 5, "height": 2}
 ERRORS = [
     (lambda: make(NONE, start_height=9), "curriculum.start_height=9: .* >= 1 and <= 5"),
@@ -227,6 +231,7 @@ ERRORS = [
     (lambda: play(make(Own(1, logs={"mood": "good"})), 10), "Own: it logs mood='good': expected a number"),
     (lambda: make(Own(1, torch.tensor(1))), r"Own: its state has seen=tensor\(1\): expected what JSON holds"),
     (lambda: make(Own(1, float("nan"))), "Own: its state has seen=nan"),
+    (lambda: make(Misspelt(1)), "Misspelt: state_keys='sean': expected the name of an attribute"),
     (lambda: play(make(Own(1, logs=None)), 10), r"Own: its update=\(1, None\): expected \(level, "),
     *(
         (lambda given=given: make(Weighted(*given)), "Weighted: its weights=.*: expected 5 numbers >= 0")

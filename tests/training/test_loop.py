@@ -257,8 +257,9 @@ def test_a_learner_expects_nothing_after_the_end_of_a_recording(smoke, tmp_path,
     torch.testing.assert_close(target[ended], torch.full_like(target[ended], 2 * 0.25))  # 2 cells, by reward_scale
 
 
-def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path):
-    """For another tote; a critic that is not among the weights, or does not fit, begins anew."""
+def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path, caplog):
+    """For another tote, which is said; a critic that is not among the weights, or does not fit, begins anew."""
+    caplog.set_level("INFO")
     words = ["threads=1", "env.num_envs=8", "algo.minibatch_size=16", "env.tote_size=[6,5,2]", "total_frames=64"]
     begun = Trainer(composed(*words, "warm_start.weights=pretrained/r4"), tmp_path)
     state, _ = checkpoint.read(checkpoint.locate("pretrained/r4"))
@@ -266,6 +267,7 @@ def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path):
         assert module.state_dict().keys() == state[key].keys()
         assert all(torch.equal(value, state[key][name]) for name, value in module.state_dict().items())
     assert begun.frames == 0 and not begun.resumed
+    assert "env.tote_size is [6, 5, 2]; those weights were trained with [6, 6, 5]" in caplog.messages
     bare = Trainer(composed(*words, "model=fcn4d", "warm_start.weights=pretrained/fcn4d"), tmp_path)
     assert "critic" not in checkpoint.read(checkpoint.locate("pretrained/fcn4d"))[0]
     assert bare.critic.module.value[0].in_features == 64 * (25 + 30) + 2

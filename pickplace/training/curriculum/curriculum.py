@@ -161,7 +161,9 @@ class Curriculum:
 
     def _rule_state(self) -> dict:
         """Return the rule's own state; raise if a checkpoint could not store it."""
-        state = {key: deepcopy(getattr(self.advance, key, None)) for key in self.advance.state_keys}
+        for key in self.advance.state_keys:
+            expect(hasattr(self.advance, key), f"{self._rule}: state_keys", key, "the name of an attribute of the rule")
+        state = {key: deepcopy(getattr(self.advance, key)) for key in self.advance.state_keys}
         for key, value in state.items():
             expect(_is_json(value), f"{self._rule}: its state has {key}", value, "what JSON holds, numbers finite")
         return state
