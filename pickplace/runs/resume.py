@@ -203,7 +203,7 @@ class StopRequest:
             os._exit(130)
         if not self.signal:  # a terminal sends several
             self.signal = number
-            log.info("stopping after this batch; press Ctrl-C again to stop at once")
+            log.warning("stopping after this batch; Ctrl-C stops at once")
 
     def restore(self) -> None:
         """Restore the earlier signal handlers."""

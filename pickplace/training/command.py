@@ -5,7 +5,7 @@ import sys
 
 from pickplace.common.errors import one_sentence
 from pickplace.common.interrupts import import_quietly
-from pickplace.common.validate import refuse_if
+from pickplace.common.validate import refuse_any
 from pickplace.config.hydra_app import Command
 from pickplace.runs import folder
 from pickplace.runs.locate import locate, read_facts
@@ -18,11 +18,14 @@ def main() -> None:
     overrides = [item for item in sys.argv[1:] if not item.startswith("-")]
     if any(item.startswith("resume=") and item not in ("resume=", "resume=null") for item in overrides):
         with one_sentence():
-            refuse_if(
-                len(overrides) < len(sys.argv) - 1,
-                "resume=...: expected only key=value overrides beside it, no flags such as -m.",
-            )
             place, words = resumed_place(overrides)
+            refuse_any(
+                (word for word in sys.argv[1:] if word.lstrip("+").startswith(("-", "hydra."))),
+                lambda word: (
+                    f"{word}: a resumed run keeps its folder and its checkpoint's config; expected values such as "
+                    f"total_frames=... beside resume={place}, or a new run with warm_start.weights={place}."
+                ),
+            )
             if facts := read_facts(locate(place, "last")):  # refuse bad overrides before torch is imported
                 logging.disable(logging.WARNING)  # the training itself warns
                 try:

@@ -51,11 +51,11 @@ class Progress:
         """
         now = time.perf_counter()
         speed = (frames - self.start) / (now - self.started)
-        seconds = max(self.total - frames, 0) / speed  # the last batch is collected whole
+        seconds = max(self.total - frames, 0) / speed
         left = timedelta(seconds=int(min(seconds, LONGEST)))
         losses = [value for key, value in metrics.items() if key.startswith("train/loss")]
         values = {
-            "share": frames / self.total,
+            "share": min(frames / self.total, 1.0),  # the last batch is collected whole
             "frames": frames,
             "speed": speed,
             "level": level,

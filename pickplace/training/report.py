@@ -110,7 +110,7 @@ def level_table(rows: list[dict], level_name: str, settings: Sequence[Mapping] =
         settings: what each of them sets, from number 1 on, if the config lists it.
     """
     lines: list[tuple] = []
-    words = [", ".join(f"{key}: {value}" for key, value in level.items()) or "the full task" for level in settings]
+    words = [str(level)[1:-1].replace("'", "") or "the full task" for level in map(dict, settings)]
     for level in played_levels(rows):
         key = f"curriculum/occupancy_at_{level}"
         seen = [row for row in rows if key in row]

@@ -73,7 +73,7 @@ def learning_curve(metrics: Path, path: Path, levels: tuple[str, int] = ("level"
     upper, *lower = figure.subplots(len(ratios), squeeze=False, sharex=True, height_ratios=ratios)[:, 0]
     for axes in lower:
         _draw_levels(axes, rows, range(played[0], max(played[-1], levels[1]) + 1))
-        axes.set_ylabel(levels[0])
+        axes.set_ylabel(levels[0].replace(" ", "\n"))
     _draw_occupancy(upper, rows, ended)
     _show_frames(figure.axes[len(lower)], rows)
     save(figure, path)

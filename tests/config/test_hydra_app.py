@@ -98,7 +98,8 @@ BAD = [
     ("evaluate", "planner=joint_dbl env.reach.radii=[1,2]", ["env.reach.radii: env.reach is null", "an option that"]),
     # resume
     ("train", "resume=nowhere", ["nowhere'", "run folder"]),
-    ("train", "resume=nowhere -m", ["resume", "flags"]),
+    ("train", "resume=nowhere -m", ["-m: a resumed run keeps", "a new run with warm_start.weights=nowhere"]),
+    ("train", "resume=nowhere hydra.run.dir=x", ["hydra.run.dir=x: a resumed run keeps its folder"]),
     ("train", "++resume=nowhere", ["resume='nowhere'", "without a +"]),
     # evaluation
     ("evaluate", "", ["checkpoint=null", "run folder"]),
