@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from pickplace.common.validate import expect, integral_number, is_whole, one_of
+from pickplace.common.validate import expect, integral_number, is_whole, one_of, reworded
 from pickplace.items.distributions import ItemDistribution
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import flags_from_turns, turns_from_flags
@@ -43,9 +43,21 @@ def _read_rotations(key: str, value: Any, cell: CellSpec) -> int:
     good = (
         isinstance(turns, Sequence) and turns and all(is_whole(turn) and 0 <= turn < cell.rotations for turn in turns)
     )
-    expected = f"a number of quarter turns, at most {cell.rotations}, or a list of those that are allowed"
-    expect(good, key, value, expected)
+    most = cell.rotations
+    expect(
+        good, key, value, f"how many quarter turns, 1 to {most} (env.rotations), or a list of some of {[*range(most)]}"
+    )
     return sum(1 << turn for turn in set(turns))
+
+
+def _read_up_to(most: Callable[[CellSpec], int], origin: str) -> Callable[[str, Any, CellSpec], int]:
+    """Return a function that reads a number between 1 and one that the environment sets."""
+
+    def read(key: str, value: Any, cell: CellSpec) -> int:
+        with reworded(ValueError, lambda error: ValueError(f"{str(error).rstrip('.')}, {origin}.")):
+            return integral_number(key, value, most=most(cell))
+
+    return read
 
 
 #: The settings, by the names of their entries in an observation.
@@ -56,7 +68,7 @@ SETTINGS: dict[str, Setting] = {
     ),
     "bin_items": Setting(
         "bin_items", lambda cell: cell.bin_items, lambda cell, items: (1, cell.bin_items),
-        lambda key, value, cell: integral_number(key, value, most=cell.bin_items),
+        _read_up_to(lambda cell: cell.bin_items, "env.bin_items"),
     ),
     "refill": Setting(
         "refill", lambda cell: REFILLS.index(cell.refill), lambda cell, items: (0, len(REFILLS) - 1),
@@ -77,7 +89,7 @@ RESET_ENTRIES: dict[str, Setting] = {
     "tote_height": Setting(
         "tote_height", lambda cell: cell.tote_size[2],
         lambda cell, items: (min(map(items.tallest, range(items.mixes))), cell.tote_size[2]),
-        lambda key, value, cell: integral_number(key, value, most=cell.tote_size[2]),
+        _read_up_to(lambda cell: cell.tote_size[2], "env.tote_size[2]"),
     ),
     **SETTINGS,
 }  # fmt: skip

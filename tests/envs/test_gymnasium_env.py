@@ -273,7 +273,7 @@ def test_options_set_what_the_environment_lets_vary():
     observation, _ = many.reset(seed=1, options={"rotations": [1, [0, 3]], "tote_height": [2, 5]})
     assert observation["rotations"].astype(int).tolist() == [[1, 0, 0, 0], [1, 0, 0, 1]]
     for options, words in (
-        ({"rotations": 5}, r"options\['rotations'\]=5: expected a number of quarter turns, at most 4"),
+        ({"rotations": 5}, r"options\['rotations'\]=5: expected how many quarter turns, 1 to 4"),
         ({"refill": "batch"}, r"options\['refill'\]: there is no such option; expected tote_height, rotations or"),
     ):
         with pytest.raises(ValueError, match=words):

@@ -82,7 +82,7 @@ ERRORS = [
     ([{"gripper": "point"}], r"levels\[0\].gripper: a level sets tote_height, items, rotations, bin_items, refill\."),
     ([{"tote_height": 6}], r"levels\[0\].tote_height=6: .* <= 5"),
     ([{"tote_height": None}], r"levels\[0\].tote_height=None: expected a whole number"),
-    ([{"rotations": 5}], r"levels\[0\].rotations=5: expected a number of quarter turns, at most 4"),
+    ([{"rotations": 5}], r"levels\[0\].rotations=5: expected how many quarter turns, 1 to 4"),
     ([{"rotations": []}], r"levels\[0\].rotations=\[\]"),
     ([{"rotations": [1.0]}], r"levels\[0\].rotations=\[1.0\]"),
     ([{"rotations": [True]}], r"levels\[0\].rotations=\[True\]"),

@@ -26,4 +26,4 @@ class WorstFirst(Advance):
         return int(worst), {"worst": self.occupancy[worst]}
 
     def weights(self):
-        return [1 - mean for mean in self.occupancy.values()]
+        return [1.01 - mean for mean in self.occupancy.values()]
