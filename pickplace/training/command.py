@@ -3,6 +3,8 @@
 import logging
 import sys
 
+from omegaconf import DictConfig, OmegaConf
+
 from pickplace.common.errors import one_sentence
 from pickplace.common.interrupts import import_quietly
 from pickplace.common.validate import refuse_any
@@ -10,6 +12,7 @@ from pickplace.config.hydra_app import Command
 from pickplace.runs import folder
 from pickplace.runs.locate import locate, read_facts
 from pickplace.runs.resume import resumed_config, resumed_place
+from pickplace.training.curriculum.keys import check_keys
 from pickplace.training.sweep import summarize
 
 
@@ -34,4 +37,11 @@ def main() -> None:
                     logging.disable(logging.NOTSET)
             import_quietly("pickplace.training.train").resume_run(overrides)
     else:
-        Command("train", "pickplace.training.train.train", folder, after_sweep=summarize)()
+        Command("train", "pickplace.training.train.train", folder, check=check, after_sweep=summarize)()
+
+
+def check(cfg: DictConfig) -> None:
+    """Refuse misspelt keys of levels, as of other settings, before torch is imported."""
+    levels = OmegaConf.select(cfg, "curriculum.levels")
+    if cfg.curriculum._target_ == "curriculum" and OmegaConf.is_list(levels) and all(map(OmegaConf.is_dict, levels)):
+        check_keys(levels)

@@ -356,6 +356,7 @@ def test_an_option_in_two_folders_is_refused(run, tmp_path, option):
         ("train", "--help", "afterstate, cpu, mixed"),
         ("evaluate", "--help", "best_fit, corner, "),
         ("train", "-m algo.gama=0.9,1", "'gamma'"),
+        ("train", "curriculum.levels=[{},{tote_hight:2}]", "curriculum.levels[1]; did you mean 'tote_height'?"),
         ("train", "resume={run} gama=1", "did you mean 'algo.gamma'?"),
         ("evaluate", "checkpoint=pretrained/r4 model.actor.filterz=8", "'filters'"),
         ("evaluate", "checkpoint=nowhere", "no checkpoint there"),
@@ -367,7 +368,7 @@ def test_an_option_in_two_folders_is_refused(run, tmp_path, option):
 )
 def test_what_needs_no_torch_does_not_wait_for_it(name, words, expected, smoke_run, tmp_path):
     code = f"import sys; from pickplace.cli import {name}\ntry: {name}()\nfinally: assert 'torch' not in sys.modules"
-    path, words = str(Path(pickplace.__file__).parents[1]), words.format(run=smoke_run).split()
+    path, words = str(Path(pickplace.__file__).parents[1]), words.replace("{run}", str(smoke_run)).split()
     result = subprocess.run(
         [sys.executable, "-c", code, *words], cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
         capture_output=True, text=True,

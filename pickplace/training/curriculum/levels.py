@@ -7,18 +7,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.common.errors import unknown_key
-from pickplace.common.validate import at_most, expect, reworded, short_text
+from pickplace.common.validate import at_most, expect, reworded
 from pickplace.envs.checks import check_items
 from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
 from pickplace.items.distributions import ItemDistribution
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import ALL_TURNS
+from pickplace.training.curriculum.keys import check_keys
 
 MAX_LEVELS = 1_000
-
-#: What a level may set. In the environment the number of a mix stands for ``items``.
-KEYS = ("tote_height", "items", "rotations", "bin_items", "refill")
 
 
 class Levels(NamedTuple):
@@ -58,7 +55,8 @@ def read_levels(given: Sequence[Mapping], cell: CellSpec, items: ItemDistributio
     """Return levels that are listed in a config, numbered from 1.
 
     Args:
-        given: of each level what it sets, by a key of :data:`KEYS`; the rest is that of the full task.
+        given: of each level what it sets, see :mod:`pickplace.training.curriculum.keys`; the rest is that of the full
+            task.
         cell, items: of the full task.
 
     Raises:
@@ -67,17 +65,14 @@ def read_levels(given: Sequence[Mapping], cell: CellSpec, items: ItemDistributio
     good = isinstance(given, Sequence) and given and all(isinstance(level, Mapping) for level in given)
     expect(good, "curriculum.levels", given, "a list of mappings, such as [{tote_height: 2}, {}]")
     at_most("curriculum.levels: the list has", len(given), "levels", MAX_LEVELS)
+    check_keys(given)
     places = [f"curriculum.levels[{number}]" for number in range(len(given))]
-    for place, level in zip(places, given, strict=True):
-        for key in level:
-            if key not in KEYS:
-                raise ValueError(_refusal(place, key))
     mixes: list[Mapping] = []
     rows: list[dict[str, int]] = []
     for place, level in zip(places, given, strict=True):
         row = {"tote_height": cell.tote_size[2], "level": len(rows) + 1}
         for key, value in level.items():
-            if key == "items":
+            if key == "items":  # in the environment the number of a mix
                 with _prefixed(place):
                     items.mixed([value])
                 mixes += [value] * (value not in mixes)
@@ -104,14 +99,3 @@ def read_levels(given: Sequence[Mapping], cell: CellSpec, items: ItemDistributio
 def _prefixed(place: str):
     """Add the place of a level to an error."""
     return reworded(ValueError, lambda error: ValueError(f"{place}: {error}"))
-
-
-def _refusal(place: str, key) -> str:
-    """Return why a level cannot set a key."""
-    if key in ("bin_size", "tote_size", "gripper", "support", "reach", "height_unit"):
-        return (
-            f"{place}.{key}: a level sets {', '.join(KEYS)}. {key} stays the same in a run; for another one chain two "
-            "runs: pickplace-train ... hydra.run.dir=outputs/first, then pickplace-train ... "
-            "warm_start.weights=outputs/first."
-        )
-    return unknown_key(f"{place}.{short_text(key)}", dict.fromkeys(KEYS), f"{place}.")
