@@ -268,7 +268,7 @@ def draw(settings: list[Setting], path: Path) -> None:
     axes.set(xlim=(0, None), xlabel="frames (environment steps)", ylabel="validation occupancy (0 to 1)")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
-    few = " (of 2 or 3 their range)" if any(1 < len(setting.finished) < 4 for setting in settings) else ""
+    few = " (their range, if 2 or 3)" if any(1 < len(setting.finished) < 4 for setting in settings) else ""
     axes.legend(
         title=f"final occupancy: mean over seeds and its 95% interval{few}; frames", loc="upper left",
         bbox_to_anchor=(0, -0.15), frameon=False, alignment="left", prop={"family": "monospace", "size": 7},
