@@ -1,4 +1,4 @@
-"""Count the frames that a policy needs with each curriculum: python benchmarks/curricula.py [mixed|gopt_rs] [seeds]
+"""Count the frames that a policy needs with each curriculum, with three seeds: python benchmarks/curricula.py
 
 A training ends at the first validation that reaches 95% of the occupancy of the shipped weights, or after about three
 times the frames that this takes without a curriculum. What was trained before is read, and what was stopped goes on.
@@ -7,7 +7,7 @@ Writes docs/results/curricula.csv.
 
 import csv
 import json
-import sys
+from itertools import product
 
 from common import ROOT, run
 
@@ -70,14 +70,14 @@ def measure(problem: str, name: str, seed: int) -> dict:
 
 
 def main() -> None:
-    given = sys.argv[1:]
-    problems, seeds = given[:1] or [*PROBLEMS], range(int((given[1:] or ["3"])[0]))
-    cases = [(problem, name, seed) for problem in problems for seed in seeds for name in curricula(problem)]
-    rows = [measure(*case) for case in cases]
-    with TABLE.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    rows = []
+    for problem, seed in product(PROBLEMS, range(3)):
+        for name in curricula(problem):
+            rows.append(measure(problem, name, seed))
+            with TABLE.open("w", newline="") as file:
+                writer = csv.DictWriter(file, rows[0])
+                writer.writeheader()
+                writer.writerows(rows)
 
 
 if __name__ == "__main__":
