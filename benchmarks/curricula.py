@@ -25,7 +25,7 @@ PROBLEMS = {
         ["experiment=afterstate", "benchmark=gopt_rs", "total_frames=240_000", "evaluation_interval=8_000"],
     ),
 }
-#: The greatest side of the items, and the height of the tote, on each level; None: those of the full task.
+#: Of each level, the greatest side of its items and the height of its tote; None: as in the full task.
 SIDES = {"mixed": (2, None), "gopt_rs": (3, 4, None)}
 TOTES = {"mixed": (4, None), "gopt_rs": (6, 8, None)}
 #: Frames after which a staircase leaves a level that is not packed well yet: some share of what the full task takes.

@@ -1,8 +1,8 @@
 """Episode settings: what episodes of one environment may differ in, beside the height of the tote.
 
 Each is a whole number for each problem. A curriculum, or ``options`` of Gymnasium, gives it with a reset; an episode
-keeps it to its end. What is not given is that of the full task. A rollout of TorchRL that resets itself hands over the
-entries of the episode that ended, so that the next one has the same settings.
+keeps it to its end. Settings that are not given are as in the full task. A rollout of TorchRL that resets itself hands
+over the entries of the episode that ended, so that the next one has the same settings.
 """
 
 from collections.abc import Callable, Sequence
