@@ -16,6 +16,7 @@ from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import build, find
 from pickplace.policies.restore import build_cell
 from pickplace.runs import checkpoint
+from pickplace.runs.locate import locate
 
 CARD = "card.json"
 
@@ -31,7 +32,7 @@ def export(source, folder: Path, evaluations: list[Path]) -> None:
     Raises:
         ValueError: for a checkpoint or an evaluation that cannot be read, or that do not belong together.
     """
-    state, facts = checkpoint.read(checkpoint.locate(source))
+    state, facts = checkpoint.read(locate(source))
     trained = {"frames": facts["frames"], "seed": facts["config"]["seed"], "commit": facts["commit"]}
     results = []
     for path in evaluations:

@@ -39,6 +39,7 @@ from pickplace.runs.folder import (
     refuse_for_sweep,
     refuse_links,
 )
+from pickplace.runs.locate import locate
 from pickplace.runs.resume import StopRequest
 from pickplace.serve import json_lines, request
 from pickplace.training import trainer
@@ -169,7 +170,7 @@ def test_a_comparison_is_checked_before_playing(run, tmp_path, monkeypatch):
     assert (code, err) == (2, f"error: compare='digits.json': expected an evaluation.json {words}\n")
 
 
-@pytest.mark.parametrize("read", [lambda value: read_comparison(Path(value), {}), checkpoint.locate, Recorded])
+@pytest.mark.parametrize("read", [lambda value: read_comparison(Path(value), {}), locate, Recorded])
 @pytest.mark.parametrize("value", ["x" * 5000, "x/" * 2500], ids=["name", "path"])
 def test_a_long_path_is_shortened(told, read, value):
     err = told(read, value)

@@ -28,6 +28,7 @@ from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.rules.masks import placing_maps
 from pickplace.rules.state import State
 from pickplace.runs import checkpoint
+from pickplace.runs.locate import locate
 from pickplace.runs.resume import checkpoint_config
 from pickplace.training import trainer
 from pickplace.training.settings import check_settings
@@ -354,7 +355,7 @@ def test_references_to_other_groups_become_their_values():
 
 
 def test_loading_a_run_with_a_teacher_of_ones_own_needs_no_trust(tmp_path):
-    state, facts = checkpoint.read(checkpoint.locate("pretrained/r4"))
+    state, facts = checkpoint.read(locate("pretrained/r4"))
     facts["config"]["warm_start"] = {"frames": 5, "teacher": {"_target_": "theirs.Teacher"}}
     facts["config"]["callbacks"] = {"stop": {"_target_": "theirs.Stop"}}
     checkpoint.write(tmp_path / "own", state, facts)
@@ -362,7 +363,7 @@ def test_loading_a_run_with_a_teacher_of_ones_own_needs_no_trust(tmp_path):
 
 
 def test_another_number_of_workers_is_refused(smoke_run, tmp_path):
-    folder = checkpoint.locate(smoke_run, "last")
+    folder = locate(smoke_run, "last")
     state, facts = checkpoint.read(folder)
     cfg = OmegaConf.create(facts["config"] | {"collector": {"_target_": "multi_sync", "workers": 2}})
     lacking = "checkpoint's collector does not fit these settings: worker0.* is missing"

@@ -29,6 +29,7 @@ from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.rules.observation import STANDARD_TERMS
 from pickplace.runs import checkpoint
+from pickplace.runs.locate import locate
 from pickplace.runs.loggers import read_csv
 from pickplace.serve import json_lines
 from pickplace.training.train import train
@@ -110,7 +111,7 @@ def test_own_planner_teaches(example, tmp_path):
     resume = [f"resume={folder}", "total_frames=256"]
     example("train", "own_planner", *resume, refused="if own_planner is yours, say trust=own_planner")
     example("train", "own_planner", *resume, "trust=own_planner")
-    states = [checkpoint.read(checkpoint.locate(place, prefer="last"))[0]["policy"] for place in (whole, folder)]
+    states = [checkpoint.read(locate(place, prefer="last"))[0]["policy"] for place in (whole, folder)]
     assert all(torch.equal(value, states[1][key]) for key, value in states[0].items())
     ours = example("evaluate", "own_planner", f"checkpoint={folder}", *EVALUATION)
     assert ours["warm_start"] == "own_planner.SoftDBL" and ours["planner"] == "policy"
@@ -130,7 +131,7 @@ def test_own_model_is_trusted_by_name_and_each_time(example, capsys, tmp_path):
         Planner.load(folder)
 
     example("train", "own_model", *resume, "trust=[own_model]")
-    assert checkpoint.read(checkpoint.locate(folder, prefer="last"))[1]["frames"] == 128
+    assert checkpoint.read(locate(folder, prefer="last"))[1]["frames"] == 128
     trained("own_model", tmp_path / "taught", *taught, "trust=own_model")
     ours = example("evaluate", "own_model", f"checkpoint={folder}", "trust=own_model", *EVALUATION)
     assert ours["planner"] == "policy" and set(ours["failures"]) == {"stuck"}
@@ -147,7 +148,7 @@ def test_own_observation(example, tmp_path):
     words = ["env=pits", "model=pit_policy", "model.actor.filters=8", "curriculum=none", "env.tote_size=[6,6,2]"]
     words += ["warm_start=imitate", "warm_start.frames=64", "warm_start.critic_frames=64", "total_frames=192"]
     folder = trained("own_observation", tmp_path / "run", *TRAINING, *words)
-    weights = checkpoint.read(checkpoint.locate(folder, prefer="last"))[0]["policy"]
+    weights = checkpoint.read(locate(folder, prefer="last"))[0]["policy"]
     given = [f"checkpoint={folder}", "trust=own_observation", *EVALUATION]
     for planner in (["planner=lookahead", "planner.samples=2", "planner.candidates=2", "evaluation.episodes=1"], []):
         ours = example("evaluate", "own_observation", *given, *planner)
@@ -212,7 +213,7 @@ def test_own_algorithm(name, example, tmp_path):
     whole, folder = trained(name, tmp_path / "whole", *words), tmp_path / "part"
     with after_batch(3, lambda _: signal.raise_signal(signal.SIGTERM)), pytest.raises(KeyboardInterrupt):
         trained(name, folder, *words)
-    assert checkpoint.read(checkpoint.locate(folder, prefer="last"))[1]["frames"] == 192
+    assert checkpoint.read(locate(folder, prefer="last"))[1]["frames"] == 192
     example("train", name, f"resume={folder}", refused=f"if {name} is yours, say trust={name}")
     example("train", name, f"resume={folder}", f"trust={name}")
     assert_same(whole, folder)
@@ -313,7 +314,7 @@ def test_own_advance(example, tmp_path):
     whole = trained("own_advance", tmp_path / "whole", *words, "total_frames=256")
     folder = trained("own_advance", tmp_path / "part", *words)
     example("train", "own_advance", f"resume={folder}", "total_frames=256", "trust=own_advance")
-    ours, theirs = (checkpoint.read(checkpoint.locate(place, "last")) for place in (whole, folder))
+    ours, theirs = (checkpoint.read(locate(place, "last")) for place in (whole, folder))
     assert all(torch.equal(value, theirs[0]["policy"][key]) for key, value in ours[0]["policy"].items())
     assert ours[1]["curriculum"] == theirs[1]["curriculum"]
     saved = ours[1]["curriculum"]["advance"]["occupancy"]

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from pickplace.common.validate import excerpt, refuse_any, refuse_if
 from pickplace.rules.observation import Term
-from pickplace.runs.checkpoint import CheckpointError, matching_state
+from pickplace.runs.checkpoint import matching_state
+from pickplace.runs.locate import CheckpointError
 
 
 class At(NamedTuple):

@@ -19,6 +19,7 @@ from pickplace.policies.base import MASKED, Policy
 from pickplace.rules.state import State
 from pickplace.rules.step import apply
 from pickplace.runs import checkpoint
+from pickplace.runs.locate import locate
 
 #: Names the settings of a teacher in the errors of planners, which call them ``planner`` and ``checkpoint``.
 _named_keys = reworded(
@@ -59,7 +60,7 @@ class WarmStart:
         expect(cfg.teacher is not None, "warm_start.frames", cfg.frames, "0 without a teacher, or warm_start=imitate")
         trained = None
         if cfg.checkpoint is not None:
-            state, facts = checkpoint.read(checkpoint.locate(cfg.checkpoint))
+            state, facts = checkpoint.read(locate(cfg.checkpoint))
             trained_cfg = trusted_config(facts["config"], trust)
             trained = (trained_cfg, state, cast(dict, OmegaConf.to_container(trained_cfg.env, resolve=True)))
         self._draws = "seed" in (accepted_arguments(find("warm_start.teacher", cfg.teacher._target_)) or cfg.teacher)

@@ -14,7 +14,7 @@ from pickplace.rules.bin import select_item
 from pickplace.rules.item import Item, bin_labels_from_items
 from pickplace.rules.observation import observe, standard_terms
 from pickplace.rules.state import Episode, State
-from pickplace.runs.checkpoint import CheckpointError
+from pickplace.runs.locate import CheckpointError
 
 
 def check_saved_states(env: PickPlaceEnv, collector: Mapping) -> None:

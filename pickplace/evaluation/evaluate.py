@@ -28,6 +28,7 @@ from pickplace.physics.recorded import plan_of
 from pickplace.planners.base import BatchPlanner
 from pickplace.planners.use import planner_parts
 from pickplace.runs import checkpoint, folder
+from pickplace.runs.locate import locate
 from pickplace.runs.provenance import first_steps
 
 log = logging.getLogger(__name__)
@@ -119,7 +120,7 @@ def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[s
     Raises:
         ValueError: for a checkpoint that cannot be read, or overrides that do not fit it.
     """
-    place = checkpoint.locate(str(cfg.checkpoint))
+    place = locate(str(cfg.checkpoint))
     state, saved = checkpoint.read(place)
     trained = trusted_config(saved["config"], cfg.trust)
     merged = merge_trained(cfg, trained)

@@ -26,6 +26,7 @@ from pickplace.rules.masks import placing_maps
 from pickplace.rules.observation import Term, check_terms
 from pickplace.rules.state import State
 from pickplace.runs import checkpoint
+from pickplace.runs.locate import locate
 
 SIZES = ("gripper", "bin_size", "tote_size")
 
@@ -168,7 +169,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
         ValueError: for a checkpoint that cannot be used, or bad sizes.
     """
     expect(isinstance(path, (str, os.PathLike)), "path", path, "a run folder, a checkpoint, or pretrained/<name>")
-    state, facts = checkpoint.read(checkpoint.locate(path))
+    state, facts = checkpoint.read(locate(path))
     cfg = trusted_config(facts["config"], trust)
     env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
     cell = build_cell(env, **sizes)
@@ -184,7 +185,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
 def load_critic(path, trained: TrainedPolicy) -> "RestoredCritic | None":
     """Return the critic of the checkpoint of a policy that :func:`load_policy` returned; None if it does not serve."""
     env = cast(dict, OmegaConf.to_container(trained.config.env, resolve=True))
-    return restore_critic(trained.config, trained.policy, checkpoint.read(checkpoint.locate(path))[0], env)
+    return restore_critic(trained.config, trained.policy, checkpoint.read(locate(path))[0], env)
 
 
 @dataclass(frozen=True)

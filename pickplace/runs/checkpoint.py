@@ -22,17 +22,7 @@ from torch import Tensor
 
 from pickplace.common.files import read_file
 from pickplace.common.validate import excerpt, first_line, refuse_any, refuse_if, reworded
-from pickplace.runs.locate import (  # noqa: F401  some for those who import this module
-    FACTS,
-    MAX_BYTES,
-    PRETRAINED,
-    PREVIOUS,
-    TENSORS,
-    CheckpointError,
-    are_facts,
-    locate,
-    read_facts,
-)
+from pickplace.runs.locate import FACTS, MAX_BYTES, PREVIOUS, TENSORS, CheckpointError, are_facts
 
 SCHEMA = 1
 

@@ -14,7 +14,7 @@ from torchrl.collectors.distributed import RayCollector
 
 from pickplace.common.errors import WorkerDied, needs_extra
 from pickplace.common.validate import expect, reworded, whole_number
-from pickplace.runs.checkpoint import CheckpointError
+from pickplace.runs.locate import CheckpointError
 from pickplace.runs.resume import STOP_SIGNALS
 
 

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 
 from pickplace.common.validate import expect
 from pickplace.runs import checkpoint, folder
+from pickplace.runs.locate import locate
 from pickplace.runs.resume import checkpoint_hint, interrupted_run, resumed_config, resumed_place
 from pickplace.training.progress import filtered_consoles, quiet_console, results
 from pickplace.training.trainer import Trainer
@@ -101,7 +102,7 @@ def resume_run(overrides: list[str]) -> float:
         ValueError: for a folder that is no run, or a change that a resumed run cannot follow.
     """
     place, words = resumed_place(overrides)
-    saved = checkpoint.locate(place, prefer="last")
+    saved = locate(place, prefer="last")
     run_dir, expected = saved.parent.parent, "a run folder, or one of its checkpoints: last, best or previous"
     expect(saved.parent.name == "checkpoints", "resume", place, expected)
     folder.refuse_links(run_dir)

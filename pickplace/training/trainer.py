@@ -25,6 +25,7 @@ from pickplace.policies.base import EstimatesValue, Policy, as_critic, refuse_la
 from pickplace.policies.restore import differences
 from pickplace.rules.state import Failure
 from pickplace.runs import checkpoint, folder, provenance
+from pickplace.runs.locate import locate
 from pickplace.runs.resume import (
     StopRequest,
     checkpoint_config,
@@ -121,7 +122,7 @@ class Trainer:
         """Make the policy, the planner that validates it, the warm start, critic and algorithm."""
         cfg, env, weights = self.cfg, self.training_env, self.state
         if not self.resumed and (path := cfg.warm_start.weights) is not None:
-            weights, facts = checkpoint.read(checkpoint.locate(path, key="warm_start.weights"))
+            weights, facts = checkpoint.read(locate(path, key="warm_start.weights"))
             log.info("beginning with the weights of %s, after %s frames", path, f"{facts['frames']:,}")
             for group in ("env", "items"):
                 for key, now, before in differences(self.saved_config[group], facts["config"][group], group):
@@ -169,7 +170,7 @@ class Trainer:
         if is_validated_alike(facts, self.saved_config):
             return self.best
         try:
-            best, _ = checkpoint.read(checkpoint.locate(self.run_dir))
+            best, _ = checkpoint.read(locate(self.run_dir))
         except checkpoint.CheckpointError:
             return NEW["best"]
         now = {key: value.clone() for key, value in self.policy.state_dict().items()}

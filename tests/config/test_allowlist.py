@@ -13,8 +13,9 @@ from omegaconf import OmegaConf
 from pickplace import Planner
 from pickplace.config.allowlist import REQUIRED_KEYS, modules_to_trust, own_modules, saved_form, trusted_config
 from pickplace.runs import checkpoint
+from pickplace.runs.locate import PRETRAINED
 
-SHIPPED = checkpoint.PRETRAINED / "r4"
+SHIPPED = PRETRAINED / "r4"
 original = functools.cache(lambda: saved_form(composed("experiment=quick")))
 
 

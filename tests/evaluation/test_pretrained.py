@@ -10,8 +10,9 @@ from safetensors import safe_open
 
 from pickplace.config.allowlist import trusted_config
 from pickplace.runs import checkpoint
+from pickplace.runs.locate import PRETRAINED
 
-CARDS = sorted(checkpoint.PRETRAINED.glob(f"*/{export.CARD}"))
+CARDS = sorted(PRETRAINED.glob(f"*/{export.CARD}"))
 EPISODES = 8
 POLICY_ALONE = ("fcn4d", "gopt_rs", "cdrl_rs", "cut1", "cut2")
 LIKE_OTHERS = ("r1", "r3", "cdrl_rs", "cut2")  # the same networks as r4, gopt_rs and cut1
@@ -53,7 +54,7 @@ def test_card_describes_the_weights(path):
 
 
 def test_export(tmp_path, monkeypatch, capsys):
-    shipped = checkpoint.PRETRAINED / "r4"
+    shipped = PRETRAINED / "r4"
     card = json.loads((shipped / export.CARD).read_text())
     right, wrong = tmp_path / "right.json", tmp_path / "wrong.json"
     right.write_text(json.dumps(card["evaluations"][0]))

@@ -12,6 +12,7 @@ from pickplace.rules.gripper.rules import Seal
 from pickplace.rules.reach.annulus import Annulus
 from pickplace.rules.reach.table import ReachTable
 from pickplace.runs import checkpoint
+from pickplace.runs.locate import locate
 from pickplace.runs.resume import resumed_config
 from pickplace.training.train import resume_run
 
@@ -42,7 +43,7 @@ def evaluation(tmp_path):
 
 def test_a_checkpoint_brings_its_reach(begun, evaluation, run, tmp_path):
     """And ``load_policy`` and ``Planner.load`` know it too."""
-    _, facts = checkpoint.read(checkpoint.locate(begun))
+    _, facts = checkpoint.read(locate(begun))
     assert facts["config"]["env"]["reach"]["radii"] == [4.6, 9.7]
     policy = load_policy(begun)
     reach = Annulus([4.6, 9.7], [0, 10], [-9, -2.5, 0], [4, -3, 0])
@@ -124,9 +125,9 @@ def test_a_resumed_run_keeps_its_cell(smoke, tmp_path):
     smoke(run_dir, *TINY, "gripper=cup_round", "env.gripper.size=[3,3]", "items.kinds=[[3,3,1],[4,3,1]]", *WIDE)
     cell = load_policy(run_dir).cell
     assert cell.gripper == Seal((3, 3), "disc", "disc", (3, 3)) and cell.reach == Annulus(*WIDE_REACH)
-    before = checkpoint.read(checkpoint.locate(run_dir, prefer="last"))[1]
+    before = checkpoint.read(locate(run_dir, prefer="last"))[1]
     resume_run([f"resume={run_dir}", "total_frames=256"])
-    after = checkpoint.read(checkpoint.locate(run_dir, prefer="last"))[1]
+    after = checkpoint.read(locate(run_dir, prefer="last"))[1]
     assert (before["frames"], after["frames"]) == (128, 256) and after["config"]["env"] == before["config"]["env"]
     for word in ("reach=everywhere", "reach=annulus", "gripper=paper", "~reach"):
         with pytest.raises(ValueError, match=f"'{word}': .*'(reach|gripper)' cannot be exchanged"):

@@ -17,6 +17,7 @@ from pickplace.rules.masks import choice_mask, placing_maps
 from pickplace.rules.state import EMPTY, State
 from pickplace.rules.step import put_down
 from pickplace.runs import checkpoint
+from pickplace.runs.locate import locate
 
 
 def untrained(cell):
@@ -190,7 +191,7 @@ def test_a_candidate_must_win_by_standard_errors_of_its_mean(gain, departs, monk
 
 def test_the_critic_of_a_checkpoint_judges_in_cells():
     """Nearly all of an empty tote's 180 cells, a little less for the discount; near nothing in a full one."""
-    state, facts = checkpoint.read(checkpoint.locate("pretrained/r4"))
+    state, facts = checkpoint.read(locate("pretrained/r4"))
     cfg = OmegaConf.create({**facts["config"], "device": "cpu"})
     policy = restore_policy(cfg, CellSpec(), state["policy"], facts["config"]["env"])
     critic = restore_critic(cfg, policy, state, facts["config"]["env"])

@@ -26,6 +26,7 @@ from pickplace.rules.grasps import footprint_index
 from pickplace.rules.masks import placing_maps
 from pickplace.rules.state import State
 from pickplace.runs import checkpoint
+from pickplace.runs.locate import locate
 from pickplace.training.train import train
 
 
@@ -203,7 +204,7 @@ def test_it_serves_other_totes():
 
 
 def test_shipped_weights_judge_for_a_search_and_begin_a_training(tmp_path):
-    state, facts = checkpoint.read(checkpoint.locate("pretrained/gopt_rs"))
+    state, facts = checkpoint.read(locate("pretrained/gopt_rs"))
     cfg = OmegaConf.create({**facts["config"], "device": "cpu"})
     policy = restore_policy(cfg, CellSpec(tote_size=(10, 10, 10), rotations=2), state["policy"], facts["config"]["env"])
     depth, height = random_totes(3, 10, 10, 10)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from safetensors.torch import save
 
 from pickplace.runs import checkpoint
-from pickplace.runs.checkpoint import CheckpointError
+from pickplace.runs.locate import CheckpointError, locate
 
 leaves = st.one_of(
     st.integers(-(2**40), 2**40), st.floats(allow_nan=False), st.booleans(), st.none(),
@@ -60,9 +60,9 @@ def write_tensors(folder, blob):
 def test_a_kill_between_the_renames_loses_nothing(tmp_path):
     folder = write(tmp_path / "run" / "checkpoints" / "last")
     folder.rename(folder.with_name(".last.old"))  # killed right after this
-    assert checkpoint.read(checkpoint.locate(tmp_path / "run", prefer="last"))[1]["frames"] == 1
+    assert checkpoint.read(locate(tmp_path / "run", prefer="last"))[1]["frames"] == 1
     write(folder, frames=2)
-    assert checkpoint.read(checkpoint.locate(tmp_path / "run", prefer="last"))[1]["frames"] == 2
+    assert checkpoint.read(locate(tmp_path / "run", prefer="last"))[1]["frames"] == 2
     assert [path.name for path in folder.parent.iterdir()] == ["last"]
 
 
@@ -70,16 +70,16 @@ def test_locate_knows_runs_and_checkpoints(tmp_path):
     saved = tmp_path / "checkpoints"
     for name in ("best", "last", "previous"):
         checkpoint.write(saved / name, {}, {})
-    assert checkpoint.locate(tmp_path).name == "best"
-    assert checkpoint.locate(tmp_path, prefer="last").name == "last"
-    assert checkpoint.locate(saved / "last").name == "last"
+    assert locate(tmp_path).name == "best"
+    assert locate(tmp_path, prefer="last").name == "last"
+    assert locate(saved / "last").name == "last"
     with pytest.raises(CheckpointError, match="no checkpoint there"):
-        checkpoint.locate(tmp_path / "elsewhere")
+        locate(tmp_path / "elsewhere")
     shutil.rmtree(saved / "last")
-    assert checkpoint.locate(tmp_path, prefer="last").name == "best"
+    assert locate(tmp_path, prefer="last").name == "best"
     shutil.rmtree(saved / "best")
     with pytest.raises(CheckpointError, match="no best checkpoint there; expected checkpoint=.*/previous"):
-        checkpoint.locate(tmp_path)
+        locate(tmp_path)
 
 
 def test_a_reader_that_comes_between_the_files_reads_again(tmp_path, monkeypatch):
@@ -155,10 +155,10 @@ def test_a_pickle_is_never_run_whatever_its_name(tmp_path, name):
         shutil.rmtree(folder)
         folder.write_bytes(blob)
     if name == "state.pt":
-        checkpoint.read(checkpoint.locate(folder))
+        checkpoint.read(locate(folder))
     else:
         with pytest.raises(CheckpointError):
-            checkpoint.read(checkpoint.locate(folder))
+            checkpoint.read(locate(folder))
     assert not made.exists()
 
 
@@ -190,7 +190,7 @@ def test_whatever_a_checkpoint_holds_it_is_read_or_refused(tmp_path_factory, fac
     (folder / checkpoint.TENSORS).write_bytes(blob)
     (folder / checkpoint.FACTS).write_text(json.dumps(content))
     try:
-        state, facts = checkpoint.read(checkpoint.locate(folder))
+        state, facts = checkpoint.read(locate(folder))
         assert isinstance(state["policy"], dict) and isinstance(facts["config"], dict) and facts["frames"] >= 0
     except CheckpointError as error:
         assert "\n" not in str(error)

@@ -20,6 +20,7 @@ from pickplace.config.allowlist import saved_form
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import OccupiedError, claim, note_failure
+from pickplace.runs.locate import locate
 from pickplace.runs.loggers import read_csv
 from pickplace.runs.resume import STOP_SIGNALS, checkpoint_config, resumed_config
 from pickplace.training.train import resume_run, train
@@ -31,7 +32,7 @@ SAVED |= {"callbacks": {}, "ended": "", "commit": None, "versions": {}}
 
 
 def saved_frames(run_dir):
-    return json.loads((checkpoint.locate(run_dir, "last") / checkpoint.FACTS).read_text())["frames"]
+    return json.loads((locate(run_dir, "last") / checkpoint.FACTS).read_text())["frames"]
 
 
 def content(run_dir):

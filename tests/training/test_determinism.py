@@ -12,6 +12,7 @@ from pickplace.planners.lookahead import Lookahead
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.restore import restore_policy
 from pickplace.runs import checkpoint
+from pickplace.runs.locate import locate
 from pickplace.runs.loggers import read_csv
 
 
@@ -51,7 +52,7 @@ def make_env(first, count):
 def test_the_same_evaluation_twice_and_a_policy_s_in_any_batch():
     """For mcts see test_mcts."""
     env = make_env(0, 1)
-    state, facts = checkpoint.read(checkpoint.locate("pretrained/r4"))
+    state, facts = checkpoint.read(locate("pretrained/r4"))
     cfg = trusted_config(facts["config"])
     policy = restore_policy(cfg, env.cell, state["policy"], OmegaConf.to_container(cfg.env, resolve=True))
     policy_planner = PolicyPlanner(env.cell, policy)

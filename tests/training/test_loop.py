@@ -22,6 +22,7 @@ from pickplace.policies.base import as_collection_policy, as_critic
 from pickplace.policies.critics import Pooled
 from pickplace.policies.fcn_grasp.policy import fcn_grasp
 from pickplace.runs import checkpoint
+from pickplace.runs.locate import locate
 from pickplace.runs.loggers import read_csv
 from pickplace.training import trainer
 from pickplace.training.collectors import ResumableCollector
@@ -262,14 +263,14 @@ def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path, caplog):
     caplog.set_level("INFO")
     words = ["threads=1", "env.num_envs=8", "algo.minibatch_size=16", "env.tote_size=[6,5,2]", "total_frames=64"]
     begun = Trainer(composed(*words, "warm_start.weights=pretrained/r4"), tmp_path)
-    state, _ = checkpoint.read(checkpoint.locate("pretrained/r4"))
+    state, _ = checkpoint.read(locate("pretrained/r4"))
     for key, module in (("policy", begun.policy), ("critic", begun.critic)):
         assert module.state_dict().keys() == state[key].keys()
         assert all(torch.equal(value, state[key][name]) for name, value in module.state_dict().items())
     assert begun.frames == 0 and not begun.resumed
     assert "env.tote_size is [6, 5, 2]; those weights were trained with [6, 6, 5]" in caplog.messages
     bare = Trainer(composed(*words, "model=fcn4d", "warm_start.weights=pretrained/fcn4d"), tmp_path)
-    assert "critic" not in checkpoint.read(checkpoint.locate("pretrained/fcn4d"))[0]
+    assert "critic" not in checkpoint.read(locate("pretrained/fcn4d"))[0]
     assert bare.critic.module.value[0].in_features == 64 * (25 + 30) + 2
     narrow = Trainer(composed(*words, "model.critic.hidden=8", "warm_start.weights=pretrained/r4"), tmp_path)
     assert all(map(torch.equal, narrow.policy.parameters(), begun.policy.parameters()))

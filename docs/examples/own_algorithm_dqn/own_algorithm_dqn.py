@@ -10,7 +10,8 @@ from torchrl.objectives import DQNLoss, SoftUpdate
 from pickplace.algorithms.base import Algorithm, load_optimizer
 from pickplace.common.validate import number, whole_number
 from pickplace.policies.base import MASKED
-from pickplace.runs.checkpoint import CheckpointError, matching_state
+from pickplace.runs.checkpoint import matching_state
+from pickplace.runs.locate import CheckpointError
 
 
 class EpsilonGreedy(TensorDictModuleBase):
