@@ -347,7 +347,8 @@ def test_an_option_in_two_folders_is_refused(run, tmp_path, option):
     folders = ["--config-dir", str(CURRICULA), f"hydra.searchpath=[file://{tmp_path}]"]
     assert run("train", *folders, "--cfg", "job")[0] == 0
     code, _, err = run("train", *folders, f"curriculum={option}", "--cfg", "job")
-    assert code == 2 and f"curriculum={option}: it is in " in err and f"{tmp_path}/curriculum/{option}.yaml" in err, err
+    assert code == 2 and f"curriculum={option}: it is in " in err, err
+    assert f"{tmp_path}/curriculum/{option}.yaml" in err and err.count(f"/curriculum/{option}.yaml") == 2, err
 
 
 @pytest.mark.parametrize(
