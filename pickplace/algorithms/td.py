@@ -4,11 +4,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.modules import ValueOperator
-from torchrl.objectives.value import GAE
+from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from pickplace.algorithms.base import At, Task
 from pickplace.algorithms.descent import MinibatchDescent
 from pickplace.common.validate import expect, number, whole_number
+from pickplace.policies.afterstate.value import ToteValue
 from pickplace.policies.base import EstimatesValue, Policy
 
 
@@ -28,32 +29,29 @@ class TD(MinibatchDescent):
         expect(isinstance(policy, EstimatesValue), "algo", "td", "model=afterstate, which follows from the values")
         super().__init__(policy, task, **descent)
         whole_number("rollout_length", task.rollout_length, 2)
-        scale = policy.value_network().reward_scale
+        self.network: ToteValue = critic.module
+        scale = self.network.reward_scale
         expect(scale == task.reward_scale, "model.actor.reward_scale", scale, f"reward_scale={task.reward_scale}")
-        self.critic = critic
-        self.advantage = GAE(
-            gamma=number("algo.gamma", gamma, most=1),
-            lmbda=number("algo.lmbda", lmbda, most=1),
-            value_network=critic,
-            deactivate_vmap=True,
-        )
-        self.use_parameters(critic.parameters())
+        self.gamma, self.lmbda = number("algo.gamma", gamma, most=1), number("algo.lmbda", lmbda, most=1)
+        self.use_parameters(self.network.parameters())
 
     def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
-        return self.descend(afterstates(batch, self.advantage, self.task.reward_scale), at, self.objective)
+        return self.descend(afterstates(batch, self.network, self.gamma, self.lmbda), at, self.objective)
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the mean squared error of the values, and the share of the targets' variance that they explain."""
-        target, value = data["value_target"], self.critic(data)["state_value"]
-        loss = torch.nn.functional.mse_loss(target, value, reduction="none").mean()
+        """Return the mean squared error, of the values and of all their parts, and the share of the targets' variance
+        that the values explain."""
+        *entries, target = self.network.random_view(*(data[key] for key in (*self.network.in_keys, "value_target")))
+        error = (target - self.network.parts(*entries)).flatten(1)
+        whole, parts = error.sum(1).square().mean(), error.square().sum(1).mean()
         with torch.no_grad():
-            rest, variance = (torch.var(values, correction=0, dim=0) for values in (target - value, target))
+            rest, variance = (values.flatten(1).sum(1).var(correction=0) for values in (error, target))
             explained = 1.0 - rest / (variance + torch.finfo(target.dtype).eps)
-        return loss, {"loss_critic": loss, "explained_variance": explained.mean()}
+        return (whole + parts) / 2, {"loss_critic": whole, "explained_variance": explained}
 
 
 @torch.no_grad()
-def afterstates(batch: TensorDictBase, advantage: GAE, reward_scale: float) -> TensorDictBase:
+def afterstates(batch: TensorDictBase, network: ToteValue, gamma: float, lmbda: float) -> TensorDictBase:
     """Return the totes that the steps of a batch left, ``[N * (T - 1)]``, with TD(lambda) targets as ``value_target``.
 
     A step from one afterstate to the next is the arrival of an item and its placement. Its reward is that of the
@@ -62,12 +60,21 @@ def afterstates(batch: TensorDictBase, advantage: GAE, reward_scale: float) -> T
 
     Args:
         batch: ``[N, T]``, at least two steps; its rewards are not scaled.
-        advantage: GAE with a critic that reads terms of the tote alone.
+        network: of the values; there is a target for each of their parts.
+        gamma: discount per step.
+        lmbda: lambda of the returns.
     """
-    after, keys = batch["next"], advantage.value_network.in_keys
+    after = batch["next"]
+    entries = [after[key] for key in network.in_keys]
+    value = network.parts(*(entry.flatten(0, 1) for entry in entries)).unflatten(0, batch.shape)
+    before, later = ([entry[:, part].flatten(0, 1) for entry in entries] for part in (slice(-1), slice(1, None)))
     ended = after["done"][:, :-1]
-    reward = torch.where(ended, 0.0, reward_scale * after["reward"][:, 1:])
-    steps = after[:, :-1].select(*keys)
-    steps["next"] = after[:, 1:].select(*keys).update({"reward": reward, "done": ended, "terminated": ended.clone()})
-    advantage(steps)
-    return steps.exclude("next").reshape(-1)
+    reward = torch.where(ended, 0.0, network.reward_scale * after["reward"][:, 1:]).flatten(0, 1)
+    credit = network.credit(before, later)
+    earned = (credit * reward.view(-1, *[1] * (credit.dim() - 1))).unflatten(0, ended.shape[:2])
+    # TorchRL wants the time last but one.
+    flat = [values.flatten(2) for values in (value[:, :-1], value[:, 1:], earned)]
+    done = ended.expand_as(flat[0])
+    advantage, _ = generalized_advantage_estimate(gamma, lmbda, *flat, done, done)
+    target = (advantage + flat[0]).view_as(earned)
+    return after[:, :-1].select(*network.in_keys).set("value_target", target).reshape(-1)

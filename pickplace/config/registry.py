@@ -51,8 +51,9 @@ REGISTRY: dict[str, dict[str, str]] = {
     ),
     "model.actor": _classes(
         "policies", fcn_grasp="fcn_grasp.policy.fcn_grasp", corners="corners.policy.Corners",
-        afterstate="afterstate.policy.Afterstate", fcn4d="fcn4d.policy.Fcn4d", typical="fcn4d.policy.Typical",
-        individual_rl="individual.policy.IndividualRl", individual_grasp="individual.policy.individual_grasp",
+        afterstate="afterstate.policy.Afterstate", afterstate_fcn="afterstate.policy.AfterstateFcn",
+        fcn4d="fcn4d.policy.Fcn4d", typical="fcn4d.policy.Typical", individual_rl="individual.policy.IndividualRl",
+        individual_grasp="individual.policy.individual_grasp",
     ),
     "model.critic": _classes("policies.critics", pooled="Pooled", conv4d="Conv4d"),
     "curriculum": _classes("training.curriculum.curriculum", curriculum="Curriculum"),

@@ -60,6 +60,7 @@ class Policy(TensorDictModuleBase, ABC):
         in_keys: entries of the observation that :meth:`logits` reads.
         map_keys: entries of the observation that its network reads.
         excludes: what :meth:`action_log_probs` gives probability 0 by construction; None if nothing.
+        any_bin: whether its network scores bins of any size, or those of its cell only.
 
     Raises:
         ValueError: as of :meth:`check_cell`.
@@ -68,6 +69,7 @@ class Policy(TensorDictModuleBase, ABC):
     choice_key: str = "action"
     map_keys: tuple[str, ...] = DEPTH_KEYS
     excludes: str | None = None
+    any_bin: bool = True
     network: Any
 
     def __init__(self, cell: CellSpec, masks: Sequence[str] = ()):
@@ -236,9 +238,11 @@ class ScoresAnySize(Protocol):
 
     Attributes:
         score_index: how an index of the scores is made.
+        any_bin: whether bins may have any size; else totes only.
     """
 
     score_index: str
+    any_bin: bool
 
     def unmasked_scores(self, observation: Observation) -> Tensor:
         """Return the score of everything that it scores, feasible or not, float32 ``[N, scores]``; it reads the entries

@@ -70,7 +70,7 @@ class FootprintScorer(Policy):
     """
 
     choice_key = "footprint"
-    map_keys = MAP_KEYS
+    map_keys: tuple[str, ...] = MAP_KEYS
     mask: str
     network_class: Callable[..., torch.nn.Module] | None = None
 

@@ -22,11 +22,12 @@ CHECKS = (((1, 4), (0, 0)), ((3, 0), (0, 0)), ((7, 5), (1, 2)))
 ENVS, STEPS = 3, 8  # each check has ENVS * (STEPS + 1) problems at most
 
 #: Sizes that the model takes as they come; those of terms of your own follow from what is done with them.
-N, BIN, TOTE = Dim("N"), (Dim("W_B"), Dim("D_B")), (Dim("W_T"), Dim("D_T"))
+N, BIN, TOTE = Dim("N"), (Dim("W_B"), Dim("D_B")), (Dim("W_T", min=3), Dim("D_T", min=3))
 SHAPES = {
     "bin_depth": (N, *BIN), "tote_depth": (N, *TOTE), "tote_bearing": (N, *TOTE), "tote_height": (N, Dim.STATIC),
     "items": (N, Dim("M"), Dim.STATIC),
 }  # fmt: skip
+FIXED_BIN = {"bin_depth": (N, Dim.STATIC, Dim.STATIC)}
 
 
 class Scores(torch.nn.Module):
@@ -76,10 +77,10 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
     if not isinstance(policy, ScoresAnySize):
         raise ValueError(
             f"{short_text(checkpoint)}: {type(policy).__name__} has no scores for totes of any size; expected "
-            "model=fcn_grasp or corners that was trained with a mask, or model=fcn4d."
+            "model=fcn_grasp or corners that was trained with a mask, model=fcn4d, or model=afterstate_fcn."
         )
     keys = [key for key in policy.in_keys if not key.endswith("_mask")]
-    model = _convert(Scores(policy, keys).eval(), keys, _observations(trained, keys, 1))
+    model = _convert(Scores(policy, keys).eval(), keys, _observations(trained, keys, 1), policy.any_bin)
     model.model.metadata_props.update({
         "pickplace": pickplace.__version__,
         "checkpoint": str(checkpoint),
@@ -92,6 +93,7 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
         model.save(new)
         session = onnxruntime.InferenceSession(new, providers=["CPUExecutionProvider"])
         for more_tote, more_bin in CHECKS:
+            more_bin = more_bin if policy.any_bin else (0, 0)
             grown = {
                 key: (*(side + more for side, more in zip(size, step, strict=False)), size[2])
                 for key, size, step in (("tote_size", cell.tote_size, more_tote), ("bin_size", cell.bin_size, more_bin))
@@ -128,12 +130,14 @@ def _observations(trained: TrainedPolicy, keys: Sequence[str], steps: int) -> li
     return [seen[key].contiguous() for key in keys]
 
 
-def _convert(scores: Scores, keys: Sequence[str], seen: list[Tensor]):
+def _convert(scores: Scores, keys: Sequence[str], seen: list[Tensor], any_bin: bool):
     """Return the ``torch.onnx.ONNXProgram`` of scores."""
+    known = SHAPES if any_bin else SHAPES | FIXED_BIN
     shapes = tuple(
-        dict(enumerate(SHAPES.get(key, (N, *[Dim.AUTO] * (entry.dim() - 1)))))
+        dict(enumerate(known.get(key, (N, *[Dim.AUTO] * (entry.dim() - 1)))))
         for key, entry in zip(keys, seen, strict=True)
     )
+    scores(*seen)  # so that the rules' tables are kept as they are, not as a trace would make them
     logger = logging.getLogger("torch.onnx")
     before = logger.level
     try:

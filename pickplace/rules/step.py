@@ -82,9 +82,11 @@ def put_down(cell: CellSpec, state: State, choice: Tensor) -> tuple[State, Item]
         choice: int64 ``[N]``, ``item * num_footprints + footprint``, with the index of
             :func:`~pickplace.rules.grasps.footprint_index`; one that some action reaches.
     """
-    taken = choice // cell.num_footprints
+    wide, deep = state.surface.shape[1:]  # an exported network serves any tote
+    places = cell.parities * wide * deep
+    taken = choice // places
     item = select_item(state.items, taken)
-    parity, x, y = split_footprint(cell.tote_size, choice - taken * cell.num_footprints)
+    parity, x, y = split_footprint((wide, deep), choice - taken * places)
     w, d = turned_size(item, parity == 1)
     surface = _add_item(cell, state.surface, x, y, *_contact(cell, state.surface, x, y, w, d), item.h)
     return state._replace(surface=surface, items=remove_item(state.items, taken)), item
@@ -115,7 +117,7 @@ def _add_item(
         x, y: minimum corner of the footprint, int64 ``[N]``.
         height: of the item, int64 ``[N]``; 0 for no item.
     """
-    grid, added = cell.tote_size[:2], height > 0
+    grid, added = surface.shape[1:], height > 0
     inside = rectangle(grid, x, y, contact.w, contact.d) & added
     highest = surface_from(contact.z + height)
     after = torch.where(inside, highest, surface.permute(1, 2, 0)).flatten(0, 1)  # [W_T * D_T, N]

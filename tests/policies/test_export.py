@@ -12,15 +12,17 @@ from torch.export import Dim
 
 from pickplace import CellSpec, PickPlaceEnv, __version__, load_policy
 from pickplace.policies import export, onnx_model
+from pickplace.policies.afterstate.policy import AfterstateFcn
 from pickplace.policies.base import MASKED
 from pickplace.policies.corners.policy import Corners
 from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
-from pickplace.policies.onnx_model import SHAPES, Scores
+from pickplace.policies.onnx_model import FIXED_BIN, SHAPES, Scores
 from pickplace.rules.item import item_from_depth
 from pickplace.rules.masks import footprint_mask, placing_maps
 from pickplace.rules.reach.annulus import Annulus
 from pickplace.rules.state import State
+from pickplace.rules.support.rules import Bearing
 
 MAKERS = {
     "fcn_grasp": lambda: FcnGrasp(CellSpec(), head_std=1.0, compute_dtype="float32"),
@@ -42,6 +44,22 @@ def test_torch_export_takes_any_size(name):
     program = torch.export.export(scores, tuple(maps[0]), dynamic_shapes=(shapes,)).module()
     for example in maps:
         torch.testing.assert_close(program(*example), scores(*example), rtol=1e-5, atol=1e-5)
+
+
+def test_torch_export_of_values_takes_any_tote():
+    torch.manual_seed(0)
+    policy = AfterstateFcn(CellSpec(support=Bearing()), stem=4, filters=8, compute_dtype="float32")
+    torch.nn.init.normal_(policy.network.head.weight, std=3)
+    examples = [(*random_maps(count, count, (5, 5), tote), torch.full((count, 1), 8))
+                for count, tote in ((2, (7, 9)), (3, (5, 8)), (4, (8, 6)))]  # fmt: skip
+    shapes = tuple(dict(enumerate((SHAPES | FIXED_BIN)[key])) for key in policy.map_keys)
+    scores = Scores(policy, policy.map_keys)
+    scores(*examples[0])
+    program = torch.export.export(scores, examples[0], dynamic_shapes=(shapes,)).module()
+    for example in examples:
+        expected = scores(*example)
+        assert expected.std() > 100
+        torch.testing.assert_close(program(*example), expected, rtol=1e-5, atol=1e-2)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,8 @@ from pickplace.training import report, trainer
 from pickplace.training.train import train
 
 ONCE = ["evaluation_interval=48", "checkpoint_interval=48", "progress_interval=48"]  # for a training of three batches
-ONE_NETWORK = [word for word in TINY if not word.startswith("model.critic.")]  # that of model=afterstate
+AFTERSTATE = ("afterstate", "afterstate_fcn")  # models whose network is the critic, too
+ONE_NETWORK = [word for word in TINY if not word.startswith("model.critic.")]
 
 
 @pytest.mark.parametrize("name", options("experiment"))
@@ -63,15 +64,15 @@ def test_the_paper_s_effector_is_the_default(env):
 @pytest.mark.parametrize("model", options("model"))
 def test_every_model_trains_with_and_without_a_mask(model, tmp_path):
     """By its usual algorithm, and by ``sampled_ppo``, without a mask for one model only."""
-    algorithms = {"afterstate": "algo=td", "fcn_grasp": "algo=a2c"}
+    algorithms = {**dict.fromkeys(AFTERSTATE, "algo=td"), "fcn_grasp": "algo=a2c"}
     samples = ["algo=sampled_ppo", "algo.samples=2"]
     cases = [(True, [algorithms.get(model, "algo=ppo")]), (False, ["algo=ppo"])]
-    cases += [(True, samples)] * (model != "afterstate") + [(False, samples)] * (model == "fcn_grasp")
+    cases += [(True, samples)] * (model not in AFTERSTATE) + [(False, samples)] * (model == "fcn_grasp")
     overrides = [f"model={model}", "curriculum=none", "logger=none", "env.rotations=2"]
-    cfg = composed(*overrides, *(ONE_NETWORK if model == "afterstate" else TINY))
+    cfg = composed(*overrides, *(ONE_NETWORK if model in AFTERSTATE else TINY))
     for number, (masked, algo) in enumerate(cases):
         cfg.model.mask_infeasible, cfg.algo = masked, composed(*algo, *TINY).algo
-        if model in ("corners", "afterstate") and not masked:
+        if model in ("corners", *AFTERSTATE) and not masked:
             with pytest.raises(ValueError, match=r"^model.mask_infeasible=False: expected true"):
                 train(cfg, tmp_path)
         else:

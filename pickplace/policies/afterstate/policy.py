@@ -1,16 +1,18 @@
-"""The policy that judges a placement by the tote that it leaves."""
+"""The policies that judge a placement by the tote that it leaves."""
 
-import torch
 from torch import Tensor
 
 from pickplace.common.validate import number
-from pickplace.policies.afterstate.network import ToteValue
+from pickplace.policies.afterstate.cells import CellsValue
+from pickplace.policies.afterstate.picture import PictureValue
+from pickplace.policies.afterstate.value import ToteValue
 from pickplace.policies.base import refuse_several_items
-from pickplace.policies.footprints import FootprintPolicy
+from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintPolicy
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.grasps import split_footprint, turned_size
-from pickplace.rules.item import Observation, item_from_depth
-from pickplace.rules.maps import FAR, rectangle
+from pickplace.rules.item import Observation
+from pickplace.rules.observation import STANDARD_TERMS, observe
+from pickplace.rules.state import State
+from pickplace.rules.step import put_down
 
 
 class Afterstate(FootprintPolicy):
@@ -24,12 +26,12 @@ class Afterstate(FootprintPolicy):
         cell: the sizes.
         mask_infeasible: must be true.
         temperature: of the softmax over the values in training, in units of the scaled reward.
-        **network: arguments of :class:`~pickplace.policies.afterstate.network.ToteValue`.
+        **network: arguments of the network, :class:`~pickplace.policies.afterstate.picture.PictureValue`.
     """
 
-    map_keys = ("bin_depth", "tote_depth", "tote_height")
+    map_keys = tuple(STANDARD_TERMS)
     mask = "corner"
-    network_class = ToteValue
+    network_class: type[ToteValue] = PictureValue
     check_cell = refuse_several_items
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = True, temperature: float = 0.003, **network):
@@ -41,25 +43,22 @@ class Afterstate(FootprintPolicy):
 
     def learning_bytes(self, samples: int | None = None) -> int:
         """Return about how many bytes a frame takes, measured at totes of 10 to 100 cells."""
-        wide, deep, steps = self.network.grid
-        tote_w, tote_d, _ = self.cell.tote_size
-        return 8 * (tote_w * tote_d + wide * deep * (steps + 3 + self.network.around.out_channels))
+        return self.network.learning_bytes(*self.cell.tote_size[:2])
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
-        after = depth_after(observation["bin_depth"], observation["tote_depth"], row, footprint)
-        return self.network(after, observation["tote_height"][row])[:, 0] / self.temperature
+        after, _ = put_down(self.cell, State.from_observation(observation).rows(row), footprint)
+        seen = observe(STANDARD_TERMS, self.cell, after, self.network.in_keys)
+        return self.network(*(seen[key] for key in self.network.in_keys))[:, 0] / self.temperature
 
 
-def depth_after(bin_depth: Tensor, tote_depth: Tensor, row: Tensor, footprint: Tensor) -> Tensor:
-    """Return the remaining height of totes after the item came to rest on a footprint, ``[M, W_T, D_T]``.
+class AfterstateFcn(Afterstate):
+    """``afterstate_fcn``: the same by a fully convolutional network, which serves any tote.
 
     Args:
-        bin_depth, tote_depth: ``[N, W_B, D_B]``, ``[N, W_T, D_T]``.
-        row: int64 ``[M]``, which problem.
-        footprint: int64 ``[M]``, index ``(parity * W_T + x) * D_T + y``; what leaves the tote is cut off.
+        cell, mask_infeasible, temperature: as of :class:`Afterstate`.
+        **network: arguments of the network, :class:`~pickplace.policies.afterstate.cells.CellsValue`.
     """
-    item, depth = item_from_depth(bin_depth).rows(row), tote_depth[row]
-    parity, x, y = split_footprint(depth.shape[1:], footprint)
-    inside = rectangle(depth.shape[1:], x, y, *turned_size(item, parity == 1)).permute(2, 0, 1)
-    rest = torch.where(inside, depth, FAR).amin((1, 2))
-    return torch.where(inside, (rest - item.h)[:, None, None], depth)
+
+    network_class = CellsValue
+    score_index = FOOTPRINT_INDEX
+    any_bin = False  # the rules look at what is below the largest item that a bin of the cell holds

@@ -1,27 +1,19 @@
-"""The network behind ``model=afterstate``: the volume that a tote will still take, whatever arrives."""
+"""The network behind ``model=afterstate``: a picture of the tote, whatever its size."""
+
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.common.validate import (
-    MAX_WIDTH,
-    check_inputs,
-    expect,
-    flag,
-    number,
-    odd_number,
-    one_of,
-    size_tuple,
-    whole_numbers,
-)
-from pickplace.policies.fcn_grasp.network import DTYPES, matrix_dtype
+from pickplace.common.validate import MAX_WIDTH, check_inputs, expect, odd_number, size_tuple, whole_numbers
+from pickplace.policies.afterstate.value import ToteValue
+from pickplace.policies.fcn_grasp.network import matrix_dtype
 
 MAX_GRID = 64  # cells of the network's picture of a tote along each axis
-TOTES_AT_ONCE = {"cpu": 4_096, "cuda": 262_144}  # a CPU's caches hold the activations of this many
 
 
-class ToteValue(nn.Module):
+class PictureValue(ToteValue):
     """Estimates which share of a tote's empty volume will be filled, from the heights of its surface.
 
     It sees every tote as a picture of ``grid`` cells, whatever its size: a cell of the picture has the greatest height
@@ -35,13 +27,10 @@ class ToteValue(nn.Module):
         filters: width of the convolutions.
         receptive_field: side of the square that the first convolution sees, odd.
         hidden: width of the linear layer before the output.
-        mirrored: whether totes are mirrored, and transposed where they are square, at random while it learns. The value
-            is the same, unless items, end effector or reach tell the sides of the tote apart.
-        reward_scale: the config's ``reward_scale``; values are volumes times this.
-        compute_dtype: as in :class:`~pickplace.policies.fcn_grasp.network.FootprintFcn`.
+        **settings: of :class:`~pickplace.policies.afterstate.value.ToteValue`.
     """
 
-    in_keys: tuple[str, ...] = ("tote_depth", "tote_height")
+    in_keys = ("tote_depth", "tote_height")
 
     def __init__(
         self,
@@ -49,18 +38,13 @@ class ToteValue(nn.Module):
         filters: int = 32,
         receptive_field: int = 3,
         hidden: int = 256,
-        mirrored: bool = True,
-        reward_scale: float = 1.0,
-        compute_dtype: str = "auto",
+        **settings,
     ):
-        super().__init__()
+        super().__init__(**settings)
         self.grid = size_tuple("model.actor.grid", grid, 3, MAX_GRID)
         expect(min(self.grid[:2]) > 1, "model.actor.grid", [*self.grid], "at least 2 cells along x and y")
         odd_number("model.actor.receptive_field", receptive_field)
         whole_numbers("model.actor", MAX_WIDTH, filters=filters, hidden=hidden)
-        self.mirrored = flag("model.actor.mirrored", mirrored)
-        self.reward_scale = number("model.actor.reward_scale", reward_scale)
-        self.compute_dtype = one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
         wide, deep, steps = self.grid
         planes = steps + 3
         check_inputs(f"model.actor.receptive_field={receptive_field}", planes * receptive_field**2)
@@ -71,30 +55,25 @@ class ToteValue(nn.Module):
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.bias, 0.5)
 
-    def forward(self, tote_depth: Tensor, tote_height: Tensor) -> Tensor:
-        """Return the value of each tote, float32 ``[..., 1]``.
-
-        Args:
-            tote_depth: remaining height, ``[..., W_T, D_T]``.
-            tote_height: ``[..., 1]``.
-        """
-        batch = tote_depth.shape[:-2]
-        depth, height = tote_depth.flatten(0, -3), tote_height.reshape(-1)
-        if self.training and torch.is_grad_enabled():
-            depth = self._mirror(depth) if self.mirrored else depth
-            return self._values(depth, height).view(*batch, 1)
-        at_once = TOTES_AT_ONCE.get(depth.device.type, TOTES_AT_ONCE["cpu"])
-        parts = zip(depth.split(at_once), height.split(at_once), strict=True)
-        return torch.cat([self._values(*part) for part in parts]).view(*batch, 1)
-
-    def _values(self, depth: Tensor, height: Tensor) -> Tensor:
-        """Return the value of totes ``[N, W_T, D_T]`` of heights ``[N]``, ``[N]``."""
+    def some_parts(self, *entries: Tensor) -> Tensor:
+        """Return the value of totes ``[N, W_T, D_T]`` of heights ``[N, 1]``, ``[N, 1]``: there is one part."""
+        depth, height = entries
         dtype = matrix_dtype(self.compute_dtype, depth.device.type)
         with torch.autocast(depth.device.type, dtype, enabled=dtype != torch.float32):
-            planes = self._picture(depth, height).to(dtype, memory_format=torch.channels_last)
+            planes = self._picture(depth, height[:, 0]).to(dtype, memory_format=torch.channels_last)
             x = F.relu(self.wider(F.relu(self.around(planes))))
             x = F.relu(self.hidden(x.flatten(1)))
-        return self.reward_scale * depth.sum((1, 2)) * torch.sigmoid(self.head(x.float())[:, 0])
+        return self.reward_scale * depth.sum((1, 2))[:, None] * torch.sigmoid(self.head(x.float()))
+
+    def credit(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Tensor:
+        return torch.ones_like(before[0][:, :1, 0])
+
+    def learning_bytes(self, wide: int, deep: int) -> int:
+        columns, rows, steps = self.grid
+        return 8 * (wide * deep + columns * rows * (steps + 3 + self.around.out_channels))
+
+    def may_turn(self, wide: int, deep: int) -> bool:
+        return wide == deep and self.grid[0] == self.grid[1]
 
     @torch.no_grad()
     def _picture(self, depth: Tensor, height: Tensor) -> Tensor:
@@ -111,10 +90,3 @@ class ToteValue(nn.Module):
             F.pad(depth.diff(dim=2) != 0, (1, 0), value=True),
         ]
         return torch.cat([above, torch.ones_like(above[:, :1]), torch.stack(edges, 1)], 1)
-
-    def _mirror(self, depth: Tensor) -> Tensor:
-        """Return the totes in one of the views under which their value is the same, drawn at random."""
-        turned, *flips = torch.rand(3).lt(0.5).tolist()
-        depth = depth.flip([axis for axis, flipped in zip((1, 2), flips, strict=True) if flipped])
-        square = depth.shape[1] == depth.shape[2] and self.grid[0] == self.grid[1]
-        return depth.transpose(1, 2) if turned and square else depth

@@ -1,0 +1,105 @@
+"""The network behind ``model=afterstate_fcn``: the volume that each cell of a tote will still take."""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pickplace.common.validate import MAX_WIDTH, number, whole_number, whole_numbers
+from pickplace.policies.afterstate.value import ToteValue
+from pickplace.policies.fcn_grasp.network import matrix_dtype
+
+
+class CellsValue(ToteValue):
+    """Estimates which share of the empty volume above each cell of a tote will be filled.
+
+    It is fully convolutional: one set of weights serves any tote. A cell outside the tote looks like one that is full,
+    as neither an item nor the end effector can go lower there. Planes tell how deep a cell is, where the surface is not
+    level with the cell before, along x and along y, and which cells bear no weight. A convolution follows, others with
+    stride 2, and residual ones, each of which sees the mean over the tote, too: whether items still have places
+    elsewhere decides how long the packing goes on. The last layer has an output for each cell that the strides joined.
+
+    Every cell is a part of the value, and learns from the volume that is placed on it. That tells more than a sum, as
+    in Go, where a network learns faster if it also predicts who will own each point (Wu, Accelerating Self-Play
+    Learning in Go, 2019).
+
+    Args:
+        depth_range: levels of the depth that are told apart; deeper cells look alike.
+        level: height units of a level.
+        stem: width of the first convolution.
+        filters: width of the others.
+        halvings: convolutions with stride 2.
+        layers: residual convolutions.
+        **settings: of :class:`~pickplace.policies.afterstate.value.ToteValue`.
+    """
+
+    in_keys = ("tote_depth", "tote_bearing")
+    cells_at_once = {"cpu": 2**17, "cuda": 2**24}
+
+    def __init__(
+        self,
+        depth_range: int = 10,
+        level: float = 1.0,
+        stem: int = 32,
+        filters: int = 64,
+        halvings: int = 1,
+        layers: int = 2,
+        **settings,
+    ):
+        super().__init__(**settings)
+        self.depth_range = whole_number("model.actor.depth_range", depth_range, most=1_000)
+        self.level = number("model.actor.level", level, 1e-9)
+        whole_numbers("model.actor", MAX_WIDTH, stem=stem, filters=filters)
+        whole_number("model.actor.halvings", halvings, most=4)
+        whole_number("model.actor.layers", layers, 0, 100)
+        self.joined = 2**halvings  # cells along x, and along y, that the strides make one
+        self.around = nn.Conv2d(depth_range + 3, stem, 3, padding=1)
+        self.halves = nn.ModuleList(
+            nn.Conv2d(filters if number else stem, filters, 3, 2, padding=1) for number in range(halvings)
+        )
+        self.layers = nn.ModuleList(nn.Conv2d(filters, filters, 3, padding=1) for _ in range(layers))
+        self.means = nn.ModuleList(nn.Linear(filters, filters) for _ in range(layers))
+        self.head = nn.Conv2d(filters, self.joined**2, 1)
+        nn.init.normal_(self.head.weight, std=0.01)
+        nn.init.constant_(self.head.get_parameter("bias"), 0.5)
+
+    def some_parts(self, *entries: Tensor) -> Tensor:
+        """Return the volume that each cell will still take, scaled, float32 ``[N, W_T, D_T]``.
+
+        Args:
+            entries: the remaining height, ``[N, W_T, D_T]``, height units; and 1 where a cell bears weight, else 0.
+        """
+        depth, bearing = entries
+        wide, deep = depth.shape[1:]
+        dtype = matrix_dtype(self.compute_dtype, depth.device.type)
+        with torch.autocast(depth.device.type, dtype, enabled=dtype != torch.float32):
+            x = F.relu(self.around(self._planes(depth, bearing, dtype)))
+            for halve in self.halves:
+                x = F.relu(halve(x))
+            for layer, mean in zip(self.layers, self.means, strict=True):
+                x = x + F.relu(layer(x) + mean(x.mean((2, 3)))[:, :, None, None])
+        logits = F.conv2d(x.float(), self.head.weight, self.head.bias)
+        share = torch.sigmoid(F.pixel_shuffle(logits, self.joined))[:, 0]
+        for axis, side in ((1, wide), (2, deep)):  # a slice would tie an exported network to even or to odd sides
+            share = share.index_select(axis, torch.arange(side, device=share.device))
+        return self.reward_scale * depth * share
+
+    def learning_bytes(self, wide: int, deep: int) -> int:
+        wide, deep = (side + self.joined for side in (wide, deep))
+        return 8 * wide * deep * (self.depth_range + self.around.out_channels + self.head.in_channels)
+
+    def credit(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Tensor:
+        """An item has the same volume on each cell that it covers: those that rise."""
+        covered = (before[0] != after[0]).float()
+        return covered / covered.sum((1, 2), keepdim=True).clamp(min=1)
+
+    @torch.no_grad()
+    def _planes(self, depth: Tensor, bearing: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return how much of each level is empty, which cells bear no weight, and where the surface is not level,
+        ``[N, planes, W_T, D_T]``, channels last."""
+        below = torch.arange(self.depth_range, device=depth.device)
+        around = F.pad(depth, (1, 0, 1, 0))
+        uneven = around.diff(dim=1)[..., 1:] != 0, around.diff(dim=2)[:, 1:] != 0
+        levels = (depth[..., None] / self.level - below).clamp_(0, 1)
+        return torch.cat([levels, torch.stack([bearing == 0, *uneven], 3)], 3).to(dtype).permute(0, 3, 1, 2)

@@ -1,0 +1,88 @@
+"""The base of networks that estimate what totes will still take, whatever arrives."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from pickplace.common.validate import flag, number, one_of
+from pickplace.policies.fcn_grasp.network import DTYPES
+
+
+class ToteValue(nn.Module, ABC):
+    """The volume that a tote will still take, as a sum of parts, each of which is learnt.
+
+    Args:
+        mirrored: whether totes are mirrored, and transposed where they are square, at random while it learns. The value
+            is the same, unless items, end effector or reach tell the sides of the tote apart.
+        reward_scale: the config's ``reward_scale``; values are volumes times this.
+        compute_dtype: as in :class:`~pickplace.policies.fcn_grasp.network.FootprintFcn`.
+
+    Attributes:
+        in_keys: entries of the observation that it reads, in order.
+        cells_at_once: cells of totes whose activations a type of device holds at a time when gradients are off.
+    """
+
+    in_keys: tuple[str, ...]
+    cells_at_once = {"cpu": 2**18, "cuda": 2**24}  # what a CPU's caches hold
+
+    def __init__(self, mirrored: bool = True, reward_scale: float = 1.0, compute_dtype: str = "auto"):
+        super().__init__()
+        self.mirrored = flag("model.actor.mirrored", mirrored)
+        self.reward_scale = number("model.actor.reward_scale", reward_scale)
+        self.compute_dtype = one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
+
+    def forward(self, *entries: Tensor) -> Tensor:
+        """Return the value of each tote, float32 ``[..., 1]``, of the entries :attr:`in_keys`, such as ``tote_depth``
+        ``[..., W_T, D_T]`` and ``tote_height`` ``[..., 1]``."""
+        batch = entries[0].shape[:-2]
+        parts = self.parts(*(entry.flatten(0, len(batch) - 1) for entry in entries))
+        return parts.flatten(1).sum(1).view(*batch, 1)
+
+    def parts(self, *entries: Tensor) -> Tensor:
+        """Return the parts of the value, float32 ``[N, ...]``, of entries ``[N, ...]``."""
+        at_once = max(1, self.cells_at_once.get(entries[0].device.type, 2**18) // max(entries[0][:1].numel(), 1))
+        if torch.is_grad_enabled() or len(entries[0]) <= at_once:
+            return self.some_parts(*entries)
+        some = zip(*(entry.split(at_once) for entry in entries), strict=True)
+        return torch.cat([self.some_parts(*each) for each in some])
+
+    @abstractmethod
+    def some_parts(self, *entries: Tensor) -> Tensor:
+        """Return what :meth:`parts` does, for few totes."""
+
+    @abstractmethod
+    def learning_bytes(self, wide: int, deep: int) -> int:
+        """Return about how many bytes a tote of ``wide x deep`` cells takes in a gradient step."""
+
+    @abstractmethod
+    def credit(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Tensor:
+        """Return which share of the reward of a placement each part of the value earns, float32 ``[N, ...]``.
+
+        Args:
+            before, after: the entries of totes before and after the placement, ``[N, ...]`` each.
+        """
+
+    def random_view(self, *maps: Tensor) -> tuple[Tensor, ...]:
+        """Return tensors from one of the sides from which totes have the same value, drawn at random.
+
+        Args:
+            maps: ``[N, W_T, D_T]``; others come back as they are.
+        """
+        turned, *flips = torch.rand(3).lt(0.5).tolist()
+        axes = [axis for axis, flipped in zip((1, 2), flips, strict=True) if flipped]
+        shape = maps[0].shape[1:]
+        turned = turned and self.may_turn(*shape)
+
+        def seen(entry: Tensor) -> Tensor:
+            if entry.shape[1:] != shape:
+                return entry
+            entry = entry.flip(axes)
+            return entry.transpose(1, 2) if turned else entry
+
+        return tuple(map(seen, maps)) if self.mirrored else maps
+
+    def may_turn(self, wide: int, deep: int) -> bool:
+        """Return whether a tote of these sides may be transposed."""
+        return wide == deep
