@@ -18,7 +18,7 @@ class TD(MinibatchDescent):
 
     Args:
         policy: one that follows from these values, and draws placements by them.
-        critic: its network.
+        critic: its network, a :class:`~pickplace.policies.afterstate.value.ToteValue`.
         task: facts of the training.
         gamma: discount per step.
         lmbda: lambda of the returns.
@@ -26,7 +26,12 @@ class TD(MinibatchDescent):
     """
 
     def __init__(self, policy: Policy, critic: ValueOperator, task: Task, gamma: float, lmbda: float, **descent):
-        expect(isinstance(policy, EstimatesValue), "algo", "td", "model=afterstate, which follows from the values")
+        expect(
+            isinstance(policy, EstimatesValue),
+            "algo",
+            "td",
+            "model=afterstate or afterstate_fcn, which follow from the values",
+        )
         super().__init__(policy, task, **descent)
         whole_number("rollout_length", task.rollout_length, 2)
         self.network: ToteValue = critic.module

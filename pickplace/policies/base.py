@@ -210,7 +210,10 @@ class EstimatesValue(Protocol):
     """A policy that follows from the value of states: its network is the critic, too, and learns by TD(lambda)."""
 
     def value_network(self) -> torch.nn.Module:
-        """Return the module from the entries of the observation in its ``in_keys`` to values ``[..., 1]``."""
+        """Return the module from the entries of the observation in its ``in_keys`` to values ``[..., 1]``.
+
+        ``algo=td`` wants a :class:`~pickplace.policies.afterstate.value.ToteValue`, whose parts it learns.
+        """
 
 
 @runtime_checkable

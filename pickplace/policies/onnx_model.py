@@ -21,12 +21,14 @@ TOLERANCE = 1e-5  # greatest difference between onnxruntime and torch, as a shar
 CHECKS = (((1, 4), (0, 0)), ((3, 0), (0, 0)), ((7, 5), (1, 2)))
 ENVS, STEPS = 3, 8  # each check has ENVS * (STEPS + 1) problems at most
 
-#: Sizes that the model takes as they come; those of terms of your own follow from what is done with them.
+#: Sizes that the model takes as they come; those of terms of your own follow from what is done with them. The least
+#: side of a tote is that of the square which the rules look at below an item.
 N, BIN, TOTE = Dim("N"), (Dim("W_B"), Dim("D_B")), (Dim("W_T", min=3), Dim("D_T", min=3))
 SHAPES = {
     "bin_depth": (N, *BIN), "tote_depth": (N, *TOTE), "tote_bearing": (N, *TOTE), "tote_height": (N, Dim.STATIC),
     "items": (N, Dim("M"), Dim.STATIC),
 }  # fmt: skip
+#: For a policy that serves the bin of its training only.
 FIXED_BIN = {"bin_depth": (N, Dim.STATIC, Dim.STATIC)}
 
 
@@ -137,7 +139,7 @@ def _convert(scores: Scores, keys: Sequence[str], seen: list[Tensor], any_bin: b
         dict(enumerate(known.get(key, (N, *[Dim.AUTO] * (entry.dim() - 1)))))
         for key, entry in zip(keys, seen, strict=True)
     )
-    scores(*seen)  # so that the rules' tables are kept as they are, not as a trace would make them
+    scores(*seen)  # makes the tables that the rules keep: those that a trace makes would spoil later decisions
     logger = logging.getLogger("torch.onnx")
     before = logger.level
     try:

@@ -16,8 +16,8 @@ class CellsValue(ToteValue):
 
     It is fully convolutional: one set of weights serves any tote. A cell outside the tote looks like one that is full,
     as neither an item nor the end effector can go lower there. Planes tell how deep a cell is, where the surface is not
-    level with the cell before, along x and along y, and which cells bear no weight. A convolution follows, others with
-    stride 2, and residual ones, each of which sees the mean over the tote, too: whether items still have places
+    level with the cell before, along x and along y, and which cells bear no weight. A convolution follows, then others
+    with stride 2, then residual ones. These also see the mean over the tote, because whether items still have places
     elsewhere decides how long the packing goes on. The last layer has an output for each cell that the strides joined.
 
     Every cell is a part of the value, and learns from the volume that is placed on it. That tells more than a sum, as

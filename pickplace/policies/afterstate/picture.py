@@ -68,9 +68,11 @@ class PictureValue(ToteValue):
     def credit(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Tensor:
         return torch.ones_like(before[0][:, :1, 0])
 
+    def cells(self, wide: int, deep: int) -> int:
+        return self.grid[0] * self.grid[1]
+
     def learning_bytes(self, wide: int, deep: int) -> int:
-        columns, rows, steps = self.grid
-        return 8 * (wide * deep + columns * rows * (steps + 3 + self.around.out_channels))
+        return 8 * (wide * deep + self.cells(wide, deep) * (self.grid[2] + 3 + self.around.out_channels))
 
     def may_turn(self, wide: int, deep: int) -> bool:
         return wide == deep and self.grid[0] == self.grid[1]

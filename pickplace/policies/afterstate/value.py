@@ -11,7 +11,7 @@ from pickplace.policies.fcn_grasp.network import DTYPES
 
 
 class ToteValue(nn.Module, ABC):
-    """The volume that a tote will still take, as a sum of parts, each of which is learnt.
+    """Estimates the volume that a tote will still take. The value is a sum of parts, and each part is learnt.
 
     Args:
         mirrored: whether totes are mirrored, and transposed where they are square, at random while it learns. The value
@@ -21,7 +21,7 @@ class ToteValue(nn.Module, ABC):
 
     Attributes:
         in_keys: entries of the observation that it reads, in order.
-        cells_at_once: cells of totes whose activations a type of device holds at a time when gradients are off.
+        cells_at_once: cells whose activations a type of device holds at a time when gradients are off.
     """
 
     in_keys: tuple[str, ...]
@@ -42,11 +42,16 @@ class ToteValue(nn.Module, ABC):
 
     def parts(self, *entries: Tensor) -> Tensor:
         """Return the parts of the value, float32 ``[N, ...]``, of entries ``[N, ...]``."""
-        at_once = max(1, self.cells_at_once.get(entries[0].device.type, 2**18) // max(entries[0][:1].numel(), 1))
+        device, (wide, deep) = entries[0].device.type, entries[0].shape[1:]
+        at_once = max(1, self.cells_at_once.get(device, self.cells_at_once["cpu"]) // self.cells(wide, deep))
         if torch.is_grad_enabled() or len(entries[0]) <= at_once:
             return self.some_parts(*entries)
         some = zip(*(entry.split(at_once) for entry in entries), strict=True)
         return torch.cat([self.some_parts(*each) for each in some])
+
+    def cells(self, wide: int, deep: int) -> int:
+        """Return how many cells the network looks at in a tote of ``wide x deep``."""
+        return wide * deep
 
     @abstractmethod
     def some_parts(self, *entries: Tensor) -> Tensor:
@@ -65,11 +70,13 @@ class ToteValue(nn.Module, ABC):
         """
 
     def random_view(self, *maps: Tensor) -> tuple[Tensor, ...]:
-        """Return tensors from one of the sides from which totes have the same value, drawn at random.
+        """Return maps as seen from a side of the tote, drawn at random among those from which the value is the same.
 
         Args:
             maps: ``[N, W_T, D_T]``; others come back as they are.
         """
+        if not self.mirrored:
+            return maps
         turned, *flips = torch.rand(3).lt(0.5).tolist()
         axes = [axis for axis, flipped in zip((1, 2), flips, strict=True) if flipped]
         shape = maps[0].shape[1:]
@@ -81,7 +88,7 @@ class ToteValue(nn.Module, ABC):
             entry = entry.flip(axes)
             return entry.transpose(1, 2) if turned else entry
 
-        return tuple(map(seen, maps)) if self.mirrored else maps
+        return tuple(map(seen, maps))
 
     def may_turn(self, wide: int, deep: int) -> bool:
         """Return whether a tote of these sides may be transposed."""
