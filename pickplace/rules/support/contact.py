@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from functools import cached_property, reduce
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from pickplace.rules.state import surface_from
-from pickplace.rules.support.hull import extents, hull_patterns
+from pickplace.rules.support.hull import NONE, hull_chords, hull_patterns
 
 
 class Contact:
@@ -119,11 +120,14 @@ class Contact:
 
         Only for one footprint of each problem, with ``surfaces`` in one tensor.
         """
-        inside, supporting = self.under.clone(), (self.surfaces == self.supporting) & self.under
-        for along in extents(self.side, inside.device):
-            reached = torch.where(supporting, along[:, :, None], along.min() - 1).amax(1, keepdim=True)
-            inside &= (along[:, :, None] <= reached).all(0)  # [normals, S * S, N], of which the first is combined
-        return inside
+        rows = ((self.surfaces == self.supporting) & self.under).view(self.side, 1, self.side, -1)
+        bounds, chords, lengths = hull_chords(self.side, rows.device)
+        reached = torch.where(rows, bounds, NONE).amax(2)  # by the supporting cells of each row, [S, 2, N]
+        reached = F.pad(reached, (0, 0, 0, 0, 1, 1), value=NONE)
+        ends = torch.maximum(reached[:-1], reached[1:])  # of the edges between rows, [S + 1, 2, N]
+        lines = (chords @ ends.flatten(1)).div_(lengths)  # how far they go where they pass an edge
+        hull = lines.unflatten(0, (self.side + 1, -1)).amax(1)
+        return (bounds <= torch.minimum(hull[:-1], hull[1:]).view(self.side, 2, 1, -1)).all(1).flatten(0, 1)
 
 
 class Patches:

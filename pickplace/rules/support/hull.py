@@ -14,16 +14,33 @@ import torch
 from torch import Tensor
 
 BITS = 32  # normals in a word of a pattern
+NONE = -1e4  # reach of a row without a supporting cell
 MAX_HULL_SIDE = 16  # longest side of an item with the rules of the hull, in cells: the tables grow with its sixth power
 
 
 @lru_cache(maxsize=64)
-def extents(side: int, device: torch.device) -> list[Tensor]:
-    """Return how far the cells of a square reach along normals, from its corner: int32 ``[BITS, side * side]`` each."""
-    ends = torch.arange(side) + torch.tensor([[0], [1]])
-    furthest = (_normals(side)[:, :, None, None] * ends).amax(2)  # [normals, axis, cell]
-    along = furthest[:, 0, :, None] + furthest[:, 1, None, :]
-    return [part.int().to(device) for part in along.flatten(1).split(BITS)]
+def hull_chords(side: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what tells how far the hull of cells of a square goes along y, where it passes the edges between its rows.
+
+    There it goes as far as the furthest of the chords from one edge to another. All numbers are whole, so that their
+    float32 quotients compare exactly.
+
+    Returns:
+        how far each cell of a row goes, to the far side and to the near one (minus its distance from there), ``[2,
+        side, 1]``; the weights of a chord's ends where it passes an edge, times its length, ``[(side + 1) * P, side +
+        1]``, P chords for each edge; and the lengths, ``[(side + 1) * P, 1]``; float32.
+    """
+    edges = range(side + 1)
+    passing = [[(start, stop) for start in edges for stop in edges if start <= edge <= stop] for edge in edges]
+    most = max(map(len, passing))
+    start, stop = torch.tensor([pairs + pairs[:1] * (most - len(pairs)) for pairs in passing]).flatten(0, 1).t()
+    edge, numbers = torch.arange(side + 1).repeat_interleave(most), torch.arange(len(start))
+    weights = torch.zeros(len(start), side + 1)
+    weights[numbers, start] = (stop - edge).float()
+    weights[numbers, stop] += torch.where(start == stop, 1, edge - start)
+    cells = torch.arange(side, dtype=torch.float32)
+    bounds = torch.stack([cells + 1, -cells])[:, :, None]
+    return bounds.to(device), weights.to(device), weights.sum(1, keepdim=True).to(device)
 
 
 def _normals(side: int) -> Tensor:
