@@ -280,8 +280,10 @@ def test_the_hull_rule_equals_scipys_hull(data):
 @settings(max_examples=200)
 @given(st.data())
 def test_an_item_bears_weight_inside_scipys_hull(data):
-    w, d = data.draw(st.integers(1, 7)), data.draw(st.integers(1, 7))
-    held = data.draw(st.lists(st.tuples(st.integers(0, w - 1), st.integers(0, d - 1)), min_size=1, unique=True))
+    w, d = data.draw(st.integers(1, 16)), data.draw(st.integers(1, 16))
+    held = data.draw(
+        st.lists(st.tuples(st.integers(0, w - 1), st.integers(0, d - 1)), min_size=1, max_size=12, unique=True)
+    )
     square = list(itertools.product(range(max(w, d)), repeat=2))
     cells = surface_from(torch.tensor([[int(corner in held)] for corner in square]))
     under = torch.tensor([[x < w and y < d] for x, y in square])

@@ -1,10 +1,13 @@
 """Hulls of supporting cells: whether they contain an item's centre, or cells.
 
-An item tilts unless the vertical line through its centre passes the hull of what supports it. The hull is never
-computed. A point lies in a convex polygon if the polygon reaches as far along the normal of each of its edges. Those of
-a hull of cells are parallel to the axes, or to a line from one cell to another: a few directions. For the centre, a
-supporting cell reaches beyond it along some of their normals, which is a pattern of bits; the item is stable if the
-patterns of its supporting cells cover all of them. That is exact, and as fast as counting for items of up to 3 cells.
+An item tilts unless the vertical line through its centre passes the hull of what supports it. That is asked of every
+footprint, and the hull is not computed for it. A point lies in a convex polygon if the polygon reaches as far along the
+normal of each of its edges. Those of a hull of cells are parallel to the axes, or to a line from one cell to another: a
+few directions. For the centre, a supporting cell reaches beyond it along some of their normals, which is a pattern of
+bits; the item is stable if the patterns of its supporting cells cover all of them. That is exact, and as fast as
+counting for items of up to 3 cells.
+
+Which cells a hull contains is asked of one footprint of each problem. There it is computed, row by row.
 """
 
 from functools import lru_cache
