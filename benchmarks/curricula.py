@@ -18,7 +18,7 @@ TABLE, RUNS = ROOT / "docs" / "results" / "curricula.csv", ROOT / "outputs" / "c
 PROBLEMS = {
     "mixed": (
         0.95 * 0.8879,
-        ["experiment=mixed", "total_frames=1_000_000", "evaluation_interval=50_000", "evaluation.episodes=256"],
+        ["experiment=mixed_grasp", "total_frames=1_000_000", "evaluation_interval=50_000", "evaluation.episodes=256"],
     ),
     "gopt_rs": (
         0.95 * 0.8053,

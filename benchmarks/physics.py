@@ -134,7 +134,7 @@ def plan(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
         training = ["experiment=quick", "model=individual_grasp", "curriculum.advance.max_frames_per_level=50_000"]
         run("pickplace-train", *training, f"env.rotations={cell.R}", f"hydra.run.dir={trained}")
     rule, _, margin = cell.support.partition("+")
-    weights = "mixed" if cell.items == "mixed" else f"r{cell.R}"
+    weights = "mixed_grasp" if cell.items == "mixed" else f"r{cell.R}"
     result = evaluate(
         cell.folder, *(word.format(R=cell.R, weights=weights) for word in words),
         f"items={cell.items}", f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"env.rotations={cell.R}",

@@ -154,8 +154,8 @@ OWN_VALUES = [
     ("experiment=smoke model=fcn4d model.actor={filters:4}", {"model.actor.filters": 4}),
     ("experiment=smoke model=fcn_grasp", {"model.actor.filters": 8}),
     ("experiment=smoke env=deep_bin", {"env.tote_size": [4, 4, 1]}),
-    ("experiment=mixed warm_start=none", {"warm_start.frames": 0}),
-    ("experiment=mixed planner@warm_start.teacher=mcts", {"warm_start.frames": 100_000}),
+    ("experiment=mixed_grasp warm_start=none", {"warm_start.frames": 0}),
+    ("experiment=mixed_grasp planner@warm_start.teacher=mcts", {"warm_start.frames": 100_000}),
     ("experiment=mine", {"curriculum.advance.window": 7}),
     # other options with the same _target_
     ("experiment=mine curriculum=mixture", {"curriculum.advance.window": 400}),

@@ -59,13 +59,13 @@ def command(run, tmp_path):
 
 def test_shipped_weights_play_with_several_items(evaluation):
     few = [*SMALL[1:], "env.tote_size=[5,5,4]", "evaluation.episodes=3", "threads=1"]
-    one = evaluation("checkpoint=pretrained/mixed", *few)
-    several = evaluation("checkpoint=pretrained/mixed", "env.bin_items=2", "env.bin_size=[6,6,1]", *few)
+    one = evaluation("checkpoint=pretrained/mixed_grasp", *few)
+    several = evaluation("checkpoint=pretrained/mixed_grasp", "env.bin_items=2", "env.bin_size=[6,6,1]", *few)
     assert "| items in the bin " in several["out"] and "up to 2, refill: each" in several["out"]
     assert "items in the bin" not in one["out"] and one["env"]["bin_items"] == 1
     path = one["path"]
     evaluation(
-        "checkpoint=pretrained/mixed", "env.bin_items=2", *few, f"compare={path}",
+        "checkpoint=pretrained/mixed_grasp", "env.bin_items=2", *few, f"compare={path}",
         refused="env.bin_items=1, expected 2",
     )  # fmt: skip
 

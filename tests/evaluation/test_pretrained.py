@@ -14,7 +14,7 @@ from pickplace.runs.locate import PRETRAINED
 
 CARDS = sorted(PRETRAINED.glob(f"*/{export.CARD}"))
 EPISODES = 8
-POLICY_ALONE = ("fcn4d", "gopt_rs", "cdrl_rs", "cut1", "cut2")
+POLICY_ALONE = ("fcn4d", "mixed", "gopt_rs", "cdrl_rs", "cut1", "cut2")
 LIKE_OTHERS = ("r1", "r3", "cdrl_rs", "cut2")  # the same networks as r4, gopt_rs and cut1
 each_card = pytest.mark.parametrize("path", CARDS, ids=lambda path: path.parent.name)
 

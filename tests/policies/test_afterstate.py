@@ -130,9 +130,9 @@ def test_planes_of_the_cells_by_plain_comparisons():
         assert planes[n, 6, x, y] == (here != (float(depth[n, x, y - 1]) if y else 0))
 
 
-@pytest.mark.parametrize(("halvings", "layers"), [(1, 2), (2, 0)])
-def test_cells_of_any_tote_take_a_share_of_what_is_above_them(halvings, layers, monkeypatch):
-    net = cells_network(halvings=halvings, layers=layers, reward_scale=0.5)
+@pytest.mark.parametrize(("patch", "halvings", "layers"), [(1, 1, 2), (1, 2, 0), (2, 1, 1), (3, 0, 1)])
+def test_cells_of_any_tote_take_a_share_of_what_is_above_them(patch, halvings, layers, monkeypatch):
+    net = cells_network(patch=patch, halvings=halvings, layers=layers, reward_scale=0.5)
     for wide, deep in ((6, 6), (5, 7), (1, 9), (11, 4)):
         depth, _ = random_totes(20, wide, deep, 9)
         with torch.no_grad():
@@ -143,6 +143,22 @@ def test_cells_of_any_tote_take_a_share_of_what_is_above_them(halvings, layers, 
             torch.testing.assert_close(value, parts.sum((1, 2)).view(4, 5, 1))
             monkeypatch.setattr(CellsValue, "cells_at_once", {"cpu": 3 * wide * deep})
             torch.testing.assert_close(net.parts(depth, random_bearing(depth)), parts)
+
+
+@pytest.mark.parametrize(("wide", "deep"), [(6, 6), (5, 7)])
+def test_a_tote_is_worth_the_same_from_every_side(wide, deep):
+    """Once the network has learnt: the mean over the eight views, each of which is worth something else."""
+    net = cells_network(all_views=True)
+    maps = random_totes(3, wide, deep, 9)[0], random_bearing(torch.empty(3, wide, deep))
+    flips = [[entry.flip(axes) for entry in maps] for axes in ((), (1,), (2,), (1, 2))]
+    views = flips + [[entry.transpose(1, 2) for entry in view] for view in flips]
+    with torch.no_grad():
+        each = torch.stack([net(*view) for view in views])
+        assert (each.std(0) > 1e-3).all()
+        net.eval()
+        for view in views:
+            torch.testing.assert_close(net(*view), each.mean(0))
+        assert torch.equal(cells_network(mirrored=False, all_views=True).eval()(*maps), each[0])
 
 
 class Empty(PictureValue):

@@ -64,7 +64,7 @@ def test_torch_export_of_values_takes_any_tote():
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """``pretrained/mixed`` in onnxruntime, what the export says of its check, and its converted network."""
+    """``pretrained/mixed_grasp`` in onnxruntime, what the export says of its check, and its converted network."""
     runtime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
     path, programs, convert = tmp_path_factory.mktemp("onnx") / "mixed.onnx", [], onnx_model._convert
@@ -75,14 +75,14 @@ def exported(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(onnx_model, "_convert", keep)
-        differences = onnx_model.export_onnx("pretrained/mixed", path)
+        differences = onnx_model.export_onnx("pretrained/mixed_grasp", path)
     (program,) = programs
     return runtime.InferenceSession(path, providers=["CPUExecutionProvider"]), differences, program
 
 
 @pytest.fixture
 def converted(exported, monkeypatch):
-    """Exports of ``pretrained/mixed`` begin with its converted network, which takes seconds to make."""
+    """Exports of ``pretrained/mixed_grasp`` begin with its converted network, which takes seconds to make."""
     monkeypatch.setattr(onnx_model, "_convert", lambda *given: exported[2])
 
 
@@ -92,7 +92,7 @@ def test_the_check_is_at_three_sizes_that_the_export_has_not_seen(exported):
     facts = session.get_modelmeta().custom_metadata_map
     assert (facts["pickplace"], facts["checkpoint"], facts["policy"]) == (
         __version__,
-        "pretrained/mixed",
+        "pretrained/mixed_grasp",
         "FcnGrasp",
     )
     assert json.loads(facts["cell"])["tote_size"] == [8, 8, 8] and facts["index"].startswith(
@@ -141,7 +141,7 @@ def test_several_items_are_an_input(tmp_path):
 def test_a_robot_with_a_reach_has_the_same_scores(converted, tmp_path):
     """The network that was converted without a reach has these scores."""
     reach = Annulus((0, 99), (0, 9), (0, 0, 0), (0, 0, 0))
-    assert max(onnx_model.export_onnx("pretrained/mixed", tmp_path / "reach.onnx", reach=reach).values()) <= 1e-5
+    assert max(onnx_model.export_onnx("pretrained/mixed_grasp", tmp_path / "reach.onnx", reach=reach).values()) <= 1e-5
 
 
 @settings(max_examples=25)
@@ -157,7 +157,7 @@ def test_any_size_is_what_a_person_would_read_off_the_maps(exported, seed, batch
     keys = ("bin_depth", "tote_depth", "tote_bearing")
     (logits,) = exported[0].run(["logits"], {key: part.numpy() for key, part in zip(keys, maps, strict=True)})
     assert logits.shape == (batch, 2 * tote[0] * tote[1])
-    network, item = load_policy("pretrained/mixed").policy.network, item_from_depth(maps[0])
+    network, item = load_policy("pretrained/mixed_grasp").policy.network, item_from_depth(maps[0])
     row, parity = batch - 1, seed % 2
     w, d, h = (int(part[row]) for part in item[2:5])
     wide, deep = (d, w) if parity else (w, d)
@@ -168,7 +168,7 @@ def test_any_size_is_what_a_person_would_read_off_the_maps(exported, seed, batch
 
 
 def test_its_best_feasible_footprint_is_the_planners(exported):
-    trained = load_policy("pretrained/mixed", tote_size=(7, 9, 6))
+    trained = load_policy("pretrained/mixed_grasp", tote_size=(7, 9, 6))
     trained.policy.network.compute_dtype = "float32"
     seen = trained.make_env(num_envs=8).rollout(10, trained, break_when_any_done=False).reshape(-1)
     keys = [entry.name for entry in exported[0].get_inputs()]
@@ -201,11 +201,11 @@ def test_the_command_replaces_a_file_when_the_check_has_passed(converted, comman
     (tmp_path / "mixed.onnx").write_text("old")
     with monkeypatch.context() as patch:
         patch.setattr(onnx_model, "TOLERANCE", -1.0)
-        code, out, err = command("pretrained/mixed", "mixed.onnx")
+        code, out, err = command("pretrained/mixed_grasp", "mixed.onnx")
     assert code == 2 and "at a tote of 9x12 cells onnxruntime and torch differ by" in err and err.count("\n") == 1
     (path,) = tmp_path.iterdir()
     assert path.name == "mixed.onnx" and path.read_text() == "old"
-    code, out, err = command("pretrained/mixed", "mixed.onnx")
+    code, out, err = command("pretrained/mixed_grasp", "mixed.onnx")
     assert (code, err) == (0, "") and out.startswith(
         "mixed.onnx: onnxruntime agrees with torch at totes of 9x12, 11x8, 15x13"
     )

@@ -134,7 +134,7 @@ def test_whole_cells_in_metres_give_the_plan_of_whole_cells(name, seed):
 
 def test_one_label_is_one_item():
     depth, labels = bin_maps({5: (1, 2, 2, 1, 1)}, (5, 5))
-    planner = Planner.load("pretrained/mixed", tote_size=(6, 6, 5))
+    planner = Planner.load("pretrained/mixed_grasp", tote_size=(6, 6, 5))
     assert plan_for(planner, depth, np.full((6, 6), 5), bin_labels=labels) == plan_for(
         planner, depth, np.full((6, 6), 5)
     )
@@ -205,7 +205,7 @@ def count_plans(name: str, scenes: int, seed: int, side: int = 6, most=(0.1, 0.1
     return found
 
 
-@pytest.mark.parametrize("name", ["pretrained/mixed", "joint_dbl"])
+@pytest.mark.parametrize("name", ["pretrained/mixed_grasp", "joint_dbl"])
 def test_no_plan_that_is_ok_goes_wrong(name):
     found = count_plans(name, 120, 1)
     assert {status for _, status in found} <= {"ok", "stuck", "impossible"}, found
@@ -213,7 +213,7 @@ def test_no_plan_that_is_ok_goes_wrong(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pretrained/r4", "pretrained/mixed", "joint_dbl"])
+@pytest.mark.parametrize("name", ["pretrained/r4", "pretrained/mixed_grasp", "joint_dbl"])
 @pytest.mark.parametrize(("side", "scenes", "least"), [(6, 2000, 240), (8, 1000, 140)])
 def test_no_plan_that_is_ok_goes_wrong_in_3_000_scenes(name, side, scenes, least):
     found = count_plans(name, scenes, 100 if side == 6 else 200, side)
@@ -255,7 +255,9 @@ def test_an_action_means_one_item():
 @pytest.mark.parametrize("name", ["joint_dbl", "corner", "random", "individual_heuristic", "policy", "lookahead"])
 def test_any_planner_chooses_among_items(name):
     if name in ("policy", "lookahead"):
-        planner, known = (Planner.load("pretrained/mixed", planner=name, **MIXED, bin_items=count) for count in (1, 3))
+        planner, known = (
+            Planner.load("pretrained/mixed_grasp", planner=name, **MIXED, bin_items=count) for count in (1, 3)
+        )
     else:
         planner, known = (Planner(CellSpec(**MIXED, bin_items=count), planner=name) for count in (1, 3))
     plan = plan_for(planner, items=BOXES, **FLAT, alternatives=0)
@@ -319,7 +321,7 @@ def test_those_that_cannot_choose_refuse_in_one_sentence():
 
 
 def test_warnings_count_the_items():
-    planner = Planner.load("pretrained/mixed", bin_size=(8, 8, 1))
+    planner = Planner.load("pretrained/mixed_grasp", bin_size=(8, 8, 1))
     depth, labels = bin_maps({1: (0, 0, 1, 1, 1), 2: (3, 3, 2, 2, 4), 3: (6, 6, 2, 2, 4)}, (8, 8))
     plan = plan_for(planner, depth, np.full((8, 8), 8), bin_labels=labels)
     assert plan.warnings == [
@@ -356,7 +358,7 @@ def test_an_item_that_stands_on_another_is_refused(upper, refused):
 
 
 def test_the_critic_of_a_search_sees_each_item():
-    planner = Planner.load("pretrained/mixed", planner="lookahead", tote_size=(6, 6, 5))
+    planner = Planner.load("pretrained/mixed_grasp", planner="lookahead", tote_size=(6, 6, 5))
     depth, labels = np.zeros((5, 5)), np.zeros((5, 5), dtype=int)
     for label, (corner, height) in enumerate(((slice(0, 1), 1), (slice(3, 5), 2)), 1):
         depth[corner, corner], labels[corner, corner] = height, label
@@ -376,7 +378,7 @@ def test_items_of_a_fine_map_and_of_a_line():
         5: (60, 60, 10, 10, 0.05),
     }.items():
         heights[x : x + w, y : y + d], labels[x : x + w, y : y + d] = h, label
-    planner = Planner.load("pretrained/mixed", **MIXED)
+    planner = Planner.load("pretrained/mixed_grasp", **MIXED)
     tote = {"tote_depth": np.full((30, 30), 0.25).tolist(), "cell_size": CELL}
     plan = plan_for(planner, heights, bin_labels=labels, **tote, alternatives=3)
     assert plan.status == "ok" and plan.item_number in (1, 2)  # the first one is lower than its neighbour
@@ -392,5 +394,5 @@ def test_items_of_a_fine_map_and_of_a_line():
 
 def test_no_alternatives_where_no_item_is_gripped():
     depth, labels = bin_maps({1: (0, 0, 4, 4, 1), 2: (4, 4, 4, 4, 2)}, (8, 8))
-    plan = plan_for(Planner.load("pretrained/mixed", **MIXED), depth, np.full((6, 6), 5), bin_labels=labels)
+    plan = plan_for(Planner.load("pretrained/mixed_grasp", **MIXED), depth, np.full((6, 6), 5), bin_labels=labels)
     assert plan.status == "impossible" and plan.alternatives == []

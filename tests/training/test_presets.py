@@ -20,11 +20,17 @@ def test_every_preset_runs(name, tmp_path, monkeypatch):
     if name != "smoke":
         monkeypatch.setattr(trainer, "learning_curve", lambda metrics, path, *_: path.touch())
         monkeypatch.setattr(report, "failure_mix", lambda rows: b"")
-    sizes = {"smoke": [4, 4, 1], "mixed": [7, 7, 3], "mixed_bin3": [7, 7, 3], "warehouse": [16, 12, 60]}
+    sizes = {
+        "smoke": [4, 4, 1],
+        "mixed_grasp": [7, 7, 3],
+        "mixed_bin3": [7, 7, 3],
+        "mixed": [7, 7, 3],
+        "warehouse": [16, 12, 60],
+    }
     extra = [f"env.tote_size={sizes[name]}".replace(" ", "")] if name in sizes else []
     extra += ["items.depth=[9,10]"] * (name == "warehouse")  # fewer kinds
     extra += ["warm_start.weights=null"] * (name == "mixed_bin3")  # of another size than these networks
-    tiny = ONE_NETWORK if name == "afterstate" else TINY
+    tiny = TINY if composed(f"experiment={name}")["model"]["critic"] else ONE_NETWORK
     assert 0 <= train(composed(f"experiment={name}", *tiny, *extra), tmp_path) <= 1
     assert [row["frames"] for row in read_csv(tmp_path / "metrics.csv")] == [16]
     files = {".lock", "checkpoints", "learning_curve.png", "metrics.csv", "report.html"}

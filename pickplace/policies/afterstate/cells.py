@@ -27,9 +27,10 @@ class CellsValue(ToteValue):
     Args:
         depth_range: levels of the depth that are told apart; deeper cells look alike.
         level: height units of a level.
+        patch: cells along x, and along y, that the first convolution makes one.
         stem: width of the first convolution.
         filters: width of the others.
-        halvings: convolutions with stride 2.
+        halvings: convolutions with stride 2; with 0 the residual ones are as wide as the first.
         layers: residual convolutions.
         **settings: of :class:`~pickplace.policies.afterstate.value.ToteValue`.
     """
@@ -41,6 +42,7 @@ class CellsValue(ToteValue):
         self,
         depth_range: int = 10,
         level: float = 1.0,
+        patch: int = 1,
         stem: int = 32,
         filters: int = 64,
         halvings: int = 1,
@@ -51,16 +53,18 @@ class CellsValue(ToteValue):
         self.depth_range = whole_number("model.actor.depth_range", depth_range, most=1_000)
         self.level = number("model.actor.level", level, 1e-9)
         whole_numbers("model.actor", MAX_WIDTH, stem=stem, filters=filters)
-        whole_number("model.actor.halvings", halvings, most=4)
+        whole_number("model.actor.halvings", halvings, 0, 4)
         whole_number("model.actor.layers", layers, 0, 100)
-        self.joined = 2**halvings  # cells along x, and along y, that the strides make one
-        self.around = nn.Conv2d(depth_range + 3, stem, 3, padding=1)
+        self.patch = whole_number("model.actor.patch", patch, most=10)
+        self.joined = patch * 2**halvings  # cells along x, and along y, that the strides make one
+        self.around = nn.Conv2d(depth_range + 3, stem, patch + 2, patch)
         self.halves = nn.ModuleList(
             nn.Conv2d(filters if number else stem, filters, 3, 2, padding=1) for number in range(halvings)
         )
-        self.layers = nn.ModuleList(nn.Conv2d(filters, filters, 3, padding=1) for _ in range(layers))
-        self.means = nn.ModuleList(nn.Linear(filters, filters) for _ in range(layers))
-        self.head = nn.Conv2d(filters, self.joined**2, 1)
+        width = filters if halvings else stem
+        self.layers = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(layers))
+        self.means = nn.ModuleList(nn.Linear(width, width) for _ in range(layers))
+        self.head = nn.Conv2d(width, self.joined**2, 1)
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.get_parameter("bias"), 0.5)
 
@@ -74,7 +78,7 @@ class CellsValue(ToteValue):
         wide, deep = depth.shape[1:]
         dtype = matrix_dtype(self.compute_dtype, depth.device.type)
         with torch.autocast(depth.device.type, dtype, enabled=dtype != torch.float32):
-            x = F.relu(self.around(self._planes(depth, bearing, dtype)))
+            x = F.relu(self.around(F.pad(self._planes(depth, bearing, dtype), self._margins(wide, deep))))
             for halve in self.halves:
                 x = F.relu(halve(x))
             for layer, mean in zip(self.layers, self.means, strict=True):
@@ -93,6 +97,9 @@ class CellsValue(ToteValue):
         """An item has the same volume on each cell that it covers: those that rise."""
         covered = (before[0] != after[0]).float()
         return covered / covered.sum((1, 2), keepdim=True).clamp(min=1)
+
+    def _margins(self, wide: int, deep: int) -> list[int]:
+        return [1, 1 + -deep % self.patch, 1, 1 + -wide % self.patch]
 
     @torch.no_grad()
     def _planes(self, depth: Tensor, bearing: Tensor, dtype: torch.dtype) -> Tensor:

@@ -9,13 +9,17 @@ from torch import Tensor, nn
 from pickplace.common.validate import flag, number, one_of
 from pickplace.policies.fcn_grasp.network import DTYPES
 
+FLIPS: tuple[list[int], ...] = ([], [1], [2], [1, 2])  # axes along which maps of totes ``[N, W_T, D_T]`` are flipped
+
 
 class ToteValue(nn.Module, ABC):
     """Estimates the volume that a tote will still take. The value is a sum of parts, and each part is learnt.
 
     Args:
-        mirrored: whether totes are mirrored, and transposed where they are square, at random while it learns. The value
-            is the same, unless items, end effector or reach tell the sides of the tote apart.
+        mirrored: whether totes are mirrored and transposed at random while it learns. The value is the same, unless
+            items, end effector or reach tell the sides of the tote apart.
+        all_views: whether a value is the mean over all these views of a tote, once it has learnt (``eval()``). This
+            takes as many times as long.
         reward_scale: the config's ``reward_scale``; values are volumes times this.
         compute_dtype: as in :class:`~pickplace.policies.fcn_grasp.network.FootprintFcn`.
 
@@ -27,18 +31,28 @@ class ToteValue(nn.Module, ABC):
     in_keys: tuple[str, ...]
     cells_at_once = {"cpu": 2**18, "cuda": 2**24}  # what a CPU's caches hold
 
-    def __init__(self, mirrored: bool = True, reward_scale: float = 1.0, compute_dtype: str = "auto"):
+    def __init__(
+        self, mirrored: bool = True, all_views: bool = False, reward_scale: float = 1.0, compute_dtype: str = "auto"
+    ):
         super().__init__()
         self.mirrored = flag("model.actor.mirrored", mirrored)
+        self.all_views = flag("model.actor.all_views", all_views)
         self.reward_scale = number("model.actor.reward_scale", reward_scale)
         self.compute_dtype = one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
 
     def forward(self, *entries: Tensor) -> Tensor:
         """Return the value of each tote, float32 ``[..., 1]``, of the entries :attr:`in_keys`, such as ``tote_depth``
         ``[..., W_T, D_T]`` and ``tote_height`` ``[..., 1]``."""
-        batch = entries[0].shape[:-2]
-        parts = self.parts(*(entry.flatten(0, len(batch) - 1) for entry in entries))
-        return parts.flatten(1).sum(1).view(*batch, 1)
+        batch, wide, deep = entries[0].shape[:-2], *entries[0].shape[-2:]
+        flat = tuple(entry.flatten(0, len(batch) - 1) for entry in entries)
+        if self.training or not (self.mirrored and self.all_views):
+            return self.parts(*flat).flatten(1).sum(1).view(*batch, 1)
+        means = []
+        for turned in (False, True) if self.may_turn(wide, deep) else (False,):
+            views = zip(*(seen_from(flat, axes, turned) for axes in FLIPS), strict=True)
+            values = self.parts(*(torch.cat(entry) for entry in views)).flatten(1).sum(1)
+            means.append(values.view(len(FLIPS), -1).mean(0))
+        return torch.stack(means).mean(0).view(*batch, 1)
 
     def parts(self, *entries: Tensor) -> Tensor:
         """Return the parts of the value, float32 ``[N, ...]``, of entries ``[N, ...]``."""
@@ -73,23 +87,20 @@ class ToteValue(nn.Module, ABC):
         """Return maps as seen from a side of the tote, drawn at random among those from which the value is the same.
 
         Args:
-            maps: ``[N, W_T, D_T]``; others come back as they are.
+            maps: ``[N, W_T, D_T]``; entries ``[N, ...]`` of other dimensions come back as they are.
         """
         if not self.mirrored:
             return maps
         turned, *flips = torch.rand(3).lt(0.5).tolist()
         axes = [axis for axis, flipped in zip((1, 2), flips, strict=True) if flipped]
-        shape = maps[0].shape[1:]
-        turned = turned and self.may_turn(*shape)
-
-        def seen(entry: Tensor) -> Tensor:
-            if entry.shape[1:] != shape:
-                return entry
-            entry = entry.flip(axes)
-            return entry.transpose(1, 2) if turned else entry
-
-        return tuple(map(seen, maps))
+        return seen_from(maps, axes, turned and self.may_turn(*maps[0].shape[1:]))
 
     def may_turn(self, wide: int, deep: int) -> bool:
         """Return whether a tote of these sides may be transposed."""
-        return wide == deep
+        return True
+
+
+def seen_from(entries: Sequence[Tensor], axes: list[int], turned: bool) -> tuple[Tensor, ...]:
+    """Return the entries, of which maps ``[N, W_T, D_T]`` are flipped along axes, and then transposed if turned."""
+    flipped = (entry.flip(axes) if entry.dim() == 3 else entry for entry in entries)
+    return tuple(entry.transpose(1, 2) if turned and entry.dim() == 3 else entry for entry in flipped)
