@@ -21,8 +21,8 @@ TOLERANCE = 1e-5  # greatest difference between onnxruntime and torch, as a shar
 CHECKS = (((1, 4), (0, 0)), ((3, 0), (0, 0)), ((7, 5), (1, 2)))
 ENVS, STEPS = 3, 8  # each check has ENVS * (STEPS + 1) problems at most
 
-#: Sizes that the model takes as they come; those of terms of your own follow from what is done with them. The least
-#: side of a tote is that of the square which the rules look at below an item.
+#: Sizes that the model takes as they come; those of terms of your own follow from what is done with them. A tote
+#: has at least 3 cells along each side: the rules look at a square of the longest item's side, which is mostly 3.
 N, BIN, TOTE = Dim("N"), (Dim("W_B"), Dim("D_B")), (Dim("W_T", min=3), Dim("D_T", min=3))
 SHAPES = {
     "bin_depth": (N, *BIN), "tote_depth": (N, *TOTE), "tote_bearing": (N, *TOTE), "tote_height": (N, Dim.STATIC),

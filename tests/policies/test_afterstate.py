@@ -147,7 +147,7 @@ def test_cells_of_any_tote_take_a_share_of_what_is_above_them(patch, halvings, l
 
 @pytest.mark.parametrize(("wide", "deep"), [(6, 6), (5, 7)])
 def test_a_tote_is_worth_the_same_from_every_side(wide, deep):
-    """Once the network has learnt: the mean over the eight views, each of which is worth something else."""
+    """In evaluation mode: the mean of the eight views, whose own values differ."""
     net = cells_network(all_views=True)
     maps = random_totes(3, wide, deep, 9)[0], random_bearing(torch.empty(3, wide, deep))
     flips = [[entry.flip(axes) for entry in maps] for axes in ((), (1,), (2,), (1, 2))]

@@ -18,8 +18,8 @@ class ToteValue(nn.Module, ABC):
     Args:
         mirrored: whether totes are mirrored and transposed at random while it learns. The value is the same, unless
             items, end effector or reach tell the sides of the tote apart.
-        all_views: whether a value is the mean over all these views of a tote, once it has learnt (``eval()``). This
-            takes as many times as long.
+        all_views: whether a value is the mean over all these views of a tote, in evaluation mode (``eval()``). With
+            eight views this takes eight times as long.
         reward_scale: the config's ``reward_scale``; values are volumes times this.
         compute_dtype: as in :class:`~pickplace.policies.fcn_grasp.network.FootprintFcn`.
 
@@ -101,6 +101,6 @@ class ToteValue(nn.Module, ABC):
 
 
 def seen_from(entries: Sequence[Tensor], axes: list[int], turned: bool) -> tuple[Tensor, ...]:
-    """Return the entries, of which maps ``[N, W_T, D_T]`` are flipped along axes, and then transposed if turned."""
+    """Return the entries with all maps ``[N, W_T, D_T]`` flipped along axes, then transposed if ``turned``."""
     flipped = (entry.flip(axes) if entry.dim() == 3 else entry for entry in entries)
     return tuple(entry.transpose(1, 2) if turned and entry.dim() == 3 else entry for entry in flipped)
