@@ -89,13 +89,9 @@ class MeasuredProblem(Problem):
         share = box.w * box.d * box.h / (wide * deep * self.side**2 * self.tote.height * self.unit)
         return float(self.tote.highest.double().mean()) / self.tote.height, share
 
-    def _suction_face(self, number: int, x_bin: int, y_bin: int) -> tuple[float, float, float]:
+    def suction_face(self, number: int, x_bin: int, y_bin: int) -> tuple[float, float, float]:
         part = self.parts[number]
         return *part.centres[x_bin * self.cell.bin_size[1] + y_bin], part.grip
-
-    def _top(self, action: Tensor) -> int:
-        part, item, footprint = self._placed(action)
-        return int(part.measured.maps.rest.flatten()[footprint] + item.h)
 
     def _placed(self, action: Tensor) -> tuple[MeasuredItem, Item, int]:
         """Return the part of the item that an action takes, the item, and the footprint that it leaves."""

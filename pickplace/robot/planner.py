@@ -30,25 +30,27 @@ from pickplace.robot.problem import Pose, Problem, read_grid
 from pickplace.robot.scene import Scene
 from pickplace.robot.training_envelope import TrainingEnvelope
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.grasps import split_action
+from pickplace.rules.checks import PICK_FAILURES
+from pickplace.rules.grasps import join_pick, split_action
 from pickplace.rules.item import Observation
-from pickplace.rules.masks import action_footprints, action_mask, footprint_mask
+from pickplace.rules.masks import first_action_reaching, footprint_mask
 from pickplace.rules.observation import Term, check_terms, observe
 from pickplace.rules.state import Failure
 
+ACTIONS_AT_ONCE = 2**16  # whose reasons are looked up at a time
 MAX_ALTERNATIVES = 100_000  # greatest number of choices that a plan may report
 CHOOSERS = "expected one item, or a checkpoint of model=fcn_grasp or corners that was trained with a mask"
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """One of the most probable choices, and whether it succeeds in a forward simulation."""
+    """One of the most probable choices; with ``candidates=K``, one of the actions that were tried."""
 
     action: int  #: flat index
     pick_cell: tuple[int, int]
     place_cell: tuple[int, int]
     rotation_degrees: int  #: turn of the end effector's pose in the tote, in quarter turns
-    #: of the action, or of the item with its footprint if the policy chooses footprints; without a mask
+    #: of the item with its footprint, among those that the policy may choose; else of the action, without a mask
     probability: float
     rejected: str | None  #: the reason why it would fail; None if it would succeed
     chosen: bool
@@ -78,7 +80,7 @@ class Plan:
     action: int | None  #: flat index
     occupancy_before: float  #: share of the tote's volume below the surface that the depth map shows, 0 to 1
     occupancy_after: float
-    alternatives: list[Alternative]  #: the most probable choices, best first
+    alternatives: list[Alternative]  #: the most probable choices, best first; none if nothing is feasible
     reasons: dict[str, int] | None  #: if stuck or impossible: how many of all flat actions fail for each reason
     #: with ``support="bearing"``: 1 where the tote bears weight once the item rests, for the next call; else None
     tote_bearing: list[list[int]] | None
@@ -157,7 +159,7 @@ class Planner:
         Args:
             scene: what lies in bin and tote.
             alternatives: how many of the most probable choices to report, and the chosen one if it is further down;
-                0 is fastest. Where no action is feasible, planning takes longest: all are simulated for the reasons.
+                0 is fastest.
 
         Raises:
             DepthMapError: for a map of another shape or type, a value that is not finite or out of range, an empty
@@ -268,9 +270,17 @@ def _decide(planner: MapPlanner, problem: Problem, observation: Observation) -> 
 
 def _reasons(problem: Problem) -> dict[str, int]:
     """Return how many of all flat actions fail for each reason, each with the item that its pick takes."""
-    actions = torch.arange(problem.cell.num_actions, device=problem.state.surface.device)
-    counts = problem.failures(actions).bincount(minlength=len(Failure)).tolist()
-    return {failure.name.lower(): count for failure, count in zip(Failure, counts, strict=True) if count}
+    cell, device = problem.cell, problem.state.surface.device
+    picks = torch.arange(cell.num_picks, device=device)
+    codes = problem.failures(join_pick(cell, picks, 0))
+    by_pick = torch.isin(codes, torch.tensor(PICK_FAILURES, device=device))
+    of_pick = cell.num_places * cell.rotations  # actions
+    counts = codes[by_pick].bincount(minlength=len(Failure)) * of_pick
+    others = picks[~by_pick]
+    for some in others.split(max(1, ACTIONS_AT_ONCE // of_pick)) if len(others) else ():
+        actions = join_pick(cell, some[:, None], torch.arange(of_pick, device=device)).flatten()
+        counts += problem.failures(actions).bincount(minlength=len(Failure))
+    return {failure.name.lower(): count for failure, count in zip(Failure, counts.tolist(), strict=True) if count}
 
 
 def _list_alternatives(
@@ -287,7 +297,9 @@ def _list_alternatives(
         log_probs = policy.action_log_probs(observation)[0]
         tried = cell.num_actions if candidates == "all" else min(candidates, cell.num_actions)
         # The planner makes the same call, so both break ties alike.
-        actions = _with_chosen(log_probs.topk(tried).indices[:count], chosen)
+        actions = log_probs.topk(tried).indices[:count]
+        if chosen is not None and not (actions == chosen).any():
+            actions = torch.cat([actions, chosen])
         probability = log_probs[actions].exp()
     if not len(actions):
         return []
@@ -310,30 +322,20 @@ def _list_alternatives(
     ]
 
 
-def _with_chosen(listed: Tensor, chosen: Tensor | None) -> Tensor:
-    return listed if chosen is None or (listed == chosen).any() else torch.cat([listed, chosen])
-
-
 def _probable_footprints(
-    policy: Policy, observation: Observation, problem: Problem, chosen: Tensor | None, count: int
+    policy: ScoresFootprints, observation: Observation, problem: Problem, chosen: Tensor | None, count: int
 ) -> tuple[Tensor, Tensor]:
-    """Return an action for each of the most probable footprints, and the footprint's probability.
+    """Return an action for each of the most probable footprints among which the policy chooses, and the probability.
 
-    Many actions leave the same footprint, and the policy does not tell them apart. The action returned is the
-    chosen one, else the first feasible one, else the first one. Of several items in the bin each has its footprints.
+    Many actions leave the same footprint, and the policy does not tell them apart. The action returned is the chosen
+    one, else the first one.
     """
-    cell = problem.cell
-    footprint = action_footprints(cell, problem.state.items, problem.maps.blocked)[0]  # [N_a]
-    lands = footprint >= 0
-    reachable = footprint.new_zeros(cell.num_choices, dtype=torch.bool).index_fill_(0, footprint[lands], True)
-    if problem.maps.bin_items == 1:
-        log_probs = policy.action_log_probs(observation)[0]
-        total = log_probs.new_zeros(cell.num_choices).scatter_add_(0, footprint[lands], log_probs[lands].exp())
-    else:  # measured items are on grids of their own: what the policy sees does not tell which picks lift them
-        total = torch.where(reachable, policy.unmasked_scores(observation)[0], -torch.inf).softmax(0).nan_to_num(0)
-    ranked = torch.where(reachable, total, -1).argsort(descending=True, stable=True)[: int(reachable.sum())][:count]
-    preference = action_mask(cell, problem.maps)[0].int()
-    if chosen is not None:
-        ranked, preference[chosen] = _with_chosen(ranked, footprint[chosen]), 2
-    shown = [int(torch.where(footprint == wanted, preference, -1).argmax()) for wanted in ranked]
-    return ranked.new_tensor(shown), total[ranked]
+    ranked = policy.ranked(problem.maps)
+    probability = policy.footprint_logits(observation, ranked)[0].softmax(0)
+    choices = torch.where(ranked[0], probability, -1).argsort(descending=True, stable=True)[: int(ranked.sum())][:count]
+    if chosen is not None and not (choices == (choice := problem.choice_of(chosen))).any():
+        choices = torch.cat([choices, choice])
+    if not len(choices):
+        return choices, probability[choices]
+    actions = first_action_reaching(problem.cell, problem.maps.rows(torch.zeros_like(choices)), choices)
+    return actions if chosen is None else torch.where(choices == choice, chosen, actions), probability[choices]

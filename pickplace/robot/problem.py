@@ -1,5 +1,6 @@
 """The problem that a robot's planner solves for the items in a bin, and how it is read from the maps of a grid."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,9 +12,10 @@ from pickplace.common.validate import refuse_if
 from pickplace.robot.box import Box, DepthMapError
 from pickplace.robot.measure import LABEL_HINT, refuse, segments_of_map, whole_map
 from pickplace.robot.scene import BinMap, Scene
-from pickplace.rules.bin import taken_item
+from pickplace.rules.bin import select_item, taken_item
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.grasps import split_action
+from pickplace.rules.failures import FailureMaps
+from pickplace.rules.grasps import carry, footprint_index, split_action
 from pickplace.rules.gripper.base import effector_centre
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR
@@ -32,8 +34,8 @@ class Pose:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Problem:
-    """The items in a bin, one tote, and what decides which actions succeed: on the grid, by the rules of training.
+class Problem(ABC):
+    """The items in a bin, one tote, and what decides which actions succeed.
 
     The states have items ``[1, M]``.
     """
@@ -47,49 +49,75 @@ class Problem:
     unit: float = 1.0  # length of a height unit
     release: float = 0.0  # height of the suction face above the item's planned top when it lets go
 
+    @abstractmethod
+    def is_feasible_in_an_empty_tote(self) -> bool:
+        """Return whether any action would succeed in an empty tote."""
+
+    @abstractmethod
+    def failures(self, actions: Tensor) -> Tensor:
+        """Return the failure codes of flat actions, int64 ``[A]``."""
+
+    @abstractmethod
+    def bearing_after(self, action: Tensor | None) -> Tensor:
+        """Return where the tote bears weight after an action that succeeds, bool ``[W_T, D_T]``."""
+
+    @abstractmethod
+    def shares(self, number: int) -> tuple[float, float]:
+        """Return the shares of the tote's volume that are below its surface, 0 to 1, and that an item takes."""
+
+    @abstractmethod
+    def suction_face(self, number: int, x_bin: int, y_bin: int) -> tuple[float, float, float]:
+        """Return the centre of the suction face over a pick cell when it grips an item."""
+
     def taken_items(self, actions: Tensor) -> Tensor:
         """Return the number of the item that each flat action takes, int64 ``[A]``; 0 for a pick that grips none."""
         items = self.state.items.map(lambda part: part.expand(len(actions), -1))
         return taken_item(self.cell, items, *split_action(self.cell, actions)[:2])
 
-    def is_feasible_in_an_empty_tote(self) -> bool:
-        """Return whether any action would succeed in an empty tote."""
-        empty = self.state._replace(surface=torch.full_like(self.state.surface, EMPTY))
-        return bool(footprint_mask(self.cell, placing_maps(self.cell, empty)).any())
-
-    def failures(self, actions: Tensor) -> Tensor:
-        """Return the failure codes of flat actions, int64 ``[A]``."""
-        parts = actions.split(4096)  # a few thousand at a time, to save memory
-        return torch.cat([apply(self.cell, self.state.repeat(len(part)), part).failure for part in parts])
-
-    def bearing_after(self, action: Tensor | None) -> Tensor:
-        """Return where the tote bears weight after an action that succeeds, bool ``[W_T, D_T]``."""
-        surface = self.state.surface if action is None else apply(self.cell, self.state, action).surface
-        return (surface[0] & 1).bool()
-
-    def shares(self, number: int) -> tuple[float, float]:
-        """Return the shares of the tote's volume that are below its surface, 0 to 1, and that an item takes."""
-        total = self.cell.tote_volume(int(self.state.tote_height))
-        return int(self.state.heights.sum()) / total, int(self.state.items.volume[0, number]) / total
+    def choice_of(self, action: Tensor) -> Tensor:
+        """Return the choice that a flat action ``[1]`` makes: ``item * num_footprints + footprint``, int64 ``[1]``."""
+        number = self.taken_items(action)
+        item = select_item(self.state.items, number)
+        _, rotation, _, (x, y, *_) = carry(self.cell, item, action)
+        parity = rotation % 2 * (item.w != item.d)  # masks have a square footprint under parity 0
+        return number * self.cell.num_footprints + footprint_index(self.cell.tote_size, parity, x, y)
 
     def motion(self, action: Tensor) -> tuple[Pose, Pose, float, float]:
         """Return the poses at pick and place, the turn in degrees, and the height of the item's underside at rest."""
         x_bin, y_bin, x_tote, y_tote, rotation = (int(part) for part in split_action(self.cell, action))
-        number, top, shape = int(self.taken_items(action)), self._top(action), self.cell.effector(rotation)
+        number, shape = int(self.taken_items(action)), self.cell.effector(rotation)
+        rest, height = int(self.maps.rest.flatten()[self.choice_of(action)]), int(self.state.items.h[0, number])
         yaw = self.boxes[number].yaw if self.boxes else 0.0
         x, y = effector_centre(x_tote, shape.width) * self.side, effector_centre(y_tote, shape.depth) * self.side
-        pick = Pose((x_bin, y_bin), _point(*self._suction_face(number, x_bin, y_bin)), round(yaw, 6))
-        place = Pose((x_tote, y_tote), _point(x, y, top * self.unit + self.release), 90.0 * rotation)
-        rest = (top - int(self.state.items.h[0, number])) * self.unit
-        return pick, place, round(90 * rotation - yaw, 6), round(float(rest), 9)
+        pick = Pose((x_bin, y_bin), _point(*self.suction_face(number, x_bin, y_bin)), round(yaw, 6))
+        place = Pose((x_tote, y_tote), _point(x, y, (rest + height) * self.unit + self.release), 90.0 * rotation)
+        return pick, place, round(90 * rotation - yaw, 6), round(rest * self.unit, 9)
 
-    def _suction_face(self, number: int, x_bin: int, y_bin: int) -> tuple[float, float, float]:
-        """Return the centre of the suction face over a pick cell when it grips an item."""
+
+@dataclass(frozen=True, kw_only=True)
+class GridProblem(Problem):
+    """A problem on the grid, by the rules of training."""
+
+    facts: FailureMaps
+
+    def is_feasible_in_an_empty_tote(self) -> bool:
+        empty = self.state._replace(surface=torch.full_like(self.state.surface, EMPTY))
+        return bool(footprint_mask(self.cell, placing_maps(self.cell, empty)).any())
+
+    def failures(self, actions: Tensor) -> Tensor:
+        return self.facts.codes(self.cell, actions)
+
+    def bearing_after(self, action: Tensor | None) -> Tensor:
+        surface = self.state.surface if action is None else apply(self.cell, self.state, action).surface
+        return (surface[0] & 1).bool()
+
+    def shares(self, number: int) -> tuple[float, float]:
+        total = self.cell.tote_volume(int(self.state.tote_height))
+        return int(self.state.heights.sum()) / total, int(self.state.items.volume[0, number]) / total
+
+    def suction_face(self, number: int, x_bin: int, y_bin: int) -> tuple[float, float, float]:
         wide, deep = self.cell.gripper.size
         return effector_centre(x_bin, wide), effector_centre(y_bin, deep), int(self.state.items.h[0, number])
-
-    def _top(self, action: Tensor) -> int:
-        return int(apply(self.cell, self.state, action).top[0])
 
 
 def _point(x: float, y: float, z: float) -> tuple[float, float, float]:
@@ -113,7 +141,8 @@ def read_grid(cell: CellSpec, scene: Scene, device) -> Problem:
         join_items(items).map(lambda part: part.to(device)),
     )
     cell = replace(cell, bin_items=len(items))
-    return Problem(cell=cell, state=state, maps=placing_maps(cell, state), seen=state)
+    facts = FailureMaps.of(cell, state)
+    return GridProblem(cell=cell, state=state, maps=facts.placing_maps(cell), seen=state, facts=facts)
 
 
 def join_items(items: list[Item]) -> Item:

@@ -7,6 +7,7 @@ combine the checks of each scope for all picks, all footprints, all places of th
 
 from collections.abc import Callable
 from functools import reduce
+from itertools import takewhile
 from operator import and_
 from typing import Any, NamedTuple
 
@@ -63,6 +64,9 @@ CHECKS: tuple[tuple[Failure, int, Callable[[Any], Tensor | None]], ...] = (
     (Failure.OUT_OF_REACH, GREATEST_TOP, lambda over: over.highest),
     (Failure.FORBIDDEN_TURN, TURN, lambda allowed: allowed),
 )
+
+#: Why an action fails by its pick alone, wherever it places the item: these checks come first.
+PICK_FAILURES = tuple(kind for kind, scope, _ in takewhile(lambda check: check[1] == PICK, CHECKS))
 
 _FINDS = {scope: [find for _, where, find in CHECKS if where == scope] for scope in _COMBINE}
 

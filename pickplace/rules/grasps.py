@@ -126,7 +126,7 @@ def join_action(cell: CellSpec, pick: Tensor, place: Tensor, rotation: Tensor) -
     return (pick * cell.num_places + place) * cell.rotations + rotation
 
 
-def join_pick(cell: CellSpec, pick: Tensor, place_rotation: Tensor) -> Tensor:
+def join_pick(cell: CellSpec, pick: Tensor, place_rotation: Tensor | int) -> Tensor:
     """Return the flat action of a pick cell and the flat index of (place cell, rotation)."""
     return pick * (cell.num_places * cell.rotations) + place_rotation
 

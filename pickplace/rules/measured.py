@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.checks import FOOTPRINT, Over, Resting, combine, first_failure
-from pickplace.rules.grasps import carry, footprint_index, is_outside, split_action
+from pickplace.rules.checks import FOOTPRINT, Over, Resting, combine
+from pickplace.rules.failures import failure_codes
+from pickplace.rules.grasps import carry, split_action
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR, NEVER
 from pickplace.rules.masks import PlacingMaps
@@ -179,13 +180,11 @@ def failures(cell: CellSpec, measured: MeasuredMaps, action: Tensor, bin_clear: 
         action: int64 ``[A]``.
         bin_clear: bool ``[P]``, whether the end effector hits no wall of the bin at each pick cell.
     """
-    (maps, stable, highest, over), (tote_w, tote_d, _) = measured, cell.tote_size
-    x_bin, y_bin, x_tote, y_tote, _ = split_action(cell, action)
-    item = maps.item.map(lambda part: part.expand(len(action)))
-    picked, rotation, _, (x, y, w, d) = carry(cell, item, action)
-    inside = ~is_outside(x, w, tote_w) & ~is_outside(y, d, tote_d)
-    footprint = footprint_index(cell.tote_size, rotation % 2, x.clamp(0, tote_w - 1), y.clamp(0, tote_d - 1))
-    place = footprint_index(cell.tote_size, rotation % len(over.leaves), x_tote, y_tote)
-    resting = Resting(inside, maps.rest.flatten()[footprint] + item.h, highest, stable.flatten()[footprint])
+    item = measured.maps.item.map(lambda part: part.expand(len(action)))
+    picked, rotation, effector, placed = carry(cell, item, action)
+    x_bin, y_bin, *_ = split_action(cell, action)
     picked = picked._replace(collides=~bin_clear[x_bin * cell.bin_size[1] + y_bin])
-    return first_failure(picked, resting, over.at(place))
+    return failure_codes(
+        cell, action, item, (picked, rotation, effector, placed),
+        measured.maps.rest, measured.stable, measured.highest_top, measured.over,
+    )  # fmt: skip
