@@ -106,6 +106,19 @@ def decision(result: dict) -> str:
     )
 
 
+def answers(result: dict) -> str:
+    rows = (
+        (f"`{name}`", *(f"{figures[key]:.0f}" for key in ("median ms", "95% ms", "greatest ms")), figures["slowest"])
+        for name, figures in result["rows"].items()
+    )
+    return section(
+        "One answer to a robot",
+        "`Planner.plan` with ten alternatives, in cells and in metres, until the tote is full: all answers of `ok`, "
+        "`stuck`, `impossible`, `rejected` and refused scenes. Milliseconds; the slowest answer has that status.",
+        table("checkpoint | median | 95% | slowest | its status", rows),
+    )
+
+
 def startup(result: dict) -> str:
     rows = ((f"`{name}`", time(figures)) for name, figures in result["rows"].items())
     return section("Start-up", table("command | ms", rows))
@@ -114,7 +127,7 @@ def startup(result: dict) -> str:
 def main() -> None:
     sections: list[str] = []
     machines: dict[str, list[str]] = {}
-    for write in (learning, training, workers, environment, decision, startup):
+    for write in (learning, training, workers, environment, decision, answers, startup):
         path = RESULTS / f"{write.__name__}.json"
         if path.is_file():
             result = json.loads(path.read_text())

@@ -21,8 +21,10 @@ from pickplace.policies.afterstate.picture import PictureValue
 from pickplace.policies.afterstate.policy import Afterstate, AfterstateFcn
 from pickplace.policies.restore import restore_critic, restore_policy
 from pickplace.rules.cell import CellSpec
+from pickplace.rules.grasps import footprint_index
 from pickplace.rules.masks import placing_maps
 from pickplace.rules.state import State
+from pickplace.rules.step import apply
 from pickplace.runs import checkpoint
 from pickplace.runs.locate import locate
 from pickplace.training.train import train
@@ -47,6 +49,31 @@ def test_a_score_is_the_value_of_the_tote_that_the_step_leaves(kind, options):
             after = env.step(observation.clone().set("action", policy.to_action(choice, observation)))["next"]
             value = policy.network(*(after[key] for key in policy.network.in_keys))
         torch.testing.assert_close(2 * value, score)
+
+
+@pytest.mark.parametrize("kind", SMALL)
+@pytest.mark.parametrize("options", [{"tote_size": (4, 3, 3)}, {"tote_size": (4, 4, 2), "rotations": 1}])
+def test_an_action_has_an_even_share_of_its_totes_probability(kind, options):
+    """Against the single step: of the feasible actions, those that leave the same tote as a choice of the policy."""
+    torch.manual_seed(0)
+    settings = {**options, "masks": ("action", "corner"), "num_envs": 3}
+    policy = kind(PickPlaceEnv(**settings).cell, compute_dtype="float32", temperature=1.0, **SMALL[kind])
+    torch.nn.init.normal_(policy.network.head.weight, std=3)
+    for env, observation in random_states(3, **settings):
+        with torch.no_grad():
+            found = policy.action_log_probs(observation).exp()
+            wanted = policy.logits(observation).softmax(1)
+        for row in range(3):
+            leads_to: dict[int, list[int]] = {}
+            for action in observation["action_mask"][row].nonzero()[:, 0].tolist():
+                x, y, w, d = apply(env.cell, env.state.rows([row]), torch.tensor([action])).footprint[0].tolist()
+                item = env.state.items.rows((row, 0))
+                parity = int((w, d) != (item.w, item.d))
+                leads_to.setdefault(int(footprint_index(env.cell.tote_size, parity, x, y)), []).append(action)
+            expected = torch.zeros(env.cell.num_actions)
+            for choice, actions in leads_to.items():
+                expected[actions] = wanted[row, choice] / len(actions)
+            torch.testing.assert_close(found[row], expected)
 
 
 def network(**settings):

@@ -1,15 +1,17 @@
 """The policies that judge a placement by the tote that it leaves."""
 
+import torch
 from torch import Tensor
 
 from pickplace.common.validate import number
 from pickplace.policies.afterstate.cells import CellsValue
 from pickplace.policies.afterstate.picture import PictureValue
 from pickplace.policies.afterstate.value import ToteValue
-from pickplace.policies.base import refuse_several_items
-from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintPolicy
+from pickplace.policies.base import MASKED, refuse_several_items
+from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintPolicy, count_ways
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
+from pickplace.rules.masks import action_footprints, action_mask, placing_maps
 from pickplace.rules.observation import STANDARD_TERMS, observe
 from pickplace.rules.state import State
 from pickplace.rules.step import put_down
@@ -33,6 +35,7 @@ class Afterstate(FootprintPolicy):
     mask = "corner"
     network_class: type[ToteValue] = PictureValue
     check_cell = refuse_several_items
+    excludes = "actions that fail, and footprints that occupy no corner"
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = True, temperature: float = 0.003, **network):
         super().__init__(cell, mask_infeasible, **network)
@@ -49,6 +52,17 @@ class Afterstate(FootprintPolicy):
         after, _ = put_down(self.cell, State.from_observation(observation).rows(row), footprint)
         seen = observe(STANDARD_TERMS, self.cell, after, self.network.in_keys)
         return self.network(*(seen[key] for key in self.network.in_keys))[:, 0] / self.temperature
+
+    def action_log_probs(self, observation: Observation) -> Tensor:
+        """Return the distribution over flat actions ``[N, N_a]``. Only those that succeed have a value: an item must be
+        put down to look at the tote after it."""
+        state = State.from_observation(observation)
+        maps = placing_maps(self.cell, state)
+        log_probs = self.footprint_logits(observation, self.ranked(maps)).log_softmax(-1)
+        footprint = torch.where(action_mask(self.cell, maps), action_footprints(self.cell, state.items), -1)
+        ways = count_ways(log_probs.shape[1], footprint, footprint >= 0)
+        share = (log_probs - ways.clamp(min=1).log()).gather(1, footprint.clamp(min=0))
+        return torch.where(footprint >= 0, share, MASKED)
 
 
 class AfterstateFcn(Afterstate):

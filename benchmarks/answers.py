@@ -1,0 +1,94 @@
+"""Time of every answer that a robot gets, on one core: python benchmarks/answers.py [checkpoint ...]
+
+Each shipped checkpoint fills totes of its own cell with its own items. Every state is planned in cells and in metres,
+with ten alternatives: until nothing fits (stuck), with an item that fits in no tote (impossible), by one candidate only
+(rejected), and with a bin whose item is no cuboid (refused). The first plan after loading counts, too.
+"""
+
+import sys
+import time
+from collections import Counter
+
+import numpy as np
+import torch
+from common import ROOT, save, use_one_core
+
+from pickplace.policies.restore import load_policy
+from pickplace.robot.box import DepthMapError
+from pickplace.robot.planner import Planner
+from pickplace.robot.scene import Scene
+
+EPISODES = 2
+CELL_SIZE = 0.05
+
+
+def maps_of(env) -> dict[str, np.ndarray | float]:
+    """Return bin and tote of an environment with one slot as whole cells."""
+    state, item = env.state, env.state.items.rows((0, 0))
+    bin_depth = np.zeros(env.cell.bin_size[:2], dtype=int)
+    x, y, w, d, h = (int(part) for part in item[:5])
+    bin_depth[x : x + w, y : y + d] = h
+    height = int(state.tote_height)
+    bearing = (state.surface[0] & 1).numpy()
+    return {
+        "bin_depth": bin_depth, "tote_depth": height - state.heights[0].numpy(), "tote_height": height,
+        "tote_bearing": bearing,
+    }  # fmt: skip
+
+
+def in_metres(maps: dict, unit: float) -> dict:
+    """Return the same in metres; ``unit`` is the length of a height unit."""
+    lengths = {key: maps[key] * unit for key in ("bin_depth", "tote_depth", "tote_height")}
+    return {**lengths, "tote_bearing": maps["tote_bearing"], "cell_size": CELL_SIZE}
+
+
+def scenes(planner: Planner, env):
+    """Yield the maps of every state of some episodes, and at last an item that is too high, and one that is no
+    cuboid."""
+    for episode in range(EPISODES):
+        env.set_seed(episode)
+        data = env.reset()
+        yield (maps := maps_of(env))
+        while (plan := planner.plan(Scene.from_maps(**maps), alternatives=0)).action is not None:
+            data = env.step(data.set("action", torch.tensor([plan.action])))["next"]
+            yield (maps := maps_of(env))
+        yield {**maps, "bin_depth": np.where(maps["bin_depth"] > 0, maps["tote_height"] + 1, 0)}
+        uneven = maps["bin_depth"].copy()
+        uneven[0, 0] += 1
+        yield {**maps, "bin_depth": uneven}
+
+
+def answer(planner: Planner, maps: dict) -> tuple[str, float]:
+    """Return the status of a plan and the milliseconds that it took."""
+    begin = time.perf_counter()
+    try:
+        status = planner.plan(Scene.from_maps(**maps)).status
+    except DepthMapError:
+        status = "refused"
+    return status, 1000 * (time.perf_counter() - begin)
+
+
+def row(path: str) -> dict:
+    """Return percentiles of the times of one checkpoint's answers, and how often each status came."""
+    env = load_policy(path).make_env(num_envs=1)
+    planners = [Planner.load(path), Planner.load(path, candidates=1)]
+    found = []
+    for maps in scenes(planners[0], env):
+        for planner in planners:
+            found += [answer(planner, each) for each in (maps, in_metres(maps, CELL_SIZE * env.cell.height_unit))]
+    times = np.array([ms for _, ms in found])
+    median, most = np.percentile(times, [50, 95])
+    return {
+        "median ms": median, "95% ms": most, "greatest ms": times.max(), "slowest": found[times.argmax()][0],
+        "statuses": dict(Counter(status for status, _ in found)),
+    }  # fmt: skip
+
+
+def main() -> None:
+    names = sys.argv[1:] or sorted(folder.name for folder in (ROOT / "pickplace/pretrained").iterdir())
+    use_one_core()
+    save("answers", {"rows": {name: row(f"pretrained/{name}") for name in names}})
+
+
+if __name__ == "__main__":
+    main()
