@@ -17,9 +17,9 @@ from pickplace.policies.restore import load_policy
 from pickplace.robot.box import DepthMapError
 from pickplace.robot.planner import Planner
 from pickplace.robot.scene import Scene
+from pickplace.rules.cell import CellSpec
 
 EPISODES = 2
-CELL_SIZE = 0.05
 
 
 def maps_of(env) -> dict[str, np.ndarray | float]:
@@ -36,10 +36,10 @@ def maps_of(env) -> dict[str, np.ndarray | float]:
     }  # fmt: skip
 
 
-def in_metres(maps: dict, unit: float) -> dict:
-    """Return the same in metres; ``unit`` is the length of a height unit."""
-    lengths = {key: maps[key] * unit for key in ("bin_depth", "tote_depth", "tote_height")}
-    return {**lengths, "tote_bearing": maps["tote_bearing"], "cell_size": CELL_SIZE}
+def in_metres(maps: dict, cell: CellSpec) -> dict:
+    """Return the same in metres."""
+    lengths = {key: maps[key] * cell.height_unit * cell.cell_size for key in ("bin_depth", "tote_depth", "tote_height")}
+    return {**lengths, "tote_bearing": maps["tote_bearing"], "cell_size": cell.cell_size}
 
 
 def scenes(planner: Planner, env):
@@ -75,7 +75,7 @@ def row(path: str) -> dict:
     found = []
     for maps in scenes(planners[0], env):
         for planner in planners:
-            found += [answer(planner, each) for each in (maps, in_metres(maps, CELL_SIZE * env.cell.height_unit))]
+            found += [answer(planner, each) for each in (maps, in_metres(maps, env.cell))]
     times = np.array([ms for _, ms in found])
     median, most = np.percentile(times, [50, 95])
     return {

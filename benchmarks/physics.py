@@ -29,7 +29,7 @@ from common import ROOT, evaluate, run
 from pickplace import PickPlaceEnv
 from pickplace.config.registry import build
 from pickplace.evaluation.result import confidence95, proportion95
-from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement, read_plans
+from pickplace.physics.plans import EpisodePlan, Placement, read_plans
 from pickplace.rules.item import Item
 
 TABLE, RUNS = ROOT / "docs" / "results" / "physics.csv", ROOT / "outputs" / "physics"
@@ -174,13 +174,14 @@ def pack_without_gripper(cell: Cell, totes: int) -> tuple[list[float], list[Epis
     for episode in range(totes):
         size = [int(side) for side in cell.tote.split("x")]
         env = PickPlaceEnv(tote_size=size, rotations=cell.R, num_envs=1, stream="test", first_episode=episode, masks=())
-        metres = [[side * CELL_SIZE for side in sides] for sides in (size, env.cell.bin_size, env.cell.gripper.size)]
+        unit = env.cell.cell_size
+        metres = [[side * unit for side in sides] for sides in (size, env.cell.bin_size, env.cell.gripper.size)]
         placements, volume = [], 0
         for item, x, y, z, wide, deep in planned_placements(env):
-            corner = tuple(at * CELL_SIZE for at in (x, y, z))
-            sides = tuple(side * CELL_SIZE for side in (wide, deep, int(item.h)))
-            lies = tuple(int(at) * CELL_SIZE for at in (item.x, item.y))
-            pick = tuple(at + int(side) * CELL_SIZE / 2 for at, side in zip(lies, (item.w, item.d), strict=True))
+            corner = tuple(at * unit for at in (x, y, z))
+            sides = tuple(side * unit for side in (wide, deep, int(item.h)))
+            lies = tuple(int(at) * unit for at in (item.x, item.y))
+            pick = tuple(at + int(side) * unit / 2 for at, side in zip(lies, (item.w, item.d), strict=True))
             place = tuple(at + side / 2 for at, side in zip(corner[:2], sides[:2], strict=True))
             turned = (wide, deep) != (int(item.w), int(item.d))
             placements.append(Placement(corner, sides, lies, pick, place, 90 * turned))

@@ -44,7 +44,6 @@ class SimulatedCell:
 
     Args:
         planner: decides.
-        cell_size: side of a cell, m.
         noise: standard deviation of every value of the depth images, m.
         accuracy, clearance: of the :class:`~pickplace.robot.scene.Scene`, m.
         seed: of the noise.
@@ -52,20 +51,20 @@ class SimulatedCell:
     """
 
     def __init__(
-        self, planner: Planner, cell_size: float = 0.05, noise: float = 0.002, accuracy: float = ACCURACY,
+        self, planner: Planner, noise: float = 0.002, accuracy: float = ACCURACY,
         clearance: float = CLEARANCE, seed: int = 0, **options,
     ):  # fmt: skip
-        self.planner, self.cell_size, self.noise = planner, cell_size, noise
+        self.planner, self.noise = planner, noise
         self.accuracy, self.clearance = accuracy, clearance
         self.draw = np.random.default_rng(seed)
         # The cup gives way by as much as heights may be wrong. The plate is narrower than its cells by the clearance.
         options = {"lip": 2 * accuracy, "gap": 2 * clearance, **options}
-        self.simulation = Execute(cell_size=cell_size, **options)
-        cell = planner.cell
+        self.simulation = Execute(**options)
+        cell, cell_size = planner.cell, planner.cell.cell_size
         scale = (cell_size, cell_size, cell_size * cell.height_unit)
         self.bin, self.tote = (tuple(np.multiply(size, scale)) for size in (cell.bin_size, cell.tote_size))
         effector = tuple(np.multiply(cell.gripper.size, cell_size))
-        plan = EpisodePlan(0, self.tote, self.bin, effector, body=body_of(cell, cell_size))
+        plan = EpisodePlan(0, self.tote, self.bin, effector, body=body_of(cell))
         self.gantry: Gantry = self.simulation.make_scene(plan)
         focal = 0.8 * IMAGE[0] * CAMERA_HEIGHT / (max(*self.bin[:2], *self.tote[:2]) + 0.1)
         self.cameras = {
@@ -97,7 +96,7 @@ class SimulatedCell:
         """Return the plan for what the cameras see."""
         views = [(camera, self.depth_image(name)) for name, camera in self.cameras.items()]
         scene = Scene.from_images(
-            self.planner.cell, *views, self.cell_size, self.accuracy, clearance=self.clearance,
+            self.planner.cell, *views, self.planner.cell.cell_size, self.accuracy, clearance=self.clearance,
             tote_bearing=tote_bearing,
         )  # fmt: skip
         return self.planner.plan(scene, alternatives=0)

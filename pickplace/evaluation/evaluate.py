@@ -23,7 +23,6 @@ from pickplace.evaluation.result import (
     summarise_physics,
 )
 from pickplace.physics.engine import build_engine
-from pickplace.physics.plans import CELL_SIZE
 from pickplace.physics.recorded import plan_of
 from pickplace.planners.base import BatchPlanner
 from pickplace.planners.use import planner_parts
@@ -58,7 +57,7 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
         episodes = play(make_env, planner, ev.episodes, ev.batch_size, range(recorded), range(artifacts.replay))
         result = describe(planner, facts | settings, episodes)
         result["latency_ms"] = decision_latency(make_env, planner, ev.latency_decisions)
-        plans = [plan_of(each, cell, engine.cell_size if engine else CELL_SIZE) for each in episodes.recordings]
+        plans = [plan_of(each, cell) for each in episodes.recordings]
         if engine:
             outcomes = carry_out(engine, plans, episodes.recordings[: artifacts.replay])
             result["physics"] = summarise_physics(engine, resolved(cfg.physics), outcomes)

@@ -17,11 +17,9 @@ class Engine(Protocol):
 
     Attributes:
         name: its name in tables and in ``evaluation.json``.
-        cell_size: side of a cell in the plans that an evaluation makes for it, m.
     """
 
     name: str
-    cell_size: float
 
     def carry_out(self, plans: Iterable[EpisodePlan], record: Collection[int] = ()) -> Iterator[Outcome]:
         """Yield the outcome of each plan, in their order; with the motion, for the episodes in ``record``."""
@@ -37,6 +35,6 @@ def build_engine(node: DictConfig) -> Engine:
     engine = build("physics", node)
     refuse_if(
         not isinstance(engine, Engine),
-        f"physics._target_={node._target_}: no physics engine; expected name, cell_size and carry_out(plans, record).",
+        f"physics._target_={node._target_}: no physics engine; expected name and carry_out(plans, record).",
     )
     return engine

@@ -33,7 +33,6 @@ from pickplace.common.validate import excerpt, is_number, is_whole, refuse_if
 from pickplace.rules.cell import MAX_BIN_ITEMS
 
 PLANS = "plans.jsonl"
-CELL_SIZE = 0.05  # side of a cell unless a robot cell says otherwise, m
 TOLERANCE = 1e-4  # distance by which boxes may overlap or float, for rounding; m
 MAX_LENGTH = 100.0  # greatest length or coordinate, m
 MAX_FILE = 2**28  # greatest size of a file, bytes

@@ -5,12 +5,12 @@ from pickplace.rules.cell import CellSpec
 from pickplace.views.recording import Recording
 
 
-def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePlan:
-    """Return the plan of a recorded episode; ``cell_size`` is the side of a cell in metres."""
+def plan_of(recording: Recording, cell: CellSpec) -> EpisodePlan:
+    """Return the plan of a recorded episode."""
 
     def metres(*values: float) -> Point:
         # Of lengths in cells a third one is a height. Nanometres: 0.15000000000000002 would only be harder to read.
-        scales = (cell_size, cell_size, cell_size * cell.height_unit)
+        scales = (cell.cell_size, cell.cell_size, cell.cell_size * cell.height_unit)
         return tuple(round(value * scale, 9) for value, scale in zip(values, scales, strict=False))
 
     def middle(corner, sides) -> Point:
@@ -27,11 +27,11 @@ def plan_of(recording: Recording, cell: CellSpec, cell_size: float) -> EpisodePl
     ]  # fmt: skip
     return EpisodePlan(
         recording.episode, metres(*cell.tote_size[:2], recording.tote_height), metres(*cell.bin_size),
-        metres(*cell.gripper.size), placements, body_of(cell, cell_size),
+        metres(*cell.gripper.size), placements, body_of(cell),
     )  # fmt: skip
 
 
-def body_of(cell: CellSpec, cell_size: float) -> tuple[Point, ...]:
+def body_of(cell: CellSpec) -> tuple[Point, ...]:
     """Return the rectangles of the end effector's body in metres; none if it is one rectangle."""
     boxes = cell.effector(0).body
-    return tuple(tuple(round(part * cell_size, 9) for part in box) for box in boxes) if len(boxes) > 1 else ()
+    return tuple(tuple(round(part * cell.cell_size, 9) for part in box) for box in boxes) if len(boxes) > 1 else ()

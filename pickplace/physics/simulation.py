@@ -13,7 +13,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from pickplace.common.validate import flag, number, refuse_if, whole_number
-from pickplace.physics.plans import CELL_SIZE, EpisodePlan, Placement
+from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.physics.scene import Scene, mujoco
 from pickplace.views.motion import Motion, Outcome
 
@@ -40,13 +40,12 @@ class Simulation(ABC):
     ``diverged``: the simulation has become impossible.
 
     Args:
-        cell_size: side of a cell, the unit of ``max_shift``; m.
         friction: sliding friction between all surfaces.
         density: of the items; kg/m^3.
         gap: total narrowing of an item along x and along y; m.
         noise: standard deviation of the error of a placement along x and along y; m. With ``settle`` an error of
             more than half the gap may put an item into its neighbour.
-        max_shift: distance beyond which an item is lost, in cells.
+        max_shift: distance beyond which an item is lost, m.
         max_tilt: angle beyond which an item is lost; degrees.
         contact_damping: damping ratio of contacts. With 1 a light item on another one may tremble and creep, by up to
             some millimetres in an episode; with 2 it does not.
@@ -55,12 +54,11 @@ class Simulation(ABC):
         workers: processes, each with an episode of its own.
     """
 
-    cell_size: float = CELL_SIZE
     friction: float = 0.6
     density: float = 300.0
     gap: float = 0.001
     noise: float = 0.0
-    max_shift: float = 0.25
+    max_shift: float = 0.0125
     max_tilt: float = 14.0
     contact_damping: float = 1.0
     sleep: bool = True
@@ -76,8 +74,8 @@ class Simulation(ABC):
     }
     #: Least and greatest value of each option that is a number.
     limits: ClassVar[dict[str, tuple[float, float]]] = {
-        "cell_size": (1e-3, 10), "friction": (0, 10), "density": (1, 1e5), "gap": (0, 0.1), "noise": (0, 0.1),
-        "max_shift": (1e-3, 10), "max_tilt": (0.1, 90), "contact_damping": (0.1, 100),
+        "friction": (0, 10), "density": (1, 1e5), "gap": (0, 0.1), "noise": (0, 0.1),
+        "max_shift": (1e-4, 1), "max_tilt": (0.1, 90), "contact_damping": (0.1, 100),
     }  # fmt: skip
 
     def __post_init__(self):
@@ -86,10 +84,6 @@ class Simulation(ABC):
         flag("physics.sleep", self.sleep)
         whole_number("physics.seed", self.seed, 0)
         whole_number("physics.workers", self.workers, 1, 64)
-        refuse_if(
-            self.gap > self.cell_size / 2,
-            f"physics.gap={self.gap:g}: expected at most half of a cell, {self.cell_size / 2:g}.",
-        )
         refuse_if(mujoco is None, f"physics={self.name}: MuJoCo is missing; pip install 'pickplace[physics]'.")
 
     @abstractmethod
@@ -125,7 +119,7 @@ class Simulation(ABC):
         errors = self.noise * np.random.default_rng((self.seed, plan.episode)).standard_normal((count, 2))
         scene, loss, placed = self.make_scene(plan), None, 0
         if record:
-            scene.motion = Motion(self.cell_size, None if scene.bin is None else tuple(scene.bin.tolist()))
+            scene.motion = Motion(None if scene.bin is None else tuple(scene.bin.tolist()))
         for placement, error in zip(plan.placements, errors, strict=True):
             if loss := self.place(scene, placement, error) or self.find_loss(scene):
                 break
@@ -171,7 +165,7 @@ class Simulation(ABC):
         if scene.diverged:
             return Loss("diverged", len(scene.boxes) - 1)
         shifts, tilts = scene.shifts, scene.tilts
-        lost = (shifts > self.max_shift * self.cell_size) | (tilts > self.max_tilt)
+        lost = (shifts > self.max_shift) | (tilts > self.max_tilt)
         return Loss("collapsed", int(np.where(lost, shifts, -1).argmax())) if lost.any() else None
 
 

@@ -45,6 +45,7 @@ class CellSpec:
             of one of :data:`~pickplace.rules.support.rules.RULES` or the least share of the footprint.
         height_unit: length of a height unit, in sides of a cell. The rules only count units; what converts heights to
             lengths (the robot's planner, the replay page) multiplies by it.
+        cell_size: length of a cell, m. The rules only count cells; simulated physics and ``plans.jsonl`` need lengths.
         reach: of the robot, such as an :class:`~pickplace.rules.reach.annulus.Annulus` or tables of
             :class:`~pickplace.rules.reach.base.Limits`; None: it reaches everything.
         bin_items: ``M``, how many items a bin holds at most.
@@ -68,6 +69,7 @@ class CellSpec:
     rotations: int = 4
     support: Support = Bearing()
     height_unit: float = 1.0
+    cell_size: float = 0.05
     reach: Reach | None = None
     bin_items: int = 1
     refill: str = "each"
@@ -91,6 +93,7 @@ class CellSpec:
             ),
             "support": read_support(self.support),
             "height_unit": float(number("height_unit", self.height_unit, 1e-3, 1e3)),
+            "cell_size": float(number("cell_size", self.cell_size, 1e-3, 10, "metres")),
         }
         for key, value in read.items():
             object.__setattr__(self, key, value)

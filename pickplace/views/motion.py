@@ -17,7 +17,6 @@ class Motion:
     has not moved are left out.
 
     Attributes:
-        cell_size: side of a cell, m.
         bin: near corner of the bin, ``[2]``, m; None without a gantry.
         pictures: number of pictures, at most :data:`INTERVAL` apart.
         plate: poses of the end effector: of the middle of its lower face.
@@ -26,7 +25,6 @@ class Motion:
         ends: number of pictures when each placement had ended.
     """
 
-    cell_size: float
     bin: tuple[float, float] | None = None
     pictures: int = 0
     plate: list[tuple[float, ...]] = field(default_factory=list)

@@ -38,7 +38,7 @@ def page(recordings: list[Recording], cell: CellSpec, title: str, at_end: bool =
         "title": title,
         "step": len(recordings[0].moves) if at_end else 0,
         # In cells, from the tote's corner.
-        "binAt": [round(at / motion.cell_size, 6) for at in motion.bin] if motion and motion.bin else None,
+        "binAt": [round(at / cell.cell_size, 6) for at in motion.bin] if motion and motion.bin else None,
         "bin": [*cell.bin_size[:2], _cells(cell.bin_size[2], cell)],
         "tote": cell.tote_size[:2],
         **effector_parts(cell),
@@ -102,10 +102,10 @@ def _episode(recording: Recording, cell: CellSpec) -> dict:
         "others": [[_item(item, cell) for item in move.others] for move in recording.moves],
         "heat": base64.b64encode(np.stack(heat).tobytes()).decode() if heat else None,
     }
-    return facts | (_physics(recording.carried_out, facts) if recording.carried_out else {})
+    return facts | (_physics(recording.carried_out, facts, cell) if recording.carried_out else {})
 
 
-def _physics(outcome: Outcome, facts: dict) -> dict:
+def _physics(outcome: Outcome, facts: dict, cell: CellSpec) -> dict:
     """Return what physics changes in the facts of an episode for the page, and its motion."""
     lost, motion = outcome.lost is not None, outcome.motion
     sentence = outcome.sentence or f"Carried out: {outcome.ending}."
@@ -121,9 +121,9 @@ def _physics(outcome: Outcome, facts: dict) -> dict:
             "lost": outcome.lost,
             "placed": outcome.placed,
             "ends": motion.ends,
-            "plate": _poses(motion.plate, motion.cell_size),
-            "boxes": [_poses(poses, motion.cell_size) for poses in motion.boxes],
-            "left": [[round(side / motion.cell_size, 6) for side in sides] for sides in motion.left],
+            "plate": _poses(motion.plate, cell.cell_size),
+            "boxes": [_poses(poses, cell.cell_size) for poses in motion.boxes],
+            "left": [[round(side / cell.cell_size, 6) for side in sides] for sides in motion.left],
         }
     return changed
 

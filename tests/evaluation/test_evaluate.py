@@ -157,14 +157,14 @@ def test_physics_and_plans(evaluation, tmp_path):
     """A table that says what was carried out, and plans with which ``pickplace-physics`` comes to the same."""
     pytest.importorskip("mujoco")
     settings = ["planner=joint_dbl", "items=mixed", *SMALL, "env.tote_size=[6,6,4]", "evaluation.episodes=4"]
-    physics = ["physics=settle", "physics.friction=0.5", "physics.cell_size=0.04", "evaluation.plans=true"]
+    physics = ["physics=settle", "physics.friction=0.5", "env.cell_size=0.04", "evaluation.plans=true"]
     result = evaluation(*settings, *physics)
     found, plans = result["physics"], read_plans(result["path"].parent / "plans.jsonl")
     assert (found["method"], found["settings"]["friction"]) == ("settle", 0.5)
     assert sum(found["endings"].values()) == len(plans) == 4 and plans[0].tote == (0.24, 0.24, 0.16)
     share = found["endings"].get("done", 0) / 4
     assert found["carried_out"]["mean"] == share and f"{share:.1%} of the episodes to their end" in result["out"]
-    outcomes = [outcome.facts() for outcome in Settle(friction=0.5, cell_size=0.04).carry_out(plans)]
+    outcomes = [outcome.facts() for outcome in Settle(friction=0.5).carry_out(plans)]
     for ours, theirs, by_rules in zip(outcomes, found["episodes"], result["occupancy"]["per_episode"], strict=True):
         assert ours | {"cpu_seconds": 0} == theirs | {"cpu_seconds": 0}
         assert theirs["occupancy"] <= by_rules + 1e-9
@@ -262,8 +262,8 @@ class Clumsy:
 
     name = "clumsy"
 
-    def __init__(self, cell_size: float = 0.1, skip: bool = False):
-        self.cell_size, self.skip = cell_size, skip
+    def __init__(self, skip: bool = False):
+        self.skip = skip
 
     def carry_out(self, plans, record=()):
         for plan in plans[self.skip :]:
@@ -274,9 +274,9 @@ class Clumsy:
 def test_a_physics_engine_of_ones_own(command, evaluation):
     """One class; it needs no MuJoCo, and its config may be a file."""
     words = [*SMALL[:2], "planner=joint_dbl", "evaluation.episodes=3", "evaluation.plans=true", "evaluation.replay=2"]
-    result = command(*words, "+physics._target_=test_evaluate.Clumsy", "+physics.cell_size=0.2")
+    result = command(*words, "+physics._target_=test_evaluate.Clumsy", "env.cell_size=0.2")
     found, plans = result["physics"], read_plans(result["path"].parent / "plans.jsonl")
-    assert (found["method"], found["settings"], found["endings"]) == ("clumsy", {"cell_size": 0.2}, {"slipped": 3})
+    assert (found["method"], found["settings"], found["endings"]) == ("clumsy", {}, {"slipped": 3})
     assert plans[0].tote == (0.8, 0.8, 0.4) and found["carried_out"]["mean"] == 0
     volumes = [plan.placements[0].volume / 0.256 for plan in plans]
     assert found["occupancy"]["per_episode"] == pytest.approx(volumes)

@@ -126,11 +126,9 @@ def test_what_the_rules_call_feasible_is_carried_out(settings, count):
 
     cell = make_env(0, 1).cell
     episodes = play(make_env, RandomFeasible(cell, seed=1), count, count, record=range(count))
-    plans = [plan_of(recording, cell, 0.05) for recording in episodes.recordings]
+    plans = [plan_of(recording, cell) for recording in episodes.recordings]
     assert {placement.rotation for plan in plans for placement in plan.placements} == {0, 90, 180, 270}
-    for outcome, plan, occupancy in zip(
-        Execute(cell_size=0.05).carry_out(plans), plans, episodes.occupancy, strict=True
-    ):
+    for outcome, plan, occupancy in zip(Execute().carry_out(plans), plans, episodes.occupancy, strict=True):
         assert (outcome.ending, outcome.placed) == ("done", len(plan.placements)), outcome
         assert outcome.occupancy == pytest.approx(float(occupancy)) and outcome.drift < 1e-3
 
@@ -170,7 +168,7 @@ def test_an_item_waits_in_the_bin_until_it_is_taken():
     execute = Execute()
     scene = execute.make_scene(plan)
     start = scene.bin
-    scene.motion = Motion(0.05, tuple(start))
+    scene.motion = Motion(tuple(start))
     assert execute.place(scene, first, np.zeros(2)) is None
     (waiting,) = scene.waiting.values()
     assert len(scene.bodies) == 2 and np.allclose(

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -38,7 +39,7 @@ def test_a_recorded_episode_in_metres(tmp_path):
         Move((0, 0, 1, 1, 4), (0, 0), (0, 0), 0, (0, 2, 1, 1), 5, Failure.NONE),
         Move((0, 0, 1, 1, 4), (0, 0), (5, 5), 0, (5, 5, 1, 1), 0, Failure.TOTE_COLLISION),
     ]
-    plan = plan_of(Recording(7, 18, moves), cell, 0.04)
+    plan = plan_of(Recording(7, 18, moves), replace(cell, cell_size=0.04))
     first = Placement((0, 0.08, 0), (0.04, 0.08, 0.05), (0.08, 0.04), (0.1, 0.04), (0.04, 0.1), 90)
     assert plan == EpisodePlan(7, (0.24, 0.24, 0.18), (0.2, 0.2, 0.03), (0.12, 0.08), [first, plan.placements[1]])
     assert plan.placements[1].corner == (0, 0.08, 0.05) and plan.placements[1].rotation == 0
@@ -93,7 +94,7 @@ def test_a_body_in_metres(tmp_path):
     """An L of cells of 5 cm, written and read."""
     cell = CellSpec(effector_size=(3, 2), body=[[1, 1], [1, 0], [1, 0]], cup=[[1, 0], [0, 0], [0, 0]])
     move = Move((2, 1, 1, 1, 1), (2, 1), (0, 0), 0, (0, 0, 1, 1), 0, Failure.NONE)
-    plan = plan_of(Recording(0, 5, [move]), cell, 0.05)
+    plan = plan_of(Recording(0, 5, [move]), cell)
     assert plan.body == ((0.0, 0.0, 0.05, 0.1), (0.05, 0.0, 0.1, 0.05))
     (tmp_path / "plans.jsonl").write_text(to_lines([plan]))
     assert read_plans(tmp_path / "plans.jsonl") == [plan]
@@ -106,7 +107,7 @@ def test_neighbours_in_metres(tmp_path):
         Move((2, 1, 2, 1, 5), (1, 0), (0, 1), 0, (0, 1, 2, 1), 0, Failure.NONE, others=[(0, 3, 1, 2, 6)]),
         Move((0, 3, 1, 2, 6), (0, 2), (3, 3), 0, (3, 3, 1, 2), 0, Failure.NONE),
     ]
-    plan = plan_of(Recording(0, 20, moves), cell, 0.04)
+    plan = plan_of(Recording(0, 20, moves), replace(cell, cell_size=0.04))
     assert [one.neighbours for one in plan.placements] == [((0.0, 0.12, 0.04, 0.08, 0.06),), ()]
     (tmp_path / "plans.jsonl").write_text(to_lines([plan]))
     lines = [json.loads(line) for line in (tmp_path / "plans.jsonl").read_text().splitlines()]
@@ -168,8 +169,8 @@ def test_the_command(tmp_path, monkeypatch, capsys):
         *(((path, word), f"{word}: ") for word in ("friction", "friction=[1", "_target_=x")),
         ((path, "--method", "execute", "friction=0.3"), "physics=execute: episode 0 has no bin"),
         ((path, "--method", "setle"), "physics._target_=setle: "),
-        ((path, "gap=0.02", "cell_size=1"), None),
-        ((path, "gap=0.06", "cell_size=1"), "episode 0, item 1: 0.1 m wide"),
+        ((path, "gap=0.02"), None),
+        ((path, "gap=0.06"), "episode 0, item 1: 0.1 m wide"),
         ((tmp_path / "none.jsonl",), "none.jsonl: No such file"),
     ):
         if expected is None:

@@ -136,7 +136,7 @@ def test_a_gap_and_an_error_move_the_boxes():
 
 
 @pytest.mark.parametrize(("key", "value"), [
-    ("cell_size", 0), ("gap", 0.03), ("friction", -1), ("density", "heavy"), ("gap", float("nan")), ("noise", 1),
+    ("gap", 0.2), ("friction", -1), ("density", "heavy"), ("gap", float("nan")), ("noise", 1),
     ("max_shift", None), ("max_tilt", 91), ("sleep", 1), ("seed", -1), ("workers", 0),
 ])  # fmt: skip
 def test_impossible_settings_are_refused(key, value):

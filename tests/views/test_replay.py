@@ -232,7 +232,7 @@ def test_page_shows_what_physics_did(browser, tmp_path):
     first = [(0, -0.3, 0.05, 0.025, 1, 0, 0, 0), (4, 0.05, 0.025, 0.025, 1, 0, 0, 0)]
     second = [(5, -0.3, 0.05, 0.025, 1, 0, 0, 0), (9, 0.2, 0.1, 0.025, *turned)]
     plate = [(0, -0.3, 0.05, 0.3, 1, 0, 0, 0), (8, -0.3, 0.05, 0.3, *turned)]
-    motion = Motion(0.05, (-0.5, 0.1), 10, plate, [first, second], [5, 10])
+    motion = Motion((-0.5, 0.1), 10, plate, [first, second], [5, 10])
     carried_out = Outcome(
         0, "collapsed", 1, 1, 1, 0.25, 0.0, 0.0, "Item 2 left its place.", "item 2 left its place", motion
     )
@@ -269,7 +269,7 @@ def test_page_shows_what_physics_did(browser, tmp_path):
 
     # A failing move is not carried out, and the episode still counts as failed.
     failing = replace(moves[1], failure=Failure.TOTE_COLLISION)
-    motion = Motion(0.05, (-0.5, 0.1), 5, plate, [first], [5])
+    motion = Motion((-0.5, 0.1), 5, plate, [first], [5])
     kept = Outcome(0, "done", None, None, 1, 2 / 180, 0.0, 0.0, "Carried out.", "carried out", motion)
     recording = Recording(0, 5, [moves[0], failing], Failure.TOTE_COLLISION, [], 2 / 180, kept)
     state = open_page(browser, written(tmp_path, [recording], CellSpec()), "#step=9")
@@ -325,7 +325,7 @@ def test_page_shows_all_that_lies_in_the_bin(browser, tmp_path):
     boxes = [[pose(0, b), (6, 0.025, 0.025, 0.05, 1, 0, 0, 0)], [pose(0, a), (15, 0.2, 0.175, 0.025, 1, 0, 0, 0)],
              [pose(0, c)], [pose(10, d)]]  # fmt: skip
     motion = Motion(
-        0.05, (-0.35, 0.025), 20, [(0, -0.3, 0.05, 0.5, 1, 0, 0, 0)], boxes, [10, 20], [(0.05, 0.1, 0.15), (0.05,) * 3]
+        (-0.35, 0.025), 20, [(0, -0.3, 0.05, 0.5, 1, 0, 0, 0)], boxes, [10, 20], [(0.05, 0.1, 0.15), (0.05,) * 3]
     )
     kept = Outcome(0, "done", None, None, 2, 0.1, 0.0, 0.0, "Carried out.", "carried out", motion)
     state = open_page(browser, written(tmp_path, [replace(recording, carried_out=kept)], cell))

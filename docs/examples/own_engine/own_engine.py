@@ -9,15 +9,14 @@ class LoadLimit:
     """Count the whole mass of an item on every item that lies anywhere below it.
 
     Args:
-        cell_size: side of a cell, m; the plans are in metres.
         density: of the items, kg/m^3.
         max_load: greatest load of an item, kg.
     """
 
     name = "load_limit"  # shown in tables and in evaluation.json
 
-    def __init__(self, cell_size: float = 0.05, density: float = 300.0, max_load: float = 0.2):
-        self.cell_size, self.density, self.max_load = cell_size, density, max_load
+    def __init__(self, density: float = 300.0, max_load: float = 0.2):
+        self.density, self.max_load = density, max_load
 
     def carry_out(self, plans, record=()):
         """Yield the outcome of each plan."""
