@@ -61,6 +61,7 @@ class Policy(TensorDictModuleBase, ABC):
         map_keys: entries of the observation that its network reads.
         excludes: what :meth:`action_log_probs` gives probability 0 by construction; None if nothing.
         any_bin: whether its network scores bins of any size, or those of its cell only.
+        least_tote: fewest cells along a side of a tote that an exported network takes.
 
     Raises:
         ValueError: as of :meth:`check_cell`.
@@ -70,6 +71,7 @@ class Policy(TensorDictModuleBase, ABC):
     map_keys: tuple[str, ...] = DEPTH_KEYS
     excludes: str | None = None
     any_bin: bool = True
+    least_tote: int = 3  # the rules look at a square of the longest item's side, which is mostly 3
     network: Any
 
     def __init__(self, cell: CellSpec, masks: Sequence[str] = ()):
@@ -242,10 +244,12 @@ class ScoresAnySize(Protocol):
     Attributes:
         score_index: how an index of the scores is made.
         any_bin: whether bins may have any size; else totes only.
+        least_tote: fewest cells along a side of a tote.
     """
 
     score_index: str
     any_bin: bool
+    least_tote: int
 
     def unmasked_scores(self, observation: Observation) -> Tensor:
         """Return the score of everything that it scores, feasible or not, float32 ``[N, scores]``; it reads the entries

@@ -21,15 +21,7 @@ TOLERANCE = 1e-5  # greatest difference between onnxruntime and torch, as a shar
 CHECKS = (((1, 4), (0, 0)), ((3, 0), (0, 0)), ((7, 5), (1, 2)))
 ENVS, STEPS = 3, 8  # each check has ENVS * (STEPS + 1) problems at most
 
-#: Sizes that the model takes as they come; those of terms of your own follow from what is done with them. A tote
-#: has at least 3 cells along each side: the rules look at a square of the longest item's side, which is mostly 3.
-N, BIN, TOTE = Dim("N"), (Dim("W_B"), Dim("D_B")), (Dim("W_T", min=3), Dim("D_T", min=3))
-SHAPES = {
-    "bin_depth": (N, *BIN), "tote_depth": (N, *TOTE), "tote_bearing": (N, *TOTE), "tote_height": (N, Dim.STATIC),
-    "items": (N, Dim("M"), Dim.STATIC),
-}  # fmt: skip
-#: For a policy that serves the bin of its training only.
-FIXED_BIN = {"bin_depth": (N, Dim.STATIC, Dim.STATIC)}
+N = Dim("N")
 
 
 class Scores(torch.nn.Module):
@@ -82,7 +74,7 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
             "model=fcn_grasp or corners that was trained with a mask, model=fcn4d, or model=afterstate_fcn."
         )
     keys = [key for key in policy.in_keys if not key.endswith("_mask")]
-    model = _convert(Scores(policy, keys).eval(), keys, _observations(trained, keys, 1), policy.any_bin)
+    model = _convert(Scores(policy, keys).eval(), keys, _observations(trained, keys, 1), shapes_of(policy))
     model.model.metadata_props.update({
         "pickplace": pickplace.__version__,
         "checkpoint": str(checkpoint),
@@ -132,9 +124,19 @@ def _observations(trained: TrainedPolicy, keys: Sequence[str], steps: int) -> li
     return [seen[key].contiguous() for key in keys]
 
 
-def _convert(scores: Scores, keys: Sequence[str], seen: list[Tensor], any_bin: bool):
+def _shapes(policy: ScoresAnySize) -> dict[str, tuple]:
+    """Return the sizes of entries that the model takes as they come; those of terms of your own follow from what is
+    done with them."""
+    tote = Dim("W_T", min=policy.least_tote), Dim("D_T", min=policy.least_tote)
+    bins = (Dim("W_B"), Dim("D_B")) if policy.any_bin else (Dim.STATIC, Dim.STATIC)
+    return {
+        "bin_depth": (N, *bins), "tote_depth": (N, *tote), "tote_bearing": (N, *tote), "tote_height": (N, Dim.STATIC),
+        "items": (N, Dim("M"), Dim.STATIC),
+    }  # fmt: skip
+
+
+def _convert(scores: Scores, keys: Sequence[str], seen: list[Tensor], known: dict[str, tuple]):
     """Return the ``torch.onnx.ONNXProgram`` of scores."""
-    known = SHAPES if any_bin else SHAPES | FIXED_BIN
     shapes = tuple(
         dict(enumerate(known.get(key, (N, *[Dim.AUTO] * (entry.dim() - 1)))))
         for key, entry in zip(keys, seen, strict=True)

@@ -17,7 +17,7 @@ from pickplace.policies.base import MASKED
 from pickplace.policies.corners.policy import Corners
 from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
-from pickplace.policies.onnx_model import FIXED_BIN, SHAPES, Scores
+from pickplace.policies.onnx_model import Scores, shapes_of
 from pickplace.rules.item import item_from_depth
 from pickplace.rules.masks import footprint_mask, placing_maps
 from pickplace.rules.reach.annulus import Annulus
@@ -40,19 +40,20 @@ def test_torch_export_takes_any_size(name):
     maps = [
         part[: len(policy.map_keys)] for part in (random_maps(0, 2, (5, 6), (7, 9)), random_maps(1, 3, (6, 4), (5, 8)))
     ]
-    shapes = tuple(dict(enumerate(SHAPES[key])) for key in policy.map_keys)
+    shapes = tuple(dict(enumerate(shapes_of(policy)[key])) for key in policy.map_keys)
     program = torch.export.export(scores, tuple(maps[0]), dynamic_shapes=(shapes,)).module()
     for example in maps:
         torch.testing.assert_close(program(*example), scores(*example), rtol=1e-5, atol=1e-5)
 
 
-def test_torch_export_of_values_takes_any_tote():
+@pytest.mark.parametrize("patch", [1, 2])
+def test_torch_export_of_values_takes_any_tote(patch):
     torch.manual_seed(0)
-    policy = AfterstateFcn(CellSpec(support=Bearing()), stem=4, filters=8, compute_dtype="float32")
+    policy = AfterstateFcn(CellSpec(support=Bearing()), patch=patch, stem=4, filters=8, compute_dtype="float32")
     torch.nn.init.normal_(policy.network.head.weight, std=3)
     examples = [(*random_maps(count, count, (5, 5), tote), torch.full((count, 1), 8))
                 for count, tote in ((2, (7, 9)), (3, (5, 8)), (4, (8, 6)))]  # fmt: skip
-    shapes = tuple(dict(enumerate((SHAPES | FIXED_BIN)[key])) for key in policy.map_keys)
+    shapes = tuple(dict(enumerate(shapes_of(policy)[key])) for key in policy.map_keys)
     scores = Scores(policy, policy.map_keys)
     scores(*examples[0])
     program = torch.export.export(scores, examples[0], dynamic_shapes=(shapes,)).module()
@@ -112,7 +113,7 @@ def test_torch_export_takes_any_number_of_items():
     policy = FcnGrasp(CellSpec(bin_items=2), head_std=1.0, compute_dtype="float32")
     scores = Scores(policy, [key for key in policy.in_keys if not key.endswith("_mask")])
     examples = [tuple(each[key] for key in scores.keys) for each in seen]
-    shapes = tuple(dict(enumerate(SHAPES.get(key, ("N", Dim.AUTO, Dim.AUTO)))) for key in scores.keys)
+    shapes = tuple(dict(enumerate(shapes_of(policy).get(key, ("N", Dim.AUTO, Dim.AUTO)))) for key in scores.keys)
     program = torch.export.export(scores, examples[0], dynamic_shapes=(shapes,)).module()
     for example in examples:
         torch.testing.assert_close(program(*example), scores(*example), rtol=1e-5, atol=1e-5)

@@ -78,7 +78,7 @@ class CellsValue(ToteValue):
         wide, deep = depth.shape[1:]
         dtype = matrix_dtype(self.compute_dtype, depth.device.type)
         with torch.autocast(depth.device.type, dtype, enabled=dtype != torch.float32):
-            x = F.relu(self.around(F.pad(self._planes(depth, bearing, dtype), self._margins(wide, deep))))
+            x = F.relu(self.around(F.pad(self._planes(depth, bearing, dtype), [1, self.patch] * 2)))
             for halve in self.halves:
                 x = F.relu(halve(x))
             for layer, mean in zip(self.layers, self.means, strict=True):
@@ -97,9 +97,6 @@ class CellsValue(ToteValue):
         """An item has the same volume on each cell that it covers: those that rise."""
         covered = (before[0] != after[0]).float()
         return covered / covered.sum((1, 2), keepdim=True).clamp(min=1)
-
-    def _margins(self, wide: int, deep: int) -> list[int]:
-        return [1, 1 + -deep % self.patch, 1, 1 + -wide % self.patch]
 
     @torch.no_grad()
     def _planes(self, depth: Tensor, bearing: Tensor, dtype: torch.dtype) -> Tensor:

@@ -76,3 +76,7 @@ class AfterstateFcn(Afterstate):
     network_class = CellsValue
     score_index = FOOTPRINT_INDEX
     any_bin = False  # the rules look at what is below the largest item that a bin of the cell holds
+
+    def __init__(self, cell: CellSpec, mask_infeasible: bool = True, **settings):
+        super().__init__(cell, mask_infeasible, **settings)
+        self.least_tote = max(self.least_tote, self.network.joined + 1)  # one cell of its coarsest grid is too few
