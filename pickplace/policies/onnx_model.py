@@ -124,7 +124,7 @@ def _observations(trained: TrainedPolicy, keys: Sequence[str], steps: int) -> li
     return [seen[key].contiguous() for key in keys]
 
 
-def _shapes(policy: ScoresAnySize) -> dict[str, tuple]:
+def shapes_of(policy: ScoresAnySize) -> dict[str, tuple]:
     """Return the sizes of entries that the model takes as they come; those of terms of your own follow from what is
     done with them."""
     tote = Dim("W_T", min=policy.least_tote), Dim("D_T", min=policy.least_tote)
