@@ -113,8 +113,8 @@ def resume_run(overrides: list[str]) -> float:
             state, facts = checkpoint.read(saved)
             cfg = resumed_config(place, facts, words)
             handlers = (logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log"))
-            form = {"format": "%(asctime)s %(message)s", "datefmt": "%H:%M:%S"}
-            logging.basicConfig(level=logging.INFO, handlers=handlers, **form)
+            form = "%(asctime)s %(message)s"
+            logging.basicConfig(level=logging.INFO, format=form, datefmt="%H:%M:%S", handlers=handlers)
             (run_dir / folder.FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
         return run(cfg, run_dir, (state, facts, saved))
