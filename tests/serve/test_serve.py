@@ -5,6 +5,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -678,3 +679,22 @@ def test_the_page_asks_for_the_token(browser):
         browser.find_element("id", "token").send_keys(TOKEN)
         browser.find_element("css selector", "#sign button").click()
         wait_until(browser, "live.state().plans === 1 && document.getElementById('sign').hidden")
+
+
+def test_a_page_without_webgl_says_so():
+    """Its script stops at the renderer; run by node with a page of its own, as a browser would refuse it."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("needs node")
+    source = (ROOT / "pickplace/views/assets/scene.js").read_text()
+    before = """
+    const shown = [], document = {createElement: () => ({style: {}, setAttribute() {}})};
+    const $ = id => ({prepend: part => shown.push(id + ": " + part.textContent)});
+    const THREE = {WebGLRenderer: class { constructor() { throw new Error("Error creating WebGL context."); } }};
+    const data = {bin: [5, 5, 1], tote: [6, 6], effector: [3, 3]};
+    try { (() => {
+    """
+    after = "\n})(); } catch (error) { shown.push(error.message); }\nconsole.log(shown.join('|'));"
+    run = subprocess.run([node, "-e", before + source + after], capture_output=True, text=True, check=True)
+    words = "stage: This browser has no WebGL, so nothing can be shown in 3D. Switch on hardware acceleration"
+    assert run.stdout.startswith(words) and run.stdout.endswith("|Error creating WebGL context.\n")
