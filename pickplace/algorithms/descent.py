@@ -28,6 +28,7 @@ DIAGNOSTICS = {
 }
 
 MAX_WEIGHT = 1e38  # float32 ends there
+MAX_RATE = 1.0  # Adam moves each weight by about the rate: with more no network stays finite for long
 
 
 class MinibatchDescent(Algorithm):
@@ -59,7 +60,7 @@ class MinibatchDescent(Algorithm):
         self.policy, self.task = policy, task
         self.epochs = whole_number("algo.epochs", epochs, most=1_000)
         self.minibatch_size = whole_number("algo.minibatch_size", minibatch_size)
-        self.lr = number("algo.lr", lr, most=MAX_WEIGHT)
+        self.lr = number("algo.lr", lr, most=MAX_RATE)
         self.lr_decay_start = or_null(number, "algo.lr_decay_start", lr_decay_start, 0, 1)
         self.max_grad_norm = number("algo.max_grad_norm", max_grad_norm, 1e-9, MAX_WEIGHT)
         self.schedule: dict = {"settings": "", "since": 0}  # of the learning rate, and its first frame

@@ -2,8 +2,9 @@
 
 import csv
 import io
+import os
 import stat
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pickplace.common.validate import at_most, excerpt, refuse_if, reworded
@@ -76,7 +77,8 @@ def replaced_file(path):
     """Yield the path of a new file beside ``path``, which replaces it when the block ends.
 
     If the block fails, the old file stays as it was and nothing of the new one is left. An old file that is a link is
-    replaced, and not written through.
+    replaced, and not written through. When the function returns, the disk has the new file under its name: a power
+    failure after that does not bring the old one back.
 
     Raises:
         OSError: naming ``path``, if it cannot be written, for example because the disk is full.
@@ -87,6 +89,22 @@ def replaced_file(path):
         try:
             new.unlink(missing_ok=True)  # a link, perhaps
             yield new
+            with new.open("rb") as file:
+                os.fsync(file.fileno())
             new.replace(path)
+            sync_folder(path.parent)
         finally:
             new.unlink(missing_ok=True)
+
+
+def sync_folder(folder) -> None:
+    """Write the names in a folder to the disk: a rename is there after a power failure only if its folder is.
+
+    File systems that cannot do it for a folder, such as some in a network, are left alone.
+    """
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

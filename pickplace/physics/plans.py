@@ -30,6 +30,7 @@ from typing import Any
 
 from pickplace.common.files import read_text
 from pickplace.common.validate import excerpt, is_number, is_whole, refuse_if
+from pickplace.physics.neighbours import BoxIndex
 from pickplace.rules.cell import MAX_BIN_ITEMS
 
 PLANS = "plans.jsonl"
@@ -137,22 +138,23 @@ def read_plans(path: str | Path) -> list[EpisodePlan]:
         OSError: if the file cannot be read.
     """
     plans: list[EpisodePlan] = []
+    episodes: set[int] = set()
     for number, line in enumerate(read_text(path, MAX_FILE).splitlines(), 1):
         try:
             values = _read_line(line)
             episode = values.pop("episode")
             sizes = {key: values.pop(key, ()) for key in ("tote", "bin", "effector", "body")}
             if not plans or plans[-1].episode != episode:
-                refuse_if(
-                    any(plan.episode == episode for plan in plans),
-                    f"episode={episode}: expected its lines to follow one another.",
-                )
+                refuse_if(episode in episodes, f"episode={episode}: expected its lines to follow one another.")
                 plans.append(EpisodePlan(episode, **sizes))
+                episodes.add(episode)
+                placed = BoxIndex()
             if changed := [key for key, value in sizes.items() if getattr(plans[-1], key) != value]:
                 raise ValueError(f"{changed[0]}: expected the same in all lines of episode {episode}.")
             placement = Placement(**values)
-            _check_place(placement, plans[-1])
+            _check_place(placement, plans[-1], placed)
             plans[-1].placements.append(placement)
+            placed.add(placement.corner, placement.size)
         except ValueError as error:
             raise ValueError(f"{path}, line {number}: {error}") from error
     return plans
@@ -204,21 +206,29 @@ def _shared(corner: Point, size: Point, other: Point, other_size: Point) -> list
     ]
 
 
-def _check_place(placement: Placement, plan: EpisodePlan) -> None:
-    """Refuse an item that cannot lie where it is planned."""
-    size, corner, below = placement.size, placement.corner, 0.0
+def _check_place(placement: Placement, plan: EpisodePlan, placed: BoxIndex) -> None:
+    """Refuse an item that cannot lie where it is planned; ``placed`` are the placements of the plan so far."""
+    size, corner = placement.size, placement.corner
     for name, low, side, most in zip("xyz", corner, size, plan.tote, strict=True):
         refuse_if(
             low < -TOLERANCE or low + side > most + TOLERANCE,
             f"the item leaves the tote: along {name} from {low:g} to {low + side:g} m, expected 0 to {most:g} m.",
         )
-    for number, other in enumerate(plan.placements, 1):
-        shared, top = _shared(corner, size, other.corner, other.size), other.corner[2] + other.size[2]
-        refuse_if(
-            min(shared) > TOLERANCE, f"the item overlaps item {number} of its episode by {1e3 * min(shared):.1f} mm."
-        )
-        if min(shared[:2]) > 0 and top <= corner[2] + TOLERANCE:
+    near = placed.near(corner, size, 2 * TOLERANCE)
+    for index in near:
+        other = plan.placements[index]
+        overlap = min(_shared(corner, size, other.corner, other.size))
+        refuse_if(overlap > TOLERANCE, f"the item overlaps item {index + 1} of its episode by {1e3 * overlap:.1f} mm.")
+    if _gap(placement, [plan.placements[index] for index in near]) > TOLERANCE:
+        gap = _gap(placement, plan.placements)  # others may lie further below
+        raise ValueError(f"the item floats {1e3 * gap:.1f} mm above what lies below it.")
+
+
+def _gap(placement: Placement, others: Iterable[Placement]) -> float:
+    """Return the distance from an item down to the highest of some others below it, or to the floor; m."""
+    size, corner, below = placement.size, placement.corner, 0.0
+    for other in others:
+        top = other.corner[2] + other.size[2]
+        if top <= corner[2] + TOLERANCE and min(_shared(corner, size, other.corner, other.size)[:2]) > 0:
             below = max(below, top)
-    refuse_if(
-        corner[2] - below > TOLERANCE, f"the item floats {1e3 * (corner[2] - below):.1f} mm above what lies below it."
-    )
+    return corner[2] - below

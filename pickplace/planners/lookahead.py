@@ -9,7 +9,7 @@ from pickplace.common.validate import check_bytes, number, or_null, refuse_if, w
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner
-from pickplace.policies.base import MASKED, EstimatesValue, Policy, ScoresFootprints
+from pickplace.policies.base import MASKED, EstimatesValue, Policy, ScoresFootprints, best_choice
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, Observation
 from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
@@ -186,7 +186,7 @@ class Lookahead(MapPlanner):
             if step == horizon:
                 volume[row] += self.critic(observation)[:, 0].double()
                 break
-            choice = policy.footprint_logits(observation, mask).argmax(1)
+            choice = best_choice(policy.footprint_logits(observation, mask))
             state, placed = put_down(cell, state, choice)
             volume[row] += placed.volume.double()
         return volume.view(-1, streams)

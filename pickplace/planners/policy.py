@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace.common.validate import expect, is_whole, one_of
 from pickplace.planners.base import ITEM_RULES, MapPlanner, pick_first, restrict_items
-from pickplace.policies.base import Policy, ScoresFootprints
+from pickplace.policies.base import Policy, ScoresFootprints, best_choice
 from pickplace.policies.footprints import count_ways
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, join_pick, select_pick
@@ -62,15 +62,17 @@ class PolicyPlanner(MapPlanner):
             reached = count_ways(cell.num_footprints, footprint, succeeds) > 0
             ranked = policy.ranked(maps) & reached
             mask = torch.where(ranked.any(1, keepdim=True), ranked, reached)
-            choice = policy.footprint_logits(observation, mask).argmax(1, keepdim=True)
-            return join_pick(cell, pick, (succeeds & (footprint == choice)).int().argmax(1))
+            choice = best_choice(policy.footprint_logits(observation, mask))
+            return join_pick(cell, pick, (succeeds & (footprint == choice[:, None])).int().argmax(1))
         if self.item != "any":
             mask = restrict_items(self.item, state, policy.ranked(maps))
-            return first_action_reaching(cell, maps, policy.footprint_logits(observation, mask).argmax(1))
+            return first_action_reaching(cell, maps, best_choice(policy.footprint_logits(observation, mask)))
         if self.candidates == "all":
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 return policy.best_feasible(observation, maps)
-        score, tried = policy.action_log_probs(observation).topk(min(self.candidates, cell.num_actions), dim=1)
+        log_probs = policy.action_log_probs(observation)
+        best_choice(log_probs)  # refuses scores that are not finite
+        score, tried = log_probs.topk(min(self.candidates, cell.num_actions), dim=1)
         succeeds = action_mask(cell, maps).gather(1, tried) & (score > -torch.inf)
         return tried.gather(1, succeeds.int().argmax(1, keepdim=True))[:, 0]
 

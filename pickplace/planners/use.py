@@ -27,10 +27,11 @@ def decide(
 
     Raises:
         ValueError: for anything else, naming the planner's class and what its ``decide`` returned or raised.
+        FloatingPointError: for a policy whose scores are not finite.
     """
     try:
         action, count = (choose or planner.decide)(observation), len(observation["bin_depth"])
-    except ValueError:
+    except (ValueError, FloatingPointError, TimeoutError):  # each says enough
         raise
     except Exception as error:
         raise ValueError(f"{type(planner).__name__}.decide failed: {sentence(error)}") from error

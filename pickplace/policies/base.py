@@ -24,7 +24,7 @@ from torch.distributions import Categorical
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ValueOperator
 
-from pickplace.common.validate import at_most, expect
+from pickplace.common.validate import at_most, expect, refuse_if
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
@@ -127,7 +127,7 @@ class Policy(TensorDictModuleBase, ABC):
             maps: what decides which actions are feasible.
         """
         score = self.action_log_probs(observation)
-        return torch.where(action_mask(self.cell, maps), score, score - FAR).argmax(1)
+        return best_choice(torch.where(action_mask(self.cell, maps), score, score - FAR))
 
     def with_cell(self, cell: CellSpec) -> Self:
         """Return this policy, with the same networks, for a cell that differs in its limits or in the number of items.
@@ -204,7 +204,7 @@ class ActionPolicy(Policy):
         return self.action_scores(observation).log_softmax(-1)
 
     def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
-        return self.action_scores(observation, action_mask(self.cell, maps)).argmax(1)
+        return best_choice(self.action_scores(observation, action_mask(self.cell, maps)))
 
 
 @runtime_checkable
@@ -279,6 +279,23 @@ def refuse_several_items(policy: Policy, cell: CellSpec) -> None:
     """Refuse a bin with several items: the ``check_cell`` of a policy that does not choose among them."""
     others = "model=fcn_grasp or corners with a mask, and fcn4d, choose among several items"
     expect(cell.bin_items == 1, "env.bin_items", cell.bin_items, f"1 with {type(policy).__name__}; {others}")
+
+
+def best_choice(scores: Tensor) -> Tensor:
+    """Return the choice of greatest score, int64 ``[N]``, of scores ``[N, choices]``.
+
+    Raises:
+        FloatingPointError: for a score that is infinite or no number. Weights and settings that are finite themselves,
+            as those of a stranger's checkpoint, may lead to one.
+    """
+    greatest, choice = scores.max(1)
+    refuse_if(
+        not greatest.isfinite().all(),
+        "the policy's scores are not finite; expected a checkpoint whose weights, reward_scale and temperature fit "
+        "each other.",
+        FloatingPointError,
+    )
+    return choice
 
 
 def pick_one(candidates: Tensor) -> Tensor:

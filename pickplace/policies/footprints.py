@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pickplace.common.validate import expect
 from pickplace.envs.torchrl import MASKS
-from pickplace.policies.base import MAP_KEYS, MASKED, Policy, pick_one
+from pickplace.policies.base import MAP_KEYS, MASKED, Policy, best_choice, pick_one
 from pickplace.policies.depth import Contents
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import footprint_index
@@ -143,4 +143,5 @@ class FootprintPolicy(FootprintScorer):
         return torch.where(footprint >= 0, share.gather(1, footprint.clamp(min=0)), MASKED)
 
     def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
-        return first_action_reaching(self.cell, maps, self.footprint_logits(observation, self.ranked(maps)).argmax(1))
+        choice = best_choice(self.footprint_logits(observation, self.ranked(maps)))
+        return first_action_reaching(self.cell, maps, choice)

@@ -17,7 +17,7 @@ class Box:
     """A measured cuboid that stands in the bin; in metres and degrees, in the bin's frame."""
 
     x: float  #: of its centre
-    y: float
+    y: float  #: of its centre
     w: float  #: side along x, before it is turned by the yaw
     d: float  #: side along y
     h: float  #: height of its top above the bin's floor

@@ -1,6 +1,7 @@
 """The problem that a robot's planner solves for items and a tote that were measured in metres."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, NamedTuple, cast
@@ -26,7 +27,7 @@ from pickplace.robot.measure import (
     turned_axes,
     whole_units,
 )
-from pickplace.robot.problem import Problem, check_longest, join_items, read_bearing
+from pickplace.robot.problem import Problem, check_longest, is_excluded, join_items, read_bearing
 from pickplace.robot.scene import BinMap, Scene
 from pickplace.rules.bin import taken_item
 from pickplace.rules.cell import MAX_SIDE, CellSpec
@@ -100,8 +101,8 @@ class MeasuredProblem(Problem):
         return part, part.measured.maps.item, int(footprint_index(self.cell.tote_size, rotation % 2, x, y))
 
 
-def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
-    """Return the problem of a scene in metres; errors as of :meth:`Planner.plan`."""
+def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[float]] = ()) -> Problem:
+    """Return the problem of a scene in metres; arguments and errors as of :meth:`Planner.plan`."""
     cell_size = cast(float, scene.cell_size)
     boxes, clearance = _read_boxes(cell, scene, cell_size)
     tote = _read_tote(cell, scene, cell_size * cell.height_unit, device)
@@ -137,7 +138,8 @@ def read_metric(cell: CellSpec, scene: Scene, device) -> Problem:
             _clear_picks(cell, index, boxes, centres, cell_size, scene.accuracy, clearance)
         ).to(device)
         limits = _limits(cell, free, bin_clear, centres / cell_size, grip, 2 * tote.accuracy)
-        limits = replace(limits, pick_ok=limits.pick_ok & (taken == index))
+        allowed = torch.from_numpy(~is_excluded(exclude, centres, cell_size)).to(device)
+        limits = replace(limits, pick_ok=limits.pick_ok & (taken == index) & allowed)
         limited = replace(free, reach=limits)
         measured = measured_maps(limited, tote, item, sides[index])
         parts.append(MeasuredItem(limits, limited, measured, sides[index], bin_clear, centres, grip * MILLIMETRE))

@@ -47,13 +47,13 @@ class Alternative:
     """One of the most probable choices; with ``candidates=K``, one of the actions that were tried."""
 
     action: int  #: flat index
-    pick_cell: tuple[int, int]
-    place_cell: tuple[int, int]
+    pick_cell: tuple[int, int]  #: of the end effector's reference cell
+    place_cell: tuple[int, int]  #: the same, in the tote
     rotation_degrees: int  #: turn of the end effector's pose in the tote, in quarter turns
     #: of the item with its footprint, among those that the policy may choose; else of the action, without a mask
     probability: float
     rejected: str | None  #: the reason why it would fail; None if it would succeed
-    chosen: bool
+    chosen: bool  #: whether it is the plan
     item_number: int = 0  #: of the item that it takes, see :attr:`Plan.item_number`; 0 if it grips none
 
 
@@ -79,7 +79,7 @@ class Plan:
     drop_height: float | None  #: height of the item's underside above the tote's floor once it rests
     action: int | None  #: flat index
     occupancy_before: float  #: share of the tote's volume below the surface that the depth map shows, 0 to 1
-    occupancy_after: float
+    occupancy_after: float  #: the same with the item
     alternatives: list[Alternative]  #: the most probable choices, best first; none if nothing is feasible
     reasons: dict[str, int] | None  #: if stuck or impossible: how many of all flat actions fail for each reason
     #: with ``support="bearing"``: 1 where the tote bears weight once the item rests, for the next call; else None
@@ -153,13 +153,15 @@ class Planner:
         )  # fmt: skip
 
     @torch.inference_mode()
-    def plan(self, scene: Scene, *, alternatives: int = 10) -> Plan:
+    def plan(self, scene: Scene, *, alternatives: int = 10, exclude: Sequence[Sequence[float]] = ()) -> Plan:
         """Return which item in the bin to pick and where, where to place it and how to turn it.
 
         Args:
             scene: what lies in bin and tote.
             alternatives: how many of the most probable choices to report, and the chosen one if it is further down;
                 0 is fastest.
+            exclude: points ``(x, y, ...)`` in the bin's frame, such as ``pick.center`` of plans whose grasp failed: no
+                pick within half a cell of one is planned. Metres with ``cell_size``, else cells.
 
         Raises:
             DepthMapError: for a map of another shape or type, a value that is not finite or out of range, an empty
@@ -174,7 +176,7 @@ class Planner:
         whole_number("alternatives", alternatives, 0, MAX_ALTERNATIVES)
         device = torch.device("cpu") if self.policy is None else next(self.policy.parameters()).device
         is_metric = scene.cell_size is not None
-        problem = (read_metric if is_metric else read_grid)(self.cell, scene, device)
+        problem = (read_metric if is_metric else read_grid)(self.cell, scene, device, exclude)
         planner, terms = self._planner_of(problem.maps.bin_items, is_metric)
         observation = observe(terms, problem.cell, problem.seen)
         status, action = _decide(planner, problem, observation)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import refuse_if
+from pickplace.common.validate import excerpt, expect, is_number, refuse_if
 from pickplace.robot.box import Box, DepthMapError
 from pickplace.robot.measure import LABEL_HINT, refuse, segments_of_map, whole_map
 from pickplace.robot.scene import BinMap, Scene
@@ -20,8 +20,11 @@ from pickplace.rules.gripper.base import effector_centre
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, footprint_mask, placing_maps
+from pickplace.rules.reach.base import Limits
 from pickplace.rules.state import EMPTY, State, surface_from
 from pickplace.rules.step import apply
+
+MAX_EXCLUDED = 1_000  # points of picks that failed
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,8 @@ class Pose:
     """Pose of the end effector, in the frame of the bin or of the tote."""
 
     cell: tuple[int, int]  #: grid cell of the end effector's reference cell
-    center: tuple[float, float, float]  #: centre of its suction face: x, y, z
+    #: centre of its suction face: x, y, z; m with cell_size, else x and y in cells and z in height units
+    center: tuple[float, float, float]
     yaw: float = 0.0  #: turn about the vertical axis, counter-clockwise seen from above; degrees
 
 
@@ -124,8 +128,43 @@ def _point(x: float, y: float, z: float) -> tuple[float, float, float]:
     return round(float(x), 9), round(float(y), 9), round(float(z), 9)  # without the tail of binary fractions
 
 
-def read_grid(cell: CellSpec, scene: Scene, device) -> Problem:
-    """Return the problem of a scene in whole cells; errors as of :meth:`Planner.plan`."""
+def is_excluded(exclude: Sequence[Sequence[float]], centres: np.ndarray, side: float) -> np.ndarray:
+    """Return which centres ``[P, 2]`` of the suction face are within half a cell of a point, bool ``[P]``.
+
+    Args:
+        exclude: points ``(x, y, ...)``, in the unit of the centres.
+        side: of a cell, in the same.
+
+    Raises:
+        ValueError: naming the first point that is none.
+    """
+    refuse_if(
+        not isinstance(exclude, (list, tuple)) or len(exclude) > MAX_EXCLUDED,
+        f"exclude={excerpt(exclude)}: expected a list of at most {MAX_EXCLUDED:,} points.",
+    )
+    found = np.zeros(len(centres), dtype=bool)
+    for number, point in enumerate(exclude):
+        good = isinstance(point, (list, tuple)) and len(point) in (2, 3) and all(map(is_number, point))
+        expect(good, f"exclude[{number}]", point, "numbers x, y or x, y, z, such as the pick.center of a plan")
+        found |= np.hypot(*(centres - np.array(point[:2], dtype=np.float64)).T) < side / 2
+    return found
+
+
+def without_excluded(cell: CellSpec, exclude: Sequence[Sequence[float]]) -> CellSpec:
+    """Return a cell whose robot does not reach the picks that :func:`is_excluded` excludes; points in cells."""
+    x_bin, y_bin = np.divmod(np.arange(cell.num_picks), cell.bin_size[1])
+    (wide, deep), limits = cell.gripper.size, cell.limits
+    centres = np.stack([effector_centre(x_bin, wide), effector_centre(y_bin, deep)], -1)
+    if not (excluded := torch.from_numpy(is_excluded(exclude, centres, 1.0))).any():
+        return cell
+    if limits is None:
+        places = torch.zeros(cell.rotations, *cell.tote_size[:2], dtype=torch.int64)
+        return replace(cell, reach=Limits(~excluded, places, places + FAR))
+    return replace(cell, reach=replace(limits, pick_ok=limits.pick_ok & ~excluded.to(limits.pick_ok.device)))
+
+
+def read_grid(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[float]] = ()) -> Problem:
+    """Return the problem of a scene in whole cells; arguments and errors as of :meth:`Planner.plan`."""
     assert isinstance(scene.items, BinMap)
     unit = " cells" if cell.height_unit == 1 else " height units"
     height = cell.tote_size[2] if scene.tote_height is None else round(scene.tote_height)
@@ -140,7 +179,7 @@ def read_grid(cell: CellSpec, scene: Scene, device) -> Problem:
         torch.tensor([height], device=device),
         join_items(items).map(lambda part: part.to(device)),
     )
-    cell = replace(cell, bin_items=len(items))
+    cell = without_excluded(replace(cell, bin_items=len(items)), exclude)
     facts = FailureMaps.of(cell, state)
     return GridProblem(cell=cell, state=state, maps=facts.placing_maps(cell), seen=state, facts=facts)
 

@@ -2,7 +2,8 @@
 
 A checkpoint is a folder with ``state.safetensors`` (all tensors, random generators included) and ``state.json``
 (config, counters, and the checksum of the tensors). It is data: reading one unpickles nothing and imports nothing.
-It is written beside its place and renamed into it, so that a reader finds the old one or the new one, both whole.
+It is written beside its place and renamed into it, so that a reader finds the old one or the new one, both whole, also
+after a power failure.
 """
 
 import hashlib
@@ -20,7 +21,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from pickplace.common.files import read_file
+from pickplace.common.files import read_file, sync_folder
 from pickplace.common.validate import excerpt, first_line, refuse_any, refuse_if, reworded
 from pickplace.runs.locate import FACTS, MAX_BYTES, PREVIOUS, TENSORS, CheckpointError, are_facts
 
@@ -60,6 +61,7 @@ def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> No
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
+        sync_folder(new)  # its names are on the disk before it takes the place of the older one
         if old.exists() and not folder.exists():  # the process was killed between the renames below
             old.rename(folder)
         shutil.rmtree(old, ignore_errors=True)
@@ -69,6 +71,7 @@ def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> No
         if keep is not None and old.exists():
             shutil.rmtree(folder.with_name(keep), ignore_errors=True)
             old.rename(folder.with_name(keep))
+        sync_folder(folder.parent)
     except OSError as error:
         shutil.rmtree(new, ignore_errors=True)
         raise CheckpointError(f"{folder}: the checkpoint cannot be written ({error}).") from error

@@ -32,8 +32,8 @@ class CsvLogger:
 
     def __init__(self, folder, frames: int = 0, settings: dict | None = None):
         self.path, self._columns = Path(folder) / "metrics.csv", ["frames"]
-        earlier = read_csv(self.path) if frames and self.path.is_file() else []
-        self._rewrite([row for row in earlier if row["frames"] <= frames])
+        earlier = read_rows(self.path) if frames and self.path.is_file() else []
+        self._rewrite([row for row in earlier if int(float(row["frames"])) <= frames])
 
     def _rewrite(self, rows):
         self._columns = [*dict.fromkeys([*self._columns, *(key for row in rows for key in row)])]
@@ -59,10 +59,10 @@ class CsvLogger:
             else:
                 self._rewrite([*self._closed_rows(), row])
 
-    def _closed_rows(self) -> list[dict[str, float]]:
+    def _closed_rows(self) -> list[dict[str, str]]:
         with self._file as file:
             file.seek(0)
-            return read_csv(self.path, file.read())
+            return read_rows(self.path, file.read())
 
     def _restore(self) -> None:
         """Write the table again, with a warning, if its path no longer leads to the open file, or if that was cut."""
@@ -217,8 +217,14 @@ class NoLogger:
         """Nothing to close."""
 
 
-def read_csv(path, text: str | None = None) -> list[dict[str, float]]:
-    """Return the complete rows of a ``metrics.csv``; empty cells are left out.
+def read_csv(path) -> list[dict[str, float]]:
+    """Return the complete rows of a ``metrics.csv`` as numbers; errors as of :func:`read_rows`."""
+    numbers = ({key: float(value) for key, value in row.items()} for row in read_rows(path))
+    return [row | {"frames": int(row["frames"])} for row in numbers]
+
+
+def read_rows(path, text: str | None = None) -> list[dict[str, str]]:
+    """Return the complete rows of a ``metrics.csv`` as they are written, 4 or 4.0; empty cells are left out.
 
     Args:
         path: the file.
@@ -236,8 +242,9 @@ def read_csv(path, text: str | None = None) -> list[dict[str, float]]:
     )
     for number, row in enumerate(table, start=2):
         try:
-            cells = {key: float(value) for key, value in row.items() if value}
-            rows.append(cells | {"frames": int(cells["frames"])})
+            cells = {key: value for key, value in row.items() if value}
+            int({key: float(value) for key, value in cells.items()}["frames"])  # refuses inf, too
+            rows.append(cells)
         except (TypeError, ValueError, KeyError, OverflowError) as error:
             raise ValueError(f"{path}, line {number}: expected a number in each column ({error}).") from error
     return rows

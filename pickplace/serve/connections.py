@@ -8,31 +8,69 @@ CLIENT_SECONDS = 10  # time that a client has to send the headers of a request, 
 CHECKS = 10  # in that time
 
 CROWDED = JSONResponse(
-    {"error": f"more than {CONNECTIONS} connections are open; expected the next request after 1 s."},
+    {"error": f"more than {CONNECTIONS} requests are open; expected the next one after 1 s."},
     503,
     {"Retry-After": "1", "Connection": "close"},
+)
+
+AMBIGUOUS = JSONResponse(
+    {"error": "Content-Length and Transfer-Encoding: got both, expected one: they may disagree where the body ends."},
+    400,
+    {"Connection": "close"},
 )
 
 
 class Connection(H11Protocol):
     """One connection, which ends where its client takes too long: uvicorn alone waits for headers without end.
 
-    Connections above :data:`CONNECTIONS` get the answer 503, in JSON: that of uvicorn's own limit is plain text. The
-    time that a client has for a body is limited where the body is read, and a plan may take as long as it needs.
+    Of more than :data:`CONNECTIONS` the one ends whose client has kept the service waiting the longest: idle ones keep
+    nobody out. If the service has yet to answer all of them, the new one gets the answer 503, in JSON: uvicorn's own
+    limit answers in plain text. The time that a client has for a body is limited where the body is read, and a plan may
+    take until its deadline.
     """
 
     def connection_made(self, transport) -> None:
         super().connection_made(transport)
         transport.set_write_buffer_limits(0)  # so that writing pauses as soon as the client reads too slowly
+        self.app = _refuse_ambiguous(self.config.loaded_app)
+        self.since = self.loop.time()  # when the connection was made, or its last answer written
         if len(self.connections) > CONNECTIONS:
-            self.app = CROWDED
+            idle = [each for each in self.connections if each is not self and each.is_clients_move]
+            if idle:
+                min(idle, key=lambda each: each.since).end()
+            else:
+                self.app = CROWDED
         self._check(None, 0)
+
+    @property
+    def is_clients_move(self) -> bool:
+        """Whether the client has to send a request, or to read an answer, before anything else happens."""
+        return self.cycle is None or self.cycle.response_complete or self.flow.write_paused
+
+    def on_response_complete(self) -> None:
+        self.since = self.loop.time()
+        super().on_response_complete()
+
+    def end(self) -> None:
+        """End the connection now."""
+        self.connections.discard(self)
+        self.transport.abort()
 
     def _check(self, last_cycle, waits: int) -> None:
         """End the connection if it was the client's move at each of the last checks, with no request between them."""
-        is_clients_move = self.cycle is None or self.cycle.response_complete or self.flow.write_paused
-        waits = waits + 1 if is_clients_move and self.cycle is last_cycle else 0
+        waits = waits + 1 if self.is_clients_move and self.cycle is last_cycle else 0
         if waits > CHECKS:
-            self.transport.abort()
+            self.end()
         elif self in self.connections:
             self.loop.call_later(CLIENT_SECONDS / CHECKS, self._check, self.cycle, waits)
+
+
+def _refuse_ambiguous(app):
+    """Return an application that refuses requests with two lengths, which a proxy may read as two requests."""
+
+    async def checked(scope, receive, send):
+        keys = {key for key, _ in scope.get("headers", ())}
+        is_ambiguous = {b"content-length", b"transfer-encoding"} <= keys
+        await (AMBIGUOUS if is_ambiguous else app)(scope, receive, send)
+
+    return checked

@@ -2,21 +2,24 @@
 
 import argparse
 import io
-import json
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from pickplace.common.errors import Parser, one_sentence, write_output
-from pickplace.common.files import read_file, read_text
+from pickplace.common.files import read_file
 from pickplace.common.interrupts import import_quietly
-from pickplace.common.validate import first_line, refuse_if, reworded, whole_number
+from pickplace.common.validate import refuse_if, reworded
 from pickplace.robot.box import DepthMapError
-from pickplace.serve.request import MAX_REQUEST, PLAN_OPTIONS, PlanRequest, answer
+from pickplace.runs.locate import read_facts
+from pickplace.serve.deadline import Deadline
+from pickplace.serve.decisions import replay
+from pickplace.serve.options import PARTS, load_planner, plan_once, planner_options
+from pickplace.serve.request import Limits, PlanRequest, answer, to_json
 
 if TYPE_CHECKING:
     from pickplace.robot.planner import Planner
@@ -52,80 +55,14 @@ def parser() -> argparse.ArgumentParser:
             "--tote-bearing": {
                 "metavar": "NPY", "help": "map [W_T, D_T]: tote_bearing of the plan before; default: all 1",
             },
+            "--replay": {
+                "metavar": "LOG", "help": "plan all requests of a log of pickplace-serve again, with the planner that "
+                "it names, and say which plans differ; exit code 1 if any does",
+            },
             "--time": {"action": "store_true", "help": "print the latency of each plan on standard error"},
             **planner_options(),
         },
     )  # fmt: skip
-
-
-def planner_options() -> dict[str, dict[str, Any]]:
-    """Return the options that say how to plan, which :func:`load_planner` reads; see :class:`Parser`."""
-    of_requests = {
-        f"--{key.name.replace('_', '-')}": {
-            "type": key.metadata["option"], "metavar": "N", "default": key.default,
-            "help": key.metadata["description"] + (" (default %(default)s)" if key.default is not None else ""),
-        }
-        for key in PLAN_OPTIONS
-    }  # fmt: skip
-    return {
-        "checkpoint": {"nargs": "?", "help": "a run folder, a checkpoint, or pretrained/<name>"},
-        "--planner": {
-            "metavar": "NAME", "help": "what decides, such as joint_dbl or lookahead; default: the policy",
-        },
-        **of_requests,
-        "--candidates": {
-            "metavar": "K", "default": "all", "help": "number of most probable actions tried, or all (the default)",
-        },
-        "--bin-size": {"type": int, "nargs": 3, "metavar": ("W", "D", "H"), "help": "cells; default: as trained"},
-        "--tote-size": {"type": int, "nargs": 3, "metavar": ("W", "D", "H"), "help": "cells; default: as trained"},
-        "--effector-size": {"type": int, "nargs": 2, "metavar": ("W", "D"), "help": "cells; default: as trained"},
-        "--rotations": {
-            "type": int, "metavar": "R", "help": "quarter turns to choose from; default: as trained",
-        },
-        "--reach": {
-            "metavar": "YAML",
-            "help": "file such as conf/reach/annulus.yaml, the robot's reach; default: as trained",
-        },
-        "--trust": {
-            "action": "append", "metavar": "MODULE", "default": [],
-            "help": "your own module whose classes the checkpoint's config may name; may be repeated",
-        },
-        "--threads": {"type": int, "metavar": "N", "help": "CPU threads; default: as many as it may use"},
-        "--device": {"default": "cpu", "help": "cpu (the default) or cuda"},
-    }  # fmt: skip
-
-
-def load_planner(args: argparse.Namespace) -> tuple["Planner", dict]:
-    """Return the planner that a command line names, and the settings of its requests unless they say otherwise.
-
-    Raises:
-        ValueError: for arguments or a checkpoint that cannot be used.
-    """
-    from pickplace.common.machine import use_threads
-    from pickplace.robot.planner import MAX_ALTERNATIVES, Planner  # here, so that --help need not wait for torch
-    from pickplace.rules.cell import CellSpec
-
-    use_threads("--threads", args.threads)
-    keys = ("bin_size", "tote_size", "effector_size", "rotations")
-    sizes = {key: value for key in keys if (value := getattr(args, key)) is not None}
-    if args.reach is not None:
-        sizes["reach"] = read_reach(args.reach)
-    candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates
-    if args.checkpoint is not None:
-        planner = Planner.load(args.checkpoint, candidates, args.device, args.trust, args.planner, **sizes)
-    else:
-        refuse_if(
-            args.planner is None, "checkpoint: missing; expected a checkpoint, or --planner joint_dbl or the like."
-        )
-        refuse_if(
-            candidates != "all",
-            f"--candidates={args.candidates}: only a policy has candidates; expected a checkpoint.",
-        )
-        planner = Planner(CellSpec(**sizes), planner=args.planner)
-    defaults = {key.name: getattr(args, key.name) for key in PLAN_OPTIONS}
-    PlanRequest(**defaults).scene()  # refuses settings now, not in the answer to each request
-    whole_number("--alternatives", args.alternatives, 0, MAX_ALTERNATIVES)
-    return planner, defaults
 
 
 def run(args: argparse.Namespace) -> None:
@@ -145,6 +82,9 @@ def run(args: argparse.Namespace) -> None:
         sys.stdout is None or (sys.stdin is None and args.bin is None),
         "standard input or output is closed; expected requests and a place for the plans.",
     )
+    if args.replay is not None:
+        replay_log(args)
+        return
     planner, defaults = load_planner(args)
     if args.bin is not None:
         files = {
@@ -154,25 +94,67 @@ def run(args: argparse.Namespace) -> None:
         maps = {key: read_map(path) for key, path in files.items() if path is not None}
         try:
             with latency(args.time):
-                result = PlanRequest.parse(maps, defaults).plan(planner).as_dict()
+                request = PlanRequest.parse(maps, defaults)
+                result = Deadline(request.deadline).run(lambda: request.plan(planner)).as_dict()
         except DepthMapError as error:
             file = next((path for key, path in files.items() if str(error).startswith(key)), args.bin)
             raise DepthMapError(f"{file}: {error}") from error
-        write_output(json.dumps(result, indent=1) + "\n")
+        write_output(to_json(result, indent=1) + "\n")
         return
-    for line in read_lines(sys.stdin.buffer):
-        if line.strip() or len(line) > MAX_REQUEST:
+    plan_once(planner)
+    most = Limits.of(planner.cell).size
+    for line in read_lines(sys.stdin.buffer, most):
+        if line.strip() or len(line) > most:
             with latency(args.time):
-                _, reply, _ = answer(planner, line, defaults)
-            write_output(json.dumps(reply) + "\n")
+                text = answer(planner, line, defaults).text
+            write_output(text + "\n")
 
 
-def read_lines(stream: BinaryIO) -> Iterator[bytes]:
-    """Yield the lines of a stream; of a line longer than :data:`MAX_REQUEST` only the first bytes, at once."""
-    while line := stream.readline(MAX_REQUEST + 1):
+def replay_log(args: argparse.Namespace) -> None:
+    """Plan the requests of a decision log again, and write how many plans are the same and which are not.
+
+    Raises:
+        ValueError: as of :func:`~pickplace.serve.decisions.replay`.
+        SystemExit: with the code 1, if a plan is not the same.
+    """
+    given = [args.checkpoint, args.planner, args.bin, args.tote, *(getattr(args, part) for part, *_ in PARTS)]
+    refuse_if(
+        any(each is not None for each in given),
+        f"--replay={args.replay}: the log names checkpoint, planner and cell; expected no other.",
+    )
+
+    def make(start: dict) -> "Planner":
+        from pickplace.policies.restore import build_cell
+        from pickplace.rules.cell import CELL_SETTINGS
+        from pickplace.runs.provenance import versions
+
+        if (changed := versions()) != start["versions"]:
+            old = {key: value for key, value in start["versions"].items() if changed.get(key) != value}
+            sys.stderr.write(f"the log was written with other versions: {old}\n")
+        if start["checkpoint"] is not None:
+            found = read_facts(start["checkpoint"])
+            refuse_if(
+                found.get("sha256") != start["sha256"],
+                f"checkpoint={start['checkpoint']}: other weights than those of the log; expected those.",
+            )
+        cell = build_cell(start["cell"])
+        again = argparse.Namespace(
+            **{**vars(args), **{key: start[key] for key in ("checkpoint", "planner", "candidates")}}
+        )
+        return load_planner(again, {key: getattr(cell, key) for key in CELL_SETTINGS})[0]
+
+    same, differing = replay(args.replay, make)
+    write_output("".join(f"{line}\n" for line in differing) + f"{same} of {same + len(differing)} plans are the same\n")
+    if differing:
+        sys.exit(1)
+
+
+def read_lines(stream: BinaryIO, most: int) -> Iterator[bytes]:
+    """Yield the lines of a stream; of a line longer than ``most`` bytes only the first ones, at once."""
+    while line := stream.readline(most + 1):
         yield line
-        while len(line) > MAX_REQUEST and not line.endswith(b"\n"):
-            line = stream.readline(MAX_REQUEST + 1)
+        while len(line) > most and not line.endswith(b"\n"):
+            line = stream.readline(most + 1)
 
 
 @contextmanager
@@ -182,26 +164,6 @@ def latency(is_printed: bool) -> Iterator[None]:
     yield
     if is_printed:
         sys.stderr.write(f"planned in {(time.perf_counter() - start) * 1e3:.1f} ms\n")  # a line leaves at once
-
-
-def read_reach(path: str):
-    """Return the reach that a file such as those of ``conf/reach`` describes; None: the robot reaches everything.
-
-    Raises:
-        ValueError: naming the file, or the key in it.
-    """
-    from yaml import YAMLError, safe_load
-
-    from pickplace.config.registry import build
-
-    expected = "expected a file with the key reach, such as conf/reach/annulus.yaml."
-    with reworded(
-        (OSError, ValueError, YAMLError),
-        lambda error: ValueError(f"--reach={path}: {first_line(error)}; {expected}"),
-    ):
-        content = safe_load(read_text(path, MAX_REQUEST))
-    refuse_if(not isinstance(content, dict) or [*content] != ["reach"], f"--reach={path}: {expected}")
-    return build("env", content)["reach"]
 
 
 def read_map(path: str) -> np.ndarray:

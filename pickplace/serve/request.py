@@ -3,20 +3,48 @@
 import json
 import math
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from pickplace.common.errors import sentence
-from pickplace.common.validate import refuse_any, refuse_if, reworded
+from pickplace.common.validate import at_most, excerpt, number, refuse_any, refuse_if, reworded
 from pickplace.robot.box import ACCURACY, CLEARANCE, Box
+from pickplace.serve.deadline import Deadline
 
 if TYPE_CHECKING:
     from pickplace.robot.planner import Plan, Planner
     from pickplace.robot.scene import Scene
+    from pickplace.rules.cell import CellSpec
 
-MAX_REQUEST = 2**24  # greatest length of a request, in bytes
+MAX_REQUEST = 2**24  # greatest length of a request, in bytes, whatever the cell
+DEADLINE, MAX_DEADLINE = 10.0, 3600.0  # of an answer, in seconds
 
 Map = list[list[float]]
 Labels = list[list[int]]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The greatest request for a cell: its maps, each with :data:`FINE` values along a cell, and some more."""
+
+    size: int  # in bytes
+    lists: int  # brackets: each costs as much to read as a row of a map
+
+    FINE = 64  # pixels of 2 mm in a cell of 128 mm
+    VALUE = 8  # bytes of a value, such as 0.1234 with a comma and a space
+    REST = 2**16  # bytes of all that is no map, such as boxes
+    OTHERS = 1_000  # lists that are no rows of maps
+
+    @classmethod
+    def of(cls, cell: "CellSpec") -> Self:
+        (bin_w, bin_d, _), (tote_w, tote_d, _) = cell.bin_size, cell.tote_size
+        values = cls.FINE**2 * (2 * bin_w * bin_d + tote_w * tote_d) + tote_w * tote_d  # labels and bearing, too
+        rows = cls.FINE * (2 * bin_w + tote_w) + tote_w
+        return cls(min(MAX_REQUEST, cls.REST + cls.VALUE * values), cls.OTHERS + rows)
+
+    def check(self, text: bytes) -> None:
+        """Refuse a text that is no request for the cell, before anything is made of it, with a ``ValueError``."""
+        refuse_if(len(text) > self.size, f"the request has more than {self.size:,} bytes; expected a shorter one.")
+        at_most("the request has", text.count(b"["), "lists, rows of maps included", self.lists)
 
 
 def _key(description: str, default: Any = None, option: type | None = None) -> Any:
@@ -26,19 +54,37 @@ def _key(description: str, default: Any = None, option: type | None = None) -> A
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """A bin and a tote; without ``cell_size`` in whole cells, else in metres."""
+    """A bin and a tote; without ``cell_size`` in whole cells and height units, else in metres.
+
+    The bin and the tote have a frame each: its origin is the outer corner of cell (0, 0) on the inner floor, x runs
+    along the first axis of a map, y along the second, z upwards.
+    """
 
     id: object = _key("comes back as it is")
-    bin_depth: Map | None = _key("height above the bin's floor, [W_B, D_B] or a multiple of it")
-    bin_labels: Labels | None = _key("a number for each of several items, 0 elsewhere")
-    items: list[Box] | None = _key("instead of bin_depth: the measured items, in metres")
-    tote_depth: Map | None = _key("height left up to the rim, [W_T, D_T] or a multiple of it")
-    tote_bearing: Labels | None = _key("tote_bearing of the plan before")
-    tote_height: float | None = _key("height of the rim above the tote's floor; default: that of the cell", None, float)
-    cell_size: float | None = _key("side of a cell in metres, if the maps are in metres", None, float)
-    accuracy: float = _key("greatest error of a measured height, in metres", ACCURACY, float)
-    clearance: float = _key("least distance from what stands beside the item, in metres", CLEARANCE, float)
+    bin_depth: Map | None = _key(
+        "height above the bin's floor, 0 where it is empty, [W_B, D_B] or a multiple of it; m with cell_size, else "
+        "height units"
+    )
+    bin_labels: Labels | None = _key("a number for each of several items, 0 elsewhere; in the shape of bin_depth")
+    items: list[Box] | None = _key("instead of bin_depth: the measured items, in the bin's frame; m and degrees")
+    tote_depth: Map | None = _key(
+        "height left from the surface up to the rim, [W_T, D_T] or a multiple of it; m with cell_size, else height "
+        "units"
+    )
+    tote_bearing: Labels | None = _key("tote_bearing of the plan before, [W_T, D_T]: 1 where a cell bears weight")
+    exclude: list[list[float]] | None = _key(
+        "pick.center of plans whose grasp failed, in the bin's frame: no pick within half a cell of one is planned "
+        "again; m with cell_size, else cells"
+    )
+    tote_height: float | None = _key(
+        "height of the rim above the tote's floor; m with cell_size, else height units; default: that of the cell",
+        None, float,
+    )  # fmt: skip
+    cell_size: float | None = _key("side of a cell, if the lengths are in metres; m", None, float)
+    accuracy: float = _key("greatest error of a measured height; m", ACCURACY, float)
+    clearance: float = _key("least distance from what stands beside the item; m", CLEARANCE, float)
     alternatives: int = _key("number of most probable choices reported", 10, int)
+    deadline: float = _key("greatest time until the answer, waiting included; s", DEADLINE, float)
 
     @classmethod
     def parse(cls, given: dict, defaults: dict) -> Self:
@@ -65,7 +111,9 @@ class PlanRequest:
             )
         for key in ("tote_depth",) if "items" in given else ("bin_depth", "tote_depth"):
             refuse_if(key not in given, f"{key}: missing; expected a depth map as a list of rows.")
-        return cls(**{**defaults, **given})
+        request = cls(**{**defaults, **given})
+        number("deadline", request.deadline, 0.001, MAX_DEADLINE, "seconds")
+        return request
 
     def scene(self) -> "Scene":
         """Return the scene that the request describes.
@@ -81,7 +129,7 @@ class PlanRequest:
 
     def plan(self, planner: "Planner") -> "Plan":
         """Return the plan for the request; errors as of :meth:`Planner.plan`."""
-        return planner.plan(self.scene(), alternatives=self.alternatives)
+        return planner.plan(self.scene(), alternatives=self.alternatives, exclude=self.exclude or ())
 
 
 #: Fields that the command line can set for all requests.
@@ -95,11 +143,11 @@ def read_boxes(items) -> list[Box]:
         ValueError: naming the first one with other keys.
     """
     boxes = []
-    for number, item in enumerate(items if isinstance(items, list) else [items]):
+    for at, item in enumerate(items if isinstance(items, list) else [items]):
         try:
             boxes.append(Box(**item))
         except TypeError as error:
-            raise ValueError(f"items[{number}]: expected the keys x, y, w, d, h and, if it is turned, yaw.") from error
+            raise ValueError(f"items[{at}]: expected the keys x, y, w, d, h and, if it is turned, yaw.") from error
     return boxes
 
 
@@ -107,14 +155,15 @@ def parse_json(text: bytes) -> dict:
     """Return the object that a request's text holds, whatever its keys.
 
     Raises:
-        ValueError: for a text that is too long, or is no object in JSON.
+        ValueError: for a text that is no object in JSON, or has a key twice.
     """
-    refuse_if(len(text) > MAX_REQUEST, f"the request has more than {MAX_REQUEST:,} bytes; expected a shorter one.")
     with reworded(
         (json.JSONDecodeError, UnicodeDecodeError, RecursionError),
         lambda error: ValueError(f"the request is not JSON: {error}."),
     ):
-        given = json.loads(text.decode(), parse_constant=finite_float, parse_float=finite_float)
+        given = json.loads(
+            text.decode(), parse_constant=finite_float, parse_float=finite_float, object_pairs_hook=without_twins
+        )
     refuse_if(
         not isinstance(given, dict), f"got {type(given).__name__}, expected an object with bin_depth and tote_depth."
     )
@@ -128,17 +177,65 @@ def finite_float(text: str) -> float:
     raise ValueError(f"the request is not JSON: got {text[:20]}, expected a finite number.")
 
 
-def answer(planner: "Planner", text: bytes, defaults: dict) -> tuple[int, dict, PlanRequest | None]:
-    """Return the reply to a request's text: a plan, or ``{"error": ...}`` in one sentence; with the request's ``id``.
+def without_twins(pairs: list[tuple[str, Any]]) -> dict:
+    """Return an object of a JSON text; refuse a key that stands twice in it: readers differ in which value counts."""
+    found: dict = {}
+    for key, value in pairs:
+        refuse_if(key in found, f"{excerpt(key)} stands twice in an object; expected each key once.")
+        found[key] = value
+    return found
 
-    Returns:
-        the status in HTTP, the reply, and the request if it could be read.
+
+def read_request(text: bytes, limits: Limits, defaults: dict) -> tuple[int, dict, PlanRequest | None]:
+    """Return the request that a text states, with the status 200 and the beginning of its reply, the ``id``.
+
+    Of a bad one: the status in HTTP, ``{"error": ...}`` in one sentence, and None.
     """
-    status, reply, request = 400, {}, None
+    status, reply = 400, {}
     try:
+        limits.check(text)
         given = parse_json(text)
         status, reply = 422, {key: given[key] for key in ("id",) if key in given}
-        request = PlanRequest.parse(given, defaults)
-        return 200, {**reply, **request.plan(planner).as_dict()}, request
+        return 200, reply, PlanRequest.parse(given, defaults)
     except ValueError as error:
-        return status, {**reply, "error": sentence(error)}, request
+        return status, {**reply, "error": sentence(error)}, None
+
+
+class Answer(NamedTuple):
+    """An answer to a request."""
+
+    status: int  # in HTTP
+    reply: dict  # a plan, or ``{"error": ...}`` in one sentence; with the request's ``id``
+    text: str  # the same as JSON
+
+
+def solve(planner: "Planner", request: PlanRequest, reply: dict, deadline: Deadline) -> Answer:
+    """Return the answer to a request: its ``reply`` so far with a plan, or with an error."""
+    try:
+        reply = {**reply, **deadline.run(lambda: request.plan(planner)).as_dict()}
+        return Answer(200, reply, to_json(reply))
+    except (ValueError, TimeoutError, FloatingPointError) as error:
+        status = 422 if isinstance(error, ValueError) else 504 if isinstance(error, TimeoutError) else 500
+        reply = {**{key: reply[key] for key in ("id",) if key in reply}, "error": sentence(error)}
+        return Answer(status, reply, json.dumps(reply))
+
+
+def to_json(reply: dict, **settings) -> str:
+    """Return a plan as JSON.
+
+    Raises:
+        FloatingPointError: for a number that JSON does not have. Only weights that no training made lead to one.
+    """
+    with reworded(
+        ValueError,
+        lambda _: FloatingPointError("the plan has a number that is not finite; expected another checkpoint."),
+    ):
+        return json.dumps(reply, allow_nan=False, **settings)
+
+
+def answer(planner: "Planner", text: bytes, defaults: dict) -> Answer:
+    """Return the answer to a line."""
+    status, reply, request = read_request(text, Limits.of(planner.cell), defaults)
+    if request is None:
+        return Answer(status, reply, json.dumps(reply))
+    return solve(planner, request, reply, Deadline(request.deadline))

@@ -8,7 +8,8 @@ import socket
 from pickplace.common.errors import Parser, one_sentence, write_output
 from pickplace.common.interrupts import import_quietly
 from pickplace.common.validate import excerpt, number, refuse_if, short_text, whole_number
-from pickplace.serve.json_lines import load_planner, planner_options
+from pickplace.serve.decisions import DecisionLog, what_is_served
+from pickplace.serve.options import load_planner, plan_once, planner_options
 
 TOKEN = "PICKPLACE_TOKEN"  # the environment variable; a command line can be read by every user of the machine
 LEAST_TOKEN = 16  # letters
@@ -48,6 +49,9 @@ def parser() -> argparse.ArgumentParser:
             "--history": {
                 "type": int, "metavar": "N", "default": 20, "help": "plans that the page shows (default %(default)s)",
             },
+            "--log": {
+                "metavar": "FILE", "help": "file to append each request and plan to, for pickplace-plan --replay",
+            },
         },
     )  # fmt: skip
 
@@ -73,13 +77,16 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"pickplace-serve: {error.name} is missing; pip install 'pickplace[serve]'.") from error
 
     planner, defaults = load_planner(args)
+    plan_once(planner)
+    log = None if args.log is None else DecisionLog(args.log, what_is_served(planner, args))
     host = f"[{args.host}]" if ":" in args.host else args.host
     # The names by which clients may call the service. A page of a stranger that has its name lead to this machine (DNS
     # rebinding) calls it by another. Where the service listens at all addresses and no name is given, any will do: the
     # token, which the page lacks, is asked for anyway.
     is_any = args.host in ("0.0.0.0", "::") and not args.allow_host
     hosts = ["*"] if is_any else ["localhost", "127.0.0.1", "[::1]", host, *args.allow_host]
-    app = make_app(planner, defaults, args.planner or "policy", args.checkpoint, token, args.rate, args.history, hosts)
+    name = args.planner or "policy"
+    app = make_app(planner, defaults, name, args.checkpoint, token, args.rate, args.history, hosts, log)
     family = socket.AF_INET6 if ":" in args.host else socket.AF_INET
     try:
         listener = socket.create_server((args.host, args.port), family=family)

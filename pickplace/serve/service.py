@@ -7,15 +7,16 @@ import math
 import re
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
+from threading import Lock
 
 from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import HTTPException, RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from pydantic import BaseModel, TypeAdapter
+from pydantic import BaseModel
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.requests import ClientDisconnect
 
@@ -25,17 +26,14 @@ from pickplace.config.registry import node_of
 from pickplace.policies.restore import cell_settings
 from pickplace.robot.planner import Plan, Planner
 from pickplace.serve import live
-from pickplace.serve.request import MAX_REQUEST, PlanRequest, answer
+from pickplace.serve.deadline import Deadline
+from pickplace.serve.decisions import DecisionLog
+from pickplace.serve.metrics import Metrics
+from pickplace.serve.request import Answer, Limits, PlanRequest, read_request, solve
+from pickplace.serve.schema import request_schema, with_comments
 
 MAX_WAITING = 16  # requests whose body is read, or that wait for their turn
 BODY_SECONDS = 30  # time that a client has to send its request
-
-GRID = {"bin_depth": [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0] * 5, [0] * 5], "tote_depth": [[5] * 6] * 6}
-METRES = {
-    "items": [{"x": 0.1, "y": 0.12, "w": 0.09, "d": 0.04, "h": 0.05, "yaw": 20}],
-    "tote_depth": [[0.25] * 6] * 6,
-    "cell_size": 0.05,
-}
 
 
 class Refusal(BaseModel):
@@ -53,6 +51,13 @@ class Health(BaseModel):
     planner: str
     checkpoint: str | None
     cell: dict
+
+
+class Ready(BaseModel):
+    """That the service takes requests, and how many it has taken and not yet answered."""
+
+    status: str
+    waiting: int
 
 
 class Rate:
@@ -82,30 +87,64 @@ class Service:
     """The planner, one request at a time in a thread of its own, and the last answers.
 
     Args:
-        planner, defaults: as :func:`pickplace.serve.json_lines.load_planner` returns them.
+        planner, defaults: as :func:`pickplace.serve.options.load_planner` returns them.
         history: how many answers are kept.
+        log: of all answers; None: there is none.
     """
 
-    def __init__(self, planner: Planner, defaults: dict, history: int):
-        self.planner, self.defaults = planner, defaults
+    def __init__(self, planner: Planner, defaults: dict, history: int, log: DecisionLog | None):
+        self.planner, self.defaults, self.log = planner, defaults, log
+        self.limits, self.metrics = Limits.of(planner.cell), Metrics()
         self.worker = ThreadPoolExecutor(1, "planner")
         self.waiting = self.count = 0
+        self.lock = Lock()
         self.history: deque[dict] = deque(maxlen=history)
 
-    def answer(self, body: bytes) -> tuple[int, str]:
-        """Return the status and the JSON text of the answer to a request; only the worker calls it."""
-        start, number = time.perf_counter(), self.count + 1
-        status, reply, request = answer(self.planner, body, self.defaults)
-        self.history.append(live.entry(self.planner.cell, number, request, reply, time.perf_counter() - start))
-        self.count = number  # now: who knows of a number finds its answer
-        return status, json.dumps(reply)
+    async def answer(self, body: bytes, wait_for_client: Callable[[], Awaitable]) -> Answer:
+        """Return the answer to a request; ``wait_for_client`` ends when the client leaves, and so does the plan then.
+
+        Bodies are read in other threads than plans are computed in, so that a deadline counts from the beginning.
+        """
+        status, reply, request = await asyncio.to_thread(read_request, body, self.limits, self.defaults)
+        if request is None:
+            self.note(None, found := Answer(status, reply, json.dumps(reply)), 0.0)
+            return found
+        deadline, loop = Deadline(request.deadline), asyncio.get_running_loop()
+        work = loop.run_in_executor(self.worker, self.plan, request, reply, deadline)
+        gone = asyncio.ensure_future(wait_for_client())
+        try:
+            await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
+            if not work.done():
+                deadline.cancel()
+            return await work
+        finally:
+            gone.cancel()
+
+    def plan(self, request: PlanRequest, reply: dict, deadline: Deadline) -> Answer:
+        """Return the answer to a request that could be read; only the worker calls it."""
+        start = time.perf_counter()
+        found = solve(self.planner, request, reply, deadline)
+        seconds = time.perf_counter() - start
+        self.metrics.time(seconds)
+        self.note(request, found, seconds)
+        return found
+
+    def note(self, request: PlanRequest | None, found: Answer, seconds: float) -> None:
+        """Keep an answer for the page, the figures and the log."""
+        entry = live.entry(self.planner.cell, 0, request, found.reply, seconds)
+        with self.lock:  # two threads come here
+            self.metrics.count(found.status, found.reply.get("status", ""))
+            if self.log is not None:
+                self.log.add(request, found.reply, seconds)
+            self.history.append({**entry, "number": self.count + 1})
+            self.count += 1  # now: who knows of a number finds its answer
 
 
-async def read_body(request: Request) -> bytes:
+async def read_body(request: Request, most: int) -> bytes:
     """Return the body of a request.
 
     Raises:
-        HTTPException: 413 for more than :data:`MAX_REQUEST` bytes, 408 for a client that is too slow, 400 for one that
+        HTTPException: 413 for more than ``most`` bytes, 408 for a client that is too slow, 400 for one that
             leaves.
     """
     body = bytearray()
@@ -113,8 +152,8 @@ async def read_body(request: Request) -> bytes:
         async with asyncio.timeout(BODY_SECONDS):
             async for chunk in request.stream():
                 body += chunk
-                if len(body) > MAX_REQUEST:
-                    raise HTTPException(413, f"the body has more than {MAX_REQUEST:,} bytes; expected a shorter one.")
+                if len(body) > most:
+                    raise HTTPException(413, f"the body has more than {most:,} bytes; expected a shorter one.")
     except TimeoutError as error:
         raise HTTPException(408, f"the body took more than {BODY_SECONDS} s; expected a faster one.") from error
     except ClientDisconnect as error:  # nobody reads the answer, but it is no fault of the service
@@ -131,18 +170,20 @@ def make_app(
     rate: float = 600,
     history: int = 20,
     hosts: Sequence[str] = ("localhost", "127.0.0.1", "[::1]"),
+    log: DecisionLog | None = None,
 ) -> FastAPI:
     """Return the service as an ASGI application.
 
     Args:
-        planner, defaults: as :func:`pickplace.serve.json_lines.load_planner` returns them.
+        planner, defaults: as :func:`pickplace.serve.options.load_planner` returns them.
         name, checkpoint: what decides, for ``/health``.
         token: what clients must send as ``Authorization: Bearer <token>``; None: nothing.
         rate: most plans a minute.
         history: answers that the page shows.
         hosts: names by which clients may call it, ``"*"``: any.
+        log: to which all answers are appended; None: none.
     """
-    service, budget = Service(planner, defaults, history), Rate(rate)
+    service, budget = Service(planner, defaults, history, log), Rate(rate)
     reach = node_of("env.reach", planner.cell.reach)
     health = Health(
         status="ok", version=pickplace.__version__, planner=name, checkpoint=checkpoint,
@@ -157,6 +198,7 @@ def make_app(
     @asynccontextmanager
     async def lifespan(_):
         yield
+        service.waiting = MAX_WAITING  # not ready any more
         service.worker.shutdown(wait=False, cancel_futures=True)
 
     async def check_host(request: Request) -> None:
@@ -165,12 +207,14 @@ def make_app(
         if "*" not in hosts and re.sub(r":\d*$", "", host).lower() not in map(str.lower, hosts):
             raise HTTPException(400, f"Host: got {excerpt(host)}; expected a name of this service, see --allow-host.")
 
-    async def refuse(_, error: Exception):
+    async def refuse(request: Request, error: Exception):
         status, text, headers = 500, "the service failed; its log says more.", None
         if isinstance(error, StarletteHTTPException):
             status, text, headers = error.status_code, error.detail, error.headers
         elif isinstance(error, RequestValidationError):
             status, text = 422, "{}: {msg}.".format(".".join(map(str, error.errors()[0]["loc"])), **error.errors()[0])
+        if request.url.path == "/plan":
+            service.metrics.count(status)
         return JSONResponse({"error": text}, status, headers)
 
     app = FastAPI(
@@ -191,6 +235,7 @@ def make_app(
         413: "The body is too long", 415: "Not application/json", 422: "Maps or settings that cannot be used",
         429: "Too many plans; Retry-After says when to come back", 500: "The service failed; its log says more",
         503: "Too many connections; Retry-After says when to come back",
+        504: "No plan within the deadline",
     }  # fmt: skip
     answers: dict = {
         200: {"description": "A plan; status says whether there is one", "model": Plan},
@@ -208,16 +253,30 @@ def make_app(
             raise HTTPException(429, detail, {"Retry-After": str(seconds)})
         service.waiting += 1  # from now on: reading a slow body takes up a place, too
         try:
-            body, loop = await read_body(request), asyncio.get_running_loop()
-            status, text = await loop.run_in_executor(service.worker, service.answer, body)
+            service.metrics.waiting.set(service.waiting)
+            body = await read_body(request, service.limits.size)
+            found = await service.answer(body, request.receive)
         finally:
             service.waiting -= 1
-        return Response(text, status, media_type="application/json")
+            service.metrics.waiting.set(service.waiting)
+        return Response(found.text, found.status, media_type="application/json")
 
     @app.get("/health")
     async def get_health() -> Health:
-        """Say what is served, also while a plan is computed; needs no token."""
+        """Say that the service lives and what it serves, also while a plan is computed; needs no token."""
         return health
+
+    @app.get("/ready", responses={503: {"description": "The queue is full", "model": Refusal}})
+    async def get_ready() -> Ready:
+        """Say whether a request would be taken now, for what spreads requests over services; needs no token."""
+        if service.waiting >= MAX_WAITING:
+            raise HTTPException(503, "too many requests wait; expected the next one after 1 s.", {"Retry-After": "1"})
+        return Ready(status="ready", waiting=service.waiting)
+
+    @app.get("/metrics", dependencies=[Depends(authorize)], response_class=Response)
+    async def get_metrics():
+        """Return figures for Prometheus: answers by status, times, and requests that wait."""
+        return Response(service.metrics.text(), media_type=service.metrics.content_type)
 
     @app.get("/plans", dependencies=[Depends(authorize)])
     async def plans(after: int = 0) -> dict:
@@ -230,12 +289,11 @@ def make_app(
         """Return the page, which asks for ``/plans``; it holds no plans itself and needs no token."""
         return HTMLResponse(page, headers=page_headers)
 
-    # The schema of requests, for the OpenAPI description: FastAPI does not see it, as it does not parse them.
+    # FastAPI does not see what requests are, as it does not parse them.
     described = app.openapi()
-    schema = TypeAdapter(PlanRequest).json_schema(ref_template="#/components/schemas/{model}")
-    schema |= {"examples": [GRID, METRES], "required": ["tote_depth"], "additionalProperties": False}
     schemas = described["components"]["schemas"]
-    schemas |= schema.pop("$defs", {}) | {"PlanRequest": schema}
+    schemas |= request_schema()
+    with_comments(schemas)
     described["paths"]["/plan"]["post"]["requestBody"] = {
         "required": True,
         "content": {"application/json": {"schema": {"$ref": "#/components/schemas/PlanRequest"}}},

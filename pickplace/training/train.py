@@ -3,7 +3,7 @@
 import logging
 import sys
 import time
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -99,18 +99,22 @@ def resume_run(overrides: list[str]) -> float:
         As :func:`train`.
 
     Raises:
-        ValueError: for a folder that is no run, or a change that a resumed run cannot follow.
+        ValueError: for a folder that is no run, or a change that a resumed run cannot follow; for one in which nothing
+            can be written it names the checkpoint that is whole.
     """
     place, words = resumed_place(overrides)
     saved = locate(place, prefer="last")
     run_dir, expected = saved.parent.parent, "a run folder, or one of its checkpoints: last, best or previous"
     expect(saved.parent.name == "checkpoints", "resume", place, expected)
     folder.refuse_links(run_dir)
-    with folder.claim(run_dir):  # before reading what another process may be writing
-        state, facts = checkpoint.read(saved)
-        cfg = resumed_config(place, facts, words)
-        handlers = (logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log"))
-        logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=handlers)
-        (run_dir / folder.FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
+    with ExitStack() as claimed:
+        with checkpoint_hint(lambda: checkpoint.read(saved) and saved, errors=OSError):
+            claimed.enter_context(folder.claim(run_dir))  # before reading what another process may be writing
+            state, facts = checkpoint.read(saved)
+            cfg = resumed_config(place, facts, words)
+            handlers = (logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log"))
+            form = "%(asctime)s %(message)s"
+            logging.basicConfig(level=logging.INFO, format=form, datefmt="%H:%M:%S", handlers=handlers)
+            (run_dir / folder.FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
         return run(cfg, run_dir, (state, facts, saved))

@@ -1,8 +1,11 @@
 """Files are replaced as a whole."""
 
+import os
+from pathlib import Path
+
 import pytest
 
-from pickplace.common.files import replaced_file
+from pickplace.common.files import replaced_file, sync_folder
 
 
 def test_an_error_names_the_file_that_was_asked_for(tmp_path):
@@ -20,3 +23,21 @@ def test_a_block_that_fails_leaves_the_old_file(tmp_path):
         new.write_text("half")
         raise ValueError("half")
     assert path.read_text() == "old" and [*tmp_path.iterdir()] == [path]
+
+
+def test_a_new_file_and_its_name_reach_the_disk(tmp_path, monkeypatch):
+    """A rename without its folder may be undone by a power failure. The order: content, rename, folder."""
+    synced = []
+
+    def fsync(descriptor):
+        path = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        synced.append((path.name, (tmp_path / "x.csv").exists()))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with replaced_file(tmp_path / "x.csv") as new:
+        new.write_text("1")
+    assert synced == [(".x.new.csv", False), (tmp_path.name, True)]
+
+
+def test_a_folder_that_cannot_be_synced_is_left_alone(tmp_path):
+    sync_folder(tmp_path / "nowhere")

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pickplace import CellSpec
-from pickplace.physics import command
+from pickplace.physics import command, plans
+from pickplace.physics.neighbours import BoxIndex
 from pickplace.physics.plans import KEYS, OPTIONAL_KEYS, ROBOT_KEYS, EpisodePlan, Placement, read_plans, to_lines
 from pickplace.physics.recorded import plan_of
 from pickplace.rules.state import Failure
@@ -135,6 +136,66 @@ def test_the_lines_of_an_episode_follow_one_another(tmp_path):
     path = written(tmp_path / "plans.jsonl", LINE, LINE | {"episode": 1}, LINE | {"corner": [0.1, 0, 0]})
     with pytest.raises(ValueError, match="line 3: episode=0: "):
         read_plans(path)
+
+
+def column(count, side=0.1, height=0.001):
+    """Return lines of plates on one another, in one episode."""
+    tote = {"tote": [0.3, 0.3, 90.0]}
+    return [LINE | tote | {"corner": [0, 0, n * height], "size": [side, side, height]} for n in range(count)]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        lambda n: column(n),  # as many in one column
+        lambda n: [LINE | {"tote": [9.0, 9.0, 0.2], "corner": [0.1 * (i % 50), 0.1 * (i // 50), 0]} for i in range(n)],
+        lambda n: [LINE | {"episode": i} for i in range(n)],
+    ],
+)
+def test_the_time_of_a_long_file_grows_with_its_length(lines, tmp_path, monkeypatch):
+    """Counted in pairs of boxes and in comparisons of episodes, which no busy machine changes."""
+    counts, shared = [], plans._shared
+
+    class Episode(int):
+        def __eq__(self, other):
+            counts[-1] += 1
+            return int(self) == int(other)
+
+        __hash__ = int.__hash__
+
+    def counted(*boxes):
+        counts[-1] += 1
+        return shared(*boxes)
+
+    read = plans._read_line
+    monkeypatch.setattr(plans, "_shared", counted)
+    monkeypatch.setattr(plans, "_read_line", lambda line: (v := read(line)) | {"episode": Episode(v["episode"])})
+    for number in (200, 800):
+        counts.append(0)
+        read_plans(written(tmp_path / "plans.jsonl", *lines(number)))
+        assert counts[-1] <= 40 * number
+
+
+@given(st.data())
+def test_boxes_near_a_box_are_all_found(data):
+    """Against every pair, for sides from a micrometre to the longest."""
+    side = st.one_of(st.floats(1e-6, 100.0), st.sampled_from([1e-6, 0.05, 0.1, 0.125, 0.25, 100.0]))
+    place = st.one_of(st.floats(-100, 100), st.sampled_from([0.0, 0.05, 0.1, 0.125, 0.25, -0.1]))
+    box = st.tuples(st.tuples(place, place, place), st.tuples(side, side, side))
+    boxes, asked = data.draw(st.lists(box, max_size=12)), data.draw(box)
+    index = BoxIndex()
+    for corner, size in boxes:
+        index.add(corner, size)
+    margin = data.draw(st.sampled_from([0.0, 1e-4, 0.3]))
+    expected = [n for n, (corner, size) in enumerate(boxes) if min(plans._shared(*asked, corner, size)) > -margin]
+    found = index.near(*asked, margin)
+    assert set(expected) <= set(found) and found == sorted(set(found))
+
+
+def test_the_gap_below_an_item_is_measured_to_the_nearest_below_it(tmp_path):
+    high = LINE | {"corner": [0.0, 0.0, 0.15]}
+    with pytest.raises(ValueError, match="line 2: the item floats 100.0 mm"):
+        read_plans(written(tmp_path / "plans.jsonl", LINE, high))
 
 
 VALUES = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.lists(st.floats(), max_size=4)

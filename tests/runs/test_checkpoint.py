@@ -6,6 +6,7 @@ import os
 import pickle
 import shutil
 import struct
+from pathlib import Path
 
 import pytest
 import torch
@@ -64,6 +65,19 @@ def test_a_kill_between_the_renames_loses_nothing(tmp_path):
     write(folder, frames=2)
     assert checkpoint.read(locate(tmp_path / "run", prefer="last"))[1]["frames"] == 2
     assert [path.name for path in folder.parent.iterdir()] == ["last"]
+
+
+def test_a_new_checkpoint_and_its_name_reach_the_disk(tmp_path, monkeypatch):
+    """A power failure after ``write`` must not bring the older one back, or a folder without its files."""
+    folder, synced = write(tmp_path / "last"), []
+
+    def fsync(descriptor):
+        found = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        synced.append(str(found.relative_to(tmp_path)))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write(folder, frames=2)
+    assert synced == [f".last.new/{checkpoint.TENSORS}", f".last.new/{checkpoint.FACTS}", ".last.new", "."]
 
 
 def test_locate_knows_runs_and_checkpoints(tmp_path):

@@ -32,6 +32,25 @@ def test_metrics_survive_a_cut_line_and_a_resume(tmp_path):
     assert rows == [{"frames": 10, "a": 1.0}, {"frames": 20, "a": 2.0, "b": 5.0}, {"frames": 30, "a": 7.0}]
 
 
+def test_a_resumed_table_has_the_same_bytes(tmp_path):
+    """Whole numbers stay whole, and new columns come in the same order."""
+    batches = [{"a": 4, "b": 0.1}, {"a": 1e-7, "b": 2.0}, {"c": 10**17, "a": 3}, {"b": -0.0, "d": 1 / 3}, {"a": 5}]
+    for name, killed_after in (("whole", None), ("killed", 4)):
+        (tmp_path / name).mkdir()
+        logger = CsvLogger(tmp_path / name)
+        for number, metrics in enumerate(batches):
+            if number == killed_after:
+                logger.close()
+                number_of_checkpoint = 2
+                logger = CsvLogger(tmp_path / name, frames=10 * number_of_checkpoint)
+                for again in range(number_of_checkpoint, number):
+                    logger.log(batches[again], 10 * (again + 1))
+            logger.log(metrics, 10 * (number + 1))
+        logger.close()
+    whole, killed = ((tmp_path / name / "metrics.csv").read_bytes() for name in ("whole", "killed"))
+    assert whole == killed and b"\n10,4,0.1,," in whole
+
+
 @pytest.mark.parametrize("damage", ["delete", "replace", "cut", "folder"])
 @pytest.mark.parametrize("when", ["row", "column", "close"])
 def test_a_table_that_is_taken_away_is_written_again(tmp_path, caplog, damage, when):

@@ -1,5 +1,6 @@
 """A run that is killed, stopped and resumed equals one that never was, bit for bit, with either collector."""
 
+import errno
 import html
 import json
 import logging
@@ -128,6 +129,25 @@ def test_a_second_process_is_refused(run, smoke_run, tmp_path):
             code, _, err = run("train", f"{command}={run_dir}")
         taken = f"{run_dir}: another process is working there; expected another run folder, or to wait for it."
         assert (code, err) == (2, f"error: {taken}\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "opens"), [(".lock", "filelock.FileLock.acquire"), ("train.log", "logging.FileHandler.__init__")]
+)
+def test_a_folder_in_which_nothing_can_be_written(name, opens, smoke_run, monkeypatch):
+    """The sentence names the checkpoint, which can be copied. Root may write anywhere, so the system is pretended."""
+    run_dir = smoke_run
+
+    def refuse(*_, **named):
+        raise OSError(errno.EROFS, "Read-only file system", str(run_dir / name))
+
+    monkeypatch.setattr(opens, refuse)
+    with pytest.raises(ValueError, match="Read-only file system") as caught:
+        resume_run([f"resume={run_dir}"])
+    assert str(caught.value) == (
+        f"{run_dir}/{name}: Read-only file system; expected a place where you may read and write. What was saved "
+        f"before is whole: pickplace-train resume={run_dir}/checkpoints/last"
+    )
 
 
 def test_a_job_of_a_sweep_that_is_started_again_goes_on(undisturbed, tmp_path, caplog, no_report):

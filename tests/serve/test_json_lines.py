@@ -3,11 +3,22 @@
 import io
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from pickplace import CellSpec, Planner, Scene
+from pickplace.rules.gripper.rules import Overlap
+from pickplace.rules.support.rules import Full, Half
+from pickplace.runs import checkpoint
+from pickplace.runs.locate import locate
 from pickplace.serve import json_lines
+from pickplace.serve.deadline import Deadline
+from pickplace.serve.decisions import DecisionLog, what_is_served
+from pickplace.serve.options import load_planner
+from pickplace.serve.request import Limits, answer, read_request, solve
 
 EMPTY = np.full((6, 6), 5)
 ITEM = np.zeros((5, 5), dtype=np.int64)
@@ -63,8 +74,10 @@ def test_command_refuses_in_one_sentence(command, tmp_path, arguments, message):
 def test_command_answers_json_lines_and_survives_bad_ones(command):
     good = {"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist(), "alternatives": 0}
     lines = [
-        (b"not json", "not JSON"), (b"\xff\xfe", "utf-8"), (b"[" * 100_000, "recursion"), (b"[1, 2]", "got list"),
-        (b"9" * 10_000, "value has 10000 digits"),
+        (b"not json", "not JSON"), (b"\xff\xfe", "utf-8"), (b"[" * 2_000, "recursion"), (b"[1, 2]", "got list"),
+        (b"9" * 10_000, "value has 10000 digits"), (b"[" * 100_000, "100,000 lists, rows of maps included"),
+        (b'{"id": 1, "tote_depth": [[5]], "id": 1}', "'id' stands twice in an object"),
+        (b'{"items": [{"x": 1, "x": 1}]}', "'x' stands twice"),
     ]  # fmt: skip
     requests = [
         ({"id": "a", **good}, None), ({"id": 7, "tote_depth": good["tote_depth"]}, "bin_depth: missing"),
@@ -84,8 +97,8 @@ def test_command_answers_json_lines_and_survives_bad_ones(command):
     assert "sys." not in out
     for reply, (_, expected) in zip(replies, lines, strict=True):
         assert ("error" in reply) == (expected is not None) and (expected or "") in reply.get("error", ""), reply
-    assert [reply.get("id") for reply in replies] == [None] * 5 + [request.get("id") for request, _ in requests]
-    first, *_, stuck, last = replies[5:]
+    assert [reply.get("id") for reply in replies] == [None] * 8 + [request.get("id") for request, _ in requests]
+    first, *_, stuck, last = replies[8:]
     assert stuck["status"] == "stuck" and sum(stuck["reasons"].values()) == 3600
     assert {**first, "id": 0} == {**last, "id": 0} and first["status"] == "ok"
 
@@ -129,7 +142,7 @@ def test_the_reach_of_a_file(command, tmp_path):
     assert all(np.hypot(x, y) < 6 for x, y, _ in near) and all(6 <= np.hypot(x, y) <= 12 for x, y, _ in far)
     for text, expected in (
         ("reach: {", "--reach=bad.yaml: while parsing"),
-        ("radii: [1, 2]", "--reach=bad.yaml: expected a file with the key reach"),
+        ("radii: [1, 2]", "--reach=bad.yaml: expected annulus, everywhere, table, or a file with the key reach"),
         (
             "reach: {_target_: anulus}",
             "env.reach._target_=anulus: there is no such class or function; did you mean 'annulus'",
@@ -155,3 +168,110 @@ def test_a_request_has_the_last_word(command):
     assert replies[1]["pick"]["center"] == pytest.approx([0.05 * length for length in replies[0]["pick"]["center"]])
     assert replies[2]["occupancy_after"] == pytest.approx(2 / 72)
     assert [bool(reply["alternatives"]) for reply in replies] == [False, False, True]
+
+
+def test_the_parts_of_the_cell_are_options(command, tmp_path):
+    """By their names in ``conf/``, or from files; the plans are those of a planner that was made with them."""
+    (tmp_path / "mine.yaml").write_text("gripper: {_target_: overlap, size: [1, 1]}")
+    request = {"bin_depth": ITEM.tolist(), "tote_depth": (EMPTY - [[1], [0], [1], [0], [1], [0]]).tolist()}
+    line = json.dumps({**request, "alternatives": 0}).encode()
+    for arguments, parts in (
+        (["--gripper", "point"], {"gripper": Overlap((1, 1))}),
+        (["--gripper", "mine.yaml", "--support", "half"], {"gripper": Overlap((1, 1)), "support": Half()}),
+        (["--support", "full"], {"support": Full()}),
+    ):
+        code, out, err = command("--planner", "joint_dbl", *arguments, lines=line)
+        assert code == 0, err
+        expected = Planner(CellSpec(**parts), planner="joint_dbl").plan(Scene.from_maps(**request), alternatives=0)
+        assert json.loads(out) == json.loads(json.dumps(expected.as_dict()))
+    assert "expected bearing, corners, full" in command("--planner", "joint_dbl", "--support", "none.yaml")[2]
+
+
+@pytest.mark.parametrize(("name", "change"), [("fcn4d", "bias"), ("cut1", "scale")])
+def test_weights_that_lead_to_no_number_are_refused(command, tmp_path, name, change):
+    """They are finite, and so is the setting, and the checksum is right: what comes of them is not."""
+    state, facts = checkpoint.read(locate(f"pretrained/{name}"))
+    if change == "bias":
+        state["policy"]["network.first.bias"] = torch.full_like(state["policy"]["network.first.bias"], 3e38)
+        words = "the policy's scores are not finite"
+    else:
+        facts["config"]["model"]["actor"]["reward_scale"] = 1e308
+        words = "model.actor.reward_scale=1e+308: expected a number between 1e-09 and 1e+38"
+    checkpoint.write(tmp_path / "bad", state, {key: facts[key] for key in facts if key not in ("schema", "sha256")})
+    line = json.dumps({"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist()}).encode()
+    code, out, err = command(tmp_path / "bad", "--tote-size", 6, 6, 5, "--bin-size", 5, 5, 1, lines=line)
+    assert (code, out) == (2, "") and words in err and err.count("\n") == 1
+    if change == "bias":
+        planner = Planner.load(tmp_path / "bad")
+        with pytest.raises(FloatingPointError, match=words):
+            planner.plan(Scene.from_maps(ITEM, EMPTY))
+
+
+def test_a_plan_with_a_number_that_json_lacks_is_no_answer(monkeypatch):
+    planner = Planner(CellSpec(), planner="joint_dbl")
+    plan = replace(planner.plan(Scene.from_maps(ITEM, EMPTY)), occupancy_after=float("nan"))
+    monkeypatch.setattr(planner, "plan", lambda *_, **__: plan)
+    line = json.dumps({"id": 1, "bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist()}).encode()
+    found = answer(planner, line, {})
+    sentence = "the plan has a number that is not finite; expected another checkpoint."
+    assert (found.status, json.loads(found.text)) == (500, {"id": 1, "error": sentence})
+
+
+def test_a_deadline_ends_the_answer_to_a_line_and_not_the_next(command):
+    lines = [{"deadline": 0.02}, {}]
+    texts = (json.dumps({"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist(), **line}) for line in lines)
+    code, out, err = command("pretrained/r4", "--planner", "lookahead", lines="\n".join(texts).encode())
+    late, plan = map(json.loads, out.splitlines())
+    assert code == 0 and "no plan within 0.02 s" in late["error"] and plan["status"] == "ok"
+
+
+def test_the_limit_of_a_request_follows_from_the_cell():
+    """64 values along a cell of each map fit, at 8 bytes each; and never more than 16 MiB."""
+    cell = CellSpec()
+    rows = [[0.25] * (64 * 6)] * (64 * 6)
+    maps = {"bin_depth": [[0.0] * 320] * 320, "bin_labels": [[0] * 320] * 320, "tote_depth": rows}
+    text = json.dumps(maps).encode()
+    Limits.of(cell).check(text)
+    with pytest.raises(ValueError, match="more than 2,883,872 bytes"):
+        Limits.of(cell).check(text + b" " * 2_000_000)
+    assert Limits.of(CellSpec(tote_size=(40, 40, 5))).size == 2**24
+
+
+def test_a_log_is_replayed(command, tmp_path, monkeypatch):
+    """The plans are the same; one that was changed is named, and so are other weights."""
+    log = tmp_path / "log.jsonl"
+    args = json_lines.parser().parse_args(["pretrained/r4", "--tote-size", "6", "6", "5", "--support", "hull"])
+    planner, defaults = load_planner(args)
+    decisions = DecisionLog(log, what_is_served(planner, args))
+    metres = {"items": [{"x": 0.1, "y": 0.125, "w": 0.09, "d": 0.04, "h": 0.05}], "cell_size": 0.05, "id": "b"}
+    given = [
+        {"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist(), "id": 1},
+        {**metres, "tote_depth": (EMPTY * 0.05).tolist()},
+        {"bin_depth": ITEM.tolist(), "tote_depth": [[5]]},
+        {"bin_depth": ITEM.tolist(), "tote_depth": (EMPTY * 0).tolist()},
+    ]
+    for one in given:
+        _, reply, request = read_request(json.dumps(one).encode(), Limits.of(planner.cell), defaults)
+        decisions.add(request, solve(planner, request, reply, Deadline(60)).reply, 0.1)
+    decisions.add(None, {"error": "the request is not JSON"}, 0.0)
+    lines = log.read_text().splitlines()
+    assert len(lines) == 6 and json.loads(lines[0])["start"]["checkpoint"] == "pretrained/r4"
+    assert command("--replay", log) == (0, "3 of 3 plans are the same\n", "")
+    DecisionLog(log, what_is_served(planner, args))  # the service was started again
+    assert log.read_text().splitlines()[:6] == lines and command("--replay", log)[0] == 0
+    changed = json.loads(lines[1])
+    changed["reply"]["action"] += 1
+    log.write_text("\n".join([lines[0], json.dumps(changed), *lines[2:]]))
+    code, out, err = command("--replay", log)
+    assert code == 1 and out.endswith("2 of 3 plans are the same\n") and "log.jsonl, line 2: action is" in out
+    start = json.loads(lines[0])
+    start["start"]["sha256"] = "0"
+    for text, words in (
+        (json.dumps(start), "line 1: checkpoint=pretrained/r4: other weights than those of the log"),
+        (lines[1], "line 1: expected a line with the key start before it"),
+        ("[1]", "line 1: expected an object in JSON (got list)"),
+    ):
+        log.write_text(text)
+        code, out, err = command("--replay", log)
+        assert (code, out) == (2, "") and words in err and err.count("\n") == 1
+    assert "expected no other" in command("pretrained/r4", "--replay", log)[2]

@@ -5,6 +5,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -195,7 +196,11 @@ def test_health_says_no_more_of_a_reach_than_its_kind(tmp_path):
         ({**GRID, "depth": 1}, 422, "depth: there is no such key"),
         ({**GRID, "tote_depth": [[5] * 6] * 5}, 422, "tote_depth"),
         ({**GRID, "alternatives": -1}, 422, "alternatives=-1: expected"),
-        (b" " * (2**24 + 1), 413, "16,777,216 bytes"),
+        (b"[" + b"[]," * 300_000 + b"1]", 400, "300,001 lists, rows of maps included; expected at most 2,030"),
+        (b'{"tote_depth": [[5]], "tote_depth": [[5]]}', 400, "'tote_depth' stands twice"),
+        ({**GRID, "deadline": 0}, 422, "deadline=0: expected seconds between 0.001 and 3600"),
+        ({**GRID, "exclude": [[1]]}, 422, "exclude[0]=[1]: expected numbers x, y or x, y, z"),
+        (b" " * 2_884_000, 413, "2,883,872 bytes"),
     ],
 )
 def test_bad_requests_have_one_sentence(client, body, status, message):
@@ -307,12 +312,12 @@ PAGES = FIRST.replace(b"/health", b"/") * 1000  # answers of many megabytes, for
 def test_clients_that_stop_are_cut_off(text, impatient):
     """In the headers of the first request or of a later one, in a body that was refused, or while they are answered.
 
-    A byte now and then does not help; nor do they keep others out for good.
+    A byte now and then does not help; nor do they keep others out.
     """
     with served("--planner", "joint_dbl") as client:
-        sockets = open_sockets(client, 32, text)
-        status, headers, reply = client.ask("GET", "/health")
-        assert status == 503 and set(reply) == {"error"} and headers["Retry-After"] == "1"
+        sockets = open_sockets(client, 40, text)
+        for _ in range(3):
+            assert client.ask("GET", "/health")[0] == client.plan(GRID)[0] == 200
 
         def are_cut_off():
             for one in sockets if text != PAGES else ():
@@ -323,6 +328,49 @@ def test_clients_that_stop_are_cut_off(text, impatient):
         wait_for(are_cut_off, seconds=5)
         assert client.ask("GET", "/health")[0] == 200
         assert all(map(is_ended, sockets))
+
+
+def test_idle_connections_keep_nobody_out():
+    """Those that wait the longest go first; one whose plan is computed stays."""
+    with served("--planner", "joint_dbl", "--rate", 1e6) as client:
+        idle = open_sockets(client, 32, b"")
+        for one in idle[16:]:
+            one.sendall(FIRST)
+        assert [client.plan(GRID)[0] for _ in range(10)] == [200] * 10
+        wait_for(lambda: is_ended(idle[0]))
+        assert len(client.server.server_state.connections) <= 32
+        newest = open_sockets(client, 1, FIRST)[0]
+        reply = http.client.HTTPResponse(newest)
+        reply.begin()
+        assert reply.status == 200
+        for one in (*idle, newest):
+            one.close()
+
+
+def test_more_requests_than_connections_are_put_off(monkeypatch):
+    """All of them are being answered: none can be ended for another."""
+    monkeypatch.setattr("pickplace.serve.connections.CONNECTIONS", 4)
+    head = b"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 99\r\n\r\n{"
+    with served("--planner", "joint_dbl") as client:
+        sockets = open_sockets(client, 4, head)
+        wait_for(lambda: sum(each.cycle is not None for each in list(client.server.server_state.connections)) == 4)
+        status, headers, reply = client.ask("GET", "/health")
+        assert status == 503 and set(reply) == {"error"} and headers["Retry-After"] == "1"
+        for one in sockets:
+            one.close()
+        wait_for(lambda: client.ask("GET", "/health")[0] == 200)
+
+
+def test_a_request_with_two_lengths_is_refused():
+    """A proxy in front may read another request than the service: request smuggling."""
+    body = b"5\r\nhello\r\n0\r\n\r\n"
+    head = b"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\nTransfer-Encoding: chunked\r\n\r\n"
+    with served("--planner", "joint_dbl") as client:
+        (one,) = open_sockets(client, 1, head % len(body) + body)
+        reply = http.client.HTTPResponse(one)
+        reply.begin()
+        assert reply.status == 400 and "got both, expected one" in json.loads(reply.read())["error"]
+        assert is_ended(one)
 
 
 def test_a_client_may_wait_and_begin_anew(monkeypatch, impatient):
@@ -373,12 +421,12 @@ def test_slow_bodies_take_up_places():
 
 def test_a_refused_body_has_spent_its_plan():
     with served("--planner", "joint_dbl", "--rate", 3) as client:
-        assert [client.plan(body)[0] for body in (b"{", b" " * (2**24 + 1), GRID, GRID)] == [400, 413, 200, 429]
+        assert [client.plan(body)[0] for body in (b"{", b" " * 2_884_000, GRID, GRID)] == [400, 413, 200, 429]
 
 
 def test_a_fault_is_answered_in_json(monkeypatch):
-    monkeypatch.setattr(Planner, "plan", None)
     with served("--planner", "joint_dbl", logged=["Exception in ASGI application\n"]) as client:
+        monkeypatch.setattr(Planner, "plan", None)
         status, _, reply = client.plan(GRID)
         assert (status, reply) == (500, {"error": "the service failed; its log says more."})
         assert client.ask("GET", "/health")[0] == 200
@@ -430,14 +478,101 @@ def test_health_answers_while_a_plan_is_computed(monkeypatch):
         events.append("end")
         return plan(*given, **named)
 
-    monkeypatch.setattr(Planner, "plan", slow)
     with served("--planner", "joint_dbl") as client, ThreadPoolExecutor(2) as clients:
+        monkeypatch.setattr(Planner, "plan", slow)
         replies = [clients.submit(client.plan, GRID) for _ in range(2)]
         wait_for(lambda: events)
         assert client.ask("GET", "/health")[0] == 200
         healthy.set()
         assert [reply.result()[0] for reply in replies] == [200, 200]
     assert events == ["begin", "end"] * 2
+
+
+LOOKAHEAD = ("pretrained/r4", "--planner", "lookahead")
+
+
+def test_a_deadline_ends_a_plan_and_its_wait():
+    """A real search, which takes a second; the next plan is right."""
+    with served(*LOOKAHEAD, "--rate", 1e6) as client, ThreadPoolExecutor(3) as clients:
+        begun = time.monotonic()
+        replies = [clients.submit(client.plan, {"id": n, **GRID, "deadline": 0.05}) for n in range(3)]
+        for number, (status, _, reply) in enumerate(reply.result() for reply in replies):
+            assert status == 504 and reply["id"] == number and "no plan within 0.05 s" in reply["error"]
+        assert time.monotonic() - begun < 1
+        status, _, reply = client.plan({**GRID, "deadline": 30})
+        assert (status, reply["status"]) == (200, "ok")
+
+
+def test_a_plan_ends_when_its_client_leaves(monkeypatch):
+    begun, ended, plan = threading.Event(), [], Planner.plan
+
+    def endless(*_, **__):
+        begun.set()
+        try:
+            while True:
+                pass
+        finally:
+            ended.append(time.monotonic())
+
+    with served("--planner", "joint_dbl", "--deadline", 60) as client:
+        monkeypatch.setattr(Planner, "plan", endless)
+        body = json.dumps(GRID).encode()
+        head = (
+            f"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: {len(body)}"
+        )
+        (one,) = open_sockets(client, 1, head.encode() + b"\r\n\r\n" + body)
+        assert begun.wait(20)
+        assert client.ask("GET", "/health")[0] == client.ask("GET", "/ready")[0] == 200  # while it computes
+        one.close()
+        wait_for(lambda: ended)
+        monkeypatch.setattr(Planner, "plan", plan)
+        assert client.plan(GRID)[0] == 200
+        assert [each["status"] for each in client.ask("GET", "/plans")[2]["plans"]] == ["refused", "ok"]
+
+
+def test_ready_says_whether_a_request_would_be_taken():
+    head = b"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 99\r\n\r\n{"
+    with served("--planner", "joint_dbl", "--rate", 1e6) as client:
+        assert client.ask("GET", "/ready")[::2] == (200, {"status": "ready", "waiting": 0})
+        sockets = open_sockets(client, 16, head)
+        wait_for(lambda: client.ask("GET", "/ready")[0] == 503)
+        status, headers, reply = client.ask("GET", "/ready")
+        assert set(reply) == {"error"} and headers["Retry-After"] == "1"
+        assert client.ask("GET", "/health")[0] == 200
+        for one in sockets:
+            one.close()
+        wait_for(lambda: client.ask("GET", "/ready")[0] == 200)
+
+
+def test_metrics_count_answers():
+    from prometheus_client.parser import text_string_to_metric_families
+
+    with served("--planner", "joint_dbl", token=TOKEN) as client:
+        sent = {"Authorization": f"Bearer {TOKEN}"}
+        for body in (GRID, GRID, b"{", {"tote_depth": [[5]]}, {**GRID, "tote_depth": [[0] * 6] * 6}):
+            client.plan(body, **sent)
+        assert client.plan(GRID)[0] == client.ask("GET", "/metrics")[0] == 401
+        status, headers, text = client.ask("GET", "/metrics", **sent)
+        families = {family.name: family for family in text_string_to_metric_families(text)}
+    assert status == 200 and headers["Content-Type"].startswith("text/plain")
+    counts = {
+        (each.labels["http_status"], each.labels["plan_status"]): each.value
+        for each in families["pickplace_answers"].samples
+        if each.name.endswith("_total")
+    }
+    assert counts == {("200", "ok"): 2, ("200", "stuck"): 1, ("400", ""): 1, ("422", ""): 1, ("401", ""): 1}
+    times = {each.name: each.value for each in families["pickplace_plan_seconds"].samples}
+    assert times["pickplace_plan_seconds_count"] == 3 and times["pickplace_plan_seconds_sum"] > 0
+    assert families["pickplace_waiting_requests"].samples[0].value == 0
+
+
+def test_the_schema_says_units_and_frames(client):
+    schemas = client.ask("GET", "/openapi.json")[2]["components"]["schemas"]
+    for name in ("PlanRequest", "Plan", "Pose", "Alternative", "Box"):
+        assert [key for key, entry in schemas[name]["properties"].items() if not entry.get("description")] == []
+        assert "outer corner of cell (0, 0)" in schemas[name]["description"]
+    assert "height units" in schemas["Pose"]["properties"]["center"]["description"]
+    assert "; m" in schemas["PlanRequest"]["properties"]["accuracy"]["description"]
 
 
 @pytest.mark.parametrize(
@@ -450,6 +585,14 @@ def test_health_answers_while_a_plan_is_computed(monkeypatch):
         (["--port", "70000"], None, "--port=70000"),
         (["--rate", "0"], None, "--rate=0"),
         (["--history", "0"], None, "--history=0"),
+        (["--deadline", "0"], None, "--deadline=0.0: expected seconds between 0.001 and 3600"),
+        (["--log", "/proc/none/x"], None, "/proc/none/x: No such file or directory"),
+        (["--support", "halves"], None, "--support=halves: "),
+        (
+            ["--gripper", "cup_array", "--effector-size", "3", "3"],
+            None,
+            "--gripper=cup_array --effector-size: got both",
+        ),
         (["--host", "192.0.2.1"], TOKEN, "expected an address of this machine and a free port"),
     ],
 )
@@ -463,6 +606,14 @@ def test_the_command_refuses_in_one_sentence(monkeypatch, capsys, arguments, tok
     err = capsys.readouterr().err
     assert err.startswith("error: ") and err.count("\n") == 1 and message in err
     assert not token or token not in err
+
+
+def test_a_bad_limit_on_the_memory_is_refused_at_the_start(monkeypatch, capsys):
+    monkeypatch.setenv("PICKPLACE_MEMORY_GB", "abc")
+    monkeypatch.setattr(sys, "argv", ["pickplace-serve", "--planner", "joint_dbl"])
+    with pytest.raises(SystemExit, match="2"):
+        serve.main()
+    assert capsys.readouterr().err == "error: PICKPLACE_MEMORY_GB='abc': expected a number of gigabytes.\n"
 
 
 def test_a_missing_extra_is_one_sentence(monkeypatch, capsys):
@@ -528,3 +679,22 @@ def test_the_page_asks_for_the_token(browser):
         browser.find_element("id", "token").send_keys(TOKEN)
         browser.find_element("css selector", "#sign button").click()
         wait_until(browser, "live.state().plans === 1 && document.getElementById('sign').hidden")
+
+
+def test_a_page_without_webgl_says_so():
+    """Its script stops at the renderer; run by node with a page of its own, as a browser would refuse it."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("needs node")
+    source = (ROOT / "pickplace/views/assets/scene.js").read_text()
+    before = """
+    const shown = [], document = {createElement: () => ({style: {}, setAttribute() {}})};
+    const $ = id => ({prepend: part => shown.push(id + ": " + part.textContent)});
+    const THREE = {WebGLRenderer: class { constructor() { throw new Error("Error creating WebGL context."); } }};
+    const data = {bin: [5, 5, 1], tote: [6, 6], effector: [3, 3]};
+    try { (() => {
+    """
+    after = "\n})(); } catch (error) { shown.push(error.message); }\nconsole.log(shown.join('|'));"
+    run = subprocess.run([node, "-e", before + source + after], capture_output=True, text=True, check=True)
+    words = "stage: This browser has no WebGL, so nothing can be shown in 3D. Switch on hardware acceleration"
+    assert run.stdout.startswith(words) and run.stdout.endswith("|Error creating WebGL context.\n")

@@ -194,3 +194,16 @@ def test_a_read_only_run_folder_is_named(read_only, monkeypatch, capsys, main, a
     assert capsys.readouterr().err == expected
     assert before == {path: path.read_bytes() for path in read_only.rglob("*") if path.is_file()}
     Planner.load(read_only)
+
+
+@pytest.mark.parametrize("rate", ["1.5", "1e37", "1e38"])
+def test_a_learning_rate_that_no_network_survives_is_one_sentence(smoke, rate, tmp_path):
+    with pytest.raises(ValueError, match=f"algo.lr={re.escape(str(float(rate)))}: expected a number between 0 and 1"):
+        smoke(tmp_path / "run", f"algo.lr={rate}")
+
+
+def test_the_greatest_learning_rate_trains_or_says_what_is_not_finite(smoke, tmp_path):
+    try:
+        smoke(tmp_path / "run", "algo.lr=1", "total_frames=256")
+    except FloatingPointError as error:
+        assert "not finite" in str(error)

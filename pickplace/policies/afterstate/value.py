@@ -37,7 +37,7 @@ class ToteValue(nn.Module, ABC):
         super().__init__()
         self.mirrored = flag("model.actor.mirrored", mirrored)
         self.all_views = flag("model.actor.all_views", all_views)
-        self.reward_scale = number("model.actor.reward_scale", reward_scale)
+        self.reward_scale = number("model.actor.reward_scale", reward_scale, 1e-9, 1e38)  # as of the training
         self.compute_dtype = one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
 
     def forward(self, *entries: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from pickplace.policies.base import MASKED, Policy, pick_one, refuse_several_items
+from pickplace.policies.base import MASKED, Policy, best_choice, pick_one, refuse_several_items
 from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.fcn_grasp.network import FootprintFcn
 from pickplace.policies.fcn_grasp.policy import UnmaskedFcnGrasp
@@ -132,7 +132,7 @@ class IndividualGrasp(FootprintScorer):
 
     def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
         seen = {**observation, "action_mask": action_mask(self.cell, maps)}
-        return self.to_action(self.logits(seen).argmax(1), seen)
+        return self.to_action(best_choice(self.logits(seen)), seen)
 
     def action_log_probs(self, observation: Observation) -> Tensor:
         pick, footprint, allowed = self._reached(observation)

@@ -3,7 +3,19 @@
 const [binW, binD, binH] = data.bin, [toteW, toteD] = data.tote, [eeW, eeD] = data.effector;
 const gap = Math.max(2, 0.25 * toteW), [binX, binY] = data.binAt ?? [-binW - gap, (toteD - binD) / 2];
 const INK = 0x263238, BAD = 0xd32f2f, TARGET = 0xc2410c;
-const renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
+function makeRenderer() {
+  try {
+    return new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
+  } catch (error) {
+    const words = document.createElement("p");
+    words.setAttribute("role", "alert");
+    words.style.padding = "0 24px";
+    words.textContent = "This browser has no WebGL, so nothing can be shown in 3D. Switch on hardware acceleration, or use another browser.";
+    $("stage").prepend(words);
+    throw error;
+  }
+}
+const renderer = makeRenderer();
 renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
 $("stage").prepend(renderer.domElement);
 renderer.domElement.setAttribute("role", "img");

@@ -1,0 +1,152 @@
+"""The options of ``pickplace-plan`` and ``pickplace-serve`` that say how to plan, and the planner that they name."""
+
+import argparse
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pickplace.common.files import read_text
+from pickplace.common.validate import check_bytes, first_line, number, refuse_if, reworded, whole_number
+from pickplace.robot.box import DepthMapError
+from pickplace.serve.deadline import Deadline
+from pickplace.serve.request import DEADLINE, MAX_DEADLINE, PLAN_OPTIONS, PlanRequest
+
+if TYPE_CHECKING:
+    from pickplace.robot.planner import Planner
+
+MAX_PART = 2**24  # greatest size of a file with a part of the cell, in bytes
+#: Parts of the cell that the command line may choose: the key, what it is, an example.
+PARTS = (
+    ("gripper", "the end effector", "cup_round"),
+    ("support", "the rule for stability", "bearing"),
+    ("reach", "the robot's reach", "annulus"),
+)
+
+
+def planner_options() -> dict[str, dict[str, Any]]:
+    """Return the options that say how to plan, which :func:`load_planner` reads; see :class:`Parser`."""
+    of_requests = {
+        f"--{key.name.replace('_', '-')}": {
+            "type": key.metadata["option"], "metavar": "N", "default": key.default,
+            "help": key.metadata["description"] + (" (default %(default)s)" if key.default is not None else ""),
+        }
+        for key in PLAN_OPTIONS
+    }  # fmt: skip
+    return {
+        "checkpoint": {"nargs": "?", "help": "a run folder, a checkpoint, or pretrained/<name>"},
+        "--planner": {
+            "metavar": "NAME", "help": "what decides, such as joint_dbl or lookahead; default: the policy",
+        },
+        **of_requests,
+        "--candidates": {
+            "metavar": "K", "default": "all", "help": "number of most probable actions tried, or all (the default)",
+        },
+        "--bin-size": {"type": int, "nargs": 3, "metavar": ("W", "D", "H"), "help": "cells; default: as trained"},
+        "--tote-size": {"type": int, "nargs": 3, "metavar": ("W", "D", "H"), "help": "cells; default: as trained"},
+        "--effector-size": {"type": int, "nargs": 2, "metavar": ("W", "D"), "help": "cells; default: as trained"},
+        "--rotations": {
+            "type": int, "metavar": "R", "help": "quarter turns to choose from; default: as trained",
+        },
+        **{
+            f"--{part}": {
+                "metavar": "NAME",
+                "help": f"{what}: an option of conf/{part}, such as {example}, or a file like those there; default: as "
+                "trained",
+            }
+            for part, what, example in PARTS
+        },
+        "--trust": {
+            "action": "append", "metavar": "MODULE", "default": [],
+            "help": "your own module whose classes the checkpoint's config may name; may be repeated",
+        },
+        "--threads": {"type": int, "metavar": "N", "help": "CPU threads; default: as many as it may use"},
+        "--device": {"default": "cpu", "help": "cpu (the default) or cuda"},
+    }  # fmt: skip
+
+
+def load_planner(args: argparse.Namespace, cell: dict | None = None) -> tuple["Planner", dict]:
+    """Return the planner that a command line names, and the settings of its requests unless they say otherwise.
+
+    Args:
+        args: the command line.
+        cell: settings of the cell, instead of those of the command line.
+
+    Raises:
+        ValueError: for arguments or a checkpoint that cannot be used.
+    """
+    from pickplace.common.machine import use_threads
+    from pickplace.robot.planner import MAX_ALTERNATIVES, Planner  # here, so that --help need not wait for torch
+    from pickplace.rules.cell import CellSpec
+
+    use_threads("--threads", args.threads)
+    keys = ("bin_size", "tote_size", "effector_size", "rotations")
+    sizes = {key: value for key in keys if (value := getattr(args, key)) is not None}
+    sizes |= {part: read_part(part, value) for part, *_ in PARTS if (value := getattr(args, part)) is not None}
+    refuse_if(
+        args.gripper is not None and args.effector_size is not None,
+        f"--gripper={args.gripper} --effector-size: got both; expected one of them, as a gripper has a size.",
+    )
+    sizes = sizes if cell is None else cell
+    candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates
+    if args.checkpoint is not None:
+        planner = Planner.load(args.checkpoint, candidates, args.device, args.trust, args.planner, **sizes)
+    else:
+        refuse_if(
+            args.planner is None, "checkpoint: missing; expected a checkpoint, or --planner joint_dbl or the like."
+        )
+        refuse_if(
+            candidates != "all",
+            f"--candidates={args.candidates}: only a policy has candidates; expected a checkpoint.",
+        )
+        planner = Planner(CellSpec(**sizes), planner=args.planner)
+    defaults = {key.name: getattr(args, key.name) for key in PLAN_OPTIONS}
+    PlanRequest(**defaults).scene()  # refuses settings now, not in the answer to each request
+    whole_number("--alternatives", args.alternatives, 0, MAX_ALTERNATIVES)
+    number("--deadline", args.deadline, 0.001, MAX_DEADLINE, "seconds")
+    check_bytes("--planner", 0)  # refuses a bad limit on the memory now
+    return planner, defaults
+
+
+def plan_once(planner: "Planner") -> None:
+    """Plan for an item in an empty tote, so that the first request takes no longer than others, and a policy that
+    cannot decide is refused at the start.
+
+    Raises:
+        FloatingPointError: for a policy whose scores are not finite.
+    """
+    from pickplace.robot.scene import Scene  # here, so that --help need not wait for torch
+
+    (wide, deep, _), sides = planner.cell.bin_size, planner.cell.tote_size
+    w, d, h = (1, 1, 1) if planner.training is None else min(planner.training.kinds)
+    bin_depth, x, y = np.zeros((wide, deep), dtype=np.int64), (wide - w) // 2, (deep - d) // 2
+    bin_depth[x : x + w, y : y + d] = h
+    with suppress(DepthMapError, TimeoutError):  # of a planner that serves no such item, or is slow
+        scene = Scene.from_maps(bin_depth, np.full(sides[:2], sides[2]))
+        Deadline(DEADLINE).run(lambda: planner.plan(scene, alternatives=1))
+
+
+def read_part(key: str, name: str):
+    """Return a part of the cell that an option of ``conf/`` describes, or a file such as those there.
+
+    Args:
+        key: ``gripper``, ``support`` or ``reach``.
+        name: of the option, or a path.
+
+    Raises:
+        ValueError: naming the file, or the key in it.
+    """
+    from yaml import YAMLError, safe_load
+
+    from pickplace.config.composition import conf_dir
+    from pickplace.config.registry import build
+
+    options = {path.stem: path for path in sorted((conf_dir() / key).glob("*.yaml"))}
+    expected = f"expected {', '.join(options)}, or a file with the key {key}, such as conf/{key}/{[*options][0]}.yaml."
+    with reworded(
+        (OSError, ValueError, YAMLError),
+        lambda error: ValueError(f"--{key}={name}: {first_line(error)}; {expected}"),
+    ):
+        content = safe_load(read_text(options.get(name, name), MAX_PART))
+    refuse_if(not isinstance(content, dict) or [*content] != [key], f"--{key}={name}: {expected}")
+    return build("env", content)[key]
