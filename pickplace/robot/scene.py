@@ -43,6 +43,9 @@ class Scene:
     cell_size: float | None = None  #: side of a cell, m; None: maps of whole cells
     accuracy: float = ACCURACY  #: greatest error of a measured height, m
     clearance: float = CLEARANCE  #: least distance that an item keeps from what stands beside it, on each side; m
+    #: greatest distance of an item from where the robot sets it down, in any direction, at most ``clearance``; m; None:
+    #: the clearance. What carries an item counts if it carries it wherever it is then
+    placement_error: float | None = None
     tote_height: float | None = None  #: height of the tote's rim above its floor; None: that of ``cell.tote_size``
     #: with ``support="bearing"``, ``[W_T, D_T]``, 1 where a cell bears weight, else 0: what the plan before this one
     #: returned; None: every cell bears weight. In metres, of a map with one value a cell, only the floor does then:
@@ -52,6 +55,8 @@ class Scene:
     def __post_init__(self):
         number("accuracy", self.accuracy, 0, 0.1, "metres")
         number("clearance", self.clearance, 0, 0.1, "metres")
+        if self.placement_error is not None:
+            number("placement_error", self.placement_error, 0, self.clearance, "metres, as clearance is the greatest")
         if self.cell_size is not None:
             number("cell_size", self.cell_size, 1e-3, 10, "metres")
         elif not isinstance(self.items, BinMap) or isinstance(self.tote, ToteMap):

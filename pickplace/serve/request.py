@@ -38,6 +38,9 @@ class PlanRequest:
     cell_size: float | None = _key("side of a cell in metres, if the maps are in metres", None, float)
     accuracy: float = _key("greatest error of a measured height, in metres", ACCURACY, float)
     clearance: float = _key("least distance from what stands beside the item, in metres", CLEARANCE, float)
+    placement_error: float | None = _key(
+        "greatest distance of an item from where it is set down, in metres; default: the clearance", None, float
+    )
     alternatives: int = _key("number of most probable choices reported", 10, int)
 
     @classmethod
