@@ -282,8 +282,8 @@ def _clear_picks(
 ) -> np.ndarray:
     """Return at which of its centres ``[P, 2]`` the end effector hits nothing in the bin, bool ``[P]``.
 
-    The rectangle around it decides, which is turned with the item. It misses the bin's walls, or passes over them. It
-    touches no other box, wider by the clearance, that may be as high; boxes that are clearly lower are ignored.
+    Its body decides, which is turned with the item. It misses the bin's walls, or passes over them. It touches no other
+    box, wider by the clearance, that may be as high; boxes that are clearly lower are ignored.
 
     Args:
         index: of the item that is picked, among the boxes.
@@ -291,15 +291,15 @@ def _clear_picks(
     box = boxes[index]
     if isinstance(box, HiddenBox):
         return np.zeros(len(centres), dtype=bool)
-    turn, (wide, deep) = math.radians(box.yaw), (size * side for size in cell.gripper.size)
-    cos, sin, far = abs(math.cos(turn)), abs(math.sin(turn)), np.array(cell.bin_size[:2]) * side
-    reach = np.array([wide / 2 * cos + deep / 2 * sin, wide / 2 * sin + deep / 2 * cos])
-    clear = ((centres >= reach - ROUNDING) & (centres <= far - reach + ROUNDING)).all(1)
+    far, axes = np.array(cell.bin_size[:2]) * side, turned_axes(math.radians(box.yaw))
+    body = [np.array(part) * side @ axes for part in cell.gripper.body_parts]
+    corners = np.concatenate(body)
+    clear = ((centres + corners.min(0) >= -ROUNDING) & (centres + corners.max(0) <= far + ROUNDING)).all(1)
     clear |= box.h - accuracy >= cell.bin_size[2] * (side * cell.height_unit) - ROUNDING
     for other in boxes[:index] + boxes[index + 1 :]:
         if other.h + accuracy >= box.h - accuracy - ROUNDING:
             wider = replace(other, w=other.w + 2 * clearance, d=other.d + 2 * clearance)
-            clear &= ~touches(centres, (wide, deep), box.yaw, wider)
+            clear &= ~np.any([touches(centres, part, wider) for part in body], axis=0)
     return clear
 
 

@@ -117,7 +117,9 @@ def resting(scene: World, sides: np.ndarray, places: np.ndarray, spare: float) -
         part = boxes[carries[number]]
         near = np.maximum(part[:, :2], low[number] + CLEARANCE) - places[number]
         far = np.minimum(part[:, 2:4], high[number] - CLEARANCE) - places[number]
-        corners = np.concatenate([near, far, np.stack([near[:, 0], far[:, 1]], 1), np.stack([far[:, 0], near[:, 1]], 1)])
+        corners = np.concatenate(
+            [near, far, np.stack([near[:, 0], far[:, 1]], 1), np.stack([far[:, 0], near[:, 1]], 1)]
+        )
         if not is_in_hull(corners, spare):
             rest[number] = np.inf
     return rest
@@ -143,7 +145,9 @@ def is_feasible(case: Case, scene: World, spare: float) -> bool:
         face = resting(scene, sides, places.reshape(-1, 2), spare).reshape(least.shape) + scene.item[2]
         at = np.argwhere(np.isfinite(face))
         turn = rotation * np.pi / 2
-        moved = np.rint(held @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) / step).astype(int)
+        moved = np.rint(held @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) / step).astype(
+            int
+        )
         for offset in moved:
             over = at + offset
             inside = ((over >= 0) & (over < shape)).all(1)
@@ -156,10 +160,18 @@ def count(case: Case, scenes: int, seed: int) -> tuple[Counter, Counter, float]:
     """Return plans by status, of the refused scenes those that are feasible, by status, and the mean seconds of a plan."""
     from pickplace.robot import planner as robot_planner
 
-    draw, planner, found, missed, seconds = np.random.default_rng(seed), Planner(case.cell, planner="joint_dbl"), Counter(), Counter(), 0.0
+    draw, planner, found, missed, seconds = (
+        np.random.default_rng(seed),
+        Planner(case.cell, planner="joint_dbl"),
+        Counter(),
+        Counter(),
+        0.0,
+    )
     robot_planner._reasons = lambda problem: {}  # most of the time of a refusal
     sizes = {name: np.multiply(getattr(case.cell, f"{name}_size")[:2], case.side) for name in ("bin", "tote")}
-    heights = {name: getattr(case.cell, f"{name}_size")[2] * case.cell.height_unit * case.side for name in ("bin", "tote")}
+    heights = {
+        name: getattr(case.cell, f"{name}_size")[2] * case.cell.height_unit * case.side for name in ("bin", "tote")
+    }
     for _ in range(scenes):
         scene = random_scene(draw, (*sizes["tote"], heights["tote"]), case.most, bin=(*sizes["bin"], heights["bin"]))
         corners = rectangle((0, 0), scene.item[:2], scene.yaw).max(0)
@@ -181,8 +193,12 @@ def count(case: Case, scenes: int, seed: int) -> tuple[Counter, Counter, float]:
 
 
 if __name__ == "__main__":
-    scenes, seed = (int(value) for value in (*sys.argv[1:], 1000, 0)[: 2]) if len(sys.argv) < 3 else map(int, sys.argv[1:3])
+    scenes, seed = (
+        (int(value) for value in (*sys.argv[1:], 1000, 0)[:2]) if len(sys.argv) < 3 else map(int, sys.argv[1:3])
+    )
     for name, case in CASES.items():
         found, missed, seconds = count(case, scenes, seed)
         refused = scenes - found["ok"]
-        print(f"{name}: {dict(found)}; refused although feasible: {dict(missed)}, {sum(missed.values()) / max(1, refused):.1%}; {1000 * seconds:.0f} ms")
+        print(
+            f"{name}: {dict(found)}; refused although feasible: {dict(missed)}, {sum(missed.values()) / max(1, refused):.1%}; {1000 * seconds:.0f} ms"
+        )

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pickplace.common.validate import excerpt, expect, size_tuple
-from pickplace.rules.gripper.shapes import Box, Mask, boxes, centred, read_shape, turned
+from pickplace.rules.gripper.shapes import Box, Mask, Polygon, boxes, centred, parts, read_shape, turned
 
 MAX_GRIPPER = 64  # greatest side of a gripper, in cells
 
@@ -147,6 +147,11 @@ class Gripper(ABC):
     def cup_mask(self) -> Mask:
         """The cells of the cup, before turning."""
         return centred(self.cup, self.cup_size or self.size, self.size)
+
+    @cached_property
+    def body_parts(self) -> tuple[Polygon, ...]:
+        """Convex polygons that cover the body, before turning, in cells from its centre: it may turn by any angle."""
+        return parts(self.body, self.size)
 
     @property
     def cup_lines(self) -> tuple[Mask, Mask]:
