@@ -31,7 +31,8 @@ class Case:
 
     cell: CellSpec
     side: float  # of a cell, m
-    most: tuple[float, float, float]  # greatest sides and height of an item, m
+    least: tuple[float, float, float]  # least sides and height of an item, m
+    most: tuple[float, float, float]
     body: float  # diameter or side
     cup: float  # diameter or side
     is_round: bool  # body and cup; a round cup seals, a square one covers the item
@@ -41,9 +42,9 @@ class Case:
 SEAL = {"effector_size": (7, 7), "body": "disc", "cup": "disc", "cup_size": (3, 3), "pick_rule": "seal"}
 WAREHOUSE = CellSpec(bin_size=(20, 20, 8), tote_size=(20, 15, 44), height_unit=0.25, **SEAL)
 CASES = {
-    "round cup": Case(WAREHOUSE, 0.02, (0.2, 0.2, 0.12), 0.12, 0.06, True),
-    "round cup, several items": Case(WAREHOUSE, 0.02, (0.18, 0.18, 0.12), 0.12, 0.06, True, 3),
-    "plate": Case(CellSpec(bin_size=(6, 6, 1), tote_size=(6, 6, 5)), 0.05, (0.14, 0.14, 0.1), 0.14, 0.14, False),
+    "round cup": Case(WAREHOUSE, 0.02, (0.07, 0.07, 0.03), (0.2, 0.2, 0.12), 0.12, 0.06, True),
+    "round cup, several items": Case(WAREHOUSE, 0.02, (0.07, 0.07, 0.03), (0.18, 0.18, 0.12), 0.12, 0.06, True, 3),
+    "plate": Case(CellSpec(bin_size=(6, 6, 1), tote_size=(6, 6, 5)), 0.05, (0.02, 0.02, 0.02), (0.14, 0.14, 0.1), 0.14, 0.14, False),
 }  # fmt: skip
 
 
@@ -100,11 +101,11 @@ def is_in_hull(points: np.ndarray, margin: float) -> bool:
     return len(points) > 0 and bool(((points @ np.stack([np.cos(angle), np.sin(angle)])).max(0) > margin).all())
 
 
-def resting(scene: World, sides: np.ndarray, places: np.ndarray, spare: float) -> np.ndarray:
+def resting(scene: World, sides: np.ndarray, places: np.ndarray, spare: float, margin: float) -> np.ndarray:
     """Return the height on which an item comes to rest at each place ``[n, 2]``; infinite where it is not stable.
 
     Nothing is higher within ``spare`` of it. What carries it counts if it is under it by the clearance, too, and its
-    centre keeps ``spare`` from the edge of that.
+    centre keeps ``spare`` and ``margin`` from the edge of that.
     """
     boxes = np.array(scene.boxes).reshape(-1, 5)
     low, high = places - sides / 2, places + sides / 2
@@ -120,7 +121,7 @@ def resting(scene: World, sides: np.ndarray, places: np.ndarray, spare: float) -
         corners = np.concatenate(
             [near, far, np.stack([near[:, 0], far[:, 1]], 1), np.stack([far[:, 0], near[:, 1]], 1)]
         )
-        if not is_in_hull(corners, spare):
+        if not is_in_hull(corners, spare + margin):
             rest[number] = np.inf
     return rest
 
@@ -142,7 +143,8 @@ def is_feasible(case: Case, scene: World, spare: float) -> bool:
     shape = np.array(least.shape)
     for rotation in range(case.cell.rotations):
         sides = np.array(scene.item[:2])[:: -1 if rotation % 2 else 1]
-        face = resting(scene, sides, places.reshape(-1, 2), spare).reshape(least.shape) + scene.item[2]
+        margin = case.cell.support.margin * case.side
+        face = resting(scene, sides, places.reshape(-1, 2), spare, margin).reshape(least.shape) + scene.item[2]
         at = np.argwhere(np.isfinite(face))
         turn = rotation * np.pi / 2
         moved = np.rint(held @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) / step).astype(
@@ -156,49 +158,56 @@ def is_feasible(case: Case, scene: World, spare: float) -> bool:
     return False
 
 
-def count(case: Case, scenes: int, seed: int) -> tuple[Counter, Counter, float]:
-    """Return plans by status, of the refused scenes those that are feasible, by status, and the mean seconds of a plan."""
-    from pickplace.robot import planner as robot_planner
-
-    draw, planner, found, missed, seconds = (
-        np.random.default_rng(seed),
-        Planner(case.cell, planner="joint_dbl"),
-        Counter(),
-        Counter(),
-        0.0,
-    )
-    robot_planner._reasons = lambda problem: {}  # most of the time of a refusal
-    sizes = {name: np.multiply(getattr(case.cell, f"{name}_size")[:2], case.side) for name in ("bin", "tote")}
-    heights = {
-        name: getattr(case.cell, f"{name}_size")[2] * case.cell.height_unit * case.side for name in ("bin", "tote")
+def random_world(case: Case, draw: np.random.Generator) -> World:
+    """Return a random scene for a cell: one item or several in the bin, and up to a dozen boxes in the tote."""
+    rooms = {
+        name: np.multiply(size, case.side) * (1, 1, case.cell.height_unit)
+        for name, size in (("bin", case.cell.bin_size), ("tote", case.cell.tote_size))
     }
+    scene = random_scene(draw, tuple(rooms["tote"]), case.most, bin=tuple(rooms["bin"]))
+    scene.item = tuple(draw.uniform(case.least, case.most))
+    corners = rectangle((0, 0), scene.item[:2], scene.yaw).max(0)
+    scene.centre = tuple(draw.uniform(corners, rooms["bin"][:2] - corners))
+    scene.add_others(draw, int(draw.integers(0, case.others + 1)), case.most)
+    return scene
+
+
+def measured(case: Case, scene: World, draw: np.random.Generator) -> Scene:
+    """Return the scene as boxes and a map with 2.5 mm a value, both with errors of height."""
+    boxes = [
+        Box(*centre, w, d, h + draw.uniform(-ACCURACY, ACCURACY), yaw) for (w, d, h), centre, yaw in scene.in_bin()
+    ]
+    shape = np.rint(np.array(scene.tote[:2]) * 400).astype(int)
+    tote = scene.tote_map(400, draw.uniform(-ACCURACY, ACCURACY, shape))
+    return Scene(boxes, tote, case.side, ACCURACY, CLEARANCE, tote_height=float(scene.tote[2]))
+
+
+def count(case: Case, scenes: int, seed: int, spare: float = 0.5) -> tuple[Counter, Counter, float]:
+    """Return plans by status, the feasible ones of the refused scenes by status, and the mean seconds of a plan.
+
+    Args:
+        spare: to everything beside the clearance, in cells.
+    """
+    draw, planner = np.random.default_rng(seed), Planner(case.cell, planner="joint_dbl")
+    found, missed, seconds = Counter(), Counter(), 0.0
     for _ in range(scenes):
-        scene = random_scene(draw, (*sizes["tote"], heights["tote"]), case.most, bin=(*sizes["bin"], heights["bin"]))
-        corners = rectangle((0, 0), scene.item[:2], scene.yaw).max(0)
-        scene.centre = tuple(draw.uniform(corners, sizes["bin"] - corners))
-        scene.add_others(draw, int(draw.integers(0, case.others + 1)), case.most)
-        boxes = [
-            Box(*centre, w, d, h + draw.uniform(-ACCURACY, ACCURACY), yaw) for (w, d, h), centre, yaw in scene.in_bin()
-        ]
-        tote = scene.tote_map(400, draw.uniform(-ACCURACY, ACCURACY, np.rint(sizes["tote"] * 400).astype(int)))
+        world = random_world(case, draw)
+        scene = measured(case, world, draw)
         start = time.perf_counter()
-        plan = planner.plan(
-            Scene(boxes, tote, case.side, ACCURACY, CLEARANCE, tote_height=scene.tote[2]), alternatives=0
-        )
+        plan = planner.plan(scene, alternatives=0)
         seconds += time.perf_counter() - start
         found[plan.status] += 1
-        if plan.status != "ok" and any(is_feasible(case, scene.taking(n), case.side / 2) for n in range(len(boxes))):
-            missed[plan.status] += 1
+        if plan.status != "ok":
+            each = range(len(scene.items))
+            missed[plan.status] += any(is_feasible(case, world.taking(number), spare * case.side) for number in each)
     return found, missed, seconds / scenes
 
 
 if __name__ == "__main__":
-    scenes, seed = (
-        (int(value) for value in (*sys.argv[1:], 1000, 0)[:2]) if len(sys.argv) < 3 else map(int, sys.argv[1:3])
-    )
+    wanted, first = map(int, (sys.argv[1:] + ["1000", "0"][len(sys.argv) - 1 :])[:2])
     for name, case in CASES.items():
-        found, missed, seconds = count(case, scenes, seed)
-        refused = scenes - found["ok"]
-        print(
-            f"{name}: {dict(found)}; refused although feasible: {dict(missed)}, {sum(missed.values()) / max(1, refused):.1%}; {1000 * seconds:.0f} ms"
+        found, missed, seconds = count(case, wanted, first)
+        share = sum(missed.values()) / max(1, wanted - found["ok"])
+        sys.stdout.write(
+            f"{name}: {dict(found)}; feasible: {dict(missed)}, {share:.1%}; {1000 * seconds:.0f} ms a plan\n"
         )
