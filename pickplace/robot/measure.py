@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
@@ -116,6 +117,16 @@ def metric_map(name: str, values, grid: Sequence[int], least: float, most: float
     # Not the opposite comparisons: all are False for NaN.
     refuse(name, ~((array >= least - ROUNDING) & (array <= most + ROUNDING)), array, " m", f"{least:g} to {most:g} m")
     return array
+
+
+def bounds_of_points(array: np.ndarray, grid: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the greatest and the least value of each patch, as :func:`patches`, of a map that was taken at points.
+
+    Each value is that of the middle of its square. An edge may pass between there and a neighbour's middle, so a square
+    has any value that it or one of its eight neighbours has. What is narrower than two squares may be missed.
+    """
+    near = sliding_window_view(np.pad(array, 1, mode="edge"), (3, 3))
+    return patches(near.max((2, 3)), grid)[0], patches(near.min((2, 3)), grid)[1]
 
 
 def patches(array: np.ndarray, grid: Sequence[int], most: int = MAX_PATCHES) -> tuple[np.ndarray, np.ndarray]:

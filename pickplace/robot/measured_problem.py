@@ -16,6 +16,7 @@ from pickplace.robot.measure import (
     ROUNDING,
     ToteMap,
     as_array,
+    bounds_of_points,
     box_of_map,
     least_height,
     metric_map,
@@ -66,6 +67,10 @@ class MeasuredProblem(Problem):
 
     def taken_items(self, actions: Tensor) -> Tensor:
         return self.taken[split_flat(self.cell, actions)[0]].clamp(min=0)
+
+    @property
+    def insets(self) -> list[tuple[int, int]]:
+        return [part.cell.item_inset for part in self.parts]
 
     def is_feasible_in_an_empty_tote(self) -> bool:
         flat = torch.zeros_like(self.tote.highest)
@@ -170,7 +175,7 @@ def _join(parts: list[MeasuredItem], items: Item) -> tuple[CellSpec, PlacingMaps
 
 
 def _inset(item: Item, sides: tuple[float, float], clearance: float) -> tuple[int, int]:
-    """Return how many cells at each edge an item, narrower by its clearance, does not cover as a whole; all in cells."""
+    """Return how many cells at each edge an item, narrower by its clearance, does not cover whole; all in cells."""
     x, y = (
         math.ceil((int(whole) - side) / 2 + clearance - ROUNDING) for whole, side in zip(item[2:4], sides, strict=True)
     )
@@ -249,7 +254,7 @@ def _read_tote(cell: CellSpec, scene: Scene, unit: float, error: float, device) 
     else:
         beyond = max(4 * scene.accuracy, 0.01)  # a floor or a rim that noise puts a little out of range
         depth = metric_map("tote_depth", scene.tote, grid, -beyond, height + beyond)
-        highest, lowest = patches(height - depth, grid)
+        highest, lowest = (patches if scene.tote_samples == "area" else bounds_of_points)(height - depth, grid)
     high, low = (whole_units(part.clip(0, None), MILLIMETRE, up) for part, up in ((highest, True), (lowest, False)))
     count = len(high) // grid[0]
     on_floor = (high <= floor_height(slack)).unflatten(0, (-1, count)).unflatten(2, (-1, count)).all(3).all(1)

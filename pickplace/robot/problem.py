@@ -62,6 +62,20 @@ class Problem:
         parts = actions.split(4096)  # a few thousand at a time, to save memory
         return torch.cat([apply(self.cell, self.state.repeat(len(part)), part).failure for part in parts])
 
+    @property
+    def insets(self) -> list[tuple[int, int]]:
+        """The ``item_inset`` of each item, see :class:`~pickplace.rules.cell.CellSpec`."""
+        return [self.cell.item_inset] * self.state.items.w.shape[1]
+
+    def hints(self) -> list[str]:
+        """Return a sentence for each item that the gripper cannot grip, wherever it lies."""
+        gripper, sides = self.cell.gripper, zip(*(part[0].tolist() for part in self.state.items[2:4]), strict=True)
+        return [
+            f"items[{number}]: {gripper.misfit}; no pick takes it."
+            for number, ((w, d), inset) in enumerate(zip(sides, self.insets, strict=True))
+            if not gripper.can_grip(w, d, inset)
+        ]
+
     def bearing_after(self, action: Tensor | None) -> Tensor:
         """Return where the tote bears weight after an action that succeeds, bool ``[W_T, D_T]``."""
         surface = self.state.surface if action is None else apply(self.cell, self.state, action).surface

@@ -41,6 +41,9 @@ class PlanRequest:
     placement_error: float | None = _key(
         "greatest distance of an item from where it is set down, in metres; default: the clearance", None, float
     )
+    tote_samples: str = _key(
+        "what a value of tote_depth in metres holds for: area, all of its square; centre, its middle", "area", str
+    )
     alternatives: int = _key("number of most probable choices reported", 10, int)
 
     @classmethod

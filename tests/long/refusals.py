@@ -41,10 +41,11 @@ class Case:
 
 SEAL = {"effector_size": (7, 7), "body": "disc", "cup": "disc", "cup_size": (3, 3), "pick_rule": "seal"}
 WAREHOUSE = CellSpec(bin_size=(20, 20, 8), tote_size=(20, 15, 44), height_unit=0.25, **SEAL)
+PLATE = CellSpec(bin_size=(6, 6, 1), tote_size=(6, 6, 5))
 CASES = {
     "round cup": Case(WAREHOUSE, 0.02, (0.07, 0.07, 0.03), (0.2, 0.2, 0.12), 0.12, 0.06, True),
     "round cup, several items": Case(WAREHOUSE, 0.02, (0.07, 0.07, 0.03), (0.18, 0.18, 0.12), 0.12, 0.06, True, 3),
-    "plate": Case(CellSpec(bin_size=(6, 6, 1), tote_size=(6, 6, 5)), 0.05, (0.02, 0.02, 0.02), (0.14, 0.14, 0.1), 0.14, 0.14, False),
+    "plate": Case(PLATE, 0.05, (0.02, 0.02, 0.02), (0.14, 0.14, 0.1), 0.14, 0.14, False),
 }  # fmt: skip
 
 
@@ -83,10 +84,8 @@ def grips(case: Case, scene: World, spare: float) -> np.ndarray:
     places = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
     turn = np.radians(scene.yaw)
     points = np.array(scene.centre) + places @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    if case.is_round:
-        reached = np.full(2, case.body / 2)
-    else:
-        reached = rectangle((0, 0), (case.body,) * 2, scene.yaw).max(0)
+    body = (case.body,) * 2
+    reached = np.divide(body, 2) if case.is_round else rectangle((0, 0), body, scene.yaw).max(0)
     inside = ((points >= reached + spare) & (points <= np.array(scene.bin[:2]) - reached - spare)).all(1)
     good = inside if h - ACCURACY < scene.bin[2] else np.ones(len(points), dtype=bool)
     for (*sides, top), centre, yaw in scene.others:

@@ -57,6 +57,8 @@ class Gripper(ABC):
         ValueError: naming the argument, the value received and what was expected.
     """
 
+    misfit = "the cup does not fit on this item"  # why an item is gripped nowhere
+
     size: tuple[int, int] = (3, 3)
     body: str | Mask = "rectangle"
     cup: str | Mask = "rectangle"
@@ -108,6 +110,11 @@ class Gripper(ABC):
             x, y = inset
             near_x, near_y, w, d = near_x + x, near_y + y, w - 2 * x, d - 2 * y
         return self.count_cells(self.shared_sides(near_x, near_y, w, d)) >= self.least_cells
+
+    def can_grip(self, w: int, d: int, inset: tuple[int, int] = (0, 0)) -> bool:
+        """Return whether an item of ``w x d`` cells is gripped anywhere on it; ``inset`` as of :meth:`is_gripped`."""
+        near_x, near_y = (torch.arange(1 - side, own) for side, own in zip((w, d), self.size, strict=True))
+        return bool(self.is_gripped(near_x[:, None], near_y, torch.tensor(w), torch.tensor(d), inset).any())
 
     def shared_sides(self, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return how many cells an item shares with each rectangle of the cup along x and y; negative beside it."""
