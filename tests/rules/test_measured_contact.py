@@ -113,3 +113,13 @@ def test_contact_that_a_shift_leaves_does_not_count():
             contact = contact_of(high, (4, 4), (4, 4), error)
             stable[strip, error] = bool(contact.is_centre_in_hull())
     assert stable == {(1, 0.0): True, (2, 0.0): True, (1, 0.25): False, (2, 0.25): True}
+
+
+@pytest.mark.parametrize(
+    ("reach", "error", "stable"), [(1, 0.0, False), (2, 0.0, True), (2, 0.25, False), (3, 0.25, True)]
+)
+def test_the_centre_keeps_the_error_and_a_patch_from_the_edge(reach, error, stable):
+    """A table ends so many patches behind the item's centre; 1.5 of them may be covered in part, and 1 is the error."""
+    high = np.zeros((16, 16), dtype=bool)
+    high[: 8 + reach] = True
+    assert bool(contact_of(high, (4, 4), (3.5, 3.5), error).is_centre_in_hull()) == stable
