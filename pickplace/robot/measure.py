@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
@@ -118,6 +119,16 @@ def metric_map(name: str, values, grid: Sequence[int], least: float, most: float
     return array
 
 
+def bounds_of_points(array: np.ndarray, grid: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the greatest and the least value of each patch, as :func:`patches`, of a map that was taken at points.
+
+    Each value is that of the middle of its square. An edge may pass between there and a neighbour's middle, so a square
+    has any value that it or one of its eight neighbours has. What is narrower than two squares may be missed.
+    """
+    near = sliding_window_view(np.pad(array, 1, mode="edge"), (3, 3))
+    return patches(near.max((2, 3)), grid)[0], patches(near.min((2, 3)), grid)[1]
+
+
 def patches(array: np.ndarray, grid: Sequence[int], most: int = MAX_PATCHES) -> tuple[np.ndarray, np.ndarray]:
     """Return the greatest and the least value of each patch of a map, with at most so many patches along a cell."""
     along, highest, lowest = array.shape[0] // grid[0], array, array
@@ -177,24 +188,26 @@ def is_inside(points: np.ndarray, centre: Sequence[float], sides: Sequence[float
     return (np.abs(away @ axes[0]) < sides[0] / 2) & (np.abs(away @ axes[1]) < sides[1] / 2)
 
 
-def touches(centres: np.ndarray, sides: Sequence[float], yaw: float, box: Box) -> np.ndarray:
-    """Return at which centres ``[P, 2]`` a rectangle overlaps a box in plan view, bool ``[P]``; an edge is no overlap.
+def rectangle(w: float, d: float, yaw: float) -> np.ndarray:
+    """Return the corners of a rectangle from its centre, counter-clockwise, ``[4, 2]``; the yaw is in degrees."""
+    return np.array([(-w, -d), (w, -d), (w, d), (-w, d)]) / 2 @ turned_axes(math.radians(yaw))
 
-    Two rectangles are apart if they are along one of their four axes.
+
+def touches(centres: np.ndarray, corners: np.ndarray, box: Box) -> np.ndarray:
+    """Return at which centres ``[P, 2]`` a convex polygon overlaps a box in plan view, bool ``[P]``; an edge does not.
+
+    Two convex polygons are apart if they are along the normal of one of their sides.
 
     Args:
-        sides, yaw: of the rectangle; m, degrees.
+        corners: of the polygon from its centre, counter-clockwise, ``[n, 2]``; m.
     """
-    # The vectors from a centre to the middles of two sides, of each rectangle.
-    halves = np.concatenate(
-        [
-            np.divide(each, 2)[:, None] * turned_axes(math.radians(turn))
-            for each, turn in ((sides, yaw), ((box.w, box.d), box.yaw))
-        ]
-    )
-    axes = halves / np.linalg.norm(halves, axis=1, keepdims=True)
-    reach = np.abs(axes @ halves.T).sum(1)
-    return (np.abs((centres - (box.x, box.y)) @ axes.T) < reach - ROUNDING).all(1)
+    other, away, apart = rectangle(box.w, box.d, box.yaw), centres - (box.x, box.y), np.zeros(len(centres), dtype=bool)
+    for one, next_one, sign in ((corners, other, 1), (other, corners, -1)):
+        edges = np.roll(one, -1, 0) - one
+        normals = np.stack([edges[:, 1], -edges[:, 0]]) / np.hypot(*edges.T)  # [2, n], outwards
+        gap = (next_one @ normals).min(0) - (one.T * normals).sum(0) - sign * (away @ normals)  # [P, n]
+        apart |= (gap > -ROUNDING).any(1)
+    return ~apart
 
 
 def refuse_stacked(boxes: list[Box], tolerance: float) -> None:
@@ -214,7 +227,7 @@ def refuse_stacked(boxes: list[Box], tolerance: float) -> None:
     for index, (number, box) in enumerate(seen):
         for other_number, other in seen[:index]:
             refuse_if(
-                touches(np.array([[box.x, box.y]]), (box.w, box.d), box.yaw, other).any(),
+                touches(np.array([[box.x, box.y]]), rectangle(box.w, box.d, box.yaw), other).any(),
                 f"items[{number}] overlaps items[{other_number}] in plan view; expected items that stand side by side "
                 "on the bin's floor, none on another.",
                 DepthMapError,

@@ -17,6 +17,7 @@ from pickplace.robot.measure import (
     ROUNDING,
     ToteMap,
     as_array,
+    bounds_of_points,
     box_of_map,
     least_height,
     metric_map,
@@ -29,10 +30,9 @@ from pickplace.robot.measure import (
 )
 from pickplace.robot.problem import Problem, check_longest, is_excluded, join_items, read_bearing
 from pickplace.robot.scene import BinMap, Scene
-from pickplace.rules.bin import taken_item
 from pickplace.rules.cell import MAX_SIDE, CellSpec
 from pickplace.rules.checks import is_within_reach
-from pickplace.rules.grasps import carry, footprint_index
+from pickplace.rules.grasps import all_grasps, carry, footprint_index, split_flat
 from pickplace.rules.gripper.base import effector_centre, reference_cell
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR
@@ -64,6 +64,14 @@ class MeasuredProblem(Problem):
 
     parts: list[MeasuredItem]
     tote: MeasuredTote
+    taken: Tensor  # int64 [P], see `_taken_items`
+
+    def taken_items(self, actions: Tensor) -> Tensor:
+        return self.taken[split_flat(self.cell, actions)[0]].clamp(min=0)
+
+    @property
+    def insets(self) -> list[tuple[int, int]]:
+        return [part.cell.item_inset for part in self.parts]
 
     def is_feasible_in_an_empty_tote(self) -> bool:
         flat = torch.zeros_like(self.tote.highest)
@@ -105,31 +113,21 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
     """Return the problem of a scene in metres; arguments and errors as of :meth:`Planner.plan`."""
     cell_size = cast(float, scene.cell_size)
     boxes, clearance = _read_boxes(cell, scene, cell_size)
-    tote = _read_tote(cell, scene, cell_size * cell.height_unit, device)
+    error = clearance if scene.placement_error is None else scene.placement_error
+    tote = _read_tote(cell, scene, cell_size * cell.height_unit, error / cell_size, device)
     each = [_on_grid(cell, box, cell_size, clearance, f"items[{index}]", device) for index, box in enumerate(boxes)]
     items, sides = join_items(each), [(box.w / cell_size, box.d / cell_size) for box in boxes]
-    # Cells at each edge that an item, narrower by its clearance, does not cover as a whole.
-    inset_x, inset_y = (
-        max(
-            math.ceil((int(item[2 + axis]) - side[axis]) / 2 + clearance / cell_size - ROUNDING)
-            for item, side in zip(each, sides, strict=True)
-        )
-        for axis in (0, 1)
-    )
     free = replace(
         cell,
         bin_size=(*cell.bin_size[:2], 1),
         tote_size=(*cell.tote_size[:2], tote.height),
         height_unit=MILLIMETRE / cell_size,
         bin_items=1,
-        item_inset=(inset_x, inset_y),
         longest_side=cell.longest_side
         or (None if cell.has_known_offsets else max(int(side) for item in each for side in item[2:4])),
     )
-    # Each item has a grid of its own. A pick cell that grips several stands for the highest, as on the grid.
-    pick = torch.arange(free.num_picks, device=device)
-    in_each = items.map(lambda part: part.expand(len(pick), -1))
-    taken = taken_item(free, in_each, pick // free.bin_size[1], pick % free.bin_size[1])
+    insets = [_inset(item, side, clearance / cell_size) for item, side in zip(each, sides, strict=True)]
+    taken = _taken_items(free, each, insets)
     parts = []
     for index, (box, item) in enumerate(zip(boxes, each, strict=True)):
         grip = int(item.h) + tote.accuracy
@@ -140,7 +138,7 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
         limits = _limits(cell, free, bin_clear, centres / cell_size, grip, 2 * tote.accuracy)
         allowed = torch.from_numpy(~is_excluded(exclude, centres, cell_size)).to(device)
         limits = replace(limits, pick_ok=limits.pick_ok & (taken == index) & allowed)
-        limited = replace(free, reach=limits)
+        limited = replace(free, reach=limits, item_inset=insets[index])
         measured = measured_maps(limited, tote, item, sides[index])
         parts.append(MeasuredItem(limits, limited, measured, sides[index], bin_clear, centres, grip * MILLIMETRE))
     joint, maps = _join(parts, items)
@@ -152,12 +150,15 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
     seen = State(surface_from(heights, tote.bears[None]), torch.tensor([seen_rim], device=device), seen_items)
     return MeasuredProblem(
         cell=joint, state=state, seen=seen, maps=maps, boxes=boxes, side=cell_size, unit=MILLIMETRE,
-        release=2 * tote.accuracy * MILLIMETRE, parts=parts, tote=tote,
+        release=2 * tote.accuracy * MILLIMETRE, parts=parts, tote=tote, taken=taken,
     )  # fmt: skip
 
 
 def _join(parts: list[MeasuredItem], items: Item) -> tuple[CellSpec, PlacingMaps]:
-    """Return the cell and the maps of all items ``[1, M]``; of several the maps forbid the picks out of reach."""
+    """Return the cell and the maps of all items ``[1, M]``; of several the maps forbid the picks that fail.
+
+    The cell's inset is the least of any item: it must not exclude a pick that grips another one.
+    """
     cell, each = parts[0].cell, [part.measured.maps for part in parts]
     if len(parts) == 1:
         return cell, each[0]
@@ -167,7 +168,27 @@ def _join(parts: list[MeasuredItem], items: Item) -> tuple[CellSpec, PlacingMaps
     blocked = ~torch.stack([part.limits.pick_ok for part in parts])
     maps = each[0]._replace(**joined, item=items.rows(0), blocked=blocked, bin_items=len(parts))
     reach = replace(parts[0].limits, pick_ok=torch.ones_like(blocked[0]))
-    return replace(cell, reach=reach, bin_items=len(parts)), maps
+    inset_x, inset_y = (min(side) for side in zip(*(part.cell.item_inset for part in parts), strict=True))
+    return replace(cell, reach=reach, bin_items=len(parts), item_inset=(inset_x, inset_y)), maps
+
+
+def _inset(item: Item, sides: tuple[float, float], clearance: float) -> tuple[int, int]:
+    """Return how many cells at each edge an item, narrower by its clearance, does not cover whole; all in cells."""
+    x, y = (
+        math.ceil((int(whole) - side) / 2 + clearance - ROUNDING) for whole, side in zip(item[2:4], sides, strict=True)
+    )
+    return x, y
+
+
+def _taken_items(cell: CellSpec, items: list[Item], insets: list[tuple[int, int]]) -> Tensor:
+    """Return the number of the item that each pick cell takes, int64 ``[P]``; -1 if it grips none.
+
+    Each item has a grid of its own. A pick cell that grips several stands for the highest, as on the grid.
+    """
+    free = replace(cell, reach=None)
+    lifted = [all_grasps(replace(free, item_inset=own), item)[0] for item, own in zip(items, insets, strict=True)]
+    height = torch.where(torch.cat(lifted), torch.cat([item.h for item in items])[:, None], 0)  # [M, P]
+    return torch.where(height.any(0), height.argmax(0), -1)
 
 
 def _effector_centres(cell: CellSpec, item: Item, box: Box, side: float) -> np.ndarray:
@@ -215,8 +236,13 @@ def _read_boxes(cell: CellSpec, scene: Scene, side: float) -> tuple[list[Box], f
     return boxes, clearance
 
 
-def _read_tote(cell: CellSpec, scene: Scene, unit: float, device) -> MeasuredTote:
-    """Return the tote, in millimetres; ``unit`` is the length of a height unit, in metres."""
+def _read_tote(cell: CellSpec, scene: Scene, unit: float, error: float, device) -> MeasuredTote:
+    """Return the tote, in millimetres.
+
+    Args:
+        unit: length of a height unit, m.
+        error: greatest distance of an item from where a plan sets it down, in cells.
+    """
     grid, slack, height = cell.tote_size[:2], math.ceil(scene.accuracy / MILLIMETRE - ROUNDING), scene.tote_height
     if height is None:
         height = number("tote_height", cell.tote_size[2] * unit, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
@@ -226,14 +252,14 @@ def _read_tote(cell: CellSpec, scene: Scene, unit: float, device) -> MeasuredTot
     else:
         beyond = max(4 * scene.accuracy, 0.01)  # a floor or a rim that noise puts a little out of range
         depth = metric_map("tote_depth", scene.tote, grid, -beyond, height + beyond)
-        highest, lowest = patches(height - depth, grid)
+        highest, lowest = (patches if scene.tote_samples == "area" else bounds_of_points)(height - depth, grid)
     high, low = (whole_units(part.clip(0, None), MILLIMETRE, up) for part, up in ((highest, True), (lowest, False)))
     count = len(high) // grid[0]
     on_floor = (high <= floor_height(slack)).unflatten(0, (-1, count)).unflatten(2, (-1, count)).all(3).all(1)
     # One value a cell does not tell whether the cell is level.
     is_unknown = scene.tote_bearing is None and count == 1
     bears = on_floor if is_unknown else read_bearing(cell, scene.tote_bearing, on_floor).bool()
-    return MeasuredTote(high.to(device), low.to(device), bears.to(device), rim, over_rim, slack)
+    return MeasuredTote(high.to(device), low.to(device), bears.to(device), rim, over_rim, slack, error)
 
 
 def _on_grid(cell: CellSpec, box: Box, cell_size: float, clearance: float, name: str, device) -> Item:
@@ -259,8 +285,8 @@ def _clear_picks(
 ) -> np.ndarray:
     """Return at which of its centres ``[P, 2]`` the end effector hits nothing in the bin, bool ``[P]``.
 
-    The rectangle around it decides, which is turned with the item. It misses the bin's walls, or passes over them. It
-    touches no other box, wider by the clearance, that may be as high; boxes that are clearly lower are ignored.
+    Its body decides, which is turned with the item. It misses the bin's walls, or passes over them. It touches no other
+    box, wider by the clearance, that may be as high; boxes that are clearly lower are ignored.
 
     Args:
         index: of the item that is picked, among the boxes.
@@ -268,15 +294,15 @@ def _clear_picks(
     box = boxes[index]
     if isinstance(box, HiddenBox):
         return np.zeros(len(centres), dtype=bool)
-    turn, (wide, deep) = math.radians(box.yaw), (size * side for size in cell.gripper.size)
-    cos, sin, far = abs(math.cos(turn)), abs(math.sin(turn)), np.array(cell.bin_size[:2]) * side
-    reach = np.array([wide / 2 * cos + deep / 2 * sin, wide / 2 * sin + deep / 2 * cos])
-    clear = ((centres >= reach - ROUNDING) & (centres <= far - reach + ROUNDING)).all(1)
+    far, axes = np.array(cell.bin_size[:2]) * side, turned_axes(math.radians(box.yaw))
+    body = [np.array(part) * side @ axes for part in cell.gripper.body_parts]
+    corners = np.concatenate(body)
+    clear = ((centres + corners.min(0) >= -ROUNDING) & (centres + corners.max(0) <= far + ROUNDING)).all(1)
     clear |= box.h - accuracy >= cell.bin_size[2] * (side * cell.height_unit) - ROUNDING
     for other in boxes[:index] + boxes[index + 1 :]:
         if other.h + accuracy >= box.h - accuracy - ROUNDING:
             wider = replace(other, w=other.w + 2 * clearance, d=other.d + 2 * clearance)
-            clear &= ~touches(centres, (wide, deep), box.yaw, wider)
+            clear &= ~np.any([touches(centres, part, wider) for part in body], axis=0)
     return clear
 
 

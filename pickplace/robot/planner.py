@@ -9,7 +9,7 @@ seen from above.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Literal
 
@@ -87,6 +87,9 @@ class Plan:
     warnings: list[str]  #: what lies outside the policy's training
     #: of the item that is taken, from 0: in ``items``, or among the ascending labels; None if none is taken
     item_number: int | None = None
+    #: if stuck or impossible: a sentence for each item that the gripper cannot grip, wherever it lies; such as
+    #: "items[1]: the cup does not fit on this item; no pick takes it."
+    hints: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict:
         """Return the plan as plain values, ready for JSON."""
@@ -201,6 +204,7 @@ class Planner:
             tote_bearing=bearing.int().tolist() if self.cell.support.marks_bearing else None,
             warnings=[] if self.training is None else self.training.warnings(self.cell, problem.seen.items),
             item_number=number,
+            hints=problem.hints() if status in ("stuck", "impossible") else [],
         )
 
     def _planner_of(self, count: int, is_metric: bool) -> tuple[MapPlanner, Mapping[str, Term]]:

@@ -86,6 +86,20 @@ class Problem(ABC):
         parity = rotation % 2 * (item.w != item.d)  # masks have a square footprint under parity 0
         return number * self.cell.num_footprints + footprint_index(self.cell.tote_size, parity, x, y)
 
+    @property
+    def insets(self) -> list[tuple[int, int]]:
+        """The ``item_inset`` of each item, see :class:`~pickplace.rules.cell.CellSpec`."""
+        return [self.cell.item_inset] * self.state.items.w.shape[1]
+
+    def hints(self) -> list[str]:
+        """Return a sentence for each item that the gripper cannot grip, wherever it lies."""
+        gripper, sides = self.cell.gripper, zip(*(part[0].tolist() for part in self.state.items[2:4]), strict=True)
+        return [
+            f"items[{number}]: {gripper.misfit}; no pick takes it."
+            for number, ((w, d), inset) in enumerate(zip(sides, self.insets, strict=True))
+            if not gripper.can_grip(w, d, inset)
+        ]
+
     def motion(self, action: Tensor) -> tuple[Pose, Pose, float, float]:
         """Return the poses at pick and place, the turn in degrees, and the height of the item's underside at rest."""
         x_bin, y_bin, x_tote, y_tote, rotation = (int(part) for part in split_action(self.cell, action))

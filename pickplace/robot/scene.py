@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from pickplace.common.validate import excerpt, integral_number, is_number, number, refuse_if
+from pickplace.common.validate import excerpt, integral_number, is_number, number, one_of, refuse_if
 from pickplace.robot.box import ACCURACY, CLEARANCE, MILLIMETRE, Box, DepthMapError
 from pickplace.robot.camera import Camera
 from pickplace.robot.measure import ToteMap
@@ -43,6 +43,12 @@ class Scene:
     cell_size: float | None = None  #: side of a cell, m; None: maps of whole cells
     accuracy: float = ACCURACY  #: greatest error of a measured height, m
     clearance: float = CLEARANCE  #: least distance that an item keeps from what stands beside it, on each side; m
+    #: greatest distance of an item from where the robot sets it down, in any direction, at most ``clearance``; m; None:
+    #: the clearance. What carries an item counts if it carries it wherever it is then
+    placement_error: float | None = None
+    #: what a value of a map of the tote in metres holds for, to within ``accuracy``: ``"area"``, all of its square; or
+    #: ``"centre"``, the point in the middle of it
+    tote_samples: str = "area"
     tote_height: float | None = None  #: height of the tote's rim above its floor; None: that of ``cell.tote_size``
     #: with ``support="bearing"``, ``[W_T, D_T]``, 1 where a cell bears weight, else 0: what the plan before this one
     #: returned; None: every cell bears weight. In metres, of a map with one value a cell, only the floor does then:
@@ -52,6 +58,14 @@ class Scene:
     def __post_init__(self):
         number("accuracy", self.accuracy, 0, 0.1, "metres")
         number("clearance", self.clearance, 0, 0.1, "metres")
+        one_of("tote_samples", self.tote_samples, ("area", "centre"))
+        if self.placement_error is not None:
+            number("placement_error", self.placement_error, 0, 0.1, "metres")
+            refuse_if(
+                self.placement_error > self.clearance,
+                f"placement_error={self.placement_error:g}: expected at most clearance={self.clearance:g} m, which the "
+                "item keeps from what stands beside it.",
+            )
         if self.cell_size is not None:
             number("cell_size", self.cell_size, 1e-3, 10, "metres")
         elif not isinstance(self.items, BinMap) or isinstance(self.tote, ToteMap):

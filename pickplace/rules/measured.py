@@ -45,6 +45,7 @@ class MeasuredTote(NamedTuple):
     height: int  # of the rim, rounded down: no item may be higher
     rim: int  # of the rim, rounded up: the end effector passes over it
     accuracy: int  # greatest error of a height
+    placement_error: float  # greatest distance of an item from where a plan sets it down, in cells
 
     def state(self, cell: CellSpec, item: Item, slack: int = 0) -> State:
         """Return the state on the grid, with the greatest height of each cell; all lower by ``slack``."""
@@ -92,33 +93,48 @@ def _contact(
 ) -> Patches:
     """Return what supports an item of ``sides`` in the middle of footprints ``[W, D]`` that rest on heights ``z``."""
     count, shape, device = tote.highest.shape[0] // cell.tote_size[0], tuple(z.shape), z.device
+    error, sizes = tote.placement_error * count, list(zip(footprint, sides, strict=True))
     spans = [
         (math.ceil((size - side) / 2 * count - 1e-6), math.floor((size + side) / 2 * count + 1e-6))
-        for size, side in zip(footprint, sides, strict=True)
+        for size, side in sizes
     ]
     (x0, x1), (y0, y1) = spans
-    if x1 <= x0 or y1 <= y0:  # an item that is narrower than a patch
-        none = torch.zeros(0, dtype=torch.int64, device=device)
-        along = torch.zeros(DIRECTIONS, 0, dtype=torch.float64, device=device)
-        return Patches(none.bool().expand(*shape, 0), along, none, count)
-    near = [torch.arange(*span, dtype=torch.float64, device=device) for span in spans]
-    under = tote.lowest[x0:, y0:].unfold(0, x1 - x0, count).unfold(1, y1 - y0, count)[: shape[0], : shape[1]]
+    near = [torch.arange(begin, max(begin, end), dtype=torch.float64, device=device) for begin, end in spans]
     number = [(part.long() // count) for part in near]
-    cells = (number[0][:, None] * footprint[1] + number[1]).flatten()
-    # A cell bears weight, or not, as a whole.
-    x, y = (torch.arange(size, device=device)[:, None] + part for size, part in zip(shape, number, strict=True))
-    bears = tote.bears[x[:, None, :, None], y[None, :, None, :]].flatten(2)
-    supports = (under.flatten(2) >= (z - level_step(tote.accuracy))[..., None]) & bears
+    supports = torch.zeros(*shape, math.prod(map(len, near)), dtype=torch.bool, device=device)
+    if supports.numel():  # else the item is narrower than a patch
+        under = tote.lowest[x0:, y0:].unfold(0, x1 - x0, count).unfold(1, y1 - y0, count)[: shape[0], : shape[1]]
+        # A cell bears weight, or not, as a whole.
+        x, y = (torch.arange(size, device=device)[:, None] + part for size, part in zip(shape, number, strict=True))
+        bears = tote.bears[x[:, None, :, None], y[None, :, None, :]].flatten(2)
+        supports = (under.flatten(2) >= (z - level_step(tote.accuracy))[..., None]) & bears
     angle = torch.arange(DIRECTIONS, dtype=torch.float64, device=device) * (2 * math.pi / DIRECTIONS)
     begins = (part - size * count / 2 for part, size in zip(near, footprint, strict=True))
     along_x, along_y = (
         torch.maximum(begin * direction[:, None], (begin + 1) * direction[:, None])
         for begin, direction in zip(begins, (angle.cos(), angle.sin()), strict=True)
     )
-    along = (along_x[:, :, None] + along_y[:, None, :]).flatten(1)
-    slack = math.hypot(*sides) * count / 2 * math.sin(math.pi / DIRECTIONS)
-    touched = math.prod(side * count for side in sides)
-    return Patches(supports, along, cells, count, slack, touched, min(x1 - x0, y1 - y0))
+    edges = [(size - side) / 2 * count for size, side in sizes]
+    uncovered = [
+        torch.stack([edge + error - part, part + 1 - (size * count - edge - error)]).clamp(0, 1).round(decimals=6)
+        for part, edge, size in zip(near, edges, footprint, strict=True)
+    ]
+    # Of each half of a side, the part that the item covers whatever the shift must hold a whole patch.
+    quartered = all(
+        math.ceil(size * count / 2 + error - 1e-6) < math.floor((size + side) / 2 * count - error + 1e-6)
+        for size, side in sizes
+    )
+    return Patches(
+        supports=supports,
+        along=(along_x[:, :, None] + along_y[:, None, :]).flatten(1),
+        cells=(number[0][:, None] * footprint[1] + number[1]).flatten(),
+        per_cell=count,
+        slack=math.hypot(*sides) * count / 2 * math.sin(math.pi / DIRECTIONS),
+        touched=math.prod(side * count for side in sides),
+        error=error,
+        uncovered=(uncovered[0], uncovered[1]),
+        quartered=quartered,
+    )
 
 
 def _oriented(item: Item, sides: tuple[float, float], parity: int) -> tuple[tuple[int, int], tuple[float, float]]:
@@ -162,8 +178,7 @@ def bearing_after(
     flags = contact.supports[0, 0]
     held = torch.ones_like(flags)
     if not flags.all() and int(z) > floor_height(tote.accuracy):
-        reached = torch.where(flags, contact.along, -FAR).amax(1, keepdim=True)
-        held = (contact.along <= reached + 1e-9).all(0)
+        held = contact.in_hull()
     # A cell bears weight if all patches of it that are under the item do; one value a cell must cover it.
     bears = torch.zeros(size, dtype=torch.bool, device=flags.device)
     bears.view(-1).index_fill_(0, contact.cells, True).index_fill_(0, contact.cells[~held], False)

@@ -83,6 +83,12 @@ class PlanRequest:
     cell_size: float | None = _key("side of a cell, if the lengths are in metres; m", None, float)
     accuracy: float = _key("greatest error of a measured height; m", ACCURACY, float)
     clearance: float = _key("least distance from what stands beside the item; m", CLEARANCE, float)
+    placement_error: float | None = _key(
+        "greatest distance of an item from where it is set down; m; default: the clearance", None, float
+    )
+    tote_samples: str = _key(
+        "what a value of tote_depth in metres holds for: area, all of its square; centre, its middle", "area", str
+    )
     alternatives: int = _key("number of most probable choices reported", 10, int)
     deadline: float = _key("greatest time until the answer, waiting included; s", DEADLINE, float)
 

@@ -157,8 +157,10 @@ def rectangle(centre, sides, yaw) -> np.ndarray:
     return np.array(centre) + half @ axes
 
 
-def fault(scene: World, plan, accuracy: float = 0.002) -> str | None:
-    """The first thing that goes wrong when a robot does exactly as the plan says; None if nothing does.
+def fault(scene: World, plan, accuracy: float = 0.002, error: float = 0.005) -> str | None:
+    """The first thing that goes wrong when a robot does as the plan says; None if nothing does.
+
+    It may set the item down by ``error`` off its place.
 
     What lies further below the highest thing under an item than heights may be wrong does not carry it.
     """
@@ -206,20 +208,28 @@ def fault(scene: World, plan, accuracy: float = 0.002) -> str | None:
         return "the effector hits an item"
     if place[2] < scene.tote[2] - EPSILON and not within(effector, scene.tote):
         return "the effector hits the tote's wall"
-    # Support.
-    level = rest - 4 * accuracy - 0.002
-    if level > 0:  # else the floor does, too
-        touching = [box for box in below if box[4] >= level]
-        points = np.concatenate([
-            [(max(x0, low[0]), max(y0, low[1])), (max(x0, low[0]), min(y1, high[1])),
-             (min(x1, high[0]), max(y0, low[1])), (min(x1, high[0]), min(y1, high[1]))]
-            for x0, y0, x1, y1, _ in touching
-        ])  # fmt: skip
-        angles = np.linspace(0, 2 * np.pi, 720, endpoint=False)
-        reach = (points - (low + high) / 2) @ np.stack([np.cos(angles), np.sin(angles)])
-        if (reach.max(0) < -1e-4).any():
+    # Support, of the item in its place and off it in any direction.
+    angles = np.arange(8) * np.pi / 4
+    for shift in ((0, 0), *(error * np.stack([np.cos(angles), np.sin(angles)], -1))):
+        if overhangs(scene.boxes, low + shift, high + shift, 4 * accuracy + 0.002):
             return "the item's centre overhangs"
     return None
+
+
+def overhangs(boxes, low, high, step: float) -> bool:
+    """Whether the centre of an item is beside the hull of what carries it: all up to a step below the highest."""
+    below = [box for box in boxes if overlaps(box, low, high)]
+    level = max([top for *_, top in below], default=0.0) - step
+    if level <= 0:  # the floor does, too
+        return False
+    points = np.concatenate([
+        [(max(x0, low[0]), max(y0, low[1])), (max(x0, low[0]), min(y1, high[1])),
+         (min(x1, high[0]), max(y0, low[1])), (min(x1, high[0]), min(y1, high[1]))]
+        for x0, y0, x1, y1, top in below if top >= level
+    ])  # fmt: skip
+    angles = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    reach = (points - (low + high) / 2) @ np.stack([np.cos(angles), np.sin(angles)])
+    return bool((reach.max(0) < -1e-4).any())
 
 
 def over_the_tote(scene: World, plan) -> list[np.ndarray]:

@@ -180,6 +180,9 @@ BAD = [
     (boxes(replace(BOX, w=0.25)), "items[0].w=0.25: with its clearance it takes 6 cells; expected at most 5"),
     ({"accuracy": -1}, "accuracy=-1: expected metres between 0 and 0.1"),
     ({"clearance": 2}, "clearance=2: expected metres between 0 and 0.1"),
+    ({"placement_error": -1}, "placement_error=-1: expected metres between 0 and 0.1"),
+    ({"placement_error": 0.006}, "placement_error=0.006: expected at most clearance=0.005 m, which"),
+    ({"tote_samples": "middle"}, "tote_samples='middle': expected 'area' or 'centre'"),
     ({"cell_size": 0.05, "tote_height": 3}, "tote_height=3: expected metres between 0.001 and 2"),
     ({"cell_size": "5cm"}, "cell_size='5cm': expected metres"),
     ({"cell_size": 1e-320}, "cell_size=1e-320: expected metres between 0.001 and 10"),
@@ -190,7 +193,7 @@ BAD = [
 
 
 #: What is wrong with every image: no DepthMapError, after which a robot takes another one.
-SETTINGS = ("accuracy", "clearance", "cell_size", "tote_height", "alternatives")
+SETTINGS = ("accuracy", "clearance", "placement_error", "tote_samples", "cell_size", "tote_height", "alternatives")
 HALVES = [
     (
         {"tote_depth": EMPTY * 1.1},

@@ -232,7 +232,7 @@ def test_rectangles_touch_as_polygons_do(seed, near):
     expected = [
         meet(rectangle(centre, sides, yaws[1]), rectangle((box.x, box.y), (w, d), box.yaw)) for centre in centres
     ]
-    assert touches(centres, sides, yaws[1], box).tolist() == expected
+    assert touches(centres, rectangle((0, 0), sides, yaws[1]), box).tolist() == expected
 
 
 def test_an_action_means_one_item():
@@ -240,7 +240,10 @@ def test_an_action_means_one_item():
     cell, draw, several = CellSpec(bin_size=(5, 5, 1)), np.random.default_rng(0), 0
     for _ in range(100):
         boxes = [Box(*draw.uniform(0.02, 0.23, 2), 0.02, 0.02, h, draw.uniform(-45, 45)) for h in (0.05, 0.1, 0.07)]
-        if any(touches(np.array([[a.x, a.y]]), (a.w, a.d), a.yaw, b).any() for a, b in combinations(boxes, 2)):
+        if any(
+            touches(np.array([[a.x, a.y]]), rectangle((0, 0), (a.w, a.d), a.yaw), b).any()
+            for a, b in combinations(boxes, 2)
+        ):
             continue
         problem = read_metric(cell, Scene(boxes, FLAT["tote_depth"], CELL, NOISE), torch.device("cpu"))
         lifted = all_grasps(problem.cell, problem.maps.item, problem.maps.blocked)[0]  # [M, P]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pickplace.common.validate import excerpt, expect, size_tuple
-from pickplace.rules.gripper.shapes import Box, Mask, boxes, centred, read_shape, turned
+from pickplace.rules.gripper.shapes import Box, Mask, Polygon, boxes, centred, parts, read_shape, turned
 
 MAX_GRIPPER = 64  # greatest side of a gripper, in cells
 
@@ -56,6 +56,8 @@ class Gripper(ABC):
     Raises:
         ValueError: naming the argument, the value received and what was expected.
     """
+
+    misfit = "the cup does not fit on this item"  # why an item is gripped nowhere
 
     size: tuple[int, int] = (3, 3)
     body: str | Mask = "rectangle"
@@ -109,6 +111,11 @@ class Gripper(ABC):
             near_x, near_y, w, d = near_x + x, near_y + y, w - 2 * x, d - 2 * y
         return self.count_cells(self.shared_sides(near_x, near_y, w, d)) >= self.least_cells
 
+    def can_grip(self, w: int, d: int, inset: tuple[int, int] = (0, 0)) -> bool:
+        """Return whether an item of ``w x d`` cells is gripped anywhere on it; ``inset`` as of :meth:`is_gripped`."""
+        near_x, near_y = (torch.arange(1 - side, own) for side, own in zip((w, d), self.size, strict=True))
+        return bool(self.is_gripped(near_x[:, None], near_y, torch.tensor(w), torch.tensor(d), inset).any())
+
     def shared_sides(self, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return how many cells an item shares with each rectangle of the cup along x and y; negative beside it."""
 
@@ -147,6 +154,11 @@ class Gripper(ABC):
     def cup_mask(self) -> Mask:
         """The cells of the cup, before turning."""
         return centred(self.cup, self.cup_size or self.size, self.size)
+
+    @cached_property
+    def body_parts(self) -> tuple[Polygon, ...]:
+        """Convex polygons that cover the body, before turning, in cells from its centre: it may turn by any angle."""
+        return parts(self.body, self.size)
 
     @property
     def cup_lines(self) -> tuple[Mask, Mask]:

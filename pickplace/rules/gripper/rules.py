@@ -14,6 +14,7 @@ class Contain(Gripper):
     """Grips an item that the cup covers as a whole, whatever part of its edge is uncertain."""
 
     least_cells = 1
+    misfit = "the cup does not cover this item"
 
     @property
     def largest_item(self) -> tuple[int, int]:

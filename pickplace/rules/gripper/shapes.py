@@ -3,6 +3,7 @@
 A mask is a tuple of columns, ``mask[x][y]``, of 0 and 1. Plain integers: no tensor is needed before masks are used.
 """
 
+import math
 from collections.abc import Sequence
 from itertools import groupby
 from typing import Any, NamedTuple
@@ -10,6 +11,9 @@ from typing import Any, NamedTuple
 from pickplace.common.validate import expect
 
 Mask = tuple[tuple[int, ...], ...]
+Polygon = tuple[tuple[float, float], ...]  # its corners, counter-clockwise
+
+DISC_SIDES = 32  # of the polygon around a disc: 0.5% wider than it
 
 
 class Box(NamedTuple):
@@ -84,3 +88,20 @@ def _runs(column: Sequence[int]) -> list[tuple[int, int]]:
     """Return where the runs of ones begin, and their lengths."""
     groups = (list(group) for _, group in groupby(enumerate(column), key=lambda entry: entry[1]))
     return [(group[0][0], len(group)) for group in groups if group[0][1]]
+
+
+def parts(shape: str | Mask, size: tuple[int, int]) -> tuple[Polygon, ...]:
+    """Return convex polygons that cover a shape of ``size``, in cells from the middle of it.
+
+    Those of a mask are its rectangles. Around a disc there is one polygon, which touches the same sides of ``size``.
+    """
+    wide, deep = size
+    if shape == "disc":
+        angles = [2 * math.pi * (number + 0.5) / DISC_SIDES for number in range(DISC_SIDES)]
+        reach = 0.5 / math.cos(math.pi / DISC_SIDES)
+        return (tuple((reach * wide * math.cos(angle), reach * deep * math.sin(angle)) for angle in angles),)
+    corners = ((0, 0), (1, 0), (1, 1), (0, 1))
+    return tuple(
+        tuple((box.x + box.width * x - wide / 2, box.y + box.depth * y - deep / 2) for x, y in corners)
+        for box in boxes(centred(shape, size, size))
+    )

@@ -133,48 +133,92 @@ class Contact:
 class Patches:
     """The patches of a measured surface that are wholly under an item, for each place of it.
 
+    The item may be set down off its place by an error, in any direction. A patch counts only if it is under the item
+    all the same; the surface stays where it is, and the item's centre moves.
+
     Args:
-        supports: whether they carry the item, bool ``[W, D, patches]``.
+        supports: whether they carry the item, bool ``[W, D, patches]``; the patches are those of a rectangle of
+            ``[X, Y]``, row by row.
         along: how far a patch reaches from the item's centre in each direction, float64 ``[directions, patches]``.
         cells: cell of the footprint in which each patch lies, row by row, int64 ``[patches]``.
         per_cell: number of patches along a side of a cell.
         slack: by which a direction between two others may differ, in patches.
         touched: number of patches that the item covers, in part too.
-        fewest: number of patches along its shorter side.
+        error: greatest distance of the item from its place, in patches.
+        uncovered: share of each row and of each line of patches that an error to either side leaves uncovered, float64
+            ``[2, X]`` and ``[2, Y]``.
+        quartered: whether each quarter of the item has a whole patch in it, whatever the error.
     """
 
     #: Least distance of an item's centre from the hull's edge, in patches: as far as a patch may be covered in part.
     MARGIN = 1.5
 
-    def __init__(self, supports: Tensor, along: Tensor, cells: Tensor, per_cell: int, slack=0.0, touched=1.0, fewest=0):
+    def __init__(
+        self, supports: Tensor, along: Tensor, cells: Tensor, per_cell: int, slack: float, touched: float,
+        error: float, uncovered: tuple[Tensor, Tensor], quartered: bool,
+    ):  # fmt: skip
         self.supports, self.along, self.cells, self.per_cell = supports, along, cells, per_cell
-        self.slack, self.touched, self.fewest = slack, touched, fewest
+        self.slack, self.touched, self.error, self.quartered = slack, touched, error, quartered
+        self.uncovered, self.always = uncovered, [(part == 0).all(0) for part in uncovered]
         self._inside: dict[float, Tensor] = {}
+
+    @cached_property
+    def robust(self) -> tuple[Tensor, Tensor]:
+        """``supports`` and ``along`` of the patches that are under the item whatever the error."""
+        rows, lines = self.always
+        if rows.all() and lines.all():
+            return self.supports, self.along
+        under = (rows[:, None] & lines).flatten()
+        return self.supports[..., under], self.along[:, under]
 
     @property
     def share(self) -> Tensor:
-        """The share of the item that is carried, float64 ``[W, D]``."""
-        return self.supports.sum(-1).double() / self.touched
+        """The share of the item that is carried whatever the error, float64 ``[W, D]``."""
+        carries = self.supports.double()
+        lines = carries.unflatten(-1, [part.shape[1] for part in self.uncovered])
+        lost = sum((lines.sum(axis) @ part.t()).amax(-1) for axis, part in zip((-1, -2), self.uncovered, strict=True))
+        return (carries.sum(-1) - lost) / self.touched
 
     @property
     def full(self) -> Tensor:
-        """Whether all of the item is carried, bool ``[W, D]``.
+        """Whether all of the item is carried, bool ``[W, D]``, and it stays up whatever the error.
 
-        There must be two patches along both sides: something then carries each quarter of the item, though a patch may
-        be covered in part. (With one value a cell only cells that are level bear weight.)
+        Something then carries each quarter of the item, though a patch may be covered in part. (With one value a cell
+        only cells that are level bear weight.)
         """
-        return self.supports.all(-1) & (self.fewest >= (2 if self.per_cell > 1 else 1))
+        stays = self.is_centre_in_hull() if self.per_cell == 1 else self.quartered
+        return self.supports.all(-1) & stays
 
     def is_centre_in_hull(self, margin: float = 0.0) -> Tensor:
         """Return whether the item's centre lies inside the hull of what carries it, bool ``[W, D]``.
 
-        A patch that is covered in part counts as whole.
+        A patch that is covered in part counts as whole. The centre may be off by the error, and so may an item below,
+        which then sticks out over what carries it.
 
         Args:
             margin: distance from the hull's edge that the centre must exceed, in cells.
         """
-        margin = max(margin * self.per_cell, self.MARGIN if self.per_cell > 1 else 0.0) + self.slack
+        margin = max(margin * self.per_cell, self.MARGIN if self.per_cell > 1 else 0.0, self.error)
+        margin += self.error + self.slack
         if margin not in self._inside:
+            supports, along = self.robust
             # [W, D, directions], of which the last is combined.
-            self._inside[margin] = (self.supports.double() @ (self.along > margin).double().t() > 0).all(-1)
+            self._inside[margin] = (supports.double() @ (along > margin).double().t() > 0).all(-1)
         return self._inside[margin]
+
+    def in_hull(self) -> Tensor:
+        """Return which patches press inside the hull of what carries the item, bool ``[patches]``; of one place.
+
+        With an error, the item may not reach a patch at its edge. Where it does, it reaches all patches of the same row
+        that are further inside, and those of the next rows on that side perhaps not. So a patch at the edge counts if
+        it carries, or lies between two of its row that do.
+        """
+        (rows, lines), flags = self.always, self.supports[0, 0]
+        supports, along = self.robust
+        reached = torch.where(supports[0, 0], along, NONE).amax(1, keepdim=True) if supports.shape[-1] else NONE
+        flags = flags.view(len(rows), len(lines))
+        held = flags | (self.along <= reached + 1e-9).all(0).view_as(flags)
+        for axis, inner in ((0, flags & rows[:, None]), (1, flags & lines)):
+            carries = inner.int()
+            held |= (carries.cummax(axis).values & carries.flip(axis).cummax(axis).values.flip(axis)).bool()
+        return held.flatten()
