@@ -124,7 +124,7 @@ class SimulatedCell:
         """Return what a camera measures, ``"bin"`` or ``"tote"``, m; the gantry is out of the way."""
         gantry, camera = self.gantry, self.cameras[name]
         mujoco.mj_forward(gantry.model, gantry.data)
-        rays = camera.rays(IMAGE)
+        rays = camera.rays()
         length = np.linalg.norm(rays, axis=-1)
         directions = rays / length[..., None]
         origin = camera.pose[:3, 3] + ((*gantry.bin, 0.0) if name == "bin" else 0.0)

@@ -8,6 +8,7 @@ cell ``(0, 0)`` on the inner floor; x runs along the first axis of the depth map
 seen from above.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -85,6 +86,9 @@ class Plan:
     warnings: list[str]  #: what lies outside the policy's training
     #: of the item that is taken, from 0: in ``items``, or among the ascending labels; None if none is taken
     item_number: int | None = None
+    #: the item as it lies in the tote once it rests, in the tote's frame, for :meth:`Scene.from_images`; None without
+    #: cell_size
+    placed: Box | None = None
 
     def as_dict(self) -> dict:
         """Return the plan as plain values, ready for JSON."""
@@ -176,15 +180,19 @@ class Planner:
         planner, terms = self._planner_of(problem.maps.bin_items, is_metric)
         observation = observe(terms, problem.cell, problem.seen)
         status, action = _decide(planner, problem, observation)
+        if action is None:
+            self._refuse_unknown(scene, device)
         number = None if action is None else int(problem.taken_items(action))
         known = 0 if problem.maps.bin_items == 1 else number
         pick, place, turn, drop_height = (None,) * 4 if action is None else problem.motion(action)
         seen = None if known is None else problem.seen.items.cuboids[0, known].tolist()
+        box = None if known is None or not problem.boxes else problem.boxes[known]
         (before, gained), bearing = problem.shares(number or 0), problem.bearing_after(action)
         return Plan(
             status=status,
             item=None if seen is None else dict(zip("xywdh", seen, strict=True)),
-            box=None if known is None or not problem.boxes else problem.boxes[known],
+            box=box,
+            placed=None if box is None or action is None else _placed(box, pick, place, turn, drop_height),
             pick=pick,
             place=place,
             rotation_degrees=turn,
@@ -198,6 +206,17 @@ class Planner:
             warnings=[] if self.training is None else self.training.warnings(self.cell, problem.seen.items),
             item_number=number,
         )
+
+    def _refuse_unknown(self, scene: Scene, device) -> None:
+        """Refuse a scene without a plan if one is likely to be feasible where images left something unknown."""
+        if (likely := scene.if_unknown_is_free()) is not None:
+            problem = read_metric(self.cell, likely, device)
+            refuse_if(
+                bool(footprint_mask(problem.cell, problem.maps).any()),
+                "depth: no plan avoids what the images leave unknown in bin and tote; expected more pixels with a "
+                "depth: take another image.",
+                DepthMapError,
+            )
 
     def _planner_of(self, count: int, is_metric: bool) -> tuple[MapPlanner, Mapping[str, Term]]:
         """Return what decides among so many items in the bin, and the terms of the observation.
@@ -264,6 +283,14 @@ def _decide(planner: MapPlanner, problem: Problem, observation: Observation) -> 
     cell = problem.cell
     action = decide(planner, cell, observation, partial(planner.choose, cell, problem.state, problem.maps))
     return ("ok", action) if int(problem.failures(action)) == 0 else ("rejected", None)
+
+
+def _placed(box: Box, pick: Pose, place: Pose, turn: float, drop_height: float) -> Box:
+    """Return a box in the tote, once the end effector brought it there; ``h`` is the height of its top."""
+    angle, x, y = math.radians(turn), box.x - pick.center[0], box.y - pick.center[1]
+    x, y = x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle)
+    moved = replace(box, x=place.center[0] + x, y=place.center[1] + y, h=drop_height + box.h, yaw=box.yaw + turn)
+    return moved.upright()
 
 
 def _reasons(problem: Problem) -> dict[str, int]:

@@ -117,7 +117,8 @@ class PickPlaceNode(Node):
             raise ValueError(f"{place}/camera_info: no message yet.")
         pose = np.array(self.poses[place]).reshape(4, 4)
         # Of the rectified image: P = [fx 0 cx .; 0 fy cy .; 0 0 1 .].
-        return Camera(fx=info.p[0], fy=info.p[5], cx=info.p[2], cy=info.p[6], pose=pose)
+        shape = info.height, info.width
+        return Camera(fx=info.p[0], fy=info.p[5], cx=info.p[2], cy=info.p[6], pose=pose, shape=shape)
 
     def publish(self, frame: str, pose) -> None:
         """Publish the centre of the suction face, z up, turned by its yaw."""
