@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -10,7 +9,7 @@ from scipy import ndimage
 
 from pickplace.common.validate import refuse_if
 from pickplace.robot.box import Box, DepthMapError, HiddenBox, UnknownBox
-from pickplace.robot.depth_image import AROUND, HOLE, Heights, Room, distance_outside, level_range
+from pickplace.robot.depth_image import AROUND, Heights, Room, distance_outside, level_range
 from pickplace.robot.measure import SNAPPED, is_inside, smallest_rectangle, turned_axes
 from pickplace.robot.room_check import fit_plane
 
@@ -43,10 +42,11 @@ def find_boxes(
         f"in the bin, expected items up to {greatest:g} m, see greatest_height: is a hand or a tool in the way?",
         DepthMapError,
     )
+    surface = seen.surface(room)
     segments = _segments(seen, above, accuracy, labels)
     numbers, counts = np.unique(segments[segments > 0], return_counts=True)
     boxes = [
-        _read_box(seen, room, segments, number, above, accuracy, labels is None)
+        _read_box(seen, room, surface, segments, number, above, accuracy, labels is None)
         for number in numbers[counts >= MIN_ITEM_PIXELS]
     ]
     hidden = [0.0 if isinstance(box, UnknownBox) else _hidden_length(seen, box, boxes) for box in boxes]
@@ -57,7 +57,7 @@ def find_boxes(
         HiddenBox(box.x, box.y, box.w + 2 * length, box.d + 2 * length, box.h, box.yaw) if length else box
         for box, length in zip(boxes, hidden, strict=True)
     ]
-    boxes += [*_rest(seen, above, boxes), *_behind_holes(seen, room, greatest)]
+    boxes += [*_rest(seen, above, boxes), *_behind_holes(seen, room, surface, accuracy, boxes, greatest)]
     refuse_if(
         bool(boxes) and all(isinstance(box, UnknownBox) for box in boxes),
         f"depth: {len(boxes)} places in the bin are not seen well enough to tell where an item ends, the first at "
@@ -86,11 +86,13 @@ def _segments(seen: Heights, above: np.ndarray, accuracy: float, labels: np.ndar
 
 
 def _read_box(
-    seen: Heights, room: Room, segments: np.ndarray, number: int, above: np.ndarray, accuracy: float, narrowed: bool
-) -> Box:
+    seen: Heights, room: Room, surface: np.ndarray, segments: np.ndarray, number: int, above: np.ndarray,
+    accuracy: float, narrowed: bool,
+) -> Box:  # fmt: skip
     """Return the cuboid whose top fills a segment; as :class:`UnknownBox` if it may go on where nothing is seen.
 
     Args:
+        surface: see :meth:`Heights.surface`.
         narrowed: whether the filter of steps took the outermost pixels off the segment; else labels made it.
     """
     top, band = segments == number, level_range(accuracy)
@@ -106,27 +108,41 @@ def _read_box(
     passed = known & ~top & (np.abs(seen.height - height) > band)
     if not narrowed:  # labels tell it from others that are as high
         passed |= (segments > 0) & ~top
-    axes, (half_w, half_d) = turned_axes(math.radians(yaw)), (w / 2, d / 2)
-    along = (points - (x, y)) @ axes.T  # [rows, columns, 2], in the frame of the rectangle
-    gaps = []
-    for axis, half, other in ((0, half_w, half_d), (1, half_d, half_w)):
-        beside = np.abs(along[..., 1 - axis]) < max(other - 1.5 * pixel, other / 2)
-        for sign in (-1, 1):
-            beyond = sign * along[..., axis] - half
-            in_front = beside & (beyond > -0.5 * pixel)
-            farthest = beyond[in_front & (distance_outside(points, room) < 0)].max(initial=0.0)
-            gaps.append(min(beyond[in_front & passed].min(initial=np.inf), farthest + pixel))
-    outer = np.maximum(0.5 * pixel, np.array(gaps) - 0.5 * pixel)  # beyond the centres of the outermost pixels
+    # It cannot stand on a place that is seen either.
+    axes = turned_axes(math.radians(yaw))
+    free = np.concatenate([points[passed], seen.at(seen.height)[passed & (seen.height < height)]])
+    free, inside = ((each - (x, y)) @ axes.T for each in (free, points[distance_outside(points, room) < 0]))
+    gaps = [
+        min(_least_beyond(free, (w, d), axis, sign, pixel), (sign * inside[:, axis]).max() - (w, d)[axis] / 2 + pixel)
+        for axis in (0, 1)
+        for sign in (-1, 1)
+    ]
+    outer = np.maximum(0.5 * pixel, np.array(gaps) - pixel)  # beyond the centres of the outermost pixels
 
     def grown(by: np.ndarray) -> dict:
         shift = np.array([by[1] - by[0], by[3] - by[2]]) / 2 @ axes
         return {"x": float(x + shift[0]), "y": float(y + shift[1]), "w": float(w + by[0] + by[1]),
                 "d": float(d + by[2] + by[3]), "h": height, "yaw": yaw}  # fmt: skip
 
-    if outer.max() <= LONGEST_GAP * pixel:
-        return Box(**grown(outer), edge_error=float(max(0.0, outer.max() - pixel))).upright()
+    error = float(max(0.0, outer.max() - pixel))
+    on_top = is_inside(points, (x, y), (w, d), yaw)
+    if outer.max() <= LONGEST_GAP * pixel and not seen.holes_above(height, surface, room, accuracy, on_top).any():
+        return Box(**grown(outer), edge_error=error).upright()
     likely = Box(**grown(np.minimum(outer, pixel))).upright()
     return UnknownBox(**vars(Box(**grown(outer)).upright()), likely=likely)
+
+
+def _least_beyond(points: np.ndarray, sides: Sequence[float], axis: int, sign: int, pixel: float) -> float:
+    """Return the least distance in front of a side of a rectangle at which one of the points lies, m; else inf.
+
+    Args:
+        points: in the frame of the rectangle, ``[M, 2]``.
+        axis, sign: tell which of its four sides.
+    """
+    other = sides[1 - axis] / 2
+    beyond = sign * points[:, axis] - sides[axis] / 2
+    in_front = (np.abs(points[:, 1 - axis]) < max(other - 1.5 * pixel, other / 2)) & (beyond > -0.5 * pixel)
+    return float(beyond[in_front].min(initial=np.inf))
 
 
 def _check_top(
@@ -142,7 +158,10 @@ def _check_top(
     border = (BORDER - 1) * pixel + SNAPPED * max(w, d) * (yaw == 0)
     inside = is_inside(points, (x, y), (w - 2 * border, d - 2 * border), yaw)
     found = f"depth: what lies at [{x:.3f}, {y:.3f}]"
-    if inside.any() and (missing := float((inside & ~top & ~np.isnan(seen.height)).sum() / inside.sum())) > MOST_MISSING:
+    if (
+        inside.any()
+        and (missing := float((inside & ~top & ~np.isnan(seen.height)).sum() / inside.sum())) > MOST_MISSING
+    ):
         raise DepthMapError(
             f"{found} leaves {missing:.0%} of its rectangle of {w + pixel:.3f} x {d + pixel:.3f} m free: it could be two "
             "items that touch, or one that is no cuboid; separate them, or pass labels."
@@ -178,16 +197,17 @@ def _rest(seen: Heights, above: np.ndarray, boxes: Sequence[Box]) -> list[Box]:
     ]
 
 
-def _behind_holes(seen: Heights, room: Room, greatest: float) -> list[Box]:
-    """Return what the holes of the image may hide, as high as an item may be.
-
-    A thing that stands on the floor hides all of the floor below it.
-    """
+def _behind_holes(
+    seen: Heights, room: Room, surface: np.ndarray, accuracy: float, boxes: Sequence[Box], greatest: float
+) -> list[Box]:  # fmt: skip
+    """Return what the holes of the image may hide on the floor, as high as an item may be; not the boxes' sides."""
     floor = seen.at(0.0)
-    inside = distance_outside(floor, room) < 0
-    holes = ndimage.binary_opening(seen.holes & inside, HOLE)
+    free = np.ones_like(seen.holes)
+    for box in boxes:
+        free &= ~is_inside(floor, (box.x, box.y), (box.w, box.d), box.yaw) | (type(box) is not Box)
+    holes = seen.holes_above(0.0, surface, room, accuracy, free)
     refuse_if(
-        (share := holes.sum() / inside.sum()) > MOST_HIDDEN,
+        (share := holes.sum() / (distance_outside(floor, room) < 0).sum()) > MOST_HIDDEN,
         f"depth: {share:.0%} of the bin are not seen, expected {MOST_HIDDEN:.0%} at most: take another image.",
         DepthMapError,
     )

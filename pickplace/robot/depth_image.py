@@ -21,6 +21,7 @@ SEAM = 5  # longest gap in a level top that is filled, pixels; a longer one may 
 MARGIN = 24  # pixels around the room that are looked at, too
 HOLE = np.ones((4, 4), dtype=bool)  # the smallest hole, pixels
 HOLE[::3, ::3] = False
+SQUARE = 1.25  # side of the squares of a seen surface, pixels
 AROUND = np.ones((3, 3), dtype=bool)
 RECORD_MARGIN = 0.008  # by which an item in the tote may be off its recorded place, m
 
@@ -51,6 +52,32 @@ class Heights:
         """Return where each pixel's ray passes a height, ``[rows, columns, 2]``; of a height or one for each pixel."""
         way = (height - self.origin[2]) / self.rays[..., 2]
         return self.origin[:2] + self.rays[..., :2] * way[..., None]
+
+    def surface(self, room: Room) -> np.ndarray:
+        """Return the greatest height that is seen in each square of :data:`SQUARE` pixels, -inf where none is."""
+        side = SQUARE * self.pixel
+        highest = np.full([math.ceil(length / side) for length in room.sides], -np.inf)
+        known = self.is_within(self.height, room, 0.0)
+        np.maximum.at(highest, tuple((self.at(self.height)[known] / side).astype(int).T), self.height[known])
+        return highest
+
+    def holes_above(
+        self, height: float, surface: np.ndarray, room: Room, accuracy: float, where: np.ndarray | bool = True
+    ) -> np.ndarray:
+        """Return the pixels of holes that may show a thing that stands on a surface of a height, bool.
+
+        Such a thing hides the whole surface below it. Pixels that can show only walls, or the sides of what is seen
+        from above, are none. So are those of a strip of the surface that is too narrow for a hole.
+
+        Args:
+            surface: see :meth:`surface`.
+            where: other pixels show no such thing, bool.
+        """
+        points = self.at(height)
+        inside = self.holes & where & (distance_outside(points, room) < 0)
+        seen = surface[tuple((points[inside] / (SQUARE * self.pixel)).astype(int).T)]
+        inside[inside] = np.isinf(seen) | (np.abs(seen - height) <= level_range(accuracy))
+        return ndimage.binary_opening(inside, HOLE)
 
     def is_within(self, height, room: Room, margin: float) -> np.ndarray:
         """Return which rays pass a height inside the room, at least ``margin`` from its walls, bool."""
@@ -111,7 +138,15 @@ def read_heights(
     height = np.where(single, smooth, height)
     highest, lowest = (np.where(gaps & ~single, bound, height) for bound in (high, low))
     return Heights(
-        origin, rays, (rows.start, columns.start), pixel, raw, height, highest, np.where(is_recorded, 0.0, lowest), holes
+        origin,
+        rays,
+        (rows.start, columns.start),
+        pixel,
+        raw,
+        height,
+        highest,
+        np.where(is_recorded, 0.0, lowest),
+        holes,
     )
 
 

@@ -8,16 +8,14 @@ from scipy import ndimage
 
 from pickplace.common.validate import refuse_if
 from pickplace.robot.box import DepthMapError
-from pickplace.robot.depth_image import AROUND, HOLE, Heights, Room, level_range
+from pickplace.robot.depth_image import AROUND, Heights, Room, level_range
 from pickplace.robot.measure import ToteMap
 from pickplace.robot.room_check import FEW
 
 MOST_UNSEEN = 0.25  # greatest share of a tote that the camera may not see
 
 
-def read_tote(
-    seen: Heights, room: Room, margin: float, accuracy: float, grid: Sequence[int], along: int
-) -> ToteMap:
+def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: Sequence[int], along: int) -> ToteMap:
     """Return the heights in each patch of a tote.
 
     Args:
@@ -39,7 +37,7 @@ def read_tote(
     )
     shape = np.array(grid) * along
     patch = room.sides[0] / shape[0]  # side of a patch, m
-    holes = _holes_inside(seen, room, margin)
+    holes = _holes_inside(seen, room, margin, accuracy)
     unknown = _patches_behind(seen, room, holes, shape, patch)
     high = ndimage.maximum_filter(np.where(np.isnan(seen.highest), -np.inf, seen.highest), 3)
     low = ndimage.minimum_filter(np.where(holes, 0.0, np.nan_to_num(seen.lowest, nan=np.inf)), 3)
@@ -68,15 +66,13 @@ def read_tote(
     return ToteMap(highest.clip(0, None), lowest.clip(0, None), unknown if unknown.any() else None)
 
 
-def _holes_inside(seen: Heights, room: Room, margin: float) -> np.ndarray:
-    """Return the pixels of holes that may show something in the tote, bool; others show its walls.
-
-    A ray that is known to pass no surface beside the hole before it meets the wall shows the wall.
-    """
-    known = seen.is_within(seen.height, room, margin)
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    inside = seen.is_within(seen.height[tuple(nearest)], room, 0.0)
-    holes = ndimage.binary_opening(seen.holes & inside, HOLE)
+def _holes_inside(seen: Heights, room: Room, margin: float, accuracy: float) -> np.ndarray:
+    """Return the pixels of holes that may show something that stands in the tote, bool; others show its walls."""
+    holes, surface = np.zeros_like(seen.holes), seen.surface(room)
+    step = level_range(accuracy)
+    levels = np.unique(np.round(seen.height[seen.is_within(seen.height, room, margin)] / step)) * step
+    for height in levels if seen.holes.any() else ():
+        holes |= seen.holes_above(height, surface, room, accuracy)
     if not holes.any():
         return holes
     # A thing at the wall goes on in front of it.
@@ -90,9 +86,7 @@ def _greatest_shift(seen: Heights, room: Room) -> float:
     return away * room.rim / seen.origin[2]
 
 
-def _patches_behind(
-    seen: Heights, room: Room, holes: np.ndarray, shape: np.ndarray, patch: float
-) -> np.ndarray:
+def _patches_behind(seen: Heights, room: Room, holes: np.ndarray, shape: np.ndarray, patch: float) -> np.ndarray:
     """Return which patches the rays of holes pass between the rim and the floor, bool ``shape``."""
     unknown = np.zeros(shape, dtype=bool)
     wide = ndimage.binary_dilation(holes, AROUND)
