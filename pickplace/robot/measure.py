@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
@@ -31,14 +30,7 @@ class ToteMap(NamedTuple):
 
     highest: np.ndarray
     lowest: np.ndarray
-    unknown: np.ndarray | None = None  #: bool: patches of which nothing is known, so that they count up to the rim
-
-    def if_level(self) -> "ToteMap":
-        """Return the map if each unknown patch is like the nearest one that is known."""
-        if self.unknown is None or self.unknown.all():
-            return self
-        nearest = ndimage.distance_transform_edt(self.unknown, return_distances=False, return_indices=True)
-        return ToteMap(self.highest[tuple(nearest)], self.lowest[tuple(nearest)])
+    likely: "ToteMap | None" = None  #: the map if places of which nothing is known are like those beside them
 
 
 def refuse(name: str, bad: np.ndarray, values: np.ndarray, unit: str, expected: str) -> None:

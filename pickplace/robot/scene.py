@@ -120,11 +120,14 @@ class Scene:
 
     def if_unknown_is_free(self) -> "Scene | None":
         """Return the scene that is likely where images left something unknown; None if nothing is unknown."""
-        tote = self.tote if isinstance(self.tote, ToteMap) else None
-        boxes = [] if isinstance(self.items, BinMap) else self.items
-        unknown = [box for box in boxes if isinstance(box, UnknownBox)]
-        if not unknown and (tote is None or tote.unknown is None):
+        tote, boxes = self.tote, [] if isinstance(self.items, BinMap) else self.items
+        likely = tote.likely if isinstance(tote, ToteMap) else None
+        if likely is None and not any(isinstance(box, UnknownBox) or box.edge_error for box in boxes):
             return None
-        likely = [box.likely if isinstance(box, UnknownBox) else box for box in boxes]
-        items = [box for box in likely if box is not None] if unknown else self.items
-        return replace(self, items=items, tote=self.tote if tote is None else tote.if_level())
+        items = [box.likely if isinstance(box, UnknownBox) else box for box in boxes]
+        narrower = [
+            replace(box, w=box.w - 2 * box.edge_error, d=box.d - 2 * box.edge_error, edge_error=0.0)
+            for box in items
+            if box is not None
+        ]
+        return replace(self, items=narrower if boxes else self.items, tote=likely or tote)

@@ -39,12 +39,8 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     patch = room.sides[0] / shape[0]  # side of a patch, m
     holes = _holes_inside(seen, room, margin, accuracy)
     unknown = _patches_behind(seen, room, holes, shape, patch)
-    high = ndimage.maximum_filter(np.where(np.isnan(seen.highest), -np.inf, seen.highest), 3)
-    low = ndimage.minimum_filter(np.where(holes, 0.0, np.nan_to_num(seen.lowest, nan=np.inf)), 3)
-    at = tuple((seen.at(seen.highest)[within] / patch).astype(int).clip(0, shape - 1).T)
-    highest, lowest = np.full(shape, -np.inf), np.full(shape, np.inf)
-    np.maximum.at(highest, at, high[within])
-    np.minimum.at(lowest, at, low[within])
+    lowest_seen = np.where(holes, 0.0, np.nan_to_num(seen.lowest, nan=np.inf))
+    highest, lowest = _patch_heights(seen, room, margin, shape, seen.highest, lowest_seen)
     refuse_if(
         (share := float((unknown | np.isinf(highest)).mean())) > MOST_UNSEEN,
         f"depth: {share:.0%} of the tote are not seen, expected {MOST_UNSEEN:.0%} at most.",
@@ -61,9 +57,41 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
         around = ndimage.binary_dilation(part, AROUND) & ~unseen
         highest[part], lowest[part] = highest[around].max(initial=0.0 if around.any() else room.rim), 0.0
     at_wall = np.isinf(highest)
-    nearest = ndimage.distance_transform_edt(at_wall, return_distances=False, return_indices=True)
-    highest, lowest = highest[tuple(nearest)], np.where(at_wall, 0.0, lowest)
-    return ToteMap(highest.clip(0, None), lowest.clip(0, None), unknown if unknown.any() else None)
+    return ToteMap(
+        _nearest(highest, at_wall).clip(0, None),
+        np.where(at_wall, 0.0, lowest).clip(0, None),
+        _likely(seen, room, margin, shape) if (within & np.isnan(seen.height)).any() or holes.any() else None,
+    )
+
+
+def _patch_heights(
+    seen: Heights, room: Room, margin: float, shape: np.ndarray, highest: np.ndarray, lowest: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the greatest and the least height in each patch, ``shape``; -inf and inf where nothing is seen.
+
+    Args:
+        highest: of each pixel, NaN if unknown; widened by a pixel.
+        lowest: of each pixel, inf if unknown; narrowed by a pixel.
+    """
+    within = seen.is_within(highest, room, margin)
+    high = ndimage.maximum_filter(np.where(np.isnan(highest), -np.inf, highest), 3)
+    low = ndimage.minimum_filter(lowest, 3)
+    at = tuple((seen.at(highest)[within] / (room.sides[0] / shape[0])).astype(int).clip(0, shape - 1).T)
+    greatest, least = np.full(shape, -np.inf), np.full(shape, np.inf)
+    np.maximum.at(greatest, at, high[within])
+    np.minimum.at(least, at, low[within])
+    return greatest, least
+
+
+def _nearest(heights: np.ndarray, missing: np.ndarray) -> np.ndarray:
+    """Return a map in which each missing patch has the value of the nearest other one."""
+    return heights[tuple(ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True))]
+
+
+def _likely(seen: Heights, room: Room, margin: float, shape: np.ndarray) -> ToteMap:
+    """Return the map if all that has no depth is like what is beside it."""
+    high, low = _patch_heights(seen, room, margin, shape, seen.height, np.nan_to_num(seen.height, nan=np.inf))
+    return ToteMap(*(_nearest(part, np.isinf(high)).clip(0, None) for part in (high, low)))
 
 
 def _holes_inside(seen: Heights, room: Room, margin: float, accuracy: float) -> np.ndarray:

@@ -314,15 +314,15 @@ def fault(truth: Truth, plan, cell: str) -> str | None:
     square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * wide / 2
     body = square if cup is None else disc(wide - 2 * 0.005)
     at_pick = body @ turned(np.radians(plan.pick.yaw)).T + pick[:2]
-    found = [each for each in truth.in_bin if contains(each.corners, pick[None, :2])]
+    suck = at_pick if cup is None else disc(cup) + pick[:2]
+    found = [
+        each for each in truth.in_bin if (contains(suck, each.corners) if cup is None else contains(each.corners, suck))
+    ]
     if not found:
-        return "nothing is gripped"
+        return "the cup fits on nothing"
     item = max(found, key=lambda each: each.top)
     if item.kind == "hand":
         return "a hand is gripped"
-    suck = at_pick if cup is None else disc(cup) + pick[:2]
-    if not (contains(suck, item.corners) if cup is None else contains(item.corners, suck)):
-        return "the cup does not fit"
     heights = [item.height_at(point) for point in (item.corners if cup is None else suck)]
     if max(heights) > pick[2] + TOUCH or min(heights) < pick[2] - 2 * ACCURACY - 0.001:
         return "the cup does not seal at this height"
@@ -394,9 +394,9 @@ def judge(planners: dict, seed: int, kinds=KINDS) -> tuple[str, str, str | None,
     wrong_with = None
     if status == "ok":
         wrong_with = fault(truth, result, cell)
-    elif status == "stuck" and kind != "good" and outcome(planners[cell], cell, clean, placed=record)[0] == "ok":
+    elif status == "stuck" and outcome(planners[cell], cell, clean, placed=record)[0] == "ok":
         wrong_with = "stuck for a bad image"
-    is_feasible = kind == "good" and outcome(planners[cell], cell, clean, placed=record)[0] == "ok"
+    is_feasible = kind == "good" and (status == "ok" or outcome(planners[cell], cell, clean, placed=record)[0] == "ok")
     return kind, status, wrong_with, (is_feasible, result)
 
 
