@@ -33,7 +33,7 @@ def find_boxes(
         greatest: height of the highest item that may lie there, m.
         labels: in the shape of ``seen``; None: items are told apart by steps.
     """
-    within, band = seen.is_within(seen.height, room, margin), level_range(accuracy)
+    within, band = seen.is_within(room, margin), level_range(accuracy)
     above = within & (seen.height > band)
     too_high = above & (seen.height > greatest + band)
     refuse_if(
@@ -110,7 +110,7 @@ def _read_box(
         passed |= (segments > 0) & ~top
     # It cannot stand on a place that is seen either.
     axes = turned_axes(math.radians(yaw))
-    free = np.concatenate([points[passed], seen.at(seen.height)[passed & (seen.height < height)]])
+    free = np.concatenate([points[passed], seen.points[passed & (seen.height < height)]])
     free, inside = ((each - (x, y)) @ axes.T for each in (free, points[distance_outside(points, room) < 0]))
     gaps = [
         min(_least_beyond(free, (w, d), axis, sign, pixel), (sign * inside[:, axis]).max() - (w, d)[axis] / 2 + pixel)
@@ -185,7 +185,7 @@ def _check_top(
 
 def _rest(seen: Heights, above: np.ndarray, boxes: Sequence[Box]) -> list[Box]:
     """Return what lies in the bin beside its boxes as boxes that are in the way."""
-    left, points = above.copy(), seen.at(seen.height)
+    left, points = above.copy(), seen.points
     for box in boxes:
         left &= ~is_inside(points, (box.x, box.y), (box.w + 5 * seen.pixel, box.d + 5 * seen.pixel), box.yaw)
     parts, count = ndimage.label(left, AROUND)

@@ -190,7 +190,7 @@ class Camera:
         """Return the heights that an image shows in a room, once it was checked that it shows the room."""
         distances, origin = self._distances(depth), self.pose[:3, 3]
         seen = read_heights(self.rays(), origin, distances, room, self.pixel(), accuracy, placed)
-        within = seen.is_within(seen.height, room, self._wall())
+        within = seen.is_within(room, self._wall())
         middle = float(np.median(seen.height[within])) if within.any() else math.nan
         refuse_if(
             not -0.05 < middle < room.rim + 0.5,

@@ -8,6 +8,7 @@ hide a thing that counts: they are filled, inside a level top by its height, els
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -51,14 +52,19 @@ class Heights:
     def at(self, height) -> np.ndarray:
         """Return where each pixel's ray passes a height, ``[rows, columns, 2]``; of a height or one for each pixel."""
         way = (height - self.origin[2]) / self.rays[..., 2]
-        return self.origin[:2] + self.rays[..., :2] * way[..., None]
+        return np.stack([self.origin[axis] + self.rays[..., axis] * way for axis in (0, 1)], -1)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """Where each pixel's ray meets what it shows, ``[rows, columns, 2]``; NaN if unknown."""
+        return self.at(self.height)
 
     def surface(self, room: Room) -> np.ndarray:
         """Return the greatest height that is seen in each square of :data:`SQUARE` pixels, -inf where none is."""
         side = SQUARE * self.pixel
         highest = np.full([math.ceil(length / side) for length in room.sides], -np.inf)
-        known = self.is_within(self.height, room, 0.0)
-        np.maximum.at(highest, tuple((self.at(self.height)[known] / side).astype(int).T), self.height[known])
+        known = distance_outside(self.points, room) < 0
+        np.maximum.at(highest, tuple((self.points[known] / side).astype(int).T), self.height[known])
         return highest
 
     def holes_above(
@@ -79,14 +85,15 @@ class Heights:
         inside[inside] = np.isinf(seen) | (np.abs(seen - height) <= level_range(accuracy))
         return ndimage.binary_opening(inside, HOLE)
 
-    def is_within(self, height, room: Room, margin: float) -> np.ndarray:
-        """Return which rays pass a height inside the room, at least ``margin`` from its walls, bool."""
-        return (distance_outside(self.at(height), room) < -margin) & ~np.isnan(height)
+    def is_within(self, room: Room, margin: float) -> np.ndarray:
+        """Return which pixels show something inside the room, at least ``margin`` from its walls, bool."""
+        return distance_outside(self.points, room) < -margin
 
 
 def distance_outside(points: np.ndarray, room: Room) -> np.ndarray:
     """Return how far points ``[..., 2]`` lie beyond the nearest wall, m; below 0 inside."""
-    return np.maximum(-points, points - room.sides).max(-1)
+    x, y = points[..., 0], points[..., 1]
+    return np.maximum(np.maximum(-x, x - room.sides[0]), np.maximum(-y, y - room.sides[1]))
 
 
 def read_heights(

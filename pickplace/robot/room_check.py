@@ -25,7 +25,7 @@ def check_room(seen: Heights, room: Room, accuracy: float, margin: float) -> Non
     Raises:
         DepthMapError: naming what is wrong.
     """
-    within, band = seen.is_within(seen.height, room, margin), level_range(accuracy)
+    within, band = seen.is_within(room, margin), level_range(accuracy)
     _refuse_over_wall(seen, room, band)
     _check_walls(seen, room)
     below = within & (seen.height < -band)
@@ -46,7 +46,7 @@ def check_room(seen: Heights, room: Room, accuracy: float, margin: float) -> Non
 
 def _check_level(seen: Heights, room: Room, floor: np.ndarray, accuracy: float) -> None:
     """Refuse a floor that is not level and flat at height 0."""
-    points, heights = seen.at(seen.height)[floor], seen.height[floor]
+    points, heights = seen.points[floor], seen.height[floor]
     plane = fit_plane(points, heights)
     at = f"the floor of the {room.name}"
     refuse_if(
@@ -115,7 +115,7 @@ def _check_walls(seen: Heights, room: Room) -> None:
 
 def _refuse_over_wall(seen: Heights, room: Room, band: float) -> None:
     """Refuse what is seen above the rim on both sides of a wall's inner face, such as an arm."""
-    outside = distance_outside(seen.at(seen.height), room)
+    outside = distance_outside(seen.points, room)
     parts, count = ndimage.label(seen.height > room.rim + band, AROUND)
     beyond = parts * ((outside > 1.5 * seen.pixel) & (outside < 1.5 * seen.pixel + 0.006))
     within = parts * (outside < -1.5 * seen.pixel)
@@ -130,7 +130,7 @@ def _refuse_over_wall(seen: Heights, room: Room, band: float) -> None:
 
 def _check_rim(seen: Heights, room: Room, band: float, accuracy: float) -> None:
     """Check the height of the rim, where too little of the floor is seen."""
-    outside = distance_outside(seen.at(seen.height), room)
+    outside = distance_outside(seen.points, room)
     rim = (outside > 0) & (outside < RIM_WIDTH) & (np.abs(seen.height - room.rim) <= band)
     height = float(np.median(seen.height[rim])) if rim.any() else 0.0
     refuse_if(

@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from pickplace.common.validate import refuse_if
 from pickplace.robot.box import DepthMapError
-from pickplace.robot.depth_image import AROUND, Heights, Room, level_range
+from pickplace.robot.depth_image import AROUND, Heights, Room, distance_outside, level_range
 from pickplace.robot.measure import ToteMap
 from pickplace.robot.room_check import FEW
 
@@ -27,7 +27,7 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     Raises:
         DepthMapError: for something above the rim, or too much that is not seen.
     """
-    within = seen.is_within(seen.highest, room, margin)
+    within = distance_outside(seen.at(seen.highest), room) < -margin
     over = within & (seen.height > room.rim + level_range(accuracy))
     refuse_if(
         over.sum() > FEW,
@@ -73,10 +73,11 @@ def _patch_heights(
         highest: of each pixel, NaN if unknown; widened by a pixel.
         lowest: of each pixel, inf if unknown; narrowed by a pixel.
     """
-    within = seen.is_within(highest, room, margin)
+    points = seen.at(highest)
+    within = distance_outside(points, room) < -margin
     high = ndimage.maximum_filter(np.where(np.isnan(highest), -np.inf, highest), 3)
     low = ndimage.minimum_filter(lowest, 3)
-    at = tuple((seen.at(highest)[within] / (room.sides[0] / shape[0])).astype(int).clip(0, shape - 1).T)
+    at = tuple((points[within] / (room.sides[0] / shape[0])).astype(int).clip(0, shape - 1).T)
     greatest, least = np.full(shape, -np.inf), np.full(shape, np.inf)
     np.maximum.at(greatest, at, high[within])
     np.minimum.at(least, at, low[within])
@@ -98,7 +99,7 @@ def _holes_inside(seen: Heights, room: Room, margin: float, accuracy: float) -> 
     """Return the pixels of holes that may show something that stands in the tote, bool; others show its walls."""
     holes, surface = np.zeros_like(seen.holes), seen.surface(room)
     step = level_range(accuracy)
-    levels = np.unique(np.round(seen.height[seen.is_within(seen.height, room, margin)] / step)) * step
+    levels = np.unique(np.round(seen.height[seen.is_within(room, margin)] / step)) * step
     for height in levels if seen.holes.any() else ():
         holes |= seen.holes_above(height, surface, room, accuracy)
     if not holes.any():
