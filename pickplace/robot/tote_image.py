@@ -36,10 +36,8 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
         DepthMapError,
     )
     shape = np.array(grid) * along
-    patch = room.sides[0] / shape[0]  # side of a patch, m
-    holes = _holes_inside(seen, room, margin, accuracy)
-    unknown = _patches_behind(seen, room, holes, shape, patch)
-    lowest_seen = np.where(holes, 0.0, np.nan_to_num(seen.lowest, nan=np.inf))
+    unknown = _behind_holes(seen, room, margin, accuracy, shape)
+    lowest_seen = np.where(seen.holes, 0.0, np.nan_to_num(seen.lowest, nan=np.inf))
     highest, lowest = _patch_heights(seen, room, margin, shape, seen.highest, lowest_seen)
     refuse_if(
         (share := float((unknown | np.isinf(highest)).mean())) > MOST_UNSEEN,
@@ -49,7 +47,7 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     highest[unknown], lowest[unknown] = room.rim, 0.0
     # At the walls the nearest place that is seen; there the camera sees the wall, not what is beside it.
     border = np.ones(shape, dtype=bool)
-    edge = math.ceil(margin / patch)
+    edge = math.ceil(margin * shape[0] / room.sides[0])
     border[edge:-edge, edge:-edge] = False
     unseen = np.isinf(highest)
     hidden, count = ndimage.label(unseen & ~border, AROUND)
@@ -60,7 +58,7 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     return ToteMap(
         _nearest(highest, at_wall).clip(0, None),
         np.where(at_wall, 0.0, lowest).clip(0, None),
-        _likely(seen, room, margin, shape) if (within & np.isnan(seen.height)).any() or holes.any() else None,
+        _likely(seen, room, margin, shape) if unknown.any() or (within & np.isnan(seen.height)).any() else None,
     )
 
 
@@ -95,34 +93,21 @@ def _likely(seen: Heights, room: Room, margin: float, shape: np.ndarray) -> Tote
     return ToteMap(*(_nearest(part, np.isinf(high)).clip(0, None) for part in (high, low)))
 
 
-def _holes_inside(seen: Heights, room: Room, margin: float, accuracy: float) -> np.ndarray:
-    """Return the pixels of holes that may show something that stands in the tote, bool; others show its walls."""
-    holes, surface = np.zeros_like(seen.holes), seen.surface(room)
-    step = level_range(accuracy)
-    levels = np.unique(np.round(seen.height[seen.is_within(room, margin)] / step)) * step
-    for height in levels if seen.holes.any() else ():
-        holes |= seen.holes_above(height, surface, room, accuracy)
-    if not holes.any():
-        return holes
-    # A thing at the wall goes on in front of it.
-    at_wall = math.ceil(_greatest_shift(seen, room) / seen.pixel)
-    return ndimage.binary_dilation(holes, AROUND, iterations=max(1, at_wall), mask=seen.holes)
+def _behind_holes(seen: Heights, room: Room, margin: float, accuracy: float, shape: np.ndarray) -> np.ndarray:
+    """Return the patches of which nothing is known: what stands on a surface there would be in a hole; bool ``shape``.
 
-
-def _greatest_shift(seen: Heights, room: Room) -> float:
-    """Return how far a ray goes sideways at most between the rim and the floor, m."""
-    away = max(math.dist(seen.origin[:2], (x, y)) for x in (0.0, room.sides[0]) for y in (0.0, room.sides[1]))
-    return away * room.rim / seen.origin[2]
-
-
-def _patches_behind(seen: Heights, room: Room, holes: np.ndarray, shape: np.ndarray, patch: float) -> np.ndarray:
-    """Return which patches the rays of holes pass between the rim and the floor, bool ``shape``."""
+    The rays of such pixels are followed up to the rim, as the surface itself may not be seen.
+    """
     unknown = np.zeros(shape, dtype=bool)
-    wide = ndimage.binary_dilation(holes, AROUND)
-    origin, rays = seen.origin, seen.rays[wide]
-    steps = math.ceil(_greatest_shift(seen, room) / (patch / 2)) + 2
-    for height in np.linspace(0.0, room.rim, steps) if wide.any() else ():
-        points = origin[:2] + rays[:, :2] * ((height - origin[2]) / rays[:, 2])[:, None]
-        index = np.floor(points / patch).astype(int)
-        unknown[tuple(index[((index >= 0) & (index < shape)).all(1)].T)] = True
+    if not seen.holes.any():
+        return unknown
+    surface, step, patch = seen.surface(room), level_range(accuracy), room.sides[0] / shape[0]
+    away = max(math.dist(seen.origin[:2], (x, y)) for x in (0.0, room.sides[0]) for y in (0.0, room.sides[1]))
+    shift = away * room.rim / seen.origin[2]  # of a ray between rim and floor, at most
+    for level in np.unique(np.round(seen.height[seen.is_within(room, margin)] / step)) * step:
+        rays = seen.rays[ndimage.binary_dilation(seen.holes_above(level, surface, room, accuracy), AROUND)]
+        for height in np.linspace(level, max(level, room.rim), math.ceil(shift / (patch / 2)) + 2) if len(rays) else ():
+            points = seen.origin[:2] + rays[:, :2] * ((height - seen.origin[2]) / rays[:, 2])[:, None]
+            index = np.floor(points / patch).astype(int)
+            unknown[tuple(index[((index >= 0) & (index < shape)).all(1)].T)] = True
     return unknown
