@@ -38,8 +38,8 @@ def find_boxes(
     too_high = above & (seen.height > greatest + band)
     refuse_if(
         too_high.sum() >= MIN_ITEM_PIXELS,
-        f"depth: something {float(np.quantile(seen.height[too_high], 0.95)) if too_high.any() else 0:.3f} m high is seen "
-        f"in the bin, expected items up to {greatest:g} m, see greatest_height: is a hand or a tool in the way?",
+        f"depth: something {float(np.quantile(seen.height[too_high], 0.95)) if too_high.any() else 0:.3f} m high is "
+        f"seen in the bin, expected items up to {greatest:g} m, see greatest_height: is a hand or a tool in the way?",
         DepthMapError,
     )
     surface = seen.surface(room)
@@ -163,8 +163,8 @@ def _check_top(
         and (missing := float((inside & ~top & ~np.isnan(seen.height)).sum() / inside.sum())) > MOST_MISSING
     ):
         raise DepthMapError(
-            f"{found} leaves {missing:.0%} of its rectangle of {w + pixel:.3f} x {d + pixel:.3f} m free: it could be two "
-            "items that touch, or one that is no cuboid; separate them, or pass labels."
+            f"{found} leaves {missing:.0%} of its rectangle of {w + pixel:.3f} x {d + pixel:.3f} m free: it could be "
+            "two items that touch, or one that is no cuboid; separate them, or pass labels."
         )
     inner = ndimage.binary_erosion(top, AROUND)
     inner = inner if inner.sum() >= MIN_ITEM_PIXELS else top

@@ -86,9 +86,22 @@ class Plan:
     warnings: list[str]  #: what lies outside the policy's training
     #: of the item that is taken, from 0: in ``items``, or among the ascending labels; None if none is taken
     item_number: int | None = None
-    #: the item as it lies in the tote once it rests, in the tote's frame, for :meth:`Scene.from_images`; None without
-    #: cell_size
-    placed: Box | None = None
+
+    @property
+    def placed(self) -> Box | None:
+        """The item as it lies in the tote once it rests, in the tote's frame; ``h`` is the height of its top.
+
+        It is the record of the tote for :meth:`Scene.from_images`. None without an action, or without ``cell_size``.
+        """
+        if not (
+            self.box and self.pick and self.place and self.drop_height is not None and self.rotation_degrees is not None
+        ):
+            return None
+        box, angle = self.box, math.radians(self.rotation_degrees)
+        x, y = box.x - self.pick.center[0], box.y - self.pick.center[1]
+        x, y = x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle)
+        centre = {"x": self.place.center[0] + x, "y": self.place.center[1] + y}
+        return replace(box, **centre, h=self.drop_height + box.h, yaw=box.yaw + self.rotation_degrees).upright()
 
     def as_dict(self) -> dict:
         """Return the plan as plain values, ready for JSON."""
@@ -192,7 +205,6 @@ class Planner:
             status=status,
             item=None if seen is None else dict(zip("xywdh", seen, strict=True)),
             box=box,
-            placed=None if box is None or action is None else _placed(box, pick, place, turn, drop_height),
             pick=pick,
             place=place,
             rotation_degrees=turn,
@@ -283,14 +295,6 @@ def _decide(planner: MapPlanner, problem: Problem, observation: Observation) -> 
     cell = problem.cell
     action = decide(planner, cell, observation, partial(planner.choose, cell, problem.state, problem.maps))
     return ("ok", action) if int(problem.failures(action)) == 0 else ("rejected", None)
-
-
-def _placed(box: Box, pick: Pose, place: Pose, turn: float, drop_height: float) -> Box:
-    """Return a box in the tote, once the end effector brought it there; ``h`` is the height of its top."""
-    angle, x, y = math.radians(turn), box.x - pick.center[0], box.y - pick.center[1]
-    x, y = x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle)
-    moved = replace(box, x=place.center[0] + x, y=place.center[1] + y, h=drop_height + box.h, yaw=box.yaw + turn)
-    return moved.upright()
 
 
 def _reasons(problem: Problem) -> dict[str, int]:

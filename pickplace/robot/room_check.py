@@ -85,8 +85,8 @@ def _check_size(seen: Heights, room: Room, floor: np.ndarray, band: float, accur
     beyond = joined & (outside > max(2 * seen.pixel, accuracy))
     refuse_if(
         beyond.sum() > FEW,
-        f"depth: the floor of the {room.name} goes on {float(outside[beyond].max(initial=0.0)):.3f} m beyond its walls, "
-        f"expected {room.sides[0]:g} x {room.sides[1]:g} m: {HINT.format(room.name)}.",
+        f"depth: the floor of the {room.name} goes on {float(outside[beyond].max(initial=0.0)):.3f} m beyond its "
+        f"walls, expected {room.sides[0]:g} x {room.sides[1]:g} m: {HINT.format(room.name)}.",
         DepthMapError,
     )
 

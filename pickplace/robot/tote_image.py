@@ -71,14 +71,16 @@ def _patch_heights(
         highest: of each pixel, NaN if unknown; widened by a pixel.
         lowest: of each pixel, inf if unknown; narrowed by a pixel.
     """
-    points = seen.at(highest)
-    within = distance_outside(points, room) < -margin
     high = ndimage.maximum_filter(np.where(np.isnan(highest), -np.inf, highest), 3)
     low = ndimage.minimum_filter(lowest, 3)
-    at = tuple((points[within] / (room.sides[0] / shape[0])).astype(int).clip(0, shape - 1).T)
     greatest, least = np.full(shape, -np.inf), np.full(shape, np.inf)
-    np.maximum.at(greatest, at, high[within])
-    np.minimum.at(least, at, low[within])
+    # A pixel beside a higher one stands for the place at that height, too.
+    for places in (highest, np.where(np.isinf(high), np.nan, high)):
+        points = seen.at(places)
+        within = distance_outside(points, room) < -margin
+        at = tuple((points[within] / (room.sides[0] / shape[0])).astype(int).clip(0, shape - 1).T)
+        np.maximum.at(greatest, at, high[within])
+        np.minimum.at(least, at, low[within])
     return greatest, least
 
 
@@ -90,7 +92,8 @@ def _nearest(heights: np.ndarray, missing: np.ndarray) -> np.ndarray:
 def _likely(seen: Heights, room: Room, margin: float, shape: np.ndarray) -> ToteMap:
     """Return the map if all that has no depth is like what is beside it."""
     high, low = _patch_heights(seen, room, margin, shape, seen.height, np.nan_to_num(seen.height, nan=np.inf))
-    return ToteMap(*(_nearest(part, np.isinf(high)).clip(0, None) for part in (high, low)))
+    missing = np.isinf(high) | np.isinf(low)
+    return ToteMap(_nearest(high, missing).clip(0, None), _nearest(low, missing).clip(0, None))
 
 
 def _behind_holes(seen: Heights, room: Room, margin: float, accuracy: float, shape: np.ndarray) -> np.ndarray:

@@ -212,7 +212,8 @@ def random_truth(draw, cell: str, kind: str) -> Truth:
             truth.in_tote = [replace(each, dark=draw.random() < 0.5) for each in truth.in_tote]
     if kind == "hand":
         name = str(draw.choice(("bin", "tote")))
-        room, height = getattr(truth, name), draw.uniform(0.1, 0.35)
+        room, height = getattr(truth, name), draw.uniform(0.0, 0.1)
+        height += getattr(truth, name)[2] + 0.045  # the arm passes over the wall
         at, angle = draw.uniform(0.1, 0.9, 2) * room[:2], draw.uniform(-np.pi, np.pi)
         palm = Thing(tuple(at), (0.1, 0.09), height - 0.03, height, angle, kind="hand", dark=draw.random() < 0.2)
         arm = Thing(tuple(at + turned(angle) @ (0.3, 0)), (0.52, 0.07), height - 0.04, height + 0.02, angle, kind="hand",
