@@ -423,13 +423,17 @@ def test_ros_node_plans_and_places(ros_node, checkpoint):
     node = ros_node(checkpoint=checkpoint)
     assert not node.services["~/placed"]().success
     assert node.services["~/plan"]().message == "bin/depth: no image yet."
-    image = np.full((240, 320), 1200, np.uint16)
-    for place in ("tote", "bin"):
+    # The rim, walls of which nothing is known, and the floor.
+    images = {"bin": np.full((240, 320), 1150, np.uint16), "tote": np.full((240, 320), 950, np.uint16)}
+    images["bin"][65:175, 105:215], images["bin"][68:172, 108:212] = 0, 1200
+    images["tote"][41:199, 81:239], images["tote"][58:182, 98:222] = 0, 1200
+    images["bin"][100:120, 140:160] = 1140  # an item of about 46 x 46 x 60 mm
+    for place, image in images.items():
         stamp = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0))
         shape = {"height": 240, "width": 320, "step": 640, "encoding": "16UC1", "is_bigendian": False}
         node.callbacks[f"{place}/depth"](SimpleNamespace(header=stamp, data=image.tobytes(), **shape))
-        node.callbacks[f"{place}/camera_info"](SimpleNamespace(p=[500, 0, 159.5, 0, 0, 500, 119.5, 0, 0, 0, 1, 0]))
-        image[100:120, 140:160] = 1140  # an item of about 46 x 46 x 60 mm, in the bin only
+        info = {"p": [500, 0, 159.5, 0, 0, 500, 119.5, 0, 0, 0, 1, 0], "height": 240, "width": 320}
+        node.callbacks[f"{place}/camera_info"](SimpleNamespace(**info))
     answer = node.services["~/plan"]()
     assert (answer.success, answer.message) == (True, "ok")
     pick, place = node.published

@@ -78,10 +78,10 @@ class SimulatedCell:
         Args:
             items: size ``(w, d, h)``, centre in the bin ``(x, y)`` in metres, and yaw in degrees, of each.
         """
-        filled, bearing = Filled(), None
+        filled, bearing, placed = Filled(), None, []
         for size, centre, yaw in items:
             self.arrive(size, centre, yaw)
-            plan = self.look_and_plan(bearing)
+            plan = self.look_and_plan(bearing, placed)
             if plan.status != "ok":
                 filled.last = plan
                 break
@@ -89,15 +89,15 @@ class SimulatedCell:
                 filled.loss = loss
                 break
             filled.sizes.append(tuple(size))
-            bearing = plan.tote_bearing
+            bearing, placed = plan.tote_bearing, [*placed, plan.placed]
         return filled
 
-    def look_and_plan(self, tote_bearing=None) -> Plan:
+    def look_and_plan(self, tote_bearing=None, placed=()) -> Plan:
         """Return the plan for what the cameras see."""
         views = [(camera, self.depth_image(name)) for name, camera in self.cameras.items()]
         scene = Scene.from_images(
             self.planner.cell, *views, self.planner.cell.cell_size, self.accuracy, clearance=self.clearance,
-            tote_bearing=tote_bearing,
+            tote_bearing=tote_bearing, placed=placed,
         )  # fmt: skip
         return self.planner.plan(scene, alternatives=0)
 
@@ -123,7 +123,7 @@ class SimulatedCell:
         """Return what a camera measures, ``"bin"`` or ``"tote"``, m; the gantry is out of the way."""
         gantry, camera = self.gantry, self.cameras[name]
         mujoco.mj_forward(gantry.model, gantry.data)
-        rays = camera.rays(IMAGE)
+        rays = camera.rays()
         length = np.linalg.norm(rays, axis=-1)
         directions = rays / length[..., None]
         origin = camera.pose[:3, 3] + ((*gantry.bin, 0.0) if name == "bin" else 0.0)

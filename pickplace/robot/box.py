@@ -22,6 +22,7 @@ class Box:
     d: float  #: side along y
     h: float  #: height of its top above the bin's floor
     yaw: float = 0.0  #: turn about the vertical axis, counter-clockwise seen from above
+    edge_error: float = 0.0  #: by which each side may end nearer to the centre than ``w`` and ``d`` say
 
     def upright(self) -> "Box":
         """Return the same cuboid with a yaw above -45 and at most 45 degrees."""
@@ -33,3 +34,10 @@ class Box:
 @dataclass(frozen=True)
 class HiddenBox(Box):
     """A box behind a higher one, of which a camera may not see all: it is in the way, and is not picked."""
+
+
+@dataclass(frozen=True)
+class UnknownBox(HiddenBox):
+    """A place in the bin of which an image has too little: as large and as high as may be, and not picked."""
+
+    likely: Box | None = None  #: the item that is probably there; None: probably nothing

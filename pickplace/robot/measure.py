@@ -31,6 +31,7 @@ class ToteMap(NamedTuple):
 
     highest: np.ndarray
     lowest: np.ndarray
+    likely: "ToteMap | None" = None  #: the map if places of which nothing is known are like those beside them
 
 
 def refuse(name: str, bad: np.ndarray, values: np.ndarray, unit: str, expected: str) -> None:

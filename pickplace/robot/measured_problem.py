@@ -116,7 +116,12 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
     error = clearance if scene.placement_error is None else scene.placement_error
     tote = _read_tote(cell, scene, cell_size * cell.height_unit, error / cell_size, device)
     each = [_on_grid(cell, box, cell_size, clearance, f"items[{index}]", device) for index, box in enumerate(boxes)]
-    items, sides = join_items(each), [(box.w / cell_size, box.d / cell_size) for box in boxes]
+    items = join_items(each)
+    # What an item covers for sure decides where it is gripped, and what supports it.
+    sides = [
+        (max(box.w - 2 * box.edge_error, 0.0) / cell_size, max(box.d - 2 * box.edge_error, 0.0) / cell_size)
+        for box in boxes
+    ]
     free = replace(
         cell,
         bin_size=(*cell.bin_size[:2], 1),
@@ -248,7 +253,7 @@ def _read_tote(cell: CellSpec, scene: Scene, unit: float, error: float, device) 
         height = number("tote_height", cell.tote_size[2] * unit, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
     rim, over_rim = (int(whole_units(height, MILLIMETRE, up)) for up in (False, True))
     if isinstance(scene.tote, ToteMap):
-        highest, lowest = (as_array("tote", part, grid) for part in scene.tote)
+        highest, lowest = (as_array("tote", part, grid) for part in scene.tote[:2])
     else:
         beyond = max(4 * scene.accuracy, 0.01)  # a floor or a rim that noise puts a little out of range
         depth = metric_map("tote_depth", scene.tote, grid, -beyond, height + beyond)

@@ -8,6 +8,7 @@ cell ``(0, 0)`` on the inner floor; x runs along the first axis of the depth map
 seen from above.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -90,6 +91,22 @@ class Plan:
     #: if stuck or impossible: a sentence for each item that the gripper cannot grip, wherever it lies; such as
     #: "items[1]: the cup does not fit on this item; no pick takes it."
     hints: list[str] = field(default_factory=list)
+
+    @property
+    def placed(self) -> Box | None:
+        """The item as it lies in the tote once it rests, in the tote's frame; ``h`` is the height of its top.
+
+        It is the record of the tote for :meth:`Scene.from_images`. None without an action, or without ``cell_size``.
+        """
+        if not (
+            self.box and self.pick and self.place and self.drop_height is not None and self.rotation_degrees is not None
+        ):
+            return None
+        box, angle = self.box, math.radians(self.rotation_degrees)
+        x, y = box.x - self.pick.center[0], box.y - self.pick.center[1]
+        x, y = x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle)
+        centre = {"x": self.place.center[0] + x, "y": self.place.center[1] + y}
+        return replace(box, **centre, h=self.drop_height + box.h, yaw=box.yaw + self.rotation_degrees).upright()
 
     def as_dict(self) -> dict:
         """Return the plan as plain values, ready for JSON."""
@@ -183,15 +200,18 @@ class Planner:
         planner, terms = self._planner_of(problem.maps.bin_items, is_metric)
         observation = observe(terms, problem.cell, problem.seen)
         status, action = _decide(planner, problem, observation)
+        if action is None:
+            self._refuse_unknown(scene, device)
         number = None if action is None else int(problem.taken_items(action))
         known = 0 if problem.maps.bin_items == 1 else number
         pick, place, turn, drop_height = (None,) * 4 if action is None else problem.motion(action)
         seen = None if known is None else problem.seen.items.cuboids[0, known].tolist()
+        box = None if known is None or not problem.boxes else problem.boxes[known]
         (before, gained), bearing = problem.shares(number or 0), problem.bearing_after(action)
         return Plan(
             status=status,
             item=None if seen is None else dict(zip("xywdh", seen, strict=True)),
-            box=None if known is None or not problem.boxes else problem.boxes[known],
+            box=box,
             pick=pick,
             place=place,
             rotation_degrees=turn,
@@ -206,6 +226,17 @@ class Planner:
             item_number=number,
             hints=problem.hints() if status in ("stuck", "impossible") else [],
         )
+
+    def _refuse_unknown(self, scene: Scene, device) -> None:
+        """Refuse a scene without a plan if one is likely to be feasible where images left something unknown."""
+        if (likely := scene.if_unknown_is_free()) is not None:
+            problem = read_metric(self.cell, likely, device)
+            refuse_if(
+                bool(footprint_mask(problem.cell, problem.maps).any()),
+                "depth: no plan avoids what the images leave unknown in bin and tote; expected more pixels with a "
+                "depth: take another image.",
+                DepthMapError,
+            )
 
     def _planner_of(self, count: int, is_metric: bool) -> tuple[MapPlanner, Mapping[str, Term]]:
         """Return what decides among so many items in the bin, and the terms of the observation.

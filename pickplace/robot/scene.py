@@ -1,11 +1,11 @@
 """A scene: what lies in the bin and in the tote, as it was measured, and how exactly."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from pickplace.common.validate import excerpt, integral_number, is_number, number, one_of, refuse_if
-from pickplace.robot.box import ACCURACY, CLEARANCE, MILLIMETRE, Box, DepthMapError
+from pickplace.robot.box import ACCURACY, CLEARANCE, MILLIMETRE, Box, DepthMapError, UnknownBox
 from pickplace.robot.camera import Camera
 from pickplace.robot.measure import ToteMap
 from pickplace.rules.cell import MAX_BIN_ITEMS, MAX_SIDE, CellSpec
@@ -88,10 +88,11 @@ class Scene:
             DepthMapError,
         )
         for at, box in enumerate(self.items):
-            for key, value in vars(box).items():
-                expected = "a length of at least 0.001 m" if key in "wdh" else "a finite number"
+            for key in (field.name for field in fields(Box)):
+                value, least = getattr(box, key), {"w": MILLIMETRE, "d": MILLIMETRE, "h": MILLIMETRE, "edge_error": 0.0}
+                expected = f"a length of at least {least[key]:g} m" if key in least else "a finite number"
                 refuse_if(
-                    not is_number(value) or abs(value) > MAX_VALUE or (key in "wdh" and value < MILLIMETRE),
+                    not is_number(value) or abs(value) > MAX_VALUE or (key in least and value < least[key]),
                     f"items[{at}].{key}={excerpt(value)}: expected {expected}.",
                     DepthMapError,
                 )
@@ -110,7 +111,8 @@ class Scene:
     @classmethod
     def from_images(
         cls, cell: CellSpec, bin_view: tuple[Camera, Any], tote_view: tuple[Camera, Any], cell_size: float,
-        accuracy: float = ACCURACY, labels=None, sizes=None, tote_height: float | None = None, **settings,
+        accuracy: float = ACCURACY, labels=None, sizes=None, tote_height: float | None = None,
+        greatest_height: float | None = None, placed: Sequence[Box] = (), **settings,
     ) -> "Scene":  # fmt: skip
         """Return the scene that two cameras see.
 
@@ -118,11 +120,28 @@ class Scene:
             cell: the sizes.
             bin_view, tote_view: a camera above each, and its depth image.
             labels, sizes: of the items, see :meth:`~pickplace.robot.camera.Camera.items`, as for errors.
+            greatest_height: of an item, m; None: the height of the tote's rim.
+            placed: the items that lie in the tote, see :meth:`~pickplace.robot.camera.Camera.tote_map`.
             **settings: the other fields.
         """
         (over_bin, bin_image), (over_tote, tote_image) = bin_view, tote_view
+        greatest = tote_height if greatest_height is None else greatest_height
         return cls(
-            over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes),
-            over_tote.tote_map(tote_image, cell, cell_size, tote_height),
+            over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes, greatest),
+            over_tote.tote_map(tote_image, cell, cell_size, tote_height, accuracy, placed),
             cell_size, accuracy, tote_height=tote_height, **settings,
         )  # fmt: skip
+
+    def if_unknown_is_free(self) -> "Scene | None":
+        """Return the scene that is likely where images left something unknown; None if nothing is unknown."""
+        tote, boxes = self.tote, [] if isinstance(self.items, BinMap) else self.items
+        likely = tote.likely if isinstance(tote, ToteMap) else None
+        if likely is None and not any(isinstance(box, UnknownBox) or box.edge_error for box in boxes):
+            return None
+        items = [box.likely if isinstance(box, UnknownBox) else box for box in boxes]
+        narrower = [
+            replace(box, w=box.w - 2 * box.edge_error, d=box.d - 2 * box.edge_error, edge_error=0.0)
+            for box in items
+            if box is not None
+        ]
+        return replace(self, items=narrower if boxes else self.items, tote=likely or tote)

@@ -167,13 +167,13 @@ def test_what_is_no_image_of_the_tote_is_refused():
     shown = image(eye, [])
     for bad, message in (
         (shown * np.nan, "got no distance above 0"), (shown * 1000, "expected metres; divide millimetres by 1000"),
-        (shown[0], "expected an image of distances"), (shown.astype(bool), "expected an image of distances"),
+        (shown[0], "expected an image of distances"), (shown.T, "the image is transposed"), (shown.astype(bool), "expected an image of distances"),
         (shown + 0.5, "the tote is seen at a height of -0.500 m"),
         (shown - 1.0, "the tote is seen at a height of 1.000 m"),
     ):  # fmt: skip
         with pytest.raises(DepthMapError, match=message):
             eye.tote_map(bad, CELL, SIZE)
-    with pytest.raises(DepthMapError, match="which is too few; expected the whole tote in the image"):
+    with pytest.raises(DepthMapError, match="the image shows nothing of the tote, expected the whole tote"):
         Camera.looking_down((1.0, 0.0), 1.2, 500.0, SHAPE).tote_map(shown, CELL, SIZE)
     with pytest.raises(DepthMapError, match="a cell is 0.8 pixels wide, expected at least 2"):
         camera(focal=20.0).tote_map(image(camera(focal=20.0), []), CELL, SIZE)
@@ -182,11 +182,11 @@ def test_what_is_no_image_of_the_tote_is_refused():
     with pytest.raises(DepthMapError, match="too few|are not seen"):
         eye.tote_map(dark, CELL, SIZE)
     with pytest.raises(ValueError, match="camera.pose: the camera does not look down"):
-        Camera(500, 500, 160, 120, np.eye(4))
+        Camera(500, 500, 160, 120, np.eye(4), SHAPE)
     with pytest.raises(ValueError, match="camera.pose: expected .4, 4."):
-        Camera(500, 500, 160, 120, np.ones((4, 4)))
+        Camera(500, 500, 160, 120, np.ones((4, 4)), SHAPE)
     with pytest.raises(ValueError, match="camera.fx=0"):
-        Camera(0, 500, 160, 120, np.eye(4))
+        Camera(0, 500, 160, 120, np.eye(4), SHAPE)
     with pytest.raises(DepthMapError, match="labels: got shape"):
         camera(BIN).items(image(camera(BIN), [], BIN), CELL, SIZE, labels=np.zeros((3, 3)))
     found = eye.tote_map(shown, CELL, SIZE)

@@ -54,7 +54,8 @@ class PickPlaceNode(Node):
                 self.create_subscription(kind, f"{place}/{topic}", keep, qos_profile_sensor_data)
         self.publishers_of = {frame: self.create_publisher(PoseStamped, f"~/{name}", 1)
                               for frame, name in (("bin", "pick"), ("tote", "place"))}  # fmt: skip
-        self.bearing = self.open = None  # where the tote bears weight, and the plan that the robot carries out
+        # Where the tote bears weight, what it holds, and the plan that the robot carries out.
+        self.bearing, self.placed_boxes, self.open = None, [], None
         for name in ("plan", "placed", "new_tote"):
             self.create_service(Trigger, f"~/{name}", getattr(self, name))
 
@@ -66,7 +67,7 @@ class PickPlaceNode(Node):
             cameras = {place: self.camera_of(place) for place in self.poses}
             scene = Scene.from_images(
                 self.planner.cell, *((cameras[place], depth[place]) for place in ("bin", "tote")), self.cell_size,
-                self.accuracy, clearance=self.clearance, tote_bearing=self.bearing,
+                self.accuracy, clearance=self.clearance, tote_bearing=self.bearing, placed=self.placed_boxes,
             )  # fmt: skip
             plan = self.planner.plan(scene)
         except (DepthMapError, ValueError) as error:
@@ -84,12 +85,13 @@ class PickPlaceNode(Node):
         response.success = self.open is not None
         response.message = "" if response.success else "no plan is open"
         if response.success:
+            self.placed_boxes.append(self.open.placed)
             self.bearing, self.open = self.open.tote_bearing, None
         return response
 
     def new_tote(self, _, response):
         """Forget the tote."""
-        self.bearing = self.open = None
+        self.bearing, self.placed_boxes, self.open = None, [], None
         response.success = True
         return response
 
@@ -117,7 +119,8 @@ class PickPlaceNode(Node):
             raise ValueError(f"{place}/camera_info: no message yet.")
         pose = np.array(self.poses[place]).reshape(4, 4)
         # Of the rectified image: P = [fx 0 cx .; 0 fy cy .; 0 0 1 .].
-        return Camera(fx=info.p[0], fy=info.p[5], cx=info.p[2], cy=info.p[6], pose=pose)
+        shape = info.height, info.width
+        return Camera(fx=info.p[0], fy=info.p[5], cx=info.p[2], cy=info.p[6], pose=pose, shape=shape)
 
     def publish(self, frame: str, pose) -> None:
         """Publish the centre of the suction face, z up, turned by its yaw."""

@@ -1,0 +1,268 @@
+"""Items in a bin, read from a depth image: boxes that can be picked, and what is only in the way."""
+
+import math
+from collections.abc import Sequence
+from itertools import combinations_with_replacement
+
+import numpy as np
+from scipy import ndimage
+
+from pickplace.common.validate import refuse_if
+from pickplace.robot.box import Box, DepthMapError, HiddenBox, UnknownBox
+from pickplace.robot.depth_image import AROUND, Heights, Room, distance_outside, level_range
+from pickplace.robot.measure import SNAPPED, is_inside, smallest_rectangle, turned_axes
+from pickplace.robot.room_check import fit_plane
+
+MOST_MISSING = 0.01  # greatest share of the inside of its rectangle that an item's top leaves free
+BORDER = 2.5  # width of the part of the rectangle that is not its inside, pixels
+LONGEST_GAP = 4.5  # beyond the seen edge of an item, pixels; behind a longer one it may go on unseen
+HIDDEN_PIXELS = 1.5  # distance from a box at which its edge should be seen, pixels
+EDGE_POINTS = 32  # along each side of a box, and along each ray
+MIN_ITEM_PIXELS = 9  # pixels of the smallest thing in a bin that counts
+MOST_HIDDEN = 0.25  # greatest share of the bin's floor that holes may hide
+
+
+def find_boxes(
+    seen: Heights, room: Room, margin: float, accuracy: float, greatest: float, labels: np.ndarray | None, sizes
+) -> list[Box]:
+    """Return the items in a bin, and as :class:`UnknownBox` what may be one; see :meth:`Camera.items`.
+
+    Args:
+        seen: of an image that was checked.
+        margin: width of the border along the walls in which a point may be one of the wall, m.
+        greatest: height of the highest item that may lie there, m.
+        labels: in the shape of ``seen``; None: items are told apart by steps.
+    """
+    within, band = seen.is_within(room, margin), level_range(accuracy)
+    above = within & (seen.height > band)
+    too_high = above & (seen.height > greatest + band)
+    refuse_if(
+        too_high.sum() >= MIN_ITEM_PIXELS,
+        f"depth: something {float(np.quantile(seen.height[too_high], 0.95)) if too_high.any() else 0:.3f} m high is "
+        f"seen in the bin, expected items up to {greatest:g} m, see greatest_height: is a hand or a tool in the way?",
+        DepthMapError,
+    )
+    surface = seen.surface(room)
+    segments = _segments(seen, above, accuracy, labels)
+    numbers, counts = np.unique(segments[segments > 0], return_counts=True)
+    boxes = [
+        _read_box(seen, room, surface, segments, number, above, accuracy, labels is None)
+        for number in numbers[counts >= MIN_ITEM_PIXELS]
+    ]
+    hidden = [0.0 if isinstance(box, UnknownBox) else _hidden_length(seen, box, boxes) for box in boxes]
+    for box, length in zip(boxes, hidden, strict=True):
+        if sizes is not None and not length and not isinstance(box, UnknownBox):
+            _check_reading(box, sizes, 2 * (seen.pixel + accuracy + box.edge_error))
+    boxes = [
+        HiddenBox(box.x, box.y, box.w + 2 * length, box.d + 2 * length, box.h, box.yaw) if length else box
+        for box, length in zip(boxes, hidden, strict=True)
+    ]
+    boxes += [*_rest(seen, above, boxes), *_behind_holes(seen, room, surface, accuracy, boxes, greatest)]
+    refuse_if(
+        bool(boxes) and all(isinstance(box, UnknownBox) for box in boxes),
+        f"depth: {len(boxes)} places in the bin are not seen well enough to tell where an item ends, the first at "
+        f"[{boxes[0].x if boxes else 0:.3f}, {boxes[0].y if boxes else 0:.3f}]; expected one item that is seen with "
+        "its whole edge: take another image.",
+        DepthMapError,
+    )
+    return boxes
+
+
+def _segments(seen: Heights, above: np.ndarray, accuracy: float, labels: np.ndarray | None) -> np.ndarray:
+    """Return the number of the item that each pixel shows, 0 for none."""
+    if labels is None:
+        known = ~np.isnan(seen.height)
+        high = ndimage.maximum_filter(np.where(known, seen.height, -np.inf), 3)
+        low = ndimage.minimum_filter(np.where(known, seen.height, np.inf), 3)
+        return ndimage.label(above & (high - low < 4 * accuracy + seen.pixel))[0]
+    named = ndimage.binary_dilation(labels > 0, AROUND, iterations=2)
+    if (left := above & ~named).sum() >= MIN_ITEM_PIXELS:
+        row, column = np.argwhere(left)[0].tolist()
+        raise DepthMapError(
+            f"labels[{row + seen.corner[0]}, {column + seen.corner[1]}]: got 0, but something "
+            f"{seen.height[row, column]:.3f} m high lies there; expected a label for each item."
+        )
+    return np.where(above & (labels > 0), labels, 0)
+
+
+def _read_box(
+    seen: Heights, room: Room, surface: np.ndarray, segments: np.ndarray, number: int, above: np.ndarray,
+    accuracy: float, narrowed: bool,
+) -> Box:  # fmt: skip
+    """Return the cuboid whose top fills a segment; as :class:`UnknownBox` if it may go on where nothing is seen.
+
+    Args:
+        surface: see :meth:`Heights.surface`.
+        narrowed: whether the filter of steps took the outermost pixels off the segment; else labels made it.
+    """
+    top, band = segments == number, level_range(accuracy)
+    height = float(np.quantile(seen.height[top], 0.95))
+    if narrowed:
+        near = ndimage.binary_dilation(top, AROUND) & above & (segments == 0)
+        top = top | (near & (np.abs(seen.height - height) <= band))
+    points, pixel = seen.at(height), seen.pixel * (seen.origin[2] - height) / seen.origin[2]
+    x, y, w, d, yaw = smallest_rectangle(points[top])
+    _check_top(seen, (x, y, w, d, yaw), points, top, pixel, accuracy)
+    # Each side may be as far out as the first ray in front of it that passes the height of the top.
+    known = ~np.isnan(seen.height)
+    passed = known & ~top & (np.abs(seen.height - height) > band)
+    if not narrowed:  # labels tell it from others that are as high
+        passed |= (segments > 0) & ~top
+    # It cannot stand on a place that is seen either.
+    axes = turned_axes(math.radians(yaw))
+    free = np.concatenate([points[passed], seen.points[passed & (seen.height < height)]])
+    free, inside = ((each - (x, y)) @ axes.T for each in (free, points[distance_outside(points, room) < 0]))
+    gaps = [
+        min(_least_beyond(free, (w, d), axis, sign, pixel), (sign * inside[:, axis]).max() - (w, d)[axis] / 2 + pixel)
+        for axis in (0, 1)
+        for sign in (-1, 1)
+    ]
+    outer = np.maximum(0.5 * pixel, np.array(gaps) - pixel)  # beyond the centres of the outermost pixels
+
+    def grown(by: np.ndarray) -> dict:
+        shift = np.array([by[1] - by[0], by[3] - by[2]]) / 2 @ axes
+        return {"x": float(x + shift[0]), "y": float(y + shift[1]), "w": float(w + by[0] + by[1]),
+                "d": float(d + by[2] + by[3]), "h": height, "yaw": yaw}  # fmt: skip
+
+    error = float(max(0.0, outer.max() - pixel))
+    on_top = is_inside(points, (x, y), (w, d), yaw)
+    if outer.max() <= LONGEST_GAP * pixel and not seen.holes_above(height, surface, room, accuracy, on_top).any():
+        return Box(**grown(outer), edge_error=error).upright()
+    likely = Box(**grown(np.minimum(outer, pixel))).upright()
+    return UnknownBox(**vars(Box(**grown(outer)).upright()), likely=likely)
+
+
+def _least_beyond(points: np.ndarray, sides: Sequence[float], axis: int, sign: int, pixel: float) -> float:
+    """Return the least distance in front of a side of a rectangle at which one of the points lies, m; else inf.
+
+    Args:
+        points: in the frame of the rectangle, ``[M, 2]``.
+        axis, sign: tell which of its four sides.
+    """
+    other = sides[1 - axis] / 2
+    beyond = sign * points[:, axis] - sides[axis] / 2
+    in_front = (np.abs(points[:, 1 - axis]) < max(other - 1.5 * pixel, other / 2)) & (beyond > -0.5 * pixel)
+    return float(beyond[in_front].min(initial=np.inf))
+
+
+def _check_top(
+    seen: Heights, rectangle: tuple, points: np.ndarray, top: np.ndarray, pixel: float, accuracy: float
+) -> None:
+    """Refuse a top that does not fill its rectangle, or is not level and flat.
+
+    Args:
+        points: where each pixel's ray passes the height of the top, ``[rows, columns, 2]``.
+        top: bool ``[rows, columns]``.
+    """
+    x, y, w, d, yaw = rectangle
+    border = (BORDER - 1) * pixel + SNAPPED * max(w, d) * (yaw == 0)
+    inside = is_inside(points, (x, y), (w - 2 * border, d - 2 * border), yaw)
+    found = f"depth: what lies at [{x:.3f}, {y:.3f}]"
+    if (
+        inside.any()
+        and (missing := float((inside & ~top & ~np.isnan(seen.height)).sum() / inside.sum())) > MOST_MISSING
+    ):
+        raise DepthMapError(
+            f"{found} leaves {missing:.0%} of its rectangle of {w + pixel:.3f} x {d + pixel:.3f} m free: it could be "
+            "two items that touch, or one that is no cuboid; separate them, or pass labels."
+        )
+    inner = ndimage.binary_erosion(top, AROUND)
+    inner = inner if inner.sum() >= MIN_ITEM_PIXELS else top
+    heights = seen.height[inner]
+    plane = fit_plane(points[inner], heights)
+    refuse_if(
+        (slope := float(np.ptp(plane))) > 2 * accuracy,
+        f"{found} has a top that slopes by {slope:.3f} m, expected a level one, {2 * accuracy:g} m at most: is it "
+        "tilted, or the camera's pose wrong?",
+        DepthMapError,
+    )
+    refuse_if(
+        (uneven := float(np.quantile(np.abs(heights - plane), 0.95))) > 2 * accuracy,
+        f"{found} has a top that is {uneven:.3f} m off a plane, expected a flat one, {2 * accuracy:g} m at most.",
+        DepthMapError,
+    )
+
+
+def _rest(seen: Heights, above: np.ndarray, boxes: Sequence[Box]) -> list[Box]:
+    """Return what lies in the bin beside its boxes as boxes that are in the way."""
+    left, points = above.copy(), seen.points
+    for box in boxes:
+        left &= ~is_inside(points, (box.x, box.y), (box.w + 5 * seen.pixel, box.d + 5 * seen.pixel), box.yaw)
+    parts, count = ndimage.label(left, AROUND)
+    found = (parts == number for number in range(1, count + 1))
+    return [
+        _around(points[part], seen.pixel, float(seen.height[part].max()))
+        for part in found
+        if part.sum() >= MIN_ITEM_PIXELS
+    ]
+
+
+def _behind_holes(
+    seen: Heights, room: Room, surface: np.ndarray, accuracy: float, boxes: Sequence[Box], greatest: float
+) -> list[Box]:  # fmt: skip
+    """Return what the holes of the image may hide on the floor, as high as an item may be; not the boxes' sides."""
+    floor = seen.at(0.0)
+    free = np.ones_like(seen.holes)
+    for box in boxes:
+        free &= ~is_inside(floor, (box.x, box.y), (box.w, box.d), box.yaw) | (type(box) is not Box)
+    holes = seen.holes_above(0.0, surface, room, accuracy, free)
+    refuse_if(
+        (share := holes.sum() / (distance_outside(floor, room) < 0).sum()) > MOST_HIDDEN,
+        f"depth: {share:.0%} of the bin are not seen, expected {MOST_HIDDEN:.0%} at most: take another image.",
+        DepthMapError,
+    )
+    parts, count = ndimage.label(holes, AROUND)
+    found = [_around(floor[parts == number], seen.pixel, greatest) for number in range(1, count + 1)]
+    for box in found:
+        refuse_if(
+            max(box.w, box.d) > 0.8 * min(room.sides),
+            f"depth: a part of the bin of {box.w:.3f} x {box.d:.3f} m at [{box.x:.3f}, {box.y:.3f}] is not seen, "
+            f"expected sides of {0.8 * min(room.sides):.3f} m at most: take another image.",
+            DepthMapError,
+        )
+    return found
+
+
+def _around(points: np.ndarray, pixel: float, height: float) -> Box:
+    """Return the box around points ``[M, 2]``, a pixel away from them, that is in the way."""
+    x, y, w, d, yaw = smallest_rectangle(points)
+    return UnknownBox(**vars(Box(x, y, w + 2 * pixel, d + 2 * pixel, height, yaw).upright()))
+
+
+def _hidden_length(seen: Heights, box: Box, boxes: Sequence[Box]) -> float:
+    """Return how far a box may go on where higher ones hide what is beside it, m; 0 if its whole edge is seen."""
+    camera = seen.origin
+    pixel = seen.pixel * (camera[2] - box.h) / camera[2]
+    side, grown = np.linspace(-1, 1, EDGE_POINTS), HIDDEN_PIXELS * pixel
+    one = np.ones_like(side)
+    edge = np.concatenate([[side, one], [side, -one], [one, side], [-one, side]], 1).T
+    edge = edge * (box.w / 2 + grown, box.d / 2 + grown) @ turned_axes(math.radians(box.yaw)) + (box.x, box.y)
+    to_camera, longest = camera[:2] - edge, 0.0
+    for other in (each for each in boxes if each.h > box.h):
+        share = (other.h - box.h) / (camera[2] - box.h)  # of the ray that runs below the other's top
+        ray = edge + np.linspace(0, share, EDGE_POINTS)[:, None, None] * to_camera
+        inside = is_inside(ray, (other.x, other.y), (other.w, other.d), other.yaw)
+        hidden = to_camera[inside.any(0) & ~inside[0]]  # what lies in the other is no part of the box
+        longest = max(longest, float((share * np.linalg.norm(hidden, axis=1)).max(initial=0.0)))
+    return longest if longest > pixel / 2 else 0.0
+
+
+def _check_reading(box: Box, sizes, tolerance: float) -> None:
+    """Refuse a box that could be two items of known sizes, or is none; both readings are named."""
+    tall = [(w, d) for a, b, h in sizes for w, d in {(a, b), (b, a)} if abs(box.h - h) <= tolerance]
+
+    def is_like(w: float, d: float) -> bool:
+        return abs(box.w - w) <= tolerance and abs(box.d - d) <= tolerance
+
+    one = [(w, d) for w, d in tall if is_like(w, d)]
+    two = [
+        (a, b)
+        for a, b in combinations_with_replacement(tall, 2)
+        if (is_like(a[0] + b[0], a[1]) and a[1] == b[1]) or (is_like(a[0], a[1] + b[1]) and a[0] == b[0])
+    ]
+    found = f"depth: what lies at [{box.x:.3f}, {box.y:.3f}], {box.w:.3f} x {box.d:.3f} x {box.h:.3f} m,"
+    if two:
+        pair = " and ".join(f"{w:g} x {d:g}" for w, d in two[0])
+        single = f"one item of {one[0][0]:g} x {one[0][1]:g} m or " if one else ""
+        raise DepthMapError(f"{found} is {single}two of {pair} m that touch; separate them, or pass labels.")
+    refuse_if(not one, f"{found} is no item of the given sizes.", DepthMapError)

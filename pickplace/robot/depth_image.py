@@ -1,0 +1,202 @@
+"""A depth image as heights above a floor: noise and single gaps are removed, and what stays unknown is told apart.
+
+A pixel without depth is *unknown*. Gaps of at most three pixels, such as those at the edges of items, are too narrow to
+hide a thing that counts: they are filled, inside a level top by its height, elsewhere by bounds of it. A wider gap is a
+*hole*, and may hide anything.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from pickplace.common.validate import refuse_if
+from pickplace.robot.box import Box, DepthMapError
+
+MOST_MISSING_PIXELS = 0.15  # greatest share of the pixels of level surfaces that may lack a depth
+SEAM = 5  # longest gap in a level top that is filled, pixels; a longer one may part two items
+MARGIN = 24  # pixels around the room that are looked at, too
+HOLE = np.ones((4, 4), dtype=bool)  # the smallest hole, pixels
+HOLE[::3, ::3] = False
+SQUARE = 1.25  # side of the squares of a seen surface, pixels
+AROUND = np.ones((3, 3), dtype=bool)
+RECORD_MARGIN = 0.008  # by which an item in the tote may be off its recorded place, m
+
+
+class Room(NamedTuple):
+    """The inside of a bin or a tote, from ``(0, 0, 0)`` to its sides and its rim; m."""
+
+    name: str
+    sides: tuple[float, float]
+    rim: float
+
+
+@dataclass(frozen=True, eq=False)
+class Heights:
+    """What each pixel of the part of an image that shows a room says; arrays are ``[rows, columns]``."""
+
+    origin: np.ndarray  # of all rays, [3]
+    rays: np.ndarray  # way along each pixel's ray, [rows, columns, 3]
+    corner: tuple[int, int]  # row and column of the first pixel in the whole image
+    pixel: float  # side of a pixel's square on the floor, m
+    raw: np.ndarray  # height as it was measured; NaN if unknown
+    height: np.ndarray  # the same without noise, and with single gaps in level surfaces filled; NaN if unknown
+    highest: np.ndarray  # the greatest height that a pixel may have; NaN in holes
+    lowest: np.ndarray  # the least height that a pixel may have; NaN in holes
+    holes: np.ndarray  # bool: pixels of holes
+
+    def at(self, height) -> np.ndarray:
+        """Return where each pixel's ray passes a height, ``[rows, columns, 2]``; of a height or one for each pixel."""
+        way = (height - self.origin[2]) / self.rays[..., 2]
+        return np.stack([self.origin[axis] + self.rays[..., axis] * way for axis in (0, 1)], -1)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """Where each pixel's ray meets what it shows, ``[rows, columns, 2]``; NaN if unknown."""
+        return self.at(self.height)
+
+    def surface(self, room: Room) -> np.ndarray:
+        """Return the greatest height that is seen in each square of :data:`SQUARE` pixels, -inf where none is."""
+        side = SQUARE * self.pixel
+        highest = np.full([math.ceil(length / side) for length in room.sides], -np.inf)
+        known = distance_outside(self.points, room) < 0
+        np.maximum.at(highest, tuple((self.points[known] / side).astype(int).T), self.height[known])
+        return highest
+
+    def holes_above(
+        self, height: float, surface: np.ndarray, room: Room, accuracy: float, where: np.ndarray | bool = True
+    ) -> np.ndarray:
+        """Return the pixels of holes that may show a thing that stands on a surface of a height, bool.
+
+        Such a thing hides the whole surface below it. Pixels that can show only walls, or the sides of what is seen
+        from above, are none. So are those of a strip of the surface that is too narrow for a hole.
+
+        Args:
+            surface: see :meth:`surface`.
+            where: other pixels show no such thing, bool.
+        """
+        points = self.at(height)
+        inside = self.holes & where & (distance_outside(points, room) < 0)
+        seen = surface[tuple((points[inside] / (SQUARE * self.pixel)).astype(int).T)]
+        inside[inside] = np.isinf(seen) | (np.abs(seen - height) <= level_range(accuracy))
+        return ndimage.binary_opening(inside, HOLE)
+
+    def is_within(self, room: Room, margin: float) -> np.ndarray:
+        """Return which pixels show something inside the room, at least ``margin`` from its walls, bool."""
+        return distance_outside(self.points, room) < -margin
+
+
+def distance_outside(points: np.ndarray, room: Room) -> np.ndarray:
+    """Return how far points ``[..., 2]`` lie beyond the nearest wall, m; below 0 inside."""
+    x, y = points[..., 0], points[..., 1]
+    return np.maximum(np.maximum(-x, x - room.sides[0]), np.maximum(-y, y - room.sides[1]))
+
+
+def read_heights(
+    rays: np.ndarray, origin: np.ndarray, depth: np.ndarray, room: Room, pixel: float, accuracy: float,
+    record: Sequence[Box] = (),
+) -> Heights:  # fmt: skip
+    """Return the heights in the part of an image that shows a room.
+
+    Args:
+        rays: of every pixel, see :meth:`Camera.rays`.
+        origin: of the rays, the camera's position.
+        depth: distances along the optical axis, NaN if unknown, ``[rows, columns]``; m.
+        room: the bin or the tote.
+        pixel: side of a pixel's square on the floor, m.
+        accuracy: greatest error of a height, m.
+        record: boxes that are known to stand in the room; an unknown pixel shows them, if its ray meets one.
+
+    Raises:
+        DepthMapError: if the image does not show the whole room, or lacks too many pixels.
+    """
+    rows, columns = _window(rays, origin, room)
+    rays = rays[rows, columns]
+    raw = depth[rows, columns] * rays[..., 2] + origin[2]
+    known, recorded = ~np.isnan(raw), np.full_like(raw, np.nan)
+    for box in record:
+        recorded = np.fmax(recorded, _entered(rays, origin, box, accuracy))
+    recorded[known] = np.nan
+    is_recorded = ~np.isnan(recorded)
+    # Unknown pixels must not pull the median up or down: in it each has the height of the nearest one.
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    smooth = ndimage.median_filter(raw[tuple(nearest)], 3, mode="nearest")
+    height = np.where(is_recorded, recorded, np.where(known, smooth, np.nan))
+    unknown = np.isnan(height)
+    holes = ndimage.binary_opening(unknown, HOLE)
+    gaps = unknown & ~holes
+    high = ndimage.maximum_filter(np.where(unknown, -np.inf, height), 5)
+    low = ndimage.minimum_filter(np.where(unknown, np.inf, np.where(is_recorded, 0.0, height)), 5)
+    level = gaps & (high - low <= level_range(accuracy))
+    seen = Heights(origin, rays, (rows.start, columns.start), pixel, raw, height, height, height, holes)
+    shown = distance_outside(seen.at(0.0), room) < 0
+    missing = (level & shown).sum() / max(1, ((level | known) & shown).sum())
+    refuse_if(
+        missing > MOST_MISSING_PIXELS,
+        f"depth: {missing:.0%} of the pixels on level surfaces in the {room.name} have no depth, expected "
+        f"{MOST_MISSING_PIXELS:.0%} at most: take another image.",
+        DepthMapError,
+    )
+    single = level & _is_short(gaps)
+    height = np.where(single, smooth, height)
+    highest, lowest = (np.where(gaps & ~single, bound, height) for bound in (high, low))
+    return Heights(
+        origin,
+        rays,
+        (rows.start, columns.start),
+        pixel,
+        raw,
+        height,
+        highest,
+        np.where(is_recorded, 0.0, lowest),
+        holes,
+    )
+
+
+def level_range(accuracy: float) -> float:
+    """Return by how much heights of neighbouring pixels on a level top may differ, m."""
+    return max(3 * accuracy, 0.005)
+
+
+def _window(rays: np.ndarray, origin: np.ndarray, room: Room) -> tuple[slice, slice]:
+    """Return the rows and columns that show a room, and what is beside it."""
+    shown = np.zeros(rays.shape[:2], dtype=bool)
+    for height in (0.0, min(room.rim, 0.9 * origin[2])):
+        points = origin[:2] + rays[..., :2] * ((height - origin[2]) / rays[..., 2])[..., None]
+        shown |= distance_outside(points, room) < 0
+    border = np.concatenate([shown[0], shown[-1], shown[:, 0], shown[:, -1]])
+    refuse_if(
+        border.any() or not shown.any(),
+        f"depth: the image shows {'a part' if shown.any() else 'nothing'} of the {room.name}, expected the whole "
+        f"{room.name} in the image, up to its rim: check the camera's pose and its focal lengths.",
+        DepthMapError,
+    )
+    (row, column), (last_row, last_column) = np.argwhere(shown).min(0), np.argwhere(shown).max(0)
+    return (
+        slice(max(0, int(row) - MARGIN), int(last_row) + MARGIN + 1),
+        slice(max(0, int(column) - MARGIN), int(last_column) + MARGIN + 1),
+    )
+
+
+def _entered(rays: np.ndarray, origin: np.ndarray, box: Box, accuracy: float) -> np.ndarray:
+    """Return the height at which each ray enters a box in the tote, wider by what its place may be wrong; else NaN."""
+    angle = math.radians(box.yaw)
+    cos, sin = math.cos(angle), math.sin(angle)
+    axes = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    half = np.array([box.w / 2 + RECORD_MARGIN, box.d / 2 + RECORD_MARGIN, (box.h + accuracy) / 2])
+    start, way = axes @ (origin - (box.x, box.y, half[2])), rays @ axes.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.stack([(-half - start) / way, (half - start) / way])
+    enter, leave = ends.min(0).max(-1), ends.max(0).min(-1)
+    return np.where(enter < leave, origin[2] + enter * rays[..., 2], np.nan)
+
+
+def _is_short(gaps: np.ndarray) -> np.ndarray:
+    """Return which gaps are single: no longer than a few pixels, and so no line between two items; bool."""
+    numbers, _ = ndimage.label(gaps, AROUND)
+    short = [False, *(max(side.stop - side.start for side in part) <= SEAM for part in ndimage.find_objects(numbers))]
+    return np.array(short)[numbers]

@@ -1,0 +1,116 @@
+"""The heights in a tote, read from a depth image."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import ndimage
+
+from pickplace.common.validate import refuse_if
+from pickplace.robot.box import DepthMapError
+from pickplace.robot.depth_image import AROUND, Heights, Room, distance_outside, level_range
+from pickplace.robot.measure import ToteMap
+from pickplace.robot.room_check import FEW
+
+MOST_UNSEEN = 0.25  # greatest share of a tote that the camera may not see
+
+
+def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: Sequence[int], along: int) -> ToteMap:
+    """Return the heights in each patch of a tote.
+
+    Args:
+        seen: of an image that was checked.
+        margin: width of the border along the walls in which a point may be one of the wall, m.
+        grid: of the tote, in cells.
+        along: patches along a cell.
+
+    Raises:
+        DepthMapError: for something above the rim, or too much that is not seen.
+    """
+    within = distance_outside(seen.at(seen.highest), room) < -margin
+    over = within & (seen.height > room.rim + level_range(accuracy))
+    refuse_if(
+        over.sum() > FEW,
+        f"depth: something {float(np.median(seen.height[over])) if over.any() else 0:.3f} m high is seen in the tote, "
+        f"expected up to {room.rim:g} m, its rim: is a hand or a tool in the way?",
+        DepthMapError,
+    )
+    shape = np.array(grid) * along
+    unknown = _behind_holes(seen, room, margin, accuracy, shape)
+    lowest_seen = np.where(seen.holes, 0.0, np.nan_to_num(seen.lowest, nan=np.inf))
+    highest, lowest = _patch_heights(seen, room, margin, shape, seen.highest, lowest_seen)
+    refuse_if(
+        (share := float((unknown | np.isinf(highest)).mean())) > MOST_UNSEEN,
+        f"depth: {share:.0%} of the tote are not seen, expected {MOST_UNSEEN:.0%} at most.",
+        DepthMapError,
+    )
+    highest[unknown], lowest[unknown] = room.rim, 0.0
+    # At the walls the nearest place that is seen; there the camera sees the wall, not what is beside it.
+    border = np.ones(shape, dtype=bool)
+    edge = math.ceil(margin * shape[0] / room.sides[0])
+    border[edge:-edge, edge:-edge] = False
+    unseen = np.isinf(highest)
+    hidden, count = ndimage.label(unseen & ~border, AROUND)
+    for part in (hidden == number for number in range(1, count + 1)):
+        around = ndimage.binary_dilation(part, AROUND) & ~unseen
+        highest[part], lowest[part] = highest[around].max(initial=0.0 if around.any() else room.rim), 0.0
+    at_wall = np.isinf(highest)
+    return ToteMap(
+        _nearest(highest, at_wall).clip(0, None),
+        np.where(at_wall, 0.0, lowest).clip(0, None),
+        _likely(seen, room, margin, shape) if unknown.any() or (within & np.isnan(seen.height)).any() else None,
+    )
+
+
+def _patch_heights(
+    seen: Heights, room: Room, margin: float, shape: np.ndarray, highest: np.ndarray, lowest: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the greatest and the least height in each patch, ``shape``; -inf and inf where nothing is seen.
+
+    Args:
+        highest: of each pixel, NaN if unknown; widened by a pixel.
+        lowest: of each pixel, inf if unknown; narrowed by a pixel.
+    """
+    high = ndimage.maximum_filter(np.where(np.isnan(highest), -np.inf, highest), 3)
+    low = ndimage.minimum_filter(lowest, 3)
+    greatest, least = np.full(shape, -np.inf), np.full(shape, np.inf)
+    # A pixel beside a higher one stands for the place at that height, too.
+    for places in (highest, np.where(np.isinf(high), np.nan, high)):
+        points = seen.at(places)
+        within = distance_outside(points, room) < -margin
+        at = tuple((points[within] / (room.sides[0] / shape[0])).astype(int).clip(0, shape - 1).T)
+        np.maximum.at(greatest, at, high[within])
+        np.minimum.at(least, at, low[within])
+    return greatest, least
+
+
+def _nearest(heights: np.ndarray, missing: np.ndarray) -> np.ndarray:
+    """Return a map in which each missing patch has the value of the nearest other one."""
+    return heights[tuple(ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True))]
+
+
+def _likely(seen: Heights, room: Room, margin: float, shape: np.ndarray) -> ToteMap:
+    """Return the map if all that has no depth is like what is beside it."""
+    high, low = _patch_heights(seen, room, margin, shape, seen.height, np.nan_to_num(seen.height, nan=np.inf))
+    missing = np.isinf(high) | np.isinf(low)
+    return ToteMap(_nearest(high, missing).clip(0, None), _nearest(low, missing).clip(0, None))
+
+
+def _behind_holes(seen: Heights, room: Room, margin: float, accuracy: float, shape: np.ndarray) -> np.ndarray:
+    """Return the patches of which nothing is known: what stands on a surface there would be in a hole; bool ``shape``.
+
+    The rays of such pixels are followed up to the rim, as the surface itself may not be seen.
+    """
+    unknown = np.zeros(shape, dtype=bool)
+    if not seen.holes.any():
+        return unknown
+    surface, step, patch = seen.surface(room), level_range(accuracy), room.sides[0] / shape[0]
+    away = max(math.dist(seen.origin[:2], (x, y)) for x in (0.0, room.sides[0]) for y in (0.0, room.sides[1]))
+    shift = away * room.rim / seen.origin[2]  # of a ray between rim and floor, at most
+    for level in np.unique(np.round(seen.height[seen.is_within(room, margin)] / step)) * step:
+        rays = seen.rays[ndimage.binary_dilation(seen.holes_above(level, surface, room, accuracy), AROUND)]
+        for height in np.linspace(level, max(level, room.rim), math.ceil(shift / (patch / 2)) + 2) if len(rays) else ():
+            points = seen.origin[:2] + rays[:, :2] * ((height - seen.origin[2]) / rays[:, 2])[:, None]
+            index = np.floor(points / patch).astype(int)
+            unknown[tuple(index[((index >= 0) & (index < shape)).all(1)].T)] = True
+    return unknown
