@@ -74,13 +74,13 @@ def _patch_heights(
     high = ndimage.maximum_filter(np.where(np.isnan(highest), -np.inf, highest), 3)
     low = ndimage.minimum_filter(lowest, 3)
     greatest, least = np.full(shape, -np.inf), np.full(shape, np.inf)
-    # A pixel beside a higher one stands for the place at that height, too.
-    for places in (highest, np.where(np.isinf(high), np.nan, high)):
+    for places, is_own in ((highest, True), (np.where(np.isinf(high), np.nan, high), False)):
+        # A pixel beside a higher one stands for the place at that height, too.
         points = seen.at(places)
         within = distance_outside(points, room) < -margin
         at = tuple((points[within] / (room.sides[0] / shape[0])).astype(int).clip(0, shape - 1).T)
         np.maximum.at(greatest, at, high[within])
-        np.minimum.at(least, at, low[within])
+        np.minimum.at(least, at, low[within] if is_own else np.inf)
     return greatest, least
 
 
