@@ -44,7 +44,8 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
         f"depth: {share:.0%} of the tote are not seen, expected {MOST_UNSEEN:.0%} at most.",
         DepthMapError,
     )
-    highest[unknown], lowest[unknown] = room.rim, 0.0
+    highest[unknown] = room.rim
+    lowest[unknown | np.isinf(lowest)] = 0.0
     # At the walls the nearest place that is seen; there the camera sees the wall, not what is beside it.
     border = np.ones(shape, dtype=bool)
     edge = math.ceil(margin * shape[0] / room.sides[0])
@@ -53,11 +54,10 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     hidden, count = ndimage.label(unseen & ~border, AROUND)
     for part in (hidden == number for number in range(1, count + 1)):
         around = ndimage.binary_dilation(part, AROUND) & ~unseen
-        highest[part], lowest[part] = highest[around].max(initial=0.0 if around.any() else room.rim), 0.0
-    at_wall = np.isinf(highest)
+        highest[part] = highest[around].max(initial=0.0 if around.any() else room.rim)
     return ToteMap(
-        _nearest(highest, at_wall).clip(0, None),
-        np.where(at_wall, 0.0, lowest).clip(0, None),
+        _nearest(highest, np.isinf(highest)).clip(0, None),
+        lowest.clip(0, None),
         _likely(seen, room, margin, shape) if unknown.any() or (within & np.isnan(seen.height)).any() else None,
     )
 
