@@ -15,7 +15,7 @@ from pickplace.robot.room_check import fit_plane
 
 MOST_MISSING = 0.01  # greatest share of the inside of its rectangle that an item's top leaves free
 BORDER = 2.5  # width of the part of the rectangle that is not its inside, pixels
-LONGEST_GAP = 4.5  # beyond the seen edge of an item, pixels; behind a longer one it may go on unseen
+LONGEST_GAP = 3.5  # beyond the seen edge of an item, pixels; behind a longer one it may go on unseen
 HIDDEN_PIXELS = 1.5  # distance from a box at which its edge should be seen, pixels
 EDGE_POINTS = 32  # along each side of a box, and along each ray
 MIN_ITEM_PIXELS = 9  # pixels of the smallest thing in a bin that counts
@@ -204,7 +204,8 @@ def _behind_holes(
     floor = seen.at(0.0)
     free = np.ones_like(seen.holes)
     for box in boxes:
-        free &= ~is_inside(floor, (box.x, box.y), (box.w, box.d), box.yaw) | (type(box) is not Box)
+        sides = box.w - 2 * box.edge_error, box.d - 2 * box.edge_error  # without the gaps at its edges
+        free &= ~is_inside(floor, (box.x, box.y), sides, box.yaw) | (type(box) is not Box)
     holes = seen.holes_above(0.0, surface, room, accuracy, free)
     refuse_if(
         (share := holes.sum() / (distance_outside(floor, room) < 0).sum()) > MOST_HIDDEN,

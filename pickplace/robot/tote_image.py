@@ -44,7 +44,8 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
         f"depth: {share:.0%} of the tote are not seen, expected {MOST_UNSEEN:.0%} at most.",
         DepthMapError,
     )
-    highest[unknown], lowest[unknown] = room.rim, 0.0
+    highest[unknown] = room.rim
+    lowest[unknown | np.isinf(lowest)] = 0.0
     # At the walls the nearest place that is seen; there the camera sees the wall, not what is beside it.
     border = np.ones(shape, dtype=bool)
     edge = math.ceil(margin * shape[0] / room.sides[0])
@@ -53,11 +54,10 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     hidden, count = ndimage.label(unseen & ~border, AROUND)
     for part in (hidden == number for number in range(1, count + 1)):
         around = ndimage.binary_dilation(part, AROUND) & ~unseen
-        highest[part], lowest[part] = highest[around].max(initial=0.0 if around.any() else room.rim), 0.0
-    at_wall = np.isinf(highest)
+        highest[part] = highest[around].max(initial=0.0 if around.any() else room.rim)
     return ToteMap(
-        _nearest(highest, at_wall).clip(0, None),
-        np.where(at_wall, 0.0, lowest).clip(0, None),
+        _nearest(highest, np.isinf(highest)).clip(0, None),
+        lowest.clip(0, None),
         _likely(seen, room, margin, shape) if unknown.any() or (within & np.isnan(seen.height)).any() else None,
     )
 
@@ -74,13 +74,13 @@ def _patch_heights(
     high = ndimage.maximum_filter(np.where(np.isnan(highest), -np.inf, highest), 3)
     low = ndimage.minimum_filter(lowest, 3)
     greatest, least = np.full(shape, -np.inf), np.full(shape, np.inf)
-    # A pixel beside a higher one stands for the place at that height, too.
-    for places in (highest, np.where(np.isinf(high), np.nan, high)):
+    for places, is_own in ((highest, True), (np.where(np.isinf(high), np.nan, high), False)):
+        # A pixel beside a higher one stands for the place at that height, too.
         points = seen.at(places)
         within = distance_outside(points, room) < -margin
         at = tuple((points[within] / (room.sides[0] / shape[0])).astype(int).clip(0, shape - 1).T)
         np.maximum.at(greatest, at, high[within])
-        np.minimum.at(least, at, low[within])
+        np.minimum.at(least, at, low[within] if is_own else np.inf)
     return greatest, least
 
 

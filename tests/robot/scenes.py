@@ -167,7 +167,6 @@ def fault(scene: World, plan, accuracy: float = 0.002, error: float = 0.005) -> 
     w, d, h = scene.item
     pick, place = np.array(plan.pick.center), np.array(plan.place.center)
     # Over the bin.
-    effector = rectangle(pick[:2], scene.effector, plan.pick.yaw)
     item = rectangle(scene.centre, (w, d), scene.yaw)
     gripper = scene.gripper or Gripper(
         [rectangle((0, 0), scene.effector, 0)], [rectangle((0, 0), scene.effector, 0)], None
@@ -176,7 +175,8 @@ def fault(scene: World, plan, accuracy: float = 0.002, error: float = 0.005) -> 
         return "the effector does not grip the item"
     if pick[2] < h - EPSILON:
         return "the effector ends inside the item"
-    if scene.bin[2] > h + EPSILON and not within(effector, scene.bin):
+    body = np.concatenate([moved(part, pick[:2], plan.pick.yaw) for part in gripper.body])
+    if scene.bin[2] > h + EPSILON and not within(body, scene.bin):
         return "the effector hits the bin's wall"
     for (*sides, top), centre, yaw in scene.others:
         box = rectangle(centre, sides, yaw)
