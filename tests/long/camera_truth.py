@@ -216,8 +216,8 @@ def random_truth(draw, cell: str, kind: str) -> Truth:
         height += getattr(truth, name)[2] + 0.045  # the arm passes over the wall
         at, angle = draw.uniform(0.1, 0.9, 2) * room[:2], draw.uniform(-np.pi, np.pi)
         palm = Thing(tuple(at), (0.1, 0.09), height - 0.03, height, angle, kind="hand", dark=draw.random() < 0.2)
-        arm = Thing(tuple(at + turned(angle) @ (0.3, 0)), (0.52, 0.07), height - 0.04, height + 0.02, angle, kind="hand",
-                    dark=palm.dark)  # fmt: skip
+        shoulder = tuple(at + turned(angle) @ (0.3, 0))
+        arm = Thing(shoulder, (0.52, 0.07), height - 0.04, height + 0.02, angle, kind="hand", dark=palm.dark)
         getattr(truth, f"in_{name}").extend([palm, arm])
     if kind == "slope":
         for number, thing in enumerate(truth.in_bin):
@@ -385,7 +385,7 @@ def outcome(planner: Planner, cell: str, views, **settings) -> tuple[str, object
 
 
 def judge(planners: dict, seed: int, kinds=KINDS) -> tuple[str, str, str | None, object]:
-    """Kind of a scene, the outcome, what is wrong with it, and for a good scene whether its clean images have a plan."""
+    """Kind of a scene, the outcome, its fault, and for a good scene whether its clean images have a plan."""
     draw = np.random.default_rng(seed)
     cell, kind = str(draw.choice(list(CELLS))), str(draw.choice(kinds))
     truth = random_truth(draw, cell, kind)
@@ -423,8 +423,11 @@ def run(seeds, kinds=KINDS, report=lambda _: None) -> tuple[Counter, list[str], 
 
 if __name__ == "__main__":
     first = int(sys.argv[2]) if len(sys.argv) > 2 else 0
-    counts, false, good = run(range(first, first + int(sys.argv[1])), report=lambda line: print(line, flush=True))
+    counts, false, good = run(range(first, first + int(sys.argv[1])), report=lambda line: sys.stdout.write(line + "\n"))
     for kind in KINDS:
-        print(kind, {status: count for (each, status), count in sorted(counts.items()) if each == kind})
-    print(f"{len(false)} false of {sum(counts[kind, 'ok'] for kind in KINDS)} plans that are ok")
-    print(f"good scenes with a plan: {sum(good.values())}, of which {sum(good.values()) - good['ok']} are refused")
+        found = {status: count for (each, status), count in sorted(counts.items()) if each == kind}
+        sys.stdout.write(f"{kind} {found}\n")
+    sys.stdout.write(
+        f"{len(false)} false of {sum(counts[kind, 'ok'] for kind in KINDS)} plans that are ok\n"
+        f"good scenes with a plan: {sum(good.values())}, of which {sum(good.values()) - good['ok']} are refused\n"
+    )

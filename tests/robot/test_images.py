@@ -86,10 +86,10 @@ def test_an_item_is_never_shorter_than_what_may_be_there(width, inside, turns):
     eye, image = see("bin", thing)
     top = np.abs(image - 1.14) < 0.01
     last = np.flatnonzero(top.any(0))[-1]
-    image[:, last - width + 1 : last + 1] = np.where(top, np.nan, image)[:, last - width + 1 : last + 1] if inside else (
-        image[:, last - width + 1 : last + 1]
-    )  # fmt: skip
-    if not inside:
+    if inside:
+        edge = slice(last - width + 1, last + 1)
+        image[:, edge] = np.where(top, np.nan, image)[:, edge]
+    else:
         rows = np.flatnonzero(top.any(1))
         image[rows[0] : rows[-1] + 1, last + 1 : last + 1 + width] = np.nan
     try:
