@@ -104,7 +104,7 @@ def test_bodies_of_any_shape_touch_no_other_item(name, scenes):
         plan = plan_for(planner, items=boxes, **seen, alternatives=0)
         status = plan.status
         if status == "ok":
-            status = fault(scene.taking(plan.item_number), plan, NOISE) or "ok"
+            status = fault(scene.taking(plan.item_number), plan, NOISE, 0.0) or "ok"  # it lies off the box
         found[status] += 1
     assert set(found) <= {"ok", "stuck", "impossible"} and found["ok"] > scenes / 4, found
 
