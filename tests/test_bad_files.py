@@ -41,7 +41,8 @@ from pickplace.runs.folder import (
 )
 from pickplace.runs.locate import locate
 from pickplace.runs.resume import StopRequest
-from pickplace.serve import json_lines, request
+from pickplace.serve import json_lines
+from pickplace.serve.request import Limits
 from pickplace.training import trainer
 from pickplace.training.train import resume_run, train
 
@@ -533,10 +534,7 @@ def test_maps_are_named_by_their_files(plan, tmp_path):
         assert plan("--bin", bin_map, "--tote", tote_map).startswith(f"error: {named}: ")
 
 
-def test_an_endless_line_is_answered_and_skipped(monkeypatch):
-    for module in (json_lines, request):
-        monkeypatch.setattr(module, "MAX_REQUEST", 8)
-
+def test_an_endless_line_is_answered_and_skipped():
     class Endless:
         """A stream whose first line has 100 bytes; no more than a few may be asked for at a time."""
 
@@ -548,9 +546,10 @@ def test_an_endless_line_is_answered_and_skipped(monkeypatch):
             self.content = self.content[len(line + end) :]
             return line + end
 
-    lines = list(json_lines.read_lines(Endless()))
+    lines = list(json_lines.read_lines(Endless(), 8))
     assert lines == [b"x" * 9, b"{}\n", b" " * 8 + b"\n", b"y" * 9]
-    assert "more than 8 bytes" in request.answer(None, lines[0], {})[1]["error"]
+    with pytest.raises(ValueError, match="more than 8 bytes"):
+        Limits(8, 10).check(lines[0])
 
 
 @pytest.mark.parametrize("name", ["stdin", "stdout"])

@@ -128,8 +128,7 @@ def _read_box(
     on_top = is_inside(points, (x, y), (w, d), yaw)
     if outer.max() <= LONGEST_GAP * pixel and not seen.holes_above(height, surface, room, accuracy, on_top).any():
         return Box(**grown(outer), edge_error=error).upright()
-    likely = Box(**grown(np.minimum(outer, pixel))).upright()
-    return UnknownBox(**vars(Box(**grown(outer)).upright()), likely=likely)
+    return UnknownBox(**grown(outer)).upright()
 
 
 def _least_beyond(points: np.ndarray, sides: Sequence[float], axis: int, sign: int, pixel: float) -> float:
@@ -227,7 +226,7 @@ def _behind_holes(
 def _around(points: np.ndarray, pixel: float, height: float) -> Box:
     """Return the box around points ``[M, 2]``, a pixel away from them, that is in the way."""
     x, y, w, d, yaw = smallest_rectangle(points)
-    return UnknownBox(**vars(Box(x, y, w + 2 * pixel, d + 2 * pixel, height, yaw).upright()))
+    return UnknownBox(x, y, float(w + 2 * pixel), float(d + 2 * pixel), height, yaw).upright()
 
 
 def _hidden_length(seen: Heights, box: Box, boxes: Sequence[Box]) -> float:

@@ -39,5 +39,3 @@ class HiddenBox(Box):
 @dataclass(frozen=True)
 class UnknownBox(HiddenBox):
     """A place in the bin of which an image has too little: as large and as high as may be, and not picked."""
-
-    likely: Box | None = None  #: the item that is probably there; None: probably nothing

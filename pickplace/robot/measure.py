@@ -31,7 +31,8 @@ class ToteMap(NamedTuple):
 
     highest: np.ndarray
     lowest: np.ndarray
-    likely: "ToteMap | None" = None  #: the map if places of which nothing is known are like those beside them
+    likely: "ToteMap | None" = None  #: the map if places that pixels without depth show are like those beside them
+    has_holes: bool = False  #: whether places of which nothing is known count up to the rim
 
 
 def refuse(name: str, bad: np.ndarray, values: np.ndarray, unit: str, expected: str) -> None:

@@ -228,15 +228,17 @@ class Planner:
         )
 
     def _refuse_unknown(self, scene: Scene, device) -> None:
-        """Refuse a scene without a plan if one is likely to be feasible where images left something unknown."""
-        if (likely := scene.if_unknown_is_free()) is not None:
+        """Refuse a scene without a plan if there may be one where images left something unknown."""
+        may_have_plan = scene.has_holes
+        if not may_have_plan and (likely := scene.without_gaps()) is not None:
             problem = read_metric(self.cell, likely, device)
-            refuse_if(
-                bool(footprint_mask(problem.cell, problem.maps).any()),
-                "depth: no plan avoids what the images leave unknown in bin and tote; expected more pixels with a "
-                "depth: take another image.",
-                DepthMapError,
-            )
+            may_have_plan = bool(footprint_mask(problem.cell, problem.maps).any())
+        refuse_if(
+            may_have_plan,
+            "depth: no plan avoids what the images leave unknown in bin and tote; expected more pixels with a depth: "
+            "take another image.",
+            DepthMapError,
+        )
 
     def _planner_of(self, count: int, is_metric: bool) -> tuple[MapPlanner, Mapping[str, Term]]:
         """Return what decides among so many items in the bin, and the terms of the observation.

@@ -132,16 +132,21 @@ class Scene:
             cell_size, accuracy, tote_height=tote_height, **settings,
         )  # fmt: skip
 
-    def if_unknown_is_free(self) -> "Scene | None":
-        """Return the scene that is likely where images left something unknown; None if nothing is unknown."""
-        tote, boxes = self.tote, [] if isinstance(self.items, BinMap) else self.items
-        likely = tote.likely if isinstance(tote, ToteMap) else None
-        if likely is None and not any(isinstance(box, UnknownBox) or box.edge_error for box in boxes):
+    @property
+    def has_holes(self) -> bool:
+        """Whether images left places in bin or tote of which nothing is known."""
+        boxes = () if isinstance(self.items, BinMap) else self.items
+        return any(isinstance(box, UnknownBox) for box in boxes) or (
+            isinstance(self.tote, ToteMap) and self.tote.has_holes
+        )
+
+    def without_gaps(self) -> "Scene | None":
+        """Return the scene that is likely if images have narrow gaps, at edges; None if they have none."""
+        likely = self.tote.likely if isinstance(self.tote, ToteMap) else None
+        boxes = () if isinstance(self.items, BinMap) else self.items
+        if likely is None and not any(box.edge_error for box in boxes):
             return None
-        items = [box.likely if isinstance(box, UnknownBox) else box for box in boxes]
         narrower = [
-            replace(box, w=box.w - 2 * box.edge_error, d=box.d - 2 * box.edge_error, edge_error=0.0)
-            for box in items
-            if box is not None
+            replace(box, w=box.w - 2 * box.edge_error, d=box.d - 2 * box.edge_error, edge_error=0.0) for box in boxes
         ]
-        return replace(self, items=narrower if boxes else self.items, tote=likely or tote)
+        return replace(self, items=narrower if boxes else self.items, tote=likely or self.tote)

@@ -58,7 +58,8 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     return ToteMap(
         _nearest(highest, np.isinf(highest)).clip(0, None),
         lowest.clip(0, None),
-        _likely(seen, room, margin, shape) if unknown.any() or (within & np.isnan(seen.height)).any() else None,
+        _likely(seen, room, margin, shape) if (within & np.isnan(seen.height)).any() else None,
+        bool(unknown.any()),
     )
 
 

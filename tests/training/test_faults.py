@@ -190,8 +190,11 @@ def test_a_read_only_run_folder_is_named(read_only, monkeypatch, capsys, main, a
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 2
-    expected = f"error: {read_only}/{name}: Permission denied; expected a place where you may read and write.\n"
-    assert capsys.readouterr().err == expected
+    expected = f"error: {read_only}/{name}: Permission denied; expected a place where you may read and write."
+    if arguments[0].startswith("resume"):
+        last = read_only / "checkpoints" / "last"
+        expected += f" What was saved before is whole: pickplace-train resume={last}"
+    assert capsys.readouterr().err == f"{expected}\n"
     assert before == {path: path.read_bytes() for path in read_only.rglob("*") if path.is_file()}
     Planner.load(read_only)
 
