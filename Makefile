@@ -9,7 +9,7 @@ DEMO ?= outputs/demo_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
 PYTEST := $(BIN)/python -m pytest -q -n logical --maxprocesses 4 --dist worksteal
 
-.PHONY: help install demo train test test-slow test-extras coverage chaos fuzz memory mutations bench results docs walk release lock audit lint format clean
+.PHONY: help install demo train test test-slow test-extras coverage chaos fuzz memory camera mutations bench results docs walk release lock audit lint format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -68,6 +68,10 @@ fuzz: $(STAMP)  ## give the commands 3,000 random bad inputs (an hour)
 memory: export OMP_NUM_THREADS ?= 1
 memory: $(STAMP)  ## check that a planner and two trainings do not grow in memory (an hour and a half)
 	$(BIN)/python tests/long/memory.py
+
+camera: export OMP_NUM_THREADS ?= 1
+camera: $(STAMP)  ## judge plans from 2,000 bad depth images against the true scenes (half an hour)
+	$(BIN)/python tests/long/camera_truth.py 2000
 
 mutations: $(STAMP)  ## change the code at 40 random places, and see whether the tests notice (an hour; ARGS="--seed 1")
 	$(BIN)/pip install --quiet --disable-pip-version-check 'cosmic-ray>=8.3,<9'

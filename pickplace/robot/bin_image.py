@@ -45,10 +45,12 @@ def find_boxes(
     surface = seen.surface(room)
     segments = _segments(seen, above, accuracy, labels)
     numbers, counts = np.unique(segments[segments > 0], return_counts=True)
-    boxes = [
-        _read_box(seen, room, surface, segments, number, above, accuracy, labels is None)
-        for number in numbers[counts >= MIN_ITEM_PIXELS]
-    ]
+    boxes, floor, free = [], seen.at(0.0), np.ones_like(seen.holes)
+    for number in numbers[counts >= MIN_ITEM_PIXELS]:
+        box, seen_top = _read_box(seen, room, surface, segments, number, above, accuracy, labels is None)
+        boxes.append(box)
+        if not isinstance(box, UnknownBox):
+            free &= ~is_inside(floor, *seen_top)
     hidden = [0.0 if isinstance(box, UnknownBox) else _hidden_length(seen, box, boxes) for box in boxes]
     for box, length in zip(boxes, hidden, strict=True):
         if sizes is not None and not length and not isinstance(box, UnknownBox):
@@ -57,7 +59,7 @@ def find_boxes(
         HiddenBox(box.x, box.y, box.w + 2 * length, box.d + 2 * length, box.h, box.yaw) if length else box
         for box, length in zip(boxes, hidden, strict=True)
     ]
-    boxes += [*_rest(seen, above, boxes), *_behind_holes(seen, room, surface, accuracy, boxes, greatest)]
+    boxes += [*_rest(seen, above, boxes), *_behind_holes(seen, room, surface, accuracy, free, greatest)]
     refuse_if(
         bool(boxes) and all(isinstance(box, UnknownBox) for box in boxes),
         f"depth: {len(boxes)} places in the bin are not seen well enough to tell where an item ends, the first at "
@@ -88,8 +90,10 @@ def _segments(seen: Heights, above: np.ndarray, accuracy: float, labels: np.ndar
 def _read_box(
     seen: Heights, room: Room, surface: np.ndarray, segments: np.ndarray, number: int, above: np.ndarray,
     accuracy: float, narrowed: bool,
-) -> Box:  # fmt: skip
-    """Return the cuboid whose top fills a segment; as :class:`UnknownBox` if it may go on where nothing is seen.
+) -> tuple[Box, tuple]:  # fmt: skip
+    """Return the cuboid whose top fills a segment, and the centre, the sides and the yaw of what is seen of its top.
+
+    It is an :class:`UnknownBox` if it may go on where nothing is seen.
 
     Args:
         surface: see :meth:`Heights.surface`.
@@ -127,8 +131,8 @@ def _read_box(
     error = float(max(0.0, outer.max() - pixel))
     on_top = is_inside(points, (x, y), (w, d), yaw)
     if outer.max() <= LONGEST_GAP * pixel and not seen.holes_above(height, surface, room, accuracy, on_top).any():
-        return Box(**grown(outer), edge_error=error).upright()
-    return UnknownBox(**grown(outer)).upright()
+        return Box(**grown(outer), edge_error=error).upright(), ((x, y), (w + pixel, d + pixel), yaw)
+    return UnknownBox(**grown(outer)).upright(), ((x, y), (w, d), yaw)
 
 
 def _least_beyond(points: np.ndarray, sides: Sequence[float], axis: int, sign: int, pixel: float) -> float:
@@ -197,14 +201,14 @@ def _rest(seen: Heights, above: np.ndarray, boxes: Sequence[Box]) -> list[Box]:
 
 
 def _behind_holes(
-    seen: Heights, room: Room, surface: np.ndarray, accuracy: float, boxes: Sequence[Box], greatest: float
+    seen: Heights, room: Room, surface: np.ndarray, accuracy: float, free: np.ndarray, greatest: float
 ) -> list[Box]:  # fmt: skip
-    """Return what the holes of the image may hide on the floor, as high as an item may be; not the boxes' sides."""
+    """Return what the holes of the image may hide on the floor, as high as an item may be.
+
+    Args:
+        free: where no item stands: a hole beyond shows its side, bool.
+    """
     floor = seen.at(0.0)
-    free = np.ones_like(seen.holes)
-    for box in boxes:
-        sides = box.w - 2 * box.edge_error, box.d - 2 * box.edge_error  # without the gaps at its edges
-        free &= ~is_inside(floor, (box.x, box.y), sides, box.yaw) | (type(box) is not Box)
     holes = seen.holes_above(0.0, surface, room, accuracy, free)
     refuse_if(
         (share := holes.sum() / (distance_outside(floor, room) < 0).sum()) > MOST_HIDDEN,

@@ -129,8 +129,8 @@ def read_heights(
     unknown = np.isnan(height)
     holes = ndimage.binary_opening(unknown, HOLE)
     gaps = unknown & ~holes
-    high = ndimage.maximum_filter(np.where(unknown, -np.inf, height), 5)
-    low = ndimage.minimum_filter(np.where(unknown, np.inf, np.where(is_recorded, 0.0, height)), 5)
+    high = _greatest_beside(np.where(unknown, -np.inf, height), gaps)
+    low = -_greatest_beside(np.where(unknown, -np.inf, np.where(is_recorded, 0.0, -height)), gaps)
     level = gaps & (high - low <= level_range(accuracy))
     seen = Heights(origin, rays, (rows.start, columns.start), pixel, raw, height, height, height, holes)
     shown = distance_outside(seen.at(0.0), room) < 0
@@ -193,6 +193,16 @@ def _entered(rays: np.ndarray, origin: np.ndarray, box: Box, accuracy: float) ->
         ends = np.stack([(-half - start) / way, (half - start) / way])
     enter, leave = ends.min(0).max(-1), ends.max(0).min(-1)
     return np.where(enter < leave, origin[2] + enter * rays[..., 2], np.nan)
+
+
+def _greatest_beside(heights: np.ndarray, gaps: np.ndarray) -> np.ndarray:
+    """Return the greatest height beside each pixel of a gap of up to three pixels, or on the other side of the gap.
+
+    Args:
+        heights: -inf if unknown.
+    """
+    near = ndimage.maximum_filter(heights, 3)
+    return np.maximum(near, ndimage.maximum_filter(np.where(gaps, near, -np.inf), 3))
 
 
 def _is_short(gaps: np.ndarray) -> np.ndarray:

@@ -171,6 +171,8 @@ def as_images(draw: np.random.Generator, world: scenes.World, cell, side: float)
             over = np.abs(away @ (math.cos(turn), math.sin(turn))) < w / 2
             over &= np.abs(away @ (-math.sin(turn), math.cos(turn))) < d / 2
             heights = np.where(over, np.maximum(heights, h), heights)
+        beside = (points < 0).any(-1) | (points > room[:2]).any(-1)
+        heights[beside & (heights == 0)] = np.nan  # nothing is known of the walls
         shown[name] = eye, 1.2 - heights + draw.normal(0, 0.001, IMAGE)
     (eye, image), (other, tote_image) = shown["bin"], shown["tote"]
     tote_height = float(world.tote[2])
