@@ -131,7 +131,7 @@ def _read_box(
     error = float(max(0.0, outer.max() - pixel))
     on_top = is_inside(points, (x, y), (w, d), yaw)
     if outer.max() <= LONGEST_GAP * pixel and not seen.holes_above(height, surface, room, accuracy, on_top).any():
-        return Box(**grown(outer), edge_error=error).upright(), ((x, y), (w + pixel, d + pixel), yaw)
+        return Box(**grown(outer), edge_error=error).upright(), ((x, y), (w + 2 * pixel, d + 2 * pixel), yaw)
     return UnknownBox(**grown(outer)).upright(), ((x, y), (w, d), yaw)
 
 

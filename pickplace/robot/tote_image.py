@@ -72,7 +72,9 @@ def _patch_heights(
         highest: of each pixel, NaN if unknown; widened by a pixel.
         lowest: of each pixel, inf if unknown; narrowed by a pixel.
     """
-    high = ndimage.maximum_filter(np.where(np.isnan(highest), -np.inf, highest), 3)
+    # A gap is as wide as what may be there; what is seen may end up to a pixel further out.
+    high = np.where(np.isnan(highest), -np.inf, highest)
+    high = np.maximum(high, ndimage.maximum_filter(np.where(np.isnan(seen.height), -np.inf, seen.height), 3))
     low = ndimage.minimum_filter(lowest, 3)
     greatest, least = np.full(shape, -np.inf), np.full(shape, np.inf)
     for places, is_own in ((highest, True), (np.where(np.isinf(high), np.nan, high), False)):
