@@ -92,7 +92,7 @@ def test_an_item_is_never_shorter_than_what_may_be_there(width, inside, turns):
     try:
         (box,) = items(eye, image)
     except DepthMapError as error:
-        assert "not seen well enough" in str(error) and width > 2
+        assert ("not seen well enough" in str(error) or "a part of the bin" in str(error)) and width > 2
         return
     right = thing.corners[:, 0].max()
     assert box.x + box.w / 2 > right - 0.002
