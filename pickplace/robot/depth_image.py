@@ -17,7 +17,7 @@ from scipy import ndimage
 from pickplace.common.validate import refuse_if
 from pickplace.robot.box import Box, DepthMapError
 
-MOST_MISSING_PIXELS = 0.15  # greatest share of the pixels of level surfaces that may lack a depth
+MOST_MISSING_PIXELS = 0.12  # greatest share of the pixels of level surfaces that may lack a depth
 SEAM = 5  # longest gap in a level top that is filled, pixels; a longer one may part two items
 MARGIN = 24  # pixels around the room that are looked at, too
 HOLE = np.ones((4, 4), dtype=bool)  # the smallest hole, pixels
@@ -120,7 +120,7 @@ def read_heights(
     known, recorded = ~np.isnan(raw), np.full_like(raw, np.nan)
     for box in record:
         recorded = np.fmax(recorded, _entered(rays, origin, box, accuracy))
-    recorded[known] = np.nan
+    recorded[~ndimage.binary_opening(~known, HOLE)] = np.nan  # the record is for holes, as it may be off its place
     is_recorded = ~np.isnan(recorded)
     # Unknown pixels must not pull the median up or down: in it each has the height of the nearest one.
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)

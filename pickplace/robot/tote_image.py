@@ -45,7 +45,7 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
         DepthMapError,
     )
     highest[unknown] = room.rim
-    lowest[unknown | np.isinf(lowest)] = 0.0
+    lowest[np.isinf(lowest)] = 0.0
     # At the walls the nearest place that is seen; there the camera sees the wall, not what is beside it.
     border = np.ones(shape, dtype=bool)
     edge = math.ceil(margin * shape[0] / room.sides[0])
