@@ -18,28 +18,29 @@ from pickplace.robot.box import DepthMapError
 from pickplace.robot.planner import Planner
 from pickplace.robot.scene import Scene
 from pickplace.rules.cell import CellSpec
+from pickplace.views.recording import items_in_bin
 
 EPISODES = 2
 
 
 def maps_of(env) -> dict[str, np.ndarray | float]:
     """Return bin and tote of an environment with one slot as whole cells."""
-    state, item = env.state, env.state.items.rows((0, 0))
-    bin_depth = np.zeros(env.cell.bin_size[:2], dtype=int)
-    x, y, w, d, h = (int(part) for part in item[:5])
-    bin_depth[x : x + w, y : y + d] = h
+    state = env.state
+    bin_depth, labels = np.zeros((2, *env.cell.bin_size[:2]), dtype=int)
+    for number, (x, y, w, d, h) in enumerate(items_in_bin(state.items, 0), 1):
+        bin_depth[x : x + w, y : y + d], labels[x : x + w, y : y + d] = h, number
     height = int(state.tote_height)
     bearing = (state.surface[0] & 1).numpy()
     return {
-        "bin_depth": bin_depth, "tote_depth": height - state.heights[0].numpy(), "tote_height": height,
-        "tote_bearing": bearing,
+        "bin_depth": bin_depth, "bin_labels": labels, "tote_depth": height - state.heights[0].numpy(),
+        "tote_height": height, "tote_bearing": bearing,
     }  # fmt: skip
 
 
 def in_metres(maps: dict, cell: CellSpec) -> dict:
     """Return the same in metres."""
     lengths = {key: maps[key] * cell.height_unit * cell.cell_size for key in ("bin_depth", "tote_depth", "tote_height")}
-    return {**lengths, "tote_bearing": maps["tote_bearing"], "cell_size": cell.cell_size}
+    return {**maps, **lengths, "cell_size": cell.cell_size}
 
 
 def scenes(planner: Planner, env):

@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace.common.validate import expect, is_whole, one_of
 from pickplace.planners.base import ITEM_RULES, MapPlanner, pick_first, restrict_items
-from pickplace.policies.base import Policy, ScoresFootprints, best_choice
+from pickplace.policies.base import Policy, ScoresFootprints, best_choice, check_finite
 from pickplace.policies.footprints import count_ways
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, join_pick, select_pick
@@ -70,9 +70,9 @@ class PolicyPlanner(MapPlanner):
         if self.candidates == "all":
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 return policy.best_feasible(observation, maps)
-        log_probs = policy.action_log_probs(observation)
-        best_choice(log_probs)  # refuses scores that are not finite
-        score, tried = log_probs.topk(min(self.candidates, cell.num_actions), dim=1)
+        score, tried = check_finite(policy.action_log_probs(observation)).topk(
+            min(self.candidates, cell.num_actions), dim=1
+        )
         succeeds = action_mask(cell, maps).gather(1, tried) & (score > -torch.inf)
         return tried.gather(1, succeeds.int().argmax(1, keepdim=True))[:, 0]
 

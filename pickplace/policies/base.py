@@ -282,20 +282,24 @@ def refuse_several_items(policy: Policy, cell: CellSpec) -> None:
 
 
 def best_choice(scores: Tensor) -> Tensor:
-    """Return the choice of greatest score, int64 ``[N]``, of scores ``[N, choices]``.
+    """Return the choice of greatest score, int64 ``[N]``, of scores ``[N, choices]``; errors as of
+    :func:`check_finite`."""
+    return check_finite(scores).argmax(1)
+
+
+def check_finite(scores: Tensor) -> Tensor:
+    """Return the scores ``[N, choices]`` if the greatest of each row is finite.
 
     Raises:
-        FloatingPointError: for a score that is infinite or no number. Weights and settings that are finite themselves,
-            as those of a stranger's checkpoint, may lead to one.
+        FloatingPointError: otherwise. The weights and settings of a checkpoint may be finite, and yet overflow.
     """
-    greatest, choice = scores.max(1)
     refuse_if(
-        not greatest.isfinite().all(),
+        not scores.amax(1).isfinite().all(),
         "the policy's scores are not finite; expected a checkpoint whose weights, reward_scale and temperature fit "
         "each other.",
         FloatingPointError,
     )
-    return choice
+    return scores
 
 
 def pick_one(candidates: Tensor) -> Tensor:

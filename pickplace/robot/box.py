@@ -22,7 +22,7 @@ class Box:
     d: float  #: side along y
     h: float  #: height of its top above the bin's floor
     yaw: float = 0.0  #: turn about the vertical axis, counter-clockwise seen from above
-    edge_error: float = 0.0  #: by which each side may end nearer to the centre than ``w`` and ``d`` say
+    edge_error: float = 0.0  #: greatest distance by which a side may end inside ``w`` or ``d``
 
     def upright(self) -> "Box":
         """Return the same cuboid with a yaw above -45 and at most 45 degrees."""
@@ -38,4 +38,4 @@ class HiddenBox(Box):
 
 @dataclass(frozen=True)
 class UnknownBox(HiddenBox):
-    """A place in the bin of which an image has too little: as large and as high as may be, and not picked."""
+    """A place in the bin that an image does not show well enough: an obstacle of the greatest possible size."""

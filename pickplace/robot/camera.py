@@ -164,7 +164,7 @@ class Camera:
 
         Raises:
             DepthMapError: for an image that does not show the bin, a floor that is not where the camera's pose says,
-                something that could be two items or is no item, or items of which none is seen well enough.
+                something that is not one item, or if no item is seen well enough.
         """
         room = self._room("bin", cell.bin_size, cell_size, cell.bin_size[2] * cell.height_unit * cell_size)
         if labels is not None:

@@ -24,7 +24,7 @@ HOLE = np.ones((4, 4), dtype=bool)  # the smallest hole, pixels
 HOLE[::3, ::3] = False
 SQUARE = 1.25  # side of the squares of a seen surface, pixels
 AROUND = np.ones((3, 3), dtype=bool)
-RECORD_MARGIN = 0.008  # by which an item in the tote may be off its recorded place, m
+RECORD_MARGIN = 0.008  # greatest distance of an item in the tote from its recorded place, m
 
 
 class Room(NamedTuple):
@@ -37,7 +37,7 @@ class Room(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Heights:
-    """What each pixel of the part of an image that shows a room says; arrays are ``[rows, columns]``."""
+    """The heights that an image shows in a room, for each pixel; arrays are ``[rows, columns]``."""
 
     origin: np.ndarray  # of all rays, [3]
     rays: np.ndarray  # way along each pixel's ray, [rows, columns, 3]
@@ -56,7 +56,7 @@ class Heights:
 
     @cached_property
     def points(self) -> np.ndarray:
-        """Where each pixel's ray meets what it shows, ``[rows, columns, 2]``; NaN if unknown."""
+        """The place that each pixel shows, ``[rows, columns, 2]``; NaN if unknown."""
         return self.at(self.height)
 
     def surface(self, room: Room) -> np.ndarray:
@@ -72,8 +72,8 @@ class Heights:
     ) -> np.ndarray:
         """Return the pixels of holes that may show a thing that stands on a surface of a height, bool.
 
-        Such a thing hides the whole surface below it. Pixels that can show only walls, or the sides of what is seen
-        from above, are none. So are those of a strip of the surface that is too narrow for a hole.
+        Such a thing hides the whole surface below it. Pixels are left out if they can show only walls, or the sides of
+        boxes whose tops are seen, or a strip that is narrower than a hole.
 
         Args:
             surface: see :meth:`surface`.

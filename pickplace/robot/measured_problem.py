@@ -253,7 +253,7 @@ def _read_tote(cell: CellSpec, scene: Scene, unit: float, error: float, device) 
         height = number("tote_height", cell.tote_size[2] * unit, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
     rim, over_rim = (int(whole_units(height, MILLIMETRE, up)) for up in (False, True))
     if isinstance(scene.tote, ToteMap):
-        highest, lowest = (as_array("tote", part, grid) for part in scene.tote[:2])
+        highest, lowest = (as_array("tote", part, grid) for part in (scene.tote.highest, scene.tote.lowest))
     else:
         beyond = max(4 * scene.accuracy, 0.01)  # a floor or a rim that noise puts a little out of range
         depth = metric_map("tote_depth", scene.tote, grid, -beyond, height + beyond)

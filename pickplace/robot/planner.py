@@ -372,9 +372,9 @@ def _probable_footprints(
     ranked = policy.ranked(problem.maps)
     probability = policy.footprint_logits(observation, ranked)[0].softmax(0)
     choices = torch.where(ranked[0], probability, -1).argsort(descending=True, stable=True)[: int(ranked.sum())][:count]
-    if chosen is not None and not (choices == (choice := problem.choice_of(chosen))).any():
-        choices = torch.cat([choices, choice])
+    own = choices[:0] if chosen is None else problem.choice_of(chosen)
+    choices = torch.cat([choices, own[~torch.isin(own, choices)]])
     if not len(choices):
         return choices, probability[choices]
     actions = first_action_reaching(problem.cell, problem.maps.rows(torch.zeros_like(choices)), choices)
-    return actions if chosen is None else torch.where(choices == choice, chosen, actions), probability[choices]
+    return actions if chosen is None else torch.where(choices == own, chosen, actions), probability[choices]

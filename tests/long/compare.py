@@ -48,7 +48,7 @@ TRAININGS = {
     " warm_start.critic_frames=2048",
     "mixed": "experiment=mixed total_frames=8192 evaluation_interval=4096",
     "afterstate": "experiment=afterstate benchmark=gopt_rs total_frames=8192 evaluation_interval=4096",
-    "warehouse": "experiment=warehouse total_frames=3072 evaluation_interval=2048 warm_start.frames=1024"
+    "warehouse": "experiment=warehouse total_frames=3072 evaluation_interval=2048"
     " warm_start.critic_frames=1024 evaluation.episodes=2",
     "imitation": "experiment=quick warm_start=imitate warm_start.frames=4096 warm_start.critic_frames=2048"
     " total_frames=8192 evaluation_interval=4096",
