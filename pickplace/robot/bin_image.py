@@ -115,10 +115,10 @@ def _read_box(
     # It cannot stand on a place that is seen either.
     axes = turned_axes(math.radians(yaw))
     free = np.concatenate([points[passed], seen.points[passed & (seen.height < height)]]) - (x, y)
-    free, corners = ([each @ axis for axis in axes] for each in (free, room.corners - (x, y)))
+    beyond, corners = ([each @ axis for axis in axes] for each in (free, room.corners - (x, y)))
     gaps = [
         min(
-            _least_beyond(free, (w, d), axis, sign, pixel),
+            _least_beyond(beyond, (w, d), axis, sign, pixel),
             (sign * corners[axis]).max() - (w, d)[axis] / 2 + pixel / 2,
         )
         for axis in (0, 1)

@@ -136,7 +136,7 @@ def read_heights(
     is_recorded = ~np.isnan(recorded)
     # Unknown pixels must not pull the median up or down: in it each has the height of the nearest one.
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    smooth = _median(raw[tuple(nearest)])
+    smooth = median_of_nine(raw[tuple(nearest)])
     height = np.where(is_recorded, recorded, np.where(known, smooth, np.nan))
     unknown = np.isnan(height)
     holes = holes_in(unknown)
@@ -208,7 +208,7 @@ def _entered(rays: np.ndarray, origin: np.ndarray, box: Box, accuracy: float) ->
     return np.where(enter < leave, origin[2] + enter * rays[..., 2], np.nan)
 
 
-def _median(image: np.ndarray) -> np.ndarray:
+def median_of_nine(image: np.ndarray) -> np.ndarray:
     """Return the median of the 3x3 pixels around each pixel of an image without NaN; SciPy's filter takes longer.
 
     It is the median of three numbers: the greatest of the columns' least values, the median of their medians, and the
