@@ -114,10 +114,13 @@ def _read_box(
         passed |= (segments > 0) & ~top
     # It cannot stand on a place that is seen either.
     axes = turned_axes(math.radians(yaw))
-    free = np.concatenate([points[passed], seen.points[passed & (seen.height < height)]])
-    free, inside = ((each - (x, y)) @ axes.T for each in (free, points[distance_outside(points, room) < 0]))
+    free = np.concatenate([points[passed], seen.points[passed & (seen.height < height)]]) - (x, y)
+    beyond, corners = ([each @ axis for axis in axes] for each in (free, room.corners - (x, y)))
     gaps = [
-        min(_least_beyond(free, (w, d), axis, sign, pixel), (sign * inside[:, axis]).max() - (w, d)[axis] / 2 + pixel)
+        min(
+            _least_beyond(beyond, (w, d), axis, sign, pixel),
+            (sign * corners[axis]).max() - (w, d)[axis] / 2 + pixel / 2,
+        )
         for axis in (0, 1)
         for sign in (-1, 1)
     ]
@@ -135,16 +138,18 @@ def _read_box(
     return UnknownBox(**grown(outer)).upright(), ((x, y), (w, d), yaw)
 
 
-def _least_beyond(points: np.ndarray, sides: Sequence[float], axis: int, sign: int, pixel: float) -> float:
+def _least_beyond(
+    points: Sequence[np.ndarray], sides: Sequence[float], axis: int, sign: int, pixel: float
+) -> float:  # fmt: skip
     """Return the least distance in front of a side of a rectangle at which one of the points lies, m; else inf.
 
     Args:
-        points: in the frame of the rectangle, ``[M, 2]``.
+        points: x and y of each point in the frame of the rectangle.
         axis, sign: tell which of its four sides.
     """
     other = sides[1 - axis] / 2
-    beyond = sign * points[:, axis] - sides[axis] / 2
-    in_front = (np.abs(points[:, 1 - axis]) < max(other - 1.5 * pixel, other / 2)) & (beyond > -0.5 * pixel)
+    beyond = sign * points[axis] - sides[axis] / 2
+    in_front = (np.abs(points[1 - axis]) < max(other - 1.5 * pixel, other / 2)) & (beyond > -0.5 * pixel)
     return float(beyond[in_front].min(initial=np.inf))
 
 

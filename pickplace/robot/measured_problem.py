@@ -59,7 +59,8 @@ class MeasuredProblem(Problem):
     """Items and one tote, in metres; heights are counted in millimetres.
 
     Each item has a grid along it, with pick cells of its own, so that no two items share an action. The robot's limits
-    forbid picks at which the end effector would touch another item in the bin that may be as high.
+    forbid picks at which the end effector would touch another box in the bin that may be as high. A
+    :class:`~pickplace.robot.box.HiddenBox` is no item, and only in the way.
     """
 
     parts: list[MeasuredItem]
@@ -115,12 +116,18 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
     boxes, clearance = _read_boxes(cell, scene, cell_size)
     error = clearance if scene.placement_error is None else scene.placement_error
     tote = _read_tote(cell, scene, cell_size * cell.height_unit, error / cell_size, device)
-    each = [_on_grid(cell, box, cell_size, clearance, f"items[{index}]", device) for index, box in enumerate(boxes)]
+    numbers = [place for place, box in enumerate(boxes) if not isinstance(box, HiddenBox)]
+    refuse_if(
+        not numbers,
+        f"items: got {len(boxes)} that are hidden in part or unknown, which are not picked; expected one that is seen.",
+        DepthMapError,
+    )
+    each = [_on_grid(cell, boxes[place], cell_size, clearance, f"items[{place}]", device) for place in numbers]
     items = join_items(each)
     # What an item covers for sure decides where it is gripped, and what supports it.
     sides = [
         (max(box.w - 2 * box.edge_error, 0.0) / cell_size, max(box.d - 2 * box.edge_error, 0.0) / cell_size)
-        for box in boxes
+        for box in (boxes[place] for place in numbers)
     ]
     free = replace(
         cell,
@@ -134,11 +141,11 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
     insets = [_inset(item, side, clearance / cell_size) for item, side in zip(each, sides, strict=True)]
     taken = _taken_items(free, each, insets)
     parts = []
-    for index, (box, item) in enumerate(zip(boxes, each, strict=True)):
+    for index, (place, item) in enumerate(zip(numbers, each, strict=True)):
         grip = int(item.h) + tote.accuracy
-        centres = _effector_centres(free, item, box, cell_size)
+        centres = _effector_centres(free, item, boxes[place], cell_size)
         bin_clear = torch.from_numpy(
-            _clear_picks(cell, index, boxes, centres, cell_size, scene.accuracy, clearance)
+            _clear_picks(cell, place, boxes, centres, cell_size, scene.accuracy, clearance)
         ).to(device)
         limits = _limits(cell, free, bin_clear, centres / cell_size, grip, 2 * tote.accuracy)
         allowed = torch.from_numpy(~is_excluded(exclude, centres, cell_size)).to(device)
@@ -154,8 +161,8 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
     seen_items = items._replace(h=(items.h.double() / ratio).round().long().clamp(min=1))
     seen = State(surface_from(heights, tote.bears[None]), torch.tensor([seen_rim], device=device), seen_items)
     return MeasuredProblem(
-        cell=joint, state=state, seen=seen, maps=maps, boxes=boxes, side=cell_size, unit=MILLIMETRE,
-        release=2 * tote.accuracy * MILLIMETRE, parts=parts, tote=tote, taken=taken,
+        cell=joint, state=state, seen=seen, maps=maps, boxes=[boxes[place] for place in numbers], numbers=numbers,
+        side=cell_size, unit=MILLIMETRE, release=2 * tote.accuracy * MILLIMETRE, parts=parts, tote=tote, taken=taken,
     )  # fmt: skip
 
 
@@ -297,8 +304,6 @@ def _clear_picks(
         index: of the item that is picked, among the boxes.
     """
     box = boxes[index]
-    if isinstance(box, HiddenBox):
-        return np.zeros(len(centres), dtype=bool)
     far, axes = np.array(cell.bin_size[:2]) * side, turned_axes(math.radians(box.yaw))
     body = [np.array(part) * side @ axes for part in cell.gripper.body_parts]
     corners = np.concatenate(body)

@@ -223,7 +223,7 @@ class Planner:
             reasons=_reasons(problem) if status in ("stuck", "impossible") else None,
             tote_bearing=bearing.int().tolist() if self.cell.support.marks_bearing else None,
             warnings=[] if self.training is None else self.training.warnings(self.cell, problem.seen.items),
-            item_number=number,
+            item_number=None if number is None else problem.numbers[number],
             hints=problem.hints() if status in ("stuck", "impossible") else [],
         )
 
@@ -353,7 +353,7 @@ def _list_alternatives(
             probability=share,
             rejected=Failure(code).name.lower() if code else None,
             chosen=chosen is not None and action == int(chosen),
-            item_number=number,
+            item_number=problem.numbers[number],
         )
         for action, x_bin, y_bin, x_tote, y_tote, rotation, share, code, number in zip(
             *(column.tolist() for column in columns), strict=True

@@ -49,6 +49,7 @@ class Problem(ABC):
     maps: PlacingMaps
     seen: State  # the state as a policy sees it, in the height units of its training
     boxes: Sequence[Box] = ()  # the items as they were measured; none on the grid
+    numbers: Sequence[int]  # of the items, in the scene
     side: float = 1.0  # length of a cell
     unit: float = 1.0  # length of a height unit
     release: float = 0.0  # height of the suction face above the item's planned top when it lets go
@@ -96,7 +97,7 @@ class Problem(ABC):
         gripper, sides = self.cell.gripper, zip(*(part[0].tolist() for part in self.state.items[2:4]), strict=True)
         return [
             f"items[{number}]: {gripper.misfit}; no pick takes it."
-            for number, ((w, d), inset) in enumerate(zip(sides, self.insets, strict=True))
+            for number, (w, d), inset in zip(self.numbers, sides, self.insets, strict=True)
             if not gripper.can_grip(w, d, inset)
         ]
 
@@ -195,7 +196,9 @@ def read_grid(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[f
     )
     cell = without_excluded(replace(cell, bin_items=len(items)), exclude)
     facts = FailureMaps.of(cell, state)
-    return GridProblem(cell=cell, state=state, maps=facts.placing_maps(cell), seen=state, facts=facts)
+    return GridProblem(
+        cell=cell, state=state, maps=facts.placing_maps(cell), seen=state, numbers=range(len(items)), facts=facts
+    )
 
 
 def join_items(items: list[Item]) -> Item:

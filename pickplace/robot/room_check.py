@@ -93,10 +93,12 @@ def _check_size(seen: Heights, room: Room, floor: np.ndarray, band: float, accur
 
 def _check_walls(seen: Heights, room: Room) -> None:
     """Refuse an image in which rays that should end at a wall go on far below."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        away = np.where(seen.rays[..., :2] > 0, room.sides, 0.0) - seen.origin[:2]
-        way = np.where(seen.rays[..., :2] == 0, np.inf, away / seen.rays[..., :2])
-    side, first = way.argmin(-1), way.min(-1)
+    ways = []
+    for axis, length in enumerate(room.sides):
+        ray = seen.rays[..., axis]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ways.append(np.where(ray == 0, np.inf, (np.where(ray > 0, length, 0.0) - seen.origin[axis]) / ray))
+    side, first = ways[1] < ways[0], np.minimum(*ways)
     leaves = np.where(np.isfinite(first), seen.origin[2] + first * seen.rays[..., 2], 0.0)
     at_wall = distance_outside(seen.at(leaves), room) < 1e-6
     known = ~np.isnan(seen.raw) & at_wall & (first > 0)

@@ -108,10 +108,12 @@ def _behind_holes(seen: Heights, room: Room, margin: float, accuracy: float, sha
     if not seen.holes.any():
         return unknown
     surface, step, patch = seen.surface(room), level_range(accuracy), room.sides[0] / shape[0]
-    away = max(math.dist(seen.origin[:2], (x, y)) for x in (0.0, room.sides[0]) for y in (0.0, room.sides[1]))
-    shift = away * room.rim / seen.origin[2]  # of a ray between rim and floor, at most
+    shift = (
+        np.linalg.norm(room.corners - seen.origin[:2], axis=1).max() * room.rim / seen.origin[2]
+    )  # of a ray between rim and floor, at most
     for level in np.unique(np.round(seen.height[seen.is_within(room, margin)] / step)) * step:
-        rays = seen.rays[ndimage.binary_dilation(seen.holes_above(level, surface, room, accuracy), AROUND)]
+        holes = seen.holes_above(level, surface, room, accuracy)
+        rays = seen.rays[ndimage.binary_dilation(holes, AROUND)] if holes.any() else seen.rays[:0, 0]
         for height in np.linspace(level, max(level, room.rim), math.ceil(shift / (patch / 2)) + 2) if len(rays) else ():
             points = seen.origin[:2] + rays[:, :2] * ((height - seen.origin[2]) / rays[:, 2])[:, None]
             index = np.floor(points / patch).astype(int)

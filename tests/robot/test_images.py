@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "long"))
 
@@ -16,6 +17,7 @@ from camera_truth import FOCAL, SHAPE, Thing, Truth  # noqa: E402
 
 from pickplace import Box, Camera, CellSpec, DepthMapError, Planner, Scene  # noqa: E402
 from pickplace.robot.box import HiddenBox, UnknownBox  # noqa: E402
+from pickplace.robot.depth_image import HOLE, holes_in, median_of_nine  # noqa: E402
 
 CELL, SIZE = CellSpec(bin_size=(6, 6, 1), tote_size=(6, 6, 5)), 0.05
 ROOMS = {"bin": (0.3, 0.3, 0.05), "tote": (0.3, 0.3, 0.25)}
@@ -37,6 +39,15 @@ def items(eye: Camera, image, **options) -> list[Box]:
 
 def tote_map(eye: Camera, image, **options):
     return eye.tote_map(image, CELL, SIZE, **options)
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 2**32 - 1))
+def test_filters_are_those_of_scipy(rows, columns, seed):
+    draw = np.random.default_rng(seed)
+    image = draw.integers(0, 5, (rows, columns)).astype(float)
+    assert np.array_equal(median_of_nine(image), ndimage.median_filter(image, 3, mode="nearest"))
+    unknown = draw.random((rows, columns)) < 0.8
+    assert np.array_equal(holes_in(unknown), ndimage.binary_opening(unknown, HOLE))
 
 
 def part_of(heights: np.ndarray, thing: Thing, border: float = 0.0) -> np.ndarray:

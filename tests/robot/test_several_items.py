@@ -18,7 +18,8 @@ from untrained import untrained_policy
 from pickplace import CellSpec, DepthMapError, Failure, Planner, Scene
 from pickplace.planners.heuristics import JointDBL
 from pickplace.policies.fcn4d.policy import Fcn4d
-from pickplace.robot.measure import Box, HiddenBox, touches
+from pickplace.robot.box import HiddenBox, UnknownBox
+from pickplace.robot.measure import Box, touches
 from pickplace.robot.measured_problem import read_metric
 from pickplace.rules.grasps import all_grasps
 from pickplace.rules.reach.annulus import Annulus
@@ -358,6 +359,27 @@ def test_an_item_that_stands_on_another_is_refused(upper, refused):
             plan_for(planner, **given)
     else:
         assert plan_for(planner, **given).status == "ok"
+
+
+@pytest.mark.parametrize("weights", ["mixed", "mixed_bin3"])
+def test_what_is_only_in_the_way_is_no_item(weights):
+    """A policy for one item plans beside a box that is not picked, and nothing but the other's way changes."""
+    planner, tote = Planner.load(f"pretrained/{weights}", tote_size=(6, 6, 5)), np.full((30, 30), 0.25)
+    item = Box(0.06, 0.06, 0.08, 0.06, 0.06)
+    alone = planner.plan(Scene([item], tote, 0.05))
+    assert alone.status == "ok" and alone.item_number == 0
+    for kind in (HiddenBox, UnknownBox):
+        beside = planner.plan(Scene([kind(0.21, 0.21, 0.03, 0.03, 0.2), item], tote, 0.05))
+        assert beside.item_number == 1 and {each.item_number for each in beside.alternatives} == {1}
+        assert (beside.pick, beside.place) == (alone.pick, alone.place)
+        with pytest.raises(
+            DepthMapError, match=r"^items: got 1 that are hidden in part or unknown, .* one that is seen"
+        ):
+            planner.plan(Scene([kind(0.21, 0.21, 0.03, 0.03, 0.2)], tote, 0.05))
+    over = planner.plan(Scene([item, HiddenBox(0.06, 0.06, 0.03, 0.03, 0.2)], tote, 0.05))
+    assert over.status == "impossible" and over.item_number is None
+    with pytest.raises(DepthMapError, match="no plan avoids what the images leave unknown"):
+        planner.plan(Scene([item, UnknownBox(0.06, 0.06, 0.03, 0.03, 0.2)], tote, 0.05))
 
 
 def test_the_critic_of_a_search_sees_each_item():
