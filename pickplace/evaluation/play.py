@@ -41,13 +41,13 @@ class Episodes:
     """Results of a planner, one entry an episode."""
 
     occupancy: Tensor  # float64 [E]
+    true_occupancy: Tensor  # float64 [E], of the true volumes, where sizes are rounded up to cells
     items_placed: Tensor  # int64 [E]
     failure: Tensor  # int64 [E], a Failure; NONE where the item stream ended
     final_heights: Tensor  # int32 [E, W_T, D_T]: the tote when the episode ended
     tote_height: Tensor  # int64 [E]
     feasible_share: float  # mean share of the N_a actions that were feasible, over all decisions
     decisions: int  # over all episodes
-    true_occupancy: Tensor | None = None  # float64 [E]: of the true volumes; None where the sizes are exact
     recordings: list[Recording] = field(default_factory=list)  # of the episodes that were to be recorded
 
 
@@ -90,12 +90,10 @@ class _Batch:
                     running[slot].moves.append(move)
 
     def _true_volumes(self, action: Tensor) -> Tensor:
-        """Return the true volume of the item that each action takes, float64 ``[N]``; 0 where the sizes are exact."""
+        """Return the true volume of the item that each action takes, float64 ``[N]``."""
         env, items, volumes = self.env, self.env.state.items, self.env.items.volumes
-        if volumes is None:
-            return torch.zeros_like(self.true_volume)
-        taken = taken_item(env.cell, items, *split_action(env.cell, action)[:2])
-        return volumes.to(env.device)[select_item(items, taken).kind]
+        item = select_item(items, taken_item(env.cell, items, *split_action(env.cell, action)[:2]))
+        return item.volume.double() if volumes is None else volumes.to(env.device)[item.kind]
 
     def step(self, action: Tensor) -> None:
         """Step the environment, and keep the results of the episodes that end.
@@ -195,11 +193,8 @@ def play(
             batch.step(action)
         parts.append(batch.results)
         recordings += batch.recordings.values()
-    results = {name: torch.cat([part[name] for part in parts]).cpu() for name in RESULTS}
-    if batch.env.items.volumes is None:
-        del results["true_occupancy"]
     return Episodes(
-        **results,
+        **{name: torch.cat([part[name] for part in parts]).cpu() for name in RESULTS},
         feasible_share=feasible / decisions,
         decisions=decisions,
         recordings=recordings,

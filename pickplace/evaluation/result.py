@@ -62,7 +62,7 @@ def describe(planner: BatchPlanner, facts: dict, episodes: Episodes) -> dict:
             "min": float(occupancy.min()),
             "per_episode": occupancy.tolist(),
         },
-        **({} if true is None else {"true_occupancy": {"mean": float(true.mean()), "ci95": list(confidence95(true))}}),
+        "true_occupancy": {"mean": float(true.mean()), "ci95": list(confidence95(true))},
         "items_placed": float(episodes.items_placed.double().mean()),
         "failures": dict(sorted(reasons.items())),
         "feasible_action_share": episodes.feasible_share,
