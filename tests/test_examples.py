@@ -292,6 +292,15 @@ def test_recorded_items(example):
     assert ours["items"]["loop"] is True and ours["occupancy"]["mean"] > 0.8
 
 
+def test_orders(example):
+    path = f"items.path={EXAMPLES}/orders/orders.csv"
+    ours = example(
+        "evaluate", "orders", "items=orders", path, "planner=joint_dbl", *EVALUATION, "evaluation.episodes=1"
+    )
+    assert ours["items"]["cell_size"] == 0.05
+    assert 0.05 < ours["true_occupancy"]["mean"] < ours["occupancy"]["mean"]
+
+
 @pytest.mark.parametrize(("name", "levels"), [("ramp", [2, 3, 3, 3, 4]), ("careful", [3, 4, 3, 4, 4])])
 def test_own_curriculum(name, levels):
     search = f"hydra.searchpath=[file://{EXAMPLES / 'own_curriculum'}]"

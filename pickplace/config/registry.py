@@ -47,7 +47,7 @@ REGISTRY: dict[str, dict[str, str]] = {
     ),
     "items": _classes(
         "items", kinds="distributions.Kinds", uniform="distributions.Uniform", recorded="distributions.Recorded",
-        cut="cut.Cut",
+        cut="cut.Cut", orders="orders.Orders",
     ),
     "model.actor": _classes(
         "policies", fcn_grasp="fcn_grasp.policy.fcn_grasp", corners="corners.policy.Corners",

@@ -87,6 +87,8 @@ def evaluation_table(result: dict) -> str:
         "items in the bin": count > 1 and f"up to {count}, refill: {env.get('refill', 'each')}",
         "episodes": f"{result['episodes']} of the {result['stream']} stream, seed {result['seed']}{same}",
         "occupancy": f"{_interval(occupancy, '.4f')}, least {occupancy['min']:.4f}",
+        "occupancy of true volumes": (true := result.get("true_occupancy", occupancy))["mean"] != occupancy["mean"]
+        and _interval(true, ".4f"),
         "items placed": f"{result['items_placed']:.1f} an episode",
         "episodes ended by": ", ".join(f"{name} {count}" for name, count in result["failures"].items()),
         "feasible actions": f"{result['feasible_action_share']:.2%} of all, mean over decisions",

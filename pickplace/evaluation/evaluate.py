@@ -100,7 +100,7 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
         )  # fmt: skip
 
     probe = make_env(0, 1)
-    check_play(ev, probe.cell, cfg.device)
+    check_play(ev, probe)
     planner = build("planner", cfg.planner, **planner_parts(cfg.planner, probe.cell, items, probe.terms, trained))
     refuse_if(  # now, not after all episodes
         not isinstance(planner, BatchPlanner) or not isinstance(planner.name, str),

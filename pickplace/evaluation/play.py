@@ -17,7 +17,8 @@ from pickplace.physics.engine import Engine
 from pickplace.physics.plans import EpisodePlan
 from pickplace.planners.base import BatchPlanner
 from pickplace.planners.use import decide
-from pickplace.rules.cell import CellSpec
+from pickplace.rules.bin import select_item, taken_item
+from pickplace.rules.grasps import split_action
 from pickplace.rules.masks import num_feasible, placing_maps
 from pickplace.rules.state import Failure
 from pickplace.views.motion import Outcome
@@ -32,7 +33,7 @@ MakeEnv = Callable[[int, int], PickPlaceEnv]
 MAX_EPISODES = 1_000_000
 
 #: The tensors of :class:`Episodes`.
-RESULTS = ("occupancy", "items_placed", "failure", "final_heights", "tote_height")
+RESULTS = ("occupancy", "items_placed", "failure", "final_heights", "tote_height", "true_occupancy")
 
 
 @dataclass
@@ -40,6 +41,7 @@ class Episodes:
     """Results of a planner, one entry an episode."""
 
     occupancy: Tensor  # float64 [E]
+    true_occupancy: Tensor  # float64 [E], of the true volumes, where sizes are rounded up to cells
     items_placed: Tensor  # int64 [E]
     failure: Tensor  # int64 [E], a Failure; NONE where the item stream ended
     final_heights: Tensor  # int32 [E, W_T, D_T]: the tote when the episode ended
@@ -63,6 +65,7 @@ class _Batch:
         self.running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
         self.observation = env.reset()
         self.results = {"tote_height": env.tote_height.clone()}  # entries of Episodes, of the slots that have ended
+        self.true_volume = torch.zeros(env.num_envs, dtype=torch.float64, device=env.device)
         self.recordings = {
             slot: Recording(first + slot, height)
             for slot, height in enumerate(env.tote_height.tolist())
@@ -86,16 +89,25 @@ class _Batch:
                 for slot, move in zip(slots, moves, strict=True):
                     running[slot].moves.append(move)
 
+    def _true_volumes(self, action: Tensor) -> Tensor:
+        """Return the true volume of the item that each action takes, float64 ``[N]``."""
+        env, items, volumes = self.env, self.env.state.items, self.env.items.volumes
+        item = select_item(items, taken_item(env.cell, items, *split_action(env.cell, action)[:2]))
+        return item.volume.double() if volumes is None else volumes.to(env.device)[item.kind]
+
     def step(self, action: Tensor) -> None:
         """Step the environment, and keep the results of the episodes that end.
 
         A slot whose episode has ended plays on, uncounted, until all have ended.
         """
-        env, after = self.env, self.env.step(self.observation.set("action", action))["next"]
+        env, placed, volume = self.env, self.env.steps.clone(), self._true_volumes(action)
+        after = env.step(self.observation.set("action", action))["next"]
+        self.true_volume += (env.steps - placed) * volume
         done, failure = after["done"][:, 0], after["failure"][:, 0]
         ended = self.running & done
         now = {
             "occupancy": env.exact_occupancy,
+            "true_occupancy": self.true_volume / env.cell.tote_volume(env.tote_height),
             "items_placed": env.steps,
             "failure": failure,
             "final_heights": env.state.heights,
@@ -126,10 +138,24 @@ def check_episode_settings(evaluation: Mapping) -> None:
     check_seed(evaluation.get("seed"), "evaluation.seed")
 
 
-def check_play(evaluation: Mapping, cell: CellSpec, device) -> None:
-    """Refuse more episodes side by side than the memory holds, with a ``ValueError`` that names the key."""
-    together = min(evaluation["batch_size"], evaluation["episodes"])
-    check_bytes(f"evaluation.batch_size={together}", together * problem_bytes(cell, ()), device)
+def check_play(evaluation: Mapping, env: PickPlaceEnv) -> None:
+    """Refuse more episodes than the items have, or more side by side than the memory holds.
+
+    Args:
+        evaluation: the config group.
+        env: an environment like those that are played.
+
+    Raises:
+        ValueError: naming the key.
+    """
+    episodes, most = evaluation["episodes"], env.items.num_episodes(evaluation["stream"])
+    refuse_if(
+        most is not None and episodes > most,
+        f"evaluation.episodes={episodes}: the items of evaluation.stream={evaluation['stream']} are {most} orders; "
+        f"expected {most} at most, as others would repeat them.",
+    )
+    together = min(evaluation["batch_size"], episodes)
+    check_bytes(f"evaluation.batch_size={together}", together * problem_bytes(env.cell, ()), env.device)
 
 
 @torch.no_grad()

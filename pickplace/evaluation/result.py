@@ -51,7 +51,7 @@ def describe(planner: BatchPlanner, facts: dict, episodes: Episodes) -> dict:
         facts: about the planner and its checkpoint, and :func:`episode_settings`.
         episodes: the results.
     """
-    occupancy = episodes.occupancy
+    occupancy, true = episodes.occupancy, episodes.true_occupancy
     reasons = Counter(Failure(code).name.lower() for code in episodes.failure.tolist())
     return {
         "planner": planner.name,
@@ -62,6 +62,7 @@ def describe(planner: BatchPlanner, facts: dict, episodes: Episodes) -> dict:
             "min": float(occupancy.min()),
             "per_episode": occupancy.tolist(),
         },
+        "true_occupancy": {"mean": float(true.mean()), "ci95": list(confidence95(true))},
         "items_placed": float(episodes.items_placed.double().mean()),
         "failures": dict(sorted(reasons.items())),
         "feasible_action_share": episodes.feasible_share,

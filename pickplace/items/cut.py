@@ -8,15 +8,13 @@ from torch import Tensor
 
 from pickplace.common.validate import at_most, one_of, size_tuple
 from pickplace.items.distributions import MAX_KINDS, ItemDistribution, check_range, hashed_uniform, place_at_random
+from pickplace.items.kept import KeptEpisodes
 
 #: Orders of arrival: CUT-1 and CUT-2.
 ORDERS = ("z", "stacking")
 
 #: Greatest side of a container, and greatest number of items of an episode: more would fill the memory.
 MAX_SIDE, MAX_ITEMS = 200, 1000
-
-#: Number of episodes whose items are kept, so that they are not cut again at each step.
-KEPT_EPISODES = 1024
 
 
 class Cut(ItemDistribution):
@@ -74,25 +72,16 @@ class Cut(ItemDistribution):
         self._num_cuts = torch.tensor([len(places) for places in cuts])
         self._cuts = torch.tensor([places + [0] * (longest - len(places)) for places in cuts])
         self._layers = self.container[2] // least
-        self._at_once = max(1, 2**22 // count**2)  # episodes, for the memory of `_arrival`
-        self._kept: dict[tuple[str, int, int], list[list[int]]] = {}
+        self._kept = KeptEpisodes(
+            lambda *episodes: [boxes[:, 3:].tolist() for boxes in self.boxes(*episodes)],
+            max(1, 2**22 // count**2),  # for the memory of `_arrival`
+        )
 
     def sample(self, stream, seed, episode, step, bin_size, mix=None):
         _, across, along = hashed_uniform(stream, seed, episode, step, 3)
-        rows = [part.tolist() for part in torch.broadcast_tensors(seed, episode, step)]
-        keys = [(stream, *key) for key in zip(*rows[:2], strict=True)]
-        # Cut the episodes that are new, and keep the sizes of their items.
-        unseen = list(dict.fromkeys(key for key in keys if key not in self._kept))
-        for start in range(0, len(unseen), self._at_once):
-            some = unseen[start : start + self._at_once]
-            boxes = self.boxes(stream, *torch.tensor([key[1:] for key in some]).unbind(1))
-            self._kept.update(zip(some, (each[:, 3:].tolist() for each in boxes), strict=True))
-        # With a slice, since the item after the last one is none.
-        size = [[*self._kept[key][at : at + 1], [0, 0, 0]][0] for key, at in zip(keys, rows[2], strict=True)]
+        size = self._kept.at(stream, seed, episode, step, end=[0, 0, 0])
         sizes = torch.tensor(size, dtype=torch.int64, device=step.device).view(-1, 3)
         item = place_at_random(sizes, across, along, bin_size)
-        if len(self._kept) > max(KEPT_EPISODES, 2 * len(keys)):
-            self._kept = {key: self._kept[key] for key in keys}
         return item.map(lambda part: torch.where(item.exists, part, 0))
 
     def boxes(self, stream: str, seed: Tensor, episode: Tensor) -> list[Tensor]:

@@ -87,6 +87,8 @@ class ItemDistribution:
         sequential: whether an episode is a sequence whose order a search must not know: it samples from ``sizes``.
         has_corners: whether each item has one place in the bin, so that of several items one waits for its place.
         mixes: number of mixes of the sizes among which episodes may choose, see :meth:`mixed`; 1: there is one.
+        volumes: float64 ``[K]``, the true volume of each kind, in cells times height units, where ``sizes`` are rounded
+            up; None: the sizes are exact.
     """
 
     sizes: Tensor
@@ -94,6 +96,7 @@ class ItemDistribution:
     sequential: bool = False
     has_corners: bool = False
     mixes: int = 1
+    volumes: Tensor | None = None
 
     def sample(
         self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size, mix: Tensor | None = None
@@ -113,6 +116,9 @@ class ItemDistribution:
     def _index(self, uniform: Tensor, step: Tensor, mix: Tensor | None = None) -> Tensor:
         """Return which row of ``sizes`` arrives, int64 ``[N]``."""
         raise NotImplementedError
+
+    def num_episodes(self, stream: str) -> int | None:
+        """Return how many different episodes a stream has; later ones repeat them. None: each is another."""
 
     def of_mix(self, mix: Tensor | None) -> dict[str, Tensor]:
         """Return the argument of :meth:`sample` and :meth:`spread` that names a mix; without mixes there is none."""

@@ -84,4 +84,4 @@ def check_memory(cfg: DictConfig, env: PickPlaceEnv, policy: Policy, algorithm: 
     for setting, needed in algorithm.memory(frame).items():
         check_bytes(setting, needed, env.device)
     check_bytes(f"env.num_envs={slots}", slots * max(problem_bytes(cell, masks), policy.acting_bytes), env.device)
-    check_play(cfg.evaluation, cell, env.device)
+    check_play(cfg.evaluation, env)

@@ -79,7 +79,7 @@ def test_our_own_configs_are_accepted():
     groups += ("warm_start",)
     for names in itertools.zip_longest(*map(options, groups)):
         choices = [f"{group}={name}" for group, name in zip(groups, names, strict=True) if name]
-        cfg = composed(*choices, *(["items.path=items.csv"] if "items=recorded" in choices else []))
+        cfg = composed(*choices, *(["items.path=items.csv"] if {"items=recorded", "items=orders"} & {*choices} else []))
         assert trusted_config(saved_form(cfg)).env == cfg.env
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2_contingency, chisquare
 
 from pickplace import PickPlaceEnv
-from pickplace.items import cut as module
+from pickplace.items import kept
 from pickplace.items.cut import ORDERS, Cut
 from pickplace.items.distributions import STREAMS, Kinds, search_items
 
@@ -179,13 +179,13 @@ def test_an_item_is_a_function_of_its_address(order, monkeypatch):
     for address in addresses:
         item = fresh.sample("test", *(torch.tensor([part]) for part in address), BIN)
         known[address] = torch.stack(item)[:, 0].tolist()
-    monkeypatch.setattr(module, "KEPT_EPISODES", 3)
+    monkeypatch.setattr(kept, "KEPT_EPISODES", 3)
     cut = Cut(order=order)
     for _ in range(40):
         asked = rng.sample(addresses, rng.randint(1, 20))
         item = cut.sample("test", *map(torch.tensor, zip(*asked, strict=True)), BIN)
         assert torch.stack(item, 1).tolist() == [known[address] for address in asked]
-        assert len(cut._kept) <= max(3, 2 * len(asked))
+        assert len(cut._kept._kept) <= max(3, 2 * len(asked))
         if rng.random() < 0.2:
             cut = pickle.loads(pickle.dumps(cut))  # as a worker gets it
     together = [len(boxes) for boxes in boxes_of(fresh, 20, stream="test")]

@@ -1,0 +1,36 @@
+"""Whole episodes of items, made once and kept while they are played."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+#: Number of episodes that are kept, or twice as many as are played side by side.
+KEPT_EPISODES = 1024
+
+
+class KeptEpisodes:
+    """The sequences of episodes.
+
+    Args:
+        make: ``make(stream, seed, episode)`` returns the sequences of episodes ``[E]``, one for each.
+        at_once: most episodes that it is asked for in one call, for its memory.
+    """
+
+    def __init__(self, make: Callable[[str, Tensor, Tensor], Sequence[Sequence]], at_once: int):
+        self._make, self._at_once = make, at_once
+        self._kept: dict[tuple[str, int, int], Sequence] = {}
+
+    def at(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, end) -> list:
+        """Return the element at a step of each episode, int64 ``[N]``; ``end`` after the last one."""
+        seeds, episodes, steps = (part.tolist() for part in torch.broadcast_tensors(seed, episode, step))
+        keys = [(stream, *key) for key in zip(seeds, episodes, strict=True)]
+        unseen = list(dict.fromkeys(key for key in keys if key not in self._kept))
+        for start in range(0, len(unseen), self._at_once):
+            some = unseen[start : start + self._at_once]
+            made = self._make(stream, *torch.tensor([key[1:] for key in some]).unbind(1))
+            self._kept.update(zip(some, made, strict=True))
+        found = [[*self._kept[key][at : at + 1], end][0] for key, at in zip(keys, steps, strict=True)]
+        if len(self._kept) > max(KEPT_EPISODES, 2 * len(keys)):
+            self._kept = {key: self._kept[key] for key in keys}
+        return found

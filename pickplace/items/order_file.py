@@ -1,0 +1,210 @@
+"""Files of orders: lists of items with sides in millimetres and weights, as CSV, or as the JSON of BED-BPP."""
+
+import csv
+import io
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from pickplace.common.files import MAX_TABLE_BYTES, read_text
+from pickplace.common.validate import at_most, excerpt, refuse_if, reworded
+
+#: Name of a column -> the names that a file may have for it, in any case; a unit may follow, as in ``length/mm``.
+NAMES = {
+    "order": ("order", "order_id", "order_nr"),
+    "id": ("id", "sku", "article", "item"),
+    "length": ("length", "l", "w"),
+    "width": ("width", "d", "depth"),
+    "height": ("height", "h"),
+    "weight": ("weight", "mass", "kg", "g"),
+    "quantity": ("quantity", "qty", "count"),
+}
+SIDES = ("length", "width", "height")
+#: What such columns ask for is no part of the task: an order would be packed as if they said nothing.
+NOT_KNOWN = ("orientation", "orientations", "max_load", "maximum_load", "stackable", "nothing_on_top")
+MILLIMETRES, GRAMS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}, {"g": 1.0, "kg": 1000.0}
+UNITS: dict[str, dict] = {**dict.fromkeys(SIDES, MILLIMETRES), "weight": GRAMS}
+DEFAULT_WEIGHT = "kg"
+COLUMN = re.compile(r"(.*?)\s*(?:[/_ (\[]\s*(mm|cm|m|kg|g)\s*[)\]]?)?")  # a name, and a unit if there is one
+EXPECTED = "columns length, width, height and weight, such as length/mm and weight/kg; and order, id or quantity if any"
+
+MAX_LENGTH, MAX_GRAMS = 10_000, 10_000_000  # of an item: 10 m, 10 t
+MAX_QUANTITY, MAX_ITEMS = 10_000, 2_000_000  # of a line, of a file
+
+
+class OrderItem(NamedTuple):
+    """One item of an order."""
+
+    id: str  # of the article; "" if the file has none
+    length: float  # along x as it lies in the bin, mm
+    width: float  # along y, mm
+    height: float  # mm
+    grams: int  # rounded up
+    place: str  # the file and where in it, for messages, such as "orders.csv, line 7"
+
+
+class Order(NamedTuple):
+    """One order: its items in their order of arrival."""
+
+    name: str
+    items: list[OrderItem]
+
+
+class _Row(NamedTuple):
+    """A row of a file."""
+
+    place: str
+    header: tuple[str, ...]
+    values: tuple
+    header_place: str
+
+
+class _Column(NamedTuple):
+    key: str  # in the file
+    unit: float  # of its values, in mm or g
+
+
+def read_orders(path, unit: str = "mm", key: str = "items.path") -> list[Order]:
+    """Return the orders of a file.
+
+    A CSV has a header and a line for each item, or for each article with its ``quantity``. Lines with the same
+    ``order`` are one order; without that column the file is one. JSON is that of BED-BPP: for each order
+    ``item_sequence``, its items by their number.
+
+    Args:
+        path: the file; ``.json``, else CSV in UTF-8.
+        unit: of lengths without one in the header, ``"mm"``, ``"cm"`` or ``"m"``. Weights without one are in kg.
+        key: the setting that names the file.
+
+    Raises:
+        ValueError: naming the file, and the line of a value that cannot be used.
+    """
+    path = Path(path)
+    refuse_if(
+        not path.exists(), f"{key}={str(path)!r}: no such file; expected a CSV with {EXPECTED}; or BED-BPP's JSON."
+    )
+    text = read_text(path, MAX_TABLE_BYTES, "utf-8-sig", empty=False)
+    rows = _rows_of_json(path, text) if path.suffix.lower() == ".json" else _rows_of_csv(path, text)
+    orders: dict[str, list[OrderItem]] = {}
+    articles: dict[str, OrderItem] = {}
+    columns: dict[tuple[str, ...], dict[str, _Column]] = {}
+    total = 0
+    for place, header, values, header_place in rows:
+        if header not in columns:
+            columns[header] = _read_header(f"{path}, {header_place}", header, unit)
+        row = dict(zip(header, values, strict=True))
+        item, order, quantity = _read_row(f"{path}, {place}", row, columns[header])
+        known = articles.setdefault(item.id, item)
+        refuse_if(
+            item.id and item[1:5] != known[1:5],
+            f"{item.place}: item {excerpt(item.id)} is {_words(item)}, but {_words(known)} in {known.place}; "
+            "expected one size and weight for each id.",
+        )
+        at_most(f"{path}:", total := total + quantity, "items", MAX_ITEMS)
+        orders.setdefault(order, []).extend([item] * quantity)
+    refuse_if(not orders, f"{path}: no items, expected at least one.")
+    return [Order(name, items) for name, items in orders.items()]
+
+
+def _words(item: OrderItem) -> str:
+    return f"{item.length:g} x {item.width:g} x {item.height:g} mm, {item.grams / 1000:g} kg"
+
+
+def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
+    first = text.partition("\n")[0]
+    with reworded(csv.Error, lambda error: ValueError(f"{path}: {error}; expected a CSV in UTF-8.")):
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=";" if ";" in first and "," not in first else ",")
+        header: tuple[str, ...] = ()
+        for row in reader:
+            fields = tuple(field.strip() for field in row)
+            if not any(fields):
+                continue
+            if header:
+                refuse_if(
+                    len(fields) != len(header),
+                    f"{path}, line {reader.line_num}: got {len(fields)} fields, expected {len(header)} as in the "
+                    "header.",
+                )
+                yield _Row(f"line {reader.line_num}", header, fields, "line 1")
+            header = header or fields
+
+
+def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
+    def wrong(what: str) -> ValueError:
+        return ValueError(
+            f'{path}: {what}; expected {{order: {{"item_sequence": {{"1": item, ...}}}}}}, as of BED-BPP.'
+        )
+
+    def unique(pairs: list[tuple]) -> dict:
+        refuse_if(len(found := dict(pairs)) < len(pairs), f"a key is there twice among {excerpt([*found])}")
+        return found
+
+    with reworded((ValueError, RecursionError), lambda error: wrong(f"it cannot be read ({error})")):
+        orders = json.loads(text, object_pairs_hook=unique)
+    if not isinstance(orders, dict):
+        raise wrong(f"got {excerpt(orders)}")
+    for name, order in orders.items():
+        items = order.get("item_sequence") if isinstance(order, dict) else None
+        if not isinstance(items, dict) or not all(number.isdecimal() and len(number) < 10 for number in items):
+            raise wrong(f"order {excerpt(name)} has no item_sequence with numbers as its keys")
+        for number in sorted(items, key=int):
+            if not isinstance(items[number], dict):
+                raise wrong(f"order {excerpt(name)}, item {number} is {excerpt(items[number])}")
+            place, entries = f"order {name}, item {number}", {**items[number], "order": name}
+            yield _Row(place, tuple(entries), tuple(entries.values()), place)
+
+
+def _read_header(place: str, header: Sequence, unit: str) -> dict[str, _Column]:
+    """Return the columns that a header names, by the names of :data:`NAMES`."""
+    found: dict[str, tuple[str, str | None]] = {}
+    for key in header:
+        name, suffix = COLUMN.fullmatch(str(key).strip().lower()).groups()  # type: ignore[union-attr]  # matches any
+        refuse_if(
+            name in NOT_KNOWN,
+            f"{place}: the column {excerpt(key)} is not read yet, and an order would be packed as if it said nothing; "
+            "expected a file without it.",
+        )
+        refuse_if(name in found, f"{place}: two columns {excerpt(name)}; expected one.")
+        found[name] = key, suffix
+    # In l,w,h and length,width,height the width is the second side; in w,d,h the first.
+    second = {"length": ("length", "l"), "width": ("width", "w")} if {"length", "l"} & {*found} else {}
+    columns = {}
+    for column, names in (NAMES | second).items():
+        for name in (name for name in names if name in found and column not in columns):
+            key, suffix = found[name]
+            units = UNITS.get(column, {None: 1.0})
+            default = name if name in units else unit if column in SIDES else DEFAULT_WEIGHT
+            value = suffix or default if column in UNITS else None
+            refuse_if(
+                value not in units,
+                f"{place}: the column {excerpt(key)} is in {value}; expected {' or '.join(map(str, units))}.",
+            )
+            columns[column] = _Column(key, units[value])
+    missing = [name for name in (*SIDES, "weight") if name not in columns]
+    refuse_if(
+        missing,
+        f"{place}: no column {' and no '.join(missing)} in {excerpt(','.join(map(str, header)))}; expected {EXPECTED}.",
+    )
+    return columns
+
+
+def _read_row(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[OrderItem, str, int]:
+    """Return the item of a row, the name of its order, and how many there are."""
+
+    def read(name: str, most: float) -> float:
+        key, unit = columns[name]
+        with suppress(TypeError, ValueError):
+            if 0 < (number := float(row[key])) * unit <= most and not isinstance(row[key], bool):
+                return number * unit
+        raise ValueError(f"{place}: {key}={excerpt(row[key])}: expected a number above 0, at most {most / unit:,g}.")
+
+    length, width, height = (read(name, MAX_LENGTH) for name in SIDES)
+    grams = math.ceil(read("weight", MAX_GRAMS) - 1e-6)
+    count = read("quantity", MAX_QUANTITY) if "quantity" in columns else 1.0
+    refuse_if(count != int(count), f"{place}: {count:g} pieces; expected a whole number.")
+    identity, order = (str(row[columns[name].key]) if name in columns else "" for name in ("id", "order"))
+    return OrderItem(identity, length, width, height, grams, place), order, int(count)

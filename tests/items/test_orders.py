@@ -1,0 +1,203 @@
+"""Orders of a file: read in any units, rounded up to cells, in streams that share none, drawn like those that train."""
+
+import csv
+import json
+import math
+from collections import Counter
+from itertools import groupby
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pickplace import PickPlaceEnv
+from pickplace.evaluation.play import check_play, play
+from pickplace.items.order_file import MILLIMETRES, read_orders
+from pickplace.items.orders import Orders
+from pickplace.planners.heuristics import JointDBL
+
+BIN = (40, 40, 1)
+SIDES = st.tuples(*[st.integers(1, 600)] * 3, st.integers(1, 30_000))  # mm and g
+ORDERS = st.lists(st.lists(SIDES, min_size=1, max_size=8), min_size=3, max_size=12, unique_by=tuple)
+
+
+def write_csv(path, orders, unit="mm", header=None, weight="kg"):
+    """A CSV of orders of (length, width, height, grams), sides written in a unit."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header or ["order", f"length/{unit}", f"width/{unit}", f"height/{unit}", f"weight/{weight}"])
+        for number, order in enumerate(orders):
+            for *sides, grams in order:
+                writer.writerow(
+                    [number, *(side / MILLIMETRES[unit] for side in sides), grams / {"kg": 1000, "g": 1}[weight]]
+                )
+    return path
+
+
+def write_bed_bpp(path, orders):
+    items = [
+        {
+            str(number): {"id": f"{order}-{number}", "article": "a", "length/mm": w, "width/mm": d, "height/mm": h,
+                          "weight/kg": grams / 1000, "sequence": number, "product_group": "b"}
+            for number, (w, d, h, grams) in reversed([*enumerate(each, 1)])  # their numbers decide, not their place
+        }
+        for order, each in enumerate(orders)
+    ]  # fmt: skip
+    path.write_text(json.dumps({f"{n:08}": {"item_sequence": each, "properties": {}} for n, each in enumerate(items)}))
+    return path
+
+
+def episode(items, stream, number, seed=0, most=200):
+    """The (w, d, h, grams) of an episode, asked for one by one."""
+    found = []
+    for step in range(most):
+        item = items.sample(stream, *(torch.tensor([value]) for value in (seed, number, step)), BIN)
+        if not item.exists:
+            return found
+        assert 0 <= item.x <= BIN[0] - item.w and 0 <= item.y <= BIN[1] - item.d
+        found.append(tuple(int(part) for part in (item.w, item.d, item.h, item.grams)))
+    raise AssertionError("the order does not end")
+
+
+def runs(order):
+    return [(kind, len([*run])) for kind, run in groupby(order)]
+
+
+def in_cells(order, cell, unit):
+    return [(math.ceil(w / cell), math.ceil(d / cell), math.ceil(h / (cell * unit)), grams) for w, d, h, grams in order]
+
+
+@settings(max_examples=25, deadline=None)
+@given(ORDERS, st.sampled_from(["mm", "cm", "m"]), st.sampled_from(["kg", "g"]))
+def test_a_file_is_read_in_any_unit(tmp_path_factory, orders, unit, weight):
+    folder = tmp_path_factory.mktemp("orders")
+    files = write_csv(folder / "a.csv", orders, unit, weight=weight), write_bed_bpp(folder / "b.json", orders)
+    header = ["order", "L", "W", "H", "mass/g"]
+    for read in (*map(read_orders, files), read_orders(write_csv(folder / "c.csv", orders, "cm", header, "g"), "cm")):
+        found = [[(*item[1:4], item.grams) for item in order.items] for order in read]
+        assert [[pytest.approx(item, abs=1e-6) for item in order] for order in orders] == found
+
+
+@settings(max_examples=25, deadline=None)
+@given(ORDERS, st.sampled_from([(0.02, 1.0), (0.03, 0.25)]))
+def test_streams_share_no_order_and_play_each_once(tmp_path_factory, orders, sizes):
+    cell, unit = sizes
+    path = write_csv(tmp_path_factory.mktemp("orders") / "a.csv", orders, "m", weight="g")
+    items = Orders(path, cell, unit, generate=False)
+    played = {
+        stream: [episode(items, stream, number) for number in range(items.num_episodes(stream) or 60)]
+        for stream in ("train", "validation", "test")
+    }
+    expected = [in_cells(order, 1000 * cell, unit) for order in orders]
+    assert all(order in expected for each in played.values() for order in each)
+    counts = {stream: items.num_episodes(stream) for stream in ("validation", "test")}
+    assert all(count >= 1 for count in counts.values()) and sum(counts.values()) < len(orders)
+    # Orders that differ in the file may be alike in cells, so kinds are compared as they stand there.
+    whole = {stream: [tuple(order) for order in items._orders[stream]] for stream in played}
+    assert len({*whole["train"], *whole["validation"], *whole["test"]}) == len(orders) == sum(map(len, whole.values()))
+
+
+def test_drawn_orders_are_made_of_the_lines_of_those_that_train(tmp_path):
+    draw, orders = torch.Generator().manual_seed(0), []
+    for number in range(40):
+        counts = torch.randint(1, 5, (6,), generator=draw).tolist()
+        # The side along x says how far to the end of the order a line stands, the height which order it is from.
+        orders.append(
+            [(10 * (6 - line), 50, 10 * (number + 1), 100) for line, count in enumerate(counts) for _ in range(count)]
+        )
+    items = Orders(write_csv(tmp_path / "a.csv", orders), 0.01)
+    train = [[tuple(items.sizes[kind].tolist()) for kind in order] for order in items._orders["train"]]
+    lines = {line for order in train for line in runs(order)}
+    drawn = [[each[:3] for each in episode(items, "train", number)] for number in range(300)]
+    others = {each[2] for stream in ("validation", "test") for order in items._orders[stream]
+              for each in items.sizes[list(order)].tolist()}  # fmt: skip
+    assert not others & {size[2] for order in drawn for size in order}
+    assert {len(order) for order in drawn} <= {len(order) for order in train}
+    found = [line for order in drawn for line in runs(order)]
+    # The line with which an order becomes too long is cut, and two of one article may meet.
+    assert sum(line not in lines for line in found) < 1.1 * len(drawn)
+    assert len({each for order in drawn for each in order}) > 0.9 * len({each for order in train for each in order})
+    early, late = ([order[at][0] for order in drawn] for at in (0, -1))
+    assert sum(early) / len(early) > 4.5 and sum(late) / len(late) < 2.5  # in the order of the lines
+    assert len({tuple(order) for order in drawn}) > 290
+    # In any batch, and asked for in any order, an episode is the same.
+    addresses = torch.tensor([[7, 3], [0, 2], [7, 0], [299, 1]])
+    batch = items.sample("train", torch.zeros(4, dtype=torch.int64), *addresses.T, BIN)
+    assert [tuple(row) for row in batch.table[:, 2:5].tolist()] == [drawn[e][s] for e, s in addresses.tolist()]
+
+
+def test_true_volumes_are_reported(tmp_path):
+    orders = [[(95 + n, 100, 41, 100)] * 3 for n in range(3)]
+    items = Orders(write_csv(tmp_path / "a.csv", orders), 0.05)
+    assert items.sizes.tolist() == [[2, 2, 1]] * 3
+
+    def make_env(first, count):
+        return PickPlaceEnv(items, num_envs=count, stream="test", first_episode=first, masks=())
+
+    episodes = play(make_env, JointDBL(make_env(0, 1).cell), 1, 1)
+    assert episodes.items_placed.tolist() == [3] and episodes.occupancy.tolist() == [12 / 180]
+    number = [order[0][0] for order in orders][items._orders["test"][0][0]]
+    assert episodes.true_occupancy.tolist() == [pytest.approx(3 * number * 100 * 41 / (300 * 300 * 250))]
+    with pytest.raises(ValueError, match=r"^evaluation.episodes=2: the items of evaluation.stream=test are 1 orders"):
+        check_play({"episodes": 2, "batch_size": 1, "stream": "test"}, make_env(0, 1))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("id,w,d\n1,2,3\n", r"line 1: no column height and no weight in 'id,w,d'; expected columns length"),
+        ("l,w,h,kg\n1,2,3,0\n", r"line 2: kg='0': expected a number above 0, at most 10,000\."),
+        ("l,w,h,kg\n1,2,3,nan\n", r"line 2: kg='nan': expected a number above 0"),
+        ("l,w,h,kg\n\n1,2,99999,4\n", r"line 3: h='99999': expected a number above 0, at most 10,000\."),
+        ("l,w,h,kg\n1,2,3\n", r"line 2: got 3 fields, expected 4 as in the header\."),
+        ("l,w,h,kg,qty\n1,2,3,4,1.5\n", r"line 2: 1.5 pieces; expected a whole number\."),
+        ("l,w,h,weight/mm\n1,2,3,4\n", r"line 1: the column 'weight/mm' is in mm; expected g or kg\."),
+        ("l,w,h,kg,max_load\n1,2,3,4,5\n", r"line 1: the column 'max_load' is not read yet"),
+        ("l,l,h,kg\n1,2,3,4\n", r"line 1: two columns 'l'; expected one\."),
+        ("id,l,w,h,kg\na,1,2,3,4\na,1,2,3,5\n", r"line 3: item 'a' is 1 x 2 x 3 mm, 5 kg, but 1 x 2 x 3 mm, 4 kg in"),
+        ("l,w,h,kg\n", r"no items, expected at least one\."),
+        ("l,w,h,kg\n1,2,3,4\n", r"the file has 1 different orders; expected three at least"),
+    ],
+)  # fmt: skip
+def test_a_bad_file_is_refused_with_its_line(tmp_path, text, message):
+    (path := tmp_path / "a.csv").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        Orders(path, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "it cannot be read"),
+        ('{"a": {}, "a": {}}', "a key is there twice"),
+        ("[]", r"got \[\]; expected {order: "),
+        ('{"a": {}}', "order 'a' has no item_sequence with numbers as its keys"),
+        ('{"a": {"item_sequence": {"1": 3}}}', "order 'a', item 1 is 3; expected"),
+        ('{"a": {"item_sequence": {"7": {"length/mm": 3}}}}', "order a, item 7: no column width and no height"),
+        (
+            '{"a": {"item_sequence": {"1": {"length/mm": true, "width/mm": 1, "height/mm": 1, "weight/kg": 1}}}}',
+            "order a, item 1: length/mm=True: expected a number above 0",
+        ),
+        ("{}", "no items"),
+    ],
+)
+def test_bad_json_is_refused_with_its_order(tmp_path, text, message):
+    (path := tmp_path / "a.json").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_orders(path)
+
+
+def test_an_item_that_fits_nowhere_is_named_with_its_line(tmp_path):
+    path = write_csv(tmp_path / "a.csv", [[(100, 100, 50 * n, 1)] for n in range(1, 7)])
+    with pytest.raises(ValueError, match=r"a.csv, line 7: item 2x2x6, 100 x 100 x 300 mm, is higher than the tote"):
+        PickPlaceEnv(Orders(path, 0.05))
+    with pytest.raises(ValueError, match="items.cell_size=null: expected the side of a cell in metres"):
+        Orders(path, None)
+
+
+def test_quantities_and_semicolons(tmp_path):
+    (path := tmp_path / "a.csv").write_text("id;w;d;h;kg;qty\na;35;20.3;20.8;1.5;2\nb;10;10;10;0.0004;1\n")
+    (order,) = read_orders(path, "cm")
+    assert Counter(item.id for item in order.items) == {"a": 2, "b": 1}
+    assert order.items[0][1:5] == (350.0, 203.0, 208.0, 1500) and order.items[2].grams == 1
