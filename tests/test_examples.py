@@ -298,6 +298,7 @@ def test_orders(example):
         "evaluate", "orders", "items=orders", path, "planner=joint_dbl", *EVALUATION, "evaluation.episodes=1"
     )
     assert ours["items"]["cell_size"] == 0.05
+    assert ours["share_placed"]["mean"] == 1
     assert 0.05 < ours["true_occupancy"]["mean"] < ours["occupancy"]["mean"]
 
 

@@ -90,6 +90,7 @@ def evaluation_table(result: dict) -> str:
         "occupancy of true volumes": (true := result.get("true_occupancy", occupancy))["mean"] != occupancy["mean"]
         and _interval(true, ".4f"),
         "items placed": f"{result['items_placed']:.1f} an episode",
+        "share of an episode's items": "share_placed" in result and _interval(result["share_placed"], ".4f"),
         "episodes ended by": ", ".join(f"{name} {count}" for name, count in result["failures"].items()),
         "feasible actions": f"{result['feasible_action_share']:.2%} of all, mean over decisions",
         f"physics, {physics and physics['method']}": physics

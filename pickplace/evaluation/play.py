@@ -33,7 +33,7 @@ MakeEnv = Callable[[int, int], PickPlaceEnv]
 MAX_EPISODES = 1_000_000
 
 #: The tensors of :class:`Episodes`.
-RESULTS = ("occupancy", "items_placed", "failure", "final_heights", "tote_height", "true_occupancy")
+RESULTS = ("occupancy", "items_placed", "failure", "final_heights", "tote_height", "true_occupancy", "num_items")
 
 
 @dataclass
@@ -43,6 +43,7 @@ class Episodes:
     occupancy: Tensor  # float64 [E]
     true_occupancy: Tensor  # float64 [E], of the true volumes, where sizes are rounded up to cells
     items_placed: Tensor  # int64 [E]
+    num_items: Tensor  # int64 [E], that arrive in the episode; 0: they do not end
     failure: Tensor  # int64 [E], a Failure; NONE where the item stream ended
     final_heights: Tensor  # int32 [E, W_T, D_T]: the tote when the episode ended
     tote_height: Tensor  # int64 [E]
@@ -64,7 +65,11 @@ class _Batch:
         self.env, self.heat_maps = env, heat_maps
         self.running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
         self.observation = env.reset()
-        self.results = {"tote_height": env.tote_height.clone()}  # entries of Episodes, of the slots that have ended
+        # Entries of Episodes, of the slots that have ended.
+        self.results = {
+            "tote_height": env.tote_height.clone(),
+            "num_items": env.items.num_items(env.stream, env.item_seed.expand_as(env.episode), env.episode),
+        }
         self.true_volume = torch.zeros(env.num_envs, dtype=torch.float64, device=env.device)
         self.recordings = {
             slot: Recording(first + slot, height)

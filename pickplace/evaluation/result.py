@@ -51,7 +51,8 @@ def describe(planner: BatchPlanner, facts: dict, episodes: Episodes) -> dict:
         facts: about the planner and its checkpoint, and :func:`episode_settings`.
         episodes: the results.
     """
-    occupancy, true = episodes.occupancy, episodes.true_occupancy
+    occupancy, true, count = episodes.occupancy, episodes.true_occupancy, episodes.num_items
+    placed = _share(episodes.items_placed / count) if (count > 0).all() else None
     reasons = Counter(Failure(code).name.lower() for code in episodes.failure.tolist())
     return {
         "planner": planner.name,
@@ -62,7 +63,8 @@ def describe(planner: BatchPlanner, facts: dict, episodes: Episodes) -> dict:
             "min": float(occupancy.min()),
             "per_episode": occupancy.tolist(),
         },
-        "true_occupancy": {"mean": float(true.mean()), "ci95": list(confidence95(true))},
+        "true_occupancy": _share(true),
+        **({} if placed is None else {"share_placed": placed}),
         "items_placed": float(episodes.items_placed.double().mean()),
         "failures": dict(sorted(reasons.items())),
         "feasible_action_share": episodes.feasible_share,
@@ -70,6 +72,11 @@ def describe(planner: BatchPlanner, facts: dict, episodes: Episodes) -> dict:
         "versions": versions(),
         "commit": commit(),
     }
+
+
+def _share(values: Tensor) -> dict:
+    """Return the mean of shares, one an episode, with its interval."""
+    return {"mean": float(values.double().mean()), "ci95": list(confidence95(values))}
 
 
 def summarise_physics(engine: Engine, settings: dict, outcomes: Sequence[Outcome]) -> dict:

@@ -72,10 +72,10 @@ class Cut(ItemDistribution):
         self._num_cuts = torch.tensor([len(places) for places in cuts])
         self._cuts = torch.tensor([places + [0] * (longest - len(places)) for places in cuts])
         self._layers = self.container[2] // least
-        self._kept = KeptEpisodes(
-            lambda *episodes: [boxes[:, 3:].tolist() for boxes in self.boxes(*episodes)],
-            max(1, 2**22 // count**2),  # for the memory of `_arrival`
-        )
+        self._kept = KeptEpisodes(self._sizes, max(1, 2**22 // count**2))  # for the memory of `_arrival`
+
+    def num_items(self, stream, seed, episode):
+        return torch.tensor([*map(len, self._kept.all_of(stream, seed, episode))], device=episode.device)
 
     def sample(self, stream, seed, episode, step, bin_size, mix=None):
         _, across, along = hashed_uniform(stream, seed, episode, step, 3)
@@ -83,6 +83,10 @@ class Cut(ItemDistribution):
         sizes = torch.tensor(size, dtype=torch.int64, device=step.device).view(-1, 3)
         item = place_at_random(sizes, across, along, bin_size)
         return item.map(lambda part: torch.where(item.exists, part, 0))
+
+    def _sizes(self, stream: str, seed: Tensor, episode: Tensor) -> list[list[list[int]]]:
+        """Return the ``w, d, h`` of the items of whole episodes, as of :meth:`boxes`."""
+        return [boxes[:, 3:].tolist() for boxes in self.boxes(stream, seed, episode)]
 
     def boxes(self, stream: str, seed: Tensor, episode: Tensor) -> list[Tensor]:
         """Return the items of whole episodes where they were cut: they tile the container.

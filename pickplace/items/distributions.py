@@ -120,6 +120,10 @@ class ItemDistribution:
     def num_episodes(self, stream: str) -> int | None:
         """Return how many different episodes a stream has; later ones repeat them. None: each is another."""
 
+    def num_items(self, stream: str, seed: Tensor, episode: Tensor) -> Tensor:
+        """Return how many items arrive in each episode, int64 ``[N]``; 0: they do not end."""
+        return torch.zeros_like(episode)
+
     def of_mix(self, mix: Tensor | None) -> dict[str, Tensor]:
         """Return the argument of :meth:`sample` and :meth:`spread` that names a mix; without mixes there is none."""
         return {} if mix is None or self.mixes == 1 else {"mix": mix}
@@ -301,6 +305,9 @@ class Recorded(ItemDistribution):
             x, y = self._corner.to(step.device)[item.kind].unbind(-1)
             item = item._replace(x=x, y=y)
         return item if self._loop else item.map(lambda part: torch.where(step < len(self.sizes), part, 0))
+
+    def num_items(self, stream: str, seed: Tensor, episode: Tensor) -> Tensor:
+        return torch.full_like(episode, 0 if self._loop else len(self.sizes))
 
     def _index(self, uniform, step, mix=None):
         return step % len(self.sizes)

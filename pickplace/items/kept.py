@@ -23,14 +23,19 @@ class KeptEpisodes:
 
     def at(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, end) -> list:
         """Return the element at a step of each episode, int64 ``[N]``; ``end`` after the last one."""
-        seeds, episodes, steps = (part.tolist() for part in torch.broadcast_tensors(seed, episode, step))
-        keys = [(stream, *key) for key in zip(seeds, episodes, strict=True)]
+        seed, episode, step = torch.broadcast_tensors(seed, episode, step)
+        sequences = self.all_of(stream, seed, episode)
+        return [[*sequence[at : at + 1], end][0] for sequence, at in zip(sequences, step.tolist(), strict=True)]
+
+    def all_of(self, stream: str, seed: Tensor, episode: Tensor) -> list[Sequence]:
+        """Return the sequence of each episode, int64 ``[N]``."""
+        keys = [(stream, *key) for key in zip(seed.tolist(), episode.tolist(), strict=True)]
         unseen = list(dict.fromkeys(key for key in keys if key not in self._kept))
         for start in range(0, len(unseen), self._at_once):
             some = unseen[start : start + self._at_once]
             made = self._make(stream, *torch.tensor([key[1:] for key in some]).unbind(1))
             self._kept.update(zip(some, made, strict=True))
-        found = [[*self._kept[key][at : at + 1], end][0] for key, at in zip(keys, steps, strict=True)]
+        found = [self._kept[key] for key in keys]
         if len(self._kept) > max(KEPT_EPISODES, 2 * len(keys)):
             self._kept = {key: self._kept[key] for key in keys}
         return found

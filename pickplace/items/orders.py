@@ -89,6 +89,9 @@ class Orders(ItemDistribution):
     def num_episodes(self, stream: str) -> int | None:
         return None if stream == "train" else len(self._orders[stream])
 
+    def num_items(self, stream, seed, episode):
+        return torch.tensor([*map(len, self._kept.all_of(stream, seed, episode))], device=episode.device)
+
     def sample(self, stream, seed, episode, step, bin_size, mix=None):
         kind = torch.tensor(self._kept.at(stream, seed, episode, step, end=-1), device=step.device)
         _, across, along = hashed_uniform(stream, seed, episode, step, 3)

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import pickle
 from collections import Counter
 from itertools import groupby
 
@@ -90,6 +91,9 @@ def test_streams_share_no_order_and_play_each_once(tmp_path_factory, orders, siz
         for stream in ("train", "validation", "test")
     }
     expected = [in_cells(order, 1000 * cell, unit) for order in orders]
+    for stream, each in played.items():
+        number = torch.arange(len(each))
+        assert items.num_items(stream, torch.zeros_like(number), number).tolist() == [*map(len, each)]
     assert all(order in expected for each in played.values() for order in each)
     counts = {stream: items.num_episodes(stream) for stream in ("validation", "test")}
     assert all(count >= 1 for count in counts.values()) and sum(counts.values()) < len(orders)
@@ -123,6 +127,7 @@ def test_drawn_orders_are_made_of_the_lines_of_those_that_train(tmp_path):
     assert len({tuple(order) for order in drawn}) > 290
     # In any batch, and asked for in any order, an episode is the same.
     addresses = torch.tensor([[7, 3], [0, 2], [7, 0], [299, 1]])
+    items = pickle.loads(pickle.dumps(items))  # as a worker gets it
     batch = items.sample("train", torch.zeros(4, dtype=torch.int64), *addresses.T, BIN)
     assert [tuple(row) for row in batch.table[:, 2:5].tolist()] == [drawn[e][s] for e, s in addresses.tolist()]
 
@@ -136,7 +141,9 @@ def test_true_volumes_are_reported(tmp_path):
         return PickPlaceEnv(items, num_envs=count, stream="test", first_episode=first, masks=())
 
     episodes = play(make_env, JointDBL(make_env(0, 1).cell), 1, 1)
-    assert episodes.items_placed.tolist() == [3] and episodes.occupancy.tolist() == [12 / 180]
+    assert episodes.items_placed.tolist() == episodes.num_items.tolist() == [3] and episodes.occupancy.tolist() == [
+        12 / 180
+    ]
     number = [order[0][0] for order in orders][items._orders["test"][0][0]]
     assert episodes.true_occupancy.tolist() == [pytest.approx(3 * number * 100 * 41 / (300 * 300 * 250))]
     with pytest.raises(ValueError, match=r"^evaluation.episodes=2: the items of evaluation.stream=test are 1 orders"):
