@@ -2,7 +2,7 @@
 
 from pickplace import DepthMapError, EmptyBinError, Scene
 
-ATTEMPTS, MARGIN = 3, 0.03  # bad images in a row until somebody is called; height above all that is passed, m
+ATTEMPTS, MARGIN = 3, 0.03  # bad images before a call for help; height above all that is passed, m
 
 
 def carry(robot, plan) -> str:
