@@ -5,6 +5,7 @@ import importlib
 import json
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -153,6 +154,12 @@ def test_the_reference_has_every_option_and_every_key_has_a_comment(monkeypatch)
 def test_the_drawing_of_the_concepts_agrees_with_the_rules(monkeypatch):
     monkeypatch.syspath_prepend(str(DOCS))
     importlib.import_module("concepts").draw()  # asserts that one grip collides and the other succeeds
+
+
+def test_the_drawing_of_the_robots_frames_shows_a_plan(monkeypatch):
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
+    names = runpy.run_path(str(DOCS / "robot_frames.py"))
+    assert names["plan"].status == "ok" and names["plan"].pick.yaw == pytest.approx(names["item"].yaw)
 
 
 def test_the_page_of_the_service_shows_the_planners_answer():
