@@ -15,7 +15,7 @@ import gymnasium  # noqa: E402
 if TYPE_CHECKING:
     from pickplace.envs.torchrl import PickPlaceEnv
     from pickplace.policies.restore import load_policy
-    from pickplace.robot.box import Box, DepthMapError
+    from pickplace.robot.box import Box, DepthMapError, EmptyBinError
     from pickplace.robot.camera import Camera
     from pickplace.robot.planner import Plan, Planner
     from pickplace.robot.scene import Scene
@@ -39,6 +39,7 @@ _MODULES = {
     "Camera": "robot.camera",
     "CellSpec": "rules.cell",
     "DepthMapError": "robot.box",
+    "EmptyBinError": "robot.box",
     "Failure": "rules.state",
     "Item": "rules.item",
     "PickPlaceEnv": "envs.torchrl",
@@ -49,8 +50,8 @@ _MODULES = {
     "load_policy": "policies.restore",
 }
 __all__ = [
-    "Box", "Camera", "CellSpec", "DepthMapError", "Failure", "Item", "PickPlaceEnv", "Plan", "Planner", "Scene",
-    "State", "__version__", "load_policy",
+    "Box", "Camera", "CellSpec", "DepthMapError", "EmptyBinError", "Failure", "Item", "PickPlaceEnv", "Plan", "Planner",
+    "Scene", "State", "__version__", "load_policy",
 ]  # fmt: skip
 
 

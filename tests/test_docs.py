@@ -5,6 +5,7 @@ import importlib
 import json
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -155,8 +156,14 @@ def test_the_drawing_of_the_concepts_agrees_with_the_rules(monkeypatch):
     importlib.import_module("concepts").draw()  # asserts that one grip collides and the other succeeds
 
 
-def test_the_robot_page_shows_the_planners_answer():
-    request, answer = re.findall(r"^(\{\"id\": 1.*\})$", (DOCS / "robot.md").read_text(), re.MULTILINE)
+def test_the_drawing_of_the_robots_frames_shows_a_plan(monkeypatch):
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
+    names = runpy.run_path(str(DOCS / "robot_frames.py"))
+    assert names["plan"].status == "ok" and names["plan"].pick.yaw == pytest.approx(names["item"].yaw)
+
+
+def test_the_page_of_the_service_shows_the_planners_answer():
+    request, answer = re.findall(r"^(\{\"id\": 1.*\})$", (DOCS / "service.md").read_text(), re.MULTILINE)
     asked, told = ({key: value for key, value in json.loads(line).items() if key != "id"} for line in (request, answer))
     plan = Planner.load("pretrained/r4").plan(Scene.from_maps(**asked), alternatives=0)
     assert json.loads(json.dumps(plan.as_dict())) == told

@@ -234,12 +234,16 @@ class Gantry(Scene):
             or self.lower(place)
         )
 
-    def leave(self, height: float) -> Loss | None:
-        """Let go of an item of a height, move up, and wait until all items are at rest."""
+    def release(self) -> None:
+        """Let go of the item."""
         self.data.eq_active[self.weld.id] = self.holding = False
         self.data.xfrc_applied[self.boxes[-1].id, 2] = -WAKING_FORCE  # else it could sleep on in the air
         self.step(1)
         self.data.xfrc_applied[self.boxes[-1].id, 2] = 0.0
+
+    def leave(self, height: float) -> Loss | None:
+        """Let go of an item of a height, move up, and wait until all items are at rest."""
+        self.release()
         loss = self.lift(self.rim + height + HEADROOM)
         wait(self)
         return loss

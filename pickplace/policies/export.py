@@ -25,7 +25,7 @@ def parser() -> argparse.ArgumentParser:
         prog="pickplace-export",
         description="Export the scoring network of a checkpoint to ONNX, for batches, bins and totes of any size, and "
         "check it with onnxruntime at three tote sizes that the export has not seen.",
-        epilog="Inputs, outputs and metadata of the file: docs/robot.md",
+        epilog="Inputs, outputs and metadata of the file: docs/service.md",
         options={
             "checkpoint": {"help": "a run folder, a checkpoint, or pretrained/<name>"},
             "file": {"help": "the ONNX file to write"},

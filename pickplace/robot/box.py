@@ -12,6 +12,10 @@ class DepthMapError(ValueError):
     """A depth map, or an argument beside it, that cannot be planned with; the message is one sentence."""
 
 
+class EmptyBinError(DepthMapError):
+    """No item lies in the bin: there is nothing to plan until one arrives."""
+
+
 @dataclass(frozen=True)
 class Box:
     """A measured cuboid that stands in the bin; in metres and degrees, in the bin's frame."""

@@ -143,7 +143,7 @@ class Camera:
 
     def items(
         self, depth, cell: CellSpec, cell_size: float, labels=None, accuracy: float = ACCURACY, sizes=None,
-        greatest_height: float | None = None,
+        greatest_height: float | None = None, bin_height: float | None = None,
     ) -> list[Box]:  # fmt: skip
         """Return the items in the bin, for a :class:`~pickplace.robot.scene.Scene`.
 
@@ -161,12 +161,14 @@ class Camera:
             sizes: known sizes of items, ``(w, d, h)`` in metres, if they are known. Two items that touch and are
                 equally high look like one to a depth image; with their sizes this is noticed.
             greatest_height: of an item, m; None: that of ``cell.tote_size``, as a higher one fits into no tote.
+            bin_height: of the bin's walls, m; None: that of ``cell.bin_size``.
 
         Raises:
             DepthMapError: for an image that does not show the bin, a floor that is not where the camera's pose says,
                 something that is not one item, or if no item is seen well enough.
         """
-        room = self._room("bin", cell.bin_size, cell_size, cell.bin_size[2] * cell.height_unit * cell_size)
+        rim = cell.bin_size[2] * cell.height_unit * cell_size if bin_height is None else bin_height
+        room = self._room("bin", cell.bin_size, cell_size, rim)
         if labels is not None:
             labels = np.asarray(labels)
             refuse_if(

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from pickplace.common.validate import refuse_if
-from pickplace.robot.box import MILLIMETRE, Box, DepthMapError, HiddenBox
+from pickplace.robot.box import MILLIMETRE, Box, DepthMapError, EmptyBinError, HiddenBox
 from pickplace.rules.cell import MAX_BIN_ITEMS
 
 #: A length is taken for the whole number of units that it is so close to: three cells of 0.05 m are not exactly 0.15 m
@@ -161,10 +161,11 @@ def segments_of_map(labels, heights: np.ndarray, least: float) -> dict[str, np.n
         least: a height above it is an item's, so it must have a label, and each label must have one.
 
     Raises:
-        DepthMapError: for an empty bin; naming the first label that is no such number, or does not fit the heights.
+        EmptyBinError: for an empty bin.
+        DepthMapError: naming the first label that is no such number, or does not fit the heights.
     """
     is_item = heights > least
-    refuse_if(labels is None and not is_item.any(), "bin_depth: got no cell above 0, expected one item.", DepthMapError)
+    refuse_if(labels is None and not is_item.any(), "bin_depth: got no cell above 0, expected one item.", EmptyBinError)
     if labels is None:
         return {"": is_item}
     array = whole_map("bin_labels", labels, heights.shape, MAX_LABEL)
@@ -174,7 +175,7 @@ def segments_of_map(labels, heights: np.ndarray, least: float) -> dict[str, np.n
     refuse_if(
         not 1 <= len(found) <= MAX_BIN_ITEMS,
         f"bin_labels: got {len(found)} labels, expected 1 to {MAX_BIN_ITEMS}, one for each item.",
-        DepthMapError,
+        DepthMapError if found else EmptyBinError,
     )
     return {f" with label {label}": array == label for label in found}
 

@@ -144,9 +144,7 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
     for index, (place, item) in enumerate(zip(numbers, each, strict=True)):
         grip = int(item.h) + tote.accuracy
         centres = _effector_centres(free, item, boxes[place], cell_size)
-        bin_clear = torch.from_numpy(
-            _clear_picks(cell, place, boxes, centres, cell_size, scene.accuracy, clearance)
-        ).to(device)
+        bin_clear = torch.from_numpy(_clear_picks(cell, scene, place, boxes, centres, clearance)).to(device)
         limits = _limits(cell, free, bin_clear, centres / cell_size, grip, 2 * tote.accuracy)
         allowed = torch.from_numpy(~is_excluded(exclude, centres, cell_size)).to(device)
         limits = replace(limits, pick_ok=limits.pick_ok & (taken == index) & allowed)
@@ -293,7 +291,7 @@ def _on_grid(cell: CellSpec, box: Box, cell_size: float, clearance: float, name:
 
 
 def _clear_picks(
-    cell: CellSpec, index: int, boxes: list[Box], centres: np.ndarray, side: float, accuracy: float, clearance: float
+    cell: CellSpec, scene: Scene, index: int, boxes: list[Box], centres: np.ndarray, clearance: float
 ) -> np.ndarray:
     """Return at which of its centres ``[P, 2]`` the end effector hits nothing in the bin, bool ``[P]``.
 
@@ -303,12 +301,13 @@ def _clear_picks(
     Args:
         index: of the item that is picked, among the boxes.
     """
-    box = boxes[index]
+    box, side, accuracy = boxes[index], cast(float, scene.cell_size), scene.accuracy
+    wall = cell.bin_size[2] * (side * cell.height_unit) if scene.bin_height is None else scene.bin_height
     far, axes = np.array(cell.bin_size[:2]) * side, turned_axes(math.radians(box.yaw))
     body = [np.array(part) * side @ axes for part in cell.gripper.body_parts]
     corners = np.concatenate(body)
     clear = ((centres + corners.min(0) >= -ROUNDING) & (centres + corners.max(0) <= far + ROUNDING)).all(1)
-    clear |= box.h - accuracy >= cell.bin_size[2] * (side * cell.height_unit) - ROUNDING
+    clear |= box.h - accuracy >= wall - ROUNDING
     for other in boxes[:index] + boxes[index + 1 :]:
         if other.h + accuracy >= box.h - accuracy - ROUNDING:
             wider = replace(other, w=other.w + 2 * clearance, d=other.d + 2 * clearance)

@@ -72,7 +72,9 @@ class Plan:
     #: the item that is taken, as the policy sees it: x, y, w, d in cells, h in height units; None if several items lie
     #: in the bin and none is taken
     item: dict[str, int] | None
-    box: Box | None  #: the same item as it was measured, in metres; None without cell_size
+    #: the same item as it was measured, in metres, with a yaw above -45 and at most 45 degrees: of a box given with
+    #: another yaw ``w`` and ``d`` may change places; None without cell_size
+    box: Box | None
     pick: Pose | None  #: in the bin's frame
     place: Pose | None  #: in the tote's frame; the end effector lets go there
     #: turn between pick and place, counter-clockwise seen from above, -45 to 315; the shorter way round is as good
@@ -184,9 +186,10 @@ class Planner:
                 pick within half a cell of one is planned. Metres with ``cell_size``, else cells.
 
         Raises:
-            DepthMapError: for a map of another shape or type, a value that is not finite or out of range, an empty
-                bin, or anything but one cuboid in it, or for each label; it names the cell. Also for several items
-                among which the planner cannot choose.
+            EmptyBinError: for a map of an empty bin.
+            DepthMapError: for a map of another shape or type, a value that is not finite or out of range, or anything
+                but one cuboid in the bin, or for each label; it names the cell. Also for several items among which the
+                planner cannot choose.
             ValueError: for another argument that cannot be used.
         """
         refuse_if(

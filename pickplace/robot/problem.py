@@ -1,5 +1,6 @@
 """The problem that a robot's planner solves for the items in a bin, and how it is read from the maps of a grid."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -32,9 +33,22 @@ class Pose:
     """Pose of the end effector, in the frame of the bin or of the tote."""
 
     cell: tuple[int, int]  #: grid cell of the end effector's reference cell
-    #: centre of its suction face: x, y, z; m with cell_size, else x and y in cells and z in height units
+    #: tool centre point, x, y, z: twice the accuracy above the middle of the lip at rest; m with cell_size, else x and
+    #: y in cells and z in height units
     center: tuple[float, float, float]
-    yaw: float = 0.0  #: turn about the vertical axis, counter-clockwise seen from above; degrees
+    #: turn about the vertical axis, counter-clockwise seen from above, degrees: the angle from the frame's x to the
+    #: end effector's width
+    yaw: float = 0.0
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The tool frame in the frame of the bin or of the tote, ``[4, 4]``, in the unit of :attr:`center`.
+
+        Its origin is the tool centre point, x runs along the end effector's width, and z downwards.
+        """
+        cos, sin = math.cos(math.radians(self.yaw)), math.sin(math.radians(self.yaw))
+        x, y, z = self.center
+        return np.array([(cos, sin, 0, x), (sin, -cos, 0, y), (0, 0, -1, z), (0, 0, 0, 1)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +208,8 @@ def read_grid(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[f
         torch.tensor([height], device=device),
         join_items(items).map(lambda part: part.to(device)),
     )
-    cell = without_excluded(replace(cell, bin_items=len(items)), exclude)
+    wall = cell.bin_size[2] if scene.bin_height is None else round(scene.bin_height)
+    cell = without_excluded(replace(cell, bin_items=len(items), bin_size=(*cell.bin_size[:2], wall)), exclude)
     facts = FailureMaps.of(cell, state)
     return GridProblem(
         cell=cell, state=state, maps=facts.placing_maps(cell), seen=state, numbers=range(len(items)), facts=facts

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from pickplace.common.validate import excerpt, integral_number, is_number, number, one_of, refuse_if
-from pickplace.robot.box import ACCURACY, CLEARANCE, MILLIMETRE, Box, DepthMapError, UnknownBox
+from pickplace.robot.box import ACCURACY, CLEARANCE, MILLIMETRE, Box, DepthMapError, EmptyBinError, UnknownBox
 from pickplace.robot.camera import Camera
 from pickplace.robot.measure import ToteMap
 from pickplace.rules.cell import MAX_BIN_ITEMS, MAX_SIDE, CellSpec
@@ -32,7 +32,8 @@ class Scene:
 
     Raises:
         ValueError: for a setting that is missing or out of range.
-        DepthMapError: for items that are no boxes, or none or too many. The planner checks what depends on its cell.
+        EmptyBinError: for no items.
+        DepthMapError: for items that are no boxes, or too many. The planner checks what depends on its cell.
     """
 
     #: everything that lies in the bin: boxes in metres, or a map, see :meth:`from_maps`
@@ -54,6 +55,7 @@ class Scene:
     #: returned; None: every cell bears weight. In metres, of a map with one value a cell, only the floor does then:
     #: nothing tells whether a cell is level
     tote_bearing: Any = None
+    bin_height: float | None = None  #: height of the bin's walls above its floor; None: that of ``cell.bin_size``
 
     def __post_init__(self):
         number("accuracy", self.accuracy, 0, 0.1, "metres")
@@ -70,10 +72,11 @@ class Scene:
             number("cell_size", self.cell_size, 1e-3, 10, "metres")
         elif not isinstance(self.items, BinMap) or isinstance(self.tote, ToteMap):
             raise ValueError("cell_size=None: expected the side of a cell in metres, as items or tote are measured.")
-        if self.tote_height is not None and self.cell_size is not None:
-            number("tote_height", self.tote_height, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
-        elif self.tote_height is not None:
-            integral_number("tote_height", self.tote_height, 1, FAR - 1)
+        for key in ("tote_height", "bin_height"):
+            if (height := getattr(self, key)) is not None and self.cell_size is not None:
+                number(key, height, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
+            elif height is not None:
+                integral_number(key, height, 1, FAR - 1)
         if isinstance(self.items, BinMap):
             return
         refuse_if(
@@ -85,7 +88,7 @@ class Scene:
             not 1 <= len(self.items) <= MAX_BIN_ITEMS,
             f"items: got {len(self.items)} boxes, expected 1 to {MAX_BIN_ITEMS}: "
             f"{'too many' if self.items else 'an empty bin'}.",
-            DepthMapError,
+            DepthMapError if self.items else EmptyBinError,
         )
         for at, box in enumerate(self.items):
             for key in (field.name for field in fields(Box)):
@@ -112,24 +115,29 @@ class Scene:
     def from_images(
         cls, cell: CellSpec, bin_view: tuple[Camera, Any], tote_view: tuple[Camera, Any], cell_size: float,
         accuracy: float = ACCURACY, labels=None, sizes=None, tote_height: float | None = None,
-        greatest_height: float | None = None, placed: Sequence[Box] = (), **settings,
+        greatest_height: float | None = None, placed: Sequence[Box] = (), bin_height: float | None = None, **settings,
     ) -> "Scene":  # fmt: skip
         """Return the scene that two cameras see.
 
         Args:
             cell: the sizes.
-            bin_view, tote_view: a camera above each, and its depth image.
+            bin_view, tote_view: a camera above each, and its depth image. One camera may see both: give it twice, with
+                a pose for each.
             labels, sizes: of the items, see :meth:`~pickplace.robot.camera.Camera.items`, as for errors.
             greatest_height: of an item, m; None: the height of the tote's rim.
             placed: the items that lie in the tote, see :meth:`~pickplace.robot.camera.Camera.tote_map`.
             **settings: the other fields.
+
+        Raises:
+            EmptyBinError: if the bin is seen, and nothing lies in it.
+            DepthMapError: for an image that cannot be planned from; another one may do.
         """
         (over_bin, bin_image), (over_tote, tote_image) = bin_view, tote_view
         greatest = tote_height if greatest_height is None else greatest_height
         return cls(
-            over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes, greatest),
+            over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes, greatest, bin_height),
             over_tote.tote_map(tote_image, cell, cell_size, tote_height, accuracy, placed),
-            cell_size, accuracy, tote_height=tote_height, **settings,
+            cell_size, accuracy, tote_height=tote_height, bin_height=bin_height, **settings,
         )  # fmt: skip
 
     @property

@@ -43,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
         'request a line from standard input, {"bin_depth": [[...]], "tote_depth": [[...]]}, and answer each with a '
         'plan in one line; "items": [{"x": .., "y": .., "w": .., "d": .., "h": .., "yaw": ..}, ...] may stand '
         "for bin_depth. A bad request is answered with an error, and the process goes on.",
-        epilog="Maps, frames of reference and errors: docs/robot.md",
+        epilog="Requests and answers: docs/service.md; maps and frames of reference: docs/robot.md",
         options={
             "--bin": {"metavar": "NPY", "help": "depth map [W_B, D_B] or finer: height above the bin's floor"},
             "--bin-labels": {

@@ -80,6 +80,10 @@ class PlanRequest:
         "height of the rim above the tote's floor; m with cell_size, else height units; default: that of the cell",
         None, float,
     )  # fmt: skip
+    bin_height: float | None = _key(
+        "height of the walls above the bin's floor; m with cell_size, else height units; default: that of the cell",
+        None, float,
+    )  # fmt: skip
     cell_size: float | None = _key("side of a cell, if the lengths are in metres; m", None, float)
     accuracy: float = _key("greatest error of a measured height; m", ACCURACY, float)
     clearance: float = _key("least distance from what stands beside the item; m", CLEARANCE, float)

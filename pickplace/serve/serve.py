@@ -29,7 +29,7 @@ def parser() -> argparse.ArgumentParser:
         prog="pickplace-serve",
         description="Answer requests over HTTP: POST /plan takes what pickplace-plan reads as a line, and / shows the "
         "last plans in 3D. Without a token it serves this machine only.",
-        epilog=f"The environment variable {TOKEN} holds the token. Requests, errors and limits: docs/robot.md",
+        epilog=f"The environment variable {TOKEN} holds the token. Requests, errors and limits: docs/service.md",
         options={
             **planner_options(),
             "--host": {

@@ -16,8 +16,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-PAGES = ("README.md", "docs/curriculum.md", "docs/robot.md", "docs/train_your_own.md", "docs/extending.md")
-RUN_PYTHON = "docs/robot.md"  # its Python writes the files that its commands read
+PAGES = ("README.md", "docs/curriculum.md", "docs/service.md", "docs/train_your_own.md", "docs/extending.md")
+RUN_PYTHON = "docs/service.md"  # its Python writes the files that its commands read
 LEFT_OUT = (
     "#", "git clone", "cd ", "make install", "pip install", ". ",
     "pickplace-serve", "PICKPLACE_TOKEN=", "curl ", "pickplace-export",  # a server does not end; the rest needs extras
