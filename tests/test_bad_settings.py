@@ -186,7 +186,8 @@ LARGE = [
     ("env.gripper.size=[2000,2000]", "gripper.size=.*<= 64"),
     ("env.gripper.size=[64,64] env.tote_size=[100,100,5]", "gripper.size=.*table of offsets"),
     (
-        "env.bin_size=[250,250,1] env.gripper.size=[10,10] items=mixed items.width=[1,10] items.depth=[1,10]",
+        "env.bin_size=[250,250,1] env.gripper.size=[10,10] reach=annulus items=mixed items.width=[1,10] "
+        "items.depth=[1,10]",
         "bin_size=.* positions in the bin",
     ),
     ("items=mixed items.width=[1,100000] items.depth=[1,100000]", "items.width=.* kinds of items"),

@@ -1,7 +1,8 @@
 """Checks before an environment is made: its memory, and whether every item fits the empty tote."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import torch
@@ -22,6 +23,18 @@ def problem_bytes(cell: CellSpec, masks: Collection[str]) -> int:
     offsets = cell.num_offsets**2
     count = 64 * cell.num_footprints + 32 * cell.rotations * (offsets + cell.num_picks)
     return cell.bin_items * (count + ("action" in masks) * (4 * cell.num_actions + 8 * offsets * cell.num_places))
+
+
+def _corners(cell: CellSpec, items: ItemDistribution, kind: int) -> Iterable[tuple[int, int]]:
+    """Return the positions of a kind in the bin that are checked: of those that are alike one.
+
+    Without limits all are alike that the end effector's size parts from a wall, if the kind may lie anywhere.
+    """
+    if cell.limits is not None or type(items).corners is not ItemDistribution.corners:
+        return items.corners(kind, cell.bin_size)
+    near = max(cell.gripper.size)
+    free = [side - int(own) for side, own in zip(cell.bin_size, items.sizes[kind, :2], strict=False)]
+    return product(*(sorted({*range(min(near, most) + 1), *range(max(0, most - near), most + 1)}) for most in free))
 
 
 def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: int = ALL_TURNS) -> None:
@@ -53,7 +66,7 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
                 raise ValueError(f"{items.label(kind)} does not fit {what}: expected at most {grid_w}x{grid_d} cells.")
         if h > height:
             raise ValueError(f"{items.label(kind)} is higher than the tote: expected at most tote_size[2]={height}.")
-        for x, y in items.corners(kind, cell.bin_size):
+        for x, y in _corners(cell, items, kind):
             if x + w > w_b or y + d > d_b:
                 raise ValueError(f"{items.label(kind)} at x={x}, y={y} leaves the bin: expected it inside {w_b}x{d_b}.")
             problems.setdefault((x, y, w, d, h), kind)
