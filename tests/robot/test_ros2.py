@@ -1,18 +1,12 @@
 """The ROS package in docs/examples/ros2, without ROS: the node with stand-ins, and the files of both packages."""
 
 import math
-import sys
 import time
 from array import array
-from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import ros_stand_ins as ros
-from hypothesis import given
-from hypothesis import strategies as st
-
-from pickplace import Box, CellSpec, Plan, Planner, Scene
 
 SHAPE = (240, 320)
 IMAGE, INFO = ros.message_class("sensor_msgs/msg/Image"), ros.message_class("sensor_msgs/msg/CameraInfo")
@@ -119,10 +113,13 @@ def test_a_goal_is_planned_and_placed(make, checkpoint):
     found = record.open
     assert (plan.action, plan.item_number, plan.drop_height) == (found.action, 0, found.drop_height)
     assert plan.rotation == pytest.approx(math.radians(found.rotation_degrees))
-    assert plan.placed.pose.pose.position.x == pytest.approx(found.placed.x)
+    placed = plan.placed.pose.pose.position
+    assert (placed.x, placed.y, placed.z) == pytest.approx(
+        (found.placed.x, found.placed.y, found.drop_height + plan.box.size.z / 2)
+    )
     assert plan.placed.size.z == pytest.approx(plan.box.size.z)
     marks = node.planner.cell.support.marks_bearing
-    assert plan.tote_cells == [6, 6] and len(plan.tote_bearing) == 36 * marks
+    assert plan.tote_cells == [6, 6] and plan.tote_bearing == (sum(found.tote_bearing, []) if marks else [])
     assert [topic for topic, _ in node.sent] == ["~/plan", "~/pick", "~/place"]
     assert [sent for _, sent in node.sent] == [plan, plan.pick, plan.place]
     assert cell.call("placed") == (True, "") and not cell.call("placed")[0]
@@ -133,7 +130,7 @@ def test_a_goal_is_planned_and_placed(make, checkpoint):
 
 
 def test_the_planner_is_told_what_was_done_before(make, monkeypatch):
-    cell, asked = make(), []
+    cell, asked = make(accuracy=0.004, clearance=0.006, placement_error=0.002, tote_height=0.24), []
     plan_for = cell.node.planner.plan
 
     def plan(scene, **given):
@@ -155,7 +152,30 @@ def test_the_planner_is_told_what_was_done_before(make, monkeypatch):
     assert cell.record.excluded == [] and len(cell.record.placed_boxes) == 1
     cell.plan()
     scene = asked[-1][0]
-    assert scene.tote_bearing == cell.record.bearing is not None
+    assert scene.tote_bearing == cell.record.bearing is not None and scene.cell_size == 0.05
+    assert (scene.accuracy, scene.clearance, scene.placement_error, scene.tote_height) == (0.004, 0.006, 0.002, 0.24)
+
+
+def test_what_lies_in_the_tote_as_planned_explains_holes_in_its_image(make):
+    """A dark item, of which no pixel has a depth."""
+    cell = make(greatest_height=0.07)
+    cell.see()
+    plan = cell.plan().plan
+    assert cell.call("placed")[0]
+    dark = np.full(SHAPE, 950, np.uint16)
+    dark[41:199, 81:239], dark[58:182, 98:222] = 0, 1200
+    at, half = plan.placed.pose.pose.position, plan.placed.size.x / 2
+    scale = 500 / (1.2 - 0.06)
+    column, row = 159.5 + (at.x - 0.15) * scale, 119.5 - (at.y - 0.15) * scale
+    reach = round(half * scale)
+    dark[round(row) - reach : round(row) + reach, round(column) - reach : round(column) + reach] = 0
+    cell.see(tote=dark)
+    second = cell.plan().plan
+    assert second.status == "ok" and second.occupancy_before == pytest.approx(0.0125, abs=0.01)
+    assert cell.call("new_tote")[0] and cell.plan().plan.occupancy_before > 0.03  # up to the rim
+    cell = make(greatest_height=0.04)
+    cell.see()
+    assert "0.04" in cell.plan().message
 
 
 def test_a_goal_that_brings_no_plan_closes_the_plan_before(make):
@@ -165,32 +185,6 @@ def test_a_goal_that_brings_no_plan_closes_the_plan_before(make):
     cell.see(items=())
     result = cell.plan()
     assert (result.outcome, result.plan.status) == (result.REFUSED, "") and not cell.call("placed")[0]
-
-
-def test_statuses_without_an_action(make, modules):
-    cell = make()
-    view = modules.messages.View(None, None, "frame", ros.message_class("builtin_interfaces/msg/Time")())
-    item, full = Box(0.1, 0.12, 0.08, 0.08, 0.06), np.zeros((6, 6))
-    stuck = cell.node.planner.plan(Scene([item], full, 0.05))
-    message = modules.messages.plan_message(stuck, view, view, (6, 6))
-    ros.written(message)
-    assert (message.status, message.item_number, message.action) == (message.STUCK, -1, -1)
-    assert {reason.name: reason.count for reason in message.reasons} == stuck.reasons
-    assert message.box.size.x == 0.08 and message.placed.size.z == 0 and message.pick.header.frame_id == ""
-    wide = Planner(CellSpec(tote_size=(6, 6, 5), cup_size=(1, 1), pick_rule="seal"), planner="joint_dbl")
-    none = wide.plan(Scene([replace(item, w=0.03), replace(item, w=0.03, x=0.2)], full, 0.05))
-    message = modules.messages.plan_message(none, view, view, (6, 6))
-    ros.written(message)
-    assert message.status == message.IMPOSSIBLE and message.hints == none.hints != []
-    assert message.box.size.x == 0
-
-
-def test_the_message_has_every_field_of_a_plan(modules):
-    """Another field of a plan asks for a decision."""
-    named = {field.name for field in fields(Plan)}
-    message = set(ros.message_class("pickplace_interfaces/msg/Plan").KINDS)
-    assert named - message == {"alternatives", "item", "rotation_degrees"}
-    assert message - named == {"placed", "rotation", "tote_cells"}
 
 
 def test_waits_for_what_is_missing_and_says_so(make):
@@ -209,7 +203,9 @@ def test_waits_for_what_is_missing_and_says_so(make):
     node.infos.update(infos)
     cell.until(lambda: len(goal.feedback) == 4)
     node.frames.known.update(known)
-    assert goal.wait().plan.status == "ok"
+    plan = goal.wait().plan
+    stamps = [pose.header.stamp.nanosec for pose in (plan.pick, plan.box.pose, plan.place, plan.placed.pose)]
+    assert plan.status == "ok" and stamps == [250_000_000, 250_000_000, 500_000_000, 500_000_000]
     assert [stage for stage, _ in goal.feedback] == [WAITING] * 4 + [PLANNING]
     assert [said for _, said in goal.feedback[:4]] == [
         "bin/depth: no image yet.",
@@ -316,52 +312,3 @@ def test_what_cannot_be_used_is_said_in_one_sentence(make, send, outcome, said):
     send(cell)
     result = cell.plan()
     assert (result.outcome, result.message[: len(said)]) == (getattr(result, outcome), said) and result.message
-
-
-@given(
-    st.sampled_from(["16UC1", "32FC1"]), st.booleans(), st.integers(1, 4), st.integers(1, 5), st.integers(0, 7),
-    st.integers(0, 2**32 - 1),
-)  # fmt: skip
-def test_every_layout_of_a_depth_image_is_read(modules, encoding, is_bigendian, height, width, padding, seed):
-    """Rows of pixels, written one by one with ``array`` and ``byteswap``."""
-    draw = np.random.default_rng(seed)
-    values = draw.integers(0, 2**16, (height, width)).tolist()
-    data = bytearray()
-    for row in values:
-        pixels = array("H" if encoding == "16UC1" else "f", row)
-        if is_bigendian != (sys.byteorder == "big"):
-            pixels.byteswap()
-        data += pixels.tobytes() + bytes(padding)
-    image = IMAGE(
-        height=height, width=width, step=len(data) // height, encoding=encoding, is_bigendian=int(is_bigendian),
-        data=array("B", data),
-    )  # fmt: skip
-    unit = 0.001 if encoding == "16UC1" else 1
-    assert modules.messages.depth_of(image, "depth") == pytest.approx(np.array(values) * unit)
-
-
-@given(
-    st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda axis: math.hypot(*axis) > 0.1), st.floats(-0.9, 0.9),
-    st.tuples(*[st.floats(-2, 2)] * 3),
-)  # fmt: skip
-def test_the_pose_of_the_camera_is_that_of_tf(modules, axis, tilt, shift):
-    """A pixel's point agrees with the formula v + 2 w (q x v) + 2 q x (q x v) of a rotation by a quaternion."""
-    turn = np.array([*(math.sin(tilt / 2) * np.array(axis) / math.hypot(*axis)), math.cos(tilt / 2)])
-    x, y, z, w = product(turn, np.array([1.0, 0, 0, 0]))  # first it looks down
-    transform = TRANSFORM()
-    transform.rotation.x, transform.rotation.y, transform.rotation.z, transform.rotation.w = map(float, (x, y, z, w))
-    transform.translation.x, transform.translation.y, transform.translation.z = shift
-    info = INFO(p=[300.0, 0.0, 2.0, 0.0, 0.0, 400.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0], height=3, width=5)
-    camera = modules.messages.camera_of(info, transform, "info")
-    points = camera.points(np.full((3, 5), 1.5))
-    q = np.array([x, y, z])
-    for row, column in ((0, 0), (2, 4)):
-        v = np.array([(column - 2) / 300, (row - 1) / 400, 1]) * 1.5
-        ours = v + 2 * w * np.cross(q, v) + 2 * np.cross(q, np.cross(q, v)) + shift
-        assert points[row, column] == pytest.approx(ours, abs=1e-9)
-
-
-def product(a, b):
-    """Return the product of two quaternions (x, y, z, w): first b turns, then a."""
-    vector = a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])
-    return np.array([*vector, a[3] * b[3] - a[:3] @ b[:3]])
