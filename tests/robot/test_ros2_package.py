@@ -177,6 +177,14 @@ def test_the_planner_has_the_parts_that_the_parameters_name(monkeypatch, modules
     ] == 8
 
 
+def test_the_planner_has_planned_before_the_first_goal(monkeypatch, modules):
+    planned = []
+    monkeypatch.setattr(modules.parameters, "plan_once", planned.append)
+    monkeypatch.setattr(ros.Node, "given", {"checkpoint": "", "planner": "joint_dbl"})
+    node = modules.node.PickPlaceNode()
+    assert planned == [node.planner]
+
+
 def test_the_node_runs_until_ctrl_c(monkeypatch, modules):
     monkeypatch.setattr(ros.Node, "given", {"checkpoint": "", "planner": "joint_dbl"})
     modules.node.main()
