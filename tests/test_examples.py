@@ -7,10 +7,8 @@ import json
 import math
 import shutil
 import signal
-import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import ClassVar
 
 import nbclient
 import nbformat
@@ -376,93 +374,6 @@ def test_a_search_with_optuna(monkeypatch, tmp_path, no_report):
     study = optuna.create_study(direction="maximize")
     importlib.import_module("optuna_search").search(study, tmp_path, 2, [*TRAINING, "model.actor.filters=8"])
     assert len(study.trials) == 2 and study.best_params["algo.epochs"] in (1, 2, 4)
-
-
-class FakeNode:
-    """Stands in for ``rclpy.node.Node``: parameters as given, messages kept."""
-
-    parameters: ClassVar[dict] = {}
-
-    def __init__(self, name):
-        self.callbacks, self.services, self.published = {}, {}, []
-
-    def declare_parameter(self, name, default):
-        return SimpleNamespace(value=self.parameters.get(name, default))
-
-    def create_subscription(self, kind, topic, callback, quality):
-        self.callbacks[topic] = callback
-
-    def create_publisher(self, kind, topic, depth):
-        return SimpleNamespace(publish=self.published.append)
-
-    def create_service(self, kind, name, callback):
-        self.services[name] = lambda: callback(None, SimpleNamespace(success=None, message=""))
-
-    def get_clock(self):
-        return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=0, to_msg=lambda: None))
-
-
-def fake_pose():
-    return SimpleNamespace(
-        header=SimpleNamespace(), pose=SimpleNamespace(position=SimpleNamespace(), orientation=SimpleNamespace())
-    )
-
-
-@pytest.fixture
-def ros_node(monkeypatch):
-    """Make the node of docs/examples/ros2 with parameters and, where ROS is, stand-ins."""
-    for name, content in {
-        "rclpy": {}, "rclpy.executors": {"ExternalShutdownException": OSError}, "rclpy.node": {"Node": FakeNode},
-        "rclpy.qos": {"qos_profile_sensor_data": 0}, "geometry_msgs.msg": {"PoseStamped": fake_pose},
-        "sensor_msgs.msg": {"CameraInfo": 0, "Image": 1}, "std_srvs.srv": {"Trigger": 2},
-    }.items():  # fmt: skip
-        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**content))
-    monkeypatch.syspath_prepend(str(EXAMPLES / "ros2"))
-    monkeypatch.delitem(sys.modules, "pickplace_node", raising=False)
-
-    def make(**parameters):
-        monkeypatch.setattr(FakeNode, "parameters", parameters)
-        return importlib.import_module("pickplace_node").PickPlaceNode()
-
-    return make
-
-
-@pytest.mark.parametrize("checkpoint", ["pretrained/r4", "pretrained/unmasked"])
-def test_ros_node_plans_and_places(ros_node, checkpoint):
-    """Also with a rule for stability that has no map of what bears weight."""
-    node = ros_node(checkpoint=checkpoint)
-    assert not node.services["~/placed"]().success
-    assert node.services["~/plan"]().message == "bin/depth: no image yet."
-    # The rim, walls of which nothing is known, and the floor.
-    images = {"bin": np.full((240, 320), 1150, np.uint16), "tote": np.full((240, 320), 950, np.uint16)}
-    images["bin"][65:175, 105:215], images["bin"][68:172, 108:212] = 0, 1200
-    images["tote"][41:199, 81:239], images["tote"][58:182, 98:222] = 0, 1200
-    images["bin"][100:120, 140:160] = 1140  # an item of about 46 x 46 x 60 mm
-    for place, image in images.items():
-        stamp = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0))
-        shape = {"height": 240, "width": 320, "step": 640, "encoding": "16UC1", "is_bigendian": False}
-        node.callbacks[f"{place}/depth"](SimpleNamespace(header=stamp, data=image.tobytes(), **shape))
-        info = {"p": [500, 0, 159.5, 0, 0, 500, 119.5, 0, 0, 0, 1, 0], "height": 240, "width": 320}
-        node.callbacks[f"{place}/camera_info"](SimpleNamespace(**info))
-    answer = node.services["~/plan"]()
-    assert (answer.success, answer.message) == (True, "ok")
-    pick, place = node.published
-    assert (pick.header.frame_id, place.header.frame_id) == ("bin", "tote")
-    # The item's middle is 10 pixels left of and above that of the image; image rows run against y.
-    off = 10 / 500 * 1.14
-    assert (node.open.box.x, node.open.box.y) == pytest.approx((0.125 - off, 0.125 + off), abs=0.002)
-    assert pick.pose.position.z == pytest.approx(0.06, abs=0.01)
-    assert node.services["~/placed"]().success and not node.services["~/placed"]().success
-    assert (node.bearing is not None) == (node.planner.cell.support.marks_bearing)
-    assert node.services["~/plan"]().success and node.services["~/new_tote"]().success
-    assert node.bearing is None and not node.services["~/placed"]().success
-
-
-def test_ros_node_has_the_tote_of_the_training(ros_node):
-    assert ros_node(checkpoint="pretrained/warehouse").planner.cell.tote_size == (30, 20, 60)
-    assert ros_node(checkpoint="pretrained/warehouse", tote_size=[12, 9, 40]).planner.cell.tote_size == (12, 9, 40)
-    middle = np.array(ros_node(checkpoint="pretrained/r4", tote_size=[8, 6, 5]).poses["tote"]).reshape(4, 4)[:3, 3]
-    assert middle == pytest.approx([0.2, 0.15, 1.2])
 
 
 NOTEBOOK = EXAMPLES / "quickstart.ipynb"

@@ -8,10 +8,10 @@ import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from itertools import product
-from typing import Self
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
 from pickplace.common.files import read_table
 from pickplace.common.validate import at_most, excerpt, expect, flag, is_number, is_whole, refuse_any, whole_number

@@ -8,7 +8,7 @@ of the choice.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ValueOperator
+from typing_extensions import Self
 
 from pickplace.common.validate import at_most, expect, refuse_if
 from pickplace.rules.cell import CellSpec

@@ -146,7 +146,8 @@ def _convert(scores: Scores, keys: Sequence[str], seen: list[Tensor], known: dic
     before = logger.level
     try:
         logger.setLevel(logging.ERROR)  # it tells of operators of packages that are not used
-        with warnings.catch_warnings(action="ignore"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             return torch.onnx.export(
                 scores, tuple(seen), input_names=list(keys), output_names=["logits"],
                 dynamic_shapes=(shapes,), dynamo=True, verbose=False,

@@ -22,7 +22,7 @@ class Deadline:
     def __init__(self, seconds: float):
         self.seconds, self._end = seconds, time.monotonic() + seconds
         self._lock, self._thread = threading.Lock(), 0  # 0: none is in the context
-        self._is_cancelled = False
+        self._is_cancelled = self._is_over = False
 
     def left(self) -> float:
         """Return the seconds that are left, at least 0."""
@@ -35,6 +35,7 @@ class Deadline:
 
     def _interrupt(self) -> None:
         with self._lock:
+            self._is_over = True
             if self._thread:
                 ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread), ctypes.py_object(Interrupt))
 
@@ -54,11 +55,13 @@ class Deadline:
         timer.daemon = True
         try:
             try:
+                # First, as up to Python 3.11 a thread that starts has the identity of the one that starts it: it would
+                # be interrupted instead, and waited for without end.
+                timer.start()
                 with self._lock:
-                    if self._is_cancelled or not self.left():
+                    if self._is_over or not self.left():
                         raise Interrupt
                     self._thread = threading.get_ident()
-                timer.start()
                 return function()
             finally:
                 with self._lock:

@@ -3,7 +3,9 @@
 import json
 import math
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from typing_extensions import Self
 
 from pickplace.common.errors import sentence
 from pickplace.common.validate import at_most, excerpt, number, refuse_any, refuse_if, reworded

@@ -117,7 +117,7 @@ def test_logits_of_single_actions_and_their_gradients(dtype):
     actions = [torch.randint(0, count, (1_080,)) for count in (12, 30, 3)]  # more pairs than computed at once
     row, weights = torch.randint(0, 70, (1_080,)), torch.rand(1_080)
     single = network.pair_logits(bins, totes, row, *actions[:2]).gather(1, actions[2][:, None])[:, 0]
-    every = network(bins, totes).view(70, 12, 30, 3)[row, *actions]
+    every = network(bins, totes).view(70, 12, 30, 3)[(row, *actions)]
     tolerance = {"float32": 1e-5, "bfloat16": 3e-2}[dtype]
     torch.testing.assert_close(single, every, rtol=tolerance, atol=tolerance)
     for ours, wanted in zip(

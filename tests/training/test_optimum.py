@@ -31,7 +31,7 @@ def share_of_optimum(make_planner, sides, rotations):
         stream = {"stream": "test", "first_episode": first, "masks": ()}
         return PickPlaceEnv(tote_size=(*sides, 1), rotations=rotations, num_envs=count, **stream)
 
-    share = play(make_env, make_planner(make_env(0, 1).cell), 2000, 1000).occupancy / OPTIMA[*sides, rotations]
+    share = play(make_env, make_planner(make_env(0, 1).cell), 2000, 1000).occupancy / OPTIMA[(*sides, rotations)]
     assert share.mean() < 1 + 3 * share.std() / len(share) ** 0.5
     return share.mean()
 

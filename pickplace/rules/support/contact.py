@@ -80,7 +80,7 @@ class Contact:
         """
         sizes = self.w.clamp(1, self.side) - 1, self.d.clamp(1, self.side) - 1
         tables = hull_patterns(self.side, margin, self.supporting.device)
-        words = [(patterns[:, *sizes], whole[sizes]) for patterns, whole in tables]
+        words = [(patterns[(slice(None), *sizes)], whole[sizes]) for patterns, whole in tables]
         reached = [torch.zeros_like(self.supporting, dtype=patterns.dtype) for patterns, _ in words]
         for number, surface in enumerate(self.surfaces):
             supports = surface == self.supporting
