@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull
 from pickplace import CellSpec
 from pickplace.rules.gripper.rules import Contain, Overlap
 from pickplace.rules.maps import FAR
-from pickplace.rules.masks import footprint_mask, placing_maps
+from pickplace.rules.masks import footprint_mask, num_feasible, placing_maps
 from pickplace.rules.placing import LargeItems, OnFootprints
 from pickplace.rules.state import surface_from
 from pickplace.rules.step import apply
@@ -157,3 +157,11 @@ def test_long_items_are_placed_as_the_oracle_says(data):
     placed = [row for row, failure in enumerate(failures) if failure == SUCCESS]
     for row in placed[:: max(1, len(placed) // 10)]:
         assert (step.surface[row] & 1).tolist() == plain.bearing_after(tried[row][0])
+
+
+def test_a_gripper_of_one_cell_takes_items_of_a_hundred_cells():
+    """On an empty tote each cell of the item is a pick, and each footprint inside the tote is a place."""
+    cell = CellSpec((100, 100, 1), (110, 105, 9), Overlap((1, 1)), 1, Bearing(), longest_side=100)
+    case = Case(9, np.zeros((110, 105), dtype=int), np.ones((110, 105), dtype=int), (0, 10, 100, 90, 1))
+    maps = placing_maps(cell, state_of(case))
+    assert footprint_mask(cell, maps).sum() == 11 * 16 and num_feasible(cell, maps).tolist() == [100 * 90 * 11 * 16]
