@@ -11,6 +11,7 @@ the tote, is higher than the item's top: one maximum over its cells decides.
 
 from collections.abc import Callable
 from functools import reduce
+from itertools import product
 from typing import Any, NamedTuple
 
 import torch
@@ -298,14 +299,19 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Te
         clear, kinds = surround(maps.clearance_in(turn), margins, FAR), grasped[turn].flip(0, 1)  # as the windows are
         if count > 3 and torch.equal(kinds, (in_x := kinds.any(1))[:, None] & (in_y := kinds.any(0))):
             # The offsets are mostly all pairs of some along x and y. Then the least is one along x, then along y.
-            along = reduce(torch.minimum, (torch.where(in_x[i], clear[i : i + tote_w], FAR) for i in range(count)))
-            usable = (torch.where(in_y[j], along[:, j : j + tote_d], FAR) for j in range(count))
+            near, far = _far_unless(in_x), _far_unless(in_y)
+            along = reduce(torch.minimum, (torch.maximum(clear[i : i + tote_w], near[i]) for i in range(count)))
+            usable = (torch.maximum(along[:, j : j + tote_d], far[j]) for j in range(count))
         else:
-            rows = zip(kinds.unbind(0), windows(clear, count).unbind(0), strict=True)
-            each = (pair for row in rows for pair in zip(*(part.unbind(0) for part in row), strict=True))
-            usable = (torch.where(used, part, FAR) for used, part in each)
+            pairs = zip(_far_unless(kinds).flatten(0, 1), product(range(count), repeat=2), strict=True)
+            usable = (torch.maximum(clear[i : i + tote_w, j : j + tote_d], limit) for limit, (i, j) in pairs)
         least.append(reduce(torch.minimum, usable))
     return reduce(torch.minimum, least)
+
+
+def _far_unless(used: Tensor) -> Tensor:
+    """Return FAR without a flag, else what no clearance is below: a maximum is faster than a choice by the flag."""
+    return torch.where(used, NEVER, FAR).int()
 
 
 def _reached_within_limits(
