@@ -184,7 +184,7 @@ LARGE = [
     ("env.tote_size=[1000,1000,1]", "the tote has 1,000,000 cells"),
     ("env.bin_size=[200,200,1] env.tote_size=[200,200,5]", "bin_size=.*tote_size=.*the cell has 6,400,000,000 actions"),
     ("env.gripper.size=[2000,2000]", "gripper.size=.*<= 64"),
-    ("env.gripper.size=[64,64] env.tote_size=[100,100,5]", "gripper.size=.*table of offsets"),
+    ("env.gripper.size=[64,64] env.tote_size=[100,100,5] env.rotations=1", "env.num_envs=256.*: .* GB"),
     (
         "env.bin_size=[250,250,1] env.gripper.size=[10,10] reach=annulus items=mixed items.width=[1,10] "
         "items.depth=[1,10]",

@@ -19,7 +19,8 @@ from pickplace.policies.restore import TrainedPolicy, cell_settings, load_policy
 TOLERANCE = 1e-5  # greatest difference between onnxruntime and torch, as a share of the greatest score
 #: Cells by which the totes, and the bins, of the check are larger than those of the training.
 CHECKS = (((1, 4), (0, 0)), ((3, 0), (0, 0)), ((7, 5), (1, 2)))
-ENVS, STEPS = 3, 8  # each check has ENVS * (STEPS + 1) problems at most
+ENVS, STEPS = 3, 8  # each check has ENVS * STEPS problems at most
+MOST_FOOTPRINTS = 2_000  # of all problems of a check together, but for one problem: on a fine grid each takes seconds
 
 N = Dim("N")
 
@@ -93,7 +94,7 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
                 for key, size, step in (("tote_size", cell.tote_size, more_tote), ("bin_size", cell.bin_size, more_bin))
             }
             other = _load(checkpoint, trust, **{**sizes, **grown})
-            asked = _observations(other, keys, STEPS)
+            asked = _some_problems(_observations(other, keys, STEPS), MOST_FOOTPRINTS // other.cell.num_choices)
             with torch.no_grad():
                 expected = Scores(other.policy, keys)(*asked)
             found = session.run(None, {key: entry.numpy() for key, entry in zip(keys, asked, strict=True)})[0]
@@ -124,6 +125,13 @@ def _observations(trained: TrainedPolicy, keys: Sequence[str], steps: int) -> li
     return [seen[key].contiguous() for key in keys]
 
 
+def _some_problems(entries: list[Tensor], count: int) -> list[Tensor]:
+    """Return evenly spaced problems, one at least and all at most, with the last one, whose tote is mostly full."""
+    most = len(entries[0])
+    rows = torch.linspace(-1, most - 1, max(1, min(count, most)) + 1)[1:].long()
+    return [entry[rows] for entry in entries]
+
+
 def shapes_of(policy: ScoresAnySize) -> dict[str, tuple]:
     """Return the sizes of entries that the model takes as they come; those of terms of your own follow from what is
     done with them."""
@@ -141,7 +149,8 @@ def _convert(scores: Scores, keys: Sequence[str], seen: list[Tensor], known: dic
         dict(enumerate(known.get(key, (N, *[Dim.AUTO] * (entry.dim() - 1)))))
         for key, entry in zip(keys, seen, strict=True)
     )
-    scores(*seen)  # makes the tables that the rules keep: those that a trace makes would spoil later decisions
+    with torch.no_grad():  # makes the tables that the rules keep: those that a trace makes would spoil later decisions
+        scores(*(entry[:1] for entry in seen))
     logger = logging.getLogger("torch.onnx")
     before = logger.level
     try:

@@ -25,8 +25,7 @@ from pickplace.rules.support.rules import Bearing, Support, read_support
 MAX_BIN_ITEMS = 100
 
 MAX_SIDE = 2_000  # greatest side of a grid or height, in cells or height units
-#: Greatest number of cells of a grid, of flat actions, and of entries in a table over offsets and place cells.
-MAX_CELLS, MAX_ACTIONS, MAX_TABLE = 2**16, 2**27, 2**26
+MAX_CELLS, MAX_ACTIONS = 2**16, 2**27  # greatest number of cells of a grid, and of flat actions
 
 
 @dataclass(frozen=True)
@@ -108,9 +107,6 @@ class CellSpec:
         at_most(f"{bin_size}: the bin has", self.num_picks, "cells", MAX_CELLS)
         at_most(f"{tote_size}: the tote has", self.num_places, "cells", MAX_CELLS)
         at_most(f"{bin_size}, {tote_size}: the cell has", self.num_actions, "actions", MAX_ACTIONS)
-        if self.has_known_offsets:  # else the items will say how many
-            words = f"gripper.size={[*self.gripper.size]}, {tote_size}: the table of offsets has"
-            at_most(words, self.rotations * self.num_offsets**2 * self.num_places, "entries", MAX_TABLE)
         if self.limits is not None:
             self.limits.check(self)
 

@@ -11,6 +11,7 @@ the tote, is higher than the item's top: one maximum over its cells decides.
 
 from collections.abc import Callable
 from functools import reduce
+from itertools import product
 from typing import Any, NamedTuple
 
 import torch
@@ -36,7 +37,7 @@ from pickplace.rules.maps import FAR, NEVER, surround, windows
 from pickplace.rules.placing import over_tote, resting_top
 from pickplace.rules.state import State
 
-CLASS_BYTES = 2**28  # of the masks of grasp classes that are held at a time
+CLASS_BYTES = 2**26  # of the masks of grasp classes that are counted at a time
 
 
 class PlacingMaps(NamedTuple):
@@ -122,41 +123,54 @@ def placing_maps(
     return maps.within_turns(cell) if cell.forbids_turns else maps
 
 
+def _tops_by_offset(cell: CellSpec, maps: PlacingMaps, turn: int) -> Tensor:
+    """Return the item's top with each offset and place cell, int32 ``[O, O, W_T, D_T, N]``, in one turn; a view."""
+    low, count = cell.min_offset, cell.num_offsets
+    _, _, ref_x, ref_y, _ = cell.effector(turn)
+    # With the reference cell at p and the item at offset o, the footprint begins at p - ref + o.
+    pad = (ref_x - low, low + count - 1 - ref_x, ref_y - low, low + count - 1 - ref_y)
+    return windows(surround(maps.top[:, turn % cell.parities].permute(1, 2, 0), pad, NEVER), count)
+
+
 def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     """Return whether placing succeeds, per grasp class and place cell, bool ``[T * K, W_T * D_T, N]``, batch last."""
-    low, count = cell.min_offset, cell.num_offsets
-    tote_w, tote_d, _ = cell.tote_size
-    mask = maps.top.new_empty(num_turns(cell), count, count, tote_w, tote_d, len(maps.top), dtype=torch.bool)
-    for number in range(num_turns(cell)):
-        parity = number % cell.parities
-        _, _, ref_x, ref_y, _ = cell.effector(number)
-        # With the reference cell at p and the item at offset o, the footprint begins at p - ref + o.
-        pad = (ref_x - low, low + count - 1 - ref_x, ref_y - low, low + count - 1 - ref_y)
-        top = windows(surround(maps.top[:, parity].permute(1, 2, 0), pad, NEVER), count)
-        torch.ge(top, maps.clearance_in(number), out=mask[number])
+    size = num_turns(cell), cell.num_offsets, cell.num_offsets, *cell.tote_size[:2], len(maps.top)
+    mask = maps.top.new_empty(*size, dtype=torch.bool)
+    for number, each in enumerate(mask):
+        top = _tops_by_offset(cell, maps, number)
+        torch.ge(top, maps.clearance_in(number), out=each)
         if maps.greatest_top is not None:
-            mask[number] &= top <= maps.greatest_top[:, number].permute(1, 2, 0)
+            each &= top <= maps.greatest_top[:, number].permute(1, 2, 0)
     return mask.flatten(3, 4).flatten(0, 2)
 
 
 def check_actions(cell: CellSpec, batch: int, device) -> None:
     """Refuse to list all flat actions of more problems than the memory holds, with a ``ValueError``."""
+    classes = num_turns(cell) * cell.num_offsets**2 * cell.num_places
     check_bytes(
         f"{cell.describe()}: {cell.num_actions:,} actions for {batch} problems at once",
-        5 * batch * cell.num_actions,
+        batch * (5 * cell.num_actions + classes),
         device,
     )
 
 
 def num_feasible(cell: CellSpec, maps: PlacingMaps) -> Tensor:
-    """Return how many flat actions succeed, int64 ``[N]``, without listing them."""
-    at_once = max(1, CLASS_BYTES // (num_turns(cell) * cell.num_offsets**2 * cell.num_places) // maps.bin_items)
+    """Return how many flat actions succeed, int64 ``[N]``, without listing them, or all grasp classes at once."""
+    at_once = max(1, CLASS_BYTES // (cell.num_offsets * cell.num_places) // maps.bin_items)
     bins = len(maps.top) // maps.bin_items
     if at_once < bins:
         parts = torch.arange(bins, device=maps.top.device).split(at_once)
         return torch.cat([num_feasible(cell, maps.rows(part)) for part in parts])
     available, classes = available_offsets(cell, maps.item, maps.blocked)
-    places = class_mask(cell, maps).sum(1)  # [T * K, N]
+    counts = []  # of the place cells where placing succeeds, by grasp class
+    for number in range(num_turns(cell)):
+        clearance = maps.clearance_in(number)
+        for top in _tops_by_offset(cell, maps, number):  # with each offset along x
+            good = top >= clearance
+            if maps.greatest_top is not None:
+                good &= top <= maps.greatest_top[:, number].permute(1, 2, 0)
+            counts.append(good.sum((1, 2)))
+    places = torch.cat(counts)  # [T * K, N]
     count = reduce(torch.add, [(places.gather(0, turned) * available).sum(0) for turned in classes])
     return count.view(bins, -1).sum(1)
 
@@ -285,14 +299,19 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Te
         clear, kinds = surround(maps.clearance_in(turn), margins, FAR), grasped[turn].flip(0, 1)  # as the windows are
         if count > 3 and torch.equal(kinds, (in_x := kinds.any(1))[:, None] & (in_y := kinds.any(0))):
             # The offsets are mostly all pairs of some along x and y. Then the least is one along x, then along y.
-            along = reduce(torch.minimum, (torch.where(in_x[i], clear[i : i + tote_w], FAR) for i in range(count)))
-            usable = (torch.where(in_y[j], along[:, j : j + tote_d], FAR) for j in range(count))
+            near, far = _far_unless(in_x), _far_unless(in_y)
+            along = reduce(torch.minimum, (torch.maximum(clear[i : i + tote_w], near[i]) for i in range(count)))
+            usable = (torch.maximum(along[:, j : j + tote_d], far[j]) for j in range(count))
         else:
-            rows = zip(kinds.unbind(0), windows(clear, count).unbind(0), strict=True)
-            each = (pair for row in rows for pair in zip(*(part.unbind(0) for part in row), strict=True))
-            usable = (torch.where(used, part, FAR) for used, part in each)
+            pairs = zip(_far_unless(kinds).flatten(0, 1), product(range(count), repeat=2), strict=True)
+            usable = (torch.maximum(clear[i : i + tote_w, j : j + tote_d], limit) for limit, (i, j) in pairs)
         least.append(reduce(torch.minimum, usable))
     return reduce(torch.minimum, least)
+
+
+def _far_unless(used: Tensor) -> Tensor:
+    """Return FAR without a flag, else what no clearance is below: a maximum is faster than a choice by the flag."""
+    return torch.where(used, NEVER, FAR).int()
 
 
 def _reached_within_limits(

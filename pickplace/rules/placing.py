@@ -3,7 +3,7 @@
 Surfaces, see :func:`~pickplace.rules.state.surface_from`, are halved where heights are needed.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import cached_property, lru_cache, reduce
 
 import torch
@@ -19,7 +19,8 @@ from pickplace.rules.state import surface_from
 from pickplace.rules.support.contact import Contact
 
 LEAST_SIDE = 8  # of the square under an item; from there on :class:`LargeItems` is faster
-MAX_ENTRIES = 2**22  # of its tables; more problems are looked at in turn
+MAX_LEVELS = 2**22  # entries of its tables; more problems are looked at in turn
+FOOTPRINTS_AT_ONCE = {"cpu": 2**17, "cuda": 2**24}  # what a CPU's caches hold; 100 bytes each on a GPU
 
 
 def resting_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item) -> tuple[Tensor, Tensor]:
@@ -31,12 +32,10 @@ def resting_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item
     support is too small. The height below it is that on which it would lie, stable or not; ``FAR`` outside the tote.
     """
     w, d = footprint_sizes(cell, item)
-    if cell.max_side < LEAST_SIDE:
-        contacts: Iterable[OnFootprints] = [OnFootprints(cell, surface, w, d)]
-    else:
-        at_once = max(1, MAX_ENTRIES // (len(surface.unique()) * cell.num_places))
-        parts = zip(surface.split(at_once), w.split(at_once, -1), d.split(at_once, -1), strict=True)
-        contacts = (LargeItems(cell, *part) for part in parts)  # one at a time, for the memory
+    at_once = max(1, FOOTPRINTS_AT_ONCE.get(surface.device.type, 2**24) // cell.num_footprints)
+    parts = zip(surface.split(at_once), w.split(at_once, -1), d.split(at_once, -1), strict=True)
+    kind = OnFootprints if cell.max_side < LEAST_SIDE else LargeItems
+    contacts = (kind(cell, *part) for part in parts)  # one at a time, for the memory
     found = [(on.z, cell.support.stable(on)) for on in contacts]
     z, stable = found[0] if len(found) == 1 else (torch.cat(each, -1) for each in zip(*found, strict=True))
     top = z + item.h.to(z.dtype)
@@ -69,13 +68,17 @@ class OnFootprints(Contact):
     def __init__(self, cell: CellSpec, surface: Tensor, w: Tensor, d: Tensor):
         self.surface, self.side, self.w, self.d = surface.permute(1, 2, 0), cell.max_side, w, d
         self.padded = surround(self.surface, (0, self.side - 1, 0, self.side - 1), 2 * FAR)
-        highest = self.padded[None]
         # The maximum over a rectangle is a maximum along one axis, then along the other.
-        for axis, size, grid in ((1, w, cell.tote_size[0]), (2, d, cell.tote_size[1])):
-            parts = (torch.where(step < size, highest.narrow(axis, step, grid), NEVER) for step in range(self.side))
-            highest = reduce(torch.maximum, parts)
-        self.z = highest >> 1
+        self.z = self._highest(self._highest(self.padded[None], -3, w), -2, d) >> 1
         self.supporting = surface_from(self.z)
+
+    def _highest(self, maps: Tensor, axis: int, size: Tensor) -> Tensor:
+        """Return the maximum over the footprints' sides along an axis, from each cell on but the last ``side - 1``."""
+        step, count = torch.arange(self.side, device=size.device), maps.shape[axis] - self.side + 1
+        # The lesser of two numbers is found far faster than one is chosen by a condition.
+        limits = torch.where(step.view(-1, 1, 1, 1, 1) < size, torch.iinfo(maps.dtype).max, NEVER).to(maps.dtype)
+        parts = (torch.minimum(maps.narrow(axis, at, count), limit) for at, limit in enumerate(limits.unbind(0)))
+        return reduce(torch.maximum, parts)
 
     @cached_property
     def surfaces(self):  # type: ignore[override]
@@ -85,41 +88,42 @@ class OnFootprints(Contact):
     def under(self):  # type: ignore[override]
         return is_under(self.w, self.d, self.side)
 
+    def ends(self) -> Iterator[Tensor]:
+        """Yield as of :meth:`Contact.ends`.
+
+        A surface and a place along y make one number, so that a maximum over a row of the footprint is of both. It is
+        the same for all footprints that begin at this y, whichever of their rows it is.
+        """
+        wide, deep, _ = self.surface.shape
+        places = 2 ** (deep - 1).bit_length()
+        whole = torch.int32 if 4 * FAR * places < 2**31 else torch.int64
+        y = torch.arange(deep, dtype=whole, device=self.z.device)[:, None]
+        surface, margins = self.surface.to(whole) * places, (0, self.side - 1, 0, self.side - 1)
+        marked = torch.stack([surround(surface + at, margins, 2 * FAR * places) for at in (y, deep - 1 - y)])
+        highest = self._highest(marked[:, None], -2, self.d)  # [2, Q, W_T + S - 1, D_T, N]
+        # How far a supporting cell goes is the excess over this; other numbers are not greater.
+        before = torch.stack(torch.broadcast_tensors(y, deep - self.d.to(whole) - y))
+        none = self.supporting.to(whole) * places - 1 + before
+        for x in range(self.side):
+            most = torch.where(x < self.w, self.side, 0).int()
+            yield (highest.narrow(2, x, wide) - none).clamp_(min=0).int().minimum(most)
+
 
 class LargeItems(OnFootprints):
     """The same for large items on fine grids, where the work must not grow with the area of an item.
 
-    For each height in a tote tables are made of the cells that have it, in which a row of any footprint is looked up.
+    The cells that have the height of the supporting ones are counted in a table for each height in a tote.
     """
-
-    @cached_property
-    def _levels(self) -> tuple[Tensor, Tensor]:
-        """Whether a cell has a height, bool ``[levels, W_T, D_T, N]``, and the index of the supporting cells' height.
-
-        Where no cell bears weight it is the index of a greater height, which no cell under the item has.
-        """
-        levels = torch.cat([self.surface.unique(), self.surface.new_tensor([4 * FAR])])
-        return self.surface == levels.view(-1, 1, 1, 1), torch.searchsorted(levels, self.supporting)
 
     @property
     def count(self) -> Tensor:
-        has_level, level = self._levels
-        return rectangle_sums(has_level, self.w, self.d, level)
-
-    def rows(self) -> Iterator[tuple[Tensor, Tensor]]:
-        (has_level, level), side = self._levels, self.side
-        _, wide, deep, count = has_level.shape
-        x_at, y_at, number = (torch.arange(size, device=level.device) for size in (wide, deep, count))
-        start = ((level * wide + x_at.view(-1, 1, 1)) * deep + y_at.view(-1, 1)) * count + number
-        y = y_at.view(-1, 1).short()
-        after = torch.where(has_level, y, deep).flip(2).cummin(2).values.flip(2)  # first of the level from y on
-        before = torch.where(has_level, y, -1).cummax(2).values
-        end = start + (self.d - 1) * count
-        for x in range(side):
-            row, most = x * deep * count, after.numel() - 1
-            first, last = after.take((start + row).clamp_(max=most)) - y, before.take((end + row).clamp_(max=most)) - y
-            held = (x < self.w) & (first < self.d)
-            yield torch.where(held, first, side), torch.where(held, last, -1)
+        levels = torch.cat([self.surface.unique(), self.surface.new_tensor([4 * FAR])])
+        # Where no cell bears weight, the height is a greater one, which no cell under the item has.
+        level = torch.searchsorted(levels, self.supporting)
+        at_once = max(1, MAX_LEVELS // (len(levels) * self.surface.shape[0] * self.surface.shape[1]))
+        parts = zip(*(part.split(at_once, -1) for part in (self.surface, self.w, self.d, level)), strict=True)
+        levels = levels.view(-1, 1, 1, 1)
+        return torch.cat([rectangle_sums(cells == levels, w, d, number) for cells, w, d, number in parts], -1)
 
 
 @lru_cache(maxsize=64)

@@ -266,3 +266,20 @@ def test_a_missing_extra_is_one_sentence(command, monkeypatch):
     code, out, err = command("pretrained/r4", "x.onnx")
     assert (code, out) == (2, "")
     assert err == "error: pickplace-export: onnx is missing; pip install 'pickplace[onnx]'.\n"
+
+
+@pytest.mark.slow
+def test_values_on_a_fine_grid_are_checked_at_a_few_problems(tmp_path):
+    """Items of up to 10 cells, whose hulls bear weight, in totes of 30x20 cells."""
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    differences = onnx_model.export_onnx("pretrained/warehouse", tmp_path / "warehouse.onnx")
+    assert [*differences] == [(31, 24), (33, 20), (37, 25)] and max(differences.values()) <= 1e-5
+
+
+@pytest.mark.parametrize(
+    ("count", "rows"), [(0, [23]), (1, [23]), (2, [11, 23]), (24, [*range(24)]), (99, [*range(24)])]
+)
+def test_a_check_has_the_last_problem(count, rows):
+    entries = onnx_model._some_problems([torch.arange(24), torch.arange(24) + 1], count)
+    assert [entry.tolist() for entry in entries] == [rows, [row + 1 for row in rows]]

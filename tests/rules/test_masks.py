@@ -229,8 +229,9 @@ def test_large_items_rest_as_small_ones_do(support, unit):
     planner, seen, stable = JointDBL(env.cell), env.reset(), 0
     for _ in range(3 if unit > 5 else 8):
         each = []
-        for least_side, at_once in ((999, placing.MAX_ENTRIES), (1, 1), (1, placing.MAX_ENTRIES)):
-            with patch.object(placing, "LEAST_SIDE", least_side), patch.object(placing, "MAX_ENTRIES", at_once):
+        for sizes in ({"LEAST_SIDE": 999}, {"LEAST_SIDE": 1, "FOOTPRINTS_AT_ONCE": {"cpu": 1}},
+                      {"LEAST_SIDE": 1, "MAX_LEVELS": 1}, {"LEAST_SIDE": 1}):  # fmt: skip
+            with patch.multiple(placing, **sizes):
                 each.append(resting_top(env.cell, *env.state.each_item()))
         (expected_top, expected_rest), *found = each
         assert all(torch.equal(top, expected_top) and torch.equal(rest, expected_rest) for top, rest in found)

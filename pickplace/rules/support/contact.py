@@ -4,14 +4,16 @@ The *supporting cells* are the cells under the footprint that are as high as the
 """
 
 from collections.abc import Iterator
-from functools import cached_property, reduce
+from functools import cached_property
+from itertools import chain
+from math import inf
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from pickplace.rules.state import surface_from
-from pickplace.rules.support.hull import NONE, hull_chords, hull_patterns
+from pickplace.rules.support.hull import COVERED, PATTERN_SIDE, exact_dtype, hull_arcs, hull_patterns
 
 
 class Contact:
@@ -46,18 +48,23 @@ class Contact:
             count += supports
         return count
 
+    def ends(self) -> Iterator[Tensor]:
+        """Yield for each row of the square along y how far supporting cells go, int32 ``[2, *shape of z]``.
+
+        First from the footprint's near side to the last of them, then from its far side to the first; 0: there is none.
+        """
+        rows = ((self.surfaces == self.supporting) & self.under).unflatten(0, (self.side, self.side))
+        step = torch.arange(self.side, dtype=torch.int32, device=rows.device)[:, None]
+        reached = torch.stack([rows * (step + 1), rows * (self.d.int() - step)], 1).amax(2)  # [S, 2, N]
+        yield from reached.unbind(0)
+
     def rows(self) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield the first and the last supporting cell of each row of the square along y, int16 of the shape of ``z``.
+        """Yield the first and the last supporting cell of each row of the square along y, int32 of the shape of ``z``.
 
         They are counted from the square's corner. Without one, the first is at least ``side``, and the last is -1.
         """
-        cells = self.cells()
-        for _ in range(self.side):
-            first = last = torch.zeros_like(self.z, dtype=torch.int16)  # counted from the ends of the square; 0: none
-            for y in range(self.side):
-                here = next(cells).short()
-                first, last = torch.maximum(first, here * (self.side - y)), torch.maximum(last, here * (y + 1))
-            yield self.side - first, last - 1
+        for far, near in self.ends():
+            yield torch.where(near > 0, self.d.int() - near, self.side), far - 1
 
     @cached_property
     def share(self) -> Tensor:
@@ -68,8 +75,8 @@ class Contact:
     def corners(self) -> Tensor:
         """The number of the footprint's corners that are supported, 0 to 4; one cell may have several corners."""
         corners = torch.zeros_like(self.z)
-        for x, (first, last) in enumerate(self.rows()):
-            corners += ((first == 0).int() + (last == self.d - 1)) * ((self.w == x + 1).int() + (x == 0))
+        for x, ends in enumerate(self.ends()):
+            corners += (ends == self.d).sum(0, dtype=torch.int32) * ((self.w == x + 1).int() + (x == 0))
         return corners
 
     def is_centre_in_hull(self, margin: float = 0.0) -> Tensor:
@@ -78,20 +85,36 @@ class Contact:
         Args:
             margin: distance from the hull's edge that the centre must exceed, in cells.
         """
+        if self.side > PATTERN_SIDE:
+            return self._is_centre_among_corners(margin)
         sizes = self.w.clamp(1, self.side) - 1, self.d.clamp(1, self.side) - 1
-        tables = hull_patterns(self.side, margin, self.supporting.device)
-        words = [(patterns[(slice(None), *sizes)], whole[sizes]) for patterns, whole in tables]
-        reached = [torch.zeros_like(self.supporting, dtype=patterns.dtype) for patterns, _ in words]
-        for number, surface in enumerate(self.surfaces):
-            supports = surface == self.supporting
-            if len(words) == 1:
-                reached[0] |= supports * words[0][0][number]
-                continue
-            # With many words: all bits of a cell that supports, or none, are combined faster than numbers multiplied.
-            supports = supports.int().neg_()
-            for bits, (patterns, _) in zip(reached, words, strict=True):
-                bits |= supports & patterns[number]
-        return reduce(torch.bitwise_and, (bits == whole for bits, (_, whole) in zip(reached, words, strict=True)))
+        table, whole = hull_patterns(self.side, margin, self.supporting.device)
+        patterns, reached = table[(slice(None), *sizes)], torch.zeros_like(self.supporting, dtype=table.dtype)
+        for surface, pattern in zip(self.surfaces, patterns, strict=True):
+            reached |= (surface == self.supporting) * pattern
+        return reached == whole[sizes]
+
+    def _is_centre_among_corners(self, margin: float) -> Tensor:
+        """Return the same as :meth:`is_centre_in_hull`, for items of any size.
+
+        Of the upper and of the lower half circle, the directions are found up to which the arcs of corners reach
+        without a gap. The corner that is furthest in a direction is the next one along x, the further the direction is
+        turned; so each corner is looked at once, those with the smallest x first, as if seen in a mirror.
+        """
+        begins, ends = hull_arcs(self.side, margin, self.supporting.device)
+        w, d = (size.clamp(1, self.side).int() for size in (self.w, self.d))
+        columns = 2 * self.side + 2  # of the table
+        before = none = torch.zeros_like(self.z, dtype=torch.int32).expand(2, *self.z.shape)
+        covered = none + 1
+        for x, after in enumerate(chain(self.ends(), [none])):
+            furthest = torch.maximum(before, after)  # of the corners on the edge between this row and the one before
+            start = (w - 2 * x + 2 * self.side - 1) * columns + self.side + 1 - d
+            # Without a corner the first entry of the table, of an empty arc.
+            entry = torch.minimum(torch.add(start, furthest, alpha=2), furthest * len(begins)).flatten()
+            begin, end = (table.index_select(0, entry).view_as(covered) for table in (begins, ends))
+            joins = begin.sub_(covered).bitwise_right_shift_(31)  # all bits, if the arc begins in what is covered
+            covered, before = torch.maximum(covered, joins.bitwise_and_(end)), after
+        return (covered == COVERED).all(0)
 
     def is_centre_in_hull_of_middles(self) -> Tensor:
         """Return whether the item's centre lies in the hull of the middles of the supporting cells, or on its edge.
@@ -100,34 +123,44 @@ class Contact:
         near side. Such a line goes from one at ``(-a, b)`` to one at ``(a', b')``, as seen from the centre, and passes
         at a height of the sign of ``b / a + b' / a'``: so the steepest on each side decide, and no pairs are compared.
         """
-        exact = torch.float32 if self.side <= 64 else torch.float64  # tells apart all ratios of whole numbers up to it
+        exact = exact_dtype(self.side)
         w, d = self.w.short(), self.d.short()
-        lowest = torch.tensor(-torch.inf, dtype=exact, device=w.device)
-        steepest = [[lowest, lowest], [lowest, lowest]]  # to the far side, left and right of the centre; to the near
-        for x, (first, last) in enumerate(self.rows()):
+        left = right = torch.tensor(-inf, dtype=exact, device=w.device)  # steepest to the far side, and to the near
+        for x, ends in enumerate(self.ends()):
             offset = (2 * x + 1 - w).to(exact)
-            gap = torch.where(last >= 0, 0.0, torch.inf).to(exact)
-            for parts, beyond in zip(steepest, (2 * last + 1 - d, d - 2 * first - 1), strict=True):
-                slope = (beyond - gap) / offset.abs()  # on the line through the centre +-inf, and nan for 0 / 0
-                slope = torch.where(slope.isnan(), torch.inf, slope)
-                parts[0] = torch.maximum(parts[0], torch.where(offset <= 0, slope, -torch.inf))
-                parts[1] = torch.maximum(parts[1], torch.where(offset >= 0, slope, -torch.inf))
-        (left, right), (near_left, near_right) = steepest
-        return (left + right >= 0) & (near_left + near_right >= 0)
+            beyond = torch.where(ends > 0, 2 * ends - 1 - d, -inf).to(exact)
+            slope = beyond / offset.abs()  # on the line through the centre +-inf, and nan for 0 / 0
+            slope = torch.where(slope.isnan(), inf, slope)
+            left = torch.maximum(left, torch.where(offset <= 0, slope, -inf))
+            right = torch.maximum(right, torch.where(offset >= 0, slope, -inf))
+        return (left + right >= 0).all(0)
 
     def in_hull(self) -> Tensor:
         """Return which cells under the items lie inside the hull of the supporting cells, bool ``[S * S, N]``.
 
-        Only for one footprint of each problem, with ``surfaces`` in one tensor.
+        Only for one footprint of each problem, with ``surfaces`` in one tensor. The hull is followed from one edge
+        between rows to the next, along the far side and the near one: from the last corner of the hull it goes to the
+        corner ahead that is furthest out, as seen from there. Only quotients of whole numbers are compared.
         """
-        rows = ((self.surfaces == self.supporting) & self.under).view(self.side, 1, self.side, -1)
-        bounds, chords, lengths = hull_chords(self.side, rows.device)
-        reached = torch.where(rows, bounds, NONE).amax(2)  # by the supporting cells of each row, [S, 2, N]
-        reached = F.pad(reached, (0, 0, 0, 0, 1, 1), value=NONE)
+        side, exact = self.side, exact_dtype(self.side)
+        step = torch.arange(side + 1, dtype=exact, device=self.z.device).view(-1, 1, 1)
+        bounds = torch.stack([step[1:], -step[:-1]])[..., 0]  # of each cell, to the far side and to the near one
+        rows = ((self.surfaces == self.supporting) & self.under).view(side, 1, side, -1)
+        none = -4.0 * side**2  # so far back that a line from there to the hull begins at the hull's first corner
+        reached = torch.where(rows, bounds, none).amax(2)  # by the supporting cells of each row, [S, 2, N]
+        reached = F.pad(reached, (0, 0, 0, 0, 1, 1), value=none)
         ends = torch.maximum(reached[:-1], reached[1:])  # of the edges between rows, [S + 1, 2, N]
-        lines = (chords @ ends.flatten(1)).div_(lengths)  # how far they go where they pass an edge
-        hull = lines.unflatten(0, (self.side + 1, -1)).amax(1)
-        return (bounds <= torch.minimum(hull[:-1], hull[1:]).view(self.side, 2, 1, -1)).all(1).flatten(0, 1)
+        at, corner = torch.zeros_like(ends[0]), ends[0]
+        hull = [corner]
+        for x in range(1, side + 1):
+            slopes = (ends[x:] - corner) / (step[x:] - at)
+            slope = slopes.amax(0)
+            hull.append(corner + slope * (x - at))
+            turns = slopes[0] == slope
+            at, corner = torch.where(turns, x, at), torch.where(turns, ends[x], corner)
+        # Where the hull passes an edge between its corners, the fraction is a multiple of one over their distance.
+        held = torch.stack(hull) + 0.5 / side
+        return (bounds <= torch.minimum(held[:-1], held[1:]).view(side, 2, 1, -1)).all(1).flatten(0, 1)
 
 
 class Patches:
@@ -215,7 +248,7 @@ class Patches:
         """
         (rows, lines), flags = self.always, self.supports[0, 0]
         supports, along = self.robust
-        reached = torch.where(supports[0, 0], along, NONE).amax(1, keepdim=True) if supports.shape[-1] else NONE
+        reached = torch.where(supports[0, 0], along, -inf).amax(1, keepdim=True) if supports.shape[-1] else -inf
         flags = flags.view(len(rows), len(lines))
         held = flags | (self.along <= reached + 1e-9).all(0).view_as(flags)
         for axis, inner in ((0, flags & rows[:, None]), (1, flags & lines)):

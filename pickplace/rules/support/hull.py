@@ -1,49 +1,33 @@
-"""Hulls of supporting cells: whether they contain an item's centre, or cells.
+"""Hulls of supporting cells: tables that tell whether they contain an item's centre.
 
 An item tilts unless the vertical line through its centre passes the hull of what supports it. That is asked of every
-footprint, and the hull is not computed for it. A point lies in a convex polygon if the polygon reaches as far along the
-normal of each of its edges. Those of a hull of cells are parallel to the axes, or to a line from one cell to another: a
-few directions. For the centre, a supporting cell reaches beyond it along some of their normals, which is a pattern of
-bits; the item is stable if the patterns of its supporting cells cover all of them. That is exact, and as fast as
-counting for items of up to 3 cells.
+footprint, and the hull is not computed for it: the centre is inside by a margin if in every direction some corner of a
+supporting cell lies beyond the margin. Two tables answer it exactly.
 
-Which cells a hull contains is asked of one footprint of each problem. There it is computed, row by row.
+For short items, *patterns*: the hull of cells has edges in few directions, so a supporting cell reaches beyond the
+centre along some of their normals, which is a pattern of bits. The item is stable if the patterns of its supporting
+cells cover all of them. That is as fast as counting for items of up to 3 cells.
+
+For longer ones, *arcs*: a corner lies beyond the margin in an open arc of directions, and the item is stable if the
+arcs of the outermost corners cover the circle. There are two such corners where the hull passes an edge between rows of
+cells, so the work grows with the length of a footprint, and the table with its square.
 """
 
 from functools import lru_cache
-from math import gcd
+from math import gcd, pi
 
 import torch
 from torch import Tensor
 
-BITS = 32  # normals in a word of a pattern
-NONE = -1e4  # reach of a row without a supporting cell
-MAX_HULL_SIDE = 16  # longest side of an item with the rules of the hull, in cells: the tables grow with its sixth power
+PATTERN_SIDE = 5  # longest side of items that are looked up in patterns: their 48 normals are bits of one number
+WORDS = {8: torch.uint8, 16: torch.int16, 32: torch.int32, 64: torch.int64}
+COVERED = 2**30  # rank of a direction behind the half circle
+TIE = 1e-12  # radians; directions that differ by less are the same, as 1e-15 is lost in computing them
 
 
-@lru_cache(maxsize=64)
-def hull_chords(side: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what tells how far the hull of cells of a square goes along y, where it passes the edges between its rows.
-
-    There it goes as far as the furthest of the chords from one edge to another. All numbers are whole, so that their
-    float32 quotients compare exactly.
-
-    Returns:
-        how far each cell of a row goes, to the far side and to the near one (minus its distance from there), ``[2,
-        side, 1]``; the weights of a chord's ends where it passes an edge, times its length, ``[(side + 1) * P, side +
-        1]``, P chords for each edge; and the lengths, ``[(side + 1) * P, 1]``; float32.
-    """
-    edges = range(side + 1)
-    passing = [[(start, stop) for start in edges for stop in edges if start <= edge <= stop] for edge in edges]
-    most = max(map(len, passing))
-    start, stop = torch.tensor([pairs + pairs[:1] * (most - len(pairs)) for pairs in passing]).flatten(0, 1).t()
-    edge, numbers = torch.arange(side + 1).repeat_interleave(most), torch.arange(len(start))
-    weights = torch.zeros(len(start), side + 1)
-    weights[numbers, start] = (stop - edge).float()
-    weights[numbers, stop] += torch.where(start == stop, 1, edge - start)
-    cells = torch.arange(side, dtype=torch.float32)
-    bounds = torch.stack([cells + 1, -cells])[:, :, None]
-    return bounds.to(device), weights.to(device), weights.sum(1, keepdim=True).to(device)
+def exact_dtype(side: int) -> torch.dtype:
+    """Return a type in which quotients of whole numbers up to a side are equal only if they are."""
+    return torch.float32 if side <= 64 else torch.float64
 
 
 def _normals(side: int) -> Tensor:
@@ -53,41 +37,66 @@ def _normals(side: int) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-def hull_patterns(side: int, margin: float, device: torch.device) -> list[tuple[Tensor, Tensor]]:
-    """Return the patterns of the cells of every footprint up to ``side x side``, in words of :data:`BITS` normals.
+def hull_patterns(side: int, margin: float, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the patterns of the cells of every footprint up to ``side x side``, a bit for each normal.
 
     Args:
-        side: longest side of a footprint, in cells.
+        side: longest side of a footprint, in cells, at most :data:`PATTERN_SIDE`.
         margin: distance from the centre that a cell has to pass along a normal, in cells.
         device: place of the tables.
 
     Returns:
-        for each word the patterns of the cells, ``[side * side, side, side]`` by cell, width and depth, 0 for cells
-        outside the footprint; and the pattern that covers all normals, ``[side, side]``; of 8, 16 or 32 bits.
-
-    Raises:
-        ValueError: for a side beyond :data:`MAX_HULL_SIDE`.
+        the patterns of the cells, ``[side * side, side, side]`` by cell, width and depth, 0 for cells outside the
+        footprint; and the pattern that covers all normals, ``[side, side]``; of as many bits as are needed.
     """
-    if side > MAX_HULL_SIDE:
-        raise ValueError(
-            f"items may be {side} cells long; with support=hull and bearing expected at most {MAX_HULL_SIDE}."
-        )
-    size, near = torch.arange(1, side + 1), torch.arange(side)
+    size, near, normals = torch.arange(1, side + 1), torch.arange(side), _normals(side)
     # Twice the distance from the centre to the near and the far edge of each cell, by cell and size of the footprint.
     ends = torch.stack([2 * near[:, None] - size, 2 * near[:, None] + 2 - size])  # [2, cell, size]
     inside = near[:, None] < size
     inside = inside[:, None, :, None] & inside[None, :, None, :]  # [x, y, w, d]
-    words, normals = [], _normals(side)
-    for chunk in normals.split(BITS):
-        furthest = (chunk[:, :, None, None, None] * ends).amax(2)  # [normals, axis, cell, size]
-        along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
-        beyond = along > 2 * margin * chunk.double().norm(dim=1).view(-1, 1, 1, 1, 1)
-        # No edge has the direction from one cell to another that is not in the footprint.
-        x, y = chunk.abs()[:, :, None, None].unbind(1)
-        fits = ((y < size[:, None]) & (x < size)) | (x + y == 1)
-        flags = torch.tensor([1 << bit for bit in range(BITS)])[: len(chunk)]
-        pattern = ((beyond & inside & fits[:, None, None]) * flags.view(-1, 1, 1, 1, 1)).sum(0)
-        whole = (fits * flags.view(-1, 1, 1)).sum(0)
-        dtype = torch.uint8 if len(normals) <= 8 else torch.int16 if len(normals) <= 16 else torch.int32
-        words.append((pattern.flatten(0, 1).to(device, dtype), whole.to(device, dtype)))
-    return words
+    furthest = (normals[:, :, None, None, None] * ends).amax(2)  # [normals, axis, cell, size]
+    along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
+    beyond = along > 2 * margin * normals.double().norm(dim=1).view(-1, 1, 1, 1, 1)
+    # No edge has the direction from one cell to another that is not in the footprint.
+    x, y = normals.abs()[:, :, None, None].unbind(1)
+    fits = ((y < size[:, None]) & (x < size)) | (x + y == 1)
+    flags = torch.tensor([1 << bit for bit in range(len(normals))])
+    pattern = ((beyond & inside & fits[:, None, None]) * flags.view(-1, 1, 1, 1, 1)).sum(0)
+    whole = (fits * flags.view(-1, 1, 1)).sum(0)
+    dtype = next(dtype for bits, dtype in WORDS.items() if len(normals) <= bits)
+    return pattern.flatten(0, 1).to(device, dtype), whole.to(device, dtype)
+
+
+@lru_cache(maxsize=16)
+def hull_arcs(side: int, margin: float, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return in which directions of a half circle a corner of a cell lies beyond a margin from the item's centre.
+
+    The corner ``(x, y)`` lies there, in half cells from the centre; ``x`` is from ``1 - 2 * side`` to ``side``, and
+    ``y`` from ``-side`` to ``side``. A direction is an angle from 0, along x, to 180 degrees, where those between point
+    to greater y. Directions are compared by their ranks, so that equal ones are equal.
+
+    Args:
+        side: longest side of a footprint, in cells.
+        margin: distance that must be exceeded, in cells.
+        device: place of the table.
+
+    Returns:
+        the rank at which each corner's arc begins and that at which it ends, int32 ``[3 * side * (2 * side + 2)]``, by
+        x, then y. An arc without its ends. It begins at 0 if it contains the angle 0, and ends at :data:`COVERED` if it
+        contains 180 degrees; where it is empty it begins behind that. So do those of the first y, which is no corner.
+    """
+    x = torch.arange(1 - 2 * side, side + 1, dtype=torch.float64)[:, None]
+    y = torch.arange(-side - 1, side + 1, dtype=torch.float64)
+    distance = (x**2 + y**2).sqrt()
+    middle = torch.atan2(y.expand_as(distance), x.expand_as(distance))
+    middle = torch.where(middle < -pi / 2, middle + 2 * pi, middle)
+    half = torch.acos((2 * margin / distance).clamp(max=1))
+    begin, end = middle - half, middle + half
+    empty = (half <= TIE) | (end <= TIE) | (begin >= pi - TIE) | (y < -side)
+    angles, order = torch.cat([begin[~empty], end[~empty]]).clamp(0, pi).sort()
+    ranks = torch.empty(len(order), dtype=torch.int32)
+    ranks[order] = 1 + (angles.diff(prepend=angles[:1]) > TIE).cumsum(0, dtype=torch.int32)
+    begins, ends = torch.full_like(begin, COVERED + 1, dtype=torch.int32), torch.zeros_like(end, dtype=torch.int32)
+    begins[~empty], ends[~empty] = ranks.chunk(2)
+    begins[~empty & (begin < -TIE)], ends[~empty & (end > pi + TIE)] = 0, COVERED
+    return begins.flatten().to(device), ends.flatten().to(device)
