@@ -184,7 +184,7 @@ def test_a_goal_that_brings_no_plan_closes_the_plan_before(make):
     assert cell.plan().plan.status == "ok" and cell.record.open
     cell.see(items=())
     result = cell.plan()
-    assert (result.outcome, result.plan.status) == (result.REFUSED, "") and not cell.call("placed")[0]
+    assert (result.outcome, result.plan.status) == (result.EMPTY, "") and not cell.call("placed")[0]
 
 
 def test_waits_for_what_is_missing_and_says_so(make):

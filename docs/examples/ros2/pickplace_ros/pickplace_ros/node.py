@@ -22,7 +22,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 from tf2_ros import Buffer, TransformException, TransformListener
 
-from pickplace import DepthMapError, Plan, Scene
+from pickplace import DepthMapError, EmptyBinError, Plan, Scene
 from pickplace.common.errors import sentence
 from pickplace.common.validate import number, refuse_if
 from pickplace.serve.deadline import Deadline
@@ -109,9 +109,10 @@ class PickPlaceNode(Node):
         except (NotReady, TimeoutError, ValueError, FloatingPointError) as error:
             outcomes = {
                 NotReady: ComputePlan.Result.NOT_READY, TimeoutError: ComputePlan.Result.TIMEOUT,
-                DepthMapError: ComputePlan.Result.REFUSED,
+                EmptyBinError: ComputePlan.Result.EMPTY, DepthMapError: ComputePlan.Result.REFUSED,
             }  # fmt: skip
-            result.outcome = outcomes.get(type(error), ComputePlan.Result.FAILED)
+            kinds = (outcome for kind, outcome in outcomes.items() if isinstance(error, kind))
+            result.outcome = next(kinds, ComputePlan.Result.FAILED)
             result.message = str(error)
             self.get_logger().warning(result.message)
             goal.abort()
@@ -211,8 +212,8 @@ class PickPlaceNode(Node):
 
     def plan(self, over_bin: View, over_tote: View) -> Plan:
         """Plan from two views and from what was done before."""
-        settings = {key: self.settings[key] for key in ("accuracy", "tote_height", "greatest_height", "clearance",
-                                                        "placement_error")}  # fmt: skip
+        keys = ("accuracy", "bin_height", "tote_height", "greatest_height", "clearance", "placement_error")
+        settings = {key: self.settings[key] for key in keys}
         scene = Scene.from_images(
             self.planner.cell, (over_bin.camera, over_bin.depth), (over_tote.camera, over_tote.depth),
             self.settings["cell_size"], tote_bearing=self.record.bearing, placed=self.record.placed_boxes, **settings,

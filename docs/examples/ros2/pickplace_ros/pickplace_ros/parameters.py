@@ -41,6 +41,7 @@ PARAMETERS = {
     "placement_error": Setting(
         CLEARANCE, "greatest distance of an item from where it is set down, m; at most the clearance", 0.0, 0.1
     ),
+    "bin_height": Setting(0.0, "height of the bin's walls above its floor, m; 0: that of bin_size", 0.0, 2.0, null=0),
     "tote_height": Setting(0.0, "height of the tote's rim above its floor, m; 0: that of tote_size", 0.0, 2.0, null=0),
     "greatest_height": Setting(0.0, "of an item, m; 0: the height of the tote's rim", 0.0, 2.0, null=0),
     "longest_age": Setting(
