@@ -117,8 +117,8 @@ def _text(name: str, place: int, count: int, container: "PackedContainer", rows:
     """Return what is printed of a container."""
     weight = sum(row["weight/kg"] for row in rows)
     lines = [
-        f"{name}, container {place} of {count}: {len(rows)} item{'s' * (len(rows) != 1)}, {container.occupancy:.1%} of its volume, "
-        f"{weight:,.1f} kg, {container.top:.0f} mm high"
+        f"{name}, container {place} of {count}: {len(rows)} item{'s' * (len(rows) != 1)}, "
+        f"{container.occupancy:.1%} of its volume, {weight:,.1f} kg, {container.top:.0f} mm high"
     ]
     keys = ("step", "item", "id", "x/mm", "y/mm", "z/mm", "along_x/mm", "along_y/mm", "height/mm")
     cells = [
