@@ -20,6 +20,7 @@ import pickplace
 from pickplace import Planner, Scene
 from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
+from pickplace.evaluation import pack_command
 from pickplace.physics import command as physics
 from pickplace.policies import export
 from pickplace.policies.restore import build_cell
@@ -29,7 +30,13 @@ ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.glob("*.md"), *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"))])
 BLOCK = re.compile(r"^```(\w*)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-PARSERS = {"plan": json_lines.parser, "physics": physics.parser, "serve": serve.parser, "export": export.parser}
+PARSERS = {
+    "plan": json_lines.parser,
+    "physics": physics.parser,
+    "serve": serve.parser,
+    "export": export.parser,
+    "pack": pack_command.parser,
+}
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 

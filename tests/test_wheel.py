@@ -44,7 +44,7 @@ def test_commands_of_the_wheel_from_another_directory(wheel, tmp_path):
     scripts.read(listed)
     assert dict(scripts["console_scripts"]) == {
         f"pickplace-{name}": f"pickplace.cli:{name}"
-        for name in ("train", "evaluate", "plan", "physics", "serve", "export")
+        for name in ("train", "evaluate", "plan", "physics", "serve", "export", "pack")
     }
     words = ["checkpoint=pretrained/r1", "evaluation.episodes=2", "evaluation.latency_decisions=0", "hydra.run.dir=run"]
     code = (

@@ -1,0 +1,162 @@
+"""The ``pickplace-pack`` command: pack the orders of a file into containers."""
+
+import argparse
+import csv
+import io
+import json
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pickplace.common.errors import Parser, one_sentence, write_output
+from pickplace.common.validate import refuse_if
+
+if TYPE_CHECKING:
+    from pickplace.evaluation.pack import PackedContainer, PackedItem
+    from pickplace.physics.plans import EpisodePlan
+
+MAX_LENGTH = 10_000  # of a container, mm
+
+
+def main() -> None:
+    """Entry point of ``pickplace-pack``."""
+    with one_sentence():
+        run(parser().parse_args())
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    return Parser(
+        prog="pickplace-pack",
+        description="Pack the orders of a file into containers. Prints where each item goes, in which sequence; writes "
+        "a table, the plan in BED-BPP's format, one for pickplace-physics, and a page that shows the containers in 3D.",
+        epilog="The file's format: docs/train_your_own.md#2-describe-the-items",
+        options={
+            "order": {
+                "help": "CSV with columns length, width, height, weight, and if there are any order, id, quantity; or "
+                "JSON of BED-BPP",
+            },
+            "--container": {
+                "required": True, "metavar": "LxWxH", "help": "inner sides of a container, such as 1200x800x1500; mm",
+            },
+            "--cell": {
+                "type": int, "default": 20, "metavar": "MM", "help": "side of a cell; places are multiples of "
+                "it (default %(default)s)",
+            },
+            "--unit": {
+                "default": "mm", "metavar": "UNIT",
+                "help": "of lengths without a unit in the header: mm (the default), cm or m",
+            },
+            "--keep-sequence": {"action": "store_true", "help": "put the items down in the sequence of the file"},
+            "--planner": {
+                "metavar": "NAME", "default": "heightmap_minimisation",
+                "help": "what chooses the places, such as joint_dbl (default %(default)s)",
+            },
+            "--out": {
+                "metavar": "FOLDER", "default": "outputs/pack", "help": "where the files go (default %(default)s)",
+            },
+        },
+    )  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> None:
+    """Pack the orders, print them and write the files.
+
+    Raises:
+        ValueError: for arguments or orders that cannot be used.
+    """
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})x(\d{1,5})", args.container)
+    refuse_if(not match, f"--container={args.container}: expected whole millimetres, such as 1200x800x1500.")
+    length, width, height = map(int, match.groups() if match else ())
+    container = length, width, height
+    refuse_if(not 1 <= args.cell <= MAX_LENGTH, f"--cell={args.cell}: expected 1 to {MAX_LENGTH:,} mm.")
+    from pickplace.common.validate import one_of
+    from pickplace.evaluation.pack import OrderPacker
+    from pickplace.items.order_file import MILLIMETRES, read_orders
+    from pickplace.physics.plans import PLANS, EpisodePlan, to_lines
+    from pickplace.views.replay import page
+
+    orders = read_orders(args.order, one_of("--unit", args.unit, MILLIMETRES), key="order")
+    packer = OrderPacker(container, args.cell, args.planner)
+    folder, rows, bed_bpp = Path(args.out), [], {}
+    plans: list[EpisodePlan] = []
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, order in enumerate(orders, 1):
+        cell, containers = packer.pack(order.items, args.keep_sequence)
+        name = order.name or Path(args.order).stem
+        for place, each in enumerate(containers, 1):
+            table = [_row(name, place, step, packed) for step, packed in enumerate(each.items, 1)]
+            write_output(_text(name, place, len(containers), each, table))
+            rows += table
+            bed_bpp[name if place == 1 else f"{name}#{place}"] = [_as_bed_bpp(packed) for packed in each.items]
+            plans.append(_as_plan(len(plans), container, each))
+        file = "replay.html" if len(orders) == 1 else f"replay_{number}.html"
+        _write(folder, {file: page([each.recording for each in containers], cell, name)})
+    columns = io.StringIO()
+    writer = csv.DictWriter(columns, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    _write(folder, {
+        "plan.csv": columns.getvalue(), "plan.json": json.dumps(bed_bpp, indent=1) + "\n", PLANS: to_lines(plans),
+    })  # fmt: skip
+    pages = "replay.html" if len(orders) == 1 else f"replay_1.html to {file}"
+    write_output(f"{folder}: plan.csv, plan.json, {PLANS}, {pages}\n")
+
+
+def _row(name: str, container: int, step: int, packed: "PackedItem") -> dict:
+    """Return the row of an item in ``plan.csv``."""
+    return {
+        "order": name, "container": container, "step": step, "item": packed.number, "id": packed.item.id,
+        **dict(zip(("x/mm", "y/mm", "z/mm"), packed.corner, strict=True)),
+        **dict(zip(("along_x/mm", "along_y/mm", "height/mm"), packed.size, strict=True)), "turned": int(packed.turned),
+        "weight/kg": packed.item.grams / 1000,
+    }  # fmt: skip
+
+
+def _text(name: str, place: int, count: int, container: "PackedContainer", rows: list[dict]) -> str:
+    """Return what is printed of a container."""
+    weight = sum(row["weight/kg"] for row in rows)
+    lines = [
+        f"{name}, container {place} of {count}: {len(rows)} item{'s' * (len(rows) != 1)}, "
+        f"{container.occupancy:.1%} of its volume, {weight:,.1f} kg, {container.top:.0f} mm high"
+    ]
+    keys = ("step", "item", "id", "x/mm", "y/mm", "z/mm", "along_x/mm", "along_y/mm", "height/mm")
+    cells = [
+        keys,
+        *([f"{row[key]:g}" if isinstance(row[key], float) else str(row[key]) for key in keys] for row in rows),
+    ]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines += ["  ".join(text.rjust(width) for text, width in zip(line, widths, strict=True)) for line in cells]
+    return "\n".join(lines) + "\n\n"
+
+
+def _as_bed_bpp(packed: "PackedItem") -> dict:
+    """Return an action of a packing plan of BED-BPP: front left bottom corner, and orientation 1 if turned."""
+    item = packed.item
+    return {
+        "item": {
+            "article": item.id, "id": item.id, "product_group": "", "length/mm": item.length, "width/mm": item.width,
+            "height/mm": item.height, "weight/kg": item.grams / 1000, "sequence": packed.number,
+        },
+        "flb_coordinates": list(packed.corner),
+        "orientation": int(packed.turned),
+    }  # fmt: skip
+
+
+def _as_plan(number: int, container: tuple[int, ...], packed: "PackedContainer") -> "EpisodePlan":
+    """Return the plan of a container for a physics engine, with the items' true sides."""
+    from pickplace.physics.plans import EpisodePlan, Placement
+
+    def metres(values) -> tuple[float, ...]:
+        return tuple(round(value / 1000, 9) for value in values)
+
+    placements = [Placement(metres(each.corner), metres(each.size)) for each in packed.items]
+    return EpisodePlan(number, metres(container), placements=placements)
+
+
+def _write(folder: Path, texts: dict[str, str]) -> None:
+    from pickplace.common.files import replaced_file
+
+    for name, text in texts.items():
+        with replaced_file(folder / name) as new:
+            new.write_text(text, encoding="utf-8")

@@ -1,0 +1,133 @@
+"""``pickplace-pack``: every item once, inside its container, apart from the others, and carried; files and errors."""
+
+import csv
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+from scipy.spatial import ConvexHull
+
+from pickplace import cli
+from pickplace.evaluation.pack import OrderPacker
+from pickplace.items.order_file import OrderItem
+from pickplace.physics.engine import build_engine
+from pickplace.physics.plans import read_plans
+
+ORDERS = Path(__file__).resolve().parents[2] / "docs/examples/orders/orders.csv"
+CONTAINER, CELL = (400, 300, 250), 20
+SIDES = st.tuples(st.integers(5, 200), st.integers(25, 200), st.one_of(st.integers(20, 120), st.floats(20, 120)))
+
+
+def overlap(one, other, axes=(0, 1, 2)):
+    """Least length of the common part of two boxes along some axes, mm."""
+    return min(
+        min(one.corner[a] + one.size[a], other.corner[a] + other.size[a]) - max(one.corner[a], other.corner[a])
+        for a in axes
+    )
+
+
+def is_carried(packed, others):
+    """Whether the centre lies in the hull of the true contact, by plane geometry."""
+    if packed.corner[2] == 0:
+        return True
+    corners = [
+        (x, y)
+        for other in others
+        if abs(other.corner[2] + other.size[2] - packed.corner[2]) < 1.0 and overlap(packed, other, (0, 1)) > 0
+        for x in (max(packed.corner[0], other.corner[0]),
+                  min(packed.corner[0] + packed.size[0], other.corner[0] + other.size[0]))
+        for y in (max(packed.corner[1], other.corner[1]),
+                  min(packed.corner[1] + packed.size[1], other.corner[1] + other.size[1]))
+    ]  # fmt: skip
+    centre = np.array([packed.corner[a] + packed.size[a] / 2 for a in (0, 1)])
+    return bool((ConvexHull(corners).equations @ [*centre, 1] < 0).all())
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.lists(SIDES, min_size=1, max_size=25), st.booleans())
+def test_items_lie_apart_inside_and_are_carried(sizes, keep):
+    items = [OrderItem(str(n), *map(float, sides), 100, f"line {n}") for n, sides in enumerate(sizes)]
+    _, containers = OrderPacker(CONTAINER, CELL).pack(items, keep_sequence=keep)
+    numbers = [packed.number for each in containers for packed in each.items]
+    assert sorted(numbers) == [*range(1, len(items) + 1)]
+    for each in containers:
+        assert not keep or [packed.number for packed in each.items] == sorted(packed.number for packed in each.items)
+        for place, packed in enumerate(each.items):
+            assert items[packed.number - 1] is packed.item
+            assert packed.size[packed.turned] == packed.item.length
+            assert all(0 <= packed.corner[a] <= CONTAINER[a] - packed.size[a] + 1e-6 for a in range(3))
+            before = each.items[:place]
+            assert all(overlap(packed, other) < 1e-6 for other in before)
+            assert is_carried(packed, before), (packed, before)
+        volume = sum(math.prod(packed.size) for packed in each.items)
+        assert each.occupancy == pytest.approx(volume / math.prod(CONTAINER))
+
+
+@pytest.fixture
+def pack(monkeypatch, capsys, tmp_path):
+    def call(*words, code=0):
+        monkeypatch.setattr(sys, "argv", ["pickplace-pack", *map(str, words), "--out", str(tmp_path / "out")])
+        try:
+            cli.pack()
+            found = 0
+        except SystemExit as end:
+            found = end.code
+        out, err = capsys.readouterr()
+        assert found == code, err
+        return tmp_path / "out" if code == 0 else err, out
+
+    return call
+
+
+def test_the_command_writes_what_it_prints(pack):
+    folder, out = pack(ORDERS, "--container", "300x300x250", "--cell", "10")
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "plan.csv", "plan.json", "plans.jsonl", *(f"replay_{number}.html" for number in range(1, 7)),
+    ]  # fmt: skip
+    assert "1001, container 1 of 1: 6 items, 14.8% of its volume, 2.8 kg" in out
+    with (folder / "plan.csv").open() as file:
+        rows = [*csv.DictReader(file)]
+    plan = json.loads((folder / "plan.json").read_text())
+    assert [*plan] == ["1001", "1002", "1003", "1004", "1005", "1006"]
+    actions = [action for actions in plan.values() for action in actions]
+    assert len(rows) == len(actions) == 39
+    for row, action in zip(rows, actions, strict=True):
+        assert [float(row[key]) for key in ("x/mm", "y/mm", "z/mm")] == action["flb_coordinates"]
+        assert (row["id"], int(row["turned"])) == (action["item"]["id"], action["orientation"])
+    plans = read_plans(folder / "plans.jsonl")  # which checks that nothing overlaps or floats
+    assert all(
+        outcome.ending == "done" for outcome in build_engine(OmegaConf.create({"_target_": "settle"})).carry_out(plans)
+    )
+    assert (folder / "replay_6.html").read_text().startswith("<!DOCTYPE html>")
+
+
+def test_a_second_container_takes_what_is_left(pack, tmp_path):
+    (path := tmp_path / "pallet.csv").write_text("l,w,h,kg,qty\n200,300,200,1,3\n100,100,30,1,1\n")
+    folder, out = pack(path, "--container", "400x300x250")
+    assert "pallet, container 1 of 2: 3 items" in out and "pallet, container 2 of 2: 1 item," in out
+    assert [*json.loads((folder / "plan.json").read_text())] == ["pallet", "pallet#2"]
+    assert (folder / "replay.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--container", "400x300"], "--container=400x300: expected whole millimetres, such as 1200x800x1500."),
+        (["--container", "400x300x250", "--cell", "7"], "container=400x300x250: expected a length and a width that"),
+        (["--container", "100x100x250"], "orders.csv, line 4: 140 x 90 x 45 mm; expected an item that fits the"),
+        (["--container", "400x300x250", "--planner", "policy"], "planner=policy: expected one that needs no training"),
+        (["--container", "400x300x250", "--planner", "jointdbl"], "did you mean 'joint_dbl'?"),
+        (["--container", "400x300x250", "--unit", "inch"], "--unit='inch': expected 'mm'"),
+        (["--container", "1000x1000x250", "--cell", "1"], "cell=1 mm is too fine: tote_size=[1000, 1000, 250]"),
+        (["--container", "400x300x9999"], "container=400x300x9999: expected a height of 1 to 2,000 mm."),
+    ],
+)  # fmt: skip
+def test_bad_words_are_refused_in_one_sentence(pack, words, message):
+    err, _ = pack(ORDERS, *words, code=2)
+    assert message in err and err.count("\n") == 1
