@@ -127,7 +127,7 @@ class OrderPacker:
         Raises:
             ValueError: for an item that fits into no container, naming its place in the file.
         """
-        refuse_any((item for item in items if not self._fits(item)), self._misfit)
+        self.check(items)
         cell = self._cell_for(items)
         planner, left = self._make(cell), list(enumerate(items, 1))
         containers: list[PackedContainer] = []
@@ -138,14 +138,21 @@ class OrderPacker:
                 tried.append(self._fill(cell, planner, sequence, len(containers)))
             # The most items, of these the greatest volume, of these the lowest pile.
             best, left = min(tried, key=lambda each: (len(each[1]), -each[0].occupancy, each[0].top))
+            refuse_if(
+                not best.items, f"planner={self._name}: it places none of {len(left)} items in an empty container."
+            )
             left = sorted(left)
             containers.append(best)
         return cell, containers
 
+    def check(self, items: Sequence[OrderItem]) -> None:
+        """Refuse an item that fits into no container, with a ``ValueError`` that names its place in the file."""
+        refuse_any((item for item in items if not self._fits(item)), self._misfit)
+
     def _sides(self, item: OrderItem) -> tuple[int, int, int]:
         """Return an item's sides in cells and millimetres, rounded up."""
-        w, d = (math.ceil(side / self.cell_mm - 1e-6) for side in (item.length, item.width))
-        return w, d, math.ceil(item.height - 1e-6)
+        w, d = (max(1, math.ceil(side / self.cell_mm - 1e-6)) for side in (item.length, item.width))
+        return w, d, max(1, math.ceil(item.height - 1e-6))
 
     def _fits(self, item: OrderItem) -> bool:
         (w, d, h), (wide, deep) = self._sides(item), (side // self.cell_mm for side in self.container[:2])
@@ -189,6 +196,12 @@ class OrderPacker:
             corner = x * self.cell_mm, y * self.cell_mm, round(below, 6)
             packed.append(PackedItem(item, place, corner, recording.moves[-1].rotation % 2 == 1))
             surface = apply(cell, state, action).surface
+            # In the map a top is rounded up once, not with each item of a pile: tops that are level there are so within
+            # a millimetre.
+            whole = math.ceil(below + item.height - 1e-6)
+            surface[0, x : x + w, y : y + d] -= 2 * (
+                recording.moves[-1].z + self._sides(item)[2] - whole
+            )  # see `State`
             for axis, count in enumerate((w, d)):
                 if packed[-1].size[axis] < count * self.cell_mm - 1e-6:  # it does not fill its last cells
                     last = surface[0, x : x + w, y : y + d].select(axis, count - 1)

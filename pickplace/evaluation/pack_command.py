@@ -69,6 +69,7 @@ def run(args: argparse.Namespace) -> None:
     refuse_if(not match, f"--container={args.container}: expected whole millimetres, such as 1200x800x1500.")
     length, width, height = map(int, match.groups() if match else ())
     container = length, width, height
+    refuse_if(not min(container), f"--container={args.container}: expected sides of 1 mm or more.")
     refuse_if(not 1 <= args.cell <= MAX_LENGTH, f"--cell={args.cell}: expected 1 to {MAX_LENGTH:,} mm.")
     from pickplace.common.validate import one_of
     from pickplace.evaluation.pack import OrderPacker
@@ -78,6 +79,8 @@ def run(args: argparse.Namespace) -> None:
 
     orders = read_orders(args.order, one_of("--unit", args.unit, MILLIMETRES), key="order")
     packer = OrderPacker(container, args.cell, args.planner)
+    for order in orders:  # before anything is written
+        packer.check(order.items)
     folder, rows, bed_bpp = Path(args.out), [], {}
     plans: list[EpisodePlan] = []
     folder.mkdir(parents=True, exist_ok=True)
@@ -88,7 +91,10 @@ def run(args: argparse.Namespace) -> None:
             table = [_row(name, place, step, packed) for step, packed in enumerate(each.items, 1)]
             write_output(_text(name, place, len(containers), each, table))
             rows += table
-            bed_bpp[name if place == 1 else f"{name}#{place}"] = [_as_bed_bpp(packed) for packed in each.items]
+            key = name if place == 1 else f"{name}#{place}"
+            while key in bed_bpp:  # another order has this name
+                key += "'"
+            bed_bpp[key] = [_as_bed_bpp(packed) for packed in each.items]
             plans.append(_as_plan(len(plans), container, each))
         file = "replay.html" if len(orders) == 1 else f"replay_{number}.html"
         _write(folder, {file: page([each.recording for each in containers], cell, name)})

@@ -33,6 +33,7 @@ COLUMN = re.compile(r"(.*?)\s*(?:[/_ (\[]\s*(mm|cm|m|kg|g)\s*[)\]]?)?")  # a nam
 EXPECTED = "columns length, width, height and weight, such as length/mm and weight/kg; and order, id or quantity if any"
 
 MAX_LENGTH, MAX_GRAMS = 10_000, 10_000_000  # of an item: 10 m, 10 t
+MAX_NAME = 100  # letters of the name of an order or an article
 MAX_QUANTITY, MAX_ITEMS = 10_000, 2_000_000  # of a line, of a file
 
 
@@ -115,10 +116,11 @@ def _words(item: OrderItem) -> str:
 
 
 def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
-    first = text.partition("\n")[0]
+    first = text.lstrip().partition("\n")[0]
     with reworded(csv.Error, lambda error: ValueError(f"{path}: {error}; expected a CSV in UTF-8.")):
         reader = csv.reader(io.StringIO(text, newline=""), delimiter=";" if ";" in first and "," not in first else ",")
         header: tuple[str, ...] = ()
+        header_line = 0
         for row in reader:
             fields = tuple(field.strip() for field in row)
             if not any(fields):
@@ -129,8 +131,9 @@ def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
                     f"{path}, line {reader.line_num}: got {len(fields)} fields, expected {len(header)} as in the "
                     "header.",
                 )
-                yield _Row(f"line {reader.line_num}", header, fields, "line 1")
-            header = header or fields
+                yield _Row(f"line {reader.line_num}", header, fields, f"line {header_line}")
+            else:
+                header, header_line = fields, reader.line_num
 
 
 def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
@@ -154,7 +157,7 @@ def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
         for number in sorted(items, key=int):
             if not isinstance(items[number], dict):
                 raise wrong(f"order {excerpt(name)}, item {number} is {excerpt(items[number])}")
-            place, entries = f"order {name}, item {number}", {**items[number], "order": name}
+            place, entries = f"order {_printable(name)}, item {number}", {**items[number], "order": name}
             yield _Row(place, tuple(entries), tuple(entries.values()), place)
 
 
@@ -168,10 +171,15 @@ def _read_header(place: str, header: Sequence, unit: str) -> dict[str, _Column]:
             f"{place}: the column {excerpt(key)} is not read yet, and an order would be packed as if it said nothing; "
             "expected a file without it.",
         )
-        refuse_if(name in found, f"{place}: two columns {excerpt(name)}; expected one.")
+        known = name in {each for names in NAMES.values() for each in names}
+        refuse_if(known and name in found, f"{place}: two columns {excerpt(name)}; expected one.")
         found[name] = key, suffix
-    # In l,w,h and length,width,height the width is the second side; in w,d,h the first.
-    second = {"length": ("length", "l"), "width": ("width", "w")} if {"length", "l"} & {*found} else {}
+    # In l,w,h and length,width,height the width is the second side; in w,d,h and width,depth,height the first.
+    second = {}
+    if {"length", "l"} & {*found}:
+        second = {"length": ("length", "l"), "width": ("width", "w", "d", "depth")}
+    elif {"d", "depth"} & {*found}:
+        second = {"length": ("w", "width"), "width": ("d", "depth")}
     columns = {}
     for column, names in (NAMES | second).items():
         for name in (name for name in names if name in found and column not in columns):
@@ -192,19 +200,25 @@ def _read_header(place: str, header: Sequence, unit: str) -> dict[str, _Column]:
     return columns
 
 
+def _printable(name) -> str:
+    """Return a name of a file without what could change a terminal or break a line; "" for none."""
+    text = "" if name is None else str(name)
+    return "".join(letter if letter.isprintable() else "?" for letter in text)[:MAX_NAME]
+
+
 def _read_row(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[OrderItem, str, int]:
     """Return the item of a row, the name of its order, and how many there are."""
 
     def read(name: str, most: float) -> float:
         key, unit = columns[name]
-        with suppress(TypeError, ValueError):
+        with suppress(TypeError, ValueError, OverflowError):
             if 0 < (number := float(row[key])) * unit <= most and not isinstance(row[key], bool):
                 return number * unit
         raise ValueError(f"{place}: {key}={excerpt(row[key])}: expected a number above 0, at most {most / unit:,g}.")
 
     length, width, height = (read(name, MAX_LENGTH) for name in SIDES)
-    grams = math.ceil(read("weight", MAX_GRAMS) - 1e-6)
+    grams = max(1, math.ceil(read("weight", MAX_GRAMS) - 1e-6))
     count = read("quantity", MAX_QUANTITY) if "quantity" in columns else 1.0
     refuse_if(count != int(count), f"{place}: {count:g} pieces; expected a whole number.")
-    identity, order = (str(row[columns[name].key]) if name in columns else "" for name in ("id", "order"))
+    identity, order = (_printable(row[columns[name].key]) if name in columns else "" for name in ("id", "order"))
     return OrderItem(identity, length, width, height, grams, place), order, int(count)

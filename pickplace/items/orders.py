@@ -80,7 +80,7 @@ class Orders(ItemDistribution):
     def cells(self, item: OrderItem) -> tuple[int, int, int]:
         """Return the sides of an item in cells and height units, rounded up."""
         units = (self._cell, self._cell, self._unit)
-        w, d, h = (math.ceil(side / unit - ROUNDING) for side, unit in zip(item[1:4], units, strict=True))
+        w, d, h = (max(1, math.ceil(side / unit - ROUNDING)) for side, unit in zip(item[1:4], units, strict=True))
         refuse_if(
             max(w, d, h) > MAX_LENGTH, f"{item.place}: {w} x {d} x {h} cells; expected at most {MAX_LENGTH:,} each."
         )

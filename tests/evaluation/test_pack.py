@@ -69,6 +69,25 @@ def test_items_lie_apart_inside_and_are_carried(sizes, keep):
         assert each.occupancy == pytest.approx(volume / math.prod(CONTAINER))
 
 
+def test_tops_that_are_rounded_alike_are_not_level():
+    """The pile of ten ends 8 mm below the box beside it, though ten heights of 10.1 mm rounded up make 110 mm, too."""
+    sizes = [(40, 100, 109.2), *[(160, 100, 10.1)] * 10, (200, 100, 20)]
+    items = [OrderItem(str(n), *map(float, sides), 100, f"line {n}") for n, sides in enumerate(sizes)]
+    _, containers = OrderPacker((200, 100, 300), CELL).pack(items, keep_sequence=True)
+    for each in containers:
+        assert all(is_carried(packed, each.items[:place]) for place, packed in enumerate(each.items))
+    assert len(containers) == 2  # nothing carries the last item in the first one
+
+
+def test_tiny_items_and_orders_of_one_name_end(pack, tmp_path):
+    (path := tmp_path / "a.csv").write_text(
+        "order,l,w,h,kg\n7,300,200,200,1\n7,300,200,200,1\n7#2,60,50,20,1\n8,1e-7,50,20,1e-9\n8\x1b[31m,50,50,50,1\n"
+    )
+    folder, out = pack(path, "--container", "300x200x200")
+    assert [*json.loads((folder / "plan.json").read_text())] == ["7", "7#2", "7#2'", "8", "8?[31m"]
+    assert "\x1b" not in out
+
+
 @pytest.fixture
 def pack(monkeypatch, capsys, tmp_path):
     def call(*words, code=0):
@@ -118,6 +137,7 @@ def test_a_second_container_takes_what_is_left(pack, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["--container", "0x300x250"], "--container=0x300x250: expected sides of 1 mm or more."),
         (["--container", "400x300"], "--container=400x300: expected whole millimetres, such as 1200x800x1500."),
         (["--container", "400x300x250", "--cell", "7"], "container=400x300x250: expected a length and a width that"),
         (["--container", "100x100x250"], "orders.csv, line 4: 140 x 90 x 45 mm; expected an item that fits the"),

@@ -187,6 +187,11 @@ def test_a_bad_file_is_refused_with_its_line(tmp_path, text, message):
             "order a, item 1: length/mm=True: expected a number above 0",
         ),
         ("{}", "no items"),
+        (
+            '{"a\\nb": {"item_sequence": {"1": {"length/mm": 1' + 400 * "0" + ', "width/mm": 1, "height/mm": 1, '
+            '"weight/kg": 1}}}}',
+            r"order a\?b, item 1: length/mm=",
+        ),
     ],
 )
 def test_bad_json_is_refused_with_its_order(tmp_path, text, message):
@@ -201,6 +206,18 @@ def test_an_item_that_fits_nowhere_is_named_with_its_line(tmp_path):
         PickPlaceEnv(Orders(path, 0.05))
     with pytest.raises(ValueError, match="items.cell_size=null: expected the side of a cell in metres"):
         Orders(path, None)
+
+
+@pytest.mark.parametrize(
+    ("header", "sides"),
+    [
+        ("w,d,h", (1, 2, 3)), ("w,h,d", (1, 3, 2)), ("l,w,h", (1, 2, 3)), ("length,width,height", (1, 2, 3)),
+        ("length,depth,height", (1, 2, 3)), ("width,depth,height", (1, 2, 3)), ("Width [mm],Length [mm],h", (2, 1, 3)),
+    ],
+)  # fmt: skip
+def test_names_of_sides(tmp_path, header, sides):
+    (path := tmp_path / "a.csv").write_text(f"\n{header},kg,,\n1,2,3,4,,\n")
+    assert read_orders(path)[0].items[0][1:4] == sides
 
 
 def test_quantities_and_semicolons(tmp_path):
