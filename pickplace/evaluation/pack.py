@@ -37,14 +37,14 @@ SEQUENCES: tuple[Callable[[OrderItem], float], ...] = (
 class RoundedUp(Bearing):
     """As :class:`Bearing`, for items that may be up to a cell smaller than their cells, at the ends of these.
 
-    Cells that an item does not fill bear nothing. So an item whose cells are all supported is supported; and else its
+    Cells that an item does not fill bear nothing. So an item whose four corners are supported cannot tip; and else its
     centre is off the middle of its cells by up to half a cell along each axis, which the margin must exceed.
     """
 
     margin: float
 
     def stable(self, contact: Contact) -> Tensor:
-        return super().stable(contact) | (contact.share >= 1)
+        return super().stable(contact) | (contact.corners >= 4)
 
 
 @dataclass(frozen=True)
