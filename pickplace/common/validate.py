@@ -65,6 +65,15 @@ def refuse_any(found: Iterable, message: Callable[[Any], str], error: type[Excep
         raise error(message(first))
 
 
+def without_twins(pairs: list[tuple[str, Any]]) -> dict:
+    """Return an object of a JSON text; refuse a key that stands twice in it: readers differ in which value counts."""
+    found: dict = {}
+    for key, value in pairs:
+        refuse_if(key in found, f"{excerpt(key)} stands twice in an object; expected each key once.")
+        found[key] = value
+    return found
+
+
 @contextmanager
 def reworded(errors, new: Callable[[Any], Exception]) -> Iterator[None]:
     """Raise ``new(error)`` instead of an error of these types in the block."""

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from pickplace.common.validate import refuse_any, refuse_if, reworded
 from pickplace.config.registry import find
@@ -17,10 +16,9 @@ from pickplace.rules.cell import MAX_SIDE, CellSpec
 from pickplace.rules.gripper.rules import Overlap
 from pickplace.rules.item import Item
 from pickplace.rules.masks import footprint_mask, placing_maps
-from pickplace.rules.state import EMPTY, Failure, State
+from pickplace.rules.state import EMPTY, Failure, State, surface_from
 from pickplace.rules.step import apply
-from pickplace.rules.support.contact import Contact
-from pickplace.rules.support.rules import Bearing
+from pickplace.rules.support.rules import RoundedUp
 from pickplace.views.recording import Recording, record_moves
 
 LEAST_MARGIN = 20.0  # of an item's centre from the edge of what carries it, mm: piles are high
@@ -31,20 +29,6 @@ SEQUENCES: tuple[Callable[[OrderItem], float], ...] = (
     lambda item: -item.length * item.width * item.height,
     lambda item: -item.height,
 )
-
-
-@dataclass(frozen=True)
-class RoundedUp(Bearing):
-    """As :class:`Bearing`, for items that may be up to a cell smaller than their cells, at the ends of these.
-
-    Cells that an item does not fill bear nothing. So an item whose four corners are supported cannot tip; and else its
-    centre is off the middle of its cells by up to half a cell along each axis, which the margin must exceed.
-    """
-
-    margin: float
-
-    def stable(self, contact: Contact) -> Tensor:
-        return super().stable(contact) | (contact.corners >= 4)
 
 
 @dataclass(frozen=True)
@@ -69,7 +53,11 @@ class PackedContainer:
 
     items: list[PackedItem]
     recording: Recording  #: for the replay page
-    occupancy: float  #: share of its volume that the items fill
+
+    @property
+    def occupancy(self) -> float:
+        """Share of its volume that the items fill."""
+        return self.recording.occupancy
 
     @property
     def top(self) -> float:
@@ -80,8 +68,8 @@ class PackedContainer:
 class OrderPacker:
     """Packs orders into containers of one size, without a gripper.
 
-    An item lies in the corner with the least x and y of the cells that it takes. Heights are exact. Nothing sticks out
-    of the container, or passes its rim.
+    An item lies in the corner with the least x and y of the cells that it takes. Items that carry another one together
+    are level within a millimetre. Nothing sticks out of the container, or passes its rim.
 
     Args:
         container: length, width and height, mm.
@@ -195,18 +183,14 @@ class OrderPacker:
             tops[x : x + w, y : y + d] = below + item.height
             corner = x * self.cell_mm, y * self.cell_mm, round(below, 6)
             packed.append(PackedItem(item, place, corner, recording.moves[-1].rotation % 2 == 1))
-            surface = apply(cell, state, action).surface
-            # In the map a top is rounded up once, not with each item of a pile: tops that are level there are so within
-            # a millimetre.
-            whole = math.ceil(below + item.height - 1e-6)
-            surface[0, x : x + w, y : y + d] -= 2 * (
-                recording.moves[-1].z + self._sides(item)[2] - whole
-            )  # see `State`
+            after = state._replace(surface=apply(cell, state, action).surface)
+            heights, bearing = after.heights, after.bearing
+            # A top is rounded up once, not with each item of its pile: so level tops are level within a millimetre.
+            heights[0, x : x + w, y : y + d] = math.ceil(below + item.height - 1e-6)
             for axis, count in enumerate((w, d)):
                 if packed[-1].size[axis] < count * self.cell_mm - 1e-6:  # it does not fill its last cells
-                    last = surface[0, x : x + w, y : y + d].select(axis, count - 1)
-                    last &= ~1  # bears nothing, see `State`
+                    bearing[0, x : x + w, y : y + d].select(axis, count - 1).fill_(False)
+            surface = surface_from(heights, bearing)
         recording.ending = Failure.STUCK if left else Failure.NONE
-        volume = sum(math.prod(each.size) for each in packed)
-        recording.occupancy = volume / math.prod(self.container)
-        return PackedContainer(packed, recording, recording.occupancy), left
+        recording.occupancy = sum(math.prod(each.size) for each in packed) / math.prod(self.container)
+        return PackedContainer(packed, recording), left

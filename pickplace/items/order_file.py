@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pickplace.common.files import MAX_TABLE_BYTES, read_text
-from pickplace.common.validate import at_most, excerpt, refuse_if, reworded
+from pickplace.common.validate import at_most, excerpt, refuse_if, reworded, without_twins
 
 #: Name of a column -> the names that a file may have for it, in any case; a unit may follow, as in ``length/mm``.
 NAMES = {
@@ -142,12 +142,8 @@ def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
             f'{path}: {what}; expected {{order: {{"item_sequence": {{"1": item, ...}}}}}}, as of BED-BPP.'
         )
 
-    def unique(pairs: list[tuple]) -> dict:
-        refuse_if(len(found := dict(pairs)) < len(pairs), f"a key is there twice among {excerpt([*found])}")
-        return found
-
     with reworded((ValueError, RecursionError), lambda error: wrong(f"it cannot be read ({error})")):
-        orders = json.loads(text, object_pairs_hook=unique)
+        orders = json.loads(text, object_pairs_hook=without_twins)
     if not isinstance(orders, dict):
         raise wrong(f"got {excerpt(orders)}")
     for name, order in orders.items():
@@ -165,7 +161,9 @@ def _read_header(place: str, header: Sequence, unit: str) -> dict[str, _Column]:
     """Return the columns that a header names, by the names of :data:`NAMES`."""
     found: dict[str, tuple[str, str | None]] = {}
     for key in header:
-        name, suffix = COLUMN.fullmatch(str(key).strip().lower()).groups()  # type: ignore[union-attr]  # matches any
+        match = COLUMN.fullmatch(" ".join(str(key).lower().split()))
+        assert match  # it matches any text
+        name, suffix = match[1].replace(" ", "_").replace("-", "_"), match[2]
         refuse_if(
             name in NOT_KNOWN,
             f"{place}: the column {excerpt(key)} is not read yet, and an order would be packed as if it said nothing; "

@@ -20,8 +20,8 @@ ROUNDING = 1e-6  # of a cell: three cells of 0.05 m are not exactly 0.15 m in bi
 class Orders(ItemDistribution):
     """The orders of a file: an episode is one order, and its items arrive in the order's sequence.
 
-    Train, validation and test have different orders: which, is decided at random, and is the same each time. An order
-    that is in the file twice counts once. Validation and test play each of theirs once, one episode each.
+    Train, validation and test have different orders, drawn at random, the same each time. An order that is in the file
+    twice counts once. Validation and test play each of theirs once.
 
     Sides are rounded up to whole cells and height units; :attr:`volumes` has the true volumes.
 
@@ -30,9 +30,8 @@ class Orders(ItemDistribution):
         cell_size: side of a cell, m.
         height_unit: of a height, in cells.
         unit: of lengths in the file without a unit in the header, ``"mm"``, ``"cm"`` or ``"m"``.
-        generate: train with orders that are drawn: as long as one of those that train, and made of their lines, an
-            article and how many of it follow each other; each line is as early or late as in its own order. Else train
-            with these orders as they are.
+        generate: train with new orders, made of the lines of those that train. A line is an article that comes several
+            times in a row; it is as early or late as in its own order. False: train with the orders as they are.
 
     Attributes:
         volumes: float64 ``[K]``, the true volume of each kind, in cells times height units.

@@ -108,13 +108,13 @@ def _behind_holes(seen: Heights, room: Room, margin: float, accuracy: float, sha
     if not seen.holes.any():
         return unknown
     surface, step, patch = seen.surface(room), level_range(accuracy), room.sides[0] / shape[0]
-    shift = (
-        np.linalg.norm(room.corners - seen.origin[:2], axis=1).max() * room.rim / seen.origin[2]
-    )  # of a ray between rim and floor, at most
+    away = np.linalg.norm(room.corners - seen.origin[:2], axis=1).max()
+    shift = away * room.rim / seen.origin[2]  # of a ray between rim and floor, at most
     for level in np.unique(np.round(seen.height[seen.is_within(room, margin)] / step)) * step:
-        holes = seen.holes_above(level, surface, room, accuracy)
-        rays = seen.rays[ndimage.binary_dilation(holes, AROUND)] if holes.any() else seen.rays[:0, 0]
-        for height in np.linspace(level, max(level, room.rim), math.ceil(shift / (patch / 2)) + 2) if len(rays) else ():
+        if not (holes := seen.holes_above(level, surface, room, accuracy)).any():
+            continue
+        rays = seen.rays[ndimage.binary_dilation(holes, AROUND)]
+        for height in np.linspace(level, max(level, room.rim), math.ceil(shift / (patch / 2)) + 2):
             points = seen.origin[:2] + rays[:, :2] * ((height - seen.origin[2]) / rays[:, 2])[:, None]
             index = np.floor(points / patch).astype(int)
             unknown[tuple(index[((index >= 0) & (index < shape)).all(1)].T)] = True

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from typing_extensions import Self
 
 from pickplace.common.errors import sentence
-from pickplace.common.validate import at_most, excerpt, number, refuse_any, refuse_if, reworded
+from pickplace.common.validate import at_most, number, refuse_any, refuse_if, reworded, without_twins
 from pickplace.robot.box import ACCURACY, CLEARANCE, Box
 from pickplace.serve.deadline import Deadline
 
@@ -187,15 +187,6 @@ def finite_float(text: str) -> float:
     if math.isfinite(value := float(text)):
         return value
     raise ValueError(f"the request is not JSON: got {text[:20]}, expected a finite number.")
-
-
-def without_twins(pairs: list[tuple[str, Any]]) -> dict:
-    """Return an object of a JSON text; refuse a key that stands twice in it: readers differ in which value counts."""
-    found: dict = {}
-    for key, value in pairs:
-        refuse_if(key in found, f"{excerpt(key)} stands twice in an object; expected each key once.")
-        found[key] = value
-    return found
 
 
 def read_request(text: bytes, limits: Limits, defaults: dict) -> tuple[int, dict, PlanRequest | None]:

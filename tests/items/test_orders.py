@@ -161,6 +161,7 @@ def test_true_volumes_are_reported(tmp_path):
         ("l,w,h,kg,qty\n1,2,3,4,1.5\n", r"line 2: 1.5 pieces; expected a whole number\."),
         ("l,w,h,weight/mm\n1,2,3,4\n", r"line 1: the column 'weight/mm' is in mm; expected g or kg\."),
         ("l,w,h,kg,max_load\n1,2,3,4,5\n", r"line 1: the column 'max_load' is not read yet"),
+        ("l,w,h,kg,Max Load [kg]\n1,2,3,4,5\n", r"line 1: the column 'Max Load \[kg\]' is not read yet"),
         ("l,l,h,kg\n1,2,3,4\n", r"line 1: two columns 'l'; expected one\."),
         ("id,l,w,h,kg\na,1,2,3,4\na,1,2,3,5\n", r"line 3: item 'a' is 1 x 2 x 3 mm, 5 kg, but 1 x 2 x 3 mm, 4 kg in"),
         ("l,w,h,kg\n", r"no items, expected at least one\."),
@@ -177,7 +178,7 @@ def test_a_bad_file_is_refused_with_its_line(tmp_path, text, message):
     ("text", "message"),
     [
         ("{", "it cannot be read"),
-        ('{"a": {}, "a": {}}', "a key is there twice"),
+        ('{"a": {}, "a": {}}', "'a' stands twice in an object"),
         ("[]", r"got \[\]; expected {order: "),
         ('{"a": {}}', "order 'a' has no item_sequence with numbers as its keys"),
         ('{"a": {"item_sequence": {"1": 3}}}', "order 'a', item 1 is 3; expected"),
@@ -213,6 +214,7 @@ def test_an_item_that_fits_nowhere_is_named_with_its_line(tmp_path):
     [
         ("w,d,h", (1, 2, 3)), ("w,h,d", (1, 3, 2)), ("l,w,h", (1, 2, 3)), ("length,width,height", (1, 2, 3)),
         ("length,depth,height", (1, 2, 3)), ("width,depth,height", (1, 2, 3)), ("Width [mm],Length [mm],h", (2, 1, 3)),
+        ('"Length\n(mm)",Width,Height', (1, 2, 3)),
     ],
 )  # fmt: skip
 def test_names_of_sides(tmp_path, header, sides):

@@ -108,6 +108,19 @@ class Bearing(Hull):
         return contact.in_hull()
 
 
+@dataclass(frozen=True)
+class RoundedUp(Bearing):
+    """As :class:`Bearing`, for items that may be up to a cell smaller than the cells that they take, at the far ends.
+
+    The cells at these ends must bear nothing if the item does not fill them. An item whose four corners are supported
+    cannot tip then. Any other needs the margin: its centre is up to half a cell, along each axis, off the middle of its
+    cells.
+    """
+
+    def stable(self, contact: Contact) -> Tensor:
+        return super().stable(contact) | (contact.corners >= 4)
+
+
 #: The rules that a short form names; a number is the least share.
 RULES: dict[str, type[Support]] = {
     "half": Half,

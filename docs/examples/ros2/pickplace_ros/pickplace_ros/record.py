@@ -1,4 +1,4 @@
-"""What the node knows of bin and tote beside the images: docs/robot.md, "From images to motions"."""
+"""What the node remembers: what was placed, and which picks failed. See docs/robot.md, "From images to motions"."""
 
 from pickplace import Box, Plan
 
