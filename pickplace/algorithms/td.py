@@ -41,7 +41,8 @@ class TD(MinibatchDescent):
         self.use_parameters(self.network.parameters())
 
     def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
-        return self.descend(afterstates(batch, self.network, self.gamma, self.lmbda), at, self.objective)
+        after = totes_left(batch, self.policy)
+        return self.descend(with_targets(after, self.network, self.gamma, self.lmbda), at, self.objective)
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the mean squared error, of the values and of all their parts, and the share of the targets' variance
@@ -55,23 +56,29 @@ class TD(MinibatchDescent):
         return (whole + parts) / 2, {"loss_critic": whole, "explained_variance": explained}
 
 
+def totes_left(batch: TensorDictBase, policy: Policy) -> TensorDictBase:
+    """Return what the steps of a batch ``[N, T]`` led to, but for the items that arrived in the bin meanwhile."""
+    flat = batch.reshape(-1)
+    left = policy.items_left(flat, flat[policy.choice_key])
+    return batch["next"].copy().set("items", left.unflatten(0, batch.shape))
+
+
 @torch.no_grad()
-def afterstates(batch: TensorDictBase, network: ToteValue, gamma: float, lmbda: float) -> TensorDictBase:
-    """Return the totes that the steps of a batch left, ``[N * (T - 1)]``, with TD(lambda) targets as ``value_target``.
+def with_targets(after: TensorDictBase, network: ToteValue, gamma: float, lmbda: float) -> TensorDictBase:
+    """Return totes after placements with TD(lambda) targets as ``value_target``, ``[N * (T - 1)]``.
 
     A step from one afterstate to the next is the arrival of an item and its placement. Its reward is that of the
     *next* action of the batch. Where the item that arrived has no place, the environment has ended the episode already,
     together with the action before: the step to that end has reward 0.
 
     Args:
-        batch: ``[N, T]``, at least two steps; its rewards are not scaled.
+        after: the afterstates ``[N, T]``, at least two of each; their rewards are not scaled.
         network: of the values; there is a target for each of their parts.
         gamma: discount per step.
         lmbda: lambda of the returns.
     """
-    after = batch["next"]
     entries = [after[key] for key in network.in_keys]
-    value = network.parts(*(entry.flatten(0, 1) for entry in entries)).unflatten(0, batch.shape)
+    value = network.parts(*(entry.flatten(0, 1) for entry in entries)).unflatten(0, after.shape)
     before, later = ([entry[:, part].flatten(0, 1) for entry in entries] for part in (slice(-1), slice(1, None)))
     ended = after["done"][:, :-1]
     reward = torch.where(ended, 0.0, network.reward_scale * after["reward"][:, 1:]).flatten(0, 1)

@@ -25,8 +25,8 @@ def _classes(module: str, **names: str) -> dict[str, str]:
 
 
 PLANNERS = _classes(
-    "planners", policy="policy.PolicyPlanner", lookahead="lookahead.Lookahead", joint_dbl="heuristics.JointDBL",
-    corner="heuristics.Corner", best_fit="spaces.BestFit", online_bph="spaces.OnlineBPH",
+    "planners", policy="policy.PolicyPlanner", lookahead="lookahead.Lookahead", beam="beam.Beam",
+    joint_dbl="heuristics.JointDBL", corner="heuristics.Corner", best_fit="spaces.BestFit", online_bph="spaces.OnlineBPH",
     heightmap_minimisation="heuristics.HeightmapMinimisation", individual_heuristic="heuristics.IndividualHeuristic",
     mcts="mcts.MCTS", random="heuristics.RandomFeasible", uniform="heuristics.UniformRandom",
 )  # fmt: skip

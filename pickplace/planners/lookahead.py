@@ -13,7 +13,7 @@ from pickplace.policies.base import MASKED, EstimatesValue, Policy, ScoresFootpr
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, Observation
 from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
-from pickplace.rules.observation import check_terms, observe
+from pickplace.rules.observation import Items, check_terms, observe
 from pickplace.rules.state import State
 from pickplace.rules.step import put_down
 
@@ -158,8 +158,8 @@ class Lookahead(MapPlanner):
             horizon: items after which the critic judges the state; None: played out to the end.
         """
         cell, policy, critic_keys = self.cell, self.policy, getattr(self.critic, "in_keys", ())
-        # A critic that sees the tote alone judges it before the next item arrives.
-        sees_items = not critic_keys or not {"bin_depth", "items"}.isdisjoint(critic_keys)
+        # Values of totes after placements are those before the next item arrives.
+        judges_before = isinstance(policy, EstimatesValue)
         self._decisions += 1
         state, problem = state.repeat(streams), problem.repeat_interleave(streams, 0)
         stream = torch.arange(len(problem), device=problem.device) % streams
@@ -170,8 +170,9 @@ class Lookahead(MapPlanner):
         # Items are spread only where the next one lies alone in the bin: with several, nobody has measured it.
         source = _Imagined(self.items, streams) if cell.bin_items == 1 else self.items
         for step in itertools.count():
-            if step == horizon and not sees_items:
-                volume[row] += self.critic(observe(self.terms, cell, state, critic_keys))[:, 0].double()
+            if step == horizon and judges_before:
+                seen = observe({**self.terms, "items": Items()}, cell, state, critic_keys)
+                volume[row] += self.critic(seen)[:, 0].double()
                 break
             address = seed[row], stream[row], arrived
             items, arrived = refill(cell, source, "train", *address, state.items, row >= 0, state.episode)

@@ -31,6 +31,7 @@ from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, action_mask
 from pickplace.rules.observation import item_keys, standard_terms
+from pickplace.rules.state import State
 
 #: The logit of what must not be chosen, far below what a network may score: its probability is exactly 0 in float32.
 #: The rest of float32's range is left for differences from the greatest logit.
@@ -216,6 +217,18 @@ class EstimatesValue(Protocol):
         """Return the module from the entries of the observation in its ``in_keys`` to values ``[..., 1]``.
 
         ``algo=td`` wants a :class:`~pickplace.policies.afterstate.value.ToteValue`, whose parts it learns.
+        """
+
+    def items_left(self, observation: Observation, choice: Tensor) -> Tensor:
+        """Return the items that a choice leaves in the bin, before others arrive, int64 ``[N, M, 5]``."""
+
+    def judge(self, before: State, choice: Tensor) -> tuple[State, Tensor, Tensor]:
+        """Return what choices lead to before others arrive, the volumes that they place, int64 ``[N]``, and the values
+        of what they leave, float32 ``[N]``, scaled as the network's.
+
+        Args:
+            before: the states.
+            choice: int64 ``[N]``, ``item * num_footprints + footprint``, feasible ones.
         """
 
 

@@ -12,7 +12,7 @@ from problems import SETTINGS, random_states
 from tensordict import TensorDict
 
 from pickplace import PickPlaceEnv
-from pickplace.algorithms.td import afterstates
+from pickplace.algorithms.td import totes_left, with_targets
 from pickplace.config.registry import build
 from pickplace.evaluation.play import play
 from pickplace.planners.policy import PolicyPlanner
@@ -35,30 +35,54 @@ SMALL = {
 }
 
 
+def weigh(net, std=3.0):
+    """Let a network's value depend on everything that it sees."""
+    torch.nn.init.normal_(net.head.weight, std=std)
+    torch.nn.init.normal_(net.waiting.sum.weight, std=0.3)
+
+
+def left_in_bins(items, taken):
+    """Return a table of bins without an item each, by plain Python."""
+    rows = []
+    for row, number in enumerate(taken.tolist()):
+        bin_ = items.cuboids[row].tolist()
+        rows.append([*bin_[:number], *bin_[number + 1 :], [0] * 5])
+    return torch.tensor(rows)
+
+
 @pytest.mark.parametrize("kind", SMALL)
-@pytest.mark.parametrize("options", [case for case in SETTINGS if "bin_items" not in case])
-def test_a_score_is_the_value_of_the_tote_that_the_step_leaves(kind, options):
+@pytest.mark.parametrize("options", SETTINGS)
+def test_a_score_is_the_items_volume_and_the_value_of_what_the_step_leaves(kind, options):
+    """Up to the volume of the largest item in the bin."""
     torch.manual_seed(0)
     settings = {**options, "masks": ("action", "corner")}
     policy = kind(PickPlaceEnv(**settings).cell, temperature=0.5, compute_dtype="float32", **SMALL[kind])
-    torch.nn.init.normal_(policy.network.head.weight, std=3)
+    weigh(policy.network)
     for env, observation in random_states(4, **settings):
         with torch.no_grad():
+            largest = env.state.items.volume.amax(1, keepdim=True)
             choice = policy.logits(observation).argmax(1)
             score = policy.logits(observation).gather(1, choice[:, None])
-            after = env.step(observation.clone().set("action", policy.to_action(choice, observation)))["next"]
+            left = left_in_bins(env.state.items, choice // env.cell.num_footprints)
+            data = env.step(observation.clone().set("action", policy.to_action(choice, observation)))
+            after = data["next"].set("items", left)
             value = policy.network(*(after[key] for key in policy.network.in_keys))
-        torch.testing.assert_close(2 * value, score)
+        torch.testing.assert_close(2 * (value + after["reward"] - largest), score)
+        batch = data.set(policy.choice_key, choice).unsqueeze(1)
+        assert torch.equal(totes_left(batch, policy)["items"][:, 0], left)
 
 
 @pytest.mark.parametrize("kind", SMALL)
-@pytest.mark.parametrize("options", [{"tote_size": (4, 3, 3)}, {"tote_size": (4, 4, 2), "rotations": 1}])
+@pytest.mark.parametrize("options", [
+    {"tote_size": (4, 3, 3)}, {"tote_size": (4, 4, 2), "rotations": 1},
+    {"tote_size": (4, 3, 3), "bin_items": 3, "bin_size": (6, 6, 2)},
+])  # fmt: skip
 def test_an_action_has_an_even_share_of_its_totes_probability(kind, options):
     """Against the single step: of the feasible actions, those that leave the same tote as a choice of the policy."""
     torch.manual_seed(0)
     settings = {**options, "masks": ("action", "corner"), "num_envs": 3}
     policy = kind(PickPlaceEnv(**settings).cell, compute_dtype="float32", temperature=1.0, **SMALL[kind])
-    torch.nn.init.normal_(policy.network.head.weight, std=3)
+    weigh(policy.network)
     for env, observation in random_states(3, **settings):
         with torch.no_grad():
             found = policy.action_log_probs(observation).exp()
@@ -66,10 +90,12 @@ def test_an_action_has_an_even_share_of_its_totes_probability(kind, options):
         for row in range(3):
             leads_to: dict[int, list[int]] = {}
             for action in observation["action_mask"][row].nonzero()[:, 0].tolist():
-                x, y, w, d = apply(env.cell, env.state.rows([row]), torch.tensor([action])).footprint[0].tolist()
-                item = env.state.items.rows((row, 0))
+                step = apply(env.cell, env.state.rows([row]), torch.tensor([action]))
+                x, y, w, d = step.footprint[0].tolist()
+                item, number = env.state.items.rows((row, int(step.taken))), int(step.taken)
                 parity = int((w, d) != (item.w, item.d))
-                leads_to.setdefault(int(footprint_index(env.cell.tote_size, parity, x, y)), []).append(action)
+                choice = number * env.cell.num_footprints + int(footprint_index(env.cell.tote_size, parity, x, y))
+                leads_to.setdefault(choice, []).append(action)
             expected = torch.zeros(env.cell.num_actions)
             for choice, actions in leads_to.items():
                 expected[actions] = wanted[row, choice] / len(actions)
@@ -80,8 +106,15 @@ def network(**settings):
     torch.manual_seed(0)
     small = {"grid": (6, 5, 4), "filters": 4, "hidden": 8, "compute_dtype": "float32"}
     net = PictureValue(**{**small, **settings})
-    torch.nn.init.normal_(net.head.weight, std=3)
+    weigh(net)
     return net
+
+
+def random_items(count, most=3):
+    """Return tables of 0 to 3 items, each with rows of zeros at the end."""
+    generator = torch.Generator().manual_seed(3)
+    items = torch.randint(1, 4, (count, most, 5), generator=generator)
+    return items * (torch.arange(most) < torch.randint(0, most + 1, (count, 1), generator=generator))[..., None]
 
 
 def random_totes(count, wide, deep, high):
@@ -91,11 +124,11 @@ def random_totes(count, wide, deep, high):
 
 @pytest.mark.parametrize("scale", [1, 3, 10])
 def test_a_finer_grid_shows_the_same_tote(scale):
-    net, (depth, height) = network(), random_totes(20, 6, 5, 4)
+    net, (depth, height), items = network(), random_totes(20, 6, 5, 4), random_items(20)
     finer = scale * depth.repeat_interleave(scale, 1).repeat_interleave(scale, 2)
     with torch.no_grad():
-        value = net(depth, height)
-        torch.testing.assert_close(net(finer, scale * height), scale**3 * value)
+        value = net(depth, height, items)
+        torch.testing.assert_close(net(finer, scale * height, scale * items), scale**3 * value)
         assert value.std() > 1 and (value >= 0).all() and (value[:, 0] <= depth.sum((1, 2))).all()
 
 
@@ -136,7 +169,7 @@ def cells_network(**settings):
     torch.manual_seed(0)
     small = {"depth_range": 4, "stem": 4, "filters": 8, "compute_dtype": "float32"}
     net = CellsValue(**{**small, **settings})
-    torch.nn.init.normal_(net.head.weight, std=1)
+    weigh(net, 1.0)
     return net
 
 
@@ -161,15 +194,16 @@ def test_planes_of_the_cells_by_plain_comparisons():
 def test_cells_of_any_tote_take_a_share_of_what_is_above_them(patch, halvings, layers, monkeypatch):
     net = cells_network(patch=patch, halvings=halvings, layers=layers, reward_scale=0.5)
     for wide, deep in ((6, 6), (5, 7), (1, 9), (11, 4)):
-        depth, _ = random_totes(20, wide, deep, 9)
+        (depth, _), items = random_totes(20, wide, deep, 9), random_items(20)
+        entries = depth, random_bearing(depth), items
         with torch.no_grad():
-            parts = net.parts(depth, random_bearing(depth))
+            parts = net.parts(*entries)
             share = parts[depth > 0] / (0.5 * depth[depth > 0])
             assert parts.shape == depth.shape and (parts >= 0).all() and 0 < share.min() < share.max() < 1
-            value = net(depth.view(4, 5, wide, deep), random_bearing(depth).view(4, 5, wide, deep))
+            value = net(*(entry.unflatten(0, (4, 5)) for entry in entries))
             torch.testing.assert_close(value, parts.sum((1, 2)).view(4, 5, 1))
             monkeypatch.setattr(CellsValue, "cells_at_once", {"cpu": 3 * wide * deep})
-            torch.testing.assert_close(net.parts(depth, random_bearing(depth)), parts)
+            torch.testing.assert_close(net.parts(*entries), parts)
 
 
 @pytest.mark.parametrize(("wide", "deep"), [(6, 6), (5, 7)])
@@ -178,14 +212,16 @@ def test_a_tote_is_worth_the_same_from_every_side(wide, deep):
     net = cells_network(all_views=True)
     maps = random_totes(3, wide, deep, 9)[0], random_bearing(torch.empty(3, wide, deep))
     flips = [[entry.flip(axes) for entry in maps] for axes in ((), (1,), (2,), (1, 2))]
-    views = flips + [[entry.transpose(1, 2) for entry in view] for view in flips]
+    items = random_items(3)
+    turned = items[..., [1, 0, 3, 2, 4]]  # their sides change with those of the tote
+    views = [[*view, items] for view in flips] + [[*(entry.transpose(1, 2) for entry in view), turned] for view in flips]
     with torch.no_grad():
         each = torch.stack([net(*view) for view in views])
         assert (each.std(0) > 1e-3).all()
         net.eval()
         for view in views:
             torch.testing.assert_close(net(*view), each.mean(0))
-        assert torch.equal(cells_network(mirrored=False, all_views=True).eval()(*maps), each[0])
+        assert torch.equal(cells_network(mirrored=False, all_views=True).eval()(*maps, items), each[0])
 
 
 class Empty(PictureValue):
@@ -205,11 +241,10 @@ class EmptyCells(CellsValue):
 
 
 def steps_of(values, reward, done):
-    """Return a batch ``[N, T]`` whose steps left totes of these values."""
+    """Return totes ``[N, T]`` of these values, which steps left."""
     depth = values[..., None, None].expand(*values.shape, 1, 1)
-    after = {"tote_depth": depth, "tote_height": torch.ones_like(values)[..., None]}
-    after |= {"reward": reward[..., None], "done": done[..., None]}
-    return TensorDict({"tote_depth": torch.full_like(depth, 99.0), "next": after}, batch_size=values.shape)
+    after = {"tote_depth": depth, "reward": reward[..., None], "done": done[..., None]}
+    return TensorDict(after, batch_size=values.shape)
 
 
 def test_targets_by_hand():
@@ -217,7 +252,7 @@ def test_targets_by_hand():
     values = torch.tensor([[5.0, 7, 11], [13, 17, 19]])
     reward = torch.tensor([[1.0, 2, 4], [8, 16, 32]])
     done = torch.tensor([[False, False, False], [False, True, False]])
-    data = afterstates(steps_of(values, reward, done), Empty(reward_scale=0.1), gamma=0.5, lmbda=0.25)
+    data = with_targets(steps_of(values, reward, done), Empty(reward_scale=0.1), gamma=0.5, lmbda=0.25)
     second = 0.4 + 0.5 * 11
     first = 0.2 + 0.5 * (0.75 * 7 + 0.25 * second)
     other = 1.6 + 0.5 * (0.75 * 17 + 0.25 * 0)
@@ -230,9 +265,9 @@ def test_a_reward_is_earned_by_the_cells_that_the_item_covers():
     depth = torch.tensor([[[9.0, 9, 5], [6, 6, 5], [6, 6, 2]]])[..., None]
     after = {"tote_depth": depth, "reward": torch.tensor([[[9.0], [6], [2]]])}
     after["done"] = torch.tensor([[[False], [False], [True]]])
-    batch = TensorDict({"next": after}, batch_size=(1, 3))
+    batch = TensorDict(after, batch_size=(1, 3))
     network = EmptyCells(reward_scale=0.1)
-    target = afterstates(batch, network, gamma=0.5, lmbda=0.25)["value_target"][..., 0]
+    target = with_targets(batch, network, gamma=0.5, lmbda=0.25)["value_target"][..., 0]
     last = [0.5 * 6, 0.5 * 6, 0.2 + 0.5 * 2]
     first = [0.3 + 0.5 * (0.75 * 6 + 0.25 * last[0])] * 2 + [0.5 * (0.75 * 5 + 0.25 * last[2])]
     torch.testing.assert_close(target, torch.tensor([first, last]))
@@ -243,7 +278,7 @@ def test_a_reward_is_earned_by_the_cells_that_the_item_covers():
 def test_the_true_value_is_where_targets_agree_with_it(lmbda, length):
     """Each item has a place with probability 3/4 and a reward of 1: 3 items follow on average."""
     done = torch.rand(20_000, length, generator=torch.Generator().manual_seed(0)) < 0.25
-    data = afterstates(steps_of(torch.full(done.shape, 3.0), torch.ones(done.shape), done), Empty(), 1.0, lmbda)
+    data = with_targets(steps_of(torch.full(done.shape, 3.0), torch.ones(done.shape), done), Empty(), 1.0, lmbda)
     assert data["value_target"].mean().item() == pytest.approx(3.0, abs=0.06)
 
 
@@ -309,11 +344,11 @@ def test_shipped_weights_judge_for_a_search_and_begin_a_training(tmp_path):
     state, facts = checkpoint.read(locate("pretrained/gopt_rs"))
     cfg = OmegaConf.create({**facts["config"], "device": "cpu"})
     policy = restore_policy(cfg, CellSpec(tote_size=(10, 10, 10), rotations=2), state["policy"], facts["config"]["env"])
-    depth, height = random_totes(3, 10, 10, 10)
+    (depth, height), items = random_totes(3, 10, 10, 10), random_items(3)
     with torch.no_grad():
         critic = restore_critic(cfg, policy, state, facts["config"]["env"])
-        found = critic({"tote_depth": depth, "tote_height": height})
-        assert torch.equal(found, policy.network(depth, height) / 0.01)
+        found = critic({"tote_depth": depth, "tote_height": height, "items": items})
+        assert torch.equal(found, policy.network(depth, height, items) / 0.01)
     words = ["experiment=afterstate", "benchmark=gopt_rs", "warm_start.weights=pretrained/gopt_rs", "algo.lr=0"]
     words += ["env.num_envs=2", "rollout_length=2", "total_frames=4", "evaluation.episodes=1", "logger=none"]
     train(composed(*words), tmp_path)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from pickplace.common.validate import MAX_WIDTH, number, whole_number, whole_numbers
 from pickplace.policies.afterstate.value import ToteValue
+from pickplace.policies.afterstate.waiting import WaitingItems
 from pickplace.policies.fcn_grasp.network import matrix_dtype
 
 
@@ -17,8 +18,8 @@ class CellsValue(ToteValue):
     It is fully convolutional: one set of weights serves any tote. A cell outside the tote looks like one that is full,
     as neither an item nor the end effector can go lower there. Planes tell how deep a cell is, where the surface is not
     level with the cell before, along x and along y, and which cells bear no weight. A convolution follows, then others
-    with stride 2, then residual ones. These also see the mean over the tote, because whether items still have places
-    elsewhere decides how long the packing goes on. The last layer has an output for each cell that the strides joined.
+    with stride 2, then residual ones. These also see the items that wait, and the mean over the tote, because whether
+    items still have places elsewhere decides how long the packing goes on. The last layer has an output for each cell that the strides joined.
 
     Every cell is a part of the value, and learns from the volume that is placed on it. That tells more than a sum, as
     in Go, where a network learns faster if it also predicts who will own each point (Wu, Accelerating Self-Play
@@ -35,7 +36,7 @@ class CellsValue(ToteValue):
         **settings: of :class:`~pickplace.policies.afterstate.value.ToteValue`.
     """
 
-    in_keys = ("tote_depth", "tote_bearing")
+    in_keys = ("tote_depth", "tote_bearing", "items")
     cells_at_once = {"cpu": 2**17, "cuda": 2**24}
 
     def __init__(
@@ -64,6 +65,7 @@ class CellsValue(ToteValue):
         width = filters if halvings else stem
         self.layers = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(layers))
         self.means = nn.ModuleList(nn.Linear(width, width) for _ in range(layers))
+        self.waiting = WaitingItems(width)
         self.head = nn.Conv2d(width, self.joined**2, 1)
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.get_parameter("bias"), 0.5)
@@ -72,15 +74,17 @@ class CellsValue(ToteValue):
         """Return the volume that each cell will still take, scaled, float32 ``[N, W_T, D_T]``.
 
         Args:
-            entries: the remaining height, ``[N, W_T, D_T]``, height units; and 1 where a cell bears weight, else 0.
+            entries: the remaining height, ``[N, W_T, D_T]``, height units; 1 where a cell bears weight, else 0; and
+                the items that wait, ``[N, M, 5]``.
         """
-        depth, bearing = entries
+        depth, bearing, items = entries
         wide, deep = depth.shape[1:]
         dtype = matrix_dtype(self.compute_dtype, depth.device.type)
         with torch.autocast(depth.device.type, dtype, enabled=dtype != torch.float32):
             x = F.relu(self.around(F.pad(self._planes(depth, bearing, dtype), [1, self.patch] * 2)))
             for halve in self.halves:
                 x = F.relu(halve(x))
+            x = x + self.waiting(items, depth.new_tensor([1.0, 1.0, 1.0 / self.level]))[:, :, None, None]
             for layer, mean in zip(self.layers, self.means, strict=True):
                 x = x + F.relu(layer(x) + mean(x.mean((2, 3)))[:, :, None, None])
         logits = F.conv2d(x.float(), self.head.weight, self.head.bias)

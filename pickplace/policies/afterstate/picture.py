@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from pickplace.common.validate import MAX_WIDTH, check_inputs, expect, odd_number, size_tuple, whole_numbers
 from pickplace.policies.afterstate.value import ToteValue
+from pickplace.policies.afterstate.waiting import WaitingItems
 from pickplace.policies.fcn_grasp.network import matrix_dtype
 
 MAX_GRID = 64  # cells of the network's picture of a tote along each axis
@@ -20,7 +21,7 @@ class PictureValue(ToteValue):
     of the cells of the tote that it covers, and the heights are told apart in ``grid[2]`` steps of the tote's height.
     So a tote of 30 cells with items of three times the size looks like one of 10. Two more planes mark where the
     surface is not level with the cell before, along x and along y, as items rest on level cells. Two convolutions, the
-    second with stride 2, and two linear layers follow.
+    second with stride 2, and two linear layers follow. The first of these also sees the items that wait.
 
     Args:
         grid: cells of the picture along x and y, and steps of the height.
@@ -30,7 +31,7 @@ class PictureValue(ToteValue):
         **settings: of :class:`~pickplace.policies.afterstate.value.ToteValue`.
     """
 
-    in_keys = ("tote_depth", "tote_height")
+    in_keys = ("tote_depth", "tote_height", "items")
 
     def __init__(
         self,
@@ -51,18 +52,20 @@ class PictureValue(ToteValue):
         self.around = nn.Conv2d(planes, filters, receptive_field, padding=receptive_field // 2)
         self.wider = nn.Conv2d(filters, filters, 3, stride=2, padding=1)
         self.hidden = nn.Linear(filters * ((wide + 1) // 2) * ((deep + 1) // 2), hidden)
+        self.waiting = WaitingItems(hidden)
         self.head = nn.Linear(hidden, 1)
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.bias, 0.5)
 
     def some_parts(self, *entries: Tensor) -> Tensor:
-        """Return the value of totes ``[N, W_T, D_T]`` of heights ``[N, 1]``, ``[N, 1]``: there is one part."""
-        depth, height = entries
+        """Return the value of totes ``[N, W_T, D_T]`` of heights ``[N, 1]``, while items ``[N, M, 5]`` wait, ``[N, 1]``:
+        there is one part."""
+        depth, height, items = entries
         dtype = matrix_dtype(self.compute_dtype, depth.device.type)
         with torch.autocast(depth.device.type, dtype, enabled=dtype != torch.float32):
             planes = self._picture(depth, height[:, 0]).to(dtype, memory_format=torch.channels_last)
             x = F.relu(self.wider(F.relu(self.around(planes))))
-            x = F.relu(self.hidden(x.flatten(1)))
+            x = F.relu(self.hidden(x.flatten(1)) + self.waiting(items, self._scale(depth, height)))
         return self.reward_scale * depth.sum((1, 2))[:, None] * torch.sigmoid(self.head(x.float()))
 
     def credit(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Tensor:
@@ -76,6 +79,12 @@ class PictureValue(ToteValue):
 
     def may_turn(self, wide: int, deep: int) -> bool:
         return wide == deep and self.grid[0] == self.grid[1]
+
+    def _scale(self, depth: Tensor, height: Tensor) -> Tensor:
+        """Return what makes sides of items those of the picture, float32 ``[N, 3]``."""
+        wide, deep, steps = self.grid
+        sides = height.new_tensor([wide / depth.shape[1], deep / depth.shape[2]], dtype=torch.float32)
+        return torch.cat([sides.expand(len(height), 2), steps / height], 1)
 
     @torch.no_grad()
     def _picture(self, depth: Tensor, height: Tensor) -> Tensor:

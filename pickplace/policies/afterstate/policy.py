@@ -7,22 +7,24 @@ from pickplace.common.validate import number
 from pickplace.policies.afterstate.cells import CellsValue
 from pickplace.policies.afterstate.picture import PictureValue
 from pickplace.policies.afterstate.value import ToteValue
-from pickplace.policies.base import MASKED, refuse_several_items
+from pickplace.policies.base import MASKED
 from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintPolicy, count_ways
+from pickplace.rules.bin import remove_item
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.item import Observation
+from pickplace.rules.item import Observation, items_from_observation
 from pickplace.rules.masks import action_footprints, action_mask, placing_maps
-from pickplace.rules.observation import STANDARD_TERMS, observe
+from pickplace.rules.observation import STANDARD_TERMS, Items, observe
 from pickplace.rules.state import State
 from pickplace.rules.step import put_down
 
 
 class Afterstate(FootprintPolicy):
-    """``afterstate``: chooses, among the footprints that occupy a corner, the one whose tote is worth most.
+    """``afterstate``: chooses, among the items and the footprints that occupy a corner, the greatest sum of the item's
+    volume and the value of the tote with it.
 
-    The reward of an item is its volume wherever it lies, so that placements differ only in the tote that they leave,
-    the *afterstate* (Sutton & Barto 2018, section 6.8). Its value is what ``algo=td`` learns; the logit of a footprint
-    is the value of its afterstate, divided by a temperature.
+    The reward of an item is its volume wherever it lies, so that placements of one item differ only in the tote that
+    they leave, the *afterstate* (Sutton & Barto 2018, section 6.8). Its value is what ``algo=td`` learns; the logit is
+    the sum, scaled as rewards are, divided by a temperature.
 
     Args:
         cell: the sizes.
@@ -34,7 +36,6 @@ class Afterstate(FootprintPolicy):
     map_keys = tuple(STANDARD_TERMS)
     mask = "corner"
     network_class: type[ToteValue] = PictureValue
-    check_cell = refuse_several_items
     excludes = "actions that fail, and footprints that occupy no corner"
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = True, temperature: float = 0.003, **network):
@@ -48,10 +49,20 @@ class Afterstate(FootprintPolicy):
         """Return about how many bytes a frame takes, measured at totes of 10 to 100 cells."""
         return self.network.learning_bytes(*self.cell.tote_size[:2])
 
+    def items_left(self, observation: Observation, choice: Tensor) -> Tensor:
+        return remove_item(items_from_observation(observation), choice // self.cell.num_footprints).cuboids
+
+    def judge(self, before: State, choice: Tensor) -> tuple[State, Tensor, Tensor]:
+        after, item = put_down(self.cell, before, choice)
+        seen = observe({**STANDARD_TERMS, "items": Items()}, self.cell, after, self.network.in_keys)
+        value = self.network(*(seen[key] for key in self.network.in_keys))[:, 0]
+        return after, item.volume, value
+
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
-        after, _ = put_down(self.cell, State.from_observation(observation).rows(row), footprint)
-        seen = observe(STANDARD_TERMS, self.cell, after, self.network.in_keys)
-        return self.network(*(seen[key] for key in self.network.in_keys))[:, 0] / self.temperature
+        before = State.from_observation(observation).rows(row)
+        _, volume, value = self.judge(before, footprint)
+        less = before.items.volume.amax(1) - volume  # than of the largest item: exactly 0 with one in the bin
+        return (value - self.network.reward_scale * less) / self.temperature
 
     def action_log_probs(self, observation: Observation) -> Tensor:
         """Return the distribution over flat actions ``[N, N_a]``. Only those that succeed have a value: an item must be

@@ -42,7 +42,8 @@ class ToteValue(nn.Module, ABC):
 
     def forward(self, *entries: Tensor) -> Tensor:
         """Return the value of each tote, float32 ``[..., 1]``, of the entries :attr:`in_keys`, such as ``tote_depth``
-        ``[..., W_T, D_T]`` and ``tote_height`` ``[..., 1]``."""
+        ``[..., W_T, D_T]`` and ``tote_height`` ``[..., 1]``. ``items`` are those that wait: without the one that has
+        been placed, and before others arrive."""
         batch, wide, deep = entries[0].shape[:-2], *entries[0].shape[-2:]
         flat = tuple(entry.flatten(0, len(batch) - 1) for entry in entries)
         if self.training or not (self.mirrored and self.all_views):
@@ -87,7 +88,7 @@ class ToteValue(nn.Module, ABC):
         """Return maps as seen from a side of the tote, drawn at random among those from which the value is the same.
 
         Args:
-            maps: ``[N, W_T, D_T]``; entries ``[N, ...]`` of other dimensions come back as they are.
+            maps: as of :func:`seen_from`.
         """
         if not self.mirrored:
             return maps
@@ -101,6 +102,15 @@ class ToteValue(nn.Module, ABC):
 
 
 def seen_from(entries: Sequence[Tensor], axes: list[int], turned: bool) -> tuple[Tensor, ...]:
-    """Return the entries with all maps ``[N, W_T, D_T]`` flipped along axes, then transposed if ``turned``."""
-    flipped = (entry.flip(axes) if entry.dim() == 3 else entry for entry in entries)
-    return tuple(entry.transpose(1, 2) if turned and entry.dim() == 3 else entry for entry in flipped)
+    """Return the entries with all maps ``[N, W_T, D_T]`` flipped along axes, then transposed if ``turned``.
+
+    Of tables of items, int64 ``[N, M, 5]``, the axes are exchanged; entries of other dimensions come back as they are.
+    """
+    return tuple(_seen_from(entry, axes, turned) if entry.dim() == 3 else entry for entry in entries)
+
+
+def _seen_from(entry: Tensor, axes: list[int], turned: bool) -> Tensor:
+    if not entry.is_floating_point():
+        return entry[..., [1, 0, 3, 2, 4]] if turned else entry  # the places of items in the bin tell nothing
+    flipped = entry.flip(axes)
+    return flipped.transpose(1, 2) if turned else flipped

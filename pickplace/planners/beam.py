@@ -1,0 +1,156 @@
+"""Beam search over the items that are seen."""
+
+from time import perf_counter
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pickplace.common.validate import expect, number, or_null, whole_number
+from pickplace.planners.base import MapPlanner
+from pickplace.policies.base import EstimatesValue, Policy, ScoresFootprints
+from pickplace.rules.cell import CellSpec
+from pickplace.rules.item import Observation
+from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
+from pickplace.rules.state import State
+from pickplace.rules.step import put_down
+
+CELLS_AT_ONCE = 2**23  # of totes that are judged at a time
+
+
+class _Plans(NamedTuple):
+    """Sequences of choices, those of a problem side by side."""
+
+    problem: Tensor  # int64 [P], of which problem
+    first: Tensor  # int64 [P], the first choice of each
+    placed: Tensor  # int64 [P], the volume that they place
+    total: Tensor  # float32 [P], with the value of what they leave
+    state: State  # of P problems
+
+    def rows(self, index: Tensor) -> "_Plans":
+        return _Plans(*(part[index] for part in self[:4]), self.state.rows(index))
+
+
+class Beam(MapPlanner):
+    """Plans the placements of several items that are seen, and plays the first one of the best plan.
+
+    At each depth every plan goes on with every item that is left, at every place that the policy ranks; those with the
+    greatest sum of placed volume and value of what they leave are kept (beam search, Lowerre 1976). Plans that leave
+    the same tote and the same items are one. The items that will arrive meanwhile are not imagined: they are part of
+    the value. With one item in the bin it decides as the policy does.
+
+    Args:
+        cell: the sizes.
+        policy: ``afterstate`` or ``afterstate_fcn``.
+        width: plans that are kept at each depth.
+        depth: placements of a plan.
+        budget: milliseconds after which a decision goes no deeper; None: always to the depth.
+    """
+
+    name = "beam"
+    needs = ("policy",)
+
+    def __init__(self, cell: CellSpec, policy: Policy, width: int = 8, depth: int = 4, budget: float | None = None):
+        self.width = whole_number("planner.width", width, most=1_000)
+        self.depth = whole_number("planner.depth", depth, most=100)
+        or_null(number, "planner.budget", budget)
+        fits = isinstance(policy, EstimatesValue) and isinstance(policy, ScoresFootprints)
+        expect(fits, "planner", "beam", "a checkpoint of model=afterstate or afterstate_fcn, whose values it adds up")
+        self.cell, self.policy, self.budget = cell, policy, budget
+
+    @torch.no_grad()
+    def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
+        start, number = perf_counter(), torch.arange(len(state.surface), device=state.surface.device)
+        # A robot's state and maps have height units of their own; the plans have those of the policy.
+        plans = _Plans(number, number * 0 - 1, number * 0, number * 0.0, State.from_observation(observation))
+        mask, ended = self.policy.with_cell(cell).ranked(maps), []
+        for depth in range(1, self.depth + 1):
+            ended.append(plans.rows(~mask.any(1)))
+            if not mask.any():
+                break
+            plans = self._longer(plans, mask)
+            if depth == self.depth or self._is_late(start, depth):
+                break
+            mask = self.policy.ranked(placing_maps(self.cell, plans.state))
+        problem, first, _, total = map(torch.cat, zip(*(part[:4] for part in [*ended, plans]), strict=True))
+        choice = first[_greatest(problem, total, 1)].clamp(min=0)  # as a policy that has no choice
+        return first_action_reaching(cell, maps, choice)
+
+    def evaluation_facts(self) -> dict:
+        return {"candidates": "all", "mask_at_decision": True}  # as a policy's planner
+
+    def _is_late(self, start: float, depth: int) -> bool:
+        """Return whether one more placement, if it takes as long as those before it, would pass the budget."""
+        return self.budget is not None and (perf_counter() - start) * 1000 * (depth + 1) / depth > self.budget
+
+    def _longer(self, plans: _Plans, mask: Tensor) -> _Plans:
+        """Return the best plans of each problem that are one placement longer.
+
+        Args:
+            mask: bool ``[P, choices]``, with which choices each plan may go on; there is one at least.
+        """
+        row, choice = mask.nonzero(as_tuple=True)
+        at_once = max(1, CELLS_AT_ONCE // plans.state.surface[0].numel())
+        parts = [self._judge(plans, *some) for some in zip(row.split(at_once), choice.split(at_once), strict=True)]
+        placed, total, outcome = map(torch.cat, zip(*parts, strict=True))
+        different = _first_of_each(outcome)
+        kept = different[_greatest(plans.problem[row[different]], total[different], self.width)]
+        row, choice = row[kept], choice[kept]
+        first = torch.where(plans.first[row] < 0, choice, plans.first[row])
+        after, _ = put_down(self.cell, plans.state.rows(row), choice)
+        return _Plans(plans.problem[row], first, placed[kept], total[kept], after)
+
+    def _judge(self, plans: _Plans, row: Tensor, choice: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return for plans that go on with a choice the volume placed, the total, and a number that is the same for
+        those that lead to the same, ``[C]`` each.
+
+        Args:
+            row, choice: int64 ``[C]``.
+        """
+        after, volume, value = self.policy.judge(plans.state.rows(row), choice)
+        placed = plans.placed[row] + volume
+        return placed, placed * self.policy.value_network().reward_scale + value, _fingerprint(plans.problem[row], after)
+
+
+def _greatest(problem: Tensor, total: Tensor, count: int) -> Tensor:
+    """Return the rows with the ``count`` greatest totals of each problem, those of a problem side by side; of equals
+    the first.
+
+    Args:
+        problem: int64 ``[P]``.
+        total: ``[P]``.
+    """
+    order = total.sort(descending=True, stable=True).indices
+    order = order[problem[order].sort(stable=True).indices]
+    sorted_ = problem[order]
+    rank = torch.arange(len(order), device=order.device) - torch.searchsorted(sorted_, sorted_)
+    return order[rank < count]
+
+
+def _first_of_each(value: Tensor) -> Tensor:
+    """Return the rows of int64 ``[P]`` whose value is in no row before them, in their order."""
+    values, same = value.unique(return_inverse=True)
+    number = torch.arange(len(value), device=value.device)
+    return number.new_full(values.shape, len(value)).scatter_reduce(0, same, number, "amin").sort().values
+
+
+def _fingerprint(problem: Tensor, state: State) -> Tensor:
+    """Return a number for each of ``P`` states, int64 ``[P]``: equal for equal problems, totes and sets of items, and
+    different for others but for one pair in 2**64."""
+    items = state.items.cuboids
+    each = _mixed(_weighted(items)) * (items[..., 4] > 0)
+    parts = torch.stack([problem, _mixed(_weighted(state.surface.flatten(1))), each.sum(1)], 1)
+    return _mixed(_weighted(parts))
+
+
+def _weighted(numbers: Tensor) -> Tensor:
+    """Return the sum of whole numbers ``[..., K]``, each times a weight of its own, modulo 2**64, int64 ``[...]``."""
+    place = torch.arange(1, numbers.shape[-1] + 1, device=numbers.device)
+    return (numbers * _mixed(place * 0x9E3779B97F4A7C1)).sum(-1)
+
+
+def _mixed(number: Tensor) -> Tensor:
+    """Return whole numbers whose bits all depend on all bits of the given ones, int64 (Stafford's mix of 2011)."""
+    for shift, factor in ((30, -0x40A7B892E31B1A47), (27, -0x6B2FB644ECCEEE15), (31, 1)):
+        number = (number ^ (number >> shift & (1 << 64 - shift) - 1)) * factor
+    return number
