@@ -8,7 +8,6 @@ from omegaconf import OmegaConf
 from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
 from pickplace.planners.policy import PolicyPlanner
-from pickplace.policies.corners.policy import Corners
 from pickplace.policies.fcn4d.policy import Fcn4d, Typical
 from pickplace.policies.fcn_grasp.policy import FcnGrasp, UnmaskedFcnGrasp, fcn_grasp
 from pickplace.policies.individual.policy import IndividualGrasp, IndividualRl, UnmaskedIndividualGrasp
@@ -18,7 +17,7 @@ from pickplace.runs.provenance import commit, versions
 GRASP, CONV4D = {"filters": 8, "hidden": 8, "head_std": 1.0}, {"filters": 4, "head_std": 1.0}
 POLICIES = {
     FcnGrasp: GRASP, UnmaskedFcnGrasp: GRASP, UnmaskedIndividualGrasp: GRASP, IndividualGrasp: GRASP,
-    Corners: GRASP, Fcn4d: CONV4D, Typical: CONV4D, IndividualRl: CONV4D,
+    Fcn4d: CONV4D, Typical: CONV4D, IndividualRl: CONV4D,
 }  # fmt: skip
 CELLS = [
     {"tote_size": (4, 4, 2), "bin_size": (4, 4, 1), "num_envs": 4},

@@ -26,9 +26,10 @@ def _classes(module: str, **names: str) -> dict[str, str]:
 
 PLANNERS = _classes(
     "planners", policy="policy.PolicyPlanner", lookahead="lookahead.Lookahead", beam="beam.Beam",
-    joint_dbl="heuristics.JointDBL", corner="heuristics.Corner", best_fit="spaces.BestFit", online_bph="spaces.OnlineBPH",
-    heightmap_minimisation="heuristics.HeightmapMinimisation", individual_heuristic="heuristics.IndividualHeuristic",
-    mcts="mcts.MCTS", random="heuristics.RandomFeasible", uniform="heuristics.UniformRandom",
+    joint_dbl="heuristics.JointDBL", corner="heuristics.Corner", best_fit="spaces.BestFit",
+    online_bph="spaces.OnlineBPH", heightmap_minimisation="heuristics.HeightmapMinimisation",
+    individual_heuristic="heuristics.IndividualHeuristic", mcts="mcts.MCTS",
+    random="heuristics.RandomFeasible", uniform="heuristics.UniformRandom",
 )  # fmt: skip
 
 #: Place in the config -> short name -> dotted path. ``*`` stands for any one key.
@@ -50,7 +51,7 @@ REGISTRY: dict[str, dict[str, str]] = {
         cut="cut.Cut", orders="orders.Orders",
     ),
     "model.actor": _classes(
-        "policies", fcn_grasp="fcn_grasp.policy.fcn_grasp", corners="corners.policy.Corners",
+        "policies", fcn_grasp="fcn_grasp.policy.fcn_grasp",
         afterstate="afterstate.policy.Afterstate", afterstate_fcn="afterstate.policy.AfterstateFcn",
         fcn4d="fcn4d.policy.Fcn4d", typical="fcn4d.policy.Typical", individual_rl="individual.policy.IndividualRl",
         individual_grasp="individual.policy.individual_grasp",

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import expect, number, or_null, whole_number
+from pickplace.common.validate import number, or_null, refuse_if, whole_number
 from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import EstimatesValue, Policy, ScoresFootprints
 from pickplace.rules.cell import CellSpec
@@ -28,7 +28,8 @@ class _Plans(NamedTuple):
     state: State  # of P problems
 
     def rows(self, index: Tensor) -> "_Plans":
-        return _Plans(*(part[index] for part in self[:4]), self.state.rows(index))
+        problem, first, placed, total = (part[index] for part in self[:4])
+        return _Plans(problem, first, placed, total, self.state.rows(index))
 
 
 class Beam(MapPlanner):
@@ -54,8 +55,10 @@ class Beam(MapPlanner):
         self.width = whole_number("planner.width", width, most=1_000)
         self.depth = whole_number("planner.depth", depth, most=100)
         or_null(number, "planner.budget", budget)
-        fits = isinstance(policy, EstimatesValue) and isinstance(policy, ScoresFootprints)
-        expect(fits, "planner", "beam", "a checkpoint of model=afterstate or afterstate_fcn, whose values it adds up")
+        refuse_if(
+            not (isinstance(policy, EstimatesValue) and isinstance(policy, ScoresFootprints)),
+            "planner=beam: expected a checkpoint of model=afterstate or afterstate_fcn, whose values it adds up.",
+        )
         self.cell, self.policy, self.budget = cell, policy, budget
 
     @torch.no_grad()
@@ -109,7 +112,11 @@ class Beam(MapPlanner):
         """
         after, volume, value = self.policy.judge(plans.state.rows(row), choice)
         placed = plans.placed[row] + volume
-        return placed, placed * self.policy.value_network().reward_scale + value, _fingerprint(plans.problem[row], after)
+        return (
+            placed,
+            placed * self.policy.value_network().reward_scale + value,
+            _fingerprint(plans.problem[row], after),
+        )
 
 
 def _greatest(problem: Tensor, total: Tensor, count: int) -> Tensor:

@@ -33,7 +33,7 @@ class Lookahead(MapPlanner):
 
     Args:
         cell: the sizes.
-        policy: ``fcn_grasp``, ``corners`` or ``afterstate``, trained with a mask.
+        policy: ``fcn_grasp`` or ``afterstate``, trained with a mask.
         items: the item distribution; of a sequence, recorded or cut, its sizes, equally likely.
         candidates: how many of the policy's most probable choices are played out.
         critic: the value of a state, a function from observations to ``[N, 1]``, in volume; None: there is none.
@@ -69,7 +69,7 @@ class Lookahead(MapPlanner):
         or_null(whole_number, "planner.horizon", horizon)
         refuse_if(
             not isinstance(policy, ScoresFootprints),
-            "planner=lookahead: expected a checkpoint of model=fcn_grasp, corners or afterstate, with a mask.",
+            "planner=lookahead: expected a checkpoint of model=fcn_grasp or afterstate, with a mask.",
         )
         self.cell, self.policy, self.items = cell, policy, search_items(items)
         self.terms = check_terms(terms, cell)
@@ -158,8 +158,8 @@ class Lookahead(MapPlanner):
             horizon: items after which the critic judges the state; None: played out to the end.
         """
         cell, policy, critic_keys = self.cell, self.policy, getattr(self.critic, "in_keys", ())
-        # Values of totes after placements are those before the next item arrives.
-        judges_before = isinstance(policy, EstimatesValue)
+        # A critic that does not see the bin values what a placement leaves, before the next item arrives.
+        judges_before = critic_keys and "bin_depth" not in critic_keys
         self._decisions += 1
         state, problem = state.repeat(streams), problem.repeat_interleave(streams, 0)
         stream = torch.arange(len(problem), device=problem.device) % streams

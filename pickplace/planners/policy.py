@@ -49,7 +49,7 @@ class PolicyPlanner(MapPlanner):
         self.item = one_of("planner.item", item, ITEM_RULES)
         self.pick = one_of("planner.pick", pick, ("any", *PICKS))
         ranks = isinstance(policy, ScoresFootprints) and candidates == "all"
-        model = "a checkpoint of model=fcn_grasp or corners that was trained with a mask"
+        model = "a checkpoint of model=afterstate, or of model=fcn_grasp that was trained with a mask"
         for key, value in (("planner.item", item), ("planner.pick", pick)):
             expect(ranks or value == "any", key, value, f"'any', or planner.candidates=all and {model}")
         expect(cell.bin_items == 1 or pick == "any", "planner.pick", pick, f"'any' with env.bin_items={cell.bin_items}")

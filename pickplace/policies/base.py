@@ -291,7 +291,7 @@ class Choice(Categorical):
 
 def refuse_several_items(policy: Policy, cell: CellSpec) -> None:
     """Refuse a bin with several items: the ``check_cell`` of a policy that does not choose among them."""
-    others = "model=fcn_grasp or corners with a mask, and fcn4d, choose among several items"
+    others = "model=afterstate, fcn_grasp with a mask, and fcn4d choose among several items"
     expect(cell.bin_items == 1, "env.bin_items", cell.bin_items, f"1 with {type(policy).__name__}; {others}")
 
 

@@ -72,7 +72,7 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
     if not isinstance(policy, ScoresAnySize):
         raise ValueError(
             f"{short_text(checkpoint)}: {type(policy).__name__} has no scores for totes of any size; expected "
-            "model=fcn_grasp or corners that was trained with a mask, model=fcn4d, or model=afterstate_fcn."
+            "model=fcn_grasp that was trained with a mask, model=fcn4d, or model=afterstate_fcn."
         )
     keys = [key for key in policy.in_keys if not key.endswith("_mask")]
     model = _convert(Scores(policy, keys).eval(), keys, _observations(trained, keys, 1), shapes_of(policy))

@@ -40,7 +40,7 @@ from pickplace.rules.state import Failure
 
 ACTIONS_AT_ONCE = 2**16  # whose reasons are looked up at a time
 MAX_ALTERNATIVES = 100_000  # greatest number of choices that a plan may report
-CHOOSERS = "expected one item, or a checkpoint of model=fcn_grasp or corners that was trained with a mask"
+CHOOSERS = "expected one item, or a checkpoint of model=afterstate, or of model=fcn_grasp that was trained with a mask"
 
 
 @dataclass(frozen=True)

@@ -243,7 +243,7 @@ def test_own_values_in_a_sweep(run, search, monkeypatch):
         ("model=mlp model.actor.hiden=1 seed=0,1", "model.actor; did you mean 'hidden'?"),
         (
             "model=null",
-            "expected model=<one of afterstate, afterstate_fcn, corners, fcn4d, fcn4d_noclip, fcn_grasp, "
+            "expected model=<one of afterstate, afterstate_fcn, fcn4d, fcn4d_noclip, fcn_grasp, "
             "individual_grasp, individual_rl, mlp, ",
         ),
         ("model=mpl", "individual_rl, mlp, typical."),

@@ -214,7 +214,9 @@ def test_a_tote_is_worth_the_same_from_every_side(wide, deep):
     flips = [[entry.flip(axes) for entry in maps] for axes in ((), (1,), (2,), (1, 2))]
     items = random_items(3)
     turned = items[..., [1, 0, 3, 2, 4]]  # their sides change with those of the tote
-    views = [[*view, items] for view in flips] + [[*(entry.transpose(1, 2) for entry in view), turned] for view in flips]
+    views = [[*view, items] for view in flips] + [
+        [*(entry.transpose(1, 2) for entry in view), turned] for view in flips
+    ]
     with torch.no_grad():
         each = torch.stack([net(*view) for view in views])
         assert (each.std(0) > 1e-3).all()

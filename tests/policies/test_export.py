@@ -14,7 +14,6 @@ from pickplace import CellSpec, PickPlaceEnv, __version__, load_policy
 from pickplace.policies import export, onnx_model
 from pickplace.policies.afterstate.policy import AfterstateFcn
 from pickplace.policies.base import MASKED
-from pickplace.policies.corners.policy import Corners
 from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.policies.onnx_model import Scores, shapes_of
@@ -26,7 +25,6 @@ from pickplace.rules.support.rules import Bearing
 
 MAKERS = {
     "fcn_grasp": lambda: FcnGrasp(CellSpec(), head_std=1.0, compute_dtype="float32"),
-    "corners": lambda: Corners(CellSpec(), head_std=1.0),
     "fcn4d": lambda: Fcn4d(CellSpec(rotations=3), filters=4, head_std=1.0, compute_dtype="float32"),
 }
 

@@ -256,11 +256,14 @@ def test_an_action_means_one_item():
     assert several > 100
 
 
-@pytest.mark.parametrize("name", ["joint_dbl", "corner", "random", "individual_heuristic", "policy", "lookahead"])
-def test_any_planner_chooses_among_items(name):
-    if name in ("policy", "lookahead"):
+@pytest.mark.parametrize(("weights", "name"), [
+    *((None, name) for name in ("joint_dbl", "corner", "random", "individual_heuristic")),
+    ("mixed_grasp", "policy"), ("mixed_grasp", "lookahead"), ("mixed", "policy"), ("mixed", "beam"),
+])  # fmt: skip
+def test_any_planner_chooses_among_items(weights, name):
+    if weights:
         planner, known = (
-            Planner.load("pretrained/mixed_grasp", planner=name, **MIXED, bin_items=count) for count in (1, 3)
+            Planner.load(f"pretrained/{weights}", planner=name, **MIXED, bin_items=count) for count in (1, 3)
         )
     else:
         planner, known = (Planner(CellSpec(**MIXED, bin_items=count), planner=name) for count in (1, 3))
@@ -306,11 +309,8 @@ def test_those_that_cannot_choose_refuse_in_one_sentence():
     depth, labels = bin_maps({1: (0, 0, 1, 1, 1), 2: (3, 3, 2, 2, 1)}, (5, 5))
     grid = {"bin_depth": depth, "bin_labels": labels, "tote_depth": np.full((6, 6), 5)}
     boxes = {"items": [Box(0.05, 0.05, 0.03, 0.03, 0.05), Box(0.2, 0.2, 0.05, 0.05, 0.05)], **FLAT}
-    small = {"tote_size": (6, 6, 5)}
     for planner, seen, message in (
         (Planner.load("pretrained/unmasked"), grid, "bin: got 2 items, among which UnmaskedFcnGrasp does not choose"),
-        (Planner.load("pretrained/gopt_rs", **small), grid, "2 items, among which Afterstate does not choose"),
-        (Planner.load("pretrained/gopt_rs", planner="lookahead", **small), boxes, "Afterstate does not choose"),
         (Planner.load("pretrained/fcn4d"), boxes, "bin: got 2 items in metres, each on a grid of its own, while Fcn4d"),
         (Planner(CellSpec(), planner=JointDBL(CellSpec())), grid, "was made for a cell with bin_items=1; expected one"),
         (Planner(CellSpec(rotations=1), planner="joint_dbl"), {**boxes, "items": [BOXES[1], BOXES[0]]},

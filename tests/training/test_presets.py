@@ -78,7 +78,7 @@ def test_every_model_trains_with_and_without_a_mask(model, tmp_path):
     cfg = composed(*overrides, *(ONE_NETWORK if model in AFTERSTATE else TINY))
     for number, (masked, algo) in enumerate(cases):
         cfg.model.mask_infeasible, cfg.algo = masked, composed(*algo, *TINY).algo
-        if model in ("corners", *AFTERSTATE) and not masked:
+        if model in AFTERSTATE and not masked:
             with pytest.raises(ValueError, match=r"^model.mask_infeasible=False: expected true"):
                 train(cfg, tmp_path)
         else:
@@ -91,7 +91,8 @@ def test_every_model_trains_with_and_without_a_mask(model, tmp_path):
 def test_any_planner_can_be_imitated(name, tmp_path, no_report):
     settings = {"mcts": {"simulations": 20}, "lookahead": {"samples": 2, "rounds": 1}}.get(name, {})
     words = [f"warm_start.teacher.{key}={value}" for key, value in settings.items()]
-    words += ["warm_start.checkpoint=pretrained/r4"] if name in ("policy", "lookahead") else []
+    checkpoint = {"policy": "r4", "lookahead": "r4", "beam": "mixed"}.get(name)
+    words += [f"warm_start.checkpoint=pretrained/{checkpoint}"] if checkpoint else []
     words += ["warm_start=imitate", f"planner@warm_start.teacher={name}", "warm_start.frames=16"]
     cfg = composed("curriculum=none", *words, *TINY, "warm_start.critic_frames=16", "total_frames=48", *ONCE)
     assert 0 <= train(cfg, tmp_path) <= 1

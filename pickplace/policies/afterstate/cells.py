@@ -19,7 +19,8 @@ class CellsValue(ToteValue):
     as neither an item nor the end effector can go lower there. Planes tell how deep a cell is, where the surface is not
     level with the cell before, along x and along y, and which cells bear no weight. A convolution follows, then others
     with stride 2, then residual ones. These also see the items that wait, and the mean over the tote, because whether
-    items still have places elsewhere decides how long the packing goes on. The last layer has an output for each cell that the strides joined.
+    items still have places elsewhere decides how long the packing goes on. The last layer has an output for each cell
+    that the strides joined.
 
     Every cell is a part of the value, and learns from the volume that is placed on it. That tells more than a sum, as
     in Go, where a network learns faster if it also predicts who will own each point (Wu, Accelerating Self-Play

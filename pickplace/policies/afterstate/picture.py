@@ -58,7 +58,7 @@ class PictureValue(ToteValue):
         nn.init.constant_(self.head.bias, 0.5)
 
     def some_parts(self, *entries: Tensor) -> Tensor:
-        """Return the value of totes ``[N, W_T, D_T]`` of heights ``[N, 1]``, while items ``[N, M, 5]`` wait, ``[N, 1]``:
+        """Return the value of totes ``[N, W_T, D_T]`` of heights ``[N, 1]`` while items ``[N, M, 5]`` wait, ``[N, 1]``;
         there is one part."""
         depth, height, items = entries
         dtype = matrix_dtype(self.compute_dtype, depth.device.type)

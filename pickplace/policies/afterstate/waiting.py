@@ -35,4 +35,3 @@ class WaitingItems(nn.Module):
         # Small networks do not multiply: the volume, and the faces, decide how well an item fits.
         seen = torch.stack([w, d, h, w * d, w * h, d * h, w * d * h], -1)
         return self.sum((self.each(seen) * exists).sum(-2))
-
