@@ -81,8 +81,8 @@ def _check_rim(seen: Heights, room: Room) -> None:
     over = np.intersect1d(wide[beyond < 0], wide[beyond > THICKEST])
     refuse_if(
         over.any(),
-        f"depth: the rim of the {room.name} has no depth over {NARROWEST * 1000:g} mm or more, expected to see it: is a "
-        "hand or a tool in the way?",
+        f"depth: the rim of the {room.name} has no depth over {NARROWEST * 1000:g} mm or more, expected to see it: is "
+        "a hand or a tool in the way?",
         DepthMapError,
     )
 
