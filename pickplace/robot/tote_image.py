@@ -13,6 +13,8 @@ from pickplace.robot.measure import ToteMap
 from pickplace.robot.room_check import FEW
 
 MOST_UNSEEN = 0.25  # greatest share of a tote that the camera may not see
+THICKEST = 0.02  # of the walls, m
+NARROWEST = 0.02  # of a hand or a tool, m
 
 
 def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: Sequence[int], along: int) -> ToteMap:
@@ -27,6 +29,7 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     Raises:
         DepthMapError: for something above the rim, or too much that is not seen.
     """
+    _check_rim(seen, room)
     within = distance_outside(seen.at(seen.highest), room) < -margin
     over = within & (seen.height > room.rim + level_range(accuracy))
     refuse_if(
@@ -60,6 +63,27 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
         lowest.clip(0, None),
         _likely(seen, room, margin, shape) if (within & np.isnan(seen.height)).any() else None,
         bool(unknown.any()),
+    )
+
+
+def _check_rim(seen: Heights, room: Room) -> None:
+    """Refuse an image in which a wide hole goes from the inside of a tote over its wall to the outside.
+
+    What stands in a tote hides no rim. A thing that does is higher, so that it is not below the hole: it cannot be told
+    where it is.
+    """
+    if not seen.holes.any():
+        return
+    pixel = seen.pixel * (1 - room.rim / seen.origin[2])
+    side = 2 * math.ceil(NARROWEST / pixel / 2) - 1
+    wide, _ = ndimage.label(ndimage.maximum_filter(ndimage.minimum_filter(seen.holes, side), side), AROUND)
+    beyond = distance_outside(seen.at(room.rim), room)
+    over = np.intersect1d(wide[beyond < 0], wide[beyond > THICKEST])
+    refuse_if(
+        over.any(),
+        f"depth: the rim of the {room.name} has no depth over {NARROWEST * 1000:g} mm or more, expected to see it: is "
+        "a hand or a tool in the way?",
+        DepthMapError,
     )
 
 

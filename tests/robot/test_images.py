@@ -269,6 +269,23 @@ def test_something_above_the_rim_is_refused():
         tote_map(*see("tote", hand))
 
 
+@pytest.mark.parametrize("width", [0.03, 0.08])
+@pytest.mark.parametrize(("yaw", "height"), [(0.0, 0.27), (0.6, 0.35)])
+def test_something_dark_above_the_rim_is_refused(width, yaw, height):
+    """It hides a place that is not below it, from a camera that does not look straight down."""
+    arm = Thing((0.05, 0.15), (0.3, width), height - 0.02, height, yaw, dark=True)
+    with pytest.raises(DepthMapError, match="the rim of the tote has no depth over 20 mm or more, expected to see it"):
+        tote_map(*see("tote", arm))
+
+
+def test_a_black_rim_is_no_hand():
+    eye, image = see("tote", Thing((0.05, 0.06), (0.08, 0.1), 0.0, 0.2))
+    places = eye.points(np.nan_to_num(see("tote", noise=0.0)[1]))
+    image[places[..., 2] > 0.004] = np.nan
+    highest = tote_map(eye, image).highest
+    assert highest[len(highest) // 2 :].max() < 0.01
+
+
 def test_a_bad_image_is_not_called_stuck():
     """The tote would be exchanged."""
     planner, bin_view = Planner(CELL, planner="joint_dbl"), see("bin", ITEM)
