@@ -4,10 +4,8 @@ Every method plays the same 100 episodes of the test stream at 8x8x8 with mixed 
 bin. Writes docs/results/bins.csv and docs/bins.png, and prints the table of docs/results.md.
 """
 
-import argparse
 import csv
 import sys
-from pathlib import Path
 
 from common import ROOT, evaluate
 
@@ -15,11 +13,13 @@ from pickplace.views.figures import COLOURS, INK, figure_of
 
 TABLE, FIGURE, RUNS = ROOT / "docs" / "results" / "bins.csv", ROOT / "docs" / "bins.png", ROOT / "outputs" / "bins"
 COUNTS = (1, 2, 3, 5)
-TRAINED, MIXED = ["checkpoint={checkpoint}"], ["items=mixed", "env.tote_size=[8,8,8]"]
+VALUES, GRASP, MIXED = ["checkpoint=pretrained/mixed"], ["checkpoint=pretrained/mixed_bin3"], ["items=mixed"]
 #: Method -> what a reader calls it, and words for pickplace-evaluate.
 METHODS = {
-    "learned": ("learned, any item", TRAINED),
-    "learned_first": ("learned, first item that has a place", [*TRAINED, "planner.item=first"]),
+    "learned": ("values of totes, any item", VALUES),
+    "beam": ("values of totes, beam search", [*VALUES, "planner=beam"]),
+    "learned_first": ("values of totes, first item that has a place", [*VALUES, "planner.item=first"]),
+    "fcn_grasp": ("fcn_grasp, trained with three items", GRASP),
     "joint_dbl": ("joint_dbl, any item", ["planner=joint_dbl", *MIXED]),
     "joint_dbl_first": ("joint_dbl, first item that has a place", ["planner=joint_dbl", "planner.item=first", *MIXED]),
     "individual_first": ("individual_heuristic, first item", ["planner=individual_heuristic", *MIXED]),
@@ -31,14 +31,12 @@ METHODS = {
 COLUMNS = ("method", "bin_items", "episodes", "mean", "low", "high", "minus_learned", "minus_low", "minus_high", "ms")
 
 
-def measure(method: str, count: int, checkpoint: str) -> dict:
-    """Return a row of the table; what was played with this checkpoint before is not played again."""
-    folder = RUNS / Path(checkpoint).name / f"{method}-{count}"
-    learned = folder.parent / f"learned-{count}" / "evaluation.json"
-    words = [word.format(checkpoint=checkpoint) for word in METHODS[method][1]]
-    words += ["env.bin_size=[8,8,1]", f"env.bin_items={count}"]
+def measure(method: str, count: int) -> dict:
+    """Return a row of the table; what was played before is not played again."""
+    folder, learned = (RUNS / f"{name}-{count}" for name in (method, "learned"))
+    words = [*METHODS[method][1], "env.tote_size=[8,8,8]", "env.bin_size=[8,8,1]", f"env.bin_items={count}"]
     if method != "learned":
-        words.append(f"compare={learned}")
+        words.append(f"compare={learned / 'evaluation.json'}")
     result = evaluate(folder, *words)
     occupancy, paired = result["occupancy"], result.get("paired_difference")
     row = {"method": method, "bin_items": count, "episodes": result["episodes"], "ms": result["latency_ms"]["p50"]}
@@ -56,7 +54,7 @@ def draw(rows: list[dict]) -> None:
         line = [row for row in rows if row["method"] == method]
         counts, means = [row["bin_items"] for row in line], [row["mean"] for row in line]
         errors = [[row["mean"] - row["low"] for row in line], [row["high"] - row["mean"] for row in line]]
-        style = "-" if method == "learned" else "--"
+        style = "-" if method in ("learned", "beam") else "--"
         axes.errorbar(counts, means, errors, label=label, color=colour, marker="o", ls=style, capsize=3)
     axes.set_xticks(COUNTS)
     axes.set_xlabel("items in the bin")
@@ -69,10 +67,7 @@ def draw(rows: list[dict]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checkpoint", default="pretrained/mixed_bin3", help="of the learned policy")
-    checkpoint = parser.parse_args().checkpoint
-    rows = [measure(method, count, checkpoint) for count in COUNTS for method in METHODS]
+    rows = [measure(method, count) for count in COUNTS for method in METHODS]
     with TABLE.open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()

@@ -322,7 +322,6 @@ def shared(state):
     (["model=afterstate", "algo=td", "rollout_length=1"], "rollout_length=1: expected a whole number >= 2"),
     (["model=afterstate", "algo=td", "warm_start.critic_frames=64"], "warm_start.critic_frames=64: expected 0"),
     (["model=afterstate", "algo=td", "model.mask_infeasible=false"], "model.mask_infeasible=False: expected true"),
-    (["model=afterstate", "algo=td", "env.bin_items=2"], "env.bin_items=2: expected 1 with Afterstate"),
     (["model=afterstate", "algo=td", "model.actor.grid=[10,10]"], r"model.actor.grid=\[10, 10\]: expected 3"),
     (["model=afterstate", "algo=td", "model.actor.grid=[10,1,10]"], r"model.actor.grid=\[10, 1, 10\]: expected at le"),
     (["model=afterstate", "algo=td", "model.actor.reward_scale=1"], "model.actor.reward_scale=1: expected reward_s"),
