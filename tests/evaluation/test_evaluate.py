@@ -93,8 +93,9 @@ def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, 
     cfg = composed(f"benchmark={name}", name="evaluate")
     sizes = build("items", cfg["items"]).sizes.tolist()
     assert sorted(sizes) == [list(size) for size in product(range(least, 6), repeat=3)]
-    assert cfg["items"].get("order") == {"cut1": "z", "cut2": "stacking"}.get(name)
-    assert cfg["items"].get("container", cfg.env.tote_size) == cfg.env.tote_size
+    drawn = cfg["items"].get("drawn", cfg["items"])
+    assert drawn.get("order") == {"cut1": "z", "cut2": "stacking"}.get(name)
+    assert drawn.get("container", cfg.env.tote_size) == cfg["items"].get("end", cfg.env.tote_size) == cfg.env.tote_size
     assert cfg.evaluation.episodes == episodes
     assert (cfg.env.tote_size, cfg.env.rotations) == ([10, 10, 10], rotations)
     assert (cfg.env.gripper.size, cfg.env.gripper._target_, cfg.env.bin_size) == ([1, 1], "overlap", [5, 5, 1])
@@ -104,8 +105,9 @@ def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, 
     with evaluation_config("checkpoint=pretrained/mixed", *short, "env.tote_size=[10,10,6]") as cfg:
         prepare(cfg)
     second = episode_settings(cfg)
-    container = {"container": [10, 10, 6]} if "container" in first["items"] else {}  # the tote's size
-    assert second["items"] == {**first["items"], **container}
+    for items in (first["items"], first["items"].get("drawn", {})):  # what is the tote's size
+        items |= {key: [10, 10, 6] for key in ("end", "container") if key in items}
+    assert second["items"] == first["items"]
     assert second["env"] == {**first["env"], "tote_size": [10, 10, 6]}
 
 

@@ -146,7 +146,7 @@ def test_true_volumes_are_reported(tmp_path):
     ]
     number = [order[0][0] for order in orders][items._orders["test"][0][0]]
     assert episodes.true_occupancy.tolist() == [pytest.approx(3 * number * 100 * 41 / (300 * 300 * 250))]
-    with pytest.raises(ValueError, match=r"^evaluation.episodes=2: the items of evaluation.stream=test are 1 orders"):
+    with pytest.raises(ValueError, match=r"^evaluation.episodes=2: the items of evaluation.stream=test have 1 "):
         check_play({"episodes": 2, "batch_size": 1, "stream": "test"}, make_env(0, 1))
 
 
