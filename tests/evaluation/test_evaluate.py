@@ -82,6 +82,32 @@ def test_larger_benchmarks_are_gopt_rs_on_a_finer_grid(side, episodes):
 
 
 @pytest.mark.parametrize(
+    ("name", "target", "base", "fine"),
+    [
+        ("bed_bpp", "euro-pallet", (1.2, 0.8), ["env.tote_size=[120,80,200]", "env.bin_size=[120,80,1]"]),
+        ("bed_bpp_roll", "rollcontainer", (0.8, 0.7), ["env.tote_size=[80,70,200]", "env.bin_size=[80,80,1]"]),
+    ],
+)
+def test_orders_of_bed_bpp_go_where_they_are_for(evaluation, tmp_path, name, target, base, fine):
+    fine += ["env.cell_size=0.01", "env.height_unit=1", "env.support.margin=2"]
+    for extra in ([], fine):
+        env = composed(f"benchmark={name}", "items.path=a", *extra, name="evaluate").env
+        assert [side * env.cell_size for side in env.tote_size[:2]] == pytest.approx(base)
+        assert env.tote_size[2] * env.height_unit * env.cell_size == pytest.approx(2)
+        assert env.support.margin * env.cell_size == pytest.approx(0.02)
+    box = {"length/mm": 600, "width/mm": 390, "height/mm": 305, "weight/kg": 4}
+    (path := tmp_path / "orders.json").write_text(json.dumps({
+        goal: {"item_sequence": {str(n): box for n in range(1, count)}, "properties": {"target": goal}}
+        for goal, count in (("euro-pallet", 4), ("rollcontainer", 3))
+    }))  # fmt: skip
+    words = [f"benchmark={name}", f"items.path={path}", "planner=joint_dbl", *SMALL[1:], "evaluation.episodes=1"]
+    result = evaluation(*words)
+    count = {"euro-pallet": 3, "rollcontainer": 2}[target]
+    assert result["share_placed"]["mean"] == 1 and result["items_placed"] == count
+    assert result["true_occupancy"]["mean"] == pytest.approx(count * 0.6 * 0.39 * 0.305 / (2 * base[0] * base[1]))
+
+
+@pytest.mark.parametrize(
     ("name", "least", "rotations", "support", "episodes"),
     [
         ("gopt_rs", 1, 2, "half_or_hull", 1000),
