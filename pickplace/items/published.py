@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import torch
 
 from pickplace.common.files import MAX_TABLE_BYTES, read_file
-from pickplace.common.validate import at_most, excerpt, is_whole, or_null, refuse_if, reworded, size_tuple
+from pickplace.common.validate import at_most, excerpt, expect, is_whole, or_null, refuse_if, reworded, size_tuple
 from pickplace.items.distributions import MAX_KINDS, MAX_LENGTH, ItemDistribution, hashed_uniform, place_at_random
 
 MAX_ITEMS = 2_000_000  # of a file
@@ -27,6 +28,8 @@ def published(drawn: ItemDistribution, path=None, end=None) -> ItemDistribution:
     Raises:
         ValueError: for a file that cannot be used.
     """
+    good = isinstance(drawn, ItemDistribution)
+    expect(good, "items.drawn", drawn, "an item distribution, such as {_target_: uniform, width: [2, 5]}")
     end = or_null(size_tuple, "items.end", end, 3, MAX_LENGTH)
     return drawn if path is None else Published(drawn, path, end)
 
@@ -105,8 +108,8 @@ def read_sequences(path, end: Sequence[int] | None = None) -> list[list[tuple[in
     Raises:
         ValueError: naming the file, and the line, or the sequence and the item, of what cannot be used.
     """
+    expect(os.path.exists(str(path)), "items.path", str(path), f"a file, {EXPECTED}")
     path = Path(path)
-    refuse_if(not path.exists(), f"items.path={str(path)!r}: no such file; expected {EXPECTED}.")
     rows = _load(path, read_file(path, MAX_TABLE_BYTES, empty=False))
     refuse_if(not _is_list(rows), f"{path}: got {excerpt(rows)}, expected {EXPECTED}.")
     sequences, total = [], 0

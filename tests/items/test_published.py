@@ -86,6 +86,8 @@ def test_without_a_file_all_items_are_drawn():
     assert published(drawn) is drawn
     with pytest.raises(ValueError, match="^items.end=10: expected 3 whole numbers"):
         published(drawn, end=10)
+    with pytest.raises(ValueError, match="^items.drawn=None: expected an item distribution"):
+        published(None)
 
 
 @pytest.mark.parametrize("name", ["cdrl_rs", "cut1", "cut2"])
@@ -154,5 +156,5 @@ def test_an_item_that_does_not_fit_is_named(tmp_path):
     cell = {"bin_size": BIN, "tote_size": (10, 10, 10), "effector_size": (1, 1), "pick_rule": "overlap"}
     with pytest.raises(ValueError, match=r"a\.json, sequence 2, item 2: item 6x2x2 does not fit bin_size"):
         PickPlaceEnv(published(Uniform(), path), num_envs=1, **cell)
-    with pytest.raises(ValueError, match="^items.path='nowhere.json': no such file; expected a list of sequences"):
+    with pytest.raises(ValueError, match="^items.path='nowhere.json': expected a file, a list of sequences"):
         read_sequences("nowhere.json")
