@@ -124,11 +124,16 @@ def is_stable(rules: Rules, supporting: list[Pair], size: Pair) -> bool:
         return bool(edges) and all(cross(a, b, size) > 2 * rules.support_margin * dist(a, b) for a, b in edges)
     if rules.support == "half_or_hull":
         return share > 0.5 or in_hull_of_middles(supporting, size)
+    w, d = size
+    held = sum(corner in supporting for corner in [(0, 0), (w - 1, 0), (0, d - 1), (w - 1, d - 1)])
+    exact = Fraction(len(supporting), w * d)
     if rules.support == "corners":
-        w, d = size
-        held = sum(corner in supporting for corner in [(0, 0), (w - 1, 0), (0, d - 1), (w - 1, d - 1)])
-        exact = Fraction(len(supporting), w * d)
         return exact >= Fraction(60 if held == 4 else 80 if held == 3 else 95, 100)
+    if rules.support == "cdrl":  # of items of up to 40 cells
+        return held >= 3 and exact > Fraction(50 if held == 4 else 85, 100)
+    if rules.support == "gopt":
+        within = in_hull_of_middles(supporting, size) and not on_near_edge(supporting, size)
+        return share > 0.5 or (len(supporting) > 1 and within)
     return {"half": share >= 0.5, "more_than_half": share > 0.5, "full": share == 1}[rules.support]
 
 
@@ -141,6 +146,13 @@ def in_hull_of_middles(supporting: list[Pair], size: Pair) -> bool:
         if within and (min(turns) >= 0 or max(turns) <= 0):
             return True
     return False
+
+
+def on_near_edge(supporting: list[Pair], size: Pair) -> bool:
+    """Whether no middle of a cell has less y than that of a rectangle, and the middles are not all on a line."""
+    points = [(2 * x + 1, 2 * y + 1) for x, y in supporting]
+    flat = not any(cross(a, b, c) for a, b, c in combinations_with_replacement(points, 3))
+    return min(y for _, y in points) >= size[1] and not flat
 
 
 def hull_edges(supporting: list[Pair]) -> list[tuple[Pair, Pair]]:

@@ -32,6 +32,8 @@ SUPPORTS = [
     ("bearing", 0.2),
     ("half_or_hull", 0.0),
     ("corners", 0.0),
+    ("cdrl", 0.0),
+    ("gopt", 0.0),
     (0.0, 0.0),
     (2 / 3, 0.0),
 ]

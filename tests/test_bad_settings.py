@@ -48,6 +48,7 @@ TRAININGS = {
     "items": [],
     "items mixed": ["items=mixed", "env.tote_size=[4,4,3]"],
     "items cut": ["items=cut2", "items.container=[4,4,3]", "items.sides=[1,2]", "env.tote_size=[4,4,3]"],
+    "items published": ["items=published", "items.drawn={_target_:uniform}", "env.tote_size=[4,4,3]"],
     "model": [],
     "model fcn4d": ["model=fcn4d", "~model.actor.hidden", "env.tote_size=[5,5,3]"],
     "warm_start": ["warm_start=imitate", "warm_start.frames=128"],

@@ -44,12 +44,14 @@ REGISTRY: dict[str, dict[str, str]] = {
     "env.reach": _classes("rules.reach", annulus="annulus.Annulus", table="table.ReachTable"),
     "env.support": _classes(
         "rules.support.rules", half="Half", more_than_half="MoreThanHalf", hull="Hull", bearing="Bearing",
-        half_or_hull="HalfOrHull", corners="Corners", full="Full", share="Share",
+        half_or_hull="HalfOrHull", corners="Corners", cdrl="Cdrl", gopt="Gopt", full="Full",
+        share="Share",
     ),
     "items": _classes(
         "items", kinds="distributions.Kinds", uniform="distributions.Uniform", recorded="distributions.Recorded",
-        cut="cut.Cut", orders="orders.Orders",
+        cut="cut.Cut", orders="orders.Orders", published="published.published",
     ),
+    "items.drawn": _classes("items", uniform="distributions.Uniform", cut="cut.Cut"),
     "model.actor": _classes(
         "policies", fcn_grasp="fcn_grasp.policy.fcn_grasp",
         afterstate="afterstate.policy.Afterstate", afterstate_fcn="afterstate.policy.AfterstateFcn",

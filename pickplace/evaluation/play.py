@@ -156,8 +156,8 @@ def check_play(evaluation: Mapping, env: PickPlaceEnv) -> None:
     episodes, most = evaluation["episodes"], env.items.num_episodes(evaluation["stream"])
     refuse_if(
         most is not None and episodes > most,
-        f"evaluation.episodes={episodes}: the items of evaluation.stream={evaluation['stream']} are {most} orders; "
-        f"expected {most} at most, as others would repeat them.",
+        f"evaluation.episodes={episodes}: the items of evaluation.stream={evaluation['stream']} have {most} different "
+        f"episodes; expected {most} at most, as others would repeat them.",
     )
     together = min(evaluation["batch_size"], episodes)
     check_bytes(f"evaluation.batch_size={together}", together * problem_bytes(env.cell, ()), env.device)

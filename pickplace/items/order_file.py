@@ -20,8 +20,9 @@ NAMES = {
     "length": ("length", "l", "w"),
     "width": ("width", "d", "depth"),
     "height": ("height", "h"),
-    "weight": ("weight", "mass", "kg", "g"),
+    "weight": ("weight", "gross_weight", "mass", "kg", "g"),
     "quantity": ("quantity", "qty", "count"),
+    "target": ("target",),
 }
 SIDES = ("length", "width", "height")
 #: What such columns ask for is no part of the task: an order would be packed as if they said nothing.
@@ -69,7 +70,7 @@ class _Column(NamedTuple):
     unit: float  # of its values, in mm or g
 
 
-def read_orders(path, unit: str = "mm", key: str = "items.path") -> list[Order]:
+def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | None = None) -> list[Order]:
     """Return the orders of a file.
 
     A CSV has a header and a line for each item, or for each article with its ``quantity``. Lines with the same
@@ -80,6 +81,8 @@ def read_orders(path, unit: str = "mm", key: str = "items.path") -> list[Order]:
         path: the file; ``.json``, else CSV in UTF-8.
         unit: of lengths without one in the header, ``"mm"``, ``"cm"`` or ``"m"``. Weights without one are in kg.
         key: the setting that names the file.
+        target: what an order is for, in the column ``target``, or in ``properties`` of BED-BPP; only these orders are
+            returned. None: all.
 
     Raises:
         ValueError: naming the file, and the line of a value that cannot be used.
@@ -93,7 +96,7 @@ def read_orders(path, unit: str = "mm", key: str = "items.path") -> list[Order]:
     orders: dict[str, list[OrderItem]] = {}
     articles: dict[str, OrderItem] = {}
     columns: dict[tuple[str, ...], dict[str, _Column]] = {}
-    total = 0
+    total, targets = 0, dict[str, None]()
     for place, header, values, header_place in rows:
         if header not in columns:
             columns[header] = _read_header(f"{path}, {header_place}", header, unit)
@@ -106,8 +109,12 @@ def read_orders(path, unit: str = "mm", key: str = "items.path") -> list[Order]:
             "expected one size and weight for each id.",
         )
         at_most(f"{path}:", total := total + quantity, "items", MAX_ITEMS)
-        orders.setdefault(order, []).extend([item] * quantity)
-    refuse_if(not orders, f"{path}: no items, expected at least one.")
+        goal = _printable(row[columns[header]["target"].key]) if "target" in columns[header] else ""
+        targets[goal] = None
+        if target in (None, goal):
+            orders.setdefault(order, []).extend([item] * quantity)
+    words = "" if target is None else f" for target={target}, but for {excerpt([*targets])}"
+    refuse_if(not orders, f"{path}: no items{words}, expected at least one.")
     return [Order(name, items) for name, items in orders.items()]
 
 
@@ -150,10 +157,12 @@ def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
         items = order.get("item_sequence") if isinstance(order, dict) else None
         if not isinstance(items, dict) or not all(number.isdecimal() and len(number) < 10 for number in items):
             raise wrong(f"order {excerpt(name)} has no item_sequence with numbers as its keys")
+        properties = order.get("properties")
+        about = {"target": properties.get("target")} if isinstance(properties, dict) else {}
         for number in sorted(items, key=int):
             if not isinstance(items[number], dict):
                 raise wrong(f"order {excerpt(name)}, item {number} is {excerpt(items[number])}")
-            place, entries = f"order {_printable(name)}, item {number}", {**items[number], "order": name}
+            place, entries = f"order {_printable(name)}, item {number}", {**about, **items[number], "order": name}
             yield _Row(place, tuple(entries), tuple(entries.values()), place)
 
 

@@ -7,7 +7,7 @@ from itertools import groupby
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import at_most, flag, number, one_of, refuse_if
+from pickplace.common.validate import at_most, expect, flag, is_name, number, one_of, refuse_if
 from pickplace.items.distributions import MAX_KINDS, MAX_LENGTH, ItemDistribution, hashed_uniform, place_at_random
 from pickplace.items.kept import KeptEpisodes
 from pickplace.items.order_file import MILLIMETRES, OrderItem, read_orders
@@ -20,8 +20,8 @@ ROUNDING = 1e-6  # of a cell: three cells of 0.05 m are not exactly 0.15 m in bi
 class Orders(ItemDistribution):
     """The orders of a file: an episode is one order, and its items arrive in the order's sequence.
 
-    Train, validation and test have different orders, drawn at random, the same each time. An order that is in the file
-    twice counts once. Validation and test play each of theirs once.
+    Train, validation and test have different orders, drawn at random, the same each time; or test has all. An order
+    that is in the file twice counts once. Validation and test play each of theirs once.
 
     Sides are rounded up to whole cells and height units; :attr:`volumes` has the true volumes.
 
@@ -32,31 +32,37 @@ class Orders(ItemDistribution):
         unit: of lengths in the file without a unit in the header, ``"mm"``, ``"cm"`` or ``"m"``.
         generate: train with new orders, made of the lines of those that train. A line is an article that comes several
             times in a row; it is as early or late as in its own order. False: train with the orders as they are.
+        target: only the orders for this target, see :func:`~pickplace.items.order_file.read_orders`; None: all.
+        split: False: test has all orders, and nothing can be trained or validated.
 
     Attributes:
         volumes: float64 ``[K]``, the true volume of each kind, in cells times height units.
 
     Raises:
-        ValueError: for a file that cannot be used, or with fewer than three different orders.
+        ValueError: for a file that cannot be used, or with too few orders to split.
     """
 
     sequential = True
 
-    def __init__(self, path, cell_size, height_unit: float = 1.0, unit: str = "mm", generate: bool = True):
+    def __init__(
+        self, path, cell_size, height_unit: float = 1.0, unit: str = "mm", generate: bool = True,
+        target: str | None = None, split: bool = True,
+    ):  # fmt: skip
         refuse_if(
             cell_size is None,
             "items.cell_size=null: expected the side of a cell in metres, such as env.cell_size=0.02.",
         )
         self._cell = 1000 * number("items.cell_size", cell_size, 1e-4, 10, "metres")
         self._unit = self._cell * number("items.height_unit", height_unit, 1e-3, 1000, "cells")
-        orders = read_orders(path, one_of("items.unit", unit, MILLIMETRES))
+        expect(target is None or is_name(target), "items.target", target, "a name in the file, such as euro-pallet")
+        orders = read_orders(path, one_of("items.unit", unit, MILLIMETRES), target=target)
         self.generate = flag("items.generate", generate)
         kinds: dict[tuple[float, float, float, int], int] = {}
         self._examples: list[OrderItem] = []  # of each kind
         numbered = [[self._number(item, kinds) for item in order.items] for order in orders]
         distinct = list(dict.fromkeys(map(tuple, numbered)))
         refuse_if(
-            len(distinct) < 3,
+            flag("items.split", split) and len(distinct) < 3,
             f"items.path={str(path)!r}: the file has {len(distinct)} different orders; expected three at least, for "
             "train, validation and test.",
         )
@@ -65,8 +71,8 @@ class Orders(ItemDistribution):
         self.grams = torch.tensor([item.grams for item in self._examples])
         sides = torch.tensor([item[1:4] for item in self._examples], dtype=torch.float64)
         self.volumes = sides.prod(1) / (self._cell**2 * self._unit)
-        self._orders = _split(distinct)
-        self._lines = _Lines(self._orders["train"])
+        self._orders = _split(distinct) if split else {"train": [], "validation": [], "test": distinct}
+        self._lines = _Lines(self._orders["train"] or distinct)
         self._kept = KeptEpisodes(self._play, max(1, 2**22 // self._lines.most))
 
     def _number(self, item: OrderItem, kinds: dict) -> int:
@@ -101,6 +107,9 @@ class Orders(ItemDistribution):
     def _play(self, stream: str, seed: Tensor, episode: Tensor) -> Sequence[Sequence[int]]:
         """Return the kinds that arrive in episodes, int64 ``[E]``."""
         orders = self._orders[stream]
+        refuse_if(
+            not orders, f"items.split=false: all orders are to test on; expected true, to have some for {stream}."
+        )
         if stream != "train":
             return [orders[number % len(orders)] for number in episode.tolist()]
         if self.generate:

@@ -79,7 +79,9 @@ def test_our_own_configs_are_accepted():
     groups += ("warm_start",)
     for names in itertools.zip_longest(*map(options, groups)):
         choices = [f"{group}={name}" for group, name in zip(groups, names, strict=True) if name]
-        cfg = composed(*choices, *(["items.path=items.csv"] if {"items=recorded", "items=orders"} & {*choices} else []))
+        path = ["items.path=items.csv"] if {"items=recorded", "items=orders"} & {*choices} else []
+        drawn = ["items.drawn={_target_:cut}"] if "items=published" in choices else []
+        cfg = composed(*choices, *path, *drawn)
         assert trusted_config(saved_form(cfg)).env == cfg.env
 
 

@@ -103,6 +103,8 @@ def test_every_env_and_item_distribution(tmp_path):
     (tmp_path / "items.csv").write_text("w,d,h\n1,1,1\n2,1,1\n")
     for name in options("items"):
         words = [f"items.path={tmp_path}/items.csv"] if name == "recorded" else []
+        if name == "published":
+            words = ["items.drawn={_target_:uniform}", "items.end=null"]
         if name == "orders":
             (tmp_path / "orders.csv").write_text("order,l,w,h,kg\n1,9,9,9,1\n2,8,8,8,1\n3,7,7,7,1\n")
             words = [f"items.path={tmp_path}/orders.csv", "items.cell_size=0.05", "items.height_unit=1"]

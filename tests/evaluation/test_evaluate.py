@@ -82,6 +82,32 @@ def test_larger_benchmarks_are_gopt_rs_on_a_finer_grid(side, episodes):
 
 
 @pytest.mark.parametrize(
+    ("name", "target", "base", "fine"),
+    [
+        ("bed_bpp", "euro-pallet", (1.2, 0.8), ["env.tote_size=[120,80,200]", "env.bin_size=[120,80,1]"]),
+        ("bed_bpp_roll", "rollcontainer", (0.8, 0.7), ["env.tote_size=[80,70,200]", "env.bin_size=[80,80,1]"]),
+    ],
+)
+def test_orders_of_bed_bpp_go_where_they_are_for(evaluation, tmp_path, name, target, base, fine):
+    fine += ["env.cell_size=0.01", "env.height_unit=1", "env.support.margin=2"]
+    for extra in ([], fine):
+        env = composed(f"benchmark={name}", "items.path=a", *extra, name="evaluate").env
+        assert [side * env.cell_size for side in env.tote_size[:2]] == pytest.approx(base)
+        assert env.tote_size[2] * env.height_unit * env.cell_size == pytest.approx(2)
+        assert env.support.margin * env.cell_size == pytest.approx(0.02)
+    box = {"length/mm": 600, "width/mm": 390, "height/mm": 305, "weight/kg": 4}
+    (path := tmp_path / "orders.json").write_text(json.dumps({
+        goal: {"item_sequence": {str(n): box for n in range(1, count)}, "properties": {"target": goal}}
+        for goal, count in (("euro-pallet", 4), ("rollcontainer", 3))
+    }))  # fmt: skip
+    words = [f"benchmark={name}", f"items.path={path}", "planner=joint_dbl", *SMALL[1:], "evaluation.episodes=1"]
+    result = evaluation(*words)
+    count = {"euro-pallet": 3, "rollcontainer": 2}[target]
+    assert result["share_placed"]["mean"] == 1 and result["items_placed"] == count
+    assert result["true_occupancy"]["mean"] == pytest.approx(count * 0.6 * 0.39 * 0.305 / (2 * base[0] * base[1]))
+
+
+@pytest.mark.parametrize(
     ("name", "least", "rotations", "support", "episodes"),
     [
         ("gopt_rs", 1, 2, "half_or_hull", 1000),
@@ -93,8 +119,9 @@ def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, 
     cfg = composed(f"benchmark={name}", name="evaluate")
     sizes = build("items", cfg["items"]).sizes.tolist()
     assert sorted(sizes) == [list(size) for size in product(range(least, 6), repeat=3)]
-    assert cfg["items"].get("order") == {"cut1": "z", "cut2": "stacking"}.get(name)
-    assert cfg["items"].get("container", cfg.env.tote_size) == cfg.env.tote_size
+    drawn = cfg["items"].get("drawn", cfg["items"])
+    assert drawn.get("order") == {"cut1": "z", "cut2": "stacking"}.get(name)
+    assert drawn.get("container", cfg.env.tote_size) == cfg["items"].get("end", cfg.env.tote_size) == cfg.env.tote_size
     assert cfg.evaluation.episodes == episodes
     assert (cfg.env.tote_size, cfg.env.rotations) == ([10, 10, 10], rotations)
     assert (cfg.env.gripper.size, cfg.env.gripper._target_, cfg.env.bin_size) == ([1, 1], "overlap", [5, 5, 1])
@@ -104,8 +131,9 @@ def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, 
     with evaluation_config("checkpoint=pretrained/mixed", *short, "env.tote_size=[10,10,6]") as cfg:
         prepare(cfg)
     second = episode_settings(cfg)
-    container = {"container": [10, 10, 6]} if "container" in first["items"] else {}  # the tote's size
-    assert second["items"] == {**first["items"], **container}
+    for items in (first["items"], first["items"].get("drawn", {})):  # what is the tote's size
+        items |= {key: [10, 10, 6] for key in ("end", "container") if key in items}
+    assert second["items"] == first["items"]
     assert second["env"] == {**first["env"], "tote_size": [10, 10, 6]}
 
 

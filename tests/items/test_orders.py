@@ -146,7 +146,7 @@ def test_true_volumes_are_reported(tmp_path):
     ]
     number = [order[0][0] for order in orders][items._orders["test"][0][0]]
     assert episodes.true_occupancy.tolist() == [pytest.approx(3 * number * 100 * 41 / (300 * 300 * 250))]
-    with pytest.raises(ValueError, match=r"^evaluation.episodes=2: the items of evaluation.stream=test are 1 orders"):
+    with pytest.raises(ValueError, match=r"^evaluation.episodes=2: the items of evaluation.stream=test have 1 "):
         check_play({"episodes": 2, "batch_size": 1, "stream": "test"}, make_env(0, 1))
 
 
@@ -220,6 +220,42 @@ def test_an_item_that_fits_nowhere_is_named_with_its_line(tmp_path):
 def test_names_of_sides(tmp_path, header, sides):
     (path := tmp_path / "a.csv").write_text(f"\n{header},kg,,\n1,2,3,4,,\n")
     assert read_orders(path)[0].items[0][1:4] == sides
+
+
+def test_boxes_of_robobpp(tmp_path):
+    """The columns of its repetitive boxes: centimetres, litres, kilograms."""
+    header, time = "Length,Width,Height,Vol/CS,Gross weight,Case_pick_finish_time", '"2022/06/07, 00:24:37"'
+    (path := tmp_path / "a.csv").write_text(f"{header}\n35,20.3,20.8,14.8,6.324,{time}\n")
+    assert [tuple(item[1:5]) for item in read_orders(path, "cm")[0].items] == [(350.0, 203.0, 208.0, 6324)]
+
+
+@pytest.mark.parametrize("kind", ["csv", "json"])
+def test_orders_for_a_target_all_of_them_to_test_on(tmp_path, kind):
+    """A file of three orders, two for the pallet."""
+    path, goals = tmp_path / f"a.{kind}", ["pallet", "cage", "pallet"]
+    orders = [[(10 * number, 20, 30, 400)] * number for number in (1, 2, 3)]
+    if kind == "csv":
+        rows = [(goal, number, *size) for number, (goal, order) in enumerate(zip(goals, orders, strict=True))
+                for size in order]  # fmt: skip
+        path.write_text("target,order,l,w,h,g\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
+    else:
+        content = json.loads(write_bed_bpp(path, orders).read_text())
+        for order, goal in zip(content.values(), goals, strict=True):
+            order["properties"]["target"] = goal
+        path.write_text(json.dumps(content))
+    items = Orders(path, 0.01, target="pallet", split=False)
+    assert items.num_episodes("test") == 2 and [len(episode(items, "test", number)) for number in (0, 1)] == [1, 3]
+    assert episode(items, "test", 1) == [(3, 2, 3, 400)] * 3
+    for stream in ("train", "validation"):
+        with pytest.raises(ValueError, match=f"^items.split=false: all orders are to test on; .* some for {stream}.$"):
+            episode(items, stream, 0)
+    assert Orders(path, 0.01, split=False).num_episodes("test") == 3 == len(read_orders(path))
+    with pytest.raises(ValueError, match=r": no items for target=van, but for \['pallet', 'cage'\], expected at"):
+        read_orders(path, target="van")
+    with pytest.raises(ValueError, match="^items.path=.* the file has 2 different orders; expected three at least"):
+        Orders(path, 0.01, target="pallet")
+    with pytest.raises(ValueError, match="^items.target=3: expected a name"):
+        Orders(path, 0.01, target=3)
 
 
 def test_quantities_and_semicolons(tmp_path):

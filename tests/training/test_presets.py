@@ -37,7 +37,10 @@ def test_every_preset_runs(name, tmp_path, monkeypatch):
     assert {path.name for path in tmp_path.iterdir()} - {"learning_curve.pdf", "learning_curve.svg"} == files
 
 
-@pytest.mark.parametrize("name", sorted({*options("benchmark")} - {"gopt_50", "gopt_100"}))
+NOT_TRAINED = {"gopt_50", "gopt_100", "bed_bpp", "bed_bpp_roll"}
+
+
+@pytest.mark.parametrize("name", sorted({*options("benchmark")} - NOT_TRAINED))
 def test_a_benchmark_is_trained_on(name, tmp_path, no_report):
     unit = composed(f"benchmark={name}")["items"].get("unit", 1)
     tiny = ["model=afterstate", "algo=td", *ONE_NETWORK] if unit > 1 else TINY

@@ -79,6 +79,16 @@ class Contact:
             corners += (ends == self.d).sum(0, dtype=torch.int32) * ((self.w == x + 1).int() + (x == 0))
         return corners
 
+    @property
+    def level_corners(self) -> Tensor:
+        """The number of the footprint's corners whose cells are as high as the highest of them, supported or not."""
+        at_w, at_d = ([size == step + 1 for step in range(self.side)] for size in (self.w, self.d))
+        rows = [self.surfaces[x * self.side : (x + 1) * self.side] for x in range(self.side)]
+        last = [sum(cell * at for cell, at in zip(row, at_d, strict=True)) for row in rows]  # of each row of cells
+        far = [sum(row * at for row, at in zip(each, at_w, strict=True)) for each in ([row[0] for row in rows], last)]
+        heights = torch.stack(torch.broadcast_tensors(rows[0][0], last[0], *far)) >> 1
+        return (heights == heights.amax(0)).sum(0, dtype=torch.int32)
+
     def is_centre_in_hull(self, margin: float = 0.0) -> Tensor:
         """Return whether the item's centre lies inside the hull of the supporting cells, bool of the shape of ``z``.
 
@@ -134,6 +144,25 @@ class Contact:
             left = torch.maximum(left, torch.where(offset <= 0, slope, -inf))
             right = torch.maximum(right, torch.where(offset >= 0, slope, -inf))
         return (left + right >= 0).all(0)
+
+    def is_centre_on_near_edge(self) -> Tensor:
+        """Return whether no supporting cell's middle has less y than the item's centre, and they are not all on a line.
+
+        Only for a centre in the hull of the middles or on its edge: a line then passes through it, so that all middles
+        lie in the same direction from there, or the opposite one.
+        """
+        exact = exact_dtype(self.side)
+        w, d, nan = self.w.short(), self.d.short(), torch.nan
+        before = torch.zeros_like(self.z, dtype=torch.bool)
+        least, most = (torch.full_like(self.z, value, dtype=exact) for value in (inf, -inf))
+        for x, (last, first) in enumerate(self.ends()):
+            offset = (2 * x + 1 - w).to(exact)
+            before = before | (2 * first > d + 1)
+            for along in (torch.where(last > 0, 2 * last - 1 - d, nan), torch.where(first > 0, d + 1 - 2 * first, nan)):
+                slope = along.to(exact) / offset  # nan for the centre's own cell, too
+                least = torch.where(slope < least, slope, least)
+                most = torch.where(slope > most, slope, most)
+        return ~before & (least < most)
 
     def in_hull(self) -> Tensor:
         """Return which cells under the items lie inside the hull of the supporting cells, bool ``[S * S, N]``.

@@ -78,6 +78,38 @@ class Corners(Share):
 
 
 @dataclass(frozen=True)
+class Cdrl(Share):
+    """More than half of the footprint and its four corners are supported, or over 85% and three, or over 95%.
+
+    As in the code of Zhao et al., 2021, "Online 3D Bin Packing with Constrained Deep Reinforcement Learning", which
+    differs from their text. With over 95% three corners must be equally high, and no lower than the fourth. On a
+    measured surface over 95% are needed.
+    """
+
+    least: float = field(default=nextafter(0.95, 1), init=False)  # the next number after 0.95
+
+    def stable(self, contact: Contact) -> Tensor:
+        corners, share = contact.corners, contact.share
+        # Of up to 40 cells some corner is supported if over 95% are, so that the highest corners are supported ones.
+        level = corners if contact.side <= 6 else contact.level_corners
+        found = super().stable(contact) & (level >= 3)
+        return found | ((corners >= 4) & (share > 0.5)) | ((corners >= 3) & (share > 0.85))
+
+
+@dataclass(frozen=True)
+class Gopt(MoreThanHalf):
+    """As :class:`HalfOrHull`, but an item needs two supporting cells, and its centre may not be on the edge of least y.
+
+    As in the code of GOPT (Xiong et al., 2024). A centre on that edge counts where the middles are all on a line. A
+    measured surface has no cells; there the share decides alone.
+    """
+
+    def stable(self, contact: Contact) -> Tensor:
+        within = contact.is_centre_in_hull_of_middles() & ~contact.is_centre_on_near_edge()
+        return super().stable(contact) | (within & (contact.count > 1))
+
+
+@dataclass(frozen=True)
 class Hull(Support):
     """The item's centre lies inside the convex hull of the supporting cells.
 
@@ -129,6 +161,8 @@ RULES: dict[str, type[Support]] = {
     "bearing": Bearing,
     "half_or_hull": HalfOrHull,
     "corners": Corners,
+    "cdrl": Cdrl,
+    "gopt": Gopt,
     "full": Full,
 }
 
