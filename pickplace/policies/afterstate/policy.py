@@ -49,7 +49,8 @@ class Afterstate(FootprintPolicy):
         return self.network.learning_bytes(*self.cell.tote_size[:2])
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
-        after, _ = put_down(self.cell, State.from_observation(observation).rows(row), footprint)
+        state = State.from_observation(observation)._replace(pile=None)  # what lies on what is not in the picture
+        after, _ = put_down(self.cell, state.rows(row), footprint)
         seen = observe(STANDARD_TERMS, self.cell, after, self.network.in_keys)
         return self.network(*(seen[key] for key in self.network.in_keys))[:, 0] / self.temperature
 
