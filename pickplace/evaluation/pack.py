@@ -14,8 +14,9 @@ from pickplace.items.order_file import OrderItem
 from pickplace.planners.base import MapPlanner
 from pickplace.rules.cell import MAX_SIDE, CellSpec
 from pickplace.rules.gripper.rules import Overlap
-from pickplace.rules.item import Item
+from pickplace.rules.item import NO_LIMIT, Item
 from pickplace.rules.masks import footprint_mask, placing_maps
+from pickplace.rules.pile import Pile
 from pickplace.rules.state import EMPTY, Failure, State, surface_from
 from pickplace.rules.step import apply
 from pickplace.rules.support.rules import RoundedUp
@@ -23,7 +24,8 @@ from pickplace.views.recording import Recording, record_moves
 
 LEAST_MARGIN = 20.0  # of an item's centre from the edge of what carries it, mm: piles are high
 
-#: Sequences that are tried, by what comes first: the largest base, volume, height.
+#: Sequences that are tried, by what comes first: the largest base, volume, height. If some item bears a limited load,
+#: also those in which what bears more comes first.
 SEQUENCES: tuple[Callable[[OrderItem], float], ...] = (
     lambda item: -item.length * item.width,
     lambda item: -item.length * item.width * item.height,
@@ -69,7 +71,8 @@ class OrderPacker:
     """Packs orders into containers of one size, without a gripper.
 
     An item lies in the corner with the least x and y of the cells that it takes. Items that carry another one together
-    are level within a millimetre. Nothing sticks out of the container, or passes its rim.
+    are level within a millimetre. Nothing sticks out of the container, or passes its rim. An item is turned only as it
+    allows, and no item carries more than it bears: the full mass of an item counts on each one below it in the pile.
 
     Args:
         container: length, width and height, mm.
@@ -121,8 +124,7 @@ class OrderPacker:
         containers: list[PackedContainer] = []
         while left:
             tried = []
-            for rank in (None,) if keep_sequence else SEQUENCES:
-                sequence = left if rank is None else sorted(left, key=lambda numbered: rank(numbered[1]))
+            for sequence in [left] if keep_sequence else _sequences(left):
                 tried.append(self._fill(cell, planner, sequence, len(containers)))
             # The most items, of these the greatest volume, of these the lowest pile.
             best, left = min(tried, key=lambda each: (len(each[1]), -each[0].occupancy, each[0].top))
@@ -144,13 +146,17 @@ class OrderPacker:
 
     def _fits(self, item: OrderItem) -> bool:
         (w, d, h), (wide, deep) = self._sides(item), (side // self.cell_mm for side in self.container[:2])
-        return h <= self.container[2] and ((w <= wide and d <= deep) or (w <= deep and d <= wide))
+        as_it_lies, turned = (bool(item.turns >> turn & 1) for turn in range(2))
+        return h <= self.container[2] and (
+            (as_it_lies and w <= wide and d <= deep) or (turned and w <= deep and d <= wide)
+        )
 
     def _misfit(self, item: OrderItem) -> str:
         sizes = " x ".join(f"{side:g}" for side in (item.length, item.width, item.height))
         return (
             f"{item.place}: {sizes} mm; expected an item that fits the container of "
-            f"{' x '.join(map(str, self.container))} mm, in cells of {self.cell_mm} mm, as it lies or turned."
+            f"{' x '.join(map(str, self.container))} mm, in cells of {self.cell_mm} mm, as it lies or turned, "
+            "where it may be turned."
         )
 
     def _cell_for(self, items: Sequence[OrderItem]) -> CellSpec:
@@ -159,7 +165,8 @@ class OrderPacker:
         length, width = (side // self.cell_mm for side in self.container[:2])
         with reworded(ValueError, lambda error: ValueError(f"cell={self.cell_mm} mm is too fine: {error}")):
             cell = CellSpec(bin_size=(wide, deep, high), tote_size=(length, width, self.container[2]), **self._settings)
-        return replace(cell, longest_side=max(wide, deep))
+        handling = any(item.has_limits for item in items)
+        return replace(cell, longest_side=max(wide, deep), handling=handling, most_items=len(items))
 
     def _fill(
         self, cell: CellSpec, planner: MapPlanner, sequence: Sequence[tuple[int, OrderItem]], number: int
@@ -169,9 +176,10 @@ class OrderPacker:
         surface = torch.full((1, *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
         tops = np.zeros(cell.tote_size[:2])  # of the surface without rounding, mm
         height = torch.tensor([cell.tote_size[2]])
+        pile = Pile.empty(1, cell.tote_size, cell.pile_room) if cell.handling else None
         for place, item in sequence:
-            columns = (torch.tensor([[value]]) for value in (0, 0, *self._sides(item)))
-            state = State(surface, height, Item(*columns))
+            columns = (0, 0, *self._sides(item), -1, item.turns, item.grams, item.max_load)
+            state = State(surface, height, Item(*(torch.tensor([[value]]) for value in columns)), pile=pile)
             maps = placing_maps(cell, state)
             if not footprint_mask(cell, maps).any():
                 left.append((place, item))
@@ -183,7 +191,8 @@ class OrderPacker:
             tops[x : x + w, y : y + d] = below + item.height
             corner = x * self.cell_mm, y * self.cell_mm, round(below, 6)
             packed.append(PackedItem(item, place, corner, recording.moves[-1].rotation % 2 == 1))
-            after = state._replace(surface=apply(cell, state, action).surface)
+            step = apply(cell, state, action)
+            after, pile = state._replace(surface=step.surface), step.pile
             heights, bearing = after.heights, after.bearing
             # A top is rounded up once, not with each item of its pile: so level tops are level within a millimetre.
             heights[0, x : x + w, y : y + d] = math.ceil(below + item.height - 1e-6)
@@ -194,3 +203,14 @@ class OrderPacker:
         recording.ending = Failure.STUCK if left else Failure.NONE
         recording.occupancy = sum(math.prod(each.size) for each in packed) / math.prod(self.container)
         return PackedContainer(packed, recording), left
+
+
+def _sequences(items: Sequence[tuple[int, OrderItem]]) -> list[list[tuple[int, OrderItem]]]:
+    """Return numbered items in each of :data:`SEQUENCES`."""
+    found = []
+    for rank in SEQUENCES:
+        ranked = sorted((rank(item), place) for place, (_, item) in enumerate(items))
+        found.append([items[place] for _, place in ranked])
+    if any(item.max_load < NO_LIMIT for _, item in items):
+        found += [sorted(each, key=lambda numbered: -numbered[1].max_load) for each in found]
+    return found

@@ -33,8 +33,8 @@ def parser() -> argparse.ArgumentParser:
         epilog="The file's format: docs/train_your_own.md#2-describe-the-items",
         options={
             "order": {
-                "help": "CSV with columns length, width, height, weight, and if there are any order, id, quantity; or "
-                "JSON of BED-BPP",
+                "help": "CSV with columns length, width, height, weight, and if there are any order, id, quantity, "
+                "max_load, stackable, orientations; or JSON of BED-BPP",
             },
             "--container": {
                 "required": True, "metavar": "LxWxH", "help": "inner sides of a container, such as 1200x800x1500; mm",
@@ -150,13 +150,15 @@ def _as_bed_bpp(packed: "PackedItem") -> dict:
 
 
 def _as_plan(number: int, container: tuple[int, ...], packed: "PackedContainer") -> "EpisodePlan":
-    """Return the plan of a container for a physics engine, with the items' true sides."""
+    """Return the plan of a container for a physics engine, with the items' true sides and masses."""
     from pickplace.physics.plans import EpisodePlan, Placement
 
     def metres(values) -> tuple[float, ...]:
         return tuple(round(value / 1000, 9) for value in values)
 
-    placements = [Placement(metres(each.corner), metres(each.size)) for each in packed.items]
+    placements = [
+        Placement(metres(each.corner), metres(each.size), mass=each.item.grams / 1000) for each in packed.items
+    ]
     return EpisodePlan(number, metres(container), placements=placements)
 
 

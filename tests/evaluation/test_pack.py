@@ -15,9 +15,10 @@ from scipy.spatial import ConvexHull
 
 from pickplace import cli
 from pickplace.evaluation.pack import OrderPacker
-from pickplace.items.order_file import OrderItem
+from pickplace.items.order_file import ORIENTATIONS, OrderItem
 from pickplace.physics.engine import build_engine
 from pickplace.physics.plans import read_plans
+from pickplace.rules.item import NO_LIMIT
 
 ORDERS = Path(__file__).resolve().parents[2] / "docs/examples/orders/orders.csv"
 CONTAINER, CELL = (400, 300, 250), 20
@@ -67,6 +68,50 @@ def test_items_lie_apart_inside_and_are_carried(sizes, keep):
             assert is_carried(packed, before), (packed, before)
         volume = sum(math.prod(packed.size) for packed in each.items)
         assert each.occupancy == pytest.approx(volume / math.prod(CONTAINER))
+
+
+LIMITS = st.tuples(
+    st.integers(1, 9), st.sampled_from([NO_LIMIT, NO_LIMIT, 20, 8, 0]),
+    st.sampled_from([ORIENTATIONS, ORIENTATIONS, ("lwh",), ("wlh", "hwl")]),
+)  # fmt: skip
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.lists(st.tuples(SIDES, LIMITS), min_size=1, max_size=25), st.booleans())
+def test_loads_and_turns_are_as_the_items_allow(sizes, keep):
+    """By the items' true sides: the loads are counted again, from the first item up."""
+    items = [
+        OrderItem(str(n), *map(float, sides), grams, f"line {n}", max_load, orientations)
+        for n, (sides, (grams, max_load, orientations)) in enumerate(sizes)
+    ]
+    _, containers = OrderPacker(CONTAINER, CELL).pack(items, keep_sequence=keep)
+    assert sum(len(each.items) for each in containers) == len(items)
+    for each in containers:
+        below = []
+        load = [0] * len(each.items)
+        for packed in each.items:
+            assert ("wlh" if packed.turned else "lwh") in packed.item.orientations
+            carriers = {
+                number
+                for number, other in enumerate(each.items[: len(below)])
+                if abs(other.corner[2] + other.size[2] - packed.corner[2]) < 1e-6 and overlap(packed, other, (0, 1)) > 0
+            }
+            below.append(carriers.union(*(below[number] for number in carriers)))
+            for number in below[-1]:
+                load[number] += packed.item.grams
+        assert all(total <= packed.item.max_load for total, packed in zip(load, each.items, strict=True))
+
+
+def test_what_bears_nothing_comes_last_if_that_packs_more():
+    """A plate on which nothing may lie fits on top of two cubes; first, it would leave no room for them."""
+    items = [
+        OrderItem("plate", 200.0, 100.0, 20.0, 9, "line 1", 0),
+        *(OrderItem("cube", *[100.0] * 3, 9, "line 2"),) * 2,
+    ]
+    _, (one,) = OrderPacker((200, 100, 130), CELL).pack(items)
+    assert [packed.item.id for packed in one.items] == ["cube", "cube", "plate"]
+    _, several = OrderPacker((200, 100, 130), CELL).pack(items, keep_sequence=True)
+    assert len(several) == 2
 
 
 def test_tops_that_are_rounded_alike_are_not_level():
