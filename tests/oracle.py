@@ -183,22 +183,19 @@ class Placed:
         return others[2] == self.corner[2] and min(shared) > 0
 
 
-def pile_below(items: list[Placed], number: int) -> set[int]:
-    """The numbers of the items on which one rests, and of those on which these rest, down to the floor."""
-    found: set[int] = set()
-    for other, item in enumerate(items):
-        if items[number].rests_on(item):
-            found |= {other} | pile_below(items, other)
+def piles_below(items: list[Placed]) -> list[set[int]]:
+    """For each item the numbers of those on which it rests, and of those on which these rest, down to the floor."""
+    found: list[set[int]] = []
+    for item in items:  # what an item rests on was there before
+        on = {other for other in range(len(found)) if item.rests_on(items[other])}
+        found.append(on.union(*(found[other] for other in on)))
     return found
 
 
 def loads(items: list[Placed]) -> list[int]:
     """The mass that counts on each item: that of every item in whose pile below it is."""
-    found = [0] * len(items)
-    for number, item in enumerate(items):
-        for other in pile_below(items, number):
-            found[other] += item.mass
-    return found
+    below = piles_below(items)
+    return [sum(item.mass for item, on in zip(items, below, strict=True) if n in on) for n in range(len(items))]
 
 
 @dataclass
@@ -397,10 +394,9 @@ class Oracle:
             return 0, True, failure
         w, d, h = self.contents[self.taken(action)][0]
         reward = w * d * h
-        if self.rules.handling is not None:
-            self.placed = [*self.placed, self.lying(action)]
+        placed = self.placed if self.rules.handling is None else [*self.placed, self.lying(action)]
         self.bearing = self.bearing_after(action)
-        self.heights, self.volume = after, self.volume + reward
+        self.heights, self.volume, self.placed = after, self.volume + reward, placed
         self.item, self.position, self.others, self.picks = next_item, next_position, list(others), {}
         stuck = not self.has_feasible_action(try_first)
         return reward, stuck, STUCK if stuck else SUCCESS

@@ -7,7 +7,7 @@ from random import Random
 
 import pytest
 import torch
-from oracle import SUCCESS, Oracle, Rules, can_always_start, cells, loads, pile_below
+from oracle import FORBIDDEN_TURN, OVERLOADED, SUCCESS, Oracle, Rules, can_always_start, cells, loads, piles_below
 from problems import SUPPORTS, random_effector, support_of
 from tensordict import TensorDict
 
@@ -123,7 +123,7 @@ def compare_pile(oracle, observation, row):
         NO_LIMIT if item.most is None else item.most - load for item, load in zip(items, loads(items), strict=True)
     ]
     assert observation["pile_spare"][row].tolist() == spare + [0] * (room - len(items))
-    below = [pile_below(items, number) | {number} for number in range(len(items))]
+    below = [on | {number} for number, on in enumerate(piles_below(items))]
     found = [{*line.nonzero()[:, 0].tolist()} for line in observation["pile_below"][row]]
     assert found == below + [set()] * (room - len(items))
 
@@ -139,14 +139,21 @@ def fresh_oracle(rules, kinds, observation, row):
 
 
 def compare_mask(oracle, mask, full, rng):
-    """Compare every entry of a `[N_a]` mask, or 24 of them, half of them feasible if there are so many."""
+    """Compare every entry of a `[N_a]` mask, or 24 of them, half of them feasible if there are so many.
+
+    Return the tally of failure codes of these 24.
+    """
+    codes = Counter()
     if full:
         assert mask.tolist() == oracle.full_mask()
-        return
+        return codes
     yes, no = mask.nonzero().flatten().tolist(), (~mask).nonzero().flatten().tolist()
     count = min(12, len(yes))
     for action in rng.sample(yes, count) + rng.sample(no, min(24 - count, len(no))):
-        assert (oracle.try_action(action)[0] == SUCCESS) == mask[action], action
+        code = oracle.try_action(action)[0]
+        assert (code == SUCCESS) == mask[action], action
+        codes[code] += 1
+    return codes
 
 
 def compare_arrivals(rules, kinds, left, found):
@@ -169,13 +176,15 @@ def has_no_room(rules, kind, contents):
     return not any(full.isdisjoint(cells(corner, kind[:2])) for corner in corners)
 
 
-def choose_action(rules, mask, rng):
+def choose_action(rules, mask, rng, good=0.8):
     """Return mostly a feasible action, else any action, or any placement of a pick that is known to succeed."""
     feasible, anything = rng.choice(mask.nonzero().flatten().tolist()), rng.randrange(rules.num_actions)
     draw = rng.random()
-    if draw < 0.8:
+    if draw < good:
         return feasible
-    return anything if draw < 0.86 else rules.join(rules.split(feasible)[0], *rules.split(anything)[1:])
+    return (
+        anything if draw < good + 0.3 * (1 - good) else rules.join(rules.split(feasible)[0], *rules.split(anything)[1:])
+    )
 
 
 def options_of(rules):
@@ -187,8 +196,12 @@ def options_of(rules):
     return {*enumerate((rules.pick_rule, support, *shapes, refill, limits, rules.rotations, handling))}
 
 
-def compare_config(rules, kinds, seed, rng, full_share):
-    """Play one configuration; return the tally of failure codes and the number of full masks compared."""
+def compare_config(rules, kinds, seed, rng, full_share, steps=STEPS, good=0.8):
+    """Play one configuration; return the tally of failure codes, the number of full masks compared, and the tally of
+    the codes in the other masks.
+
+    ``good`` is the share of actions that are feasible for sure.
+    """
     num_envs = rng.choice(NUM_ENVS)
     env = make_env(rules, kinds, num_envs=num_envs, seed=seed)
     least, most = max(h for _, _, h in kinds), rules.tote_size[2]
@@ -196,14 +209,14 @@ def compare_config(rules, kinds, seed, rng, full_share):
     td = env.reset(TensorDict({"tote_height": asked}, [num_envs]))
     assert td["tote_height"].equal(asked)
     oracles = [fresh_oracle(rules, kinds, td, row) for row in range(num_envs)]
-    codes, full_masks = Counter(), 0
-    for _ in range(STEPS):
+    codes, full_masks, in_masks = Counter(), 0, Counter()
+    for _ in range(steps):
         actions = []
         for oracle, mask in zip(oracles, td["action_mask"], strict=True):
             full = rng.random() < full_share
             full_masks += full
-            compare_mask(oracle, mask, full, rng)
-            actions.append(choose_action(rules, mask, rng))
+            in_masks += compare_mask(oracle, mask, full, rng)
+            actions.append(choose_action(rules, mask, rng, good))
         before = td
         td, following = env.step_and_maybe_reset(td.clone().set("action", torch.tensor(actions)))
         after = td["next"]
@@ -228,7 +241,7 @@ def compare_config(rules, kinds, seed, rng, full_share):
                 assert following["action_mask"][row].equal(mask)
             codes[failure] += 1
         td = following
-    return codes, full_masks
+    return codes, full_masks, in_masks
 
 
 SHAPES = "rectangle", "disc", "mask"
@@ -259,7 +272,7 @@ def test_env_equals_oracle(transitions, full_masks, handling, seed):
                 make_env(rules, kinds, num_envs=2, seed=env_seed)
             refused += 1
             continue
-        more_codes, more_masks = compare_config(rules, kinds, env_seed, rng, full_share=full_masks / transitions)
+        more_codes, more_masks, _ = compare_config(rules, kinds, env_seed, rng, full_share=full_masks / transitions)
         codes, masks, configs = codes + more_codes, masks + more_masks, configs + 1
         met |= options_of(rules)
     assert set(codes) == set(range(11)), codes
@@ -267,3 +280,22 @@ def test_env_equals_oracle(transitions, full_masks, handling, seed):
     assert met <= OPTIONS and not missing, missing
     assert configs >= transitions // (max(NUM_ENVS) * STEPS)
     assert 0 < refused < 3 * configs
+
+
+@pytest.mark.parametrize(("configs", "steps"), [(5, 25), pytest.param(400, 100, marks=pytest.mark.slow)])
+def test_high_piles_equal_the_oracle(configs, steps):
+    """Small items without a gripper on a small base, so that many lie on others, and over edges."""
+    rng, codes, in_masks, full = Random(configs), Counter(), Counter(), 0
+    for seed in range(configs):
+        kinds = sorted({tuple(rng.randint(1, most) for most in (3, 2, 2)) for _ in range(4)})
+        turns = [rng.choice(((0, 1), (0, 1), (0,))) for _ in kinds]
+        given = [(each, rng.randint(0, 5), rng.choice((None, None, 0, 6, 12, 20))) for each in turns]
+        rules = Rules(
+            (3, 2, 1), (rng.randint(3, 5), rng.randint(3, 4), 9), (1, 1), 2, "overlap",
+            rng.choice((0.0, 0.5, "bearing")), bin_items=rng.choice((1, 2)),
+            handling=dict(zip(kinds, given, strict=True)),
+        )  # fmt: skip
+        some, count, others = compare_config(rules, kinds, seed, rng, 0.05, steps, 0.97)
+        codes, full, in_masks = codes + some, full + count, in_masks + others
+    assert in_masks[OVERLOADED] > 10 * configs and in_masks[FORBIDDEN_TURN] > configs and full
+    assert codes[SUCCESS] > 0.8 * codes.total()

@@ -8,7 +8,7 @@ import torch
 from problems import SETTINGS, random_states
 
 from pickplace import PickPlaceEnv
-from pickplace.envs.saved_state import check_saved_states
+from pickplace.envs.saved_state import _is_possible, check_saved_states
 from pickplace.items.distributions import Kinds
 from pickplace.planners.lookahead import Lookahead
 from pickplace.planners.mcts import MCTS
@@ -142,6 +142,28 @@ def test_a_pile_that_no_episode_leads_to_is_refused(change, words):
     change(saved["environment"])
     with pytest.raises(CheckpointError, match=f"of no use: {words}"):
         check_saved_states(env, saved)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda pile: pile.below[0, 2, 0].fill_(False),  # what is below what is below
+        lambda pile: pile.below[0, 0, 1].fill_(True),  # a later item
+        lambda pile: pile.below[0, 3, 3].fill_(True),  # one that is not there
+        lambda pile: pile.spare[0, 3].fill_(1),
+        lambda pile: pile.spare[0, 0].fill_(-1),
+        lambda pile: pile.labels[0, 1, 0].fill_(4),
+        lambda pile: pile.labels[0, 1, 0].fill_(2),  # on two heights
+    ],
+)
+def test_impossible_piles_by_hand(change):
+    """The lowest item of a tower of three takes two cells; there is room for a fourth."""
+    below = torch.tensor([[[1, 0, 0, 0], [1, 1, 0, 0], [1, 1, 1, 0], [0, 0, 0, 0]]]).bool()
+    pile = Pile(torch.tensor([[[3], [1]]]), torch.tensor([[0, 5, NO_LIMIT, 0]]), below)
+    steps, heights = torch.tensor([3]), torch.tensor([[[3], [1]]], dtype=torch.int32)
+    assert _is_possible(pile, steps, heights).tolist() == [True]
+    change(pile)
+    assert _is_possible(pile, steps, heights).tolist() == [False]
 
 
 @pytest.mark.parametrize(
