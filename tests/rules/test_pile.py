@@ -153,7 +153,7 @@ def test_a_pile_that_no_episode_leads_to_is_refused(change, words):
         lambda pile: pile.spare[0, 3].fill_(1),
         lambda pile: pile.spare[0, 0].fill_(-1),
         lambda pile: pile.labels[0, 1, 0].fill_(4),
-        lambda pile: pile.labels[0, 1, 0].fill_(2),  # on two heights
+        lambda pile: pile.labels[0, 1, 0].fill_(3),  # on two heights
     ],
 )
 def test_impossible_piles_by_hand(change):
