@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from pickplace.common.files import MAX_TABLE_BYTES, read_text
 from pickplace.common.validate import at_most, excerpt, refuse_if, reworded, without_twins
-from pickplace.rules.item import ALL_TURNS, NO_LIMIT
+from pickplace.rules.item import NO_LIMIT
 
 #: Name of a column -> the names that a file may have for it, in any case; a unit may follow, as in ``length/mm``.
 NAMES = {
@@ -71,8 +71,9 @@ class OrderItem(NamedTuple):
 
     @property
     def has_limits(self) -> bool:
-        """Whether it forbids a quarter turn, or bears a limited load only."""
-        return self.turns != ALL_TURNS or self.max_load < NO_LIMIT
+        """Whether it bears a limited load only, or forbids a quarter turn about z, on a face that may be the lowest."""
+        pairs = zip(ORIENTATIONS[::2], ORIENTATIONS[1::2], strict=True)
+        return self.max_load < NO_LIMIT or any(len({*pair} & {*self.orientations}) == 1 for pair in pairs)
 
 
 class Order(NamedTuple):
@@ -286,8 +287,8 @@ def _read_orientations(place: str, row: Mapping, columns: dict[str, _Column]) ->
     words = re.split(r"[\s,;|/+]+", str(value).strip().lower())
     found = {each for word in words for each in WORDS.get(word, (word,))}
     refuse_if(
-        not found <= {*ORIENTATIONS} or not found & {*TURNS},
+        not found <= {*ORIENTATIONS},
         f"{place}: {columns['orientations'].key}={excerpt(value)}: expected any, upright or fixed; or some of "
-        f"{', '.join(ORIENTATIONS)}, the sides along x, y and z, among them lwh or wlh.",
+        f"{', '.join(ORIENTATIONS)}, the sides along x, y and z.",
     )
     return tuple(each for each in ORIENTATIONS if each in found)

@@ -73,6 +73,11 @@ class Orders(ItemDistribution):
 
     def _number(self, item: OrderItem, kinds: dict) -> int:
         """Return the number of an item's kind: of its sides, its weight, and what it allows."""
+        refuse_if(
+            not item.turns,
+            f"{item.place}: orientations={' '.join(item.orientations)}: expected lwh or wlh among them; items=orders "
+            "does not tip items.",
+        )
         kind = kinds.setdefault(item.kind, len(kinds))
         if kind == len(self._examples):
             self._examples.append(item)
