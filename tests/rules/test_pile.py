@@ -3,6 +3,7 @@
 That masks, step and environment are those of the plain-Python oracle, ``tests/envs/test_env_oracle.py`` checks.
 """
 
+import gymnasium
 import pytest
 import torch
 from problems import SETTINGS, random_states
@@ -17,7 +18,7 @@ from pickplace.robot.planner import Planner
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import NO_LIMIT, Item
 from pickplace.rules.masks import choice_mask, first_action_reaching, placing_maps
-from pickplace.rules.observation import ToteCapacity, observe, standard_terms
+from pickplace.rules.observation import HANDLING_TERMS, ToteCapacity, observe, standard_terms
 from pickplace.rules.pile import Pile
 from pickplace.rules.state import EMPTY, Failure, State
 from pickplace.rules.step import apply, put_down
@@ -177,6 +178,18 @@ def test_impossible_piles_by_hand(change):
 def test_bad_instructions_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         Kinds([(1, 1, 1), (2, 1, 1), (2, 2, 1)], **settings)
+
+
+def test_gymnasium_has_the_entries_of_handling():
+    items = Kinds([(1, 1, 1), (2, 1, 1), (2, 2, 1)], **HANDLING)
+    env = gymnasium.make("pickplace/PickPlace-v0", items=items, handling=True).unwrapped
+    observation, info = env.reset(seed=0)
+    for _ in range(12):
+        assert env.observation_space.contains(observation) and set(HANDLING_TERMS) <= set(observation)
+        observation, _, ended, *_, info = env.step(int(info["action_mask"].argmax()))
+        if ended:
+            break
+    assert observation["pile_below"].any()
 
 
 def test_limits_without_handling_are_refused():
