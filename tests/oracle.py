@@ -14,7 +14,7 @@ from itertools import chain, combinations_with_replacement, product
 from math import dist
 
 SUCCESS, PICK_MISS, BIN_COLLISION, TOTE_COLLISION, OVERFLOW, ITEM_COLLISION, UNSTABLE, STUCK, OUT_OF_REACH = range(9)
-FORBIDDEN_TURN = 9
+FORBIDDEN_TURN, OVERLOADED = 9, 10
 
 Pair = tuple[int, int]
 Triple = tuple[int, int, int]
@@ -44,6 +44,7 @@ class Rules:
     lowest_pick: list[int] | None = None  # for each pick cell, of the item's height; None: any height
     highest_pick: list[int] | None = None
     turns: tuple[int, ...] | None = None  # rotations that are allowed; None: all
+    handling: dict[Triple, tuple[tuple[int, ...], int, int | None]] | None = None  # rotations, mass, greatest load
 
     @property
     def num_actions(self) -> int:
@@ -178,6 +179,37 @@ def inside(cell: Pair, grid: Grid) -> bool:
     return 0 <= cell[0] < len(grid) and 0 <= cell[1] < len(grid[0])
 
 
+@dataclass(frozen=True)
+class Placed:
+    """An item in the tote: its corner, its sides, its mass and the greatest load on it; None: any."""
+
+    corner: Triple
+    size: Triple
+    mass: int
+    most: int | None
+
+    def rests_on(self, other: Placed) -> bool:
+        """Whether this one's underside and the other's top are level and have an area in common."""
+        ends, others = ([a + b for a, b in zip(box.corner, box.size, strict=True)] for box in (self, other))
+        shared = [min(ends[i], others[i]) - max(self.corner[i], other.corner[i]) for i in range(2)]
+        return others[2] == self.corner[2] and min(shared) > 0
+
+
+def piles_below(items: list[Placed]) -> list[set[int]]:
+    """For each item the numbers of those on which it rests, and of those on which these rest, down to the floor."""
+    found: list[set[int]] = []
+    for item in items:  # what an item rests on was there before
+        on = {other for other in range(len(found)) if item.rests_on(items[other])}
+        found.append(on.union(*(found[other] for other in on)))
+    return found
+
+
+def loads(items: list[Placed]) -> list[int]:
+    """The mass that counts on each item: that of every item in whose pile below it is."""
+    below = piles_below(items)
+    return [sum(item.mass for item, on in zip(items, below, strict=True) if n in on) for n in range(len(items))]
+
+
 @dataclass
 class Oracle:
     """One environment: an episode's tote and the item that waits in the bin.
@@ -195,6 +227,7 @@ class Oracle:
     bearing: Grid = field(default_factory=list)
     others: list[tuple[Triple, Pair]] = field(default_factory=list)
     picks: dict[Pair, tuple[int, int | None]] = field(default_factory=dict)  # those that were tried: they come up often
+    placed: list[Placed] = field(default_factory=list)  # with handling
 
     def __post_init__(self):
         wide, deep, _ = self.rules.tote_size
@@ -305,11 +338,29 @@ class Oracle:
 
         if rules.turns is not None and r not in rules.turns:
             return FORBIDDEN_TURN, None
+        if rules.handling is not None:
+            if r not in rules.handling[w, d, h][0]:
+                return FORBIDDEN_TURN, None
+            items = [*self.placed, self.lying(action)]
+            if any(item.most is not None and load > item.most for item, load in zip(items, loads(items), strict=True)):
+                return OVERLOADED, None
 
         after = [column[:] for column in heights]
         for x, y in footprint:
             after[x][y] = top
         return SUCCESS, after
+
+    def lying(self, action: int) -> Placed:
+        """The item of an action as it would lie in the tote, if its footprint is inside."""
+        pick, place, r = self.rules.split(action)
+        (w, d, h), position = self.contents[self.try_pick(pick)[1]]
+        corner = corner_for(pick, self.rules.effector_size)
+        offset = position[0] - corner[0], position[1] - corner[1]
+        effector, (dx, dy), size = rotate(r, self.rules.effector_size, offset, (w, d))
+        x, y = corner_for(place, effector)
+        x, y = x + dx, y + dy
+        z = max(self.heights[a][b] for a, b in cells((x, y), size))
+        return Placed((x, y, z), (*size, h), *self.rules.handling[w, d, h][1:])
 
     def bearing_after(self, action: int) -> Grid:
         """1 for each cell that bears weight after an action that succeeds; of an item: inside its support's hull."""
@@ -355,8 +406,9 @@ class Oracle:
             return 0, True, failure
         w, d, h = self.contents[self.taken(action)][0]
         reward = w * d * h
+        placed = self.placed if self.rules.handling is None else [*self.placed, self.lying(action)]
         self.bearing = self.bearing_after(action)
-        self.heights, self.volume = after, self.volume + reward
+        self.heights, self.volume, self.placed = after, self.volume + reward, placed
         self.item, self.position, self.others, self.picks = next_item, next_position, list(others), {}
         stuck = not self.has_feasible_action(try_first)
         return reward, stuck, STUCK if stuck else SUCCESS

@@ -38,7 +38,7 @@ REGISTRY: dict[str, dict[str, str]] = {
     "env": _classes("envs.torchrl", pick_place="PickPlaceEnv"),
     "env.observation.*": _classes(
         "rules.observation", bin_depth="BinDepth", tote_depth="ToteDepth", tote_bearing="ToteBearing",
-        tote_height="ToteHeight",
+        tote_height="ToteHeight", tote_capacity="ToteCapacity",
     ),
     "env.gripper": _classes("rules.gripper.rules", contain="Contain", overlap="Overlap", seal="Seal"),
     "env.reach": _classes("rules.reach", annulus="annulus.Annulus", table="table.ReachTable"),

@@ -22,7 +22,14 @@ def problem_bytes(cell: CellSpec, masks: Collection[str]) -> int:
     """Return about how many bytes the masks of one problem, and what they are found with, take."""
     offsets = cell.num_offsets**2
     count = 64 * cell.num_footprints + 32 * cell.rotations * (offsets + cell.num_picks)
+    count += cell.handling * (16 * cell.num_footprints + 10 * cell.pile_room**2)
     return cell.bin_items * (count + ("action" in masks) * (4 * cell.num_actions + 8 * offsets * cell.num_places))
+
+
+def most_items(cell: CellSpec, items: ItemDistribution) -> int:
+    """Return how many items a tote holds at most: as many as have room by their volume, or come in an episode."""
+    by_volume = cell.tote_volume(cell.tote_size[2]) // int(items.sizes.prod(1).min())
+    return max(1, min(by_volume, items.longest_episode or by_volume))
 
 
 def _corners(cell: CellSpec, items: ItemDistribution, kind: int) -> Iterable[tuple[int, int]]:
@@ -53,7 +60,7 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
         ValueError: naming the kind, the position and the tote height.
     """
     (w_b, d_b, _), height = cell.bin_size, cell.tote_size[2]
-    # (x, y, w, d, h) -> the first kind like it: the rows of a long recording repeat themselves
+    # (x, y, w, d, h, turns) -> the first kind like it: the rows of a long recording repeat themselves
     problems: dict[tuple[int, ...], int] = {}
     widest: dict[str, tuple[int, ...]] = {"bin_size": (w_b, d_b)}
     if largest := cell.gripper.largest_item:
@@ -66,10 +73,11 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
                 raise ValueError(f"{items.label(kind)} does not fit {what}: expected at most {grid_w}x{grid_d} cells.")
         if h > height:
             raise ValueError(f"{items.label(kind)} is higher than the tote: expected at most tote_size[2]={height}.")
+        allowed = turns & items.turns(kind)
         for x, y in _corners(cell, items, kind):
             if x + w > w_b or y + d > d_b:
                 raise ValueError(f"{items.label(kind)} at x={x}, y={y} leaves the bin: expected it inside {w_b}x{d_b}.")
-            problems.setdefault((x, y, w, d, h), kind)
+            problems.setdefault((x, y, w, d, h, allowed), kind)
         words = f"bin_size={[*cell.bin_size]}: the kinds of items have at least"
         at_most(words, len(problems), "positions in the bin", MAX_POSITIONS)
     description = f"{cell.describe()}, support={cell.support}" + (f", reach={cell.reach}" if cell.reach else "")
@@ -85,13 +93,13 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
     for numbers in torch.arange(len(rows)).split(max(1, 2**22 // (cell.rotations * cell.num_offsets**2))):
         available, _ = available_offsets(cell, Item.from_table(rows[numbers, :5]))  # [K, M]
         ways = np.packbits(available.numpy(), axis=0).T
-        sizes = rows[numbers, 2 : 4 if cell.limits is None else 5].contiguous()
+        sizes = rows[numbers][:, [2, 3, 5] if cell.limits is None else [2, 3, 4, 5]].contiguous()
         keys = np.concatenate([sizes.numpy().view(np.uint8), ways], 1)
         for key, number in zip(keys, numbers.tolist(), strict=True):
             distinct.setdefault(key.tobytes(), number)
     for chunk in rows[list(distinct.values())].split(max(1, min(1024, 2**24 // cell.num_footprints))):
         empty = torch.full((len(chunk), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
-        item = Item.from_table(chunk[:, None, :5])._replace(turns=torch.full((len(chunk), 1), turns))
+        item = Item.from_table(chunk[:, None, :5])._replace(turns=chunk[:, None, 5])
         maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), item))
         feasible = footprint_mask(cell, maps).flatten(1).any(1)
         if not feasible.all():

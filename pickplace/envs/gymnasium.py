@@ -50,6 +50,7 @@ class PickPlaceGymEnv(gymnasium.Env):
     | `bin_labels` | `(W_B, D_B)` float32 | number of the item on each cell of the bin, from 1; 0 where empty |
     | `items` | `(M, 5)` int64 | x, y, w, d, h of each item in the bin; zeros: none |
 
+    with `handling=True` the items' `handling`, and what lies on what: `tote_labels`, `pile_spare` and `pile_below`;
     and what `observation=` adds (see `PickPlaceEnv`).
 
     ## Rewards

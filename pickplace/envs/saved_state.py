@@ -11,8 +11,9 @@ from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.arrival import next_item
 from pickplace.items.distributions import MAX_SEED
 from pickplace.rules.bin import select_item
-from pickplace.rules.item import Item, bin_labels_from_items
+from pickplace.rules.item import NO_LIMIT, Item, bin_labels_from_items
 from pickplace.rules.observation import observe, standard_terms
+from pickplace.rules.pile import Pile
 from pickplace.rules.state import Episode, State
 from pickplace.runs.locate import CheckpointError
 
@@ -55,12 +56,15 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
         value = saved[RESET_ENTRIES[key].field]
         check(key, (value >= low) & (value <= high), f"{low} to {high}")
     episode = Episode(**{SETTINGS[key].field: saved[SETTINGS[key].field] for key in cell.varies})
-    state = State(surface, tote_height, Item.from_table(saved["item"]), episode)
+    pile = Pile(*(saved[key] for key in Pile._fields)) if cell.handling else None
+    state = State(surface, tote_height, Item.from_table(saved["item"]), episode, pile)
     heights = state.heights
     check("surface", (heights >= 0) & (heights <= tote_height[:, None, None]), "heights of 0 to tote_height")
     check("surface", state.bearing | ((heights > 0) & cell.support.marks_bearing), "cells that bear weight")
     check("volume", (volume >= 0) & (volume <= heights.sum((1, 2))), "at most the volume below the surface")
     check("steps", (steps >= 0) & (steps <= volume), "at most one for each unit of volume")
+    if pile is not None:
+        check("pile", _is_possible(pile, steps, heights), "what lies on what after so many placements")
     check("episode", number >= 0, "at least 0")
     check("item_seed", (seed >= 0) & (seed < MAX_SEED), "at least 0 and below 2**62")
     items, limits = state.items, torch.tensor(cell.bin_size[:2])
@@ -83,3 +87,27 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     for key, value in seen.items():
         close = (carried[key].double() - value.double()).abs() < 1e-4  # another device rounds in another way
         check(f"the carried {key}", close, "what the state shows")
+
+
+def _is_possible(pile: Pile, steps: Tensor, heights: Tensor) -> Tensor:
+    """Return whether piles can be those of totes in which ``steps`` items lie, bool ``[N]``.
+
+    Args:
+        steps: int64 ``[N]``.
+        heights: int32 ``[N, W_T, D_T]``.
+    """
+    labels, spare, below = pile
+    there = torch.arange(spare.shape[1]) < steps[:, None]
+    within = there[:, :, None] & there[:, None]
+    earlier = within.tril(-1) | within & torch.eye(spare.shape[1], dtype=torch.bool)
+    through = (below.float() @ below.float()) > 0  # below what is below
+    good = (below.diagonal(dim1=1, dim2=2) == there).all(1) & ~(below & ~earlier).flatten(1).any(1)
+    good &= (through == below).flatten(1).all(1)
+    good &= ((spare >= 0) & (spare <= NO_LIMIT) & (there | (spare == 0))).all(1)
+    seen = (labels >= 0) & (labels <= steps[:, None, None]) & ((labels > 0) == (heights > 0))
+    # The cells on which one item is seen are level.
+    number = labels.flatten(1)
+    tops = torch.zeros(len(labels), spare.shape[1] + 1, dtype=heights.dtype)
+    tops.scatter_(1, number.clamp(0, spare.shape[1]), heights.flatten(1))
+    level = tops.gather(1, number.clamp(0, spare.shape[1])) == heights.flatten(1)
+    return good & seen.flatten(1).all(1) & level.all(1)

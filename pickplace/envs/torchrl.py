@@ -11,8 +11,8 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from pickplace.common.machine import usable_device
-from pickplace.common.validate import check_bytes, expect, one_of, or_null, whole_number
-from pickplace.envs.checks import check_items, problem_bytes
+from pickplace.common.validate import check_bytes, expect, one_of, or_null, refuse_if, whole_number
+from pickplace.envs.checks import check_items, most_items, problem_bytes
 from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
@@ -21,6 +21,7 @@ from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.rules.item import ALL_TURNS, Item
 from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, corner_mask, placing_maps
 from pickplace.rules.observation import Term, check_terms, observe
+from pickplace.rules.pile import Pile
 from pickplace.rules.state import EMPTY, Episode, Failure, State
 from pickplace.rules.step import apply
 
@@ -58,6 +59,11 @@ class PickPlaceEnv(EnvBase):
         * ``tote_depth``, float32 ``[N, W_T, D_T]``: remaining height, ``H_T - height``.
         * ``tote_bearing``, float32 ``[N, W_T, D_T]``: 1 where the cell bears weight; all 1 unless ``support=bearing``.
         * ``tote_height``, int64 ``[N, 1]``: ``H_T`` of the running episode.
+        * with ``handling``: ``handling``, int64 ``[N, M, 3]``, the turns that each item allows (bit ``r`` for rotation
+          ``r``), its mass, and the greatest load on it, grams; and the pile in the tote of up to ``L`` items:
+          ``tote_labels``, int64 ``[N, W_T, D_T]``, number of the item on each cell, from 1, 0 for the floor;
+          ``pile_spare``, int64 ``[N, L]``, the mass that each still bears; ``pile_below``, bool ``[N, L, L]``, which
+          items lie below each, itself included.
         * with ``varies``: ``rotations``, bool ``[N, R]``; ``item_mix``, ``bin_items``, ``refill`` and ``level``, int64
           ``[N, 1]``.
         * further terms, see ``observation``.
@@ -131,6 +137,12 @@ class PickPlaceEnv(EnvBase):
         items = Kinds(items) if isinstance(items, (list, tuple)) else items
         kind = "a list of (w, d, h), or an ItemDistribution such as pickplace.items.distributions.Kinds"
         expect(isinstance(items, ItemDistribution), "items", items, kind)
+        refuse_if(
+            items.has_limits and not cell.handling,
+            "env.handling=false: the items have greatest loads or turns of their own; expected env.handling=true.",
+        )
+        if cell.handling:
+            cell = replace(cell, most_items=most_items(cell, items))
         self.items, self.cell, self.terms = items, cell, check_terms(observation, cell)
         check_items(cell, items)
         # Mixes and rotations with which every item fits the empty tote.
@@ -175,6 +187,7 @@ class PickPlaceEnv(EnvBase):
             "episode": zeros(),
             "item_seed": torch.tensor(0, device=self.device),
             "feasible": zeros(dtype=torch.bool),
+            **({} if (pile := self._empty_pile(num_envs)) is None else pile._asdict()),
             **{RESET_ENTRIES[key].field: zeros() + RESET_ENTRIES[key].full(cell) for key in self.limits},
             **{name: zeros(size, dtype=torch.bool) for name, size in sizes.items()},
         }
@@ -225,6 +238,8 @@ class PickPlaceEnv(EnvBase):
         self.item.masked_fill_(rows[:, None, None], 0)
         for count in (self.arrived, self.volume, self.steps):
             count.masked_fill_(rows, 0)
+        for part in self._pile or ():
+            part.masked_fill_(rows.view(-1, *[1] * (part.dim() - 1)), 0)
         self._refill(rows, self.state.items)
         self._update_masks(rows, empty=True)
         if (jammed := rows & ~self.feasible).any():  # the first one alone always has a feasible action
@@ -262,6 +277,8 @@ class PickPlaceEnv(EnvBase):
         placed = step.failure == 0
         gained = torch.where(placed, step.item.volume, 0)
         self.surface.copy_(step.surface)
+        for part, after in zip(self._pile or (), step.pile or (), strict=True):
+            part.copy_(after)
         self.volume.add_(gained)
         self.steps.add_(placed)
         items = self._refill(placed, remove_item(state.items, step.taken, placed))
@@ -288,7 +305,15 @@ class PickPlaceEnv(EnvBase):
     @property
     def state(self) -> State:
         """The state of all problems."""
-        return State(self.surface, self.tote_height, Item.from_table(self.item), self._differs)
+        return State(self.surface, self.tote_height, Item.from_table(self.item), self._differs, self._pile)
+
+    def _empty_pile(self, batch: int) -> Pile | None:
+        cell = self.cell
+        return Pile.empty(batch, cell.tote_size, cell.pile_room, self.device) if cell.handling else None
+
+    @property
+    def _pile(self) -> Pile | None:
+        return Pile(*map(self.get_buffer, Pile._fields)) if self.cell.handling else None
 
     @property
     def _differs(self) -> Episode:
@@ -318,7 +343,7 @@ class PickPlaceEnv(EnvBase):
             return
         index = slice(None) if len(numbers) == len(rows) else numbers
         make = self._masks_of_empty_totes if empty and self.device.type == "cpu" else self._masks_of
-        masks = make(self.surface[index], self.tote_height[index], self.item[index])
+        masks = make(self.state.rows(index))
         mask = next(iter(masks.values()))
         self.feasible[index] = mask.view(torch.uint8).amax(1) > 0  # as any(1), which is far slower on a CPU
         for name in self.masks:
@@ -326,17 +351,18 @@ class PickPlaceEnv(EnvBase):
             old, new = getattr(self, f"{name}_mask"), masks[name]
             setattr(self, f"{name}_mask", new if len(numbers) == len(rows) else old.index_copy(0, numbers, new))
 
-    def _masks_of(self, surface: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
-        """Return the masks that are emitted, or ``footprint``, bool ``[M, ...]``, of problems ``[M, ...]``."""
-        maps = placing_maps(self.cell, State(surface, tote_height, Item.from_table(item)))
+    def _masks_of(self, state: State) -> dict[str, Tensor]:
+        """Return the masks that are emitted, or ``footprint``, bool ``[M, ...]``, of the states of ``M`` problems."""
+        maps = placing_maps(self.cell, state)
         return {name: MASKS[name].make(self.cell, maps) for name in self.masks or ("footprint",)}
 
-    def _masks_of_empty_totes(self, surface: Tensor, tote_height: Tensor, item: Tensor) -> dict[str, Tensor]:
+    def _masks_of_empty_totes(self, state: State) -> dict[str, Tensor]:
         """Return the same as :meth:`_masks_of`; episodes begin in few ways, so what was computed is kept."""
-        keys = [tuple(key) for key in torch.cat([item.flatten(1), tote_height[:, None]], 1).tolist()]
+        item, tote_height = state.items.table.flatten(1), state.tote_height[:, None]
+        keys = [tuple(key) for key in torch.cat([item, tote_height], 1).tolist()]
         if unseen := {key: row for row, key in enumerate(keys) if key not in self._starts}:
             rows = torch.tensor(list(unseen.values()))
-            masks = self._masks_of(surface[rows], tote_height[rows], item[rows])
+            masks = self._masks_of(state.rows(rows))
             if len(self._starts) * sum(mask.shape[1] for mask in masks.values()) > CACHE_BYTES:
                 self._starts = {key: self._starts[key] for key in keys if key in self._starts}
             # Copies, since a view would keep all of its batch in memory.

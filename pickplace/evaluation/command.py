@@ -45,6 +45,8 @@ def merge_trained(cfg: DictConfig, trained: DictConfig) -> DictConfig:
         elif places := places_in_other_groups(word):
             for part in places:  # such as env.reach
                 OmegaConf.update(changed, part, OmegaConf.select(groups, part), merge=False, force_add=True)
+        elif key.startswith("env.") and key[4:] in groups.env and key[4:] not in changed.env:
+            changed.env[key[4:]] = groups.env[key[4:]]  # a setting that is younger than the checkpoint
         elif key.split(".")[0] in TRAINED:
             ours.append(word)
     return apply_overrides(changed, ours, groups)

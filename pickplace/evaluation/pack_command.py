@@ -33,8 +33,8 @@ def parser() -> argparse.ArgumentParser:
         epilog="The file's format: docs/train_your_own.md#2-describe-the-items",
         options={
             "order": {
-                "help": "CSV with columns length, width, height, weight, and if there are any order, id, quantity; or "
-                "JSON of BED-BPP",
+                "help": "CSV with columns length, width, height, weight, and if there are any order, id, quantity, "
+                "max_load, stackable, orientations; or JSON of BED-BPP",
             },
             "--container": {
                 "required": True, "metavar": "LxWxH", "help": "inner sides of a container, such as 1200x800x1500; mm",
@@ -48,6 +48,10 @@ def parser() -> argparse.ArgumentParser:
                 "help": "of lengths without a unit in the header: mm (the default), cm or m",
             },
             "--keep-sequence": {"action": "store_true", "help": "put the items down in the sequence of the file"},
+            "--tipping": {
+                "action": "store_true",
+                "help": "put items down on another side, too, unless their column orientations forbids it",
+            },
             "--planner": {
                 "metavar": "NAME", "default": "heightmap_minimisation",
                 "help": "what chooses the places, such as joint_dbl (default %(default)s)",
@@ -78,7 +82,7 @@ def run(args: argparse.Namespace) -> None:
     from pickplace.views.replay import page
 
     orders = read_orders(args.order, one_of("--unit", args.unit, MILLIMETRES), key="order")
-    packer = OrderPacker(container, args.cell, args.planner)
+    packer = OrderPacker(container, args.cell, args.planner, args.tipping)
     for order in orders:  # before anything is written
         packer.check(order.items)
     folder, rows, bed_bpp = Path(args.out), [], {}
@@ -89,6 +93,10 @@ def run(args: argparse.Namespace) -> None:
         name = order.name or Path(args.order).stem
         for place, each in enumerate(containers, 1):
             table = [_row(name, place, step, packed) for step, packed in enumerate(each.items, 1)]
+            if args.tipping:
+                table = [
+                    {**row, "orientation": packed.orientation} for row, packed in zip(table, each.items, strict=True)
+                ]
             write_output(_text(name, place, len(containers), each, table))
             rows += table
             key = name if place == 1 else f"{name}#{place}"
@@ -137,7 +145,9 @@ def _text(name: str, place: int, count: int, container: "PackedContainer", rows:
 
 
 def _as_bed_bpp(packed: "PackedItem") -> dict:
-    """Return an action of a packing plan of BED-BPP: front left bottom corner, and orientation 1 if turned."""
+    """Return an action of a packing plan of BED-BPP: front left bottom corner; orientation 1: turned."""
+    from pickplace.items.order_file import ORIENTATIONS
+
     item = packed.item
     return {
         "item": {
@@ -145,18 +155,20 @@ def _as_bed_bpp(packed: "PackedItem") -> dict:
             "height/mm": item.height, "weight/kg": item.grams / 1000, "sequence": packed.number,
         },
         "flb_coordinates": list(packed.corner),
-        "orientation": int(packed.turned),
+        "orientation": ORIENTATIONS.index(packed.orientation),
     }  # fmt: skip
 
 
 def _as_plan(number: int, container: tuple[int, ...], packed: "PackedContainer") -> "EpisodePlan":
-    """Return the plan of a container for a physics engine, with the items' true sides."""
+    """Return the plan of a container for a physics engine, with the items' true sides and masses."""
     from pickplace.physics.plans import EpisodePlan, Placement
 
     def metres(values) -> tuple[float, ...]:
         return tuple(round(value / 1000, 9) for value in values)
 
-    placements = [Placement(metres(each.corner), metres(each.size)) for each in packed.items]
+    placements = [
+        Placement(metres(each.corner), metres(each.size), mass=each.item.grams / 1000) for each in packed.items
+    ]
     return EpisodePlan(number, metres(container), placements=placements)
 
 

@@ -59,6 +59,7 @@ class Cut(ItemDistribution):
             raise ValueError(f"{key}: sides of {least} to {greatest} do not add up to {bad[0]}; expected some that do.")
         count = math.prod(side // least for side in self.container)
         at_most(f"{key}: an episode has up to", count, "items", MAX_ITEMS)
+        self.longest_episode = count
         cuts = [
             [at for at in range(least, length - least + 1) if length > greatest and fits[at] and fits[length - at]]
             for length in range(longest + 1)

@@ -5,9 +5,10 @@ depend on the batch size, and every method that plays an episode meets the same 
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from itertools import product
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from typing_extensions import Self
 
 from pickplace.common.files import read_table
 from pickplace.common.validate import at_most, excerpt, expect, flag, is_number, is_whole, refuse_any, whole_number
-from pickplace.rules.item import Item
+from pickplace.rules.item import ALL_TURNS, NO_LIMIT, Item
 
 #: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
 STREAMS = ("train", "validation", "test")
@@ -89,6 +90,9 @@ class ItemDistribution:
         mixes: number of mixes of the sizes among which episodes may choose, see :meth:`mixed`; 1: there is one.
         volumes: float64 ``[K]``, the true volume of each kind, in cells times height units, where ``sizes`` are rounded
             up; None: the sizes are exact.
+        handling: int64 ``[K, 3]``, columns ``turns``, ``grams`` and ``max_load`` of each kind, as of an
+            :class:`~pickplace.rules.item.Item`; None: any turn, no mass, any load.
+        longest_episode: how many items come in an episode at most; None: episodes do not end.
     """
 
     sizes: Tensor
@@ -97,6 +101,8 @@ class ItemDistribution:
     has_corners: bool = False
     mixes: int = 1
     volumes: Tensor | None = None
+    handling: Tensor | None = None
+    longest_episode: int | None = None
 
     def sample(
         self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size, mix: Tensor | None = None
@@ -110,8 +116,27 @@ class ItemDistribution:
             mix: int64 ``[N]``, the mix of each episode; None: mix 0. Given only where :attr:`mixes` is above 1.
         """
         uniform, across, along = hashed_uniform(stream, seed, episode, step, 3)
-        kind = self._index(uniform, step, mix)
-        return place_at_random(self.sizes.to(step.device)[kind], across, along, bin_size, kind)
+        return self.of_kind(self._index(uniform, step, mix), across, along, bin_size)
+
+    def of_kind(self, kind: Tensor, across: Tensor, along: Tensor, bin_size) -> Item:
+        """Return items of kinds, int64 ``[N]``, in the bin, at places that two uniform numbers decide, ``[N]``."""
+        item = place_at_random(self.sizes.to(kind.device)[kind], across, along, bin_size, kind)
+        if self.handling is None:
+            return item
+        turns, grams, max_load = self.handling.to(kind.device)[kind].unbind(-1)
+        return item._replace(turns=turns, grams=grams, max_load=max_load)
+
+    @property
+    def has_limits(self) -> bool:
+        """Whether some kind forbids a turn, or bears a limited load only."""
+        if self.handling is None:
+            return False
+        turns, _, max_load = self.handling.unbind(-1)
+        return bool(((turns != ALL_TURNS) | (max_load < NO_LIMIT)).any())
+
+    def turns(self, kind: int) -> int:
+        """Return the bit mask of the turns that kind number ``kind`` allows."""
+        return ALL_TURNS if self.handling is None else int(self.handling[kind, 0])
 
     def _index(self, uniform: Tensor, step: Tensor, mix: Tensor | None = None) -> Tensor:
         """Return which row of ``sizes`` arrives, int64 ``[N]``."""
@@ -167,12 +192,15 @@ class Kinds(ItemDistribution):
     Args:
         kinds: ``(w, d, h)`` triples, in cells and height units.
         weights: a relative frequency for each kind; None means equally likely.
+        grams: mass of each kind; None: 0.
+        max_load: for each kind the greatest mass that may lie on it, grams, or None for any; 0: nothing on top.
+        turns: for each kind the rotations that are allowed, such as ``[0, 2]``, or None for all.
 
     Raises:
-        ValueError: an empty list, a size that is not a positive whole number, or weights that do not fit the kinds.
+        ValueError: an empty list, a size that is not a positive whole number, or lists that do not fit the kinds.
     """
 
-    def __init__(self, kinds, weights=None):
+    def __init__(self, kinds, weights=None, grams=None, max_load=None, turns=None):
         expect(isinstance(kinds, (list, tuple)) and kinds, "items.kinds", kinds, "a list of at least one (w, d, h)")
         at_most("items.kinds: the list has", len(kinds), "kinds of items", MAX_KINDS)
         if bad := [kind for kind in kinds if not _are_lengths(kind, 3)]:
@@ -186,6 +214,8 @@ class Kinds(ItemDistribution):
         self.sizes = torch.tensor([list(kinds[i]) for i in self._used], dtype=torch.int64)
         self._share = torch.tensor([[weights[i] for i in self._used]], dtype=torch.float64)  # [mixes, K]
         self._edges = self._edges_of(self._share)
+        if not grams is max_load is turns is None:
+            self.handling = _read_handling(len(kinds), turns, grams, max_load)[self._used]
 
     @staticmethod
     def _edges_of(share: Tensor) -> Tensor:
@@ -246,8 +276,7 @@ class Kinds(ItemDistribution):
         first = torch.zeros_like(rank)
         start = hashed_uniform("train", seed, torch.full_like(rank, count), first, 1)[0]
         across, along = hashed_uniform("train", seed, rank, first, 2)
-        kind = self._index((start + rank / count) % 1, first, mix)
-        return place_at_random(self.sizes.to(rank.device)[kind], across, along, bin_size, kind)
+        return self.of_kind(self._index((start + rank / count) % 1, first, mix), across, along, bin_size)
 
 
 class Uniform(Kinds):
@@ -266,6 +295,30 @@ class Uniform(Kinds):
         at_most(f"{words}: the ranges have", math.prod(map(len, lengths)), "kinds of items", MAX_KINDS)
         whole_number("items.unit", unit, most=MAX_LENGTH)
         super().__init__([tuple(unit * side for side in sides) for sides in product(*lengths)])
+
+
+def _read_handling(count: int, turns, grams, max_load) -> Tensor:
+    """Return the ``handling`` of kinds from a list for each column, or None; ``ValueError`` for others."""
+
+    def column(key: str, values, default, expected: str, is_good: Callable[[Any], bool]) -> list:
+        values = [default] * count if values is None else values
+        good = isinstance(values, (list, tuple)) and len(values) == count and all(map(is_good, values))
+        expect(good, f"items.{key}", values, f"{count} {expected}, one for each kind")
+        return [*values]
+
+    def are_turns(value) -> bool:
+        turns = value if isinstance(value, (list, tuple)) else ()
+        return value is None or (len(turns) > 0 and all(is_whole(turn) and 0 <= turn < 4 for turn in turns))
+
+    given = column("turns", turns, None, "lists of some of [0, 1, 2, 3], or null", are_turns)
+    masks = [ALL_TURNS if each is None else sum(1 << turn for turn in {*each}) for each in given]
+    mass = column("grams", grams, 0, "whole numbers >= 0", lambda value: is_whole(value) and 0 <= value < NO_LIMIT)
+    loads = column(
+        "max_load", max_load, None, "whole numbers of grams >= 0, or null for any load",
+        lambda value: value is None or (is_whole(value) and 0 <= value < NO_LIMIT),
+    )  # fmt: skip
+    loads = [NO_LIMIT if load is None else load for load in loads]
+    return torch.tensor([masks, mass, loads]).t().contiguous()
 
 
 class Recorded(ItemDistribution):
@@ -294,6 +347,7 @@ class Recorded(ItemDistribution):
                     "w, d, h >= 1 and x, y >= 0."
                 )
         self._lines = [line for line, _ in table]
+        self.longest_episode = None if loop else len(self._lines)
         numbers = torch.tensor([[int(field) for field in row] for _, row in table])
         self.sizes, self._corner = numbers[:, :3], numbers[:, 3:]
         self.has_corners = self._corner.numel() > 0
@@ -321,4 +375,8 @@ class Recorded(ItemDistribution):
 
 def search_items(items: ItemDistribution) -> ItemDistribution:
     """Return the distribution that a search samples from: of a sequence only its sizes, equally likely."""
-    return Kinds(items.sizes.tolist()) if items.sequential else items
+    if not items.sequential:
+        return items
+    kinds = Kinds(items.sizes.tolist())
+    kinds.handling = items.handling
+    return kinds

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from pickplace.common.files import MAX_TABLE_BYTES, read_text
 from pickplace.common.validate import at_most, excerpt, refuse_if, reworded, without_twins
+from pickplace.rules.item import NO_LIMIT
 
 #: Name of a column -> the names that a file may have for it, in any case; a unit may follow, as in ``length/mm``.
 NAMES = {
@@ -23,17 +24,26 @@ NAMES = {
     "weight": ("weight", "gross_weight", "mass", "kg", "g"),
     "quantity": ("quantity", "qty", "count"),
     "target": ("target",),
+    "max_load": ("max_load", "maximum_load"),
+    "stackable": ("stackable",),
+    "nothing_on_top": ("nothing_on_top",),
+    "orientations": ("orientations", "orientation"),
 }
 SIDES = ("length", "width", "height")
-#: What such columns ask for is no part of the task: an order would be packed as if they said nothing.
-NOT_KNOWN = ("orientation", "orientations", "max_load", "maximum_load", "stackable", "nothing_on_top")
+#: An item's sides along x, y and z, for each way in which it may lie; it stands upright in the first two.
+ORIENTATIONS = ("lwh", "wlh", "lhw", "hlw", "whl", "hwl")
+#: Quarter turns about z that lead to an orientation, as a bit mask.
+TURNS = {"lwh": 0b0101, "wlh": 0b1010}
+#: Words for some of the orientations.
+WORDS = {"any": ORIENTATIONS, "upright": ("lwh", "wlh"), "fixed": ("lwh",)}
+YES_NO = {**dict.fromkeys(("yes", "true", "1"), True), **dict.fromkeys(("no", "false", "0"), False)}
 MILLIMETRES, GRAMS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}, {"g": 1.0, "kg": 1000.0}
-UNITS: dict[str, dict] = {**dict.fromkeys(SIDES, MILLIMETRES), "weight": GRAMS}
+UNITS: dict[str, dict] = {**dict.fromkeys(SIDES, MILLIMETRES), "weight": GRAMS, "max_load": GRAMS}
 DEFAULT_WEIGHT = "kg"
 COLUMN = re.compile(r"(.*?)\s*(?:[/_ (\[]\s*(mm|cm|m|kg|g)\s*[)\]]?)?")  # a name, and a unit if there is one
 EXPECTED = "columns length, width, height and weight, such as length/mm and weight/kg; and order, id or quantity if any"
 
-MAX_LENGTH, MAX_GRAMS = 10_000, 10_000_000  # of an item: 10 m, 10 t
+MAX_LENGTH, MAX_GRAMS, MAX_LOAD = 10_000, 10_000_000, 1_000_000_000  # of an item: 10 m, 10 t; on it: 1,000 t
 MAX_NAME = 100  # letters of the name of an order or an article
 MAX_QUANTITY, MAX_ITEMS = 10_000, 2_000_000  # of a line, of a file
 
@@ -47,6 +57,24 @@ class OrderItem(NamedTuple):
     height: float  # mm
     grams: int  # rounded up
     place: str  # the file and where in it, for messages, such as "orders.csv, line 7"
+    max_load: int = NO_LIMIT  # greatest mass on top of it, g, rounded down
+    orientations: tuple[str, ...] = ORIENTATIONS  # those that are allowed
+
+    @property
+    def kind(self) -> tuple:
+        """All but its id and its place in the file."""
+        return *self[1:5], *self[6:]
+
+    @property
+    def turns(self) -> int:
+        """The quarter turns about z that are allowed, as a bit mask."""
+        return sum(TURNS.get(each, 0) for each in self.orientations)
+
+    @property
+    def has_limits(self) -> bool:
+        """Whether it bears a limited load only, or forbids a quarter turn about z, on a face that may be the lowest."""
+        pairs = zip(ORIENTATIONS[::2], ORIENTATIONS[1::2], strict=True)
+        return self.max_load < NO_LIMIT or any(len({*pair} & {*self.orientations}) == 1 for pair in pairs)
 
 
 class Order(NamedTuple):
@@ -77,6 +105,9 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
     ``order`` are one order; without that column the file is one. JSON is that of BED-BPP: for each order
     ``item_sequence``, its items by their number.
 
+    Of each item the columns ``max_load`` (empty: any), ``stackable`` or ``nothing_on_top`` (yes or no) and
+    ``orientations`` may say what is allowed: :data:`WORDS`, or some of :data:`ORIENTATIONS`.
+
     Args:
         path: the file; ``.json``, else CSV in UTF-8.
         unit: of lengths without one in the header, ``"mm"``, ``"cm"`` or ``"m"``. Weights without one are in kg.
@@ -104,7 +135,7 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
         item, order, quantity = _read_row(f"{path}, {place}", row, columns[header])
         known = articles.setdefault(item.id, item)
         refuse_if(
-            item.id and item[1:5] != known[1:5],
+            item.id and item.kind != known.kind,
             f"{item.place}: item {excerpt(item.id)} is {_words(item)}, but {_words(known)} in {known.place}; "
             "expected one size and weight for each id.",
         )
@@ -119,7 +150,12 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
 
 
 def _words(item: OrderItem) -> str:
-    return f"{item.length:g} x {item.width:g} x {item.height:g} mm, {item.grams / 1000:g} kg"
+    words = [f"{item.length:g} x {item.width:g} x {item.height:g} mm, {item.grams / 1000:g} kg"]
+    if item.max_load < NO_LIMIT:
+        words.append(f"at most {item.max_load / 1000:g} kg on top")
+    if item.orientations != ORIENTATIONS:
+        words.append(" ".join(item.orientations))
+    return ", ".join(words)
 
 
 def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
@@ -173,14 +209,12 @@ def _read_header(place: str, header: Sequence, unit: str) -> dict[str, _Column]:
         match = COLUMN.fullmatch(" ".join(str(key).lower().split()))
         assert match  # it matches any text
         name, suffix = match[1].replace(" ", "_").replace("-", "_"), match[2]
-        refuse_if(
-            name in NOT_KNOWN,
-            f"{place}: the column {excerpt(key)} is not read yet, and an order would be packed as if it said nothing; "
-            "expected a file without it.",
-        )
         known = name in {each for names in NAMES.values() for each in names}
         refuse_if(known and name in found, f"{place}: two columns {excerpt(name)}; expected one.")
         found[name] = key, suffix
+    for column in ("max_load", "orientations"):
+        given = [name for name in NAMES[column] if name in found]
+        refuse_if(len(given) > 1, f"{place}: columns {' and '.join(map(excerpt, given))}; expected one of them.")
     # In l,w,h and length,width,height the width is the second side; in w,d,h and width,depth,height the first.
     second = {}
     if {"length", "l"} & {*found}:
@@ -228,4 +262,42 @@ def _read_row(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[Or
     count = read("quantity", MAX_QUANTITY) if "quantity" in columns else 1.0
     refuse_if(count != int(count), f"{place}: {count:g} pieces; expected a whole number.")
     identity, order = (_printable(row[columns[name].key]) if name in columns else "" for name in ("id", "order"))
-    return OrderItem(identity, length, width, height, grams, place), order, int(count)
+    limits = _read_max_load(place, row, columns), _read_orientations(place, row, columns)
+    return OrderItem(identity, length, width, height, grams, place, *limits), order, int(count)
+
+
+def _read_max_load(place: str, row: Mapping, columns: dict[str, _Column]) -> int:
+    """Return the greatest mass on top of the item of a row, g."""
+    loads = [NO_LIMIT]
+    if "max_load" in columns and (value := row[columns["max_load"].key]) not in ("", None):
+        key, unit = columns["max_load"]
+        good = False
+        with suppress(TypeError, ValueError, OverflowError):
+            good = 0 <= float(value) * unit <= MAX_LOAD and not isinstance(value, bool)
+        refuse_if(
+            not good,
+            f"{place}: {key}={excerpt(value)}: expected a number from 0 to {int(MAX_LOAD / unit):,}, or nothing.",
+        )
+        loads.append(math.floor(float(value) * unit + 1e-6))
+    for column, forbids in (("stackable", False), ("nothing_on_top", True)):
+        if column in columns and (value := row[columns[column].key]) not in ("", None):
+            answer = YES_NO.get(str(value).lower())
+            refuse_if(answer is None, f"{place}: {columns[column].key}={excerpt(value)}: expected yes or no.")
+            if answer == forbids:
+                loads.append(0)
+    return min(loads)
+
+
+def _read_orientations(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[str, ...]:
+    """Return how the item of a row may lie."""
+    value = row[columns["orientations"].key] if "orientations" in columns else None
+    if value in ("", None):
+        return ORIENTATIONS
+    words = re.split(r"[\s,;|/+]+", str(value).strip().lower())
+    found = {each for word in words for each in WORDS.get(word, (word,))}
+    refuse_if(
+        not found <= {*ORIENTATIONS},
+        f"{place}: {columns['orientations'].key}={excerpt(value)}: expected any, upright or fixed; or some of "
+        f"{', '.join(ORIENTATIONS)}, the sides along x, y and z.",
+    )
+    return tuple(each for each in ORIENTATIONS if each in found)

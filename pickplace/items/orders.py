@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pickplace.common.validate import at_most, expect, flag, is_name, number, one_of, refuse_if
-from pickplace.items.distributions import MAX_KINDS, MAX_LENGTH, ItemDistribution, hashed_uniform, place_at_random
+from pickplace.items.distributions import MAX_KINDS, MAX_LENGTH, ItemDistribution, hashed_uniform
 from pickplace.items.kept import KeptEpisodes
 from pickplace.items.order_file import MILLIMETRES, OrderItem, read_orders
 
@@ -57,7 +57,7 @@ class Orders(ItemDistribution):
         expect(target is None or is_name(target), "items.target", target, "a name in the file, such as euro-pallet")
         orders = read_orders(path, one_of("items.unit", unit, MILLIMETRES), target=target)
         self.generate = flag("items.generate", generate)
-        kinds: dict[tuple[float, float, float, int], int] = {}
+        kinds: dict[tuple, int] = {}
         self._examples: list[OrderItem] = []  # of each kind
         numbered = [[self._number(item, kinds) for item in order.items] for order in orders]
         distinct = list(dict.fromkeys(map(tuple, numbered)))
@@ -68,7 +68,9 @@ class Orders(ItemDistribution):
         )
         at_most(f"items.path={str(path)!r}: the file has", len(kinds), "kinds of items", MAX_KINDS)
         self.sizes = torch.tensor([self.cells(item) for item in self._examples])
-        self.grams = torch.tensor([item.grams for item in self._examples])
+        columns = [(item.turns, item.grams, item.max_load) for item in self._examples]
+        self.handling = torch.tensor(columns)
+        self.longest_episode = max(map(len, distinct))
         sides = torch.tensor([item[1:4] for item in self._examples], dtype=torch.float64)
         self.volumes = sides.prod(1) / (self._cell**2 * self._unit)
         self._orders = _split(distinct) if split else {"train": [], "validation": [], "test": distinct}
@@ -76,8 +78,13 @@ class Orders(ItemDistribution):
         self._kept = KeptEpisodes(self._play, max(1, 2**22 // self._lines.most))
 
     def _number(self, item: OrderItem, kinds: dict) -> int:
-        """Return the number of an item's kind: of its sides and weight."""
-        kind = kinds.setdefault(tuple(item[1:5]), len(kinds))
+        """Return the number of an item's kind: of its sides, its weight, and what it allows."""
+        refuse_if(
+            not item.turns,
+            f"{item.place}: orientations={' '.join(item.orientations)}: expected lwh or wlh among them; items=orders "
+            "does not tip items.",
+        )
+        kind = kinds.setdefault(item.kind, len(kinds))
         if kind == len(self._examples):
             self._examples.append(item)
         return kind
@@ -100,8 +107,7 @@ class Orders(ItemDistribution):
     def sample(self, stream, seed, episode, step, bin_size, mix=None):
         kind = torch.tensor(self._kept.at(stream, seed, episode, step, end=-1), device=step.device)
         _, across, along = hashed_uniform(stream, seed, episode, step, 3)
-        item = place_at_random(self.sizes.to(step.device)[kind], across, along, bin_size, kind)
-        item = item._replace(grams=self.grams.to(step.device)[kind])
+        item = self.of_kind(kind, across, along, bin_size)
         return item.map(lambda part: torch.where(kind >= 0, part, 0))
 
     def _play(self, stream: str, seed: Tensor, episode: Tensor) -> Sequence[Sequence[int]]:

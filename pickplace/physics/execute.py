@@ -92,7 +92,7 @@ class Execute(Simulation):
         w, d, height = placement.size
         gantry.fill(placement.neighbours)
         lying = (d, w, height) if placement.rotation % 180 else placement.size
-        gantry.take((*placement.item, *lying), placement.centre)
+        gantry.take((*placement.item, *lying), placement.centre, placement.mass)
         low = placement.corner[2] + height + self.lip + self.release_height
         turn = ((placement.rotation + 90) % 360 - 90) / 180 * pi  # the short way round
         pick, place = (*(gantry.bin + placement.pick), height + self.lip, 0.0), (*(placement.place + error), low, turn)
@@ -178,12 +178,16 @@ class Gantry(Scene):
             self.compile()
             self.record()
 
-    def take(self, box: Point, planned: Point) -> None:
-        """Choose the item that is carried next, ``box`` as of :meth:`fill`; ``planned`` is its centre in the tote."""
+    def take(self, box: Point, planned: Point, mass: float) -> None:
+        """Choose the item that is carried next, ``box`` as of :meth:`fill`; ``planned`` is its centre in the tote.
+
+        It has its ``mass`` from now on; until then it waited with that of the density.
+        """
         if (known := self._find(box)) is None:
-            self.add((*(self.bin + box[:2]), 0.0), box[2:], planned)
+            self.add((*(self.bin + box[:2]), 0.0), box[2:], planned, mass=mass)
         else:
             self.boxes.append(self.waiting.pop(known))
+            self.weigh(mass)
             self.planned = np.vstack([self.planned, planned])
             self.compile()
 

@@ -7,8 +7,8 @@ A line has the keys
 * ``corner``: near corner of the item at rest in the tote, ``[x, y, z]``, from the tote's near corner on its floor.
 * ``size``: sides of the item as it lies in the tote, ``[w, d, h]``.
 
-which is all that ``settle`` needs, and for a robot (of these only their types are checked, and that nothing overlaps in
-the bin)
+and, if the item's mass is known, ``mass``, kg. That is all that ``settle`` needs. For a robot there are also (of these
+only their types are checked, and that nothing overlaps in the bin)
 
 * ``bin``: inner sides of the bin, ``[w, d, h]``; ``item``: near corner of the item in the bin, ``[x, y]``.
 * ``effector``: sides of the end effector as it hangs over the bin, ``[w, d]``; ``body``, if it is not a rectangle:
@@ -36,6 +36,7 @@ from pickplace.rules.cell import MAX_BIN_ITEMS
 PLANS = "plans.jsonl"
 TOLERANCE = 1e-4  # distance by which boxes may overlap or float, for rounding; m
 MAX_LENGTH = 100.0  # greatest length or coordinate, m
+MAX_MASS = 1e5  # greatest mass of an item, kg
 MAX_FILE = 2**28  # greatest size of a file, bytes
 
 MAX_BODY = 2_048  # rectangles of a body
@@ -71,6 +72,7 @@ ROBOT_KEYS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "rotation": ("0, 90, 180 or 270", lambda value: is_whole(value) and value in (0, 90, 180, 270)),
 }
 OPTIONAL_KEYS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "mass": ("a mass above 0, in kg", lambda value: is_number(value) and 1e-6 <= value <= MAX_MASS),
     "body": (
         f"up to {MAX_BODY:,} rectangles x, y, w, d, in metres",
         partial(_are_boxes, count=4, sides=2, most=MAX_BODY),
@@ -95,6 +97,7 @@ class Placement:
     place: Point = ()
     rotation: int = 0
     neighbours: tuple[Point, ...] = ()  # what else lies in the bin, x, y, w, d, h
+    mass: float = 0.0  # kg; 0: not known, it follows from the density of the simulation
 
     @property
     def centre(self) -> Point:
@@ -124,7 +127,7 @@ def to_lines(plans: Iterable[EpisodePlan]) -> str:
     lines = []
     for plan in plans:
         for values in ({**vars(plan), **vars(placement)} for placement in plan.placements):
-            keys = [*KEYS, *ROBOT_KEYS, *(key for key in OPTIONAL_KEYS if values[key])] if plan.bin else KEYS
+            keys = [*KEYS, *(ROBOT_KEYS if plan.bin else ()), *(key for key in OPTIONAL_KEYS if values[key])]
             lines.append(json.dumps({key: values[key] for key in keys}) + "\n")
     return "".join(lines)
 
@@ -170,7 +173,7 @@ def _read_line(line: str) -> dict:
     kinds = {**known, **OPTIONAL_KEYS}
     if unknown := [key for key in given if key not in kinds]:
         raise ValueError(f"{excerpt(unknown[0])}: there is no such key; expected {', '.join(known)}.")
-    needed = known if given.keys() - KEYS.keys() else KEYS
+    needed = known if given.keys() - KEYS.keys() - {"mass"} else KEYS
     if missing := [key for key in needed if key not in given]:
         raise ValueError(f"{missing[0]}: missing; expected {', '.join(needed)}.")
     for key, value in given.items():

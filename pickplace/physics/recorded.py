@@ -21,6 +21,7 @@ def plan_of(recording: Recording, cell: CellSpec) -> EpisodePlan:
             metres(*move.footprint[:2], move.z), metres(*move.footprint[2:], move.item[4]), metres(*move.item[:2]),
             middle(move.pick, cell.gripper.size), middle(move.place, cell.effector(move.rotation)[:2]),
             90 * move.rotation, tuple((*metres(*other[:2]), *metres(*other[2:])) for other in move.others),
+            move.grams / 1000,
         )
         for move in recording.moves
         if not move.failure

@@ -30,7 +30,7 @@ class Scene:
 
     Args:
         friction: sliding friction between all surfaces.
-        density: of the boxes.
+        density: of the boxes whose mass is not known.
         gap: total narrowing of a box along x and along y.
         sleep: let bodies that do not move sleep.
         contact_damping: damping ratio of contacts.
@@ -88,7 +88,7 @@ class Scene:
         for at in (y - WALL / 2, y + depth + WALL / 2):
             self.add_geom(self.spec.worldbody, (width, WALL, height), (middle[0], at, height / 2))
 
-    def add(self, corner: Vector, size: Vector, planned: Vector, yaw: float = 0.0) -> None:
+    def add(self, corner: Vector, size: Vector, planned: Vector, yaw: float = 0.0, mass: float = 0.0) -> None:
         """Add a box.
 
         Args:
@@ -96,11 +96,18 @@ class Scene:
             size: its planned sides.
             planned: centre of the box where it is planned to rest.
             yaw: its turn, rad.
+            mass: of the box; 0: by the density.
         """
         self.planned = np.vstack([self.planned, planned])
         self.boxes.append(self._add_body(corner, size, yaw))
+        self.weigh(mass)
         self.compile()
         self.record()
+
+    def weigh(self, mass: float) -> None:
+        """Give the last one of :attr:`boxes` a mass; 0: by the density."""
+        if mass:
+            self.boxes[-1].geoms[0].mass = mass
 
     def _add_body(self, corner: Vector, size: Vector, yaw: float = 0.0):
         body = self.spec.worldbody.add_body(

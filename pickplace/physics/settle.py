@@ -24,6 +24,7 @@ class Settle(Simulation):
         return scene
 
     def place(self, scene: Scene, placement: Placement, error: np.ndarray) -> Loss | None:
-        scene.add(np.add(placement.corner, (*error, DROP_HEIGHT)), placement.size, placement.centre)
+        corner = np.add(placement.corner, (*error, DROP_HEIGHT))
+        scene.add(corner, placement.size, placement.centre, mass=placement.mass)
         wait(scene)
         return None

@@ -41,7 +41,7 @@ class Simulation(ABC):
 
     Args:
         friction: sliding friction between all surfaces.
-        density: of the items; kg/m^3.
+        density: of the items whose mass the plan does not tell; kg/m^3.
         gap: total narrowing of an item along x and along y; m.
         noise: standard deviation of the error of a placement along x and along y; m. With ``settle`` an error of
             more than half the gap may put an item into its neighbour.

@@ -93,7 +93,9 @@ class Beam(MapPlanner):
             mask: bool ``[P, choices]``, with which choices each plan may go on; there is one at least.
         """
         row, choice = mask.nonzero(as_tuple=True)
-        at_once = max(1, CELLS_AT_ONCE // plans.state.surface[0].numel())
+        at_once = max(
+            1, CELLS_AT_ONCE // (plans.state.surface[0].numel() + self.cell.handling * self.cell.pile_room**2)
+        )
         parts = [self._judge(plans, *some) for some in zip(row.split(at_once), choice.split(at_once), strict=True)]
         placed, total, outcome = map(torch.cat, zip(*parts, strict=True))
         different = _first_of_each(outcome)
@@ -142,12 +144,13 @@ def _first_of_each(value: Tensor) -> Tensor:
 
 
 def _fingerprint(problem: Tensor, state: State) -> Tensor:
-    """Return a number for each of ``P`` states, int64 ``[P]``: equal for equal problems, totes and sets of items, and
-    different for others but for one pair in 2**64."""
-    items = state.items.cuboids
-    each = _mixed(_weighted(items)) * (items[..., 4] > 0)
-    parts = torch.stack([problem, _mixed(_weighted(state.surface.flatten(1))), each.sum(1)], 1)
-    return _mixed(_weighted(parts))
+    """Return a number for each of ``P`` states, int64 ``[P]``: equal for equal problems, totes, loads that they bear,
+    and sets of items, and different for others but for one pair in 2**64."""
+    table = state.items.table
+    each = _mixed(_weighted(table)) * state.items.exists
+    maps = [state.surface] if state.pile is None else [state.surface, state.pile.capacity]
+    parts = [problem, *(_mixed(_weighted(part.flatten(1))) for part in maps), each.sum(1)]
+    return _mixed(_weighted(torch.stack(parts, 1)))
 
 
 def _weighted(numbers: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -21,10 +22,15 @@ from pickplace.rules.masks import (
     first_action_reaching,
     placing_maps,
 )
+from pickplace.rules.pile import Pile
 from pickplace.rules.state import State
 from pickplace.rules.step import apply, put_down
 
 MAX_NODES = 1_000_000  # of all trees of a decision
+
+
+#: Surface, table of the items in the bin, and pile, of one problem.
+_Tote: TypeAlias = tuple[Tensor, Tensor, Pile | None]
 
 
 @dataclass(eq=False)
@@ -35,6 +41,7 @@ class _Node:
     items: Tensor  # int64 [M, 9], a table
     untried: list[int] | None  # actions in random order, of which the last comes first; None: all N_a flat actions
     edges: dict[int, "_Edge"] = field(default_factory=dict)
+    pile: Pile | None = None  # of the items in the tote, see State
 
 
 @dataclass(eq=False)
@@ -46,7 +53,7 @@ class _Edge:
     visits: int = 0
     total: float = 0.0  # of the returns
     volume: int = 0  # that the action places
-    left: tuple[Tensor, Tensor] | None = None  # surface and items as in _Node; None until simulated, and if it fails
+    left: "_Tote | None" = None  # None until simulated, and if it fails
     failed: bool = False
     bins: list[_Node] = field(default_factory=list)
 
@@ -171,14 +178,14 @@ class MCTS(MapPlanner):
         walks = [walk for walk in walks if walk[1]]
         last = [(number, problem, path[-1]) for number, (problem, path, over) in enumerate(walks) if not over]
         if tried := [(problem, edge) for _, problem, edge in last if edge.left is None and not edge.failed]:
-            totes = [(edge.node.surface, edge.node.items) for _, edge in tried]
+            totes = [(edge.node.surface, edge.node.items, edge.node.pile) for _, edge in tried]
             before = _stack(totes, roots.rows([problem for problem, _ in tried]))
             after, placed, good = self._move(before, torch.tensor([edge.action for _, edge in tried]))
-            parts = zip(after.surface, after.items.table, placed.volume.tolist(), good.tolist(), strict=True)
-            for (_, edge), (surface, items, volume, succeeds) in zip(tried, parts, strict=True):
+            parts = zip(_unstack(after), placed.volume.tolist(), good.tolist(), strict=True)
+            for (_, edge), (left, volume, succeeds) in zip(tried, parts, strict=True):
                 edge.failed = not succeeds
                 if succeeds:
-                    edge.left, edge.volume = (surface, items), volume
+                    edge.left, edge.volume = left, volume
         returns = torch.zeros(len(walks), dtype=torch.float64)
         if going := [(number, problem, edge) for number, problem, edge in last if edge.left is not None]:
             numbers, problems, edges = map(list, zip(*going, strict=True))
@@ -196,7 +203,7 @@ class MCTS(MapPlanner):
         if self.mask:
             return *put_down(self.cell, state, action), torch.ones_like(action, dtype=torch.bool)
         step = apply(self.cell, state, action)
-        after = state._replace(surface=step.surface, items=remove_item(state.items, step.taken))
+        after = state._replace(surface=step.surface, items=remove_item(state.items, step.taken), pile=step.pile)
         return after, step.item, step.failure == 0
 
     def _nodes(self, state: State, mask: Tensor | None = None) -> list[_Node]:
@@ -210,7 +217,8 @@ class MCTS(MapPlanner):
                 mask, number = (narrow_first(self.cell, state.items.flatten(), part) for part in (mask, number))
             rows = zip(number.numpy(), mask.numpy(), strict=True)
             untried = [self._random.permutation(row[good]).tolist() for row, good in rows]
-        return [_Node(*parts) for parts in zip(state.surface, state.items.table, untried, strict=True)]
+        totes = zip(_unstack(state), untried, strict=True)
+        return [_Node(surface, items, actions, pile=pile) for (surface, items, pile), actions in totes]
 
     def _arrive(self, state: State) -> State:
         """Return the states with items in the bins that come from the item distribution, each drawn once."""
@@ -245,6 +253,14 @@ def _on_cpu(observation: Observation) -> State:
     return State.from_observation({key: entry.cpu() for key, entry in observation.items()})
 
 
-def _stack(parts: list[tuple[Tensor, Tensor]], problems: State) -> State:
-    surface, items = map(torch.stack, zip(*parts, strict=True))
-    return problems._replace(surface=surface, items=Item.from_table(items))
+def _unstack(state: State) -> list[_Tote]:
+    count = len(state.surface)
+    piles = [None] * count if state.pile is None else [state.pile.rows(row) for row in range(count)]
+    return [*zip(state.surface, state.items.table, piles, strict=True)]
+
+
+def _stack(parts: Sequence[_Tote], problems: State) -> State:
+    """Return the states of problems with other totes and bins: the inverse of :func:`_unstack`."""
+    surface, items, piles = zip(*parts, strict=True)
+    pile = None if piles[0] is None else Pile(*map(torch.stack, zip(*piles, strict=True)))
+    return problems._replace(surface=torch.stack(surface), items=Item.from_table(torch.stack(items)), pile=pile)

@@ -142,6 +142,9 @@ class Planner:
         training: TrainingEnvelope | None = None,
         critic=None,
     ):
+        refuse_if(
+            cell.handling, "env.handling=true: the robot's planner does not know what lies on what; expected false."
+        )
         self.cell, self.policy, self.training = cell, policy, training
         self.terms = check_terms(terms, cell)
         self._name, self._parts = None, {"items": items, "critic": critic, "candidates": candidates}

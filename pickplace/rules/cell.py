@@ -7,6 +7,7 @@ from inspect import signature
 from pickplace.common.validate import (
     at_most,
     expect,
+    flag,
     is_whole,
     number,
     one_of,
@@ -49,8 +50,12 @@ class CellSpec:
             :class:`~pickplace.rules.reach.base.Limits`; None: it reaches everything.
         bin_items: ``M``, how many items a bin holds at most.
         refill: of several items: a new one arrives after ``"each"`` pick, or a ``"batch"`` when the bin is empty.
+        handling: whether each item has handling instructions of its own: the greatest load that may lie on it, and the
+            turns that are allowed. The rules then keep count of which items lie on which.
         longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and unless the
             gripper limits the items it also sets the number of offsets.
+        most_items: how many items a tote holds at most, where it is known; else there is room for one in each cell and
+            height unit. Used with ``handling`` alone.
         varies: what episodes may differ in, beside the height of the tote: names of
             :data:`~pickplace.rules.observation.EPISODE_TERMS`. The observation has an entry for each.
         item_inset: cells at each edge of the item, along x and y, that a measured item may cover in part only; see
@@ -72,7 +77,9 @@ class CellSpec:
     reach: Reach | None = None
     bin_items: int = 1
     refill: str = "each"
+    handling: bool = False
     longest_side: int | None = field(default=None, metadata={"derived": True})
+    most_items: int | None = field(default=None, metadata={"derived": True})
     varies: tuple[str, ...] = field(default=(), metadata={"derived": True})
     item_inset: tuple[int, int] = field(default=(0, 0), metadata={"derived": True})
     effector_size: InitVar[tuple[int, int] | None] = None
@@ -100,7 +107,9 @@ class CellSpec:
         expect(good, "rotations", self.rotations, "1, 2, 3 or 4 (quarter turns to choose from)")
         whole_number("bin_items", self.bin_items, most=MAX_BIN_ITEMS)
         one_of("refill", self.refill, REFILLS)
+        flag("handling", self.handling)
         or_null(whole_number, "longest_side", self.longest_side)
+        or_null(whole_number, "most_items", self.most_items)
         expect(isinstance(self.reach, Reach | None), "reach", self.reach, "a Reach, such as an Annulus, or None")
         # Each size is possible alone, but these products would fill the memory.
         bin_size, tote_size = f"bin_size={[*self.bin_size]}", f"tote_size={[*self.tote_size]}"
@@ -147,7 +156,12 @@ class CellSpec:
     @property
     def forbids_turns(self) -> bool:
         """Whether some rotations may be forbidden; see ``turns`` of an :class:`~pickplace.rules.item.Item`."""
-        return "rotations" in self.varies
+        return self.handling or "rotations" in self.varies
+
+    @property
+    def pile_room(self) -> int:
+        """``L``, how many items a tote has room for, see :class:`~pickplace.rules.pile.Pile`."""
+        return self.most_items or self.tote_volume(self.tote_size[2])
 
     @cached_property
     def limits(self) -> Limits | None:

@@ -32,6 +32,7 @@ class Resting(NamedTuple):
     top: Tensor  # height of the item's top
     rim: Tensor | int  # height of the tote
     stable: Tensor
+    borne: Tensor | None = None  # whether the items below bear the load; None: any item bears any load
 
 
 class Over(NamedTuple):
@@ -63,6 +64,7 @@ CHECKS: tuple[tuple[Failure, int, Callable[[Any], Tensor | None]], ...] = (
     (Failure.OUT_OF_REACH, LEAST_TOP, lambda over: over.lowest),
     (Failure.OUT_OF_REACH, GREATEST_TOP, lambda over: over.highest),
     (Failure.FORBIDDEN_TURN, TURN, lambda allowed: allowed),
+    (Failure.OVERLOADED, FOOTPRINT, lambda resting: resting.borne),
 )
 
 #: Why an action fails by its pick alone, wherever it places the item: these checks come first.

@@ -134,7 +134,9 @@ def read_items(bin_depth: Tensor, table: Tensor | None = None, rotations: Tensor
 
 def items_from_observation(observation: Observation) -> Item:
     """Return what lies in the bins, ``[N, M]``; see :func:`read_items`."""
-    return read_items(observation["bin_depth"], observation.get("items", None), observation.get("rotations", None))
+    items = read_items(observation["bin_depth"], observation.get("items", None), observation.get("rotations", None))
+    handling = observation.get("handling", None)
+    return items if handling is None else Item(*items[:6], *handling.unbind(-1))
 
 
 def turns_from_flags(flags: Tensor) -> Tensor:

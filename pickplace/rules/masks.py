@@ -118,7 +118,7 @@ def placing_maps(
     """
     surface, tote_height, item = state.each_item()
     over = over_tote(cell, state.surface, state.tote_height)
-    top, rest = find_top(cell, surface, tote_height, item)
+    top, rest = find_top(cell, surface, tote_height, item, state.capacity)
     maps = PlacingMaps.of(top, rest, over, item, blocked_picks(cell, state.items))
     return maps.within_turns(cell) if cell.forbids_turns else maps
 

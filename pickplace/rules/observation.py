@@ -11,9 +11,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import expect, refuse_if, short_text
+from pickplace.common.validate import expect, number, refuse_if, short_text
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.item import bin_depth_from_items, bin_labels_from_items, flags_from_turns
+from pickplace.rules.item import NO_LIMIT, bin_depth_from_items, bin_labels_from_items, flags_from_turns
 from pickplace.rules.state import State
 
 PAPER_CELL = CellSpec()
@@ -80,6 +80,62 @@ class Items(Term):
 
     def value(self, cell, state):
         return state.items.cuboids
+
+
+class Handling(Term):
+    """Handling instructions of the items in the bin, int64 ``[N, M, 3]``, in the order in which they arrived: the turns
+    that are allowed, as a bit mask, the mass, and the greatest load on top of it, grams.
+
+    A row of zeros stands for no item. See :class:`~pickplace.rules.item.Item`.
+    """
+
+    def bounds(self, cell, tallest):
+        return Bounds(0, NO_LIMIT, (cell.bin_items, 3), torch.int64)
+
+    def value(self, cell, state):
+        return torch.stack(state.items[6:], -1)
+
+
+class PilePart(Term):
+    """A part of the :class:`~pickplace.rules.pile.Pile` of the items in the tote, in cells with ``handling``.
+
+    Args:
+        key: name of the part: ``"labels"``, ``"spare"`` or ``"below"``.
+    """
+
+    def __init__(self, key: str):
+        self.key = key
+
+    def bounds(self, cell, tallest):
+        room = cell.pile_room
+        return {
+            "labels": Bounds(0, room, cell.tote_size[:2], torch.int64),
+            "spare": Bounds(0, NO_LIMIT, (room,), torch.int64),
+            "below": Bounds(0, 1, (room, room), torch.bool),
+        }[self.key]
+
+    def value(self, cell, state):
+        return getattr(state.pile, self.key).clone()
+
+
+class ToteCapacity(Term):
+    """The greatest load that each cell of the tote still bears, float32 ``[N, W_T, D_T]``, in kg; at most ``most``.
+
+    For networks; in cells with ``handling``.
+
+    Args:
+        most: greater loads look alike.
+    """
+
+    def __init__(self, most: float = 100.0):
+        self.most = number("observation.most", most, 1e-3, 1e6, "kg")
+
+    def bounds(self, cell, tallest):
+        return Bounds(-1e-3, self.most, cell.tote_size[:2])
+
+    def value(self, cell, state):
+        refuse_if(state.pile is None, "tote_capacity: there are no loads; expected env.handling=true.")
+        return (state.pile.capacity / 1000).clamp(max=self.most).float()
 
 
 class ToteDepth(Term):
@@ -153,6 +209,14 @@ STANDARD_TERMS: Mapping[str, Term] = {
     "tote_height": ToteHeight(),
 }
 
+#: What an observation holds in cells with ``handling``, beside that.
+HANDLING_TERMS: Mapping[str, Term] = {
+    "handling": Handling(),
+    "tote_labels": PilePart("labels"),
+    "pile_spare": PilePart("spare"),
+    "pile_below": PilePart("below"),
+}
+
 #: Keys of the environment, the policies and the learner that no term may have.
 RESERVED = (
     "action",
@@ -185,7 +249,8 @@ RESERVED = (
 def standard_terms(cell: CellSpec) -> dict[str, Term]:
     """Return the terms that an observation of a cell always has."""
     several: dict[str, Term] = {"bin_labels": BinLabels(), "items": Items()} if cell.bin_items > 1 else {}
-    return {**STANDARD_TERMS, **several, **{key: EPISODE_TERMS[key] for key in cell.varies}}
+    handling = HANDLING_TERMS if cell.handling else {}
+    return {**STANDARD_TERMS, **several, **handling, **{key: EPISODE_TERMS[key] for key in cell.varies}}
 
 
 def item_keys(bin_items: int) -> tuple[str, ...]:

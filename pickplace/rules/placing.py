@@ -23,28 +23,39 @@ MAX_LEVELS = 2**22  # entries of its tables; more problems are looked at in turn
 FOOTPRINTS_AT_ONCE = {"cpu": 2**17, "cuda": 2**24}  # what a CPU's caches hold; 100 bytes each on a GPU
 
 
-def resting_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item) -> tuple[Tensor, Tensor]:
+def resting_top(
+    cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item, capacity: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Return the height of the item's top for every footprint, and what it rests on; int32 ``[N, Q, W_T, D_T]`` each.
 
-    Arguments as of :meth:`~pickplace.rules.state.State.each_item`.
+    Arguments as of :meth:`~pickplace.rules.state.State.each_item` and :attr:`~pickplace.rules.state.State.capacity`.
 
-    The top is ``NEVER`` where the item cannot rest: the footprint leaves the tote, the top passes the rim, or the
-    support is too small. The height below it is that on which it would lie, stable or not; ``FAR`` outside the tote.
+    The top is ``NEVER`` where the item cannot rest: the footprint leaves the tote, the top passes the rim, the support
+    is too small, or something below would be overloaded. The height below it is that on which it would lie, stable or
+    not; ``FAR`` outside the tote.
     """
     w, d = footprint_sizes(cell, item)
     at_once = max(1, FOOTPRINTS_AT_ONCE.get(surface.device.type, 2**24) // cell.num_footprints)
     parts = zip(surface.split(at_once), w.split(at_once, -1), d.split(at_once, -1), strict=True)
     kind = OnFootprints if cell.max_side < LEAST_SIDE else LargeItems
     contacts = (kind(cell, *part) for part in parts)  # one at a time, for the memory
-    found = [(on.z, cell.support.stable(on)) for on in contacts]
-    z, stable = found[0] if len(found) == 1 else (torch.cat(each, -1) for each in zip(*found, strict=True))
+    found: list[tuple[Tensor, ...]]
+    if capacity is None:
+        found = [(on.z, cell.support.stable(on)) for on in contacts]
+    else:
+        some = zip(contacts, capacity.split(at_once), strict=True)
+        found = [(on.z, cell.support.stable(on), on.least(borne)) for on, borne in some]
+    z, stable, *least = found[0] if len(found) == 1 else (torch.cat(each, -1) for each in zip(*found, strict=True))
     top = z + item.h.to(z.dtype)
-    good = combine(FOOTPRINT, Resting(None, top, tote_height, stable)) & item.exists
+    resting = Resting(None, top, tote_height, stable, least[0] >= item.grams if least else None)
+    good = combine(FOOTPRINT, resting) & item.exists
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
 
-def unchecked_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item) -> tuple[Tensor, Tensor]:
-    """Return the same as :func:`resting_top`, but for every footprint in the tote, stable or not."""
+def unchecked_top(
+    cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item, capacity: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return the same as :func:`resting_top`, but for every footprint in the tote, stable and borne or not."""
     z = OnFootprints(cell, surface, *footprint_sizes(cell, item)).z
     return (z + item.h.to(z.dtype)).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
@@ -79,6 +90,20 @@ class OnFootprints(Contact):
         limits = torch.where(step.view(-1, 1, 1, 1, 1) < size, torch.iinfo(maps.dtype).max, NEVER).to(maps.dtype)
         parts = (torch.minimum(maps.narrow(axis, at, count), limit) for at, limit in enumerate(limits.unbind(0)))
         return reduce(torch.maximum, parts)
+
+    def least(self, values: Tensor) -> Tensor:
+        """Return the least of values on the cells that are as high as what the item rests on, int64 of the shape of
+        ``z``.
+
+        A height and a value make one number, so that one maximum is of the highest, and of these the least value.
+
+        Args:
+            values: int64 ``[N, W_T, D_T]``, from -1 to 2**31 - 1.
+        """
+        most = 2**32 - 1
+        marked = (self.surface >> 1).long() * 2**32 + (most - 1 - values.permute(1, 2, 0))
+        padded = surround(marked, (0, self.side - 1, 0, self.side - 1), FAR * 2**32)
+        return most - 1 - (self._highest(self._highest(padded[None], -3, self.w), -2, self.d) & most)
 
     @cached_property
     def surfaces(self):  # type: ignore[override]

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from pickplace.rules.item import Item, Observation, items_from_observation, turns_from_flags
+from pickplace.rules.pile import Pile
 
 EMPTY = 1  # surface of an empty tote, see `surface_from`
 REFILLS = ("each", "batch")  # see :attr:`~pickplace.rules.cell.CellSpec.refill`
@@ -32,7 +33,8 @@ class Failure(IntEnum):
     UNSTABLE = 6, "The item would not rest stably.", "unstable"
     STUCK = 7, "This item fits nowhere any more.", "no place left"
     OUT_OF_REACH = 8, "The robot does not reach this pick or this place.", "out of reach"  # judged after 1 to 6
-    FORBIDDEN_TURN = 9, "The item may not be turned like that.", "forbidden turn"  # judged last
+    FORBIDDEN_TURN = 9, "The item may not be turned like that.", "forbidden turn"
+    OVERLOADED = 10, "An item below would carry more than it bears.", "overloaded"  # judged last
 
     def __new__(cls, code: int, sentence: str = "", label: str = ""):
         failure = int.__new__(cls, code)
@@ -77,6 +79,7 @@ class State(NamedTuple):
     tote_height: Tensor  # int64 [N]: height of the episode's tote, H_T
     items: Item  # in the bin, [N, M]
     episode: Episode = FULL_TASK  # what the running episodes may differ in
+    pile: Pile | None = None  # of the items in the tote; None: any item bears any load
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "State":
@@ -84,7 +87,10 @@ class State(NamedTuple):
         tote_height = observation["tote_height"].reshape(-1)
         heights = tote_height[:, None, None] - observation["tote_depth"]
         surface, items = surface_from(heights, observation["tote_bearing"]), items_from_observation(observation)
-        return cls(surface, tote_height, items, Episode.from_observation(observation))
+        pile = None
+        if "pile_below" in observation:
+            pile = Pile(*(observation[key] for key in ("tote_labels", "pile_spare", "pile_below")))
+        return cls(surface, tote_height, items, Episode.from_observation(observation), pile)
 
     @property
     def heights(self) -> Tensor:
@@ -99,7 +105,7 @@ class State(NamedTuple):
     def rows(self, index) -> "State":
         """Return the state of some problems, by their numbers, which may come up more than once."""
         parts = self.surface[index], self.tote_height[index], self.items.rows(index)
-        return State(*parts, self.episode.rows(index))
+        return State(*parts, self.episode.rows(index), None if self.pile is None else self.pile.rows(index))
 
     def each_item(self) -> tuple[Tensor, Tensor, Item]:
         """Return a problem for each item, those of a bin one after the other.
@@ -111,6 +117,12 @@ class State(NamedTuple):
         count = self.items.x.shape[1]
         each = self if count == 1 else self.repeat(count)
         return each.surface, each.tote_height, self.items.flatten()
+
+    @property
+    def capacity(self) -> Tensor | None:
+        """The greatest mass that each cell of the tote bears for each item of :meth:`each_item`, int64
+        ``[N * M, W_T, D_T]``; None: any."""
+        return None if self.pile is None else self.pile.capacity.repeat_interleave(self.items.x.shape[1], 0)
 
     def repeat(self, count: int) -> "State":
         """Return each problem ``count`` times, one copy after the other."""

@@ -17,8 +17,9 @@ from pickplace.rules.grasps import (
     turned_size,
 )
 from pickplace.rules.gripper.base import EffectorShape
-from pickplace.rules.item import Item, flags_from_turns
+from pickplace.rules.item import NO_LIMIT, Item, flags_from_turns
 from pickplace.rules.maps import NEVER, is_under, rectangle, square_cells
+from pickplace.rules.pile import Pile
 from pickplace.rules.state import State, surface_from
 from pickplace.rules.support.contact import Contact
 
@@ -32,6 +33,7 @@ class Step(NamedTuple):
     footprint: Tensor  # int64 [N, 4]: x, y, w, d of the footprint in the tote
     item: Item  # the item that is taken, [N]
     taken: Tensor  # int64 [N]: its number in the bin
+    pile: Pile | None  # of the items in the tote, see State
 
 
 def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
@@ -40,7 +42,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     Args:
         action: int64 ``[N]``, the flat index, in ``[0, N_a)``.
     """
-    (surface, tote_height, items, _), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.gripper.size
+    (surface, tote_height, items, _, pile), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.gripper.size
     taken, item, blocked = take_item(cell, items, action)
     picked, rotation, (left, front, wide, deep), (x, y, w, d) = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
@@ -56,13 +58,15 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
         limits, place = cell.limits.on(action.device), (rotation, *split_action(cell, action)[2:4])
         over = over._replace(lowest=limits.lowest_top[place], highest=limits.highest_top[place])
     inside = ~(is_outside(x, w, tote_w) | is_outside(y, d, tote_d))
-    resting = Resting(inside, top, tote_height, cell.support.stable(contact))
+    borne = None if pile is None else _least_capacity(pile, contact, index) >= item.grams
+    resting = Resting(inside, top, tote_height, cell.support.stable(contact), borne)
     turn = (
         flags_from_turns(item.turns, cell.rotations).gather(1, rotation[:, None])[:, 0] if cell.forbids_turns else None
     )
     failure = first_failure(picked, resting, over, turn)
-    after = _add_item(cell, surface, x, y, contact, index, torch.where(failure == 0, item.h, 0))
-    return Step(after, failure, top, torch.stack([x, y, w, d], -1), item, taken)
+    height = torch.where(failure == 0, item.h, 0)
+    after, pile = _add_item(cell, surface, pile, item, x, y, contact, index, height)
+    return Step(after, failure, top, torch.stack([x, y, w, d], -1), item, taken, pile)
 
 
 @lru_cache(maxsize=64)
@@ -88,8 +92,9 @@ def put_down(cell: CellSpec, state: State, choice: Tensor) -> tuple[State, Item]
     item = select_item(state.items, taken)
     parity, x, y = split_footprint((wide, deep), choice - taken * places)
     w, d = turned_size(item, parity == 1)
-    surface = _add_item(cell, state.surface, x, y, *_contact(cell, state.surface, x, y, w, d), item.h)
-    return state._replace(surface=surface, items=remove_item(state.items, taken)), item
+    on = _contact(cell, state.surface, x, y, w, d)
+    surface, pile = _add_item(cell, state.surface, state.pile, item, x, y, *on, item.h)
+    return state._replace(surface=surface, items=remove_item(state.items, taken), pile=pile), item
 
 
 def _contact(cell: CellSpec, surface: Tensor, x: Tensor, y: Tensor, w: Tensor, d: Tensor) -> tuple[Contact, Tensor]:
@@ -107,13 +112,27 @@ def _contact(cell: CellSpec, surface: Tensor, x: Tensor, y: Tensor, w: Tensor, d
     return Contact(cells, under, torch.where(under, cells, NEVER).amax(0) >> 1, w, d), index
 
 
+def _least_capacity(pile: Pile, contact: Contact, index: Tensor) -> Tensor:
+    """Return the greatest mass that items may have, int64 ``[N]``; contact and index as of :func:`_contact`."""
+    capacity = pile.capacity.flatten(1).t().gather(0, index)
+    return torch.where(_touched(contact), capacity, NO_LIMIT).amin(0)
+
+
+def _touched(contact: Contact) -> Tensor:
+    """Return which cells items rest on, whether these bear weight or not, bool ``[S * S, N]``."""
+    return contact.under & (contact.surfaces >> 1 == contact.z)
+
+
 def _add_item(
-    cell: CellSpec, surface: Tensor, x: Tensor, y: Tensor, contact: Contact, index: Tensor, height: Tensor
-) -> Tensor:
-    """Return the tote with an item in it, int32 ``[N, W_T, D_T]``; contact and index as of :func:`_contact`.
+    cell: CellSpec, surface: Tensor, pile: Pile | None, item: Item, x: Tensor, y: Tensor, contact: Contact,
+    index: Tensor, height: Tensor,
+) -> tuple[Tensor, Pile | None]:  # fmt: skip
+    """Return totes, int32 ``[N, W_T, D_T]``, and piles with an item in them; contact and index as of :func:`_contact`.
 
     Args:
         surface: int32 ``[N, W_T, D_T]``.
+        pile: of the items in the totes.
+        item: ``[N]``.
         x, y: minimum corner of the footprint, int64 ``[N]``.
         height: of the item, int64 ``[N]``; 0 for no item.
     """
@@ -124,4 +143,6 @@ def _add_item(
     if cell.support.marks_bearing:
         weak = contact.under & added & ~cell.support.bearing(contact)
         after.scatter_add_(0, index, -weak.int())
-    return after.t().unflatten(1, grid).contiguous()
+    if pile is not None:
+        pile = pile.add(item, index, _touched(contact), inside.permute(2, 0, 1))
+    return after.t().unflatten(1, grid).contiguous(), pile

@@ -366,8 +366,9 @@ def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
     if done.any():
         metrics["train/occupancy"] = batch["next", "occupancy"][done].mean().item()
         reasons = batch["next", "failure"][done]
-        # Without such an entry no rotation is forbidden.
-        possible = [each for each in Failure if each != Failure.FORBIDDEN_TURN or "rotations" in batch]
+        # Without such an entry no rotation is forbidden, and no load is too much.
+        entries = {Failure.FORBIDDEN_TURN: ("rotations", "handling"), Failure.OVERLOADED: ("handling",)}
+        possible = [each for each in Failure if each not in entries or any(key in batch for key in entries[each])]
         metrics |= {f"train/failure_{each.name.lower()}": (reasons == each).float().mean().item() for each in possible}
     return metrics
 

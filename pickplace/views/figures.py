@@ -19,7 +19,7 @@ COLOURS = ["#56b4e9", "#e69f00", "#009e73", "#f0e442", "#cc79a7", "#0072b2", "#d
 FAILURES = {
     "stuck": "#cfd5da", "none": "#eceff1", "pick_miss": "#d55e00", "bin_collision": "#e69f00",
     "tote_collision": "#0072b2", "overflow": "#56b4e9", "item_collision": "#009e73", "unstable": "#cc79a7",
-    "out_of_reach": "#f0e442", "forbidden_turn": "#5d4037",
+    "out_of_reach": "#f0e442", "forbidden_turn": "#5d4037", "overloaded": "#000000",
 }  # fmt: skip
 
 

@@ -50,6 +50,7 @@ class Move:
     failure: Failure
     heat: np.ndarray | None = None  # uint8 [W_T, D_T]: the policy's preference for each place cell, 255 the highest
     others: list[InBin] = field(default_factory=list)  # what else lies in the bin
+    grams: int = 0  # mass of the item; 0: not known
 
 
 @dataclass
@@ -118,6 +119,7 @@ def record_moves(
             failure=Failure(int(step.failure[row])),
             heat=None if heat is None else heat[row],
             others=items_in_bin(others, row),
+            grams=int(step.item.grams[row]),
         )
         for row in range(len(action))
     ]

@@ -15,9 +15,10 @@ from scipy.spatial import ConvexHull
 
 from pickplace import cli
 from pickplace.evaluation.pack import OrderPacker
-from pickplace.items.order_file import OrderItem
+from pickplace.items.order_file import ORIENTATIONS, OrderItem
 from pickplace.physics.engine import build_engine
 from pickplace.physics.plans import read_plans
+from pickplace.rules.item import NO_LIMIT
 
 ORDERS = Path(__file__).resolve().parents[2] / "docs/examples/orders/orders.csv"
 CONTAINER, CELL = (400, 300, 250), 20
@@ -50,23 +51,83 @@ def is_carried(packed, others):
 
 
 @settings(max_examples=12, deadline=None)
-@given(st.lists(SIDES, min_size=1, max_size=25), st.booleans())
-def test_items_lie_apart_inside_and_are_carried(sizes, keep):
+@given(st.lists(SIDES, min_size=1, max_size=25), st.booleans(), st.booleans())
+def test_items_lie_apart_inside_and_are_carried(sizes, keep, tipping):
     items = [OrderItem(str(n), *map(float, sides), 100, f"line {n}") for n, sides in enumerate(sizes)]
-    _, containers = OrderPacker(CONTAINER, CELL).pack(items, keep_sequence=keep)
+    _, containers = OrderPacker(CONTAINER, CELL, tipping=tipping).pack(items, keep_sequence=keep)
     numbers = [packed.number for each in containers for packed in each.items]
     assert sorted(numbers) == [*range(1, len(items) + 1)]
     for each in containers:
         assert not keep or [packed.number for packed in each.items] == sorted(packed.number for packed in each.items)
         for place, packed in enumerate(each.items):
             assert items[packed.number - 1] is packed.item
-            assert packed.size[packed.turned] == packed.item.length
+            sides = dict(zip(packed.orientation, packed.size, strict=True))
+            assert sides == {"l": packed.item.length, "w": packed.item.width, "h": packed.item.height}
+            assert tipping or packed.size[packed.turned] == packed.item.length
             assert all(0 <= packed.corner[a] <= CONTAINER[a] - packed.size[a] + 1e-6 for a in range(3))
             before = each.items[:place]
             assert all(overlap(packed, other) < 1e-6 for other in before)
             assert is_carried(packed, before), (packed, before)
         volume = sum(math.prod(packed.size) for packed in each.items)
         assert each.occupancy == pytest.approx(volume / math.prod(CONTAINER))
+
+
+LIMITS = st.tuples(
+    st.integers(1, 9), st.sampled_from([NO_LIMIT, NO_LIMIT, 20, 8, 0]),
+    st.sampled_from([ORIENTATIONS, ORIENTATIONS, ("lwh",), ("wlh", "hwl"), ("lwh", "wlh", "hlw")]),
+)  # fmt: skip
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.lists(st.tuples(SIDES, LIMITS), min_size=1, max_size=25), st.booleans(), st.booleans())
+def test_loads_and_turns_are_as_the_items_allow(sizes, keep, tipping):
+    """By the items' true sides: the loads are counted again, from the first item up."""
+    items = [
+        OrderItem(str(n), *map(float, sides), grams, f"line {n}", max_load, orientations)
+        for n, (sides, (grams, max_load, orientations)) in enumerate(sizes)
+    ]
+    _, containers = OrderPacker(CONTAINER, CELL, tipping=tipping).pack(items, keep_sequence=keep)
+    assert sum(len(each.items) for each in containers) == len(items)
+    for each in containers:
+        below = []
+        load = [0] * len(each.items)
+        for packed in each.items:
+            assert packed.orientation in packed.item.orientations[: None if tipping else 2]
+            carriers = {
+                number
+                for number, other in enumerate(each.items[: len(below)])
+                if abs(other.corner[2] + other.size[2] - packed.corner[2]) < 1e-6 and overlap(packed, other, (0, 1)) > 0
+            }
+            below.append(carriers.union(*(below[number] for number in carriers)))
+            for number in below[-1]:
+                load[number] += packed.item.grams
+        assert all(total <= packed.item.max_load for total, packed in zip(load, each.items, strict=True))
+
+
+@pytest.mark.parametrize(("orientations", "tipping", "containers"), [
+    (("lhw", "wlh"), True, 1), (ORIENTATIONS, True, 2), (("lwh", "wlh"), True, 3), (ORIENTATIONS, False, 3),
+    (("lwh", "hlw"), True, 3),
+])  # fmt: skip
+def test_boxes_that_may_lie_on_their_side(orientations, tipping, containers):
+    """In 200 x 180 x 100 mm one box of 200 x 100 x 60 mm lies flat, with another one on its side; or three on their
+    sides, as lhw."""
+    items = [OrderItem("box", 200.0, 100.0, 60.0, 9, "line 1", orientations=orientations)] * 3
+    cell, found = OrderPacker((200, 180, 100), CELL, tipping=tipping).pack(items)
+    assert len(found) == containers
+    for move in (move for each in found for move in each.recording.moves):  # the page shows an item alone in a bin
+        assert move.item[:2] == (0, 0) and not move.others and move.item[2] <= cell.bin_size[0] and cell.bin_items == 1
+
+
+def test_what_bears_nothing_comes_last_if_that_packs_more():
+    """A plate on which nothing may lie fits on top of two cubes; first, it would leave no room for them."""
+    items = [
+        OrderItem("plate", 200.0, 100.0, 20.0, 9, "line 1", 0),
+        *(OrderItem("cube", *[100.0] * 3, 9, "line 2"),) * 2,
+    ]
+    _, (one,) = OrderPacker((200, 100, 130), CELL).pack(items)
+    assert [packed.item.id for packed in one.items] == ["cube", "cube", "plate"]
+    _, several = OrderPacker((200, 100, 130), CELL).pack(items, keep_sequence=True)
+    assert len(several) == 2
 
 
 def test_tops_that_are_rounded_alike_are_not_level():

@@ -14,9 +14,12 @@ from hypothesis import strategies as st
 
 from pickplace import PickPlaceEnv
 from pickplace.evaluation.play import check_play, play
-from pickplace.items.order_file import MILLIMETRES, read_orders
+from pickplace.items.order_file import MILLIMETRES, ORIENTATIONS, read_orders
 from pickplace.items.orders import Orders
 from pickplace.planners.heuristics import JointDBL
+from pickplace.rules.item import NO_LIMIT
+from pickplace.rules.state import Failure
+from pickplace.rules.step import apply
 
 BIN = (40, 40, 1)
 SIDES = st.tuples(*[st.integers(1, 600)] * 3, st.integers(1, 30_000))  # mm and g
@@ -160,8 +163,15 @@ def test_true_volumes_are_reported(tmp_path):
         ("l,w,h,kg\n1,2,3\n", r"line 2: got 3 fields, expected 4 as in the header\."),
         ("l,w,h,kg,qty\n1,2,3,4,1.5\n", r"line 2: 1.5 pieces; expected a whole number\."),
         ("l,w,h,weight/mm\n1,2,3,4\n", r"line 1: the column 'weight/mm' is in mm; expected g or kg\."),
-        ("l,w,h,kg,max_load\n1,2,3,4,5\n", r"line 1: the column 'max_load' is not read yet"),
-        ("l,w,h,kg,Max Load [kg]\n1,2,3,4,5\n", r"line 1: the column 'Max Load \[kg\]' is not read yet"),
+        ("l,w,h,kg,max_load\n1,2,3,4,-1\n", r"line 2: max_load='-1': expected a number from 0 to 1,000,000, or"),
+        ("l,w,h,kg,max_load/g\n1,2,3,4,nan\n", r"line 2: max_load/g='nan': expected a number from 0 to 1,000,000,000"),
+        ("l,w,h,kg,max_load/mm\n1,2,3,4,5\n", r"line 1: the column 'max_load/mm' is in mm; expected g or kg\."),
+        ("l,w,h,kg,max_load,maximum load\n1,2,3,4,5,5\n", r"line 1: columns 'max_load' and 'maximum_load'; expected"),
+        ("l,w,h,kg,stackable\n1,2,3,4,perhaps\n", r"line 2: stackable='perhaps': expected yes or no\."),
+        ("l,w,h,kg,orientations\n1,2,3,4,lwh hwd\n", r"line 2: orientations='lwh hwd': expected any, upright"),
+        ("l,w,h,kg,orientations\n1,2,3,4,hlw\n", r"line 2: orientations=hlw: expected lwh or wlh among them; items"),
+        ("id,l,w,h,kg,stackable\na,1,2,3,4,yes\na,1,2,3,4,no\n",
+         r"line 3: item 'a' is 1 x 2 x 3 mm, 4 kg, at most 0 kg on top, but 1 x 2 x 3 mm, 4 kg in .*, line 2"),
         ("l,l,h,kg\n1,2,3,4\n", r"line 1: two columns 'l'; expected one\."),
         ("id,l,w,h,kg\na,1,2,3,4\na,1,2,3,5\n", r"line 3: item 'a' is 1 x 2 x 3 mm, 5 kg, but 1 x 2 x 3 mm, 4 kg in"),
         ("l,w,h,kg\n", r"no items, expected at least one\."),
@@ -263,3 +273,52 @@ def test_quantities_and_semicolons(tmp_path):
     (order,) = read_orders(path, "cm")
     assert Counter(item.id for item in order.items) == {"a": 2, "b": 1}
     assert order.items[0][1:5] == (350.0, 203.0, 208.0, 1500) and order.items[2].grams == 1
+
+
+LIMITS = [
+    ("", "", "", "", NO_LIMIT, ORIENTATIONS), ("2.5", "", "", "any", 2500, ORIENTATIONS),
+    ("0", "", "", "", 0, ORIENTATIONS),
+    ("2.5", "no", "", "", 0, ORIENTATIONS), ("", "Yes", "no", "upright", NO_LIMIT, ("lwh", "wlh")),
+    ("7", "", "TRUE", "fixed", 0, ("lwh",)), ("", "", "", "wlh", NO_LIMIT, ("wlh",)),
+    ("0.0009", "1", "0", "hwl LWH", 0, ("lwh", "hwl")),
+]  # fmt: skip
+
+
+def test_limits_by_hand(tmp_path):
+    """As CSV, and as JSON, where an answer may be a bool and nothing may be null."""
+    columns = ["Max Load [kg]", "stackable", "nothing on top", "Orientations"]
+    with (tmp_path / "a.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([["l", "w", "h", "kg", *columns], *[(3, 2, 1, 1, *row[:4]) for row in LIMITS]])
+    json_of = {"": None, "no": False, "Yes": True, "TRUE": True}
+    size = {"length/mm": 3, "width/mm": 2, "height/mm": 1, "weight/kg": 1}
+    items = {
+        str(number): {**size, **{key: json_of.get(value, value) for key, value in zip(columns, row, strict=False)}}
+        for number, row in enumerate(LIMITS)
+    }
+    (tmp_path / "a.json").write_text(json.dumps({"one": {"item_sequence": items}}))
+    for file in ("a.csv", "a.json"):
+        (order,) = read_orders(tmp_path / file)
+        assert [(item.max_load, item.orientations) for item in order.items] == [row[4:] for row in LIMITS]
+    assert [item.turns for item in order.items] == [15, 15, 15, 15, 15, 5, 10, 5]
+
+
+def test_limits_are_obeyed(tmp_path):
+    """Pairs of a table that bears nothing and a cup: they lie side by side, and the table as it does in the bin."""
+    lines = [f"{n},2{n},30,10,1,0,fixed\n{n},10,10,10,1,,\n" for n in range(4)]
+    (path := tmp_path / "a.csv").write_text("order,l,w,h,kg,max_load,orientations\n" + "".join(lines))
+    items = Orders(path, 0.01)
+    assert sorted({*map(tuple, items.handling.tolist())}) == [(5, 1000, 0), (15, 1000, NO_LIMIT)]
+    settings = {"bin_size": (3, 3, 1), "tote_size": (3, 4, 3), "stream": "test", "num_envs": 1}
+    with pytest.raises(ValueError, match=r"env.handling=false: the items have greatest loads or turns of their own"):
+        PickPlaceEnv(items, **settings)
+    env = PickPlaceEnv(items, **settings, handling=True)
+    seen = env.reset()
+    assert env.cell.pile_room == 2 and seen["handling"].tolist() == [[[5, 1000, 0]]]
+    feasible = seen["action_mask"][0].nonzero()[:, 0]
+    assert len(feasible) and not (feasible % 2).any()  # never turned by a quarter
+    for failures in ({Failure.NONE}, {Failure.NONE, Failure.OVERLOADED}):
+        state = env.state.repeat(env.cell.num_actions)
+        found = apply(env.cell, state, torch.arange(env.cell.num_actions)).failure.unique().tolist()
+        assert failures <= {*found} and (Failure.OVERLOADED in failures) == (Failure.OVERLOADED in found)
+        action = seen["action_mask"].int().argmax(1)
+        _, seen = env.step_and_maybe_reset(seen.set("action", action))

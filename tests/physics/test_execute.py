@@ -40,6 +40,8 @@ TALL, LOW = ((0.0, 0.1, 0.0), (0.1, 0.1, 0.1)), ((0.1, 0.1, 0.0), (0.1, 0.1, 0.0
     ([placed((0.0, 0.1, 0.0), (0.1, 0.1, 0.25))], "done", None),  # over the wall, level with it
     ([replace(placed(*LOW), pick=(0.0, 0.0))], "dropped", 0),  # the plate is not above the item
     ([replace(placed(*LOW), place=(0.16, 0.15))], "wedged", 0),  # a centimetre beside where it was planned
+    ([replace(placed(*LOW), mass=3.0)], "done", None),  # the suction bears 100 N, and also accelerates it
+    ([replace(placed(*LOW), mass=11.0)], "dropped", 0),
 ])  # fmt: skip
 def test_cases_by_hand(placements, ending, during):
     outcome = carry(*placements)
@@ -163,7 +165,7 @@ def test_an_item_waits_in_the_bin_until_it_is_taken():
     """B lies there from the first pick on and is taken second; C comes with the second pick and stays."""
     first = Placement((0.1, 0.1, 0.0), A[2:], A[:2], (0.075, 0.075), (0.175, 0.175), 0, (B,))
     near = (0.1 + 1e-9, *B[1:2])  # written by another program
-    second = Placement((0.1, 0.2, 0.0), B[2:], near, (0.15, 0.05), (0.15, 0.25), 0, (C,))
+    second = Placement((0.1, 0.2, 0.0), B[2:], near, (0.15, 0.05), (0.15, 0.25), 0, (C,), 1.5)
     plan = EpisodePlan(0, (0.4, 0.4, 0.25), (0.25, 0.25, 0.02), EFFECTOR, [first, second])
     execute = Execute()
     scene = execute.make_scene(plan)
@@ -177,6 +179,7 @@ def test_an_item_waits_in_the_bin_until_it_is_taken():
     assert execute.place(scene, second, np.zeros(2)) is None
     assert len(scene.bodies) == 3 and scene.boxes[1].name == waiting.name
     assert np.allclose(scene.data.xpos[waiting.id], (0.15, 0.25, 0.02), atol=1e-3) and list(scene.waiting) == [C]
+    assert scene.model.body_mass[[body.id for body in scene.boxes]] == pytest.approx([0.075, 1.5], rel=0.05)  # own mass
 
     motion = execute.carry_out_one(plan, record=True).motion
     a, b, c = motion.boxes

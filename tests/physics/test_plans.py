@@ -37,18 +37,21 @@ def test_a_recorded_episode_in_metres(tmp_path):
     cell = CellSpec((5, 5, 3), (6, 6, 20), effector_size=(3, 2), height_unit=0.25)
     moves = [
         Move((2, 1, 2, 1, 5), (1, 0), (0, 1), 1, (0, 2, 1, 2), 0, Failure.NONE),
-        Move((0, 0, 1, 1, 4), (0, 0), (0, 0), 0, (0, 2, 1, 1), 5, Failure.NONE),
+        Move((0, 0, 1, 1, 4), (0, 0), (0, 0), 0, (0, 2, 1, 1), 5, Failure.NONE, grams=1500),
         Move((0, 0, 1, 1, 4), (0, 0), (5, 5), 0, (5, 5, 1, 1), 0, Failure.TOTE_COLLISION),
     ]
     plan = plan_of(Recording(7, 18, moves), replace(cell, cell_size=0.04))
     first = Placement((0, 0.08, 0), (0.04, 0.08, 0.05), (0.08, 0.04), (0.1, 0.04), (0.04, 0.1), 90)
     assert plan == EpisodePlan(7, (0.24, 0.24, 0.18), (0.2, 0.2, 0.03), (0.12, 0.08), [first, plan.placements[1]])
     assert plan.placements[1].corner == (0, 0.08, 0.05) and plan.placements[1].rotation == 0
+    assert [placement.mass for placement in plan.placements] == [0.0, 1.5]
     path = tmp_path / "plans.jsonl"
     path.write_text(to_lines([plan, EpisodePlan(8, (1.0, 1.0, 1.0), placements=[Placement((0, 0, 0), (1, 1, 1))])]))
     assert list(map(json.loads, path.read_text().splitlines()))[0].keys() == {*KEYS, *ROBOT_KEYS}
     back = read_plans(path)
     assert back[0] == plan and back[1].placements == [Placement((0, 0, 0), (1, 1, 1))]
+    written(path, {**LINE, "mass": 2.5})  # enough for `settle`
+    assert read_plans(path)[0].placements == [Placement((0, 0, 0), (0.1, 0.1, 0.05), mass=2.5)]
 
 
 @pytest.mark.parametrize(("change", "words"), [
@@ -62,6 +65,7 @@ def test_a_recorded_episode_in_metres(tmp_path):
     ({"size": [0.1, 0, 0.1]}, r"size=\[0.1, 0, 0.1\]: "),
     ({"size": "large"}, "size='large': "),
     *(({"episode": value}, f"episode={value}: ") for value in (0.5, -1)),
+    *(({"mass": value}, f"mass={value}: expected a mass above 0") for value in (0, -1, 1e9)),
     ({"tote": [0.3, 0.3, 0.3]}, "tote: .* episode 0"),
     ({"volume": 1}, "'volume': "),
     ({"pick": [0, 0]}, "bin: missing"),

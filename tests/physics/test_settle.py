@@ -44,6 +44,17 @@ def test_the_limit_of_the_harmonic_stack(share, ending):
     assert EXACT.carry_out_one(bricks(*(share * 0.1 / part for part in (6, 4, 2)))).ending == ending
 
 
+@pytest.mark.parametrize(("mass", "ending"), [(0.3, "done"), (0.43, "collapsed"), (0.0, "done")])
+def test_a_lever_with_known_masses(mass, ending):
+    """A beam of 1 kg has its centre 20 mm inside the edge on which it lies; the load 55 mm outside. Without a mass the
+    load has that of the density, 37.5 g."""
+    boxes = plan(((0.3, 0.4, 0), (0.12, 0.1, 0.05)), ((0.3, 0.4, 0.05), (0.2, 0.1, 0.05)),
+                 ((0.45, 0.4, 0.1), (0.05, 0.05, 0.05)))  # fmt: skip
+    _, beam, load = boxes.placements
+    boxes.placements[1:] = [replace(beam, mass=1.0), replace(load, mass=mass)]
+    assert EXACT.carry_out_one(boxes).ending == ending
+
+
 @pytest.mark.parametrize(("friction", "slides"), [(0.0, True), (0.15, True), (0.2, False), (0.6, False)])
 def test_a_tower_slides_apart_without_friction(friction, slides):
     """On a slope of 10 degrees, whose tangent is 0.176."""

@@ -59,7 +59,8 @@ class Afterstate(FootprintPolicy):
         return after, item.volume, value
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
-        before = State.from_observation(observation).rows(row)
+        state = State.from_observation(observation)._replace(pile=None)  # what lies on what is not in the picture
+        before = state.rows(row)
         _, volume, value = self.judge(before, footprint)
         less = before.items.volume.amax(1) - volume  # than of the largest item: exactly 0 with one in the bin
         return (value - self.network.reward_scale * less) / self.temperature
