@@ -149,7 +149,9 @@ class PickPlaceEnv(EnvBase):
         self._checked_starts = {(0, SETTINGS["rotations"].full(cell) if "rotations" in varies else ALL_TURNS)}
         self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
         device = usable_device(device)
-        check_bytes(f"num_envs={num_envs}", num_envs * problem_bytes(self.cell, masks), device)
+        words = f"num_envs={num_envs}"
+        words += f" with handling=true and room for {cell.pile_room:,} items in a tote" if cell.handling else ""
+        check_bytes(words, num_envs * problem_bytes(self.cell, masks), device)
         super().__init__(device=device, batch_size=[num_envs])
         self.stream, self.masks = stream, tuple(masks)
         tallest = [*map(items.tallest, range(items.mixes))]

@@ -45,8 +45,16 @@ def merge_trained(cfg: DictConfig, trained: DictConfig) -> DictConfig:
         elif places := places_in_other_groups(word):
             for part in places:  # such as env.reach
                 OmegaConf.update(changed, part, OmegaConf.select(groups, part), merge=False, force_add=True)
-        elif key.startswith("env.") and key[4:] in groups.env and key[4:] not in changed.env:
-            changed.env[key[4:]] = groups.env[key[4:]]  # a setting that is younger than the checkpoint
+        elif _is_younger(key, groups, changed):
+            OmegaConf.update(changed, key, OmegaConf.select(groups, key), merge=False, force_add=True)
         elif key.split(".")[0] in TRAINED:
             ours.append(word)
     return apply_overrides(changed, ours, groups)
+
+
+def _is_younger(key: str, groups: DictConfig, trained: DictConfig) -> bool:
+    """Return whether a checkpoint's config lacks a setting of the cell, or of items of its kind, as it is older."""
+    group, _, name = key.partition(".")
+    if group not in groups or name not in groups[group] or name in trained[group]:
+        return False
+    return groups[group].get("_target_") == trained[group].get("_target_")

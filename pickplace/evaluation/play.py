@@ -154,10 +154,12 @@ def check_play(evaluation: Mapping, env: PickPlaceEnv) -> None:
         ValueError: naming the key.
     """
     episodes, most = evaluation["episodes"], env.items.num_episodes(evaluation["stream"])
+    stream = f"evaluation.stream={evaluation['stream']}"
+    refuse_if(most == 0, f"{stream}: the items have no episodes for it; expected another stream, or items.split=true.")
     refuse_if(
         most is not None and episodes > most,
-        f"evaluation.episodes={episodes}: the items of evaluation.stream={evaluation['stream']} have {most} different "
-        f"episodes; expected {most} at most, as others would repeat them.",
+        f"evaluation.episodes={episodes}: the items of {stream} have {most} different episodes; expected {most} at "
+        "most, as others would repeat them.",
     )
     together = min(evaluation["batch_size"], episodes)
     check_bytes(f"evaluation.batch_size={together}", together * problem_bytes(env.cell, ()), env.device)

@@ -16,7 +16,7 @@ from typing_extensions import Self
 
 from pickplace.common.files import read_table
 from pickplace.common.validate import at_most, excerpt, expect, flag, is_number, is_whole, refuse_any, whole_number
-from pickplace.rules.item import ALL_TURNS, NO_LIMIT, Item
+from pickplace.rules.item import ALL_TURNS, MAX_GRAMS, NO_LIMIT, Item
 
 #: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
 STREAMS = ("train", "validation", "test")
@@ -312,7 +312,10 @@ def _read_handling(count: int, turns, grams, max_load) -> Tensor:
 
     given = column("turns", turns, None, "lists of some of [0, 1, 2, 3], or null", are_turns)
     masks = [ALL_TURNS if each is None else sum(1 << turn for turn in {*each}) for each in given]
-    mass = column("grams", grams, 0, "whole numbers >= 0", lambda value: is_whole(value) and 0 <= value < NO_LIMIT)
+    mass = column(
+        "grams", grams, 0, f"whole numbers from 0 to {MAX_GRAMS:,}",
+        lambda value: is_whole(value) and 0 <= value <= MAX_GRAMS,
+    )  # fmt: skip
     loads = column(
         "max_load", max_load, None, "whole numbers of grams >= 0, or null for any load",
         lambda value: value is None or (is_whole(value) and 0 <= value < NO_LIMIT),

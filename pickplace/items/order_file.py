@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from pickplace.common.files import MAX_TABLE_BYTES, read_text
 from pickplace.common.validate import at_most, excerpt, refuse_if, reworded, without_twins
-from pickplace.rules.item import NO_LIMIT
+from pickplace.rules.item import MAX_GRAMS, NO_LIMIT
 
 #: Name of a column -> the names that a file may have for it, in any case; a unit may follow, as in ``length/mm``.
 NAMES = {
@@ -36,14 +36,17 @@ ORIENTATIONS = ("lwh", "wlh", "lhw", "hlw", "whl", "hwl")
 TURNS = {"lwh": 0b0101, "wlh": 0b1010}
 #: Words for some of the orientations.
 WORDS = {"any": ORIENTATIONS, "upright": ("lwh", "wlh"), "fixed": ("lwh",)}
-YES_NO = {**dict.fromkeys(("yes", "true", "1"), True), **dict.fromkeys(("no", "false", "0"), False)}
+YES_NO = {
+    **dict.fromkeys(("yes", "y", "true", "1", "1.0"), True),
+    **dict.fromkeys(("no", "n", "false", "0", "0.0"), False),
+}
 MILLIMETRES, GRAMS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}, {"g": 1.0, "kg": 1000.0}
 UNITS: dict[str, dict] = {**dict.fromkeys(SIDES, MILLIMETRES), "weight": GRAMS, "max_load": GRAMS}
 DEFAULT_WEIGHT = "kg"
 COLUMN = re.compile(r"(.*?)\s*(?:[/_ (\[]\s*(mm|cm|m|kg|g)\s*[)\]]?)?")  # a name, and a unit if there is one
 EXPECTED = "columns length, width, height and weight, such as length/mm and weight/kg; and order, id or quantity if any"
 
-MAX_LENGTH, MAX_GRAMS, MAX_LOAD = 10_000, 10_000_000, 1_000_000_000  # of an item: 10 m, 10 t; on it: 1,000 t
+MAX_LENGTH, MAX_LOAD = 10_000, 1_000_000_000  # of an item: 10 m; on it: 1,000 t
 MAX_NAME = 100  # letters of the name of an order or an article
 MAX_QUANTITY, MAX_ITEMS = 10_000, 2_000_000  # of a line, of a file
 
@@ -281,7 +284,7 @@ def _read_max_load(place: str, row: Mapping, columns: dict[str, _Column]) -> int
         loads.append(math.floor(float(value) * unit + 1e-6))
     for column, forbids in (("stackable", False), ("nothing_on_top", True)):
         if column in columns and (value := row[columns[column].key]) not in ("", None):
-            answer = YES_NO.get(str(value).lower())
+            answer = YES_NO.get(str(value).strip().lower())
             refuse_if(answer is None, f"{place}: {columns[column].key}={excerpt(value)}: expected yes or no.")
             if answer == forbids:
                 loads.append(0)
@@ -293,7 +296,10 @@ def _read_orientations(place: str, row: Mapping, columns: dict[str, _Column]) ->
     value = row[columns["orientations"].key] if "orientations" in columns else None
     if value in ("", None):
         return ORIENTATIONS
-    words = re.split(r"[\s,;|/+]+", str(value).strip().lower())
+    listed = value if isinstance(value, list) else [value]
+    words = [word for each in listed for word in re.split(r"[\s,;|/+]+", str(each).lower()) if word]
+    if not words:
+        return ORIENTATIONS
     found = {each for word in words for each in WORDS.get(word, (word,))}
     refuse_if(
         not found <= {*ORIENTATIONS},

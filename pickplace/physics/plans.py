@@ -72,7 +72,10 @@ ROBOT_KEYS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "rotation": ("0, 90, 180 or 270", lambda value: is_whole(value) and value in (0, 90, 180, 270)),
 }
 OPTIONAL_KEYS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "mass": ("a mass above 0, in kg", lambda value: is_number(value) and 1e-6 <= value <= MAX_MASS),
+    "mass": (
+        f"a mass above 0, and up to {MAX_MASS:,.0f} kg",
+        lambda value: is_number(value) and 1e-6 <= value <= MAX_MASS,
+    ),
     "body": (
         f"up to {MAX_BODY:,} rectangles x, y, w, d, in metres",
         partial(_are_boxes, count=4, sides=2, most=MAX_BODY),

@@ -78,7 +78,8 @@ def select_item(items: Item, number: Tensor) -> Item:
     """Return one item of each bin, ``[N]``; ``number`` is int64 ``[N]``."""
     if items.x.shape[1] == 1:
         return items.flatten()
-    return items.rows((torch.arange(len(number), device=number.device), number))
+    count = number.shape[0]  # not len(), of which torch.export would make a constant
+    return items.rows((torch.arange(count, device=number.device), number))
 
 
 def remove_item(items: Item, number: Tensor, removed: Tensor | None = None) -> Item:

@@ -14,6 +14,7 @@ Observation: TypeAlias = TensorDictBase | Mapping[str, Tensor]
 
 ALL_TURNS = 0b1111  # a bit for each quarter turn
 NO_LIMIT = 2**31 - 1  # grams
+MAX_GRAMS = 10_000_000  # greatest mass of an item
 
 
 DEFAULTS = (-1, ALL_TURNS, 0, NO_LIMIT)  # of the columns kind, turns, grams and max_load

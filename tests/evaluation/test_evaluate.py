@@ -2,6 +2,7 @@
 
 import base64
 import json
+import math
 import re
 import zlib
 from itertools import product
@@ -21,6 +22,7 @@ from pickplace.evaluation.result import episode_settings, read_comparison
 from pickplace.physics.plans import read_plans
 from pickplace.physics.settle import Settle
 from pickplace.planners.heuristics import JointDBL
+from pickplace.rules.cell import MAX_ACTIONS
 from pickplace.views.motion import Outcome
 
 SMALL = ["env.tote_size=[4,4,2]", "evaluation.latency_decisions=0", "evaluation.replay=0"]
@@ -84,7 +86,7 @@ def test_larger_benchmarks_are_gopt_rs_on_a_finer_grid(side, episodes):
 @pytest.mark.parametrize(
     ("name", "target", "base", "fine"),
     [
-        ("bed_bpp", "euro-pallet", (1.2, 0.8), ["env.tote_size=[120,80,200]", "env.bin_size=[120,80,1]"]),
+        ("bed_bpp", "euro-pallet", (1.2, 0.8), ["env.tote_size=[120,80,200]", "env.bin_size=[80,80,1]"]),
         ("bed_bpp_roll", "rollcontainer", (0.8, 0.7), ["env.tote_size=[80,70,200]", "env.bin_size=[80,80,1]"]),
     ],
 )
@@ -95,6 +97,7 @@ def test_orders_of_bed_bpp_go_where_they_are_for(evaluation, tmp_path, name, tar
         assert [side * env.cell_size for side in env.tote_size[:2]] == pytest.approx(base)
         assert env.tote_size[2] * env.height_unit * env.cell_size == pytest.approx(2)
         assert env.support.margin * env.cell_size == pytest.approx(0.02)
+        assert math.prod(env.bin_size[:2]) * math.prod(env.tote_size[:2]) * env.rotations <= MAX_ACTIONS
     box = {"length/mm": 600, "width/mm": 390, "height/mm": 305, "weight/kg": 4}
     (path := tmp_path / "orders.json").write_text(json.dumps({
         goal: {"item_sequence": {str(n): box for n in range(1, count)}, "properties": {"target": goal}}
@@ -105,6 +108,8 @@ def test_orders_of_bed_bpp_go_where_they_are_for(evaluation, tmp_path, name, tar
     count = {"euro-pallet": 3, "rollcontainer": 2}[target]
     assert result["share_placed"]["mean"] == 1 and result["items_placed"] == count
     assert result["true_occupancy"]["mean"] == pytest.approx(count * 0.6 * 0.39 * 0.305 / (2 * base[0] * base[1]))
+    with pytest.raises(ValueError, match="^evaluation.stream=validation: the items have no episodes for it; expected"):
+        evaluation(*words, "evaluation.stream=validation")
 
 
 @pytest.mark.parametrize(

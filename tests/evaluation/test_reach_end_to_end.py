@@ -87,8 +87,8 @@ def test_shipped_weights_are_evaluated_with_a_reach_and_another_gripper(evaluati
     assert limited["env"]["reach"]["radii"] == [4, 7.6]
     assert max(limited["occupancy"]["per_episode"]) <= 30 / 36 < min(plain["occupancy"]["per_episode"])
     assert "env.reach=None, expected {" in evaluation(*words, "reach=annulus", compare)
-    # A setting that is younger than these weights; nothing lies on anything at this height.
-    loads = evaluation(*words, "env.handling=true", "items=kinds", "items.max_load=[0,0,0,0]")
+    # Settings that are younger than these weights; nothing lies on anything at this height.
+    loads = evaluation(*words, "env.handling=true", "items.max_load=[0,0,0,0]")
     assert loads["env"]["handling"] and loads["occupancy"]["per_episode"] == plain["occupancy"]["per_episode"]
     assert "env.reach.radii: there is no key" in evaluation(*words, "env.reach.radii=[4,9.6]")
 

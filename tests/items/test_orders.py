@@ -281,6 +281,7 @@ LIMITS = [
     ("2.5", "no", "", "", 0, ORIENTATIONS), ("", "Yes", "no", "upright", NO_LIMIT, ("lwh", "wlh")),
     ("7", "", "TRUE", "fixed", 0, ("lwh",)), ("", "", "", "wlh", NO_LIMIT, ("wlh",)),
     ("0.0009", "1", "0", "hwl LWH", 0, ("lwh", "hwl")),
+    ("", "y", "N ", "lhw,hlw, wlh,", NO_LIMIT, ("wlh", "lhw", "hlw")), ("", "1.0", "", " ", NO_LIMIT, ORIENTATIONS),
 ]  # fmt: skip
 
 
@@ -289,7 +290,7 @@ def test_limits_by_hand(tmp_path):
     columns = ["Max Load [kg]", "stackable", "nothing on top", "Orientations"]
     with (tmp_path / "a.csv").open("w", newline="") as file:
         csv.writer(file).writerows([["l", "w", "h", "kg", *columns], *[(3, 2, 1, 1, *row[:4]) for row in LIMITS]])
-    json_of = {"": None, "no": False, "Yes": True, "TRUE": True}
+    json_of = {"": None, "no": False, "Yes": True, "TRUE": True, "1.0": 1.0, "hwl LWH": ["hwl", "LWH"]}
     size = {"length/mm": 3, "width/mm": 2, "height/mm": 1, "weight/kg": 1}
     items = {
         str(number): {**size, **{key: json_of.get(value, value) for key, value in zip(columns, row, strict=False)}}
@@ -299,7 +300,7 @@ def test_limits_by_hand(tmp_path):
     for file in ("a.csv", "a.json"):
         (order,) = read_orders(tmp_path / file)
         assert [(item.max_load, item.orientations) for item in order.items] == [row[4:] for row in LIMITS]
-    assert [item.turns for item in order.items] == [15, 15, 15, 15, 15, 5, 10, 5]
+    assert [item.turns for item in order.items] == [15, 15, 15, 15, 15, 5, 10, 5, 10, 15]
 
 
 def test_limits_are_obeyed(tmp_path):

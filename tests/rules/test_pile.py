@@ -171,7 +171,13 @@ def test_impossible_piles_by_hand(change):
     ("settings", "message"),
     [
         ({"max_load": [1, None]}, r"items.max_load=\[1, None\]: expected 3 whole numbers of grams >= 0, or null"),
-        ({"grams": [1, 2, -1]}, r"items.grams=\[1, 2, -1\]: expected 3 whole numbers >= 0, one for each kind"),
+        *(
+            (
+                {"grams": [1, 2, bad]},
+                r"items.grams=\[1, 2, .*\]: expected 3 whole numbers from 0 to 10,000,000, ",
+            )
+            for bad in (-1, 10_000_001)
+        ),
         ({"turns": [[0], [], None]}, r"items.turns=\[\[0\], \[\], None\]: expected 3 lists of some of \[0, 1, 2, 3\]"),
     ],
 )
