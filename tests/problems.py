@@ -19,6 +19,7 @@ from pickplace.rules.reach.base import Limits
 from pickplace.rules.state import surface_from
 from pickplace.rules.support.rules import RULES, Support, read_support
 
+NOT_OF_THE_ORACLE = ("height_unit", "cell_size", "reach", "gripper", "support", "handling")
 SIDES, NEVER = st.integers(1, 4), st.just(False)
 
 #: Stability rules and their margins.
@@ -68,7 +69,7 @@ def state_of(*cases: Case) -> State:
 def oracle_of(cell: CellSpec, case: Case) -> Oracle:
     """Return a case as the oracle sees it."""
     tables = {} if cell.limits is None else {k: v.tolist() for k, v in vars(cell.limits).items() if v is not None}
-    names = (name for name in CELL_SETTINGS if name not in ("height_unit", "cell_size", "reach", "gripper", "support"))
+    names = (name for name in CELL_SETTINGS if name not in NOT_OF_THE_ORACLE)
     name = next((name for name, kind in RULES.items() if type(cell.support) is kind), None)
     rule, margin = cell.support.least if name is None else name, getattr(cell.support, "margin", 0.0)
     settings = {name: getattr(cell, name) for name in names} | {"support": rule, "support_margin": margin}

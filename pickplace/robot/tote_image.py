@@ -29,7 +29,6 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     Raises:
         DepthMapError: for something above the rim, or too much that is not seen.
     """
-    _check_rim(seen, room)
     within = distance_outside(seen.at(seen.highest), room) < -margin
     over = within & (seen.height > room.rim + level_range(accuracy))
     refuse_if(
@@ -47,6 +46,7 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
         f"depth: {share:.0%} of the tote are not seen, expected {MOST_UNSEEN:.0%} at most.",
         DepthMapError,
     )
+    _check_rim(seen, room)
     highest[unknown] = room.rim
     lowest[np.isinf(lowest)] = 0.0
     # At the walls the nearest place that is seen; there the camera sees the wall, not what is beside it.
