@@ -269,7 +269,7 @@ def test_something_above_the_rim_is_refused():
         tote_map(*see("tote", hand))
 
 
-@pytest.mark.parametrize("width", [0.03, 0.08])
+@pytest.mark.parametrize("width", [0.03, 0.05])
 @pytest.mark.parametrize(("yaw", "height"), [(0.0, 0.27), (0.6, 0.35)])
 def test_something_dark_above_the_rim_is_refused(width, yaw, height):
     """It hides a place that is not below it, from a camera that does not look straight down."""
