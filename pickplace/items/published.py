@@ -103,7 +103,7 @@ def read_sequences(path, end: Sequence[int] | None = None) -> list[list[tuple[in
 
     Args:
         path: JSON, ``[[[w, d, h], ...], ...]``; or ``.pt``, the same as a file of torch's, which the authors publish.
-        end: size with which the authors' files end a sequence, as no tote has room for it; it is left out.
+        end: size of the item that ends each sequence of the authors' files; it is left out.
 
     Raises:
         ValueError: naming the file, and the line, or the sequence and the item, of what cannot be used.

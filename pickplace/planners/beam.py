@@ -22,7 +22,7 @@ class _Plans(NamedTuple):
     """Sequences of choices, those of a problem side by side."""
 
     problem: Tensor  # int64 [P], of which problem
-    first: Tensor  # int64 [P], the first choice of each
+    first: Tensor  # int64 [P], the first choice of each; -1: none yet
     placed: Tensor  # int64 [P], the volume that they place
     total: Tensor  # float32 [P], with the value of what they leave
     state: State  # of P problems
@@ -65,7 +65,8 @@ class Beam(MapPlanner):
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         start, number = perf_counter(), torch.arange(len(state.surface), device=state.surface.device)
         # A robot's state and maps have height units of their own; the plans have those of the policy.
-        plans = _Plans(number, number * 0 - 1, number * 0, number * 0.0, State.from_observation(observation))
+        nothing = torch.zeros_like(number)
+        plans = _Plans(number, nothing - 1, nothing, nothing.float(), State.from_observation(observation))
         mask, ended = self.policy.with_cell(cell).ranked(maps), []
         for depth in range(1, self.depth + 1):
             ended.append(plans.rows(~mask.any(1)))
@@ -102,6 +103,7 @@ class Beam(MapPlanner):
         kept = different[_greatest(plans.problem[row[different]], total[different], self.width)]
         row, choice = row[kept], choice[kept]
         first = torch.where(plans.first[row] < 0, choice, plans.first[row])
+        # The states of all plans would not fit into the memory; those of the kept ones are made again.
         after, _ = put_down(self.cell, plans.state.rows(row), choice)
         return _Plans(plans.problem[row], first, placed[kept], total[kept], after)
 
