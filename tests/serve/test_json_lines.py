@@ -184,7 +184,7 @@ def test_the_parts_of_the_cell_are_options(command, tmp_path):
         assert code == 0, err
         expected = Planner(CellSpec(**parts), planner="joint_dbl").plan(Scene.from_maps(**request), alternatives=0)
         assert json.loads(out) == json.loads(json.dumps(expected.as_dict()))
-    assert "expected bearing, corners, full" in command("--planner", "joint_dbl", "--support", "none.yaml")[2]
+    assert "expected bearing, cdrl, corners, full" in command("--planner", "joint_dbl", "--support", "none.yaml")[2]
 
 
 @pytest.mark.parametrize(("name", "change"), [("fcn4d", "bias"), ("cut1", "scale")])
