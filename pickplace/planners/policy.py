@@ -8,12 +8,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace.common.validate import expect, is_whole, one_of
 from pickplace.planners.base import ITEM_RULES, MapPlanner, pick_first, restrict_items
-from pickplace.policies.base import Policy, ScoresFootprints, best_choice, check_finite
-from pickplace.policies.footprints import count_ways
+from pickplace.policies.base import Policy, Ranking, ScoresFootprints, best_choice, check_finite, rank_actions
+from pickplace.policies.footprints import count_ways, rank_footprints
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, join_pick, select_pick
 from pickplace.rules.item import Observation
-from pickplace.rules.masks import PlacingMaps, action_mask, first_action_reaching, placing_maps
+from pickplace.rules.masks import PlacingMaps, action_mask, placing_maps
 from pickplace.rules.state import State
 
 
@@ -54,27 +54,42 @@ class PolicyPlanner(MapPlanner):
             expect(ranks or value == "any", key, value, f"'any', or planner.candidates=all and {model}")
         expect(cell.bin_items == 1 or pick == "any", "planner.pick", pick, f"'any' with env.bin_items={cell.bin_items}")
 
-    @torch.no_grad()
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
+        return self.rank(cell, state, maps, observation).action
+
+    @torch.no_grad()
+    def rank(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Ranking:
+        """Return the choices that it considers with their scores; arguments as of :meth:`choose`."""
         policy = self.policy.with_cell(cell)
         if self.pick != "any":
             pick, footprint, succeeds = pick_first(cell, maps, self.pick)
             reached = count_ways(cell.num_footprints, footprint, succeeds) > 0
             ranked = policy.ranked(maps) & reached
             mask = torch.where(ranked.any(1, keepdim=True), ranked, reached)
-            choice = best_choice(policy.footprint_logits(observation, mask))
-            return join_pick(cell, pick, (succeeds & (footprint == choice[:, None])).int().argmax(1))
+            scores = policy.footprint_logits(observation, mask)
+
+            def reach(row: Tensor, choice: Tensor) -> Tensor:
+                leads_to = succeeds[row] & (footprint[row] == choice[:, None])
+                return join_pick(cell, pick[row], leads_to.int().argmax(1))
+
+            return Ranking(reach(torch.arange(len(pick), device=pick.device), best_choice(scores)), scores, reach)
         if self.item != "any":
             mask = restrict_items(self.item, state, policy.ranked(maps))
-            return first_action_reaching(cell, maps, best_choice(policy.footprint_logits(observation, mask)))
+            return rank_footprints(cell, maps, policy.footprint_logits(observation, mask))
         if self.candidates == "all":
             with set_exploration_type(ExplorationType.DETERMINISTIC):
-                return policy.best_feasible(observation, maps)
-        score, tried = check_finite(policy.action_log_probs(observation)).topk(
-            min(self.candidates, cell.num_actions), dim=1
-        )
+                return policy.rank(observation, maps)
+        scores = policy.action_log_probs(observation)
+        score, tried = self.tried(check_finite(scores))
         succeeds = action_mask(cell, maps).gather(1, tried) & (score > -torch.inf)
-        return tried.gather(1, succeeds.int().argmax(1, keepdim=True))[:, 0]
+        action = tried.gather(1, succeeds.int().argmax(1, keepdim=True))[:, 0]
+        return rank_actions(scores)._replace(action=action)
+
+    def tried(self, scores: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the scores of the choices that are tried, best first, and the choices, ``[N, K]`` each."""
+        if self.candidates == "all":
+            return scores.sort(dim=1, descending=True, stable=True)
+        return scores.topk(min(self.candidates, scores.shape[1]), dim=1)
 
     def evaluation_facts(self) -> dict:
         mask = self.candidates == "all" or self.policy.excludes or False

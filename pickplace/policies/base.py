@@ -8,7 +8,7 @@ of the choice.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
@@ -45,6 +45,14 @@ DEPTH_KEYS = ("bin_depth", "tote_depth")
 
 #: Entries of the observation that the networks of ``fcn_grasp`` read.
 MAP_KEYS = ("bin_depth", "tote_depth", "tote_bearing")
+
+
+class Ranking(NamedTuple):
+    """What a policy thinks of the choices in ``N`` problems."""
+
+    action: Tensor  #: flat action of the best choice, int64 [N]
+    scores: Tensor  #: a logit for each choice, float32 [N, choices]
+    reach: Callable[[Tensor, Tensor], Tensor]  #: from problems and choices, int64 [K] each, to flat actions
 
 
 class Policy(TensorDictModuleBase, ABC):
@@ -120,16 +128,20 @@ class Policy(TensorDictModuleBase, ABC):
         return observation.set("logits", self.logits(observation))
 
     def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
-        """Return the most probable feasible action, int64 ``[N]``.
+        """Return the most probable feasible action, int64 ``[N]``: the best of :meth:`rank`."""
+        return self.rank(observation, maps).action
 
-        If a policy has probability for none of the feasible ones, its most probable action is returned, and fails.
+    def rank(self, observation: Observation, maps: PlacingMaps) -> "Ranking":
+        """Return the feasible choices with their scores.
+
+        If a policy has probability for none of the feasible ones, its most probable action is the best, and fails.
 
         Args:
             observation: what the networks see.
             maps: what decides which actions are feasible.
         """
         score = self.action_log_probs(observation)
-        return best_choice(torch.where(action_mask(self.cell, maps), score, score - FAR))
+        return rank_actions(torch.where(action_mask(self.cell, maps), score, score - FAR))
 
     def with_cell(self, cell: CellSpec) -> Self:
         """Return this policy, with the same networks, for a cell that differs in its limits or in the number of items.
@@ -205,8 +217,8 @@ class ActionPolicy(Policy):
     def action_log_probs(self, observation: Observation) -> Tensor:
         return self.action_scores(observation).log_softmax(-1)
 
-    def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
-        return best_choice(self.action_scores(observation, action_mask(self.cell, maps)))
+    def rank(self, observation: Observation, maps: PlacingMaps) -> "Ranking":
+        return rank_actions(self.action_scores(observation, action_mask(self.cell, maps)))
 
 
 @runtime_checkable
@@ -299,6 +311,11 @@ def best_choice(scores: Tensor) -> Tensor:
     """Return the choice of greatest score, int64 ``[N]``, of scores ``[N, choices]``; errors as of
     :func:`check_finite`."""
     return check_finite(scores).argmax(1)
+
+
+def rank_actions(scores: Tensor) -> Ranking:
+    """Return the ranking of flat actions by their scores, float32 ``[N, N_a]``."""
+    return Ranking(best_choice(scores), scores, lambda row, action: action)
 
 
 def check_finite(scores: Tensor) -> Tensor:

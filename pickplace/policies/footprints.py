@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pickplace.common.validate import expect
 from pickplace.envs.torchrl import MASKS
-from pickplace.policies.base import MAP_KEYS, MASKED, Policy, best_choice, pick_one
+from pickplace.policies.base import MAP_KEYS, MASKED, Policy, Ranking, best_choice, pick_one
 from pickplace.policies.depth import Contents
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import footprint_index
@@ -44,6 +44,12 @@ def count_ways(choices: int, footprint: Tensor, allowed: Tensor) -> Tensor:
         footprint: int64 ``[N, A]``, the footprint that each action leaves, or -1.
     """
     return footprint.new_zeros(len(footprint), choices + 1).scatter_add_(1, footprint + 1, allowed.long())[:, 1:]
+
+
+def rank_footprints(cell: CellSpec, maps: PlacingMaps, scores: Tensor) -> Ranking:
+    """Return the ranking of footprints by their scores, float32 ``[N, footprints]``, with the first action to each."""
+    best = first_action_reaching(cell, maps, best_choice(scores))
+    return Ranking(best, scores, lambda row, choice: first_action_reaching(cell, maps.rows(row), choice))
 
 
 def every_footprint(tote_depth: Tensor, parities: int) -> tuple[Tensor, Tensor]:
@@ -142,6 +148,5 @@ class FootprintPolicy(FootprintScorer):
         share = torch.where(ways > 0, scores, MASKED).log_softmax(-1) - ways.clamp(min=1).log()
         return torch.where(footprint >= 0, share.gather(1, footprint.clamp(min=0)), MASKED)
 
-    def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
-        choice = best_choice(self.footprint_logits(observation, self.ranked(maps)))
-        return first_action_reaching(self.cell, maps, choice)
+    def rank(self, observation: Observation, maps: PlacingMaps) -> Ranking:
+        return rank_footprints(self.cell, maps, self.footprint_logits(observation, self.ranked(maps)))

@@ -11,7 +11,6 @@ seen from above.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from typing import Literal
 
 import torch
@@ -23,7 +22,7 @@ from pickplace.items.distributions import ItemDistribution
 from pickplace.planners.base import MapPlanner
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.planners.use import decide
-from pickplace.policies.base import Policy, ScoresActions, ScoresFootprints
+from pickplace.policies.base import MASKED, Policy, Ranking, ScoresActions, ScoresFootprints
 from pickplace.policies.restore import load_critic, load_policy
 from pickplace.robot.box import Box, DepthMapError
 from pickplace.robot.measured_problem import read_metric
@@ -34,7 +33,7 @@ from pickplace.rules.cell import CellSpec
 from pickplace.rules.checks import PICK_FAILURES
 from pickplace.rules.grasps import join_pick, split_action
 from pickplace.rules.item import Observation
-from pickplace.rules.masks import first_action_reaching, footprint_mask
+from pickplace.rules.masks import footprint_mask
 from pickplace.rules.observation import Term, check_terms, observe
 from pickplace.rules.state import Failure
 
@@ -51,7 +50,7 @@ class Alternative:
     pick_cell: tuple[int, int]  #: of the end effector's reference cell
     place_cell: tuple[int, int]  #: the same, in the tote
     rotation_degrees: int  #: turn of the end effector's pose in the tote, in quarter turns
-    #: of the item with its footprint, among those that the policy may choose; else of the action, without a mask
+    #: of the item with its footprint, or of the action, among the feasible ones; with ``candidates=K`` among all
     probability: float
     rejected: str | None  #: the reason why it would fail; None if it would succeed
     chosen: bool  #: whether it is the plan
@@ -205,7 +204,7 @@ class Planner:
         problem = (read_metric if is_metric else read_grid)(self.cell, scene, device, exclude)
         planner, terms = self._planner_of(problem.maps.bin_items, is_metric)
         observation = observe(terms, problem.cell, problem.seen)
-        status, action = _decide(planner, problem, observation)
+        status, action, ranking = _decide(planner, problem, observation)
         if action is None:
             self._refuse_unknown(scene, device)
         number = None if action is None else int(problem.taken_items(action))
@@ -225,7 +224,7 @@ class Planner:
             action=None if action is None else int(action),
             occupancy_before=before,
             occupancy_after=before if action is None else before + gained,
-            alternatives=_list_alternatives(planner, problem, observation, action, alternatives),
+            alternatives=_list_alternatives(planner, problem, ranking, action, alternatives),
             reasons=_reasons(problem) if status in ("stuck", "impossible") else None,
             tote_bearing=bearing.int().tolist() if self.cell.support.marks_bearing else None,
             warnings=[] if self.training is None else self.training.warnings(self.cell, problem.seen.items),
@@ -304,13 +303,24 @@ def _several_items(policy, count: int) -> DepthMapError:
     return DepthMapError(f"bin: got {count} items, among which {type(policy).__name__} does not choose; {CHOOSERS}.")
 
 
-def _decide(planner: MapPlanner, problem: Problem, observation: Observation) -> tuple[str, Tensor | None]:
-    """Return the status, and the action if one was found that succeeds."""
+def _decide(
+    planner: MapPlanner, problem: Problem, observation: Observation
+) -> tuple[str, Tensor | None, Ranking | None]:
+    """Return the status, the action if one was found that succeeds, and the choices of a policy if it was asked."""
     if not footprint_mask(problem.cell, problem.maps).any():
-        return "stuck" if problem.is_feasible_in_an_empty_tote() else "impossible", None
-    cell = problem.cell
-    action = decide(planner, cell, observation, partial(planner.choose, cell, problem.state, problem.maps))
-    return ("ok", action) if int(problem.failures(action)) == 0 else ("rejected", None)
+        return "stuck" if problem.is_feasible_in_an_empty_tote() else "impossible", None, None
+    cell, ranking = problem.cell, None
+
+    def choose(seen: Observation) -> Tensor:
+        nonlocal ranking
+        if not isinstance(planner, PolicyPlanner):
+            return planner.choose(cell, problem.state, problem.maps, seen)
+        ranking = planner.rank(cell, problem.state, problem.maps, seen)
+        return ranking.action
+
+    action = decide(planner, cell, observation, choose)
+    status = "ok" if int(problem.failures(action)) == 0 else "rejected"
+    return status, action if status == "ok" else None, ranking
 
 
 def _reasons(problem: Problem) -> dict[str, int]:
@@ -329,26 +339,25 @@ def _reasons(problem: Problem) -> dict[str, int]:
 
 
 def _list_alternatives(
-    planner: MapPlanner, problem: Problem, observation: Observation, chosen: Tensor | None, count: int
+    planner: MapPlanner, problem: Problem, ranking: Ranking | None, chosen: Tensor | None, count: int
 ) -> list[Alternative]:
-    """Return the most probable choices, in the order in which its policy prefers them."""
-    if count == 0 or not isinstance(planner, PolicyPlanner):
+    """Return the most probable choices, in the order in which the planner prefers them, and the chosen one."""
+    if count == 0 or ranking is None or not isinstance(planner, PolicyPlanner):
         return []
-    cell, candidates = problem.cell, planner.candidates
-    policy = planner.policy.with_cell(cell)
-    if candidates == "all" and isinstance(policy, ScoresFootprints):
-        actions, probability = _probable_footprints(policy, observation, problem, chosen, count)
-    else:
-        log_probs = policy.action_log_probs(observation)[0]
-        tried = cell.num_actions if candidates == "all" else min(candidates, cell.num_actions)
-        # The planner makes the same call, so both break ties alike.
-        actions = log_probs.topk(tried).indices[:count]
-        if chosen is not None and not (actions == chosen).any():
-            actions = torch.cat([actions, chosen])
-        probability = log_probs[actions].exp()
+    log_probs = ranking.scores.log_softmax(1)
+    _, tried = planner.tried(ranking.scores)
+    choices = tried[0, :count]
+    choices = choices[ranking.scores[0, choices] > MASKED]
+    actions = ranking.reach(torch.zeros_like(choices), choices)
+    if chosen is not None and not (actions == chosen).any():  # it is tried after others, so choices are flat actions
+        choices, actions = torch.cat([choices, chosen]), torch.cat([actions, chosen])
+    probability, failures = log_probs[0, choices].exp(), problem.failures(actions)
+    if planner.candidates == "all":
+        considered = failures == 0
+        actions, probability, failures = actions[considered], probability[considered], failures[considered]
     if not len(actions):
         return []
-    places, failures, numbers = split_action(cell, actions), problem.failures(actions), problem.taken_items(actions)
+    places, numbers = split_action(problem.cell, actions), problem.taken_items(actions)
     columns = actions, *places, probability, failures, numbers
     return [
         Alternative(
@@ -365,22 +374,3 @@ def _list_alternatives(
             *(column.tolist() for column in columns), strict=True
         )
     ]
-
-
-def _probable_footprints(
-    policy: ScoresFootprints, observation: Observation, problem: Problem, chosen: Tensor | None, count: int
-) -> tuple[Tensor, Tensor]:
-    """Return an action for each of the most probable footprints among which the policy chooses, and the probability.
-
-    Many actions leave the same footprint, and the policy does not tell them apart. The action returned is the chosen
-    one, else the first one.
-    """
-    ranked = policy.ranked(problem.maps)
-    probability = policy.footprint_logits(observation, ranked)[0].softmax(0)
-    choices = torch.where(ranked[0], probability, -1).argsort(descending=True, stable=True)[: int(ranked.sum())][:count]
-    own = choices[:0] if chosen is None else problem.choice_of(chosen)
-    choices = torch.cat([choices, own[~torch.isin(own, choices)]])
-    if not len(choices):
-        return choices, probability[choices]
-    actions = first_action_reaching(problem.cell, problem.maps.rows(torch.zeros_like(choices)), choices)
-    return actions if chosen is None else torch.where(choices == own, chosen, actions), probability[choices]

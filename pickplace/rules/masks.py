@@ -318,17 +318,16 @@ def _reached_within_limits(
     cell: CellSpec, maps: PlacingMaps, greatest_top: Tensor, parity: int, grasped: Tensor
 ) -> Tensor:
     """Return the footprints that some grasp of this parity reaches, bool ``[W_T, D_T, N]``, under the limits."""
-    (tote_w, tote_d, _), count, margins = cell.tote_size, cell.num_offsets, _footprint_margins(cell, parity)
+    (tote_w, tote_d, _), margins = cell.tote_size, _footprint_margins(cell, parity)
     top = maps.top[:, parity].permute(1, 2, 0)
     reached = torch.zeros_like(top, dtype=torch.bool)
     for rotation in range(parity, cell.rotations, 2):
         clear = surround(maps.clearance_in(rotation), margins, FAR)
         highest = surround(greatest_top[:, rotation].permute(1, 2, 0), margins, NEVER)
-        for i in range(count):
-            for j in range(count):
-                here = slice(i, i + tote_w), slice(j, j + tote_d)
-                good = (top >= clear[here]) & (top <= highest[here])
-                reached |= good & grasped[rotation, count - 1 - i, count - 1 - j]
+        kinds = grasped[rotation].flip(0, 1)  # as the windows are
+        for i, j in kinds.flatten(2).any(2).nonzero().tolist():  # an item in metres has few: the whole cup lies on it
+            here = slice(i, i + tote_w), slice(j, j + tote_d)
+            reached |= (top >= clear[here]) & (top <= highest[here]) & kinds[i, j]
     return reached
 
 

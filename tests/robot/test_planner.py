@@ -70,6 +70,9 @@ def test_plans_agree_with_the_oracle_and_with_plane_geometry(problem, candidates
     assert all(a >= b for a, b in zip(shares[:6], shares[1:6], strict=False))
     chosen = [other for other in result.alternatives if other.chosen]
     assert [other.action for other in chosen] == [action] * ok
+    if candidates == "all":  # only what can be carried out counts, and all of it is listed if there is little
+        assert all(other.rejected is None for other in result.alternatives)
+        assert len(shares) == 6 or sum(shares) == pytest.approx(float(ok), abs=1e-4)
     if not ok:
         assert result.pick is result.place is result.drop_height is result.rotation_degrees is None
         assert result.occupancy_after == result.occupancy_before

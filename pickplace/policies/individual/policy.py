@@ -5,7 +5,7 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from pickplace.policies.base import MASKED, Policy, best_choice, pick_one, refuse_several_items
+from pickplace.policies.base import MASKED, Policy, Ranking, best_choice, pick_one, refuse_several_items
 from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.fcn_grasp.network import FootprintFcn
 from pickplace.policies.fcn_grasp.policy import UnmaskedFcnGrasp
@@ -60,7 +60,7 @@ class PlaceRotationPolicy(Policy):
         pick = self._pick(observation)
         return spread_over_actions(self.cell, self.place_scores(observation, pick).log_softmax(-1), pick)
 
-    best_feasible = Policy.best_feasible  # that of :class:`Fcn4d` scores every pick
+    rank = Policy.rank  # that of :class:`Fcn4d` scores every pick
 
 
 class IndividualRl(PlaceRotationPolicy, Fcn4d):
@@ -130,9 +130,14 @@ class IndividualGrasp(FootprintScorer):
         place_rotation = pick_one(torch.where(allowed & (footprint == choice[:, None]), number, -1))
         return join_pick(self.cell, pick, place_rotation.clamp(min=0))
 
-    def best_feasible(self, observation: Observation, maps: PlacingMaps) -> Tensor:
+    def rank(self, observation: Observation, maps: PlacingMaps) -> Ranking:
         seen = {**observation, "action_mask": action_mask(self.cell, maps)}
-        return self.to_action(best_choice(self.logits(seen)), seen)
+        scores = self.logits(seen)
+
+        def reach(row: Tensor, choice: Tensor) -> Tensor:
+            return self.to_action(choice, {key: value[row] for key, value in seen.items()})
+
+        return Ranking(self.to_action(best_choice(scores), seen), scores, reach)
 
     def action_log_probs(self, observation: Observation) -> Tensor:
         pick, footprint, allowed = self._reached(observation)
