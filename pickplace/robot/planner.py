@@ -11,12 +11,12 @@ seen from above.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import excerpt, refuse_if, whole_number
+from pickplace.common.validate import excerpt, expect, refuse_if, whole_number
 from pickplace.config.registry import build, find
 from pickplace.items.distributions import ItemDistribution
 from pickplace.planners.base import MapPlanner
@@ -122,7 +122,8 @@ class Planner:
         policy: a policy made for this cell, if the planner needs one.
         candidates: as in :class:`~pickplace.planners.policy.PolicyPlanner`: ``"all"``, or ``K``.
         terms: of the observation, by key; None: the standard ones.
-        planner: what decides: None: the policy; the short name of a planner (``"joint_dbl"``), or one that was made.
+        planner: what decides: None: the policy; the short name of a planner (``"joint_dbl"``), or a config of the group
+            ``planner`` (``{"_target_": "beam", "depth": 3}``), or a planner that was made.
         items: the item distribution, for a search to imagine.
         training: what the policy was trained with, for :attr:`Plan.warnings`; None: it is not known.
 
@@ -136,7 +137,7 @@ class Planner:
         policy: Policy | None = None,
         candidates: int | Literal["all"] = "all",
         terms: Mapping[str, Term] | None = None,
-        planner: str | MapPlanner | None = None,
+        planner: str | Mapping[str, Any] | MapPlanner | None = None,
         items: ItemDistribution | None = None,
         training: TrainingEnvelope | None = None,
         critic=None,
@@ -146,9 +147,9 @@ class Planner:
         )
         self.cell, self.policy, self.training = cell, policy, training
         self.terms = check_terms(terms, cell)
-        self._name, self._parts = None, {"items": items, "critic": critic, "candidates": candidates}
-        if planner is None or isinstance(planner, str):
-            self._name = planner or "policy"
+        self._settings, self._parts = None, {"items": items, "critic": critic}
+        if planner is None or isinstance(planner, (str, Mapping)):
+            self._settings = planner_settings(planner, candidates)
             planner = self._make(cell, policy, self.terms)
         refuse_if(
             not isinstance(planner, MapPlanner),
@@ -159,18 +160,18 @@ class Planner:
     @classmethod
     def load(
         cls, path, candidates: int | Literal["all"] = "all", device: str = "cpu", trust: Sequence[str] = (),
-        planner: str | None = None, **sizes,
+        planner: str | Mapping[str, Any] | None = None, **sizes,
     ) -> "Planner":  # fmt: skip
         """Return a planner from a checkpoint.
 
         Args:
             path, device, trust, **sizes: see :func:`~pickplace.policies.restore.load_policy`, as for errors.
             candidates: ``"all"``, or ``K``: how many of the most probable actions are tried.
-            planner: the short name of what decides, such as ``"lookahead"``; None: the policy.
+            planner: the short name of what decides, such as ``"beam"``, or its config; None: the policy.
         """
         trained = load_policy(path, device, trust, **sizes)
         items = build("items", trained.config["items"])
-        needs = getattr(find("planner", planner or "policy"), "needs", ())
+        needs = getattr(find("planner", planner_settings(planner)["_target_"]), "needs", ())
         return cls(
             trained.cell, trained.policy, candidates, trained.terms, planner, items,
             TrainingEnvelope.of(trained.config, items), load_critic(path, trained) if "critic" in needs else None,
@@ -252,7 +253,7 @@ class Planner:
             DepthMapError: for a planner that cannot.
         """
         terms = check_terms(self.terms, replace(self.cell, bin_items=max(count, self.cell.bin_items)))
-        if self._name is not None and count not in self._planners:
+        if self._settings is not None and count not in self._planners:
             cell, policy = replace(self.cell, bin_items=count), self.policy
             try:
                 policy = policy and policy.with_cell(cell)
@@ -265,18 +266,28 @@ class Planner:
         return planner, terms
 
     def _make(self, cell: CellSpec, policy: Policy | None, terms: Mapping[str, Term]) -> MapPlanner:
-        """Return the planner of the name, for a cell, a policy made for it and the terms of the observation."""
-        maker = find("planner", self._name)
+        """Return the planner of the settings, for a cell, a policy made for it and the terms of the observation."""
+        assert self._settings is not None
+        name = self._settings["_target_"]
+        maker = find("planner", name)
         parts, needs = {**self._parts, "policy": policy, "terms": terms}, getattr(maker, "needs", ())
         for key in ("policy", "items"):
             refuse_if(
                 key in needs and parts[key] is None,
-                f"{key}=None: planner={self._name!r} needs it; Planner.load has it from a checkpoint.",
+                f"{key}=None: planner={name!r} needs it; Planner.load has it from a checkpoint.",
             )
         if "critic" in needs and parts["critic"] is not None:
             parts["critic"] = parts["critic"].with_bin_items(cell.bin_items)
-        given = (*needs, "candidates") if maker is PolicyPlanner else needs
-        return maker(cell=cell, **{key: parts[key] for key in given})
+        return build("planner", self._settings, cell=cell, **{key: parts[key] for key in needs})
+
+
+def planner_settings(
+    planner: str | Mapping[str, Any] | None, candidates: int | Literal["all"] = "all"
+) -> dict[str, Any]:
+    """Return a planner's short name or its config as a config; of the policy with its ``candidates``."""
+    settings = dict(planner) if isinstance(planner, Mapping) else {"_target_": planner or "policy"}
+    expect(isinstance(settings.get("_target_"), str), "planner", planner, "a config with the key _target_")
+    return {"candidates": candidates, **settings} if settings["_target_"] == "policy" else settings
 
 
 def _check_choice(planner: MapPlanner, count: int, is_metric: bool) -> None:

@@ -14,6 +14,7 @@ from pickplace.common.errors import sentence
 from pickplace.common.files import MAX_BYTES, read_text
 from pickplace.common.validate import excerpt, refuse_if
 from pickplace.serve.deadline import Deadline
+from pickplace.serve.options import read_planner
 from pickplace.serve.request import MAX_DEADLINE, Answer, PlanRequest, solve
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def what_is_served(planner: "Planner", args) -> dict[str, Any]:
     sha256 = None if args.checkpoint is None else read_facts(args.checkpoint)["sha256"]
     return {
         "versions": versions(), "commit": commit(), "checkpoint": args.checkpoint, "sha256": sha256,
-        "planner": args.planner, "candidates": args.candidates, "cell": cell_settings(planner.cell),
+        "planner": read_planner(args.planner), "candidates": args.candidates, "cell": cell_settings(planner.cell),
     }  # fmt: skip
 
 

@@ -1,7 +1,9 @@
 """The options of ``pickplace-plan`` and ``pickplace-serve`` that say how to plan, and the planner that they name."""
 
 import argparse
+from collections.abc import Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,7 +38,9 @@ def planner_options() -> dict[str, dict[str, Any]]:
     return {
         "checkpoint": {"nargs": "?", "help": "a run folder, a checkpoint, or pretrained/<name>"},
         "--planner": {
-            "metavar": "NAME", "help": "what decides, such as joint_dbl or lookahead; default: the policy",
+            "metavar": "NAME",
+            "help": "what decides, such as joint_dbl or beam, or a file with its settings like those of conf/planner; "
+            "default: the policy",
         },
         **of_requests,
         "--candidates": {
@@ -89,8 +93,9 @@ def load_planner(args: argparse.Namespace, cell: dict | None = None) -> tuple["P
     )
     sizes = sizes if cell is None else cell
     candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates
+    decides = read_planner(args.planner)
     if args.checkpoint is not None:
-        planner = Planner.load(args.checkpoint, candidates, args.device, args.trust, args.planner, **sizes)
+        planner = Planner.load(args.checkpoint, candidates, args.device, args.trust, decides, **sizes)
     else:
         refuse_if(
             args.planner is None, "checkpoint: missing; expected a checkpoint, or --planner joint_dbl or the like."
@@ -99,7 +104,7 @@ def load_planner(args: argparse.Namespace, cell: dict | None = None) -> tuple["P
             candidates != "all",
             f"--candidates={args.candidates}: only a policy has candidates; expected a checkpoint.",
         )
-        planner = Planner(CellSpec(**sizes), planner=args.planner)
+        planner = Planner(CellSpec(**sizes), planner=decides)
     defaults = {key.name: getattr(args, key.name) for key in PLAN_OPTIONS}
     PlanRequest(**defaults).scene()  # refuses settings now, not in the answer to each request
     whole_number("--alternatives", args.alternatives, 0, MAX_ALTERNATIVES)
@@ -124,6 +129,27 @@ def plan_once(planner: "Planner") -> None:
     with suppress(DepthMapError, TimeoutError):  # of a planner that serves no such item, or is slow
         scene = Scene.from_maps(bin_depth, np.full(sides[:2], sides[2]))
         Deadline(DEADLINE).run(lambda: planner.plan(scene, alternatives=1))
+
+
+def read_planner(name: str | Mapping[str, Any] | None) -> str | Mapping[str, Any] | None:
+    """Return the settings of a planner from a file such as those of ``conf/planner``; anything but the name of a file
+    is returned as it is.
+
+    Raises:
+        ValueError: for a file that cannot be read, or holds no settings.
+    """
+    from yaml import YAMLError, safe_load
+
+    if not isinstance(name, str) or not Path(name).is_file():
+        return name
+    expected = "expected settings with the key _target_, such as conf/planner/beam.yaml."
+    with reworded(
+        (OSError, ValueError, YAMLError),
+        lambda error: ValueError(f"--planner={name}: {first_line(error)}; {expected}"),
+    ):
+        content = safe_load(read_text(name, MAX_PART))
+    refuse_if(not isinstance(content, dict) or "_target_" not in content, f"--planner={name}: {expected}")
+    return content
 
 
 def read_part(key: str, name: str):

@@ -4,6 +4,7 @@ import io
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -185,6 +186,32 @@ def test_the_parts_of_the_cell_are_options(command, tmp_path):
         expected = Planner(CellSpec(**parts), planner="joint_dbl").plan(Scene.from_maps(**request), alternatives=0)
         assert json.loads(out) == json.loads(json.dumps(expected.as_dict()))
     assert "expected bearing, cdrl, corners, full" in command("--planner", "joint_dbl", "--support", "none.yaml")[2]
+
+
+def test_a_file_holds_the_settings_of_a_planner(command):
+    labels = np.zeros((5, 5), dtype=int)
+    labels[4, 4], labels[0, 0] = 1, 2
+    bin_depth = (labels > 0).astype(int)
+    lists = {"bin_depth": bin_depth.tolist(), "bin_labels": labels.tolist(), "tote_depth": EMPTY.tolist()}
+    taken = []
+    for rule in ("any", "nearest"):
+        Path("mine.yaml").write_text(f"{{_target_: joint_dbl, item: {rule}}}")
+        code, out, err = command("--planner", "mine.yaml", lines=json.dumps({**lists, "alternatives": 0}).encode())
+        assert code == 0, err
+        taken.append(json.loads(out)["item_number"])
+    assert taken == [0, 1]  # equal items: the first, and the one at the origin
+    line = json.dumps(lists).encode()
+    for content, message in (
+        ("{item: any}", "--planner=mine.yaml: expected settings with the key _target_, such as conf/planner/"),
+        ("[", "--planner=mine.yaml: while parsing a flow node"),
+        (
+            "{_target_: joint_dbl, distance_weight: 1}",
+            "planner.distance_weight: there is no key 'distance_weight'",
+        ),
+    ):
+        Path("mine.yaml").write_text(content)
+        code, _, err = command("--planner", "mine.yaml", lines=line)
+        assert code == 2 and message in err, err
 
 
 @pytest.mark.parametrize(("name", "change"), [("fcn4d", "bias"), ("cut1", "scale")])
