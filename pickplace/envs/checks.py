@@ -9,6 +9,7 @@ import torch
 
 from pickplace.common.validate import at_most
 from pickplace.items.distributions import ItemDistribution
+from pickplace.items.tipping import longest_side
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import available_offsets
 from pickplace.rules.item import ALL_TURNS, Item
@@ -81,7 +82,7 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
         words = f"bin_size={[*cell.bin_size]}: the kinds of items have at least"
         at_most(words, len(problems), "positions in the bin", MAX_POSITIONS)
     description = f"{cell.describe()}, support={cell.support}" + (f", reach={cell.reach}" if cell.reach else "")
-    cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
+    cell = replace(cell, longest_side=longest_side(cell, items))
     rows = torch.tensor([(*item, kind) for item, kind in problems.items()])
     if cell.limits is None:
         # The lower an item, the harder to clear the rim; and what is far from all walls of the tote is alike.

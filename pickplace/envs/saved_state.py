@@ -10,6 +10,7 @@ from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.arrival import next_item
 from pickplace.items.distributions import MAX_SEED
+from pickplace.items.tipping import in_pose, sizes_in_bin
 from pickplace.rules.bin import select_item
 from pickplace.rules.item import NO_LIMIT, Item, bin_labels_from_items
 from pickplace.rules.observation import observe, standard_terms
@@ -70,15 +71,15 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     items, limits = state.items, torch.tensor(cell.bin_size[:2])
     corner, size, cuboids = saved["item"][..., :2], saved["item"][..., 2:4], items.cuboids
     check("item", (corner >= 0) & (size >= 0) & (corner + size <= limits), "items inside the bin")
-    sizes = torch.cat([env.items.sizes, torch.zeros(1, 3, dtype=torch.int64)])
+    sizes = torch.cat([sizes_in_bin(cell, env.items), torch.zeros(1, 3, dtype=torch.int64)])
     check("item", (cuboids[..., None, 2:] == sizes).all(-1).any(-1), "sizes of the distribution")
     covered = (bin_labels_from_items(items, cell.bin_size) > 0).sum((1, 2))
     check("item", covered == (items.w * items.d).sum(1), "items that do not overlap")
     count = items.exists.sum(1)
-    check("arrived", saved["arrived"] == steps + count, "the items placed and those in the bin")
+    check("arrived", saved["arrived"] == steps + count // cell.poses, "the items placed and those in the bin")
     newest = select_item(items, (count - 1).clamp(min=0)).table
     address = seed.expand_as(number), number, saved["arrived"] - 1
-    arrival = next_item(cell, env.items, env.stream, *address, episode)
+    arrival = in_pose(cell, env.items, next_item(cell, env.items, env.stream, *address, episode), cell.poses - 1)
     same = (newest == arrival.table)[:, 2:].all(1)  # wherever it lies
     check("item", same | (count < cell.bin_items), "the newest item of this episode")  # it may have been taken
     seen = observe(standard_terms(cell), cell, state)

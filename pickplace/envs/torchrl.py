@@ -16,6 +16,7 @@ from pickplace.envs.checks import check_items, most_items, problem_bytes
 from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
+from pickplace.items.tipping import check_tipping, longest_side, sizes_in_bin
 from pickplace.rules.bin import remove_item
 from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.rules.item import ALL_TURNS, Item
@@ -145,9 +146,10 @@ class PickPlaceEnv(EnvBase):
             cell = replace(cell, most_items=most_items(cell, items))
         self.items, self.cell, self.terms = items, cell, check_terms(observation, cell)
         check_items(cell, items)
+        check_tipping(cell, items)
         # Mixes and rotations with which every item fits the empty tote.
         self._checked_starts = {(0, SETTINGS["rotations"].full(cell) if "rotations" in varies else ALL_TURNS)}
-        self.cell = replace(cell, longest_side=int(items.sizes[:, :2].max()))
+        self.cell = replace(cell, longest_side=longest_side(cell, items))
         device = usable_device(device)
         words = f"num_envs={num_envs}"
         words += f" with handling=true and room for {cell.pile_room:,} items in a tote" if cell.handling else ""
@@ -157,7 +159,8 @@ class PickPlaceEnv(EnvBase):
         tallest = [*map(items.tallest, range(items.mixes))]
         self.limits = {key: RESET_ENTRIES[key].limits(cell, items) for key in ("tote_height", *varies)}
         self.first_episode, self.episode_stride = first_episode, episode_stride or num_envs
-        self.bounds = {key: term.bounds(self.cell, max(tallest)) for key, term in self.terms.items()}
+        highest = int(sizes_in_bin(cell, items)[:, 2].max())
+        self.bounds = {key: term.bounds(self.cell, highest) for key, term in self.terms.items()}
         self.bounds["tote_height"] = self.bounds["tote_height"]._replace(low=min(tallest))
         specs: dict = {
             key: Bounded(low, high, (num_envs, *shape), dtype=dtype, device=device)
@@ -245,7 +248,7 @@ class PickPlaceEnv(EnvBase):
         self._refill(rows, self.state.items)
         self._update_masks(rows, empty=True)
         if (jammed := rows & ~self.feasible).any():  # the first one alone always has a feasible action
-            self.item[:, 1:] *= ~jammed[:, None, None]
+            self.item[:, self.cell.poses :] *= ~jammed[:, None, None]
             self.arrived.masked_fill_(jammed, 1)
             self._update_masks(jammed, empty=True)
         return self._observation().update({key: torch.zeros_like(rows)[:, None] for key in DONE_KEYS})
@@ -283,7 +286,7 @@ class PickPlaceEnv(EnvBase):
             part.copy_(after)
         self.volume.add_(gained)
         self.steps.add_(placed)
-        items = self._refill(placed, remove_item(state.items, step.taken, placed))
+        items = self._refill(placed, remove_item(self.cell, state.items, step.taken, placed))
         self._update_masks(placed)
         ended = placed & ~items.exists.any(1)  # the stream has no further item
         stuck = placed & ~self.feasible & ~ended

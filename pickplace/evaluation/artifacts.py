@@ -10,7 +10,7 @@ from pickplace.common.errors import sentence
 from pickplace.common.files import replaced_file
 from pickplace.common.validate import flag, reworded, whole_number
 from pickplace.physics.plans import PLANS, EpisodePlan, to_lines
-from pickplace.rules.cell import CellSpec
+from pickplace.rules.cell import POSES, CellSpec
 from pickplace.runs.folder import EVALUATION
 from pickplace.views.recording import Recording
 from pickplace.views.replay import animation, page, picture
@@ -76,7 +76,8 @@ def to_json(value: Any) -> Any:
 def evaluation_table(result: dict) -> str:
     """Return the figures of an ``evaluation.json`` as a Markdown table."""
     env, physics, paired, latency = result["env"], *map(result.get, ("physics", "paired_difference", "latency_ms"))
-    count, occupancy, trained = env.get("bin_items", 1), result["occupancy"], result.get("trained", {})
+    count = env.get("bin_items", 1) // (POSES if env.get("tipping") else 1)
+    occupancy, trained = result["occupancy"], result.get("trained", {})
     same = ", all of the same items" if result.get("same_items") else ""
     words = {True: "yes", False: "no", None: "unknown"}
     masks = (result.get(key) for key in ("mask_in_training", "mask_at_decision"))
@@ -84,6 +85,7 @@ def evaluation_table(result: dict) -> str:
     rows = {
         "planner": result["planner"],
         "tote, rotations": f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}",
+        "orientations": env.get("tipping") and f"{POSES * min(env['rotations'], 2)}: items may be tipped",
         "items in the bin": count > 1 and f"up to {count}, refill: {env.get('refill', 'each')}",
         "episodes": f"{result['episodes']} of the {result['stream']} stream, seed {result['seed']}{same}",
         "occupancy": f"{_interval(occupancy, '.4f')}, least {occupancy['min']:.4f}",

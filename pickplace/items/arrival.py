@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from pickplace.items.distributions import ItemDistribution, hashed_uniform
+from pickplace.items.tipping import in_pose
 from pickplace.rules.bin import add_item, must_share
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item
@@ -20,7 +21,8 @@ def refill(
 
     Items arrive in the order of the stream. Into an empty bin an item comes at its own place; else at a uniformly
     random place where it overlaps no other. One that has no room waits, and those after it wait, too. With
-    ``refill="batch"`` only empty bins are filled.
+    ``refill="batch"`` only empty bins are filled. With ``cell.tipping`` an item comes in all its poses, or waits, each
+    at the first place that is free.
 
     Args:
         cell: has the refill rule, unless episodes differ in it.
@@ -33,18 +35,25 @@ def refill(
     """
     waits = cell.refill == "batch" if differs.refill is None else differs.refill == REFILLS.index("batch")
     open_ = rows & ~(items.exists[:, 0] & waits)  # waits: for an empty bin
-    for number in range(items.x.shape[1]):
+    for number in range(0, items.x.shape[1], cell.poses):
         open_ = open_ & ~items.exists[:, -1]
         if differs.bin_items is not None:
             open_ = open_ & (items.exists.sum(1) < differs.bin_items)
         if number and not open_.any():
             break
-        item = next_item(cell, source, stream, seed, episode, arrived, differs)
-        if must_share(items, open_):
-            uniform = hashed_uniform(stream, seed, episode, arrived, 4)[3]
-            item = _find_room(cell, item, items, ~items.exists[:, 0] | source.has_corners, uniform)
-        open_ = open_ & item.exists
-        items, arrived = add_item(items, item, open_), arrived + open_
+        item, before = next_item(cell, source, stream, seed, episode, arrived, differs), items
+        for pose in range(cell.poses):
+            posed = in_pose(cell, source, item, pose)
+            if must_share(items, open_):
+                # The place among the free ones: any, or with poses the first.
+                share = hashed_uniform(stream, seed, episode, arrived, 4)[3] * (not cell.tipping)
+                keeps_place = ~items.exists[:, 0] | (source.has_corners and not cell.tipping)
+                posed = _find_room(cell, posed, items, keeps_place, share)
+            open_ = open_ & posed.exists
+            items = add_item(items, posed, open_)
+        if cell.tipping:  # where the last pose had no room, the item waits
+            items = Item.from_table(torch.where(open_[:, None, None], items.table, before.table))
+        arrived = arrived + open_
     return items, arrived
 
 

@@ -92,6 +92,8 @@ class ItemDistribution:
             up; None: the sizes are exact.
         handling: int64 ``[K, 3]``, columns ``turns``, ``grams`` and ``max_load`` of each kind, as of an
             :class:`~pickplace.rules.item.Item`; None: any turn, no mass, any load.
+        tipped_turns: int64 ``[K, 2]``, the ``turns`` of each kind on its two other pairs of faces, see
+            :mod:`pickplace.items.tipping`; None: those of the upright item.
         longest_episode: how many items come in an episode at most; None: episodes do not end.
     """
 
@@ -102,6 +104,7 @@ class ItemDistribution:
     mixes: int = 1
     volumes: Tensor | None = None
     handling: Tensor | None = None
+    tipped_turns: Tensor | None = None
     longest_episode: int | None = None
 
     def sample(

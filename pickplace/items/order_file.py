@@ -74,6 +74,16 @@ class OrderItem(NamedTuple):
         return sum(TURNS.get(each, 0) for each in self.orientations)
 
     @property
+    def tipped_turns(self) -> tuple[int, int]:
+        """The same on its other faces, ``lhw`` and ``whl`` without a turn."""
+        pairs = ORIENTATIONS[2:4], ORIENTATIONS[4:]
+        first, second = (
+            sum(turn for each, turn in zip(pair, TURNS.values(), strict=True) if each in self.orientations)
+            for pair in pairs
+        )
+        return first, second
+
+    @property
     def has_limits(self) -> bool:
         """Whether it bears a limited load only, or forbids a quarter turn about z, on a face that may be the lowest."""
         pairs = zip(ORIENTATIONS[::2], ORIENTATIONS[1::2], strict=True)

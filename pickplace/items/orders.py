@@ -70,6 +70,7 @@ class Orders(ItemDistribution):
         self.sizes = torch.tensor([self.cells(item) for item in self._examples])
         columns = [(item.turns, item.grams, item.max_load) for item in self._examples]
         self.handling = torch.tensor(columns)
+        self.tipped_turns = torch.tensor([item.tipped_turns for item in self._examples])
         self.longest_episode = max(map(len, distinct))
         sides = torch.tensor([item[1:4] for item in self._examples], dtype=torch.float64)
         self.volumes = sides.prod(1) / (self._cell**2 * self._unit)

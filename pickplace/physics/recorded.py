@@ -16,19 +16,20 @@ def plan_of(recording: Recording, cell: CellSpec) -> EpisodePlan:
     def middle(corner, sides) -> Point:
         return metres(*(at + side / 2 for at, side in zip(corner, sides, strict=True)))
 
+    gripped = not cell.tipping  # no gripper tips an item: then only places are planned
     placements = [
         Placement(
             metres(*move.footprint[:2], move.z), metres(*move.footprint[2:], move.item[4]), metres(*move.item[:2]),
             middle(move.pick, cell.gripper.size), middle(move.place, cell.effector(move.rotation)[:2]),
-            90 * move.rotation, tuple((*metres(*other[:2]), *metres(*other[2:])) for other in move.others),
+            90 * move.rotation, tuple((*metres(*other[:2]), *metres(*other[2:])) for other in move.others if gripped),
             move.grams / 1000,
         )
         for move in recording.moves
         if not move.failure
     ]  # fmt: skip
     return EpisodePlan(
-        recording.episode, metres(*cell.tote_size[:2], recording.tote_height), metres(*cell.bin_size),
-        metres(*cell.gripper.size), placements, body_of(cell),
+        recording.episode, metres(*cell.tote_size[:2], recording.tote_height),
+        metres(*cell.bin_size) if gripped else (), metres(*cell.gripper.size), placements, body_of(cell),
     )  # fmt: skip
 
 

@@ -203,7 +203,9 @@ class MCTS(MapPlanner):
         if self.mask:
             return *put_down(self.cell, state, action), torch.ones_like(action, dtype=torch.bool)
         step = apply(self.cell, state, action)
-        after = state._replace(surface=step.surface, items=remove_item(state.items, step.taken), pile=step.pile)
+        after = state._replace(
+            surface=step.surface, items=remove_item(self.cell, state.items, step.taken), pile=step.pile
+        )
         return after, step.item, step.failure == 0
 
     def _nodes(self, state: State, mask: Tensor | None = None) -> list[_Node]:

@@ -19,6 +19,7 @@ from pickplace.common.validate import expect, refuse_if
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import build, node_of
 from pickplace.envs.torchrl import MASKS, PickPlaceEnv
+from pickplace.items.tipping import longest_side
 from pickplace.policies.base import EstimatesValue, Policy, as_collection_policy, as_critic
 from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
 from pickplace.rules.item import Observation
@@ -174,7 +175,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
     cell = build_cell(env, **sizes)
     if not (cell.has_known_offsets or cfg.model.mask_infeasible):  # the policy chooses among grasps: so many are there
-        cell = replace(cell, longest_side=int(build("items", cfg["items"]).sizes[:, :2].max()))
+        cell = replace(cell, longest_side=longest_side(cell, build("items", cfg["items"])))
     policy = restore_policy(cfg, cell, state["policy"], env).to(usable_device(device))
     given = env.get("observation") or {}
     expect(isinstance(given, dict), "env.observation", given, "terms by their keys")

@@ -145,6 +145,7 @@ class Planner:
         refuse_if(
             cell.handling, "env.handling=true: the robot's planner does not know what lies on what; expected false."
         )
+        refuse_if(cell.tipping, "env.tipping=true: a robot's gripper does not tip items; expected false.")
         self.cell, self.policy, self.training = cell, policy, training
         self.terms = check_terms(terms, cell)
         self._settings, self._parts = None, {"items": items, "critic": critic}

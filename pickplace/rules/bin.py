@@ -82,10 +82,12 @@ def select_item(items: Item, number: Tensor) -> Item:
     return items.rows((torch.arange(count, device=number.device), number))
 
 
-def remove_item(items: Item, number: Tensor, removed: Tensor | None = None) -> Item:
+def remove_item(cell: CellSpec, items: Item, number: Tensor, removed: Tensor | None = None) -> Item:
     """Return what is left in the bins ``[N, M]``; later items move up, so that the first is the oldest.
 
     Args:
+        cell: with its ``tipping`` an item leaves in all its poses.
+        items: ``[N, M]``.
         number: int64 ``[N]``.
         removed: bool ``[N]``, whether that item is removed at all; None: it is.
     """
@@ -95,9 +97,9 @@ def remove_item(items: Item, number: Tensor, removed: Tensor | None = None) -> I
             torch.zeros_like(table) if removed is None else table.masked_fill(removed[:, None, None], 0)
         )
     place = torch.arange(table.shape[1], device=table.device)
-    later = place >= number[:, None]
-    after = place + (later if removed is None else later & removed[:, None])  # [N, M]
-    longer = torch.cat([table, torch.zeros_like(table[:, :1])], 1)
+    later = place >= (number - number % cell.poses)[:, None]
+    after = place + cell.poses * (later if removed is None else later & removed[:, None])  # [N, M]
+    longer = torch.cat([table, torch.zeros_like(table[:, : cell.poses])], 1)
     return Item.from_table(longer.gather(1, after[..., None].expand_as(table)))
 
 

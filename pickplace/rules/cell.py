@@ -24,6 +24,7 @@ from pickplace.rules.state import REFILLS
 from pickplace.rules.support.rules import Bearing, Support, read_support
 
 MAX_BIN_ITEMS = 100
+POSES = 3  # in which an item may be put down if it may be tipped: one for each pair of its faces
 
 MAX_SIDE = 2_000  # greatest side of a grid or height, in cells or height units
 MAX_CELLS, MAX_ACTIONS = 2**16, 2**27  # greatest number of cells of a grid, and of flat actions
@@ -52,6 +53,9 @@ class CellSpec:
         refill: of several items: a new one arrives after ``"each"`` pick, or a ``"batch"`` when the bin is empty.
         handling: whether each item has handling instructions of its own: the greatest load that may lie on it, and the
             turns that are allowed. The rules then keep count of which items lie on which.
+        tipping: whether items may be put down on another side, too, for cells in which the gripper does not matter. An
+            item then lies in the bin once in each of its three poses, side by side, and takes three of its places; who
+            picks one has taken it. Heights are in cells.
         longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and unless the
             gripper limits the items it also sets the number of offsets.
         most_items: how many items a tote holds at most, where it is known; else there is room for one in each cell and
@@ -78,6 +82,7 @@ class CellSpec:
     bin_items: int = 1
     refill: str = "each"
     handling: bool = False
+    tipping: bool = False
     longest_side: int | None = field(default=None, metadata={"derived": True})
     most_items: int | None = field(default=None, metadata={"derived": True})
     varies: tuple[str, ...] = field(default=(), metadata={"derived": True})
@@ -108,6 +113,9 @@ class CellSpec:
         whole_number("bin_items", self.bin_items, most=MAX_BIN_ITEMS)
         one_of("refill", self.refill, REFILLS)
         flag("handling", self.handling)
+        if flag("tipping", self.tipping):
+            expect(self.bin_items % POSES == 0, "bin_items", self.bin_items, "a multiple of 3 with tipping=true")
+            expect(self.height_unit == 1, "height_unit", self.height_unit, "1 with tipping=true")
         or_null(whole_number, "longest_side", self.longest_side)
         or_null(whole_number, "most_items", self.most_items)
         expect(isinstance(self.reach, Reach | None), "reach", self.reach, "a Reach, such as an Annulus, or None")
@@ -152,6 +160,11 @@ class CellSpec:
     def num_choices(self) -> int:
         """The number of pairs of an item in the bin and a footprint, ``item * num_footprints + footprint``."""
         return self.bin_items * self.num_footprints
+
+    @property
+    def poses(self) -> int:
+        """How many of the bin's places an item takes, see ``tipping``."""
+        return POSES if self.tipping else 1
 
     @property
     def forbids_turns(self) -> bool:

@@ -94,7 +94,7 @@ def put_down(cell: CellSpec, state: State, choice: Tensor) -> tuple[State, Item]
     w, d = turned_size(item, parity == 1)
     on = _contact(cell, state.surface, x, y, w, d)
     surface, pile = _add_item(cell, state.surface, state.pile, item, x, y, *on, item.h)
-    return state._replace(surface=surface, items=remove_item(state.items, taken), pile=pile), item
+    return state._replace(surface=surface, items=remove_item(cell, state.items, taken), pile=pile), item
 
 
 def _contact(cell: CellSpec, surface: Tensor, x: Tensor, y: Tensor, w: Tensor, d: Tensor) -> tuple[Contact, Tensor]:

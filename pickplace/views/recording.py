@@ -106,7 +106,7 @@ def record_moves(
     heat = planner.heat_map(observation) if hasattr(planner, "heat_map") else None
     if heat is not None:
         heat = (255 * heat / heat.amax((1, 2), keepdim=True).clamp(min=1e-30)).round().byte().cpu().numpy()
-    items, others = step.item.cuboids.tolist(), remove_item(state.items, step.taken)
+    items, others = step.item.cuboids.tolist(), remove_item(cell, state.items, step.taken)
     shape, turned = cell.effector(0), [cell.effector(turns) for turns in rotation]
     return [
         Move(

@@ -79,7 +79,9 @@ def test_what_a_pick_takes_and_what_stands_in_its_way(seed):
 
 def test_items_are_taken_out_and_the_others_move_up():
     items = as_items([[(0, 0, 1, 1, 1), (1, 0, 1, 1, 2), (2, 0, 1, 1, 3)]] * 4, 3)
-    left = remove_item(items, torch.tensor([0, 1, 2, 1]), torch.tensor([True, True, True, False]))
+    left = remove_item(
+        CellSpec(bin_items=3), items, torch.tensor([0, 1, 2, 1]), torch.tensor([True, True, True, False])
+    )
     assert left.h.tolist() == [[2, 3, 0], [1, 3, 0], [1, 2, 0], [1, 2, 3]] and left.w[:3, 2].tolist() == [0, 0, 0]
     assert select_item(items, torch.tensor([2, 0, 1, 1])).h.tolist() == [3, 1, 2, 2]
 
@@ -180,8 +182,8 @@ def test_a_bin_for_one_item_takes_a_shorter_path_to_the_same_result(support):
     assert same(taken_item(lone, items, zero, zero), taken_item(two, padded, zero, zero))
     assert same(select_item(items, zero), select_item(padded, zero))
     for removed in (None, rows):
-        left = remove_item(items, zero, removed)
-        assert same(left, remove_item(padded, zero, removed).rows(first))
+        left = remove_item(lone, items, zero, removed)
+        assert same(left, remove_item(two, padded, zero, removed).rows(first))
         assert same(left.table, torch.stack(left, -1))
     open_ = rows & ~there
     assert not must_share(items, open_) and not must_share(padded, open_) and must_share(padded, there)

@@ -45,7 +45,7 @@ def test_every_setting_reaches_the_cell_of_the_environment():
         "bin_size": [4, 6, 2], "tote_size": [5, 7, 6], "gripper": Overlap([2, 4], "disc", "disc", [2, 4]),
         "rotations": 3, "support": Hull(0.3), "height_unit": 0.5, "cell_size": 0.02,
         "reach": Annulus([0, 99], [0, 9], [-9, 0, 0], [2, 0, 0]), "bin_items": 2, "refill": "batch",
-        "handling": True,
+        "handling": True, "tipping": False,
     }  # fmt: skip
     assert tuple(given) == CELL_SETTINGS
     cell = PickPlaceEnv(num_envs=1, **given).cell

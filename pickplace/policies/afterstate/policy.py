@@ -50,7 +50,8 @@ class Afterstate(FootprintPolicy):
         return self.network.learning_bytes(*self.cell.tote_size[:2])
 
     def items_left(self, observation: Observation, choice: Tensor) -> Tensor:
-        return remove_item(items_from_observation(observation), choice // self.cell.num_footprints).cuboids
+        items = items_from_observation(observation)
+        return remove_item(self.cell, items, choice // self.cell.num_footprints).cuboids
 
     def judge(self, before: State, choice: Tensor) -> tuple[State, Tensor, Tensor]:
         after, item = put_down(self.cell, before, choice)
