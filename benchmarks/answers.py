@@ -1,8 +1,9 @@
 """Time of every answer that a robot gets, on one core: python benchmarks/answers.py [checkpoint ...]
 
 Each shipped checkpoint fills totes of its own cell with its own items. Every state is planned in cells and in metres,
-with ten alternatives: until nothing fits (stuck), with an item that fits in no tote (impossible), by one candidate only
-(rejected), and with a bin whose item is no cuboid (refused). The first plan after loading counts, too.
+with ten alternatives: until nothing fits (stuck), with an item that fits in no tote (impossible), and with a bin whose
+item is no cuboid (refused); and once more by a planner with one candidate (rejected). The first plan after loading
+counts, too.
 """
 
 import sys
@@ -72,16 +73,20 @@ def answer(planner: Planner, maps: dict) -> tuple[str, float]:
 def row(path: str) -> dict:
     """Return percentiles of the times of one checkpoint's answers, and how often each status came."""
     env = load_policy(path).make_env(num_envs=1)
-    planners = [Planner.load(path), Planner.load(path, candidates=1)]
-    found = []
-    for maps in scenes(planners[0], env):
-        for planner in planners:
-            found += [answer(planner, each) for each in (maps, in_metres(maps, env.cell))]
-    times = np.array([ms for _, ms in found])
+    planners = {"all": Planner.load(path), "one candidate": Planner.load(path, candidates=1)}
+    found: dict[str, list] = {name: [] for name in planners}
+    for maps in scenes(planners["all"], env):
+        for name, planner in planners.items():
+            found[name] += [answer(planner, each) for each in (maps, in_metres(maps, env.cell))]
+    return {name: summary(answers) for name, answers in found.items()}
+
+
+def summary(answers: list[tuple[str, float]]) -> dict:
+    times = np.array([ms for _, ms in answers])
     median, most = np.percentile(times, [50, 95])
     return {
-        "median ms": median, "95% ms": most, "greatest ms": times.max(), "slowest": found[times.argmax()][0],
-        "statuses": dict(Counter(status for status, _ in found)),
+        "median ms": median, "95% ms": most, "greatest ms": times.max(), "slowest": answers[times.argmax()][0],
+        "statuses": dict(Counter(status for status, _ in answers)),
     }  # fmt: skip
 
 

@@ -9,8 +9,9 @@ from torch import Tensor, nn
 from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, refuse_if, whole_numbers
 from pickplace.policies.base import MAP_KEYS
 from pickplace.policies.depth import clip_depth, item_code
-from pickplace.policies.fcn4d.network import BIN_PADDING, HIDDEN_DTYPES, TOTE_PADDING, check_clips, clip_and_pad
-from pickplace.policies.fcn_grasp.network import DTYPES, MAX_LEVELS, matrix_dtype
+from pickplace.policies.dtypes import DTYPES, matrix_dtype
+from pickplace.policies.fcn4d.network import BIN_PADDING, TOTE_PADDING, check_clips, clip_and_pad
+from pickplace.policies.fcn_grasp.network import MAX_LEVELS
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, read_items
 from pickplace.rules.observation import item_keys
@@ -116,7 +117,7 @@ class Conv4d(nn.Module):
         hidden: width of the fully connected layer.
         bin_clip, tote_clip, floor: as in :class:`~pickplace.policies.fcn4d.network.Conv4dNet`.
         depth_scale: the two unclipped figures are divided by it.
-        compute_dtype: of all but the last layer, ``float32`` or ``bfloat16``; parameters and values stay float32.
+        compute_dtype: of all but the last layer, as in :class:`~pickplace.policies.fcn4d.network.Conv4dNet`.
     """
 
     def __init__(
@@ -132,7 +133,7 @@ class Conv4d(nn.Module):
     ):
         super().__init__()
         whole_numbers("model.critic", MAX_WIDTH, filters=filters, hidden=hidden)
-        one_of("model.critic.compute_dtype", compute_dtype, HIDDEN_DTYPES)
+        one_of("model.critic.compute_dtype", compute_dtype, DTYPES)
         check_clips("model.critic", bin_clip, tote_clip, floor)
         number("model.critic.depth_scale", depth_scale, 1e-3, 1e6)
         self.bin_size, self.tote_size = cell.bin_size[:2], cell.tote_size[:2]
@@ -162,6 +163,7 @@ class Conv4d(nn.Module):
         left = torch.stack((totes.mean((1, 2, 3)), totes.amax((1, 2, 3))), dim=-1) / self.depth_scale
         bins = clip_and_pad(bins, self.bin_clip, self.floor, BIN_PADDING)
         totes = clip_and_pad(totes, self.tote_clip, self.floor, TOTE_PADDING)
-        with torch.autocast(bins.device.type, torch.bfloat16, enabled=self.compute_dtype == "bfloat16"):
+        fast = matrix_dtype(self.compute_dtype, bins.device.type)
+        with torch.autocast(bins.device.type, fast, enabled=fast != torch.float32):
             hidden = self.value[:-1](torch.cat((self.bin_layers(bins), self.tote_layers(totes), left), dim=-1))
         return self.value[-1](hidden.to(dtype)).reshape(*batch, 1)

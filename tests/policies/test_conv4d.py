@@ -159,7 +159,7 @@ def test_initialisation():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: network(compute_dtype="float16"), "model.actor.compute_dtype='float16': expected 'float32' or"),
+        (lambda: network(compute_dtype="float16"), "model.actor.compute_dtype='float16': expected 'auto' or"),
         (lambda: network(filters=0), "model.actor.filters=0"),
         (lambda: Conv4d(CellSpec(), filters=0), "model.critic.filters=0"),
         (lambda: Conv4d(CellSpec(), hidden=1.5), "model.critic.hidden=1.5"),

@@ -16,7 +16,8 @@ from pickplace.items.distributions import Kinds, Uniform
 from pickplace.policies.base import MAP_KEYS, MASKED, as_collection_policy
 from pickplace.policies.critics import Pooled
 from pickplace.policies.depth import Contents
-from pickplace.policies.fcn_grasp.network import FootprintFcn, matrix_dtype
+from pickplace.policies.dtypes import matrix_dtype
+from pickplace.policies.fcn_grasp.network import FootprintFcn
 from pickplace.policies.fcn_grasp.policy import FcnGrasp, UnmaskedFcnGrasp
 from pickplace.policies.footprints import every_footprint
 from pickplace.rules.item import item_from_depth, read_items

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from pickplace.common.validate import MAX_WIDTH, number, whole_number, whole_numbers
 from pickplace.policies.afterstate.value import ToteValue
 from pickplace.policies.afterstate.waiting import WaitingItems
-from pickplace.policies.fcn_grasp.network import matrix_dtype
+from pickplace.policies.dtypes import matrix_dtype
 
 
 class CellsValue(ToteValue):

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from pickplace.common.validate import MAX_WIDTH, check_inputs, expect, odd_number, size_tuple, whole_numbers
 from pickplace.policies.afterstate.value import ToteValue
 from pickplace.policies.afterstate.waiting import WaitingItems
-from pickplace.policies.fcn_grasp.network import matrix_dtype
+from pickplace.policies.dtypes import matrix_dtype
 
 MAX_GRID = 64  # cells of the network's picture of a tote along each axis
 

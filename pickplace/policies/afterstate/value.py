@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from pickplace.common.validate import flag, number, one_of
-from pickplace.policies.fcn_grasp.network import DTYPES
+from pickplace.policies.dtypes import DTYPES
 
 FLIPS: tuple[list[int], ...] = ([], [1], [2], [1, 2])  # axes along which maps of totes ``[N, W_T, D_T]`` are flipped
 

@@ -25,9 +25,9 @@ from torch import Tensor, nn
 
 from pickplace.common.validate import MAX_WIDTH, number_or_null, one_of, whole_number
 from pickplace.policies.depth import clip_depth
+from pickplace.policies.dtypes import DTYPES, matrix_dtype
 
 BIN_PADDING, TOTE_PADDING = -1.0, 0.0
-HIDDEN_DTYPES = ("float32", "bfloat16")
 MAX_DEPTH = 10_000  # height units; deeper than any tote
 PAIRS_AT_ONCE = {"cpu": 512, "cuda": 65_536}  # a CPU's caches hold the hidden activations of so many
 PADDED_PAIRS = 64  # their number is rounded up to a multiple; see PADDED_ROWS in fcn_grasp/network.py
@@ -74,9 +74,9 @@ class Conv4dNet(nn.Module):
         bin_clip: ``H_0_max`` of eq. 4; None for no clipping.
         tote_clip: ``H_1_max`` of eq. 4; None for no clipping, the "4D FCN" that the paper compares with.
         floor: clamps the clipped maps, both, from below; None, as in the paper, for no floor.
-        compute_dtype: of the hidden layers' activations, ``float32`` (the parameters' own type, strictly) or
-            ``bfloat16``, 3 to 5 times faster on CPUs with bf16 matrix units. Parameters, head and logits stay
-            float32.
+        compute_dtype: of the hidden layers' activations, ``float32`` (the parameters' own type, strictly),
+            ``bfloat16``, or ``auto``: bfloat16 where the device has units for it, which are 3 to 5 times as fast.
+            Parameters, head and logits stay float32.
         head_std: standard deviation of the head's initial weights, its bias being 0, so that the policy
             starts near uniform; None for PyTorch's default.
         chunk_bytes: hidden activations held at a time when gradients are off: large batches are cut along the
@@ -99,7 +99,7 @@ class Conv4dNet(nn.Module):
     ):
         super().__init__()
         whole_number("model.actor.filters", filters, most=MAX_WIDTH)
-        one_of("model.actor.compute_dtype", compute_dtype, HIDDEN_DTYPES)
+        one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
         check_clips("model.actor", bin_clip, tote_clip, floor)
         number_or_null("model.actor.head_std", head_std, 0, 1e3)
         whole_number("model.actor.chunk_bytes", chunk_bytes, most=2**30)
@@ -186,7 +186,7 @@ class Conv4dNet(nn.Module):
         states, rows = len(bins), bins.shape[1] - 4
         if torch.is_grad_enabled():
             return max(states, 1), rows
-        element = 2 if self.compute_dtype == "bfloat16" else self.first.weight.element_size()
+        element = self._dtype.itemsize
         depth, cells = bins.shape[2] - 2, (totes.shape[1] - 2) * (totes.shape[2] - 2)
         row_bytes = 3 * element * self.filters * depth * cells  # first layer, second layer, one tap of it
         if row_bytes * (rows + 2) <= self.chunk_bytes:
@@ -217,7 +217,8 @@ class Conv4dNet(nn.Module):
 
     @property
     def _dtype(self) -> torch.dtype:
-        return torch.bfloat16 if self.compute_dtype == "bfloat16" else self.first.weight.dtype
+        fast = matrix_dtype(self.compute_dtype, self.first.weight.device.type)
+        return self.first.weight.dtype if fast == torch.float32 else fast
 
     def _first_layer(self, bins: Tensor, totes: Tensor) -> tuple[Tensor, Tensor]:
         """Return the bin's and the tote's part of the first layer, before its ReLU: ``[N, filters, W + 2, D + 2]``."""

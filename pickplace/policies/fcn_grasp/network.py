@@ -6,11 +6,11 @@ from torch import Tensor, nn
 
 from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_numbers
 from pickplace.policies.depth import Contents, clip_depth
+from pickplace.policies.dtypes import DTYPES, matrix_dtype
 from pickplace.rules.grasps import split_footprint
 from pickplace.rules.gripper.base import reference_cell
 from pickplace.rules.maps import rectangle
 
-DTYPES = ("auto", "float32", "bfloat16")
 CHUNK_BYTES = 2**29  # inputs of the first layer that are held at a time when gradients are off
 MAX_LEVELS = 255  # levels are uint8
 OUTSIDE = -1000  # the depth of a cell that is not in the tote
@@ -159,13 +159,3 @@ class FootprintFcn(nn.Module):
         ]
         planes = torch.eye(self.planes + 1, self.planes, dtype=dtype, device=row.device)
         return F.embedding(torch.cat([level, torch.stack(codes, 1)], 1).int(), planes).flatten(1), weak
-
-
-def matrix_dtype(name: str, device: str) -> torch.dtype:
-    """Return the type of matrix products on a type of device; for ``"auto"`` the fastest one there."""
-    if name != "auto":
-        return getattr(torch, name)
-    if device == "cuda":
-        return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
-    able = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
-    return torch.bfloat16 if any(able.get(key) for key in ("amx_bf16", "avx512_bf16", "bf16")) else torch.float32
