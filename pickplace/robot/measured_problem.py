@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pickplace.common.validate import number, refuse_if
 from pickplace.robot.box import MILLIMETRE, Box, DepthMapError, HiddenBox
+from pickplace.robot.loads import grams_of, read_loads
 from pickplace.robot.measure import (
     ROUNDING,
     ToteMap,
@@ -34,7 +35,7 @@ from pickplace.rules.cell import MAX_SIDE, CellSpec
 from pickplace.rules.checks import is_within_reach
 from pickplace.rules.grasps import all_grasps, carry, footprint_index, split_flat
 from pickplace.rules.gripper.base import effector_centre, reference_cell
-from pickplace.rules.item import Item
+from pickplace.rules.item import ALL_TURNS, Item
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, footprint_mask
 from pickplace.rules.measured import MeasuredMaps, MeasuredTote, bearing_after, failures, floor_height, measured_maps
@@ -138,6 +139,7 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
         longest_side=cell.longest_side
         or (None if cell.has_known_offsets else max(int(side) for item in each for side in item[2:4])),
     )
+    loads = read_loads(scene, tote, len(tote.highest) // cell.tote_size[0])
     insets = [_inset(item, side, clearance / cell_size) for item, side in zip(each, sides, strict=True)]
     taken = _taken_items(free, each, insets)
     parts = []
@@ -149,7 +151,7 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
         allowed = torch.from_numpy(~is_excluded(exclude, centres, cell_size)).to(device)
         limits = replace(limits, pick_ok=limits.pick_ok & (taken == index) & allowed)
         limited = replace(free, reach=limits, item_inset=insets[index])
-        measured = measured_maps(limited, tote, item, sides[index])
+        measured = measured_maps(limited, tote, item, sides[index], loads)
         parts.append(MeasuredItem(limits, limited, measured, sides[index], bin_clear, centres, grip * MILLIMETRE))
     joint, maps = _join(parts, items)
     # A policy sees heights as in training.
@@ -286,8 +288,8 @@ def _on_grid(cell: CellSpec, box: Box, cell_size: float, clearance: float, name:
         min(max(0, round(at / cell_size - size / 2)), most_cells - size)
         for at, size, most_cells in zip((box.x, box.y), whole, cell.bin_size[:2], strict=True)
     )
-    sides = *whole, int(whole_units(box.h, MILLIMETRE, up=True))
-    return check_longest(cell, Item(*(torch.tensor([part], device=device) for part in (x, y, *sides))), name)
+    columns = x, y, *whole, int(whole_units(box.h, MILLIMETRE, up=True)), -1, ALL_TURNS, grams_of(box)
+    return check_longest(cell, Item(*(torch.tensor([part], device=device) for part in columns)), name)
 
 
 def _clear_picks(

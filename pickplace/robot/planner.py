@@ -142,10 +142,9 @@ class Planner:
         training: TrainingEnvelope | None = None,
         critic=None,
     ):
-        refuse_if(
-            cell.handling, "env.handling=true: the robot's planner does not know what lies on what; expected false."
-        )
         refuse_if(cell.tipping, "env.tipping=true: a robot's gripper does not tip items; expected false.")
+        self._handling = cell.handling
+        cell = replace(cell, handling=False)  # the loads of a scene are those of its boxes
         self.cell, self.policy, self.training = cell, policy, training
         self.terms = check_terms(terms, cell)
         self._settings, self._parts = None, {"items": items, "critic": critic}
@@ -203,6 +202,11 @@ class Planner:
         whole_number("alternatives", alternatives, 0, MAX_ALTERNATIVES)
         device = torch.device("cpu") if self.policy is None else next(self.policy.parameters()).device
         is_metric = scene.cell_size is not None
+        refuse_if(
+            self._handling and not is_metric,
+            "env.handling=true: a scene in whole cells has no loads; expected one in metres, with Box(..., mass=, "
+            "max_load=), and placed.",
+        )
         problem = (read_metric if is_metric else read_grid)(self.cell, scene, device, exclude)
         planner, terms = self._planner_of(problem.maps.bin_items, is_metric)
         observation = observe(terms, problem.cell, problem.seen)

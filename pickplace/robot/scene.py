@@ -11,7 +11,12 @@ from pickplace.robot.measure import ToteMap
 from pickplace.rules.cell import MAX_BIN_ITEMS, MAX_SIDE, CellSpec
 from pickplace.rules.maps import FAR
 
-MAX_VALUE = 1e3  # greatest coordinate of a box, m, and greatest yaw, degrees
+MAX_VALUE = 1e3  # greatest coordinate of a box, m, its greatest yaw, degrees, and mass, kg
+#: Least values of a box's fields: lengths in metres, masses in kilograms.
+LEAST = {
+    **dict.fromkeys("wdh", (MILLIMETRE, "a length", "m")), "edge_error": (0.0, "a length", "m"),
+    "mass": (0.0, "a mass", "kg"), "max_load": (0.0, "a mass", "kg"),
+}  # fmt: skip
 
 
 class BinMap(NamedTuple):
@@ -56,6 +61,9 @@ class Scene:
     #: nothing tells whether a cell is level
     tote_bearing: Any = None
     bin_height: float | None = None  #: height of the bin's walls above its floor; None: that of ``cell.bin_size``
+    #: everything that lies in the tote, :attr:`Plan.placed` of each plan that was carried out; None: not known. Needed
+    #: where a box has a ``max_load``, in metres alone
+    placed: Sequence[Box] | None = None
 
     def __post_init__(self):
         number("accuracy", self.accuracy, 0, 0.1, "metres")
@@ -77,28 +85,18 @@ class Scene:
                 number(key, height, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
             elif height is not None:
                 integral_number(key, height, 1, FAR - 1)
+        if self.placed is not None:
+            refuse_if(self.cell_size is None, "placed: the lengths are whole cells; expected a scene in metres.")
+            _check_boxes("placed", self.placed)
         if isinstance(self.items, BinMap):
             return
-        refuse_if(
-            not isinstance(self.items, (list, tuple)) or not all(isinstance(item, Box) for item in self.items),
-            f"items={excerpt(self.items)}: expected a list of Box.",
-            DepthMapError,
-        )
+        _check_boxes("items", self.items)
         refuse_if(
             not 1 <= len(self.items) <= MAX_BIN_ITEMS,
             f"items: got {len(self.items)} boxes, expected 1 to {MAX_BIN_ITEMS}: "
             f"{'too many' if self.items else 'an empty bin'}.",
             DepthMapError if self.items else EmptyBinError,
         )
-        for at, box in enumerate(self.items):
-            for key in (field.name for field in fields(Box)):
-                value, least = getattr(box, key), {"w": MILLIMETRE, "d": MILLIMETRE, "h": MILLIMETRE, "edge_error": 0.0}
-                expected = f"a length of at least {least[key]:g} m" if key in least else "a finite number"
-                refuse_if(
-                    not is_number(value) or abs(value) > MAX_VALUE or (key in least and value < least[key]),
-                    f"items[{at}].{key}={excerpt(value)}: expected {expected}.",
-                    DepthMapError,
-                )
 
     @classmethod
     def from_maps(cls, bin_depth, tote_depth, bin_labels=None, **settings) -> "Scene":
@@ -137,7 +135,7 @@ class Scene:
         return cls(
             over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes, greatest, bin_height),
             over_tote.tote_map(tote_image, cell, cell_size, tote_height, accuracy, placed),
-            cell_size, accuracy, tote_height=tote_height, bin_height=bin_height, **settings,
+            cell_size, accuracy, tote_height=tote_height, bin_height=bin_height, placed=placed, **settings,
         )  # fmt: skip
 
     @property
@@ -158,3 +156,18 @@ class Scene:
             replace(box, w=box.w - 2 * box.edge_error, d=box.d - 2 * box.edge_error, edge_error=0.0) for box in boxes
         ]
         return replace(self, items=narrower if boxes else self.items, tote=likely or self.tote)
+
+
+def _check_boxes(key: str, boxes: Any) -> None:
+    """Refuse anything but a list of boxes with numbers in range; ``key`` is the field of the scene."""
+    refuse_if(
+        not isinstance(boxes, (list, tuple)) or not all(isinstance(box, Box) for box in boxes),
+        f"{key}={excerpt(boxes)}: expected a list of Box.",
+        DepthMapError,
+    )
+    for at, box in enumerate(boxes):
+        for name in (field.name for field in fields(Box)):
+            value, (least, what, unit) = getattr(box, name), LEAST.get(name, (-MAX_VALUE, "", ""))
+            expected = f"{what} of at least {least:g} {unit}" if unit else "a finite number"
+            good = is_number(value) and least <= value <= MAX_VALUE or (name == "max_load" and value is None)
+            refuse_if(not good, f"{key}[{at}].{name}={excerpt(value)}: expected {expected}.", DepthMapError)

@@ -61,6 +61,7 @@ def failure_codes(
     rim: Tensor | int,
     over: Over,
     number: Tensor | int = 0,
+    borne: Tensor | None = None,
 ) -> Tensor:
     """Return the failure codes of flat actions, int64 ``[A]``, in the order of the rules' checks.
 
@@ -74,6 +75,7 @@ def failure_codes(
         rim: greatest height of its top.
         over: the end effector over every place cell.
         number: of the item, int64 ``[A]``, from 0 to ``M - 1``.
+        borne: whether the items below bear it, in the shape of ``stable``; None: they bear any.
     """
     (wide, deep, _), (_, _, x_tote, y_tote, _) = cell.tote_size, split_action(cell, action)
     picked, rotation, _, (x, y, w, d) = carried
@@ -81,7 +83,10 @@ def failure_codes(
     footprint = footprint_index(cell.tote_size, rotation % 2, x.clamp(0, wide - 1), y.clamp(0, deep - 1))
     footprint = footprint + number * cell.num_footprints
     place = footprint_index(cell.tote_size, rotation % len(over.leaves), x_tote, y_tote)
-    resting = Resting(inside, rest.flatten()[footprint] + item.h, rim, stable.flatten()[footprint])
+    resting = Resting(
+        inside, rest.flatten()[footprint] + item.h, rim, stable.flatten()[footprint],
+        None if borne is None else borne.flatten()[footprint],
+    )  # fmt: skip
     turn = None
     if cell.forbids_turns:
         turn = flags_from_turns(item.turns, cell.rotations).gather(1, rotation[:, None])[:, 0]

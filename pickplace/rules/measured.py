@@ -19,6 +19,7 @@ from pickplace.rules.grasps import carry, split_action
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR, NEVER
 from pickplace.rules.masks import PlacingMaps
+from pickplace.rules.measured_loads import MeasuredLoads
 from pickplace.rules.placing import OnFootprints, footprint_sizes, over_tote
 from pickplace.rules.state import State, surface_from
 from pickplace.rules.support.contact import Patches
@@ -63,9 +64,12 @@ class MeasuredMaps(NamedTuple):
     stable: Tensor  # bool [Q, W_T, D_T]
     highest_top: int  # greatest top that does not pass the rim
     over: Over  # the end effector over every place cell
+    borne: Tensor | None = None  # bool [Q, W_T, D_T]: whether what lies below bears the item; None: it bears any
 
 
-def measured_maps(cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[float, float]) -> MeasuredMaps:
+def measured_maps(
+    cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[float, float], loads: MeasuredLoads | None = None
+) -> MeasuredMaps:
     """Return everything that decides which actions succeed in a measured tote.
 
     An item may be ``accuracy`` higher than measured, and so may what it rests on. So it is released twice that above
@@ -75,17 +79,23 @@ def measured_maps(cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[f
         cell: the sizes; heights are in small units, such as millimetres.
         item: of one problem; its width and depth in whole cells, rounded up.
         sides: its width and depth, in cells, as measured.
+        loads: on what lies in the tote; None: it bears any.
     """
     slack = tote.accuracy
     z = OnFootprints(cell, tote.state(cell, item).surface, *footprint_sizes(cell, item)).z[..., 0]  # [Q, W_T, D_T]
     stable = torch.stack([_is_stable(cell, tote, item, sides, parity, z[parity]) for parity in range(cell.parities)])
+    borne = None
+    if loads is not None:
+        parts = [_is_borne(tote, item, sides, parity, z[parity], loads) for parity in range(cell.parities)]
+        borne = torch.stack(parts)
     if int(item.w) == int(item.d):  # one footprint to the masks, whichever way the item lies in it
         stable = stable.all(0).expand_as(stable)
+        borne = None if borne is None else borne.all(0).expand_as(borne)
     top, highest = z + item.h.to(z.dtype), tote.height - 2 * slack
-    good = combine(FOOTPRINT, Resting(z < FAR, top, highest, stable))
+    good = combine(FOOTPRINT, Resting(z < FAR, top, highest, stable, borne))
     over = over_tote(cell, tote.state(cell, item, slack).surface, torch.tensor([tote.rim - 2 * slack], device=z.device))
     maps = PlacingMaps.of(torch.where(good, top, NEVER)[None], z[None], over, item, None)
-    return MeasuredMaps(maps._replace(level_step=level_step(slack)), stable, highest, over)
+    return MeasuredMaps(maps._replace(level_step=level_step(slack)), stable, highest, over, borne)
 
 
 def _contact(
@@ -143,13 +153,19 @@ def _oriented(item: Item, sides: tuple[float, float], parity: int) -> tuple[tupl
     return (footprint[::-1], sides[::-1]) if parity else (footprint, sides)
 
 
+def _inside(z: Tensor, footprint: tuple[int, int]) -> tuple[slice, slice]:
+    """Return where a footprint of these sides is inside the tote, of all its places ``[W_T, D_T]``."""
+    wide, deep = (max(0, size - side + 1) for size, side in zip(z.shape, footprint, strict=True))
+    return slice(0, wide), slice(0, deep)
+
+
 def _is_stable(
     cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[float, float], parity: int, z: Tensor
 ) -> Tensor:
     """Return whether the item is stable on every footprint of a parity, bool ``[W_T, D_T]``."""
     footprint, sides = _oriented(item, sides, parity)
     stable = torch.zeros_like(z, dtype=torch.bool)
-    inside = slice(0, max(0, len(z) - footprint[0] + 1)), slice(0, max(0, z.shape[1] - footprint[1] + 1))
+    inside = _inside(z, footprint)
     z = z[inside]
     if not z.numel():
         return stable
@@ -158,6 +174,19 @@ def _is_stable(
     # By every rule the centre must be above what carries the item.
     stable[inside] = on_floor | contact.full | (contact.is_centre_in_hull() & cell.support.measured(contact))
     return stable
+
+
+def _is_borne(
+    tote: MeasuredTote, item: Item, sides: tuple[float, float], parity: int, z: Tensor, loads: MeasuredLoads
+) -> Tensor:
+    """Return whether what lies below bears the item on every footprint of a parity, bool ``[W_T, D_T]``."""
+    footprint, sides = _oriented(item, sides, parity)
+    reach = sides[0] / 2 + tote.placement_error, sides[1] / 2 + tote.placement_error
+    borne = torch.zeros_like(z, dtype=torch.bool)
+    inside = _inside(z, footprint)
+    if (z := z[inside]).numel():
+        borne[inside] = loads.bear(int(item.grams), footprint, reach, z.long())
+    return borne
 
 
 def bearing_after(
@@ -201,5 +230,5 @@ def failures(cell: CellSpec, measured: MeasuredMaps, action: Tensor, bin_clear: 
     picked = picked._replace(collides=~bin_clear[x_bin * cell.bin_size[1] + y_bin])
     return failure_codes(
         cell, action, item, (picked, rotation, effector, placed),
-        measured.maps.rest, measured.stable, measured.highest_top, measured.over,
+        measured.maps.rest, measured.stable, measured.highest_top, measured.over, borne=measured.borne,
     )  # fmt: skip

@@ -74,6 +74,10 @@ class PlanRequest:
         "units"
     )
     tote_bearing: Labels | None = _key("tote_bearing of the plan before, [W_T, D_T]: 1 where a cell bears weight")
+    placed: list[Box] | None = _key(
+        "what lies in the tote, as the plans before placed it, in the tote's frame, h the height of its top; m and "
+        "degrees; needed where a box has a max_load"
+    )
     exclude: list[list[float]] | None = _key(
         "pick.center of plans whose grasp failed, in the bin's frame: no pick within half a cell of one is planned "
         "again; m with cell_size, else cells"
@@ -115,8 +119,10 @@ class PlanRequest:
             lambda key: f"{key[:40]}: there is no such key; expected any of {', '.join(known)}.",
         )
         given = {key: value for key, value in given.items() if value is not None}
+        for key in ("items", "placed"):
+            if key in given:
+                given[key] = read_boxes(key, given[key])
         if "items" in given:
-            given["items"] = read_boxes(given["items"])
             refuse_any(
                 (key for key in ("bin_depth", "bin_labels") if key in given),
                 lambda key: f"{key}, items: got both, expected one of the two.",
@@ -148,8 +154,8 @@ class PlanRequest:
 PLAN_OPTIONS = [key for key in fields(PlanRequest) if key.metadata["option"]]
 
 
-def read_boxes(items) -> list[Box]:
-    """Return the boxes of a request's ``items``.
+def read_boxes(key: str, items) -> list[Box]:
+    """Return the boxes of a request's ``items`` or ``placed``.
 
     Raises:
         ValueError: naming the first one with other keys.
@@ -159,7 +165,9 @@ def read_boxes(items) -> list[Box]:
         try:
             boxes.append(Box(**item))
         except TypeError as error:
-            raise ValueError(f"items[{at}]: expected the keys x, y, w, d, h and, if it is turned, yaw.") from error
+            raise ValueError(
+                f"{key}[{at}]: expected the keys x, y, w, d, h and, if it is turned, yaw; mass, max_load."
+            ) from error
     return boxes
 
 

@@ -14,7 +14,6 @@ from pickplace.items.distributions import Kinds
 from pickplace.planners.lookahead import Lookahead
 from pickplace.planners.mcts import MCTS
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
-from pickplace.robot.planner import Planner
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import NO_LIMIT, Item
 from pickplace.rules.masks import choice_mask, first_action_reaching, placing_maps
@@ -203,5 +202,3 @@ def test_limits_without_handling_are_refused():
         PickPlaceEnv(Kinds([(1, 1, 1)], max_load=[0]))
     with pytest.raises(ValueError, match=r"item 2x1x1 at x=0, y=0 in the bin has no feasible action"):
         PickPlaceEnv(Kinds([(2, 1, 1)], turns=[[1]]), handling=True, rotations=1)
-    with pytest.raises(ValueError, match=r"env.handling=true: the robot's planner does not know what lies on what"):
-        Planner(CellSpec(handling=True), planner="joint_dbl")

@@ -1,0 +1,52 @@
+"""The loads on what lies in a tote, from the record of what was placed there."""
+
+import math
+from typing import cast
+
+import torch
+
+from pickplace.robot.box import MILLIMETRE, Box, DepthMapError
+from pickplace.robot.scene import BinMap, Scene
+from pickplace.rules.item import NO_LIMIT
+from pickplace.rules.measured import MeasuredTote, level_step
+from pickplace.rules.measured_loads import MeasuredLoads
+
+
+def grams_of(box: Box) -> int:
+    """Return the mass of a box, rounded up; grams."""
+    return math.ceil(1000 * box.mass - 1e-6)
+
+
+def read_loads(scene: Scene, tote: MeasuredTote, per_cell: int) -> MeasuredLoads | None:
+    """Return the loads on what lies in the tote; None if everything bears any load.
+
+    Args:
+        scene: in metres, with the record of the tote.
+        tote: the same tote as it was measured.
+        per_cell: patches of its map along the side of a cell.
+
+    Raises:
+        DepthMapError: for items of which some bear a limited load only, without that record.
+    """
+    items = () if isinstance(scene.items, BinMap) else scene.items
+    placed, side = scene.placed, cast(float, scene.cell_size)
+    if all(box.max_load is None for box in (*items, *(placed or ()))):
+        return None
+    if placed is None:
+        raise DepthMapError(
+            "placed=None: some items have a max_load; expected what lies in the tote, plan.placed of the plans before, "
+            "or [] for an empty one."
+        )
+    bounds = []
+    for box in placed:
+        cos, sin = abs(math.cos(math.radians(box.yaw))), abs(math.sin(math.radians(box.yaw)))
+        sides = box.w * cos + box.d * sin, box.w * sin + box.d * cos
+        reach = [along / 2 / side + tote.placement_error for along in sides]
+        x, y = box.x / side, box.y / side
+        bounds.append([x - reach[0], x + reach[0], y - reach[1], y + reach[1]])
+    limits = [NO_LIMIT if box.max_load is None else math.floor(1000 * box.max_load + 1e-6) for box in placed]
+    columns = [round(box.h / MILLIMETRE) for box in placed], [*map(grams_of, placed)], limits
+    device, step = tote.highest.device, level_step(tote.accuracy)
+    tops, grams, max_load = (torch.tensor(column, dtype=torch.int64, device=device) for column in columns)
+    spans = torch.tensor(bounds, dtype=torch.float64, device=device).reshape(-1, 4)
+    return MeasuredLoads.of(spans, tops, grams, max_load, tote.highest, per_cell, step)

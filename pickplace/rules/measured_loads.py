@@ -1,0 +1,83 @@
+"""Loads on items that were measured: which of them carry a new one, and whether they may."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pickplace.rules.item import NO_LIMIT
+
+ROUNDING = 1e-6  # of a cell: two that only touch share no ground
+
+
+class MeasuredLoads(NamedTuple):
+    """What lies in a tote, and how much each item still bears; ``B`` items. Heights are in height units."""
+
+    bounds: Tensor  # float64 [B, 4]: least and greatest x, least and greatest y that it may cover; cells
+    tops: Tensor  # int64 [B]: height of its top
+    capacity: Tensor  # int64 [B]: greatest mass on top of it, at which it and all below it are not overloaded; grams
+    unknown: Tensor  # int64 [k W_T, k D_T]: greatest height of each patch that none of them explains; else -1
+    step: int  # by how much two heights that are the same may differ
+
+    @classmethod
+    def of(
+        cls, bounds: Tensor, tops: Tensor, grams: Tensor, max_load: Tensor, highest: Tensor, per_cell: int, step: int
+    ) -> "MeasuredLoads":
+        """Return the loads of items that lie on one another: the full mass of an item counts on each one below it.
+
+        Args:
+            bounds, tops, step: as of the result; at most ``step`` high is the floor, too.
+            grams, max_load: int64 ``[B]``, as of an :class:`~pickplace.rules.item.Item`.
+            highest: int32 ``[k W_T, k D_T]``, greatest height of each patch.
+            per_cell: ``k``, patches along the side of a cell.
+        """
+        spans = [_span(torch.arange(size, device=highest.device) / per_cell, 1 / per_cell) for size in highest.shape]
+        explained = highest <= step
+        for bound, top in zip(bounds, tops, strict=True):  # one by one: a fine map of many items would be large
+            inside = _meet(spans[0], bound[None, :2]) & _meet(spans[1], bound[None, 2:]).t()
+            explained |= inside & ((highest - top).abs() <= step)
+        unknown = torch.where(explained, -1, highest.long())
+        if not len(tops):
+            return cls(bounds, tops, max_load, unknown, step)
+        over = _meet(bounds[:, :2], bounds[:, :2]) & _meet(bounds[:, 2:], bounds[:, 2:])
+        over &= tops[:, None] > tops  # [B, B]: the first may lie on the second
+        rest = torch.where(over, tops, 0).amax(1)
+        below = over & (tops >= (rest - step)[:, None])
+        for middle in tops.argsort().tolist():  # what lies on an item lies on all that is below it, too
+            below |= below[:, middle, None] & below[middle]
+        spare = max_load - torch.where(below, grams[:, None], 0).sum(0)
+        held = torch.where(below | torch.eye(len(tops), dtype=torch.bool, device=tops.device), spare, NO_LIMIT)
+        return cls(bounds, tops, held.amin(1).clamp(min=0), unknown, step)
+
+    def bear(self, grams: int, footprint: tuple[int, int], reach: tuple[float, float], z: Tensor) -> Tensor:
+        """Return whether what lies below bears a new item wherever it comes to lie, bool in the shape of ``z``.
+
+        What is not the floor and not known bears nothing.
+
+        Args:
+            grams: its mass.
+            footprint: its sides in whole cells.
+            reach: how far it may reach from the middle of its footprint along x and y; cells.
+            z: height on which it lies on each footprint inside the tote, ``[X, Y]``.
+        """
+        if grams == 0:
+            return torch.ones_like(z, dtype=torch.bool)
+        middles = (torch.arange(len, device=z.device) + size / 2 for len, size in zip(z.shape, footprint, strict=True))
+        x, y = (_span(middle - by, 2 * by) for middle, by in zip(middles, reach, strict=True))
+        in_x, in_y = _meet(x, self.bounds[:, :2]), _meet(y, self.bounds[:, 2:])  # [X, B], [Y, B]
+        carries = in_x[:, None] & in_y & ((z[..., None] - self.tops).abs() <= self.step)
+        enough = (torch.where(carries, self.capacity, NO_LIMIT) >= grams).all(2)
+        count = self.unknown.shape[0] // (len(z) + footprint[0] - 1)  # patches along a cell
+        (wide, deep), patches = footprint, self.unknown
+        highest = patches.unfold(0, wide * count, count).unfold(1, deep * count, count).amax((2, 3))
+        return enough & ((highest < 0) | (highest < z - self.step))
+
+
+def _span(begin: Tensor, length: float) -> Tensor:
+    """Return intervals ``[K, 2]``."""
+    return torch.stack([begin, begin + length], 1).double()
+
+
+def _meet(one: Tensor, other: Tensor) -> Tensor:
+    """Return which of some intervals ``[K, 2]`` meet others ``[L, 2]``, bool ``[K, L]``."""
+    return (one[:, None, 0] < other[:, 1] - ROUNDING) & (one[:, None, 1] > other[:, 0] + ROUNDING)
