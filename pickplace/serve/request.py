@@ -165,9 +165,7 @@ def read_boxes(key: str, items) -> list[Box]:
         try:
             boxes.append(Box(**item))
         except TypeError as error:
-            raise ValueError(
-                f"{key}[{at}]: expected the keys x, y, w, d, h and, if it is turned, yaw; mass, max_load."
-            ) from error
+            raise ValueError(f"{key}[{at}]: expected the keys x, y, w, d, h and any of yaw, mass, max_load.") from error
     return boxes
 
 

@@ -414,7 +414,7 @@ def test_items_of_a_fine_map_and_of_a_line():
     _, reply, _ = answer(planner, json.dumps({"items": boxes, **tote}).encode(), {})
     assert reply["status"] == "ok" and reply["box"] == boxes[reply["item_number"]]
     _, bad, _ = answer(planner, json.dumps({"items": [*boxes, {"x": 1}], **tote}).encode(), {})
-    assert bad == {"error": "items[3]: expected the keys x, y, w, d, h and, if it is turned, yaw."}
+    assert bad == {"error": "items[3]: expected the keys x, y, w, d, h and any of yaw, mass, max_load."}
 
 
 def test_no_alternatives_where_no_item_is_gripped():
