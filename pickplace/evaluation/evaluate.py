@@ -48,6 +48,10 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
         engine = build_engine(cfg.physics) if cfg.physics else None
         make_env, planner, facts = prepare(cfg)
         cell, settings = make_env(0, 1).cell, episode_settings(cfg)
+        refuse_if(
+            cell.tipping and getattr(engine, "grips", False),
+            "env.tipping=true: physics=execute carries items with a gripper, which tips none; expected physics=settle.",
+        )
         other = (
             None if cfg.compare is None else read_comparison(Path(str(cfg.compare)), settings, own_modules(cfg.trust))
         )

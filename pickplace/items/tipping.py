@@ -67,5 +67,5 @@ def check_tipping(cell: CellSpec, items: ItemDistribution) -> None:
     limited = items.tipped_turns is not None and bool((items.tipped_turns != ALL_TURNS).any())
     refuse_if(
         limited and not cell.handling,
-        "env.handling=false: some items may not be tipped as they like; expected env.handling=true.",
+        "env.handling=false: some items may not lie on every side; expected env.handling=true.",
     )

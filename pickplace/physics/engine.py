@@ -17,6 +17,7 @@ class Engine(Protocol):
 
     Attributes:
         name: its name in tables and in ``evaluation.json``.
+        grips: optional; whether it carries items from the bin with a gripper.
     """
 
     name: str

@@ -58,6 +58,7 @@ class Execute(Simulation):
     slow_speed: float = 0.2
 
     name: ClassVar[str] = "execute"
+    grips: ClassVar[bool] = True
     endings: ClassVar[dict[str, tuple[str, str]]] = Simulation.endings | {
         "dropped": ("The suction did not hold item {}.", "item {} not held"),
         "effector_contact": ("The gripper hit something while it moved item {}.", "gripper hit something"),

@@ -67,10 +67,11 @@ class MapPlanner(ABC):
 ITEM_RULES = ("any", "first", "nearest")
 
 
-def restrict_items(rule: str, state: State, mask: Tensor) -> Tensor:
+def restrict_items(cell: CellSpec, rule: str, state: State, mask: Tensor) -> Tensor:
     """Return a mask of choices in which one item of each bin is left, the first by a rule that has any choice.
 
     Args:
+        cell: with its ``tipping`` all poses of the item are left.
         rule: ``"first"``: in the order of arrival; ``"nearest"``: by the distance of the item's centre from the bin's
             origin; ``"any"``: the mask stays as it is.
         state: has the items.
@@ -83,6 +84,8 @@ def restrict_items(rule: str, state: State, mask: Tensor) -> Tensor:
     distance = (2 * items.x + items.w) ** 2 + (2 * items.y + items.d) ** 2 if rule == "nearest" else 0
     order = distance * count + torch.arange(count, device=mask.device)
     order = torch.where(mask.any(2), order, torch.iinfo(order.dtype).max)
+    if cell.tipping:  # the poses of an item are one item
+        order = order.unflatten(1, (-1, cell.poses)).amin(2).repeat_interleave(cell.poses, 1)
     return (mask & (order == order.amin(1, keepdim=True))[:, :, None]).flatten(1)
 
 

@@ -105,7 +105,7 @@ class _Cheapest(MapPlanner):
         """
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        feasible = restrict_items(self.item, state, choice_mask(cell, maps))
+        feasible = restrict_items(cell, self.item, state, choice_mask(cell, maps))
         x, y = (torch.arange(side, device=feasible.device) for side in cell.tote_size[:2])
         cost = self.cost(cell, state, maps, x[:, None] + y)
         order = torch.where(feasible, maps.join(cost), torch.inf)
@@ -209,7 +209,7 @@ class IndividualHeuristic(MapPlanner):
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         lifted = all_grasps(cell, maps.item, maps.blocked)[0]  # [N * M, P]
-        lifted = restrict_items(self.item, state, lifted.reshape(len(state.surface), -1))
+        lifted = restrict_items(cell, self.item, state, lifted.reshape(len(state.surface), -1))
         number = lifted.unflatten(1, (maps.bin_items, -1)).any(2).int().argmax(1)
         maps, _ = maps.of_choice(cell, number * cell.num_footprints)
         pick, footprint, succeeds = pick_first(cell, maps, self.pick)

@@ -74,7 +74,7 @@ class PolicyPlanner(MapPlanner):
 
             return Ranking(reach(torch.arange(len(pick), device=pick.device), best_choice(scores)), scores, reach)
         if self.item != "any":
-            mask = restrict_items(self.item, state, policy.ranked(maps))
+            mask = restrict_items(cell, self.item, state, policy.ranked(maps))
             return rank_footprints(cell, maps, policy.footprint_logits(observation, mask))
         if self.candidates == "all":
             with set_exploration_type(ExplorationType.DETERMINISTIC):

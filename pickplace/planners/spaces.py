@@ -107,7 +107,7 @@ class SpacePlanner(MapPlanner):
         """
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        feasible = restrict_items(self.item, state, choice_mask(cell, maps))
+        feasible = restrict_items(cell, self.item, state, choice_mask(cell, maps))
         last = LAST * cell.num_places
         at_origin, elsewhere = (
             torch.where(feasible, maps.join(dbl_order(cell, order)), last)

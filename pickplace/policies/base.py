@@ -48,7 +48,7 @@ MAP_KEYS = ("bin_depth", "tote_depth", "tote_bearing")
 
 
 class Ranking(NamedTuple):
-    """What a policy thinks of the choices in ``N`` problems."""
+    """A policy's scores of all choices in ``N`` problems, and the best one."""
 
     action: Tensor  #: flat action of the best choice, int64 [N]
     scores: Tensor  #: a logit for each choice, float32 [N, choices]

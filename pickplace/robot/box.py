@@ -27,7 +27,7 @@ class Box:
     h: float  #: height of its top above the bin's floor
     yaw: float = 0.0  #: turn about the vertical axis, counter-clockwise seen from above
     edge_error: float = 0.0  #: greatest distance by which a side may end inside ``w`` or ``d``
-    mass: float = 0.0  #: kg; 0: not known, and no load on anything
+    mass: float = 0.0  #: kg; 0: not known, so that it may lie only on what bears any load
     max_load: float | None = None  #: greatest mass on top of it, kg; 0: nothing may lie on it; None: any
 
     def upright(self) -> "Box":

@@ -7,18 +7,17 @@ import torch
 
 from pickplace.robot.box import MILLIMETRE, Box, DepthMapError
 from pickplace.robot.scene import BinMap, Scene
-from pickplace.rules.item import NO_LIMIT
 from pickplace.rules.measured import MeasuredTote, level_step
-from pickplace.rules.measured_loads import MeasuredLoads
+from pickplace.rules.measured_loads import ANY_LOAD, UNKNOWN_MASS, MeasuredLoads
 
 
 def grams_of(box: Box) -> int:
-    """Return the mass of a box, rounded up; grams."""
-    return math.ceil(1000 * box.mass - 1e-6)
+    """Return the mass of a box, rounded up; grams. One that is not known is more than any limit."""
+    return math.ceil(1000 * box.mass - 1e-6) if box.mass > 0 else UNKNOWN_MASS
 
 
 def read_loads(scene: Scene, tote: MeasuredTote, per_cell: int) -> MeasuredLoads | None:
-    """Return the loads on what lies in the tote; None if everything bears any load.
+    """Return the loads on what lies in the tote; None if no box says what it weighs or bears.
 
     Args:
         scene: in metres, with the record of the tote.
@@ -30,7 +29,10 @@ def read_loads(scene: Scene, tote: MeasuredTote, per_cell: int) -> MeasuredLoads
     """
     items = () if isinstance(scene.items, BinMap) else scene.items
     placed, side = scene.placed, cast(float, scene.cell_size)
-    if all(box.max_load is None for box in (*items, *(placed or ()))):
+    boxes = (*items, *(placed or ()))
+    if all(box.max_load is None and not box.mass for box in boxes):
+        return None
+    if placed is None and all(box.max_load is None for box in boxes):
         return None
     if placed is None:
         raise DepthMapError(
@@ -44,7 +46,7 @@ def read_loads(scene: Scene, tote: MeasuredTote, per_cell: int) -> MeasuredLoads
         reach = [along / 2 / side + tote.placement_error for along in sides]
         x, y = box.x / side, box.y / side
         bounds.append([x - reach[0], x + reach[0], y - reach[1], y + reach[1]])
-    limits = [NO_LIMIT if box.max_load is None else math.floor(1000 * box.max_load + 1e-6) for box in placed]
+    limits = [ANY_LOAD if box.max_load is None else math.floor(1000 * box.max_load + 1e-6) for box in placed]
     columns = [round(box.h / MILLIMETRE) for box in placed], [*map(grams_of, placed)], limits
     device, step = tote.highest.device, level_step(tote.accuracy)
     tops, grams, max_load = (torch.tensor(column, dtype=torch.int64, device=device) for column in columns)

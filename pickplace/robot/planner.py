@@ -34,7 +34,7 @@ from pickplace.rules.checks import PICK_FAILURES
 from pickplace.rules.grasps import join_pick, split_action
 from pickplace.rules.item import Observation
 from pickplace.rules.masks import footprint_mask
-from pickplace.rules.observation import Term, check_terms, observe
+from pickplace.rules.observation import HANDLING_TERMS, Term, ToteCapacity, check_terms, observe
 from pickplace.rules.state import Failure
 
 ACTIONS_AT_ONCE = 2**16  # whose reasons are looked up at a time
@@ -92,22 +92,9 @@ class Plan:
     #: if stuck or impossible: a sentence for each item that the gripper cannot grip, wherever it lies; such as
     #: "items[1]: the cup does not fit on this item; no pick takes it."
     hints: list[str] = field(default_factory=list)
-
-    @property
-    def placed(self) -> Box | None:
-        """The item as it lies in the tote once it rests, in the tote's frame; ``h`` is the height of its top.
-
-        It is the record of the tote for :meth:`Scene.from_images`. None without an action, or without ``cell_size``.
-        """
-        if not (
-            self.box and self.pick and self.place and self.drop_height is not None and self.rotation_degrees is not None
-        ):
-            return None
-        box, angle = self.box, math.radians(self.rotation_degrees)
-        x, y = box.x - self.pick.center[0], box.y - self.pick.center[1]
-        x, y = x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle)
-        centre = {"x": self.place.center[0] + x, "y": self.place.center[1] + y}
-        return replace(box, **centre, h=self.drop_height + box.h, yaw=box.yaw + self.rotation_degrees).upright()
+    #: the item as it lies in the tote once it rests, in the tote's frame, ``h`` the height of its top: for the record
+    #: that the next scene needs; None without an action, or without ``cell_size``
+    placed: Box | None = None
 
     def as_dict(self) -> dict:
         """Return the plan as plain values, ready for JSON."""
@@ -145,6 +132,10 @@ class Planner:
         refuse_if(cell.tipping, "env.tipping=true: a robot's gripper does not tip items; expected false.")
         self._handling = cell.handling
         cell = replace(cell, handling=False)  # the loads of a scene are those of its boxes
+        loads = [key for key, term in (terms or {}).items() if key in HANDLING_TERMS or isinstance(term, ToteCapacity)]
+        read = [key for key in loads if policy is not None and key in policy.in_keys]
+        refuse_if(read, f"policy: it reads {', '.join(read)}, which a scene does not have; expected another.")
+        terms = {key: term for key, term in (terms or {}).items() if key not in loads}
         self.cell, self.policy, self.training = cell, policy, training
         self.terms = check_terms(terms, cell)
         self._settings, self._parts = None, {"items": items, "critic": critic}
@@ -206,6 +197,7 @@ class Planner:
             self._handling and not is_metric,
             "env.handling=true: a scene in whole cells has no loads; expected one in metres, with Box(..., mass=, "
             "max_load=), and placed.",
+            DepthMapError,
         )
         problem = (read_metric if is_metric else read_grid)(self.cell, scene, device, exclude)
         planner, terms = self._planner_of(problem.maps.bin_items, is_metric)
@@ -218,6 +210,9 @@ class Planner:
         pick, place, turn, drop_height = (None,) * 4 if action is None else problem.motion(action)
         seen = None if known is None else problem.seen.items.cuboids[0, known].tolist()
         box = None if known is None or not problem.boxes else problem.boxes[known]
+        placed = None
+        if box and pick and place and turn is not None and drop_height is not None:
+            placed = _at_rest(box, pick, place, turn, drop_height)
         (before, gained), bearing = problem.shares(number or 0), problem.bearing_after(action)
         return Plan(
             status=status,
@@ -236,6 +231,7 @@ class Planner:
             warnings=[] if self.training is None else self.training.warnings(self.cell, problem.seen.items),
             item_number=None if number is None else problem.numbers[number],
             hints=problem.hints() if status in ("stuck", "impossible") else [],
+            placed=placed,
         )
 
     def _refuse_unknown(self, scene: Scene, device) -> None:
@@ -286,13 +282,24 @@ class Planner:
         return build("planner", self._settings, cell=cell, **{key: parts[key] for key in needs})
 
 
+def _at_rest(box: Box, pick: Pose, place: Pose, turn: float, drop_height: float) -> Box:
+    """Return an item as it lies in the tote; a turn in degrees."""
+    cos, sin = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    x, y = box.x - pick.center[0], box.y - pick.center[1]
+    centre = {"x": place.center[0] + x * cos - y * sin, "y": place.center[1] + x * sin + y * cos}
+    return replace(box, **centre, h=drop_height + box.h, yaw=box.yaw + turn).upright()
+
+
 def planner_settings(
     planner: str | Mapping[str, Any] | None, candidates: int | Literal["all"] = "all"
 ) -> dict[str, Any]:
     """Return a planner's short name or its config as a config; of the policy with its ``candidates``."""
     settings = dict(planner) if isinstance(planner, Mapping) else {"_target_": planner or "policy"}
     expect(isinstance(settings.get("_target_"), str), "planner", planner, "a config with the key _target_")
-    return {"candidates": candidates, **settings} if settings["_target_"] == "policy" else settings
+    if settings["_target_"] != "policy" or candidates == "all":
+        return settings
+    expect("candidates" not in settings, "candidates", candidates, "'all' with a planner that has its own")
+    return {**settings, "candidates": candidates}
 
 
 def _check_choice(planner: MapPlanner, count: int, is_metric: bool) -> None:

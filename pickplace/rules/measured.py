@@ -86,7 +86,7 @@ def measured_maps(
     stable = torch.stack([_is_stable(cell, tote, item, sides, parity, z[parity]) for parity in range(cell.parities)])
     borne = None
     if loads is not None:
-        parts = [_is_borne(tote, item, sides, parity, z[parity], loads) for parity in range(cell.parities)]
+        parts = [_is_borne(item, sides, parity, z[parity], loads) for parity in range(cell.parities)]
         borne = torch.stack(parts)
     if int(item.w) == int(item.d):  # one footprint to the masks, whichever way the item lies in it
         stable = stable.all(0).expand_as(stable)
@@ -176,16 +176,13 @@ def _is_stable(
     return stable
 
 
-def _is_borne(
-    tote: MeasuredTote, item: Item, sides: tuple[float, float], parity: int, z: Tensor, loads: MeasuredLoads
-) -> Tensor:
+def _is_borne(item: Item, sides: tuple[float, float], parity: int, z: Tensor, loads: MeasuredLoads) -> Tensor:
     """Return whether what lies below bears the item on every footprint of a parity, bool ``[W_T, D_T]``."""
-    footprint, sides = _oriented(item, sides, parity)
-    reach = sides[0] / 2 + tote.placement_error, sides[1] / 2 + tote.placement_error
+    footprint, _ = _oriented(item, sides, parity)
     borne = torch.zeros_like(z, dtype=torch.bool)
     inside = _inside(z, footprint)
     if (z := z[inside]).numel():
-        borne[inside] = loads.bear(int(item.grams), footprint, reach, z.long())
+        borne[inside] = loads.bear(int(item.grams), footprint, z.long())
     return borne
 
 

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.rules.item import NO_LIMIT
-
 ROUNDING = 1e-6  # of a cell: two that only touch share no ground
+UNKNOWN_MASS = 2**40  # grams: more than any limit, and so few of them as lie in a tote are less than ANY_LOAD
+ANY_LOAD = 2**60
 
 
 class MeasuredLoads(NamedTuple):
@@ -39,34 +39,32 @@ class MeasuredLoads(NamedTuple):
         unknown = torch.where(explained, -1, highest.long())
         if not len(tops):
             return cls(bounds, tops, max_load, unknown, step)
-        over = _meet(bounds[:, :2], bounds[:, :2]) & _meet(bounds[:, 2:], bounds[:, 2:])
-        over &= tops[:, None] > tops  # [B, B]: the first may lie on the second
-        rest = torch.where(over, tops, 0).amax(1)
-        below = over & (tops >= (rest - step)[:, None])
+        below = _meet(bounds[:, :2], bounds[:, :2]) & _meet(bounds[:, 2:], bounds[:, 2:])
+        # Whatever is lower may carry it: its underside is not known.
+        below &= tops[:, None] > tops  # [B, B]: the second may lie below the first
         for middle in tops.argsort().tolist():  # what lies on an item lies on all that is below it, too
             below |= below[:, middle, None] & below[middle]
         spare = max_load - torch.where(below, grams[:, None], 0).sum(0)
-        held = torch.where(below | torch.eye(len(tops), dtype=torch.bool, device=tops.device), spare, NO_LIMIT)
+        held = torch.where(below | torch.eye(len(tops), dtype=torch.bool, device=tops.device), spare, ANY_LOAD)
         return cls(bounds, tops, held.amin(1).clamp(min=0), unknown, step)
 
-    def bear(self, grams: int, footprint: tuple[int, int], reach: tuple[float, float], z: Tensor) -> Tensor:
+    def bear(self, grams: int, footprint: tuple[int, int], z: Tensor) -> Tensor:
         """Return whether what lies below bears a new item wherever it comes to lie, bool in the shape of ``z``.
 
         What is not the floor and not known bears nothing.
 
         Args:
             grams: its mass.
-            footprint: its sides in whole cells.
-            reach: how far it may reach from the middle of its footprint along x and y; cells.
+            footprint: its sides in whole cells; it does not leave them, whatever its error.
             z: height on which it lies on each footprint inside the tote, ``[X, Y]``.
         """
-        if grams == 0:
-            return torch.ones_like(z, dtype=torch.bool)
-        middles = (torch.arange(len, device=z.device) + size / 2 for len, size in zip(z.shape, footprint, strict=True))
-        x, y = (_span(middle - by, 2 * by) for middle, by in zip(middles, reach, strict=True))
+        x, y = (
+            _span(torch.arange(count, device=z.device), side) for count, side in zip(z.shape, footprint, strict=True)
+        )
         in_x, in_y = _meet(x, self.bounds[:, :2]), _meet(y, self.bounds[:, 2:])  # [X, B], [Y, B]
-        carries = in_x[:, None] & in_y & ((z[..., None] - self.tops).abs() <= self.step)
-        enough = (torch.where(carries, self.capacity, NO_LIMIT) >= grams).all(2)
+        # A recorded top may differ from what is measured there, and that from the height on which the item lies.
+        carries = in_x[:, None] & in_y & ((z[..., None] - self.tops).abs() <= 2 * self.step)
+        enough = (torch.where(carries, self.capacity, ANY_LOAD) >= grams).all(2)
         count = self.unknown.shape[0] // (len(z) + footprint[0] - 1)  # patches along a cell
         (wide, deep), patches = footprint, self.unknown
         highest = patches.unfold(0, wide * count, count).unfold(1, deep * count, count).amax((2, 3))

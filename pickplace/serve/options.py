@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Mapping
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,6 +79,7 @@ def load_planner(args: argparse.Namespace, cell: dict | None = None) -> tuple["P
         ValueError: for arguments or a checkpoint that cannot be used.
     """
     from pickplace.common.machine import use_threads
+    from pickplace.config.allowlist import own_modules, refuse_foreign_targets
     from pickplace.robot.planner import MAX_ALTERNATIVES, Planner  # here, so that --help need not wait for torch
     from pickplace.rules.cell import CellSpec
 
@@ -94,6 +94,7 @@ def load_planner(args: argparse.Namespace, cell: dict | None = None) -> tuple["P
     sizes = sizes if cell is None else cell
     candidates = int(args.candidates) if args.candidates.isdecimal() else args.candidates
     decides = read_planner(args.planner)
+    refuse_foreign_targets({"planner": decides}, own_modules(args.trust))
     if args.checkpoint is not None:
         planner = Planner.load(args.checkpoint, candidates, args.device, args.trust, decides, **sizes)
     else:
@@ -132,15 +133,14 @@ def plan_once(planner: "Planner") -> None:
 
 
 def read_planner(name: str | Mapping[str, Any] | None) -> str | Mapping[str, Any] | None:
-    """Return the settings of a planner from a file such as those of ``conf/planner``; anything but the name of a file
-    is returned as it is.
+    """Return the settings of a planner from a file ``.yaml`` such as those of ``conf/planner``; a short name as it is.
 
     Raises:
         ValueError: for a file that cannot be read, or holds no settings.
     """
     from yaml import YAMLError, safe_load
 
-    if not isinstance(name, str) or not Path(name).is_file():
+    if not isinstance(name, str) or not name.endswith((".yaml", ".yml")):
         return name
     expected = "expected settings with the key _target_, such as conf/planner/beam.yaml."
     with reworded(

@@ -2,12 +2,14 @@
 
 import pytest
 import torch
+from commands import composed
 
 from pickplace import PickPlaceEnv, Planner
 from pickplace.envs.saved_state import check_saved_states
+from pickplace.evaluation.evaluate import run
 from pickplace.items.distributions import Kinds
 from pickplace.items.orders import Orders
-from pickplace.planners.heuristics import RandomFeasible
+from pickplace.planners.heuristics import JointDBL, RandomFeasible
 from pickplace.rules.gripper.rules import Overlap
 from pickplace.rules.step import apply
 from pickplace.runs.checkpoint import CheckpointError
@@ -93,6 +95,30 @@ def test_a_saved_state_has_all_poses_of_its_items():
 def test_what_does_not_go_with_tipping_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         PickPlaceEnv(Kinds(KINDS), **{**CELL, **changes})
+
+
+def test_the_first_item_is_considered_in_all_its_poses():
+    """The lowest pose of the first of two equal items is the best, and none of the second is taken."""
+    cell = {**CELL, "bin_items": 6, "bin_size": (9, 6, 1), "tote_size": (4, 4, 3)}
+    env = PickPlaceEnv(Kinds([(1, 2, 3)]), **cell)
+    taken = set()
+    for seed in range(4):
+        env.set_seed(seed)
+        data = env.reset()
+        for _ in range(4):
+            action = JointDBL(env.cell, item="first").decide(data)
+            taken.add(int(apply(env.cell, env.state, action).taken))
+            data = env.step(data.set("action", action))["next"]
+            if data["done"]:
+                break
+    assert taken <= {0, 1, 2} and 2 in taken
+
+
+def test_a_gantry_does_not_tip(tmp_path):
+    words = ["benchmark=gopt_rs", "env.tipping=true", "env.bin_items=3", "env.bin_size=[15,5,5]", "planner=joint_dbl"]
+    cfg = composed(*words, "physics=execute", name="evaluate")
+    with pytest.raises(ValueError, match="env.tipping=true: physics=execute carries items with a gripper, which tips"):
+        run(cfg, tmp_path / "run")
 
 
 def test_a_robot_does_not_tip():

@@ -203,6 +203,7 @@ def test_a_file_holds_the_settings_of_a_planner(command):
     line = json.dumps(lists).encode()
     for content, message in (
         ("{item: any}", "--planner=mine.yaml: expected settings with the key _target_, such as conf/planner/"),
+        ("{_target_: joint_dbl, item: {_target_: os.system, command: ls}}", "planner.item._target_='os.system'"),
         ("[", "--planner=mine.yaml: while parsing a flow node"),
         (
             "{_target_: joint_dbl, distance_weight: 1}",
