@@ -82,7 +82,7 @@ class Orders(ItemDistribution):
         """Return the number of an item's kind: of its sides, its weight, and what it allows."""
         refuse_if(
             not item.turns,
-            f"{item.place}: orientations={' '.join(item.orientations)}: expected lwh or wlh among them: with "
+            f"{item.place}: orientations={' '.join(item.orientations)}: expected lwh or wlh among them; with "
             "items=orders each item must be able to stand upright.",
         )
         kind = kinds.setdefault(item.kind, len(kinds))

@@ -169,7 +169,7 @@ def test_true_volumes_are_reported(tmp_path):
         ("l,w,h,kg,max_load,maximum load\n1,2,3,4,5,5\n", r"line 1: columns 'max_load' and 'maximum_load'; expected"),
         ("l,w,h,kg,stackable\n1,2,3,4,perhaps\n", r"line 2: stackable='perhaps': expected yes or no\."),
         ("l,w,h,kg,orientations\n1,2,3,4,lwh hwd\n", r"line 2: orientations='lwh hwd': expected any, upright"),
-        ("l,w,h,kg,orientations\n1,2,3,4,hlw\n", r"line 2: orientations=hlw: expected lwh or wlh among them; items"),
+        ("l,w,h,kg,orientations\n1,2,3,4,hlw\n", r"line 2: orientations=hlw: expected lwh or wlh among them; with"),
         ("id,l,w,h,kg,stackable\na,1,2,3,4,yes\na,1,2,3,4,no\n",
          r"line 3: item 'a' is 1 x 2 x 3 mm, 4 kg, at most 0 kg on top, but 1 x 2 x 3 mm, 4 kg in .*, line 2"),
         ("l,l,h,kg\n1,2,3,4\n", r"line 1: two columns 'l'; expected one\."),

@@ -41,12 +41,14 @@ def weigh(net, std=3.0):
     torch.nn.init.normal_(net.waiting.sum.weight, std=0.3)
 
 
-def left_in_bins(items, taken):
-    """Return a table of bins without an item each, by plain Python."""
+def left_in_bins(items, taken, tipping):
+    """Return a table of bins without an item each, in all its poses, by plain Python."""
     rows = []
     for row, number in enumerate(taken.tolist()):
         bin_ = items.cuboids[row].tolist()
-        rows.append([*bin_[:number], *bin_[number + 1 :], [0] * 5])
+        gone = {number // 3 * 3 + pose for pose in range(3)} if tipping else {number}
+        kept = [item for place, item in enumerate(bin_) if place not in gone]
+        rows.append(kept + [[0] * 5] * len(gone))
     return torch.tensor(rows)
 
 
@@ -63,7 +65,7 @@ def test_a_score_is_the_items_volume_and_the_value_of_what_the_step_leaves(kind,
             largest = env.state.items.volume.amax(1, keepdim=True)
             choice = policy.logits(observation).argmax(1)
             score = policy.logits(observation).gather(1, choice[:, None])
-            left = left_in_bins(env.state.items, choice // env.cell.num_footprints)
+            left = left_in_bins(env.state.items, choice // env.cell.num_footprints, env.cell.tipping)
             data = env.step(observation.clone().set("action", policy.to_action(choice, observation)))
             after = data["next"].set("items", left)
             value = policy.network(*(after[key] for key in policy.network.in_keys))
