@@ -3,7 +3,7 @@
 Each shipped checkpoint fills totes of its own cell with its own items. Every state is planned in cells and in metres,
 with ten alternatives: until nothing fits (stuck), with an item that fits in no tote (impossible), and with a bin whose
 item is no cuboid (refused); and once more by a planner with one candidate (rejected). The first plan after loading
-counts, too.
+counts, too. Images that become a scene before that are timed alone.
 """
 
 import sys
@@ -81,6 +81,29 @@ def row(path: str) -> dict:
     return {name: summary(answers) for name, answers in found.items()}
 
 
+def images(count: int = 40) -> dict:
+    """Return percentiles of the times in which two depth images of 640 x 480 pixels become a scene, or are refused.
+
+    The images are those of ``tests/long/camera_truth.py``, good and bad ones.
+    """
+    sys.path.insert(0, str(ROOT / "tests/long"))
+    import camera_truth as truths
+
+    found = []
+    for seed in range(90_000, 90_000 + count):
+        draw = np.random.default_rng(seed)
+        cell, kind = str(draw.choice(list(truths.CELLS))), str(draw.choice(truths.KINDS))
+        views, _ = truths.images(draw, truths.random_truth(draw, cell, kind), kind)
+        spec, side, rim, _ = truths.CELLS[cell]
+        begin, status = time.perf_counter(), "seen"
+        try:
+            Scene.from_images(spec, *views, side, truths.ACCURACY, tote_height=rim)
+        except DepthMapError:
+            status = "refused"
+        found.append((status, 1000 * (time.perf_counter() - begin)))
+    return summary(found)
+
+
 def summary(answers: list[tuple[str, float]]) -> dict:
     times = np.array([ms for _, ms in answers])
     median, most = np.percentile(times, [50, 95])
@@ -93,7 +116,7 @@ def summary(answers: list[tuple[str, float]]) -> dict:
 def main() -> None:
     names = sys.argv[1:] or sorted(folder.name for folder in (ROOT / "pickplace/pretrained").iterdir())
     use_one_core()
-    save("answers", {"rows": {name: row(f"pretrained/{name}") for name in names}})
+    save("answers", {"images": images(), "rows": {name: row(f"pretrained/{name}") for name in names}})
 
 
 if __name__ == "__main__":
