@@ -116,7 +116,7 @@ def answers(result: dict) -> str:
     return section(
         "One answer to a robot",
         "`Planner.plan` with ten alternatives, in cells and in metres, until the tote is full: all answers of `ok`, "
-        "`stuck` and `impossible`, and refused scenes; `K=1` is `candidates=1`, of which many are `rejected`. "
+        "`stuck` and `impossible`, and refused scenes. `K=1`: with `candidates=1`; many answers are `rejected`. "
         "Milliseconds. Two images of 640 x 480 pixels become a scene before that, or are refused, in "
         f"{seen} (median, 95%, slowest).",
         table("checkpoint | median | 95% | slowest | K=1, median | K=1, 95% | K=1, slowest", rows),

@@ -75,7 +75,7 @@ class OrderItem(NamedTuple):
 
     @property
     def tipped_turns(self) -> tuple[int, int]:
-        """The same on its other faces, ``lhw`` and ``whl`` without a turn."""
+        """The same for the item on its front, which is ``lhw`` without a turn, and on its side, which is ``whl``."""
         pairs = ORIENTATIONS[2:4], ORIENTATIONS[4:]
         first, second = (
             sum(turn for each, turn in zip(pair, TURNS.values(), strict=True) if each in self.orientations)

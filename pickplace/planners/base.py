@@ -84,8 +84,7 @@ def restrict_items(cell: CellSpec, rule: str, state: State, mask: Tensor) -> Ten
     distance = (2 * items.x + items.w) ** 2 + (2 * items.y + items.d) ** 2 if rule == "nearest" else 0
     order = distance * count + torch.arange(count, device=mask.device)
     order = torch.where(mask.any(2), order, torch.iinfo(order.dtype).max)
-    if cell.tipping:  # the poses of an item are one item
-        order = order.unflatten(1, (-1, cell.poses)).amin(2).repeat_interleave(cell.poses, 1)
+    order = order.unflatten(1, (-1, cell.poses)).amin(2).repeat_interleave(cell.poses, 1)  # poses are one item
     return (mask & (order == order.amin(1, keepdim=True))[:, :, None]).flatten(1)
 
 

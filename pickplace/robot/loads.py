@@ -17,7 +17,8 @@ def grams_of(box: Box) -> int:
 
 
 def read_loads(scene: Scene, tote: MeasuredTote, per_cell: int) -> MeasuredLoads | None:
-    """Return the loads on what lies in the tote; None if no box says what it weighs or bears.
+    """Return the loads on what lies in the tote; None if no box says what it weighs or bears,
+    or if there are only masses, and no record.
 
     Args:
         scene: in metres, with the record of the tote.
@@ -25,14 +26,13 @@ def read_loads(scene: Scene, tote: MeasuredTote, per_cell: int) -> MeasuredLoads
         per_cell: patches of its map along the side of a cell.
 
     Raises:
-        DepthMapError: for items of which some bear a limited load only, without that record.
+        DepthMapError: without that record, if some item bears a limited load only.
     """
     items = () if isinstance(scene.items, BinMap) else scene.items
     placed, side = scene.placed, cast(float, scene.cell_size)
     boxes = (*items, *(placed or ()))
-    if all(box.max_load is None and not box.mass for box in boxes):
-        return None
-    if placed is None and all(box.max_load is None for box in boxes):
+    has_limits = any(box.max_load is not None for box in boxes)
+    if not has_limits and (placed is None or not any(box.mass for box in boxes)):
         return None
     if placed is None:
         raise DepthMapError(

@@ -138,16 +138,10 @@ def read_planner(name: str | Mapping[str, Any] | None) -> str | Mapping[str, Any
     Raises:
         ValueError: for a file that cannot be read, or holds no settings.
     """
-    from yaml import YAMLError, safe_load
-
     if not isinstance(name, str) or not name.endswith((".yaml", ".yml")):
         return name
     expected = "expected settings with the key _target_, such as conf/planner/beam.yaml."
-    with reworded(
-        (OSError, ValueError, YAMLError),
-        lambda error: ValueError(f"--planner={name}: {first_line(error)}; {expected}"),
-    ):
-        content = safe_load(read_text(name, MAX_PART))
+    content = _read_yaml("planner", name, name, expected)
     refuse_if(not isinstance(content, dict) or "_target_" not in content, f"--planner={name}: {expected}")
     return content
 
@@ -162,17 +156,22 @@ def read_part(key: str, name: str):
     Raises:
         ValueError: naming the file, or the key in it.
     """
-    from yaml import YAMLError, safe_load
-
     from pickplace.config.composition import conf_dir
     from pickplace.config.registry import build
 
     options = {path.stem: path for path in sorted((conf_dir() / key).glob("*.yaml"))}
     expected = f"expected {', '.join(options)}, or a file with the key {key}, such as conf/{key}/{[*options][0]}.yaml."
-    with reworded(
-        (OSError, ValueError, YAMLError),
-        lambda error: ValueError(f"--{key}={name}: {first_line(error)}; {expected}"),
-    ):
-        content = safe_load(read_text(options.get(name, name), MAX_PART))
+    content = _read_yaml(key, name, options.get(name, name), expected)
     refuse_if(not isinstance(content, dict) or [*content] != [key], f"--{key}={name}: {expected}")
     return build("env", content)[key]
+
+
+def _read_yaml(option: str, name: str, path, expected: str) -> Any:
+    """Return the content of a file that the value ``name`` of an option means; ``expected`` ends its errors."""
+    from yaml import YAMLError, safe_load  # here, so that --help is fast
+
+    with reworded(
+        (OSError, ValueError, YAMLError),
+        lambda error: ValueError(f"--{option}={name}: {first_line(error)}; {expected}"),
+    ):
+        return safe_load(read_text(path, MAX_PART))
