@@ -5,11 +5,14 @@ import math
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pickplace import CellSpec
 from pickplace.policies.base import MASKED
 from pickplace.policies.critics import Conv4d
 from pickplace.policies.depth import clip_depth
+from pickplace.policies.fcn4d import network as conv4d
 from pickplace.policies.fcn4d import policy as fcn4d
 from pickplace.policies.fcn4d.network import Conv4dNet, clip_and_pad
 from pickplace.policies.fcn4d.policy import Fcn4d, Typical
@@ -109,7 +112,30 @@ def test_chunks_change_nothing(chunk_bytes):
     whole, pieces = network(), network(chunk_bytes=chunk_bytes)
     maps = depths((4, 3), (5, 6), batch=7)
     with torch.no_grad():
-        assert_close(pieces(*maps), whole(*maps))
+        assert_close(pieces._logits_by_chunks(*pieces._prepare(*maps)).flatten(1), whole(*maps))
+
+
+sides = st.integers(1, 14)
+
+
+@settings(max_examples=40, deadline=None)
+@given(bin_size=st.tuples(sides, sides), tote_size=st.tuples(sides, sides), batch=st.integers(1, 5), data=st.data())
+def test_tiles_equal_the_naive_4d_convolution(bin_size, tote_size, batch, data):
+    """By minimal filtering, which acts on a CPU; in float64, so that an error is no rounding."""
+    model = network(2, 3).double()
+    maps = depths(bin_size, tote_size, batch, torch.float64)
+    with torch.no_grad(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(conv4d, "FEW_TILES", 1)
+        patch.setattr(conv4d, "TILE_BYTES", data.draw(st.sampled_from((1, 2**15, 2**23))))
+        assert model._by_tiles(*model._prepare(*maps))
+        assert_close(model(*maps), naive(model, *maps), 1e-10)
+
+
+def test_rounding_of_tiles_is_small():
+    model, maps = network(4, 64), depths((5, 5), (6, 6), batch=8)
+    with torch.no_grad():
+        got, want = model(*maps), naive(model.double(), *(m.double() for m in maps))
+    assert (got - want).abs().max() < 2e-5 * want.abs().max()
 
 
 def test_given_pick_cells_select_their_part():
