@@ -1,4 +1,4 @@
-"""The second 4D convolution by minimal filtering, with a seventh of the multiplications.
+"""The second 4D convolution by minimal filtering, with a tenth of the multiplications.
 
 Minimal filtering (Winograd, Arithmetic Complexity of Computations, 1980; Lavin and Gray, Fast Algorithms for
 Convolutional Neural Networks, 2016) computes ``m`` outputs of a kernel with three taps by ``m + 2`` multiplications in
