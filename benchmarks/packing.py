@@ -131,13 +131,13 @@ def leaderboard(lines: dict[str, dict]) -> list[str]:
 
 
 def gripper_table(lines: dict[str, dict]) -> list[str]:
-    """Return the table with and without a gripper."""
-    made = ["| `benchmark=` | effector | rotations | learned | learned, picks first | DBL | DBL, picks first |"]
+    """Return the table of ``gopt_rs`` with and without a gripper."""
+    made = ["| `gripper=` | learned | learned, picks first | DBL | DBL, picks first |"]
     made[0] += " `settle` keeps, %: learned | `settle` keeps, %: DBL |"
-    made.append("|---" * 9 + "|")
-    for where in dict.fromkeys(row[:3] for row in rows() if row.benchmark not in ("gopt_50", "gopt_100")):
-        found = {planner: lines.get(Row(*where, planner).name) for planner in PLANNERS}
-        cells = [f"`{where[0]}`", f"`{where[1]}`", str(where[2]), *map(interval, found.values())]
+    made.append("|---" * 7 + "|")
+    for effector in ("point", *PLATES):
+        found = {planner: lines.get(Row("gopt_rs", effector, 2, planner).name) for planner in PLANNERS}
+        cells = [f"`{effector}`", *map(interval, found.values())]
         cells += [interval(found[planner], "kept") for planner in ("learned", "joint_dbl")]
         made.append(f"| {' | '.join(cells)} |")
     return made
