@@ -141,7 +141,7 @@ def measure() -> list[dict]:
 
 
 def less(seeds: list[list[float]], others: list[list[float]]) -> dict:
-    """Return the difference of two methods in the same episodes, seed by seed; all seeds meet the only one of another."""
+    """Return the difference of two methods in the same episodes, seed by seed; an only seed meets all of the other."""
     others = others * len(seeds) if len(others) == 1 else others
     return over_seeds([[a - b for a, b in zip(*pair, strict=False)] for pair in zip(seeds, others, strict=False)])
 
