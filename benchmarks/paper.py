@@ -179,11 +179,12 @@ def draw_bars(axes, rows: list[dict], methods: tuple[str, ...], totes: tuple[str
                 bars.append((place + (order - (len(methods) - 1) / 2) * width, row))
         if bars:
             xs, means = [x for x, _ in bars], [row["mean"] for _, row in bars]
-            errors = [[row["mean"] - row["low"] for _, row in bars], [row["high"] - row["mean"] for _, row in bars]]
+            low, high = [row["mean"] - row["low"] for _, row in bars], [row["high"] - row["mean"] for _, row in bars]
             style = {"color": STYLE[method], "ecolor": "#37474f", "error_kw": {"elinewidth": 1}, "capsize": 2}
-            axes.bar(xs, means, width * 0.92, yerr=errors, label=LABELS[method], **style)
+            drawn = axes.bar(xs, means, width * 0.92, yerr=[low, high], label=LABELS[method], **style)
+            axes.bar_label(drawn, fmt="%.2f", fontsize=7, padding=2)
     axes.set_xticks(range(len(totes)), totes)
-    axes.set_ylim(0, 1)
+    axes.set_ylim(0, 1.1)
     axes.set_xlabel("tote")
 
 
