@@ -71,7 +71,7 @@ class MinibatchDescent(Algorithm):
     def use_parameters(self, parameters: Iterable[torch.nn.Parameter]) -> None:
         """Make the optimizer of these parameters."""
         self.parameters = [*parameters]
-        self.optimizer = torch.optim.Adam(self.parameters, lr=self.lr, eps=1e-5)
+        self.optimizer = torch.optim.Adam(self.parameters, lr=self.lr, eps=1e-5, fused=True)
 
     def descend(self, data: TensorDictBase, at: At, objective: Objective) -> dict[str, float]:
         """Minimise an objective for ``epochs`` epochs of shuffled minibatches over frames ``[B]``.

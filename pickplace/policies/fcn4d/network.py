@@ -31,7 +31,7 @@ from pickplace.policies.fcn4d.winograd import SumConvolution, tile_count
 
 BIN_PADDING, TOTE_PADDING = -1.0, 0.0
 MAX_DEPTH = 10_000  # height units; deeper than any tote
-PAIRS_AT_ONCE = {"cpu": 512, "cuda": 65_536}  # a CPU's caches hold the hidden activations of so many
+PAIRS_AT_ONCE = {"cpu": 128, "cuda": 65_536}  # whose hidden activations stay in a CPU's caches
 FEW_TILES = 4  # fewer are not worth a transformed kernel
 TILE_BYTES = 8 * 2**20  # of the tiles computed at a time, which stay in the caches
 PADDED_PAIRS = 64  # their number is rounded up to a multiple; see PADDED_ROWS in fcn_grasp/network.py
