@@ -409,6 +409,22 @@ def test_quickstart_notebook(monkeypatch, no_report, tmp_path):
     names["plt"].close(names["figure"])
 
 
+def test_robot_notebook(monkeypatch):
+    """The committed outputs are there, and the cells run from top to bottom."""
+    notebook = nbformat.read(EXAMPLES / "robot.ipynb", as_version=4)
+    shown = [output.get("data", {}) for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert sum("image/png" in data for data in shown) == 3
+    pytest.importorskip("mujoco")
+    code = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code")
+    assert code.count("range(1, 9)") == 1
+    names = {}
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    monkeypatch.setattr("matplotlib.pyplot.show", lambda: None)
+    exec(compile(code.replace("range(1, 9)", "range(1, 3)"), "robot.ipynb", "exec"), names)
+    assert names["plan"].status == "ok" and len(names["placed"]) == 2
+    names["plt"].close("all")
+
+
 @pytest.mark.slow
 def test_quickstart_notebook_in_jupyter(tmp_path):
     """The notebook runs unchanged in Jupyter, and shows its results."""
