@@ -10,11 +10,19 @@ import time
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageChops
 from selenium import webdriver
 
-WIDTH, HEIGHT, RATE = 1280, 760, 12  # of the window, pixels; pictures a second
-STEP = 0.045  # of a move between two pictures
+WIDTH, HEIGHT, RATE = 1280, 900, 12  # of the window, pixels; pictures a second
+SIDE = 720  # width of the film, pixels
+STEP = 0.06  # of a move between two pictures
+HOLD = 8  # pictures before a move, in which the heat map can be read
+
+
+def slowly(first, last):
+    """Return the moments of some moves, each after a look at what the policy thinks of it."""
+    return [moment for move in range(first, last) for moment in [move] * HOLD + [*np.arange(move, move + 1, STEP)]]
+
 
 options = webdriver.ChromeOptions()
 for word in ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"):
@@ -28,25 +36,27 @@ moves = browser.execute_script("return replay.state().moves")
 browser.execute_script(
     "document.body.style.display = 'block'; document.getElementById('stage').style.height = '100vh';"
     "for (const id of ['panel', 'controls']) document.getElementById(id).style.display = 'none';"
-    "document.getElementById('heat').checked = false; document.getElementById('seek').step = 'any'"
+    "document.getElementById('seek').step = 'any'"
 )
 time.sleep(1)
 pictures = []
 for moment in [
-    *np.arange(0, 3, STEP),
-    *np.linspace(3, moves - 3, 60),
-    *np.arange(moves - 3, moves, STEP),
+    *slowly(0, 3),
+    *np.linspace(3, moves - 2, 50),
+    *slowly(moves - 2, moves),
     moves,
 ]:
     browser.execute_script(
         "const s = document.getElementById('seek'); s.value = arguments[0]; s.oninput()", float(moment)
     )
     time.sleep(0.05)
-    image = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
-    pictures.append(
-        image.resize((WIDTH // 2, image.height * WIDTH // 2 // image.width)).quantize(96, dither=Image.Dither.NONE)
-    )
+    pictures.append(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB"))
 browser.quit()
+# What any picture shows, and a margin.
+boxes = np.array([ImageChops.difference(p, Image.new("RGB", p.size, p.getpixel((2, 2)))).getbbox() for p in pictures])
+left, top, right, bottom = *(boxes[:, :2].min(0) - 20).clip(0), *(boxes[:, 2:].max(0) + 20).clip(0, pictures[0].size)
+size = SIDE, round(SIDE * (bottom - top) / (right - left))
+pictures = [p.crop((left, top, right, bottom)).resize(size).quantize(64, dither=Image.Dither.NONE) for p in pictures]
 times = [1000 // RATE] * (len(pictures) - 1) + [3000]
 pictures[0].save(
     Path(__file__).with_name("executed.gif"), save_all=True, append_images=pictures[1:], duration=times, loop=0
