@@ -8,6 +8,12 @@ from pickplace.rules.cell import CellSpec
 from pickplace.views.figures import COLOURS, INK, WALL, figure_of
 from pickplace.views.recording import PlacedItem, Recording
 
+#: ColorBrewer's diverging scheme "Spectral"; matplotlib has it, but a page without figures need not import that.
+SPECTRUM = (
+    "#9e0142", "#d53e4f", "#f46d43", "#fdae61", "#fee08b", "#ffffbf", "#e6f598", "#abdda4", "#66c2a5", "#3288bd",
+    "#5e4fa2",
+)  # fmt: skip
+
 #: Size of an item ``(w, d, h)`` with ``w <= d``, so that it does not depend on how the item is turned.
 Kind = tuple[int, int, int]
 
@@ -54,11 +60,13 @@ def kind_of(item: Sequence[int]) -> Kind:
 
 def item_colours(items: Iterable[Sequence[int]]) -> dict[Kind, str]:
     """Return a colour for each kind of items ``(..., w, d, h)``, the small ones first; many kinds share a spectrum."""
-    from matplotlib import colormaps, colors
-
     kinds = sorted(set(map(kind_of, items)), key=lambda kind: (np.prod(kind), kind))
-    spectrum = colormaps["Spectral"](np.linspace(0, 1, len(kinds)))
-    return dict(zip(kinds, COLOURS if len(kinds) <= len(COLOURS) else map(colors.to_hex, spectrum), strict=False))
+    if len(kinds) <= len(COLOURS):
+        return dict(zip(kinds, COLOURS, strict=False))
+    stops = np.array([[*bytes.fromhex(colour[1:])] for colour in SPECTRUM])
+    at, places = np.linspace(0, len(stops) - 1, len(kinds)), np.arange(len(stops))
+    shades = np.stack([np.interp(at, places, channel) for channel in stops.T], 1).round().astype(np.uint8)
+    return {kind: f"#{shade.tobytes().hex()}" for kind, shade in zip(kinds, shades, strict=True)}
 
 
 #: Faces of a unit cube that the viewer sees: outward normal, share of the light, corners as a cycle.
