@@ -126,7 +126,7 @@ def test_the_picture_in_3d_shows_items_that_hide_one_another_in_a_circle():
     """Each hides a part of the next one, so that in no order of whole items the nearest is drawn last."""
     seen = [(0, 0, 1, 3, 1, 1), (1, 0, 0, 1, 3, 1), (0, 1, 0, 1, 1, 3)]  # with y turned around
     items = [PlacedItem(x, 3 - y - d, z, w, d, h) for x, y, z, w, d, h in seen]
-    assert count_lines_through_several(items, (3, 3, 3), 1, np.random.default_rng(0)) > 20
+    assert count_lines_through_several(items, (3, 3, 3), 1, np.random.default_rng(0)) > 10
 
 
 def test_the_picture_takes_no_longer_on_a_finer_grid():
