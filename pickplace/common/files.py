@@ -41,8 +41,16 @@ def read_file(path, most: int = MAX_BYTES, links: bool = True, empty: bool = Tru
 
 def read_text(path, most: int = MAX_BYTES, encoding: str = "utf-8", empty: bool = True) -> str:
     """Return the text of a regular file; arguments and errors as of :func:`read_file`."""
-    with reworded(UnicodeDecodeError, lambda error: ValueError(f"{path}: {error}; expected a text in UTF-8.")):
+    with reworded(
+        UnicodeDecodeError, lambda error: ValueError(f"{path}, {_bad_byte(error)}; expected a text in UTF-8.")
+    ):
         return read_file(path, most, empty=empty).decode(encoding)
+
+
+def _bad_byte(error: UnicodeDecodeError) -> str:
+    """Return the line and the value of a byte that is not UTF-8."""
+    line = error.object[: error.start].count(b"\n") + 1
+    return f"line {line}: got the byte 0x{error.object[error.start]:02x}"
 
 
 def read_table(key: str, path, *headers: str) -> tuple[str, list[tuple[int, list[str]]]]:

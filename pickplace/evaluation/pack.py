@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from pickplace.common.validate import refuse_any, refuse_if, reworded
 from pickplace.config.registry import find
@@ -15,12 +17,17 @@ from pickplace.planners.base import MapPlanner
 from pickplace.rules.cell import MAX_SIDE, CellSpec
 from pickplace.rules.gripper.rules import Overlap
 from pickplace.rules.item import NO_LIMIT, Item
-from pickplace.rules.masks import footprint_mask, placing_maps
+from pickplace.rules.maps import NEVER
+from pickplace.rules.masks import placing_maps
 from pickplace.rules.pile import Pile
 from pickplace.rules.state import EMPTY, Failure, State, surface_from
 from pickplace.rules.step import apply
 from pickplace.rules.support.rules import RoundedUp
 from pickplace.views.recording import Move, Recording, record_moves
+
+Numbered: TypeAlias = list[tuple[int, OrderItem]]  # items with their numbers in the order
+Faces: TypeAlias = Sequence[tuple[str, str]]  # the orientations of each face, as it lies and turned by 90 degrees
+Variant: TypeAlias = tuple[tuple[str, str], list[int]]  # an item on one of its faces, as a row of a table of items
 
 LEAST_MARGIN = 20.0  # of an item's centre from the edge of what carries it, mm: piles are high
 
@@ -133,11 +140,10 @@ class OrderPacker:
         planner, left = self._make(cell), list(enumerate(items, 1))
         containers: list[PackedContainer] = []
         while left:
-            tried = []
-            for sequence in [left] if keep_sequence else _sequences(left):
-                tried.append(self._fill(cell, planner, sequence, len(containers), self._faces))
-                if len(self._faces) > 1:  # what is tipped may stand in the way of more
-                    tried.append(self._fill(cell, planner, sequence, len(containers), self._faces[:1]))
+            # What is tipped may stand in the way of more.
+            faces = [self._faces, self._faces[:1]] if len(self._faces) > 1 else [self._faces]
+            tries = [*product([left] if keep_sequence else _sequences(left), faces)]
+            tried = self._fill(cell, planner, tries, len(containers))
             # The most items, of these the greatest volume, of these the lowest pile.
             best, left = min(tried, key=lambda each: (len(each[1]), -each[0].occupancy, each[0].top))
             refuse_if(
@@ -151,7 +157,7 @@ class OrderPacker:
         """Refuse an item that fits into no container, with a ``ValueError`` that names its place in the file."""
         refuse_any((item for item in items if not self._variants(item, self._faces)), self._misfit)
 
-    def _variants(self, item: OrderItem, faces: Sequence[tuple[str, str]]) -> list[tuple[tuple[str, str], list[int]]]:
+    def _variants(self, item: OrderItem, faces: Faces) -> list[Variant]:
         """Return the faces that an item may lie on in the container; and with it, as it then lies in the bin, its sides
         in cells and millimetres, rounded up, and the bit mask of its turns.
 
@@ -159,7 +165,7 @@ class OrderPacker:
             faces: the orientations of each face, as it lies and turned by 90 degrees.
         """
         wide, deep = (side // self.cell_mm for side in self.container[:2])
-        variants: list[tuple[tuple[str, str], list[int]]] = []
+        variants: list[Variant] = []
         known: set[tuple[float, float, float]] = set()
         for face in faces:
             w, d = (max(1, math.ceil(side / self.cell_mm - 1e-6)) for side in _oriented(item, face[0])[:2])
@@ -195,47 +201,87 @@ class OrderPacker:
         )
 
     def _fill(
-        self, cell: CellSpec, planner: MapPlanner, sequence: Sequence[tuple[int, OrderItem]], number: int,
-        faces: Sequence[tuple[str, str]],
-    ) -> tuple[PackedContainer, list[tuple[int, OrderItem]]]:  # fmt: skip
-        """Return an empty container after items were put down one by one, and those that found no place.
+        self, cell: CellSpec, planner: MapPlanner, tries: Sequence[tuple[Numbered, Faces]], number: int
+    ) -> list[tuple[PackedContainer, Numbered]]:
+        """Return for each try an empty container after items were put down one by one, and those that found no place.
 
-        An item lies in the bin on each of its faces at once, and the planner takes one of these.
+        An item lies in the bin on each of its faces at once, and the planner takes one of these. The tries are problems
+        of one batch: that takes little more time than one of them.
+
+        Args:
+            tries: the same items in a sequence, and the orientations of the faces on which they may lie.
         """
-        recording, packed, left = Recording(number, cell.tote_size[2]), [], []
-        surface = torch.full((1, *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
-        tops = np.zeros(cell.tote_size[:2])  # of the surface without rounding, mm
-        height = torch.tensor([cell.tote_size[2]])
-        pile = Pile.empty(1, cell.tote_size, cell.pile_room) if cell.handling else None
-        for place, item in sequence:
-            variants, step_x = self._variants(item, faces), cell.bin_size[0] // cell.bin_items
-            table = torch.zeros(1, cell.bin_items, len(Item._fields), dtype=torch.int64)
-            for row, (_, columns) in enumerate(variants):
-                table[0, row] = torch.tensor([row * step_x, 0, *columns])
-            state = State(surface, height, Item.from_table(table), pile=pile)
+        fills = [_Filling(Recording(number, cell.tote_size[2]), np.zeros(cell.tote_size[:2])) for _ in tries]
+        surface = torch.full((len(tries), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
+        height = torch.full((len(tries),), cell.tote_size[2])
+        pile = Pile.empty(len(tries), cell.tote_size, cell.pile_room) if cell.handling else None
+        for items in zip(*(sequence for sequence, _ in tries), strict=True):
+            variants = [self._variants(item, faces) for (_, item), (_, faces) in zip(items, tries, strict=True)]
+            state = State(surface, height, _in_bins(cell, variants), pile=pile)
             maps = placing_maps(cell, state)
-            if not footprint_mask(cell, maps).any():
-                left.append((place, item))
+            if (maps.top == NEVER).all():
+                for fill, each in zip(fills, items, strict=True):
+                    fill.left.append(each)
                 continue
-            action = planner.choose(cell, state, maps, {})
-            (move,), step = record_moves(cell, None, None, state, action), apply(cell, state, action)
-            recording.moves.append(_alone(move))
-            x, y, w, d = move.footprint
-            below, face = float(tops[x : x + w, y : y + d].max()), variants[int(step.taken)][0]
-            corner = x * self.cell_mm, y * self.cell_mm, round(below, 6)
-            packed.append(PackedItem(item, place, corner, face[move.rotation % 2]))
-            tops[x : x + w, y : y + d] = below + packed[-1].size[2]
+            step = apply(cell, state, action := planner.choose(cell, state, maps, {}))
             after, pile = state._replace(surface=step.surface), step.pile
             heights, bearing = after.heights, after.bearing
-            # A top is rounded up once, not with each item of its pile: so level tops are level within a millimetre.
-            heights[0, x : x + w, y : y + d] = math.ceil(below + packed[-1].size[2] - 1e-6)
-            for axis, count in enumerate((w, d)):
-                if packed[-1].size[axis] < count * self.cell_mm - 1e-6:  # it does not fill its last cells
-                    bearing[0, x : x + w, y : y + d].select(axis, count - 1).fill_(False)
+            for row, move in enumerate(record_moves(cell, None, None, state, action, step)):
+                if move.failure:
+                    fills[row].left.append(items[row])
+                    continue
+                face = variants[row][int(step.taken[row])][0]
+                self._put_down(fills[row], items[row], face[move.rotation % 2], move, heights[row], bearing[row])
             surface = surface_from(heights, bearing)
-        recording.ending = Failure.STUCK if left else Failure.NONE
-        recording.occupancy = sum(math.prod(each.size) for each in packed) / math.prod(self.container)
-        return PackedContainer(packed, recording), left
+        return [self._closed(fill) for fill in fills]
+
+    def _put_down(
+        self, fill: "_Filling", numbered: tuple[int, OrderItem], orientation: str, move: Move, heights: Tensor,
+        bearing: Tensor,
+    ) -> None:  # fmt: skip
+        """Add an item to a container, and change the height of its cells and which of them bear weight, in place.
+
+        Args:
+            numbered: the item with its number in the order.
+            heights: int32 ``[W_T, D_T]``, after the move.
+            bearing: bool ``[W_T, D_T]``.
+        """
+        (number, item), (x, y, w, d) = numbered, move.footprint
+        below = float(fill.tops[x : x + w, y : y + d].max())
+        packed = PackedItem(item, number, (x * self.cell_mm, y * self.cell_mm, round(below, 6)), orientation)
+        fill.recording.moves.append(_alone(move))
+        fill.items.append(packed)
+        fill.tops[x : x + w, y : y + d] = below + packed.size[2]
+        # A top is rounded up once, not with each item of its pile: so level tops are level within a millimetre.
+        heights[x : x + w, y : y + d] = math.ceil(below + packed.size[2] - 1e-6)
+        for axis, count in enumerate((w, d)):
+            if packed.size[axis] < count * self.cell_mm - 1e-6:  # it does not fill its last cells
+                bearing[x : x + w, y : y + d].select(axis, count - 1).fill_(False)
+
+    def _closed(self, fill: "_Filling") -> tuple[PackedContainer, Numbered]:
+        """Return a container that gets no more items, and those that found no place in it."""
+        fill.recording.ending = Failure.STUCK if fill.left else Failure.NONE
+        fill.recording.occupancy = sum(math.prod(each.size) for each in fill.items) / math.prod(self.container)
+        return PackedContainer(fill.items, fill.recording), fill.left
+
+
+@dataclass
+class _Filling:
+    """A container that is being filled."""
+
+    recording: Recording
+    tops: np.ndarray  # of what is in it, without rounding, mm, [W_T, D_T]
+    items: list[PackedItem] = field(default_factory=list)
+    left: Numbered = field(default_factory=list)  # those that found no place
+
+
+def _in_bins(cell: CellSpec, variants: Sequence[Sequence[Variant]]) -> Item:
+    """Return the items of bins ``[N, M]`` in which the variants of an item lie side by side along x."""
+    table = torch.zeros(len(variants), cell.bin_items, len(Item._fields), dtype=torch.int64)
+    for row, each in enumerate(variants):
+        for place, (_, columns) in enumerate(each):
+            table[row, place] = torch.tensor([place * (cell.bin_size[0] // cell.bin_items), 0, *columns])
+    return Item.from_table(table)
 
 
 def _oriented(item: OrderItem, orientation: str) -> tuple[float, float, float]:
@@ -252,7 +298,7 @@ def _alone(move: Move) -> Move:
     return replace(move, item=(0, 0, w, d, h), pick=(move.pick[0] - x, move.pick[1] - y), others=[])
 
 
-def _sequences(items: Sequence[tuple[int, OrderItem]]) -> list[list[tuple[int, OrderItem]]]:
+def _sequences(items: Numbered) -> list[Numbered]:
     """Return numbered items in each of :data:`SEQUENCES`."""
     found = []
     for rank in SEQUENCES:

@@ -104,17 +104,26 @@ class _Row(NamedTuple):
     header: tuple[str, ...]
     values: tuple
     header_place: str
+    decimal: str = "."  # what stands before decimals, beside a point
 
 
 class _Column(NamedTuple):
     key: str  # in the file
     unit: float  # of its values, in mm or g
+    decimal: str  # what stands before decimals, beside a point
+
+    def number(self, row: Mapping) -> float:
+        """Return the value in a row as a number, in the unit of the column; a ``ValueError`` if it is none."""
+        value = row[self.key]
+        refuse_if(isinstance(value, bool), "a bool is no number")
+        return float(value.replace(self.decimal, ".") if isinstance(value, str) else value)
 
 
 def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | None = None) -> list[Order]:
     """Return the orders of a file.
 
-    A CSV has a header and a line for each item, or for each article with its ``quantity``. Lines with the same
+    A CSV has a header and a line for each item, or for each article with its ``quantity``. Commas, semicolons or tabs
+    separate the columns; with semicolons or tabs, decimals may have a comma. Lines with the same
     ``order`` are one order; without that column the file is one. JSON is that of BED-BPP: for each order
     ``item_sequence``, its items by their number.
 
@@ -141,9 +150,9 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
     articles: dict[str, OrderItem] = {}
     columns: dict[tuple[str, ...], dict[str, _Column]] = {}
     total, targets = 0, dict[str, None]()
-    for place, header, values, header_place in rows:
+    for place, header, values, header_place, decimal in rows:
         if header not in columns:
-            columns[header] = _read_header(f"{path}, {header_place}", header, unit)
+            columns[header] = _read_header(f"{path}, {header_place}", header, unit, decimal)
         row = dict(zip(header, values, strict=True))
         item, order, quantity = _read_row(f"{path}, {place}", row, columns[header])
         known = articles.setdefault(item.id, item)
@@ -173,8 +182,9 @@ def _words(item: OrderItem) -> str:
 
 def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
     first = text.lstrip().partition("\n")[0]
+    separator = max(",;\t", key=first.count)
     with reworded(csv.Error, lambda error: ValueError(f"{path}: {error}; expected a CSV in UTF-8.")):
-        reader = csv.reader(io.StringIO(text, newline=""), delimiter=";" if ";" in first and "," not in first else ",")
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
         header: tuple[str, ...] = ()
         header_line = 0
         for row in reader:
@@ -182,12 +192,14 @@ def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
             if not any(fields):
                 continue
             if header:
+                count, place = len(fields), f"line {reader.line_num}"
+                hint = "; decimals need a point" if count > len(header) and separator == "," else ""
                 refuse_if(
-                    len(fields) != len(header),
-                    f"{path}, line {reader.line_num}: got {len(fields)} fields, expected {len(header)} as in the "
-                    "header.",
+                    count != len(header),
+                    f"{path}, {place}: got {count} field{'s' * (count != 1)}, expected {len(header)} as in the header"
+                    f"{hint}.",
                 )
-                yield _Row(f"line {reader.line_num}", header, fields, f"line {header_line}")
+                yield _Row(place, header, fields, f"line {header_line}", "." if separator == "," else ",")
             else:
                 header, header_line = fields, reader.line_num
 
@@ -215,7 +227,7 @@ def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
             yield _Row(place, tuple(entries), tuple(entries.values()), place)
 
 
-def _read_header(place: str, header: Sequence, unit: str) -> dict[str, _Column]:
+def _read_header(place: str, header: Sequence, unit: str, decimal: str) -> dict[str, _Column]:
     """Return the columns that a header names, by the names of :data:`NAMES`."""
     found: dict[str, tuple[str, str | None]] = {}
     for key in header:
@@ -245,7 +257,7 @@ def _read_header(place: str, header: Sequence, unit: str) -> dict[str, _Column]:
                 value not in units,
                 f"{place}: the column {excerpt(key)} is in {value}; expected {' or '.join(map(str, units))}.",
             )
-            columns[column] = _Column(key, units[value])
+            columns[column] = _Column(key, units[value], decimal)
     missing = [name for name in (*SIDES, "weight") if name not in columns]
     refuse_if(
         missing,
@@ -264,11 +276,12 @@ def _read_row(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[Or
     """Return the item of a row, the name of its order, and how many there are."""
 
     def read(name: str, most: float) -> float:
-        key, unit = columns[name]
+        key, unit, _ = columns[name]
         with suppress(TypeError, ValueError, OverflowError):
-            if 0 < (number := float(row[key])) * unit <= most and not isinstance(row[key], bool):
+            if 0 < (number := columns[name].number(row)) * unit <= most:
                 return number * unit
-        raise ValueError(f"{place}: {key}={excerpt(row[key])}: expected a number above 0, at most {most / unit:,g}.")
+        what = "a number with a decimal point" if "," in str(row[key]) else "a number"
+        raise ValueError(f"{place}: {key}={excerpt(row[key])}: expected {what} above 0, at most {most / unit:,g}.")
 
     length, width, height = (read(name, MAX_LENGTH) for name in SIDES)
     grams = max(1, math.ceil(read("weight", MAX_GRAMS) - 1e-6))
@@ -283,15 +296,15 @@ def _read_max_load(place: str, row: Mapping, columns: dict[str, _Column]) -> int
     """Return the greatest mass on top of the item of a row, g."""
     loads = [NO_LIMIT]
     if "max_load" in columns and (value := row[columns["max_load"].key]) not in ("", None):
-        key, unit = columns["max_load"]
-        good = False
+        key, unit, _ = columns["max_load"]
+        load = math.nan
         with suppress(TypeError, ValueError, OverflowError):
-            good = 0 <= float(value) * unit <= MAX_LOAD and not isinstance(value, bool)
+            load = columns["max_load"].number(row) * unit
         refuse_if(
-            not good,
+            not 0 <= load <= MAX_LOAD,
             f"{place}: {key}={excerpt(value)}: expected a number from 0 to {int(MAX_LOAD / unit):,}, or nothing.",
         )
-        loads.append(math.floor(float(value) * unit + 1e-6))
+        loads.append(math.floor(load + 1e-6))
     for column, forbids in (("stackable", False), ("nothing_on_top", True)):
         if column in columns and (value := row[columns[column].key]) not in ("", None):
             answer = YES_NO.get(str(value).strip().lower())

@@ -6,72 +6,85 @@ the least x and y.
 """
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from pickplace.common.validate import check_bytes, flag, one_of
+from pickplace.common.validate import flag, one_of
 from pickplace.planners.base import ITEM_RULES, MapPlanner, first_choice, restrict_items
 from pickplace.planners.heuristics import dbl_order
 from pickplace.rules.cell import MAX_SIDE, CellSpec
+from pickplace.rules.grasps import footprint_index
 from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, first_action_reaching
 from pickplace.rules.state import State
 
 LAST = FAR**2  # order of a footprint at the origin of no space
-MAX_RECTANGLES = 2**23  # that are looked at together, over all problems
+CELLS_AT_ONCE = 2**18  # that are looked at together, over all floors
 
 
-def all_rectangles(wide: int, deep: int, device) -> list[Tensor]:
-    """Return all rectangles of a grid: ``x0``, ``y0``, ``x1`` and ``y1``, int64 ``[S]`` each.
+class Spaces(NamedTuple):
+    """Maximal empty spaces, from ``x0`` to before ``x1``, and the same along y; int64 ``[S]`` each."""
 
-    They reach from ``x0`` to before ``x1``, and the same along y.
-
-    Raises:
-        ValueError: if the memory does not hold them.
-    """
-    count = wide * (wide + 1) // 2 * (deep * (deep + 1) // 2)
-    check_bytes(f"tote_size: {count:,} rectangles of cells", 100 * count, device)
-    along_x, along_y = (torch.combinations(torch.arange(side + 1, device=device)) for side in (wide, deep))
-    x, y = along_x.repeat_interleave(len(along_y), 0), along_y.repeat(len(along_x), 1)
-    return [x[:, 0], y[:, 0], x[:, 1], y[:, 1]]
+    row: Tensor  # the number of the tote
+    floor: Tensor  # the height
+    x0: Tensor
+    y0: Tensor
+    x1: Tensor
+    y1: Tensor
 
 
-def empty_spaces(heights: Tensor, rectangles: list[Tensor], level_step: int = 0) -> Iterator[tuple[int, Tensor]]:
-    """Yield each height in the totes, and which rectangles are maximal empty spaces with their floor there.
+def empty_spaces(heights: Tensor, level_step: int = 0) -> Spaces:
+    """Return the maximal empty spaces of totes; some come up more than once.
 
     Args:
         heights: int32 ``[N, W_T, D_T]``.
-        rectangles: see :func:`all_rectangles`.
         level_step: by how much the heights of a level surface may differ.
-
-    Yields:
-        the height, and bool ``[S, N]``, batch last
     """
-    x0, y0, x1, y1 = rectangles
-    area = ((x1 - x0) * (y1 - y0))[:, None]
-    one_further = [(x0 - 1, y0, x1, y1), (x0, y0 - 1, x1, y1), (x0, y0, x1 + 1, y1), (x0, y0, x1, y1 + 1)]
-    for level in heights.unique().tolist():
-        higher = _counter(heights > level + level_step)
-        lower = _counter(heights < level, outside=0)
-        space = (higher(*rectangles) == 0) & (lower(*rectangles) < area)
-        for grown in one_further:
-            space &= higher(*grown) > 0
-        yield level, space
+    wide, deep = heights.shape[1:]
+    levels = heights.flatten(1).sort(1).values
+    row, place = F.pad(levels.diff(dim=1) > 0, (1, 0), value=True).nonzero(as_tuple=True)  # each height of a tote once
+    at_once = max(1, CELLS_AT_ONCE // (wide * deep))
+    parts = zip(row.split(at_once), levels[row, place].split(at_once), strict=True)
+    found = [_spaces_on(heights, *part, level_step) for part in parts]
+    return Spaces(*(torch.cat(each) for each in zip(*found, strict=True)))
 
 
-def _counter(cells: Tensor, outside: int = 1):
-    """Return a function that counts marked cells ``[N, W, D]`` in rectangles, ``[S, N]``; ``outside`` beyond walls."""
-    padded = torch.nn.functional.pad(cells.int(), (1, 1, 1, 1), value=outside)
-    table = torch.nn.functional.pad(padded.cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32), (1, 0, 1, 0))
-    deep, table = table.shape[2], table.flatten(1).t().contiguous()
+def _spaces_on(heights: Tensor, row: Tensor, floor: Tensor, level_step: int) -> Spaces:
+    """Return the maximal empty spaces with given floors, ``[F]``, in the totes of given numbers.
 
-    def at(x: Tensor, y: Tensor) -> Tensor:
-        return table.index_select(0, (x + 1) * deep + y + 1)
+    Such a space is as deep as the run of free cells along y from some cell of its first row: no deeper rectangle there
+    is free. To both sides it goes to where a run is shorter. That leaves the side of least y to be looked at.
+    """
+    heights, level = heights[row], floor[:, None, None]
+    (wide, deep), y = heights.shape[1:], torch.arange(heights.shape[2], device=heights.device, dtype=torch.int32)
+    free = heights <= level + level_step  # [F, W_T, D_T]
+    run = torch.where(free, deep, y).flip(2).cummin(2).values.flip(2) - y
+    x = torch.arange(wide, device=heights.device)[:, None]
+    x0, x1 = x - _reach(run), x + 1 + _reach(run.flip(1)).flip(1)
+    before = F.pad(free[:, :, :-1], (1, 0))  # whether the cell before along y is free
+    closed = F.pad((~before).cumsum(1), (0, 0, 1, 0))
+    grows = closed.gather(1, x1) == closed.gather(1, x0)
+    number, x, y0 = (free & ~grows).nonzero(as_tuple=True)
+    x0, x1, y1 = x0[number, x, y0], x1[number, x, y0], y0 + run[number, x, y0]
+    filled = F.pad((heights >= level).cumsum(1).cumsum(2), (1, 0, 1, 0))  # counts of the cells as high as the floor
+    count = filled[number, x1, y1] - filled[number, x0, y1] - filled[number, x1, y0] + filled[number, x0, y0]
+    spaces = Spaces(row[number], floor[number].long(), x0, y0, x1, y1)
+    return Spaces(*(part[count > 0] for part in spaces))
 
-    return lambda x0, y0, x1, y1: at(x1, y1) - at(x0, y1) - at(x1, y0) + at(x0, y0)
+
+def _reach(run: Tensor) -> Tensor:
+    """Return over how many cells of less x, one after the other, runs are no shorter, int64 of the same shape."""
+    reach, going = torch.zeros_like(run, dtype=torch.int64), run > 0
+    for step in range(1, run.shape[1]):
+        going = going[:, 1:] & (run[:, :-step] >= run[:, step:])
+        if not going.any():
+            break
+        reach[:, step:] += going
+    return reach
 
 
 class SpacePlanner(MapPlanner):
@@ -98,12 +111,12 @@ class SpacePlanner(MapPlanner):
         self.dbl_fallback = flag("planner.dbl_fallback", dbl_fallback)
 
     @abstractmethod
-    def space_order(self, floor: int, left_x: Tensor, left_y: Tensor) -> Tensor | int:
-        """Return a number >= 0 by which the planner orders spaces, least first, int64 of the shape of ``left_x``.
+    def space_order(self, floor: Tensor, left_x: Tensor, left_y: Tensor) -> Tensor:
+        """Return a number >= 0 by which the planner orders spaces, least first, int64 that broadcasts to ``[S, M]``.
 
         Args:
-            floor: height of the spaces' floor.
-            left_x, left_y: cells along x and y that the item leaves free in each space.
+            floor: height of each space's floor, ``[S, 1]``.
+            left_x, left_y: cells along x and y that each item leaves free in each space, ``[S, M]``.
         """
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
@@ -122,23 +135,20 @@ class SpacePlanner(MapPlanner):
 
     def _least_order(self, cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:
         """Return the least order of a space at whose origin a footprint lies, int64 ``[N * M, Q, W_T, D_T]``."""
-        surface, tote_height, item = state.each_item()
-        heights = surface >> 1
-        x0, y0, x1, y1 = rectangles = all_rectangles(*cell.tote_size[:2], heights.device)
-        wide, deep, origin = (sides[:, None] for sides in (x1 - x0, y1 - y0, x0 * cell.tote_size[1] + y0))
-        order = torch.full((cell.parities, cell.num_places, len(heights)), LAST, device=origin.device)
-        for rows in torch.arange(len(heights), device=origin.device).split(max(1, MAX_RECTANGLES // len(origin))):
-            w_and_d, height = (item.w[rows], item.d[rows]), item.h[rows]
-            for floor, space in empty_spaces(heights[rows], rectangles, maps.level_step):
-                for parity in range(cell.parities):
-                    w, d = w_and_d[:: 1 - 2 * parity]
-                    left_x, left_y = wide - w, deep - d
-                    fits = (left_x >= 0) & (left_y >= 0) & (floor + height <= tote_height[rows])
-                    usable = space & fits if self.holds_item else space
-                    found = torch.where(usable, self.space_order(floor, left_x, left_y), LAST)
-                    at = origin.expand_as(found)
-                    order[parity, :, rows] = order[parity][:, rows].scatter_reduce(0, at, found, "amin")
-        return order.permute(2, 0, 1).unflatten(2, cell.tote_size[:2])
+        spaces, item, bins = empty_spaces(state.heights, maps.level_step), state.items.flatten(), maps.bin_items
+        order = torch.full((len(item.w), cell.parities, *cell.tote_size[:2]), LAST, device=item.w.device)
+        row, floor, x0, y0, x1, y1 = (part[:, None] for part in spaces)
+        number = row * bins + torch.arange(bins, device=row.device)  # of each item in the bin, [S, M]
+        low_enough = floor + item.h[number] <= state.tote_height[row]
+        for parity in range(cell.parities):
+            w, d = (side[number] for side in (item.w, item.d)[:: 1 - 2 * parity])
+            left_x, left_y = x1 - x0 - w, y1 - y0 - d
+            fits = (left_x >= 0) & (left_y >= 0) & low_enough
+            usable = fits if self.holds_item else torch.ones_like(fits)
+            found = torch.where(usable, self.space_order(floor, left_x, left_y), LAST)
+            at = footprint_index(cell.tote_size, number * cell.parities + parity, x0, y0)
+            order.view(-1).scatter_reduce_(0, at.flatten(), found.flatten(), "amin")
+        return order
 
 
 class BestFit(SpacePlanner):
@@ -147,7 +157,7 @@ class BestFit(SpacePlanner):
 
     name = "best_fit"
 
-    def space_order(self, floor: int, left_x: Tensor, left_y: Tensor) -> Tensor:
+    def space_order(self, floor: Tensor, left_x: Tensor, left_y: Tensor) -> Tensor:
         return floor * MAX_SIDE + torch.minimum(left_x, left_y)
 
 
@@ -158,5 +168,5 @@ class OnlineBPH(SpacePlanner):
 
     name, holds_item = "online_bph", False
 
-    def space_order(self, floor: int, left_x: Tensor, left_y: Tensor) -> int:
+    def space_order(self, floor: Tensor, left_x: Tensor, left_y: Tensor) -> Tensor:
         return floor

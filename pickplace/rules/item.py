@@ -1,16 +1,18 @@
 """Items in bins: their columns, and how an observation shows them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from pickplace.rules.maps import rectangle
 
+if TYPE_CHECKING:
+    from tensordict import TensorDictBase  # which takes longer to import than all of the rules
+
 #: An observation ``[N]``: a TensorDict, or a dict of its entries.
-Observation: TypeAlias = TensorDictBase | Mapping[str, Tensor]
+Observation: TypeAlias = "TensorDictBase | Mapping[str, Tensor]"
 
 ALL_TURNS = 0b1111  # a bit for each quarter turn
 NO_LIMIT = 2**31 - 1  # grams

@@ -5,6 +5,7 @@ Surfaces, see :func:`~pickplace.rules.state.surface_from`, are halved where heig
 
 from collections.abc import Iterator
 from functools import cached_property, lru_cache, reduce
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -112,6 +113,13 @@ class OnFootprints(Contact):
     @cached_property
     def under(self):  # type: ignore[override]
         return is_under(self.w, self.d, self.side)
+
+    def at_corners(self) -> Iterator[Tensor]:
+        wide, deep, batch = self.surface.shape
+        place = torch.arange(self.padded.numel(), device=self.z.device).view(self.padded.shape)[:wide, :deep]
+        along_x, along_y = ((size.clamp(1, self.side) - 1) * batch for size in (self.w, self.d))
+        for x, y in product((0 * along_x, along_x), (0 * along_y, along_y)):
+            yield self.padded.take((place + x * self.padded.shape[1] + y).expand_as(self.z))
 
     def ends(self) -> Iterator[Tensor]:
         """Yield as of :meth:`Contact.ends`.

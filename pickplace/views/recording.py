@@ -1,10 +1,9 @@
 """Recorded episodes, move by move."""
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from pickplace.rules.bin import remove_item
@@ -12,8 +11,11 @@ from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_action
 from pickplace.rules.item import Item
 from pickplace.rules.state import Failure, State
-from pickplace.rules.step import apply
+from pickplace.rules.step import Step, apply
 from pickplace.views.motion import Outcome
+
+if TYPE_CHECKING:
+    from tensordict import TensorDictBase  # its import takes a second, and packing an order needs none
 
 FULL = "The tote is full."
 
@@ -90,8 +92,9 @@ def items_in_bin(items: Item, row: int) -> list[InBin]:
 
 
 def record_moves(
-    cell: CellSpec, planner, observation: TensorDictBase | None, state: State, action: Tensor
-) -> list[Move]:
+    cell: CellSpec, planner, observation: "TensorDictBase | None", state: State, action: Tensor,
+    step: Step | None = None,
+) -> list[Move]:  # fmt: skip
     """Return the moves that actions make, one for each row.
 
     Args:
@@ -100,8 +103,9 @@ def record_moves(
         observation: what the planner saw, ``[N]``; it is needed for heat maps alone.
         state: the states before the moves.
         action: int64 ``[N]``.
+        step: what the actions do, if it is known.
     """
-    step = apply(cell, state, action)
+    step = apply(cell, state, action) if step is None else step
     x_bin, y_bin, x_tote, y_tote, rotation = (part.tolist() for part in split_action(cell, action))
     heat = planner.heat_map(observation) if hasattr(planner, "heat_map") else None
     if heat is not None:

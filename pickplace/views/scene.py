@@ -1,12 +1,19 @@
 """Drawing of a packed tote: boxes in isometric projection, and the height map from above."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
 from pickplace.rules.cell import CellSpec
 from pickplace.views.figures import COLOURS, INK, WALL, figure_of
 from pickplace.views.recording import PlacedItem, Recording
+
+#: ColorBrewer's diverging scheme "Spectral"; matplotlib has it, but a page without figures need not import that.
+SPECTRUM = (
+    "#9e0142", "#d53e4f", "#f46d43", "#fdae61", "#fee08b", "#ffffbf", "#e6f598", "#abdda4", "#66c2a5", "#3288bd",
+    "#5e4fa2",
+)  # fmt: skip
 
 #: Size of an item ``(w, d, h)`` with ``w <= d``, so that it does not depend on how the item is turned.
 Kind = tuple[int, int, int]
@@ -54,11 +61,13 @@ def kind_of(item: Sequence[int]) -> Kind:
 
 def item_colours(items: Iterable[Sequence[int]]) -> dict[Kind, str]:
     """Return a colour for each kind of items ``(..., w, d, h)``, the small ones first; many kinds share a spectrum."""
-    from matplotlib import colormaps, colors
-
     kinds = sorted(set(map(kind_of, items)), key=lambda kind: (np.prod(kind), kind))
-    spectrum = colormaps["Spectral"](np.linspace(0, 1, len(kinds)))
-    return dict(zip(kinds, COLOURS if len(kinds) <= len(COLOURS) else map(colors.to_hex, spectrum), strict=False))
+    if len(kinds) <= len(COLOURS):
+        return dict(zip(kinds, COLOURS, strict=False))
+    stops = np.array([[*bytes.fromhex(colour[1:])] for colour in SPECTRUM])
+    at, places = np.linspace(0, len(stops) - 1, len(kinds)), np.arange(len(stops))
+    shades = np.stack([np.interp(at, places, channel) for channel in stops.T], 1).round().astype(np.uint8)
+    return {kind: f"#{shade.tobytes().hex()}" for kind, shade in zip(kinds, shades, strict=True)}
 
 
 #: Faces of a unit cube that the viewer sees: outward normal, share of the light, corners as a cycle.
@@ -99,57 +108,78 @@ def draw_tote(axes, size: tuple[float, float, float]) -> None:
 
 
 def draw_items(axes, items: list[PlacedItem], colours: dict[Kind, str], size: tuple[int, ...], unit: float) -> None:
-    """Draw items in a tote of this size, in the projection of :func:`draw_tote`; ``unit`` is a height unit in cells.
-
-    They are drawn in columns of one cell by one cell. From the direction (1, 1, 1) a column can hide only those that
-    are farther along x + y, and lower parts of its own cell. So there is an order in which all of them are drawn right.
-    """
+    """Draw items in a tote of this size, in the projection of :func:`draw_tote`; ``unit`` is a height unit in cells."""
     from matplotlib import collections, colors
 
     wide, deep, _ = size
-    pen = (*colors.to_rgb(INK), 1.0), float(np.clip(10 / (wide + deep), 0.35, 1.1))  # colour and width
-    spans: dict[tuple[int, int], list[tuple[int, int]]] = {}  # cell -> heights that are filled; y is turned around
-    columns = []
-    for item in items:
-        x, y = item.x, deep - item.y - item.d
-        for i, j in np.ndindex(item.w, item.d):
-            spans.setdefault((x + i, y + j), []).append((item.z, item.z + item.h))
-            columns.append((x + i + y + j, item.z, (x + i, y + j), (i, j), item))
-
-    def is_covered(x: int, y: int, low: int, high: int) -> bool:
-        return sum(max(0, min(high, top) - max(low, z)) for z, top in spans.get((x, y), ())) == high - low
-
+    table = np.array(items)
+    table[:, 1] = deep - table[:, 1] - table[:, 4]  # y turned around, as the tote is
+    low, high = table[:, :3], table[:, :3] + table[:, 3:]
+    side = np.sqrt(table[:, 3] * table[:, 4]).mean() / (wide + deep)
+    pen = (*colors.to_rgb(INK), 1.0), float(np.clip(5 * side, 0.35, 1.1))  # colour and width
+    fills = [np.array(colors.to_rgb(colours[kind_of(item)])) for item in items]
+    seen = [[not _is_covered(low, high, number, axis) for axis in range(3)] for number in range(len(items))]
     drawn: list[tuple] = []  # polygon, fill, colour and width of its line
-    for _, low, cell, place, item in sorted(columns):
-        top = low + item.h
-        for (i, j, k), light, corners in FACES:
-            if is_covered(cell[0] + i, cell[1] + j, *((top, top + 1) if k else (low, top))):
+    for number, *ends in _back_to_front(np.hstack([np.arange(len(items))[:, None], low, high])):
+        for normal, light, corners in FACES:
+            axis = normal.index(1)
+            if not seen[number][axis] or ends[3 + axis] < high[number][axis]:  # a cut through the item
                 continue
-            heights = [unit * (top if c else low) for *_, c in corners]
-            points = [
-                _to_paper(cell[0] + a - z, cell[1] + b - z) for (a, b, _), z in zip(corners, heights, strict=True)
-            ]
-            fill = (*np.multiply(colors.to_rgb(colours[kind_of(item)]), light), 1.0)
-            drawn.append((points, fill, fill, 0.6))  # the line closes the seam between columns
+            places = [[ends[axis + 3 * end] for axis, end in enumerate(corner)] for corner in corners]
+            points = [_to_paper(x - z * unit, y - z * unit) for x, y, z in places]
+            fill = (*fills[number] * light, 1.0)
+            drawn.append((points, fill, fill, 0.6))  # the line closes the seam between parts of an item
             for start, end in ((0, 1), (1, 2), (2, 3), (3, 0)):
-                if _is_edge(place, corners[start], corners[end], item):
+                if _is_edge(places[start], places[end], low[number], high[number]):
                     drawn.append(([points[start], points[end]], (0.0, 0.0, 0.0, 0.0), *pen))
-    polygons, fills, lines, widths = zip(*drawn, strict=True)
+    polygons, faces, lines, widths = zip(*drawn, strict=True)
     axes.add_collection(
         collections.PolyCollection(
-            polygons, facecolors=fills, edgecolors=lines, linewidths=widths, capstyle="round", zorder=2
+            polygons, facecolors=faces, edgecolors=lines, linewidths=widths, capstyle="round", zorder=2
         )
     )
 
 
-def _is_edge(place, start, end, item: PlacedItem) -> bool:
-    """Return whether a side of a column's face, between two corners, is part of an edge of its item.
+def _back_to_front(parts: np.ndarray) -> Iterator[list[int]]:
+    """Yield boxes in an order in which none hides a later one from the direction (1, 1, 1); some are cut for it.
+
+    A plane between boxes splits them in those behind it and those before it, and so on with both. Where every such
+    plane passes a box, the one that passes the fewest cuts them.
 
     Args:
-        place: the column's cell in its item, along x and y.
+        parts: rows of a number and the least and the greatest x, y and z, ``[N, 7]``; boxes that are apart.
     """
-    fixed = [(axis, place[axis] + start[axis]) for axis in (0, 1) if start[axis] == end[axis]]
-    return all(at in (0, (item.w, item.d)[axis]) for axis, at in fixed)
+    waiting = [parts]
+    while waiting:
+        parts = waiting.pop()
+        if len(parts) == 1:
+            yield parts[0].tolist()
+            continue
+        planes = []
+        for axis in range(3):
+            low, high = parts[:, 1 + axis], parts[:, 4 + axis]
+            at = np.unique(low)
+            behind, before = (high <= at[:, None]).sum(1), (low >= at[:, None]).sum(1)
+            cut = len(parts) - behind - before
+            planes += [(c, abs(n - f), axis, a) for c, n, f, a in zip(cut, before, behind, at, strict=True) if n and f]
+        _, _, axis, at = min(planes)
+        low, high = parts[:, 1 + axis], parts[:, 4 + axis]
+        far, near = parts[low < at].copy(), parts[high > at].copy()
+        far[:, 4 + axis], near[:, 1 + axis] = np.minimum(far[:, 4 + axis], at), np.maximum(near[:, 1 + axis], at)
+        waiting += [near, far]
+
+
+def _is_covered(low: np.ndarray, high: np.ndarray, number: int, axis: int) -> bool:
+    """Return whether other boxes cover the far face of a box along an axis; their corners are ``[N, 3]``."""
+    others = [other for other in range(3) if other != axis]
+    touching = low[:, axis] == high[number, axis]
+    shared = np.minimum(high[touching], high[number]) - np.maximum(low[touching], low[number])
+    return shared[:, others].clip(0).prod(1).sum() == (high[number] - low[number])[others].prod()
+
+
+def _is_edge(start: list[int], end: list[int], low: np.ndarray, high: np.ndarray) -> bool:
+    """Return whether the line between two corners of a part's face is part of an edge of the item, and no cut."""
+    return all(at in (low[axis], high[axis]) for axis, at in enumerate(start) if at == end[axis])
 
 
 def _sides(size: tuple[int, ...], cell: CellSpec) -> str:
@@ -157,14 +187,14 @@ def _sides(size: tuple[int, ...], cell: CellSpec) -> str:
 
 
 def _draw_plan(axes, heights: np.ndarray, highest: np.ndarray, limit: int, cell: CellSpec) -> None:
-    """Draw a height map ``[W_T, D_T]`` from above, in one colour for each whole height up to ``limit``.
+    """Draw a height map ``[W_T, D_T]`` from above, in at most 256 colours up to ``limit``.
 
     Where the number of the ``highest`` item changes from one cell to the next, a line shows the items' sides.
     """
     from matplotlib import collections, colormaps, colors, ticker
 
-    colours = colors.ListedColormap(colormaps["YlGnBu"](np.linspace(0, 0.6, limit + 1)))
-    norm = colors.BoundaryNorm(np.arange(limit + 2) - 0.5, colours.N)
+    colours = colors.ListedColormap(colormaps["YlGnBu"](np.linspace(0, 0.6, min(limit + 1, 256))))
+    norm = colors.Normalize(-0.5, limit + 0.5)
     image = axes.imshow(heights.T, origin="lower", cmap=colours, norm=norm)
     if max(heights.shape) <= 12:
         for (x, y), height in np.ndenumerate(heights):
@@ -175,9 +205,8 @@ def _draw_plan(axes, heights: np.ndarray, highest: np.ndarray, limit: int, cell:
     sides += [((x - 0.5, y + 0.5), (x + 0.5, y + 0.5)) for x, y in np.argwhere(highest[:, 1:] != highest[:, :-1])]
     axes.add_collection(collections.LineCollection(sides, colors=INK, linewidths=2, capstyle="projecting"))
     axes.set(title="height map and items from above", xlabel="x (cells)", ylabel="y (cells)")
+    whole = partial(ticker.MaxNLocator, 12, integer=True, min_n_ticks=1)
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(ticker.MaxNLocator(12, integer=True, min_n_ticks=1))
+        axis.set_major_locator(whole())
     unit = "cells" if cell.height_unit == 1 else f"units of {cell.height_unit:g} cells"
-    axes.figure.colorbar(
-        image, ax=axes, label=f"height ({unit})", shrink=0.8, ticks=range(0, limit + 1, limit // 12 + 1)
-    )
+    axes.figure.colorbar(image, ax=axes, label=f"height ({unit})", shrink=0.8, ticks=whole())

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import random
 import sys
 from pathlib import Path
 
@@ -128,6 +129,40 @@ def test_what_bears_nothing_comes_last_if_that_packs_more():
     assert [packed.item.id for packed in one.items] == ["cube", "cube", "plate"]
     _, several = OrderPacker((200, 100, 130), CELL).pack(items, keep_sequence=True)
     assert len(several) == 2
+
+
+@settings(max_examples=6, deadline=None)
+@given(st.lists(SIDES, min_size=15, max_size=30), st.booleans())
+def test_the_first_container_is_the_best_of_the_sequences_one_by_one(sizes, tipping):
+    items = [OrderItem(str(n), *map(float, sides), 100, f"line {n}") for n, sides in enumerate(sizes)]
+    keys = (
+        lambda item: -item.length * item.width,
+        lambda item: -item.length * item.width * item.height,
+        lambda item: -item.height,
+    )
+    alone = []
+    for key in keys:
+        for tipped in {tipping, False}:
+            packer = OrderPacker(CONTAINER, CELL, tipping=tipped)
+            alone.append(packer.pack(sorted(items, key=key), keep_sequence=True)[1][0])
+    _, (together, *_) = OrderPacker(CONTAINER, CELL, tipping=tipping).pack(items)
+    best = min(alone, key=lambda each: (-len(each.items), -each.occupancy, each.top))
+    found, expected = (
+        [(packed.item.id, packed.corner, packed.orientation) for packed in each.items] for each in (together, best)
+    )
+    assert found == expected
+
+
+@pytest.mark.parametrize("planner", ["joint_dbl", "best_fit", "individual_heuristic"])
+def test_a_planner_that_finds_no_place_leaves_the_item(planner):
+    """individual_heuristic finds none in some containers where there is one."""
+    draw = random.Random("FalseFalseFalse")
+    items = [OrderItem(str(n), *(draw.uniform(40, 160) for _ in range(3)), 100, f"line {n}") for n in range(14)]
+    _, containers = OrderPacker((300, 240, 250), CELL, planner).pack(items)
+    assert sorted(packed.number for each in containers for packed in each.items) == [*range(1, 15)]
+    for each in containers:
+        assert all(is_carried(packed, each.items[:place]) for place, packed in enumerate(each.items))
+        assert all(overlap(a, b) < 1e-6 for place, a in enumerate(each.items) for b in each.items[:place])
 
 
 def test_tops_that_are_rounded_alike_are_not_level():

@@ -211,7 +211,7 @@ def test_ways_to_write_the_same_file(recorded, text):
         ("w,d,h,x\n1,1,1,1\n", "the header is 'w,d,h,x'"),
         ("1,1,1\n", "the header is '1,1,1'"),
         ("w,d,h\n", "no rows"),
-        (b"w,d,h\n1,1,\xff\n", "expected a text in UTF-8"),
+        (b"w,d,h\n1,1,\xff\n", "line 2: got the byte 0xff; expected a text in UTF-8"),
         ("w,d,h\n1,1,1\n1,x,1\n", "line 3: got '1,x,1'"),
         ("w,d,h\n1,1\n", "line 2: got '1,1', expected w,d,h as whole numbers"),
         ("w,d,h\n1,1,1\n\n1,1,1.5\n", "line 4: got '1,1,1.5'"),

@@ -161,6 +161,10 @@ def test_true_volumes_are_reported(tmp_path):
         ("l,w,h,kg\n1,2,3,nan\n", r"line 2: kg='nan': expected a number above 0"),
         ("l,w,h,kg\n\n1,2,99999,4\n", r"line 3: h='99999': expected a number above 0, at most 10,000\."),
         ("l,w,h,kg\n1,2,3\n", r"line 2: got 3 fields, expected 4 as in the header\."),
+        ("l,w,h,kg\n1,2,3,4,5\n", r"line 2: got 5 fields, expected 4 as in the header; decimals need a point\."),
+        ("l,w,h,kg\n1\n", r"line 2: got 1 field, expected 4 as in the header\."),
+        ('l,w,h,kg\n1,2,"3,5",4\n', r"line 2: h='3,5': expected a number with a decimal point above 0, at most 10,000"),
+        ("l;w;h;kg\n1;2;3;4.000,5\n", r"line 2: kg='4.000,5': expected a number with"),
         ("l,w,h,kg,qty\n1,2,3,4,1.5\n", r"line 2: 1.5 pieces; expected a whole number\."),
         ("l,w,h,weight/mm\n1,2,3,4\n", r"line 1: the column 'weight/mm' is in mm; expected g or kg\."),
         ("l,w,h,kg,max_load\n1,2,3,4,-1\n", r"line 2: max_load='-1': expected a number from 0 to 1,000,000, or"),
@@ -273,6 +277,15 @@ def test_quantities_and_semicolons(tmp_path):
     (order,) = read_orders(path, "cm")
     assert Counter(item.id for item in order.items) == {"a": 2, "b": 1}
     assert order.items[0][1:5] == (350.0, 203.0, 208.0, 1500) and order.items[2].grams == 1
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_decimal_commas_of_a_spreadsheet(tmp_path, separator):
+    """With a byte order mark, as some programs write; a comma in a name stays."""
+    lines = ["id;l/mm;w/mm;h/mm;kg;max_load;note, if any", "a,1;100,5;20;30.25;1,25;2,5;b, c"]
+    (path := tmp_path / "a.csv").write_text("\n".join(lines).replace(";", separator), encoding="utf-8-sig")
+    ((_, (item,)),) = read_orders(path)
+    assert item[:5] == ("a,1", 100.5, 20.0, 30.25, 1250) and item.max_load == 2500
 
 
 LIMITS = [

@@ -1,12 +1,16 @@
 """Planners of maximal empty spaces against a search over all rectangles, cell by cell."""
 
+import time
 from itertools import combinations, product
 
 import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from problems import SETTINGS, occupancies, random_states, results_by_hand, tie_by_hand
 
 from pickplace import PickPlaceEnv
-from pickplace.planners.spaces import BestFit, OnlineBPH
+from pickplace.planners.spaces import BestFit, OnlineBPH, empty_spaces
 
 
 def spaces_by_hand(heights):
@@ -73,7 +77,29 @@ def test_an_episode_may_end_where_no_corner_is_left():
         OnlineBPH(PickPlaceEnv(num_envs=1).cell, item="last")
 
 
-def test_memory_is_refused_before_it_is_taken():
+@settings(max_examples=60, deadline=None)
+@given(st.data(), st.integers(1, 6), st.integers(1, 6), st.integers(1, 3))
+def test_all_spaces_are_found(data, wide, deep, totes):
+    """Of several totes at once, which have other heights."""
+    row = st.lists(st.integers(0, 3), min_size=deep, max_size=deep)
+    heights = data.draw(st.lists(st.lists(row, min_size=wide, max_size=wide), min_size=totes, max_size=totes))
+    found = empty_spaces(torch.tensor(heights, dtype=torch.int32))
+    expected = {(n, *space) for n, each in enumerate(heights) for space in spaces_by_hand(each)}
+    assert {*zip(*(part.tolist() for part in found), strict=True)} == expected
+
+
+def test_a_surface_is_level_up_to_a_step():
+    """The cell of 7 is lower than the floor of 8 and the cell of 9 is as high; 10 is in the way."""
+    found = empty_spaces(torch.tensor([[[7, 8, 9, 10]]], dtype=torch.int32), level_step=1)
+    spaces = {*zip(*(part.tolist() for part in found), strict=True)}
+    assert spaces == {(0, 7, 0, 0, 1, 2), (0, 8, 0, 0, 1, 3), (0, 9, 0, 0, 1, 4), (0, 10, 0, 0, 1, 4)}
+
+
+def test_a_fine_grid_needs_neither_memory_nor_time():
+    """62,500 cells have 10**9 rectangles."""
     env = PickPlaceEnv(num_envs=1, tote_size=(250, 250, 2))
-    with pytest.raises(ValueError, match="tote_size: .* rectangles of cells"):
-        BestFit(env.cell).decide(env.reset())
+    observation = env.reset()
+    begin = time.process_time()
+    action = BestFit(env.cell).decide(observation)
+    assert env.step(observation.set("action", action))["next", "reward"].item() > 0
+    assert time.process_time() - begin < 20

@@ -84,18 +84,9 @@ def test_the_picture_in_3d_shows_items_where_they_lie(x, y):
     assert middle == pytest.approx(floor + [0, 0.5])
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("unit", [1, 0.4])
-def test_the_picture_in_3d_shows_the_nearest_item(seed, unit):
-    """On lines of sight through items that hang in the air or not, the last face drawn is the one that is seen."""
-    size, deep = (5, 4, 6), 4
-    draw, items, taken = np.random.default_rng(seed), [], np.zeros(size, dtype=bool)
-    for corner, sides in zip(draw.integers(0, size, (40, 3)), draw.integers(1, 4, (40, 3)), strict=True):
-        space = tuple(slice(c, c + s) for c, s in zip(corner, sides, strict=True))
-        if (corner + sides <= size).all() and not taken[space].any():
-            taken[space] = True
-            items.append(PlacedItem(*corner.tolist(), *sides.tolist()))
-    colours = item_colours(items)
+def count_lines_through_several(items, size, unit, draw):
+    """Check on lines of sight that the last face drawn is the nearest one; return how many pass several items."""
+    colours, deep = item_colours(items), size[1]
     cell = CellSpec(tote_size=size, height_unit=unit)
     drawn = draw_scene(recording_of(items, size), cell, colours).axes[0].collections[-1]
     faces = [(path, fill) for path, fill in zip(drawn.get_paths(), drawn.get_facecolors(), strict=True) if fill[3]]
@@ -114,7 +105,40 @@ def test_the_picture_in_3d_shows_the_nearest_item(seed, unit):
         if hits:
             met += len(hits) > 1
             assert shown[-1] == pytest.approx(max(hits, key=lambda hit: hit[0])[1])
-    assert met > 20 and len(items) > 5
+    return met
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("unit", [1, 0.4])
+def test_the_picture_in_3d_shows_the_nearest_item(seed, unit):
+    """Of items that hang in the air or not."""
+    size = (5, 4, 6)
+    draw, items, taken = np.random.default_rng(seed), [], np.zeros(size, dtype=bool)
+    for corner, sides in zip(draw.integers(0, size, (40, 3)), draw.integers(1, 4, (40, 3)), strict=True):
+        space = tuple(slice(c, c + s) for c, s in zip(corner, sides, strict=True))
+        if (corner + sides <= size).all() and not taken[space].any():
+            taken[space] = True
+            items.append(PlacedItem(*corner.tolist(), *sides.tolist()))
+    assert len(items) > 5 and count_lines_through_several(items, size, unit, draw) > 20
+
+
+def test_the_picture_in_3d_shows_items_that_hide_one_another_in_a_circle():
+    """Each hides a part of the next one, so that in no order of whole items the nearest is drawn last."""
+    seen = [(0, 0, 1, 3, 1, 1), (1, 0, 0, 1, 3, 1), (0, 1, 0, 1, 1, 3)]  # with y turned around
+    items = [PlacedItem(x, 3 - y - d, z, w, d, h) for x, y, z, w, d, h in seen]
+    assert count_lines_through_several(items, (3, 3, 3), 1, np.random.default_rng(0)) > 10
+
+
+def test_the_picture_takes_no_longer_on_a_finer_grid():
+    counts = []
+    for scale in (1, 25):
+        boxes = [(0, 0, 0, 2, 1, 2), (0, 1, 0, 1, 2, 1), (2, 0, 0, 1, 1, 1)]
+        boxes, size = [tuple(scale * side for side in box) for box in boxes], (4 * scale, 3 * scale, 20 * scale)
+        figure = draw_scene(recording_of(boxes, size), CellSpec(tote_size=size), item_colours(boxes))
+        bar = figure.axes[2].yaxis
+        counts.append(len(figure.axes[0].collections[-1].get_paths()))
+        assert len(bar.get_ticklocs()) < 20 and not len(bar.get_ticklocs(minor=True))
+    assert counts[0] == counts[1] < 60
 
 
 CURVES = {

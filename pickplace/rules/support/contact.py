@@ -5,7 +5,7 @@ The *supporting cells* are the cells under the footprint that are as high as the
 
 from collections.abc import Iterator
 from functools import cached_property
-from itertools import chain
+from itertools import chain, product
 from math import inf
 
 import torch
@@ -71,22 +71,21 @@ class Contact:
         """The supported share of the footprint, float64 of the shape of ``z``."""
         return self.count.double() / (self.w * self.d)
 
+    def at_corners(self) -> Iterator[Tensor]:
+        """Yield the surface of the cell in each of the footprint's four corners, int32 of the shape of ``z``."""
+        along_x, along_y = ((0 * size, size.clamp(1, self.side) - 1) for size in (self.w, self.d))
+        for x, y in product(along_x, along_y):
+            yield self.surfaces.gather(0, (x * self.side + y).expand_as(self.z)[None])[0]
+
     @property
     def corners(self) -> Tensor:
         """The number of the footprint's corners that are supported, 0 to 4; one cell may have several corners."""
-        corners = torch.zeros_like(self.z)
-        for x, ends in enumerate(self.ends()):
-            corners += (ends == self.d).sum(0, dtype=torch.int32) * ((self.w == x + 1).int() + (x == 0))
-        return corners
+        return torch.stack([surface == self.supporting for surface in self.at_corners()]).sum(0, dtype=torch.int32)
 
     @property
     def level_corners(self) -> Tensor:
         """The number of the footprint's corners whose cells are as high as the highest of them, supported or not."""
-        at_w, at_d = ([size == step + 1 for step in range(self.side)] for size in (self.w, self.d))
-        rows = [self.surfaces[x * self.side : (x + 1) * self.side] for x in range(self.side)]
-        last = [sum(cell * at for cell, at in zip(row, at_d, strict=True)) for row in rows]  # of each row of cells
-        far = [sum(row * at for row, at in zip(each, at_w, strict=True)) for each in ([row[0] for row in rows], last)]
-        heights = torch.stack(torch.broadcast_tensors(rows[0][0], last[0], *far)) >> 1
+        heights = torch.stack([*self.at_corners()]) >> 1
         return (heights == heights.amax(0)).sum(0, dtype=torch.int32)
 
     def is_centre_in_hull(self, margin: float = 0.0) -> Tensor:
