@@ -41,14 +41,15 @@ def weigh(net, std=3.0):
     torch.nn.init.normal_(net.waiting.sum.weight, std=0.3)
 
 
-def left_in_bins(items, taken, tipping):
-    """Return a table of bins without an item each, in all its poses, by plain Python."""
+def left_in_bins(state, taken, tipping):
+    """Return a table of bins without an item each, in all its poses, and of what comes, by plain Python."""
     rows = []
     for row, number in enumerate(taken.tolist()):
-        bin_ = items.cuboids[row].tolist()
+        bin_ = state.items.cuboids[row].tolist()
+        coming = [] if state.coming is None else state.coming.cuboids[row].tolist()
         gone = {number // 3 * 3 + pose for pose in range(3)} if tipping else {number}
         kept = [item for place, item in enumerate(bin_) if place not in gone]
-        rows.append(kept + [[0] * 5] * len(gone))
+        rows.append(kept + [[0] * 5] * len(gone) + coming)
     return torch.tensor(rows)
 
 
@@ -65,7 +66,7 @@ def test_a_score_is_the_items_volume_and_the_value_of_what_the_step_leaves(kind,
             largest = env.state.items.volume.amax(1, keepdim=True)
             choice = policy.logits(observation).argmax(1)
             score = policy.logits(observation).gather(1, choice[:, None])
-            left = left_in_bins(env.state.items, choice // env.cell.num_footprints, env.cell.tipping)
+            left = left_in_bins(env.state, choice // env.cell.num_footprints, env.cell.tipping)
             data = env.step(observation.clone().set("action", policy.to_action(choice, observation)))
             after = data["next"].set("items", left)
             value = policy.network(*(after[key] for key in policy.network.in_keys))
