@@ -71,8 +71,10 @@ class Beam(MapPlanner):
         plans = _Plans(number, nothing - 1, nothing, nothing.float(), State.from_observation(observation))
         mask, ended = self.policy.with_cell(cell).ranked(maps), []
         for depth in range(1, self.depth + 1):
-            ended.append(self._without_choice(plans.rows(~mask.any(1))))
-            if not mask.any():
+            goes_on = mask.any(1)
+            ended.append(self._without_choice(plans.rows(~goes_on)))
+            if not goes_on.any():
+                plans = plans.rows(goes_on)
                 break
             plans = self._longer(plans, mask)
             if depth == self.depth or self._is_late(start, depth):

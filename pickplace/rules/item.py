@@ -146,7 +146,7 @@ def coming_from_observation(observation: Observation) -> Item | None:
     The table ``coming``, int64 ``[N, p, 5]``, has x, y, w, d and h; or, ``[N, p, 8]``, turns, mass and greatest load,
     too.
     """
-    if (table := observation.get("coming", None)) is None:
+    if (table := observation.get("coming", None)) is None or table.shape[1] == 0:
         return None
     x, y, w, d, h, *handling = table.unbind(-1)
     rotations = observation.get("rotations", None)

@@ -94,8 +94,9 @@ class Coming(Term):
         return Bounds(0, high, (cell.preview, 8 if cell.handling else 5), torch.int64)
 
     def value(self, cell, state):
-        columns = [*state.coming[:5], *(state.coming[6:] if cell.handling else ())]
-        return torch.stack(columns, -1)
+        if state.coming is None:  # of a robot's scene that shows none
+            return torch.zeros(len(state.surface), 0, 8 if cell.handling else 5, dtype=torch.int64)
+        return torch.stack([*state.coming[:5], *(state.coming[6:] if cell.handling else ())], -1)
 
 
 class SeenItems(Term):
