@@ -95,7 +95,7 @@ class Coming(Term):
 
     def value(self, cell, state):
         if state.coming is None:  # of a robot's scene that shows none
-            return torch.zeros(len(state.surface), 0, 8 if cell.handling else 5, dtype=torch.int64)
+            return state.tote_height.new_zeros(len(state.tote_height), 0, 8 if cell.handling else 5)
         return torch.stack([*state.coming[:5], *(state.coming[6:] if cell.handling else ())], -1)
 
 
