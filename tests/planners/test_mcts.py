@@ -106,6 +106,8 @@ def test_what_is_seen_to_come_is_the_next_bin(mask):
     assert not any(edge.is_known for edge in later)
     assert len({tuple(node.items.flatten().tolist()) for edge in later for node in edge.bins}) > 3
     assert max(len(edge.bins) for edge in later) > 1
+    known = [edge for edge in edges_of(searched(mask, 800, preview=2, **sizes)) if edge.is_known]
+    assert len(known) > 20 and max(len(edge.bins) for edge in known) == 1
 
 
 def test_without_a_mask_it_tries_what_fails():
