@@ -19,7 +19,7 @@ from pickplace.rules.reach.base import Limits
 from pickplace.rules.state import surface_from
 from pickplace.rules.support.rules import RULES, Support, read_support
 
-NOT_OF_THE_ORACLE = ("height_unit", "cell_size", "reach", "gripper", "support", "handling", "tipping")
+NOT_OF_THE_ORACLE = ("height_unit", "cell_size", "reach", "gripper", "support", "handling", "tipping", "preview")
 SIDES, NEVER = st.integers(1, 4), st.just(False)
 
 #: Stability rules and their margins.
@@ -163,6 +163,8 @@ SETTINGS = [
     {"num_envs": 4, "body": [[1, 1, 1], [1, 1, 0], [1, 1, 0]], "cup": [[0, 0, 0], [1, 1, 0], [0, 0, 0]],
      "pick_rule": "seal", "min_seal": 0.5},
     {"num_envs": 4, "bin_items": 3, "bin_size": (6, 5, 1), "items": Uniform((1, 3), (1, 3), (1, 2)), "rotations": 2},
+    {"num_envs": 4, "preview": 2, "items": Uniform((1, 3), (1, 3), (1, 2)), "rotations": 2, "tote_size": (5, 4, 3)},
+    {"num_envs": 4, "preview": 3, "bin_items": 2, "bin_size": (6, 5, 1), "rotations": 2, "tote_size": (5, 5, 4)},
     {"num_envs": 4, "bin_items": 3, "tipping": True, "bin_size": (6, 2, 1), "items": Uniform((1, 2), (1, 2), (1, 2)),
      "effector_size": (1, 1), "pick_rule": "overlap", "rotations": 2, "tote_size": (4, 5, 4)},
 ]  # fmt: skip

@@ -41,10 +41,10 @@ class SampledPPO(PPO):
         self.advantages = one_of("algo.advantages", advantages, ("vine", "gae"))
         super().__init__(*networks, **settings)
         expect(
-            self.policy.cell.bin_items == 1 or advantages == "gae",
+            advantages == "gae" or (self.policy.cell.bin_items == 1 and self.policy.cell.preview == 0),
             "algo.advantages",
             advantages,
-            "gae with env.bin_items > 1; vine knows one item in the bin",
+            "gae with env.bin_items > 1 or env.preview > 0; vine knows one item in the bin alone",
         )
 
     def make_loss(self, **common) -> ClipPPOLoss:

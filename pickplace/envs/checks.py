@@ -1,4 +1,4 @@
-"""Checks before an environment is made: its memory, and whether every item fits the empty tote."""
+"""Checks of an environment: its memory, whether every item fits the empty tote, and the numbers that it is given."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import replace
@@ -109,3 +109,12 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
                 f"{items.label(kind)} at x={x}, y={y} in the bin has no feasible action on the empty tote of height "
                 f"{height} ({description}): expected every item to fit somewhere."
             )
+
+
+def check_numbers(key: str, values: torch.Tensor, low: int, high: int, expected: str) -> torch.Tensor:
+    """Return whole numbers in ``[low, high]`` as int64; ``ValueError`` for others."""
+    if not torch.can_cast(values.dtype, torch.int64):
+        raise ValueError(f"{key}={values[0].item()} ({values.dtype}): expected whole numbers, as integers.")
+    if (bad := (values < low) | (values > high)).any():
+        raise ValueError(f"{key}={values[bad][0].item()}: expected {expected}.")
+    return values.to(torch.int64)

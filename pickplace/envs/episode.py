@@ -50,12 +50,12 @@ def _read_rotations(key: str, value: Any, cell: CellSpec) -> int:
     return sum(1 << turn for turn in set(turns))
 
 
-def _read_up_to(most: Callable[[CellSpec], int], origin: str) -> Callable[[str, Any, CellSpec], int]:
-    """Return a function that reads a number between 1 and one that the environment sets."""
+def _read_up_to(most: Callable[[CellSpec], int], origin: str, least: int = 1) -> Callable[[str, Any, CellSpec], int]:
+    """Return a function that reads a number between a least one and one that the environment sets."""
 
     def read(key: str, value: Any, cell: CellSpec) -> int:
         with reworded(ValueError, lambda error: ValueError(f"{str(error).rstrip('.')}, {origin}.")):
-            return integral_number(key, value, most=most(cell))
+            return integral_number(key, value, least, most(cell))
 
     return read
 
@@ -73,6 +73,10 @@ SETTINGS: dict[str, Setting] = {
     "refill": Setting(
         "refill", lambda cell: REFILLS.index(cell.refill), lambda cell, items: (0, len(REFILLS) - 1),
         lambda key, value, cell: REFILLS.index(one_of(key, value, REFILLS)),
+    ),
+    "preview": Setting(
+        "preview", lambda cell: cell.preview, lambda cell, items: (0, cell.preview),
+        _read_up_to(lambda cell: cell.preview, "env.preview", 0),
     ),
     "item_mix": Setting(
         "item_mix", lambda cell: 0, lambda cell, items: (0, items.mixes - 1),

@@ -50,6 +50,7 @@ class PickPlaceGymEnv(gymnasium.Env):
     | `bin_labels` | `(W_B, D_B)` float32 | number of the item on each cell of the bin, from 1; 0 where empty |
     | `items` | `(M, 5)` int64 | x, y, w, d, h of each item in the bin; zeros: none |
 
+    with `preview=p` `coming`, `(p, 5)` int64: x, y, w, d, h of the items that arrive next, in their order; zeros: none;
     with `handling=True` the items' `handling`, and what lies on what: `tote_labels`, `pile_spare` and `pile_below`;
     and what `observation=` adds (see `PickPlaceEnv`).
 
@@ -61,7 +62,8 @@ class PickPlaceGymEnv(gymnasium.Env):
     An empty tote, and a bin with the first item of an episode. `reset(seed=s)` begins the item stream `s`; later resets
     without a seed go on to its next episode. `options={"tote_height": h}` sets the height of this episode's tote; with
     `varies=("rotations", ...)` an option sets each of these, too: `rotations` (a number, or a list of those that are
-    allowed), `bin_items`, `refill`, `item_mix` (a number, see `ItemDistribution.mixed`) and `level`.
+    allowed), `bin_items`, `refill`, `preview`, `item_mix` (a number, see `ItemDistribution.mixed`)
+    and `level`.
 
     ## Episode End
     Termination: the action fails, or nothing can be done with any item in the bin. Truncation: the item stream has

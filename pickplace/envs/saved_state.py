@@ -8,7 +8,7 @@ from torch import Tensor
 from pickplace.common.validate import refuse_if
 from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
 from pickplace.envs.torchrl import PickPlaceEnv
-from pickplace.items.arrival import next_item
+from pickplace.items.arrival import coming_items, next_item
 from pickplace.items.distributions import MAX_SEED
 from pickplace.items.tipping import in_pose, sizes_in_bin
 from pickplace.rules.bin import select_item
@@ -58,7 +58,8 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
         check(key, (value >= low) & (value <= high), f"{low} to {high}")
     episode = Episode(**{SETTINGS[key].field: saved[SETTINGS[key].field] for key in cell.varies})
     pile = Pile(*(saved[key] for key in Pile._fields)) if cell.handling else None
-    state = State(surface, tote_height, Item.from_table(saved["item"]), episode, pile)
+    coming = Item.from_table(saved["coming"]) if cell.preview else None
+    state = State(surface, tote_height, Item.from_table(saved["item"]), episode, pile, coming)
     heights = state.heights
     check("surface", (heights >= 0) & (heights <= tote_height[:, None, None]), "heights of 0 to tote_height")
     check("surface", state.bearing | ((heights > 0) & cell.support.marks_bearing), "cells that bear weight")
@@ -82,6 +83,10 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     arrival = in_pose(cell, env.items, next_item(cell, env.items, env.stream, *address, episode), cell.poses - 1)
     same = (newest == arrival.table)[:, 2:].all(1)  # wherever it lies
     check("item", same | (count < cell.bin_items), "the newest item of this episode")  # it may have been taken
+    if coming is not None:
+        address = seed.expand_as(number), number, saved["arrived"]
+        expected = coming_items(cell, env.items, env.stream, *address, episode)
+        check("coming", coming.table == expected.table, "the next items of this episode")
     seen = observe(standard_terms(cell), cell, state)
     seen["occupancy"] = (volume / cell.tote_volume(tote_height))[:, None]
     seen |= {key: torch.zeros(len(steps), 1) for key in ("failure", "done", "terminated", "truncated")}

@@ -12,9 +12,9 @@ from torchrl.envs import EnvBase
 
 from pickplace.common.machine import usable_device
 from pickplace.common.validate import check_bytes, expect, one_of, or_null, refuse_if, whole_number
-from pickplace.envs.checks import check_items, most_items, problem_bytes
+from pickplace.envs.checks import check_items, check_numbers, most_items, problem_bytes
 from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
-from pickplace.items.arrival import refill
+from pickplace.items.arrival import coming_items, refill
 from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.items.tipping import check_tipping, longest_side, sizes_in_bin
 from pickplace.rules.bin import remove_item
@@ -57,6 +57,8 @@ class PickPlaceEnv(EnvBase):
         * ``bin_depth``, float32 ``[N, W_B, D_B]``: height above the bin's floor, 0 where empty.
         * with ``bin_items`` above 1: ``bin_labels``, float32 ``[N, W_B, D_B]``: number of the item on each cell, from 1
           in the order of arrival, 0 where empty; and ``items``, int64 ``[N, M, 5]``: their x, y, w, d, h, or zeros.
+        * with ``preview``: ``coming``, int64 ``[N, p, 5]``: x, y, w, d, h of the items that arrive next, in their
+          order, or zeros; with ``handling`` ``[N, p, 8]``, as below.
         * ``tote_depth``, float32 ``[N, W_T, D_T]``: remaining height, ``H_T - height``.
         * ``tote_bearing``, float32 ``[N, W_T, D_T]``: 1 where the cell bears weight; all 1 unless ``support=bearing``.
         * ``tote_height``, int64 ``[N, 1]``: ``H_T`` of the running episode.
@@ -65,8 +67,8 @@ class PickPlaceEnv(EnvBase):
           ``tote_labels``, int64 ``[N, W_T, D_T]``, number of the item on each cell, from 1, 0 for the floor;
           ``pile_spare``, int64 ``[N, L]``, the mass that each still bears; ``pile_below``, bool ``[N, L, L]``, which
           items lie below each, itself included.
-        * with ``varies``: ``rotations``, bool ``[N, R]``; ``item_mix``, ``bin_items``, ``refill`` and ``level``, int64
-          ``[N, 1]``.
+        * with ``varies``: ``rotations``, bool ``[N, R]``; int64 ``[N, 1]``: ``item_mix``, ``bin_items``, ``refill``,
+          ``preview`` and ``level``.
         * further terms, see ``observation``.
         * ``action_mask``, bool ``[N, N_a]``: True where and only where the action would succeed.
         * ``footprint_mask``, bool ``[N, M * Q * W_T * D_T]``, only with ``masks`` naming it: the distinct
@@ -187,6 +189,7 @@ class PickPlaceEnv(EnvBase):
             "surface": zeros(*cell.tote_size[:2], dtype=torch.int32) + EMPTY,
             "item": zeros(cell.bin_items, len(Item._fields)),
             "arrived": zeros(),  # items of the episode so far
+            **({"coming": zeros(cell.preview, len(Item._fields))} if cell.preview else {}),
             "volume": zeros(),
             "steps": zeros(),
             "episode": zeros(),
@@ -250,6 +253,7 @@ class PickPlaceEnv(EnvBase):
         if (jammed := rows & ~self.feasible).any():  # the first one alone always has a feasible action
             self.item[:, self.cell.poses :] *= ~jammed[:, None, None]
             self.arrived.masked_fill_(jammed, 1)
+            self._look_ahead()
             self._update_masks(jammed, empty=True)
         return self._observation().update({key: torch.zeros_like(rows)[:, None] for key in DONE_KEYS})
 
@@ -261,7 +265,7 @@ class PickPlaceEnv(EnvBase):
             wanted = values.masked_fill(rows, setting.full(self.cell))
             if key in given:
                 wanted = torch.where(rows, setting.encode(given[key]), values)
-            found[setting.field] = _checked(key, wanted, low, high, f"between {low} and {high}")
+            found[setting.field] = check_numbers(key, wanted, low, high, f"between {low} and {high}")
         height = found["tote_height"]
         mix = found.get("item_mix", torch.zeros_like(height))
         if (low_rows := height < self.tallest[mix]).any():
@@ -278,7 +282,7 @@ class PickPlaceEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         most, state = self.cell.num_actions - 1, self.state
         action = tensordict["action"].reshape(self.num_envs)
-        step = apply(self.cell, state, _checked("action", action, 0, most, f"between 0 and {most} (N_a - 1)"))
+        step = apply(self.cell, state, check_numbers("action", action, 0, most, f"between 0 and {most} (N_a - 1)"))
         placed = step.failure == 0
         gained = torch.where(placed, step.item.volume, 0)
         self.surface.copy_(step.surface)
@@ -310,11 +314,11 @@ class PickPlaceEnv(EnvBase):
     @property
     def state(self) -> State:
         """The state of all problems."""
-        return State(self.surface, self.tote_height, Item.from_table(self.item), self._differs, self._pile)
+        items, coming = Item.from_table(self.item), Item.from_table(self.coming) if self.cell.preview else None
+        return State(self.surface, self.tote_height, items, self._differs, self._pile, coming)
 
     def _empty_pile(self, batch: int) -> Pile | None:
-        cell = self.cell
-        return Pile.empty(batch, cell.tote_size, cell.pile_room, self.device) if cell.handling else None
+        return Pile.empty(batch, self.cell.tote_size, self.cell.pile_room, self.device) if self.cell.handling else None
 
     @property
     def _pile(self) -> Pile | None:
@@ -331,11 +335,20 @@ class PickPlaceEnv(EnvBase):
 
     def _refill(self, rows: Tensor, left: Item) -> Item:
         """Let items arrive in the bins in ``rows``, bool ``[N]``; ``left`` and the result are all items, ``[N, M]``."""
-        address = self.item_seed.expand_as(self.episode), self.episode, self.arrived
-        items, arrived = refill(self.cell, self.items, self.stream, *address, left, rows, self._differs)
+        items, arrived = refill(self.cell, self.items, self.stream, *self._address, left, rows, self._differs)
         self.item.copy_(items.table)
         self.arrived.copy_(arrived)
+        self._look_ahead()
         return items
+
+    def _look_ahead(self) -> None:
+        """Find the items that are seen before they arrive."""
+        if self.cell.preview:
+            self.coming.copy_(coming_items(self.cell, self.items, self.stream, *self._address, self._differs).table)
+
+    @property
+    def _address(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.item_seed.expand_as(self.episode), self.episode, self.arrived
 
     def _update_masks(self, rows: Tensor, empty: bool = False):
         """Recompute the masks of the problems in ``rows``, bool ``[N]``; the others' states did not change.
@@ -384,12 +397,3 @@ class PickPlaceEnv(EnvBase):
         for name in self.masks:
             observation[f"{name}_mask"] = getattr(self, f"{name}_mask")  # never written to again, see `_update_masks`
         return TensorDict(observation, batch_size=self.batch_size, device=self.device)
-
-
-def _checked(key: str, values: Tensor, low: int, high: int, expected: str) -> Tensor:
-    """Return whole numbers in ``[low, high]`` as int64; ``ValueError`` for others."""
-    if not torch.can_cast(values.dtype, torch.int64):
-        raise ValueError(f"{key}={values[0].item()} ({values.dtype}): expected whole numbers, as integers.")
-    if (bad := (values < low) | (values > high)).any():
-        raise ValueError(f"{key}={values[bad][0].item()}: expected {expected}.")
-    return values.to(torch.int64)

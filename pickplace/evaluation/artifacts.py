@@ -87,6 +87,7 @@ def evaluation_table(result: dict) -> str:
         "tote, rotations": f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}",
         "orientations": env.get("tipping") and f"{POSES * min(env['rotations'], 2)}: items may be tipped",
         "items in the bin": count > 1 and f"up to {count}, refill: {env.get('refill', 'each')}",
+        "items in the preview": str(env.get("preview") or ""),
         "episodes": f"{result['episodes']} of the {result['stream']} stream, seed {result['seed']}{same}",
         "occupancy": f"{_interval(occupancy, '.4f')}, least {occupancy['min']:.4f}",
         "occupancy of true volumes": (true := result.get("true_occupancy", occupancy))["mean"] != occupancy["mean"]

@@ -1,16 +1,14 @@
 """Arrival: how bins are filled again from the stream of items."""
 
-from functools import reduce
-
 import torch
 from torch import Tensor
 
 from pickplace.items.distributions import ItemDistribution, hashed_uniform
 from pickplace.items.tipping import in_pose
-from pickplace.rules.bin import add_item, must_share
+from pickplace.rules.bin import add_item, find_room, is_below_limit, may_arrive, must_share
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item
-from pickplace.rules.state import FULL_TASK, REFILLS, Episode
+from pickplace.rules.state import FULL_TASK, Episode
 
 
 def refill(
@@ -33,12 +31,9 @@ def refill(
         rows: bool ``[N]``, the bins in which items may arrive.
         differs: what the episodes differ in.
     """
-    waits = cell.refill == "batch" if differs.refill is None else differs.refill == REFILLS.index("batch")
-    open_ = rows & ~(items.exists[:, 0] & waits)  # waits: for an empty bin
+    open_ = rows & may_arrive(cell, items, differs)
     for number in range(0, items.x.shape[1], cell.poses):
-        open_ = open_ & ~items.exists[:, -1]
-        if differs.bin_items is not None:
-            open_ = open_ & (items.exists.sum(1) < differs.bin_items)
+        open_ = open_ & is_below_limit(items, differs)
         if number and not open_.any():
             break
         item, before = next_item(cell, source, stream, seed, episode, arrived, differs), items
@@ -48,7 +43,7 @@ def refill(
                 # The place among the free ones: any, or with poses the first.
                 share = hashed_uniform(stream, seed, episode, arrived, 4)[3] * (not cell.tipping)
                 keeps_place = ~items.exists[:, 0] | (source.has_corners and not cell.tipping)
-                posed = _find_room(cell, posed, items, keeps_place, share)
+                posed = find_room(cell, posed, items, keeps_place, share)
             open_ = open_ & posed.exists
             items = add_item(items, posed, open_)
         if cell.tipping:  # where the last pose had no room, the item waits
@@ -66,28 +61,17 @@ def next_item(
     return item if differs.turns is None else item._replace(turns=item.turns & differs.turns)
 
 
-def _find_room(cell: CellSpec, item: Item, others: Item, keeps_place: Tensor, uniform: Tensor) -> Item:
-    """Return an item at a place where it overlaps no other, ``[N]``; of size 0 if there is none.
+def coming_items(
+    cell: CellSpec, source: ItemDistribution, stream: str, seed: Tensor, episode: Tensor, arrived: Tensor,
+    differs: Episode = FULL_TASK,
+) -> Item:  # fmt: skip
+    """Return the items that are seen before they arrive, in their order, ``[N, p]``; arguments as of :func:`refill`.
 
-    Args:
-        item: ``[N]``.
-        others: ``[N, M]``.
-        keeps_place: bool ``[N]``, whether only its own place counts.
-        uniform: float64 ``[N]``, decides among the places.
+    Each is at its own place. Rows of zeros are no items: after the stream's end, and beyond an episode's own preview.
     """
-    (bin_w, bin_d), count = cell.bin_size[:2], len(item.x)
-    x, y = (torch.arange(side, device=item.x.device) for side in (bin_w, bin_d))
-    w, d = item.w[:, None], item.d[:, None]
-    hits = []
-    for other in zip(*(part.t()[..., None] for part in others[:4]), strict=True):  # [N, 1] each
-        in_x = (x < other[0] + other[2]) & (x + w > other[0])  # [N, W_B]
-        in_y = (y < other[1] + other[3]) & (y + d > other[1])
-        hits.append(in_x[:, :, None] & in_y[:, None])
-    inside = (x <= bin_w - w)[:, :, None] & (y <= bin_d - d)[:, None]
-    free = (inside & ~reduce(torch.logical_or, hits)).flatten(1)  # [N, W_B * D_B]
-    rank = free.cumsum(1)
-    wanted = (uniform * rank[:, -1]).long() + 1
-    drawn = torch.searchsorted(rank, wanted[:, None])[:, 0].clamp(max=bin_w * bin_d - 1)
-    place = torch.where(keeps_place, item.x * bin_d + item.y, drawn)
-    found = free[torch.arange(count, device=place.device), place] & item.exists
-    return item._replace(x=place // bin_d, y=place % bin_d).map(lambda part: torch.where(found, part, 0))
+    count, number = len(arrived), torch.arange(cell.preview, device=arrived.device)
+    row = torch.arange(count, device=arrived.device).repeat_interleave(cell.preview)
+    later = (arrived[:, None] + number).flatten()
+    item = next_item(cell, source, stream, seed[row], episode[row], later, differs.rows(row))
+    seen = item.exists if differs.preview is None else item.exists & (number.repeat(count) < differs.preview[row])
+    return Item.from_table((item.table * seen[:, None]).unflatten(0, (count, cell.preview)))

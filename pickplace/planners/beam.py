@@ -9,6 +9,7 @@ from torch import Tensor
 from pickplace.common.validate import number, or_null, refuse_if, whole_number
 from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import EstimatesValue, Policy, ScoresFootprints
+from pickplace.rules.bin import awaits_unseen, let_in
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
 from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
@@ -37,8 +38,9 @@ class Beam(MapPlanner):
 
     At each depth every plan goes on with every item that is left, at every place that the policy ranks; those with the
     greatest sum of placed volume and value of what they leave are kept (beam search, Lowerre 1976). Plans that leave
-    the same tote and the same items are one. The items that will arrive meanwhile are not imagined: they are part of
-    the value. With one item in the bin it decides as the policy does.
+    the same tote and the same items are one. Items that are seen to come arrive in their order; the others are not
+    imagined: they are part of the value. A plan is worth no more than what it places if all that it leaves is known to
+    fit nowhere. Where one item alone is seen it decides as the policy does.
 
     Args:
         cell: the sizes.
@@ -69,8 +71,10 @@ class Beam(MapPlanner):
         plans = _Plans(number, nothing - 1, nothing, nothing.float(), State.from_observation(observation))
         mask, ended = self.policy.with_cell(cell).ranked(maps), []
         for depth in range(1, self.depth + 1):
-            ended.append(plans.rows(~mask.any(1)))
-            if not mask.any():
+            goes_on = mask.any(1)
+            ended.append(self._without_choice(plans.rows(~goes_on)))
+            if not goes_on.any():
+                plans = plans.rows(goes_on)
                 break
             plans = self._longer(plans, mask)
             if depth == self.depth or self._is_late(start, depth):
@@ -82,6 +86,11 @@ class Beam(MapPlanner):
 
     def evaluation_facts(self) -> dict:
         return {"candidates": "all", "mask_at_decision": True}  # as a policy's planner
+
+    def _without_choice(self, plans: _Plans) -> _Plans:
+        """Return plans that cannot go on; if no item arrives that may save them, the value of what they leave is 0."""
+        placed = plans.placed * self.policy.value_network().reward_scale
+        return plans._replace(total=torch.where(awaits_unseen(self.cell, plans.state), plans.total, placed))
 
     def _is_late(self, start: float, depth: int) -> bool:
         """Return whether one more placement, if it takes as long as those before it, would pass the budget."""
@@ -105,7 +114,7 @@ class Beam(MapPlanner):
         first = torch.where(plans.first[row] < 0, choice, plans.first[row])
         # The states of all plans would not fit into the memory; those of the kept ones are made again.
         after, _ = put_down(self.cell, plans.state.rows(row), choice)
-        return _Plans(plans.problem[row], first, placed[kept], total[kept], after)
+        return _Plans(plans.problem[row], first, placed[kept], total[kept], let_in(self.cell, after))
 
     def _judge(self, plans: _Plans, row: Tensor, choice: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return for plans that go on with a choice the volume placed, the total, and a number that is the same for
@@ -147,10 +156,11 @@ def _first_of_each(value: Tensor) -> Tensor:
 
 def _fingerprint(problem: Tensor, state: State) -> Tensor:
     """Return a number for each of ``P`` states, int64 ``[P]``: equal for equal problems, totes, loads that they bear,
-    and sets of items, and different for others but for one pair in 2**64."""
+    sets of items in the bin and items that come, and different for others but for one pair in 2**64."""
     table = state.items.table
     each = _mixed(_weighted(table)) * state.items.exists
     maps = [state.surface] if state.pile is None else [state.surface, state.pile.capacity]
+    maps += [] if state.coming is None else [state.coming.table]
     parts = [problem, *(_mixed(_weighted(part.flatten(1))) for part in maps), each.sum(1)]
     return _mixed(_weighted(torch.stack(parts, 1)))
 

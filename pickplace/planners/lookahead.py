@@ -10,10 +10,11 @@ from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import MASKED, EstimatesValue, Policy, ScoresFootprints, best_choice
+from pickplace.rules.bin import awaits_unseen, let_in
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, Observation
 from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
-from pickplace.rules.observation import Items, check_terms, observe
+from pickplace.rules.observation import SeenItems, check_terms, observe
 from pickplace.rules.state import State
 from pickplace.rules.step import put_down
 
@@ -28,8 +29,8 @@ class Lookahead(MapPlanner):
     policy, to that confidence. A critic that errs could, where the policy fills nearly all: what wins by its judgement
     must gain without it too, both played out to the end; unless the policy itself follows from the critic. The imagined
     items come from the item distribution, never from the stream that is played; the first of all streams are spread
-    over its kinds, so that with as many streams as kinds their mean is exact. What lies in the bin already is known,
-    and played out before them.
+    over its kinds, so that with as many streams as kinds their mean is exact. What lies in the bin already, or is seen
+    to come, is known, and played out before them.
 
     Args:
         cell: the sizes.
@@ -171,11 +172,13 @@ class Lookahead(MapPlanner):
         source = _Imagined(self.items, streams) if cell.bin_items == 1 else self.items
         for step in itertools.count():
             if step == horizon and judges_before:
-                seen = observe({**self.terms, "items": Items()}, cell, state, critic_keys)
+                seen = observe({**self.terms, "items": SeenItems()}, cell, state, critic_keys)
                 volume[row] += self.critic(seen)[:, 0].double()
                 break
             address = seed[row], stream[row], arrived
-            items, arrived = refill(cell, source, "train", *address, state.items, row >= 0, state.episode)
+            state = let_in(cell, state)
+            open_ = awaits_unseen(cell, state)
+            items, arrived = refill(cell, source, "train", *address, state.items, open_, state.episode)
             state = state._replace(items=items)
             mask = policy.ranked(placing_maps(cell, state))
             going = mask.view(torch.uint8).amax(1).nonzero()[:, 0]

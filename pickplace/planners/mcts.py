@@ -12,7 +12,7 @@ from pickplace.common.validate import flag, number, refuse_if, whole_number
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner, narrow_first
-from pickplace.rules.bin import remove_item
+from pickplace.rules.bin import awaits_unseen, let_in, remove_item
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, Observation
 from pickplace.rules.masks import (
@@ -29,8 +29,8 @@ from pickplace.rules.step import apply, put_down
 MAX_NODES = 1_000_000  # of all trees of a decision
 
 
-#: Surface, table of the items in the bin, and pile, of one problem.
-_Tote: TypeAlias = tuple[Tensor, Tensor, Pile | None]
+#: Surface, table of the items in the bin, pile, and table of the items that are seen to come, of one problem.
+_Tote: TypeAlias = tuple[Tensor, Tensor, Pile | None, Tensor | None]
 
 
 @dataclass(eq=False)
@@ -42,6 +42,11 @@ class _Node:
     untried: list[int] | None  # actions in random order, of which the last comes first; None: all N_a flat actions
     edges: dict[int, "_Edge"] = field(default_factory=dict)
     pile: Pile | None = None  # of the items in the tote, see State
+    coming: Tensor | None = None  # int64 [p, 9], a table of those that arrive next, see State
+
+    @property
+    def tote(self) -> _Tote:
+        return self.surface, self.items, self.pile, self.coming
 
 
 @dataclass(eq=False)
@@ -56,6 +61,7 @@ class _Edge:
     left: "_Tote | None" = None  # None until simulated, and if it fails
     failed: bool = False
     bins: list[_Node] = field(default_factory=list)
+    is_known: bool = False  # whether all items of the bin after it are seen, so that there is one such bin
 
 
 class MCTS(MapPlanner):
@@ -144,7 +150,7 @@ class MCTS(MapPlanner):
         while (edge := self._choose(node)) is not None:
             edge.visits += 1
             path.append(edge)
-            if edge.left is None or len(edge.bins) < int(edge.visits**self.widening):
+            if edge.left is None or len(edge.bins) < (1 if edge.is_known else int(edge.visits**self.widening)):
                 break
             node = edge.bins[self._random.integers(len(edge.bins))]
         self._walks += 1
@@ -178,8 +184,7 @@ class MCTS(MapPlanner):
         walks = [walk for walk in walks if walk[1]]
         last = [(number, problem, path[-1]) for number, (problem, path, over) in enumerate(walks) if not over]
         if tried := [(problem, edge) for _, problem, edge in last if edge.left is None and not edge.failed]:
-            totes = [(edge.node.surface, edge.node.items, edge.node.pile) for _, edge in tried]
-            before = _stack(totes, roots.rows([problem for problem, _ in tried]))
+            before = _stack([edge.node.tote for _, edge in tried], roots.rows([problem for problem, _ in tried]))
             after, placed, good = self._move(before, torch.tensor([edge.action for _, edge in tried]))
             parts = zip(_unstack(after), placed.volume.tolist(), good.tolist(), strict=True)
             for (_, edge), (left, volume, succeeds) in zip(tried, parts, strict=True):
@@ -189,9 +194,10 @@ class MCTS(MapPlanner):
         returns = torch.zeros(len(walks), dtype=torch.float64)
         if going := [(number, problem, edge) for number, problem, edge in last if edge.left is not None]:
             numbers, problems, edges = map(list, zip(*going, strict=True))
-            arrived = self._arrive(_stack([edge.left for edge in edges], roots.rows(problems)))
-            for edge, node in zip(edges, self._nodes(arrived), strict=True):
-                edge.bins.append(node)
+            arrived, known = self._arrive(_stack([edge.left for edge in edges], roots.rows(problems)))
+            for edge, node, edge.is_known in zip(edges, self._nodes(arrived), known.tolist(), strict=True):
+                if not (edge.is_known and edge.bins):
+                    edge.bins.append(node)
             returns[numbers] = self._play_out(arrived)
         for (problem, path, _), volume in zip(walks, returns.tolist(), strict=True):
             for edge in reversed(path):
@@ -220,15 +226,20 @@ class MCTS(MapPlanner):
             rows = zip(number.numpy(), mask.numpy(), strict=True)
             untried = [self._random.permutation(row[good]).tolist() for row, good in rows]
         totes = zip(_unstack(state), untried, strict=True)
-        return [_Node(surface, items, actions, pile=pile) for (surface, items, pile), actions in totes]
+        return [_Node(*tote[:2], actions, pile=tote[2], coming=tote[3]) for tote, actions in totes]
 
-    def _arrive(self, state: State) -> State:
-        """Return the states with items in the bins that come from the item distribution, each drawn once."""
+    def _arrive(self, state: State) -> tuple[State, Tensor]:
+        """Return the states after items have arrived, and in which of them all were seen to come, bool ``[M]``.
+
+        Those that were not seen come from the item distribution, each drawn once.
+        """
+        state = let_in(self.cell, state)
+        rows = awaits_unseen(self.cell, state)
         number = torch.arange(self._sampled, self._sampled + len(state.surface))
         self._sampled += len(number)
-        seed, first, rows = torch.full_like(number, self.seed), torch.zeros_like(number), number >= 0
+        seed, first = torch.full_like(number, self.seed), torch.zeros_like(number)
         items, _ = refill(self.cell, self.items, "train", seed, number, first, state.items, rows, state.episode)
-        return state._replace(items=items)
+        return state._replace(items=items), ~rows
 
     def _play_out(self, state: State) -> Tensor:
         """Return the volume that uniformly random actions place until the episode ends, float64 ``[M]``."""
@@ -248,7 +259,7 @@ class MCTS(MapPlanner):
             volume[row] += placed.volume[going].double()
             if len(row) == 0:
                 return volume
-            state = self._arrive(state.rows(going))
+            state, _ = self._arrive(state.rows(going))
 
 
 def _on_cpu(observation: Observation) -> State:
@@ -258,11 +269,14 @@ def _on_cpu(observation: Observation) -> State:
 def _unstack(state: State) -> list[_Tote]:
     count = len(state.surface)
     piles = [None] * count if state.pile is None else [state.pile.rows(row) for row in range(count)]
-    return [*zip(state.surface, state.items.table, piles, strict=True)]
+    coming = [None] * count if state.coming is None else state.coming.table
+    return [*zip(state.surface, state.items.table, piles, coming, strict=True)]
 
 
 def _stack(parts: Sequence[_Tote], problems: State) -> State:
     """Return the states of problems with other totes and bins: the inverse of :func:`_unstack`."""
-    surface, items, piles = zip(*parts, strict=True)
+    surface, items, piles, tables = zip(*parts, strict=True)
     pile = None if piles[0] is None else Pile(*map(torch.stack, zip(*piles, strict=True)))
-    return problems._replace(surface=torch.stack(surface), items=Item.from_table(torch.stack(items)), pile=pile)
+    coming = None if tables[0] is None else Item.from_table(torch.stack(tables))
+    bins = Item.from_table(torch.stack(items))
+    return problems._replace(surface=torch.stack(surface), items=bins, pile=pile, coming=coming)

@@ -144,7 +144,7 @@ class Policy(TensorDictModuleBase, ABC):
         return rank_actions(torch.where(action_mask(self.cell, maps), score, score - FAR))
 
     def with_cell(self, cell: CellSpec) -> Self:
-        """Return this policy, with the same networks, for a cell that differs in its limits or in the number of items.
+        """Return this policy, with the same networks, for a cell with other limits, or another number of items.
 
         Raises:
             ValueError: as of :meth:`check_cell`.
@@ -152,8 +152,12 @@ class Policy(TensorDictModuleBase, ABC):
         self.check_cell(cell)
         other = copy(self)
         other.cell = cell
-        other.in_keys = [*dict.fromkeys([*self.in_keys, *item_keys(cell.bin_items)])]
+        other.in_keys = [*dict.fromkeys([*self.in_keys, *self.item_keys(cell)])]
         return other
+
+    def item_keys(self, cell: CellSpec) -> tuple[str, ...]:
+        """Return the entries of the observation that list items, of those that it reads."""
+        return item_keys(cell.bin_items)
 
     def act(self, choice: Tensor, *values: Tensor) -> Tensor:
         """Return :meth:`to_action` for the entries :attr:`act_keys` of an observation, in that order."""
@@ -232,7 +236,7 @@ class EstimatesValue(Protocol):
         """
 
     def items_left(self, observation: Observation, choice: Tensor) -> Tensor:
-        """Return the items that a choice leaves in the bin, before others arrive, int64 ``[N, M, 5]``."""
+        """Return the items that are seen after a choice, before others arrive, int64 ``[N, M + p, 5]``."""
 
     def judge(self, before: State, choice: Tensor) -> tuple[State, Tensor, Tensor]:
         """Return what choices lead to before others arrive, the volumes that they place, int64 ``[N]``, and the values

@@ -24,7 +24,6 @@ from pickplace.rules.masks import (
     first_action_reaching,
     placing_maps,
 )
-from pickplace.rules.observation import item_keys
 from pickplace.rules.placing import unchecked_top
 from pickplace.rules.state import State
 from pickplace.rules.step import apply
@@ -84,7 +83,7 @@ class FootprintScorer(Policy):
         expected = f"true with {type(self).__name__}; its choices are feasible ones"
         expect(mask_infeasible, "model.mask_infeasible", mask_infeasible, expected)
         super().__init__(cell, masks=(self.mask,))
-        self.in_keys += item_keys(cell.bin_items)
+        self.in_keys += self.item_keys(cell)
         if self.network_class is not None:
             self.network = self.network_class(**network)
 

@@ -139,7 +139,7 @@ def shapes_of(policy: ScoresAnySize) -> dict[str, tuple]:
     bins = (Dim("W_B"), Dim("D_B")) if policy.any_bin else (Dim.STATIC, Dim.STATIC)
     return {
         "bin_depth": (N, *bins), "tote_depth": (N, *tote), "tote_bearing": (N, *tote), "tote_height": (N, Dim.STATIC),
-        "items": (N, Dim("M"), Dim.STATIC),
+        "items": (N, Dim("M"), Dim.STATIC), "coming": (N, Dim("p"), Dim.STATIC),
     }  # fmt: skip
 
 

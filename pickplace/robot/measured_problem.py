@@ -158,8 +158,16 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
     ratio = cell_size * cell.height_unit / MILLIMETRE
     state, seen_rim = tote.state(free, each[0])._replace(items=items), max(1, round(tote.height / ratio))
     heights = (state.heights / ratio).round().clamp(max=seen_rim).int()
-    seen_items = items._replace(h=(items.h.double() / ratio).round().long().clamp(min=1))
-    seen = State(surface_from(heights, tote.bears[None]), torch.tensor([seen_rim], device=device), seen_items)
+
+    def in_units(items: Item) -> Item:
+        return items._replace(h=(items.h.double() / ratio).round().long().clamp(min=1))
+
+    seen = State(surface_from(heights, tote.bears[None]), torch.tensor([seen_rim], device=device), in_units(items))
+    if scene.coming:
+        seen = seen._replace(coming=in_units(join_items([
+            _on_grid(cell, box.upright(), cell_size, clearance, f"coming[{number}]", device)
+            for number, box in enumerate(scene.coming)
+        ])))  # fmt: skip
     return MeasuredProblem(
         cell=joint, state=state, seen=seen, maps=maps, boxes=[boxes[place] for place in numbers], numbers=numbers,
         side=cell_size, unit=MILLIMETRE, release=2 * tote.accuracy * MILLIMETRE, parts=parts, tote=tote, taken=taken,

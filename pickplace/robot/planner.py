@@ -114,8 +114,8 @@ class Planner:
         items: the item distribution, for a search to imagine.
         training: what the policy was trained with, for :attr:`Plan.warnings`; None: it is not known.
 
-    Any number of items may lie in the bin, whatever ``cell.bin_items`` is. A planner that was made must have been made
-    for several.
+    Any number of items may lie in the bin, and be seen to come, whatever ``cell.bin_items`` and ``cell.preview`` are. A
+    planner that was made must have been made for several.
     """
 
     def __init__(
@@ -131,11 +131,11 @@ class Planner:
     ):
         refuse_if(cell.tipping, "env.tipping=true: a robot's gripper does not tip items; expected false.")
         self._handling = cell.handling
-        cell = replace(cell, handling=False)  # the loads of a scene are those of its boxes
+        cell = replace(cell, handling=False, preview=0)  # loads, and what comes, are those of a scene
         loads = [key for key, term in (terms or {}).items() if key in HANDLING_TERMS or isinstance(term, ToteCapacity)]
         read = [key for key in loads if policy is not None and key in policy.in_keys]
         refuse_if(read, f"policy: it reads {', '.join(read)}, which a scene does not have; expected another.")
-        terms = {key: term for key, term in (terms or {}).items() if key not in loads}
+        terms = {key: term for key, term in (terms or {}).items() if key not in (*loads, "coming")}
         self.cell, self.policy, self.training = cell, policy, training
         self.terms = check_terms(terms, cell)
         self._settings, self._parts = None, {"items": items, "critic": critic}
@@ -146,7 +146,7 @@ class Planner:
             not isinstance(planner, MapPlanner),
             f"planner={excerpt(planner)}: it does not choose among feasible actions; expected another.",
         )
-        self._planners: dict[int, MapPlanner] = {cell.bin_items: planner}  # by the number of items in the bin
+        self._planners: dict[tuple[int, int], MapPlanner] = {(cell.bin_items, 0): planner}  # items in the bin, to come
 
     @classmethod
     def load(
@@ -200,7 +200,7 @@ class Planner:
             DepthMapError,
         )
         problem = (read_metric if is_metric else read_grid)(self.cell, scene, device, exclude)
-        planner, terms = self._planner_of(problem.maps.bin_items, is_metric)
+        planner, terms = self._planner_of(problem.maps.bin_items, len(scene.coming or ()), is_metric)
         observation = observe(terms, problem.cell, problem.seen)
         status, action, ranking = _decide(planner, problem, observation)
         if action is None:
@@ -247,21 +247,21 @@ class Planner:
             DepthMapError,
         )
 
-    def _planner_of(self, count: int, is_metric: bool) -> tuple[MapPlanner, Mapping[str, Term]]:
-        """Return what decides among so many items in the bin, and the terms of the observation.
+    def _planner_of(self, count: int, preview: int, is_metric: bool) -> tuple[MapPlanner, Mapping[str, Term]]:
+        """Return what decides with so many items in the bin, and to come, and the terms of the observation.
 
         Raises:
             DepthMapError: for a planner that cannot.
         """
-        terms = check_terms(self.terms, replace(self.cell, bin_items=max(count, self.cell.bin_items)))
-        if self._settings is not None and count not in self._planners:
-            cell, policy = replace(self.cell, bin_items=count), self.policy
+        terms = check_terms(self.terms, replace(self.cell, bin_items=max(count, self.cell.bin_items), preview=preview))
+        if self._settings is not None and (count, preview) not in self._planners:
+            cell, policy = replace(self.cell, bin_items=count, preview=preview), self.policy
             try:
                 policy = policy and policy.with_cell(cell)
             except ValueError as error:
                 raise _several_items(policy, count) from error
-            self._planners[count] = self._make(cell, policy, terms)
-        planner = self._planners.get(count, self._planners[self.cell.bin_items])
+            self._planners[count, preview] = self._make(cell, policy, terms)
+        planner = self._planners.get((count, preview), self._planners[self.cell.bin_items, 0])
         if count > 1:
             _check_choice(planner, count, is_metric)
         return planner, terms

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
-from pickplace.common.validate import excerpt, integral_number, is_number, number, one_of, refuse_if
+from pickplace.common.validate import at_most, excerpt, integral_number, is_number, number, one_of, refuse_if
 from pickplace.robot.box import ACCURACY, CLEARANCE, MILLIMETRE, Box, DepthMapError, EmptyBinError, UnknownBox
 from pickplace.robot.camera import Camera
 from pickplace.robot.measure import ToteMap
@@ -64,6 +64,9 @@ class Scene:
     #: everything that lies in the tote, :attr:`Plan.placed` of each plan that was carried out; None: not known. Needed
     #: where a box has a ``max_load``, in metres alone
     placed: Sequence[Box] | None = None
+    #: the items that arrive next, in their order, each as it will lie in the bin; None: not known. What is feasible
+    #: does not depend on them; ``afterstate``, ``afterstate_fcn`` and searches plan with them. In metres alone
+    coming: Sequence[Box] | None = None
 
     def __post_init__(self):
         number("accuracy", self.accuracy, 0, 0.1, "metres")
@@ -88,6 +91,10 @@ class Scene:
         if self.placed is not None:
             refuse_if(self.cell_size is None, "placed: the lengths are whole cells; expected a scene in metres.")
             _check_boxes("placed", self.placed)
+        if self.coming is not None:
+            refuse_if(self.cell_size is None, "coming: the lengths are whole cells; expected a scene in metres.")
+            _check_boxes("coming", self.coming)
+            at_most("coming: the list has", len(self.coming), "boxes", MAX_BIN_ITEMS)
         if isinstance(self.items, BinMap):
             return
         _check_boxes("items", self.items)

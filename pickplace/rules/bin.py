@@ -1,9 +1,11 @@
-"""A bin with several items: which one a pick takes, and what stands in the way.
+"""A bin with several items: which one a pick takes, what stands in the way, and where others have room.
 
 Each pick takes one item: the highest that the cup grips. The end effector may hang over lower ones; one that is as high
 or higher would be lifted, too, or hit. Nothing is in the way of an item that lies alone: with ``M = 1`` the
 functions take a shorter path to the same result.
 """
+
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -11,6 +13,7 @@ from torch import Tensor
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_action
 from pickplace.rules.item import Item
+from pickplace.rules.state import REFILLS, Episode, State
 
 
 def blocked_picks(cell: CellSpec, items: Item) -> Tensor | None:
@@ -120,3 +123,76 @@ def add_item(items: Item, item: Item, rows: Tensor) -> Item:
     if count > 1:
         added = added & (torch.arange(count, device=rows.device) == items.exists.sum(1, keepdim=True))
     return Item.from_table(torch.where(added[..., None], item.table[:, None], items.table))
+
+
+def find_room(cell: CellSpec, item: Item, others: Item, keeps_place: Tensor, uniform: Tensor) -> Item:
+    """Return an item at a place where it overlaps no other, ``[N]``; of size 0 if there is none.
+
+    Args:
+        item: ``[N]``.
+        others: ``[N, M]``.
+        keeps_place: bool ``[N]``, whether only its own place counts.
+        uniform: float64 ``[N]``, decides among the places.
+    """
+    (bin_w, bin_d), count = cell.bin_size[:2], len(item.x)
+    x, y = (torch.arange(side, device=item.x.device) for side in (bin_w, bin_d))
+    w, d = item.w[:, None], item.d[:, None]
+    hits = []
+    for other in zip(*(part.t()[..., None] for part in others[:4]), strict=True):  # [N, 1] each
+        in_x = (x < other[0] + other[2]) & (x + w > other[0])  # [N, W_B]
+        in_y = (y < other[1] + other[3]) & (y + d > other[1])
+        hits.append(in_x[:, :, None] & in_y[:, None])
+    inside = (x <= bin_w - w)[:, :, None] & (y <= bin_d - d)[:, None]
+    free = (inside & ~reduce(torch.logical_or, hits)).flatten(1)  # [N, W_B * D_B]
+    rank = free.cumsum(1)
+    wanted = (uniform * rank[:, -1]).long() + 1
+    drawn = torch.searchsorted(rank, wanted[:, None])[:, 0].clamp(max=bin_w * bin_d - 1)
+    place = torch.where(keeps_place, item.x * bin_d + item.y, drawn)
+    found = free[torch.arange(count, device=place.device), place] & item.exists
+    return item._replace(x=place // bin_d, y=place % bin_d).map(lambda part: torch.where(found, part, 0))
+
+
+def may_arrive(cell: CellSpec, items: Item, differs: Episode) -> Tensor:
+    """Return whether items may arrive in the bins ``[N, M]`` now, bool ``[N]``: with ``refill="batch"`` in empty ones.
+
+    Args:
+        cell: has the refill rule, unless episodes differ in it.
+        items: ``[N, M]``.
+        differs: what the episodes differ in.
+    """
+    waits = cell.refill == "batch" if differs.refill is None else differs.refill == REFILLS.index("batch")
+    return ~(items.exists[:, 0] & waits)
+
+
+def is_below_limit(items: Item, differs: Episode) -> Tensor:
+    """Return whether the bins ``[N, M]`` hold fewer items than they may, bool ``[N]``."""
+    below = ~items.exists[:, -1]
+    return below if differs.bin_items is None else below & (items.exists.sum(1) < differs.bin_items)
+
+
+def awaits_unseen(cell: CellSpec, state: State) -> Tensor:
+    """Return whether an item that is not seen yet may arrive next, before any is taken, bool ``[N]``."""
+    open_ = may_arrive(cell, state.items, state.episode) & is_below_limit(state.items, state.episode)
+    return open_ if state.coming is None else open_ & ~state.coming.exists[:, 0]
+
+
+def let_in(cell: CellSpec, state: State) -> State:
+    """Return the state after the items that are seen have arrived, as far as the bins take them.
+
+    An item lies at its own place in a bin that was empty, as in the environment. It lies at the first free place in any
+    other bin, where the environment draws one.
+    """
+    _, _, items, differs, _, coming = state
+    if coming is None:
+        return state
+    open_, first = may_arrive(cell, items, differs), torch.zeros_like(state.tote_height)
+    for _ in range(items.x.shape[1]):
+        open_ = open_ & is_below_limit(items, differs)
+        item = select_item(coming, first)
+        if must_share(items, open_):
+            item = find_room(cell, item, items, ~items.exists[:, 0], first.double())
+        open_ = open_ & item.exists
+        if not open_.any():
+            break
+        items, coming = add_item(items, item, open_), remove_item(cell, coming, first, open_)
+    return state._replace(items=items, coming=coming)

@@ -51,6 +51,8 @@ class CellSpec:
             :class:`~pickplace.rules.reach.base.Limits`; None: it reaches everything.
         bin_items: ``M``, how many items a bin holds at most.
         refill: of several items: a new one arrives after ``"each"`` pick, or a ``"batch"`` when the bin is empty.
+        preview: how many of the next items are seen before they arrive, in their order. What is feasible does not
+            depend on it.
         handling: whether each item has handling instructions of its own: the greatest load that may lie on it, and the
             turns that are allowed. The rules then keep count of which items lie on which.
         tipping: whether items may be put down on another side, too, for cells in which the gripper does not matter. An
@@ -81,6 +83,7 @@ class CellSpec:
     reach: Reach | None = None
     bin_items: int = 1
     refill: str = "each"
+    preview: int = 0
     handling: bool = False
     tipping: bool = False
     longest_side: int | None = field(default=None, metadata={"derived": True})
@@ -112,10 +115,12 @@ class CellSpec:
         expect(good, "rotations", self.rotations, "1, 2, 3 or 4 (quarter turns to choose from)")
         whole_number("bin_items", self.bin_items, most=MAX_BIN_ITEMS)
         one_of("refill", self.refill, REFILLS)
+        whole_number("preview", self.preview, 0, MAX_BIN_ITEMS)
         flag("handling", self.handling)
         if flag("tipping", self.tipping):
             expect(self.bin_items % POSES == 0, "bin_items", self.bin_items, "a multiple of 3 with tipping=true")
             expect(self.height_unit == 1, "height_unit", self.height_unit, "1 with tipping=true")
+            expect(self.preview == 0, "preview", self.preview, "0 with tipping=true")
         or_null(whole_number, "longest_side", self.longest_side)
         or_null(whole_number, "most_items", self.most_items)
         expect(isinstance(self.reach, Reach | None), "reach", self.reach, "a Reach, such as an Annulus, or None")

@@ -142,6 +142,21 @@ def items_from_observation(observation: Observation) -> Item:
     return items if handling is None else Item(*items[:6], *handling.unbind(-1))
 
 
+def coming_from_observation(observation: Observation) -> Item | None:
+    """Return the items that arrive next, ``[N, p]``, in their order; None where none are shown.
+
+    The table ``coming``, int64 ``[N, p, 5]``, has x, y, w, d and h; or, ``[N, p, 8]``, turns, mass and greatest load,
+    too.
+    """
+    if (table := observation.get("coming", None)) is None or table.shape[1] == 0:
+        return None
+    x, y, w, d, h, *handling = table.unbind(-1)
+    rotations = observation.get("rotations", None)
+    if rotations is not None and not handling:
+        handling = [turns_from_flags(rotations)[:, None].expand_as(x)]
+    return Item(x, y, w, d, h, None, *handling)
+
+
 def turns_from_flags(flags: Tensor) -> Tensor:
     """Return bool ``[..., R]``, whether each rotation is allowed, as bit masks: int64 ``[...]``."""
     return (flags.long() << torch.arange(flags.shape[-1], device=flags.device)).sum(-1)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pickplace.common.validate import expect, number, refuse_if, short_text
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.item import NO_LIMIT, bin_depth_from_items, bin_labels_from_items, flags_from_turns
+from pickplace.rules.item import NO_LIMIT, Item, bin_depth_from_items, bin_labels_from_items, flags_from_turns
 from pickplace.rules.state import State
 
 PAPER_CELL = CellSpec()
@@ -80,6 +80,33 @@ class Items(Term):
 
     def value(self, cell, state):
         return state.items.cuboids
+
+
+class Coming(Term):
+    """The items that arrive next, in their order, int64 ``[N, p, 5]``: x, y, w, d in cells, h in height units.
+
+    A row of zeros stands for no item: the stream is over. An item lies at x, y if it comes into an empty bin. In cells
+    with ``handling`` the turns, the mass and the greatest load follow, as of :class:`Handling`: ``[N, p, 8]``.
+    """
+
+    def bounds(self, cell, tallest):
+        high = NO_LIMIT if cell.handling else max(tallest, *cell.bin_size[:2])
+        return Bounds(0, high, (cell.preview, 8 if cell.handling else 5), torch.int64)
+
+    def value(self, cell, state):
+        if state.coming is None:  # of a robot's scene that shows none
+            return state.tote_height.new_zeros(len(state.tote_height), 0, 8 if cell.handling else 5)
+        return torch.stack([*state.coming[:5], *(state.coming[6:] if cell.handling else ())], -1)
+
+
+class SeenItems(Term):
+    """All items that are seen, int64 ``[N, M + p, 5]``: those of :class:`Items`, then those that arrive next."""
+
+    def bounds(self, cell, tallest):
+        return Bounds(0, max(tallest, *cell.bin_size[:2]), (cell.bin_items + cell.preview, 5), torch.int64)
+
+    def value(self, cell, state):
+        return seen_items(state.items, state.coming)
 
 
 class Handling(Term):
@@ -198,7 +225,7 @@ class EpisodeNumber(Term):
 #: Entries for what episodes may differ in, in environments that let it vary.
 EPISODE_TERMS: Mapping[str, Term] = {
     "rotations": Rotations(),
-    **{key: EpisodeNumber(key) for key in ("item_mix", "bin_items", "refill", "level")},
+    **{key: EpisodeNumber(key) for key in ("item_mix", "bin_items", "refill", "preview", "level")},
 }
 
 #: What every observation holds; the whole state can be read from it, see :meth:`State.from_observation`.
@@ -249,13 +276,19 @@ RESERVED = (
 def standard_terms(cell: CellSpec) -> dict[str, Term]:
     """Return the terms that an observation of a cell always has."""
     several: dict[str, Term] = {"bin_labels": BinLabels(), "items": Items()} if cell.bin_items > 1 else {}
+    coming = {"coming": Coming()} if cell.preview else {}
     handling = HANDLING_TERMS if cell.handling else {}
-    return {**STANDARD_TERMS, **several, **handling, **{key: EPISODE_TERMS[key] for key in cell.varies}}
+    return {**STANDARD_TERMS, **several, **coming, **handling, **{key: EPISODE_TERMS[key] for key in cell.varies}}
 
 
 def item_keys(bin_items: int) -> tuple[str, ...]:
     """Return the entries of such an observation that list the items; one item is in the depth map."""
     return ("items",) if bin_items > 1 else ()
+
+
+def seen_items(items: Item, coming: Item | None) -> Tensor:
+    """Return the items in the bins, ``[N, M]``, and those that arrive next, ``[N, p]``, as of :class:`SeenItems`."""
+    return items.cuboids if coming is None else torch.cat([items.cuboids, coming.cuboids], 1)
 
 
 def check_terms(terms: Mapping[str, Term] | None, cell: CellSpec = PAPER_CELL) -> dict[str, Term]:

@@ -6,7 +6,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.rules.item import Item, Observation, items_from_observation, turns_from_flags
+from pickplace.rules.item import (
+    Item,
+    Observation,
+    coming_from_observation,
+    items_from_observation,
+    turns_from_flags,
+)
 from pickplace.rules.pile import Pile
 
 EMPTY = 1  # surface of an empty tote, see `surface_from`
@@ -52,12 +58,13 @@ class Episode(NamedTuple):
     turns: Tensor | None = None  # int64: bit mask of the rotations that are allowed, as of an item
     bin_items: Tensor | None = None  # int64: how many items the bin holds at most
     refill: Tensor | None = None  # int64: index of the rule in REFILLS
+    preview: Tensor | None = None  # int64: how many of the next items are seen
     level: Tensor | None = None  # int64: number of the curriculum's level
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "Episode":
         """Return what the entries of an observation say."""
-        read = {key: observation.get(key, None) for key in ("item_mix", "bin_items", "refill", "level")}
+        read = {key: observation.get(key, None) for key in ("item_mix", "bin_items", "refill", "preview", "level")}
         rotations = observation.get("rotations", None)
         return cls(
             turns=rotations if rotations is None else turns_from_flags(rotations),
@@ -80,6 +87,7 @@ class State(NamedTuple):
     items: Item  # in the bin, [N, M]
     episode: Episode = FULL_TASK  # what the running episodes may differ in
     pile: Pile | None = None  # of the items in the tote; None: any item bears any load
+    coming: Item | None = None  # those that arrive next, in their order, [N, p]; None: none are seen
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "State":
@@ -90,7 +98,8 @@ class State(NamedTuple):
         pile = None
         if "pile_below" in observation:
             pile = Pile(*(observation[key] for key in ("tote_labels", "pile_spare", "pile_below")))
-        return cls(surface, tote_height, items, Episode.from_observation(observation), pile)
+        coming = coming_from_observation(observation)
+        return cls(surface, tote_height, items, Episode.from_observation(observation), pile, coming)
 
     @property
     def heights(self) -> Tensor:
@@ -104,8 +113,9 @@ class State(NamedTuple):
 
     def rows(self, index) -> "State":
         """Return the state of some problems, by their numbers, which may come up more than once."""
-        parts = self.surface[index], self.tote_height[index], self.items.rows(index)
-        return State(*parts, self.episode.rows(index), None if self.pile is None else self.pile.rows(index))
+        parts = self.surface[index], self.tote_height[index], self.items.rows(index), self.episode.rows(index)
+        pile = None if self.pile is None else self.pile.rows(index)
+        return State(*parts, pile, None if self.coming is None else self.coming.rows(index))
 
     def each_item(self) -> tuple[Tensor, Tensor, Item]:
         """Return a problem for each item, those of a bin one after the other.

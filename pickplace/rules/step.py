@@ -42,7 +42,11 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     Args:
         action: int64 ``[N]``, the flat index, in ``[0, N_a)``.
     """
-    (surface, tote_height, items, _, pile), (tote_w, tote_d, _), (ee_w, ee_d) = state, cell.tote_size, cell.gripper.size
+    (surface, tote_height, items, _, pile, _), (tote_w, tote_d, _), (ee_w, ee_d) = (
+        state,
+        cell.tote_size,
+        cell.gripper.size,
+    )
     taken, item, blocked = take_item(cell, items, action)
     picked, rotation, (left, front, wide, deep), (x, y, w, d) = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
@@ -81,6 +85,8 @@ def body_cells(shapes: tuple[EffectorShape, ...], side: int, device: torch.devic
 
 def put_down(cell: CellSpec, state: State, choice: Tensor) -> tuple[State, Item]:
     """Return the state after a successful choice, before other items arrive, and the item that is placed, ``[N]``.
+
+    :func:`~pickplace.rules.bin.let_in` returns the state after those have arrived that are seen.
 
     Args:
         choice: int64 ``[N]``, ``item * num_footprints + footprint``, with the index of

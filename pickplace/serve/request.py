@@ -78,6 +78,9 @@ class PlanRequest:
         "what lies in the tote, as the plans before placed it, in the tote's frame, h the height of its top; m and "
         "degrees; needed where a box has a max_load"
     )
+    coming: list[Box] | None = _key(
+        "the items that arrive next, in their order, each as it will lie in the bin, as in items; m and degrees"
+    )
     exclude: list[list[float]] | None = _key(
         "pick.center of plans whose grasp failed, in the bin's frame: no pick within half a cell of one is planned "
         "again; m with cell_size, else cells"
@@ -119,7 +122,7 @@ class PlanRequest:
             lambda key: f"{key[:40]}: there is no such key; expected any of {', '.join(known)}.",
         )
         given = {key: value for key, value in given.items() if value is not None}
-        for key in ("items", "placed"):
+        for key in ("items", "placed", "coming"):
             if key in given:
                 given[key] = read_boxes(key, given[key])
         if "items" in given:
@@ -155,7 +158,7 @@ PLAN_OPTIONS = [key for key in fields(PlanRequest) if key.metadata["option"]]
 
 
 def read_boxes(key: str, items) -> list[Box]:
-    """Return the boxes of a request's ``items`` or ``placed``.
+    """Return the boxes of a request's ``items``, ``placed`` or ``coming``.
 
     Raises:
         ValueError: naming the first one with other keys.

@@ -53,6 +53,7 @@ class Move:
     heat: np.ndarray | None = None  # uint8 [W_T, D_T]: the policy's preference for each place cell, 255 the highest
     others: list[InBin] = field(default_factory=list)  # what else lies in the bin
     grams: int = 0  # mass of the item; 0: not known
+    coming: list[InBin] = field(default_factory=list)  # what is seen to arrive next, in its order
 
 
 @dataclass
@@ -124,6 +125,7 @@ def record_moves(
             heat=None if heat is None else heat[row],
             others=items_in_bin(others, row),
             grams=int(step.item.grams[row]),
+            coming=[] if state.coming is None else items_in_bin(state.coming, row),
         )
         for row in range(len(action))
     ]

@@ -100,6 +100,7 @@ def _episode(recording: Recording, cell: CellSpec) -> dict:
         "waiting": [_item(item, cell) for item in recording.waiting],
         "moves": moves,
         "others": [[_item(item, cell) for item in move.others] for move in recording.moves],
+        "coming": [[_item(item, cell) for item in move.coming] for move in recording.moves],
         "heat": base64.b64encode(np.stack(heat).tobytes()).decode() if heat else None,
     }
     return facts | (_physics(recording.carried_out, facts, cell) if recording.carried_out else {})

@@ -43,7 +43,7 @@ def assert_equal(a, b, keys=None):
 
 
 @pytest.mark.parametrize(
-    "kwargs", [{}, {"bin_size": (4, 6, 2), "effector_size": (2, 3), "rotations": 3}, {"bin_items": 3}]
+    "kwargs", [{}, {"bin_size": (4, 6, 2), "effector_size": (2, 3), "rotations": 3}, {"bin_items": 3, "preview": 2}]
 )
 def test_checkers_of_other_projects(kwargs):
     with warnings.catch_warnings():

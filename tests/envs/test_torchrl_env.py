@@ -48,6 +48,7 @@ def same(left, right):
         {"kinds": [(2, 3, 2), (1, 1, 1)], "bin_size": (4, 6, 2), "tote_size": (5, 7, 6), "effector_size": (2, 4)},
         {"reach": random_limits(CellSpec(rotations=2), 1), "rotations": 2, "kinds": [(1, 1, 1)]},
         {"bin_items": 3, "masks": ("footprint", "action")},
+        {"preview": 2, "handling": True},
         {"bin_items": 4, "refill": "batch", "kinds": [(2, 3, 2), (1, 1, 1)], "bin_size": (4, 6, 1)},
     ],
 )

@@ -11,13 +11,17 @@ from pickplace.planners.beam import Beam, _fingerprint, _Plans
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.afterstate.policy import Afterstate, AfterstateFcn
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
+from pickplace.rules.bin import let_in
 from pickplace.rules.gripper.rules import Overlap
 from pickplace.rules.item import Item
 from pickplace.rules.masks import placing_maps
-from pickplace.rules.state import EMPTY, State
+from pickplace.rules.observation import check_terms, observe
+from pickplace.rules.state import EMPTY, State, surface_from
 from pickplace.rules.step import put_down
 
 SEVERAL = {"tote_size": (4, 4, 3), "bin_items": 3, "bin_size": (6, 6, 1), "rotations": 2}
+CONVEYOR = {"tote_size": (4, 4, 2), "preview": 3, "rotations": 2, "items": [(2, 2, 1), (3, 1, 1), (1, 2, 1)]}
+BOTH = {**CONVEYOR, "preview": 2, "bin_items": 2, "bin_size": (6, 6, 1)}
 
 
 def untrained(cell, kind=Afterstate):
@@ -56,10 +60,13 @@ def totals(policy, state, depth):
     if len(choices) == 0:
         return [], []
     after, item = put_down(policy.cell, state.repeat(len(choices)), choices)
+    after = let_in(policy.cell, after)
     values = policy.judge(state.repeat(len(choices)), choices)[2].tolist()
     if depth > 1:
         later = [totals(policy, after.rows([row]), depth - 1)[1] for row in range(len(choices))]
-        values = [max(those, default=value) for those, value in zip(later, values, strict=True)]
+        # Nothing follows where a full bin fits nowhere.
+        ends = [0.0 if full else value for full, value in zip(after.items.exists.all(1).tolist(), values, strict=True)]
+        values = [max(those, default=value) for those, value in zip(later, ends, strict=True)]
     return choices.tolist(), (policy.network.reward_scale * item.volume + torch.tensor(values)).tolist()
 
 
@@ -67,6 +74,8 @@ def totals(policy, state, depth):
     (SEVERAL, 2, 8),
     ({**SEVERAL, "gripper": Overlap((1, 1)), "support": "full"}, 2, 8),
     ({**SEVERAL, "tote_size": (3, 3, 3)}, 3, 1),
+    ({**CONVEYOR, "tote_size": (3, 3, 2)}, 3, 4),
+    (BOTH, 2, 4),
 ])  # fmt: skip
 def test_a_wide_beam_finds_the_best_of_all_plans(settings, depth, problems):
     policy, decided = untrained(PickPlaceEnv(**settings).cell), 0
@@ -84,10 +93,11 @@ def test_a_wide_beam_finds_the_best_of_all_plans(settings, depth, problems):
     raise AssertionError("too few problems")
 
 
-def test_problems_do_not_mix():
+@pytest.mark.parametrize("settings", [SEVERAL, CONVEYOR, BOTH])
+def test_problems_do_not_mix(settings):
     """Each problem of a batch is decided as alone, also where others have ended or need no more placements."""
-    policy = untrained(PickPlaceEnv(**SEVERAL).cell)
-    for env, seen in states(3, **SEVERAL):
+    policy = untrained(PickPlaceEnv(**settings).cell)
+    for env, seen in states(3, **settings):
         beam = Beam(env.cell, policy, width=3, depth=3)
         together = policy.to_choice(beam.decide(seen), seen)
         alone = [policy.to_choice(beam.decide(seen[row : row + 1]), seen[row : row + 1]) for row in range(len(seen))]
@@ -114,6 +124,31 @@ def test_plans_are_the_same_if_tote_and_items_are(surface, place, other, problem
     changed = [*surface]
     changed[place] = other
     assert (found == number(changed, items + none)) == (changed == surface)
+
+
+def test_plans_are_the_same_if_what_comes_is():
+    """In its order."""
+    state = State(torch.ones(1, 2, 3).int(), torch.tensor([3]), Item.from_table(torch.tensor([[[0, 0, 2, 1, 1]]])))
+    queue = [[0, 0, 1, 1, 1], [1, 0, 2, 1, 1]]
+    numbers = [
+        _fingerprint(torch.tensor([0]), state._replace(coming=coming)).item()
+        for coming in (None, *(Item.from_table(torch.tensor([rows])) for rows in (queue, queue[::-1], queue[:1])))
+    ]
+    assert len({*numbers}) == 4
+
+
+@pytest.mark.parametrize(("preview", "depth", "place"), [(1, 2, 4), (1, 1, 0), (0, 2, 0)])
+def test_a_plan_that_strands_what_comes_is_worth_what_it_places(preview, depth, place):
+    """A row of cells of which one is full. Only what goes to the last cell leaves room for an item of three cells,
+    while the policy would keep that cell free at any cost."""
+    cell = CellSpec((3, 1, 1), (5, 1, 1), Overlap((1, 1)), rotations=1, support="half", preview=preview)
+    policy = untrained(cell)
+    policy.network.forward = lambda depth, *_: 10 * depth[:, 4, 0, None]
+    items, coming = (Item.from_table(torch.tensor([[[0, 0, w, 1, 1]]])) for w in (1, 3))
+    surface = surface_from(torch.tensor([[[0], [0], [0], [1], [0]]]))
+    state = State(surface, torch.tensor([1]), items, coming=coming if preview else None)
+    seen = observe(check_terms(None, cell), cell, state)
+    assert policy.to_choice(Beam(cell, policy, depth=depth).decide(seen), seen).item() == place
 
 
 def test_equal_outcomes_are_kept_once():

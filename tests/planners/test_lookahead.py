@@ -119,6 +119,17 @@ def test_what_lies_in_the_bin_is_played_before_anything_is_imagined():
     assert further.std(1).max() > 0  # then comes an imagined batch
 
 
+def test_what_is_seen_to_come_is_played_before_anything_is_imagined():
+    env = make_env(64, (6, 6, 5), preview=2)
+    env.reset()
+    search = search_of(env, lambda observation: torch.zeros(len(observation["tote_depth"]), 1))
+    state = env.state
+    choice = choice_mask(env.cell, placing_maps(env.cell, state)).int().argmax(1)
+    expected = (state.items.volume + state.coming.volume.sum(1, keepdim=True)).double().expand(64, 4)
+    assert torch.equal(search._returns(state, torch.arange(64), choice, 4, 2), expected)
+    assert search._returns(state, torch.arange(64), choice, 4, 3).std(1).max() > 0
+
+
 def gain_bounds(gain):
     """Return mean -+ two standard errors."""
     error = 2 * gain.std() / len(gain) ** 0.5

@@ -7,6 +7,7 @@ from problems import occupancies
 from pickplace import PickPlaceEnv
 from pickplace.items.distributions import Kinds, Recorded
 from pickplace.planners.mcts import MCTS, _Edge, _Node
+from pickplace.rules.gripper.rules import Overlap
 from pickplace.rules.item import Item
 from pickplace.rules.masks import actions_reaching, placing_maps
 from pickplace.rules.state import State
@@ -36,7 +37,7 @@ def test_more_simulations_come_closer_to_the_optimum():
 
 def searched(mask, simulations, rollouts=True, **settings):
     """Return the root of the tree of one decision."""
-    env, roots = make_env(tote_size=(4, 4, 2), **settings), []
+    env, roots = make_env(**{"tote_size": (4, 4, 2), **settings}), []
     search = search_of(env, simulations, mask=mask, wave=7)
     make = search._nodes
     search._nodes = lambda *args: roots.append(make(*args)) or roots[-1]
@@ -91,6 +92,22 @@ def test_what_is_not_taken_stays_in_the_bin(mask):
             assert node.items.tolist()[:2] == before[:taken] + before[taken + 1 :]
             looked.add(taken)
     assert len(looked) > 1
+
+
+@pytest.mark.parametrize("mask", [True, False])
+def test_what_is_seen_to_come_is_the_next_bin(mask):
+    """There is one such bin after an action, until what is seen is used up; several are imagined after that."""
+    sizes = {"bin_size": (2, 2, 1), "tote_size": (3, 2, 2), "gripper": Overlap((1, 1)), "rotations": 1}
+    root = searched(mask, 800, preview=1, **sizes)
+    after = [node for edge in root.edges.values() for node in edge.bins]
+    assert after and all(torch.equal(node.items, root.coming) and not node.coming.any() for node in after)
+    assert all(edge.is_known for edge in root.edges.values() if edge.bins)
+    later = [edge for node in after for edge in node.edges.values() if edge.bins]
+    assert not any(edge.is_known for edge in later)
+    assert len({tuple(node.items.flatten().tolist()) for edge in later for node in edge.bins}) > 3
+    assert max(len(edge.bins) for edge in later) > 1
+    known = [edge for edge in edges_of(searched(mask, 800, preview=2, **sizes)) if edge.is_known]
+    assert len(known) > 20 and max(len(edge.bins) for edge in known) == 1
 
 
 def test_without_a_mask_it_tries_what_fails():

@@ -62,7 +62,7 @@ def test_a_planner_that_fails_is_named():
 def ask_robot(planner):
     robot, item = Planner(CellSpec(), untrained_policy(CellSpec())), torch.zeros(5, 5)
     item[0, 0] = 1
-    robot._planners[1] = planner
+    robot._planners[1, 0] = planner
     planner.choose = lambda cell, state, maps, observation: planner.decide(observation)
     robot.plan(Scene.from_maps(item, torch.full((6, 6), 5)), alternatives=0)
 

@@ -8,23 +8,26 @@ import torch
 from commands import composed
 from dynamic_programming import optimal_occupancy
 from omegaconf import OmegaConf
-from problems import SETTINGS, random_states
+from problems import SETTINGS, late_state, random_states
 from tensordict import TensorDict
 
 from pickplace import PickPlaceEnv
 from pickplace.algorithms.td import totes_left, with_targets
 from pickplace.config.registry import build
 from pickplace.evaluation.play import play
+from pickplace.items.distributions import Uniform
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.afterstate.cells import CellsValue
 from pickplace.policies.afterstate.picture import PictureValue
 from pickplace.policies.afterstate.policy import Afterstate, AfterstateFcn
 from pickplace.policies.restore import restore_critic, restore_policy
+from pickplace.rules.bin import let_in
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import footprint_index
 from pickplace.rules.masks import placing_maps
+from pickplace.rules.observation import SeenItems, observe
 from pickplace.rules.state import State
-from pickplace.rules.step import apply
+from pickplace.rules.step import apply, put_down
 from pickplace.runs import checkpoint
 from pickplace.runs.locate import locate
 from pickplace.training.train import train
@@ -41,14 +44,15 @@ def weigh(net, std=3.0):
     torch.nn.init.normal_(net.waiting.sum.weight, std=0.3)
 
 
-def left_in_bins(items, taken, tipping):
-    """Return a table of bins without an item each, in all its poses, by plain Python."""
+def left_in_bins(state, taken, tipping):
+    """Return a table of bins without an item each, in all its poses, and of what comes, by plain Python."""
     rows = []
     for row, number in enumerate(taken.tolist()):
-        bin_ = items.cuboids[row].tolist()
+        bin_ = state.items.cuboids[row].tolist()
+        coming = [] if state.coming is None else state.coming.cuboids[row].tolist()
         gone = {number // 3 * 3 + pose for pose in range(3)} if tipping else {number}
         kept = [item for place, item in enumerate(bin_) if place not in gone]
-        rows.append(kept + [[0] * 5] * len(gone))
+        rows.append(kept + [[0] * 5] * len(gone) + coming)
     return torch.tensor(rows)
 
 
@@ -65,13 +69,36 @@ def test_a_score_is_the_items_volume_and_the_value_of_what_the_step_leaves(kind,
             largest = env.state.items.volume.amax(1, keepdim=True)
             choice = policy.logits(observation).argmax(1)
             score = policy.logits(observation).gather(1, choice[:, None])
-            left = left_in_bins(env.state.items, choice // env.cell.num_footprints, env.cell.tipping)
+            left = left_in_bins(env.state, choice // env.cell.num_footprints, env.cell.tipping)
             data = env.step(observation.clone().set("action", policy.to_action(choice, observation)))
             after = data["next"].set("items", left)
             value = policy.network(*(after[key] for key in policy.network.in_keys))
         torch.testing.assert_close(2 * (value + after["reward"] - largest), score)
         batch = data.set(policy.choice_key, choice).unsqueeze(1)
         assert torch.equal(totes_left(batch, policy)["items"][:, 0], left)
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_what_waits_is_one_set(kind):
+    """The value is the same before and after what is seen has arrived; it depends on what comes, in any number."""
+    torch.manual_seed(0)
+    settings = {"tote_size": (5, 5, 4), "bin_items": 3, "bin_size": (9, 9, 1), "preview": 2}
+    env, observation = late_state(4, items=Uniform((1, 3), (1, 3), (1, 2)), **settings)
+    policy = kind(env.cell, compute_dtype="float32", **SMALL[kind])
+    weigh(policy.network)
+    choice = observation["action_mask"].int().argmax(1)
+    left, _ = put_down(env.cell, env.state, policy.to_choice(choice, observation))
+    assert left.items.exists.sum(1).min() < 3
+
+    def value(state):
+        seen = observe({**env.terms, "items": SeenItems()}, env.cell, state, policy.network.in_keys)
+        with torch.no_grad():
+            return policy.network(*(seen[key] for key in policy.network.in_keys))[:, 0]
+
+    torch.testing.assert_close(value(let_in(env.cell, left)), value(left), rtol=1e-5, atol=1e-3)
+    fewer = left._replace(coming=left.coming.rows((slice(None), slice(0, 1))))
+    assert ((value(fewer) - value(left)).abs() > 1e-2).all()
+    assert ((value(left._replace(coming=None)) - value(left)).abs() > 1e-2).all()
 
 
 @pytest.mark.parametrize("kind", SMALL)

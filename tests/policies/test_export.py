@@ -44,17 +44,19 @@ def test_torch_export_takes_any_size(name):
         torch.testing.assert_close(program(*example), scores(*example), rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize(("patch", "bin_items"), [(1, 1), (2, 1), (1, 2)])
-def test_torch_export_of_values_takes_any_tote(patch, bin_items):
+@pytest.mark.parametrize(("patch", "bin_items", "preview"), [(1, 1, 0), (2, 1, 0), (1, 2, 0), (1, 1, 3), (1, 2, 3)])
+def test_torch_export_of_values_takes_any_tote(patch, bin_items, preview):
     torch.manual_seed(0)
-    cell = CellSpec(support=Bearing(), bin_items=bin_items, longest_side=3)
+    cell = CellSpec(support=Bearing(), bin_items=bin_items, longest_side=3, preview=preview)
     policy = AfterstateFcn(cell, patch=patch, stem=4, filters=8, compute_dtype="float32")
     torch.nn.init.normal_(policy.network.head.weight, std=3)
+    torch.nn.init.normal_(policy.network.waiting.sum.weight, std=0.1)
     keys = [key for key in policy.in_keys if not key.endswith("_mask")]
     examples = []
     for count, tote in ((2, (7, 9)), (3, (5, 8)), (4, (8, 6))):
         maps, height = random_maps(count, count, (5, 5), tote), torch.full((count, 1), 8)
-        examples.append((*maps, height, torch.randint(1, 4, (count, 2, 5)))[: len(keys)])
+        tables = {"items": torch.randint(1, 4, (count, 2, 5)), "coming": torch.randint(1, 4, (count, 1 + count, 5))}
+        examples.append((*maps, height, *(table for key, table in tables.items() if key in keys)))
     shapes = tuple(dict(enumerate(shapes_of(policy)[key])) for key in keys)
     scores = Scores(policy, keys)
     scores(*examples[0])

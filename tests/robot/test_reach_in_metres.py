@@ -107,7 +107,7 @@ def test_lookahead_ranks_what_the_robot_reaches():
     planners = [Planner.load("pretrained/mixed", planner=name, tote_size=(6, 6, 5), reach=ANNULUS_OF_ALL)
                 for name in (None, "lookahead")]  # fmt: skip
     for key, value in {"samples": 2, "rounds": 1, "candidates": 2, "horizon": 1}.items():
-        setattr(planners[1]._planners[1], key, value)
+        setattr(planners[1]._planners[1, 0], key, value)
     for place in ((0.07, 0.07), (0.18, 0.06), (0.06, 0.18)):
         seen = {"items": [Box(*place, 0.1, 0.08, 0.06)], "tote_depth": depth, "cell_size": CELL, "alternatives": 0}
         assert [plan_for(planner, **seen).status for planner in planners] == ["ok", "ok"]

@@ -387,9 +387,9 @@ def test_the_critic_of_a_search_sees_each_item():
     depth, labels = np.zeros((5, 5)), np.zeros((5, 5), dtype=int)
     for label, (corner, height) in enumerate(((slice(0, 1), 1), (slice(3, 5), 2)), 1):
         depth[corner, corner], labels[corner, corner] = height, label
-    critics = [planner._planners[1].critic]
+    critics = [planner._planners[1, 0].critic]
     assert plan_for(planner, depth, np.full((6, 6), 5), bin_labels=labels).status == "ok"
-    critics.append(planner._planners[2].critic)
+    critics.append(planner._planners[2, 0].critic)
     assert [critic.in_keys[3:] for critic in critics] == [[], ["items"]]
     assert critics[0].network is critics[1].network
 

@@ -14,7 +14,9 @@ from pickplace.items.arrival import refill
 from pickplace.items.distributions import Kinds, Recorded, Uniform, hashed_uniform
 from pickplace.rules.bin import (
     add_item,
+    awaits_unseen,
     blocked_picks,
+    let_in,
     must_share,
     remove_item,
     select_item,
@@ -24,7 +26,7 @@ from pickplace.rules.bin import (
 from pickplace.rules.gripper.base import reference_cell
 from pickplace.rules.item import bin_depth_from_items, bin_labels_from_items
 from pickplace.rules.masks import action_footprints, action_mask, choice_mask, placing_maps
-from pickplace.rules.state import State, surface_from
+from pickplace.rules.state import EMPTY, REFILLS, Episode, State, surface_from
 from pickplace.rules.step import apply, put_down
 
 
@@ -128,6 +130,39 @@ def test_items_arrive_in_their_order_where_they_have_room(kind, rule, tmp_path):
         if rows[n]:
             found, number = arrivals_by_hand(source, "train", address, contents[n], cell, int(arrived[n]))
         assert [tuple(row) for row in items.cuboids[n].tolist() if row[4]] == found and after[n] == number
+
+
+@pytest.mark.parametrize("varies", [False, True])
+@pytest.mark.parametrize("count", [1, 4])
+def test_what_is_seen_enters_in_its_order_at_the_first_place(count, varies):
+    """Against plain Python: the first in an empty bin at its own place; and whether an unseen one may follow."""
+    rng, size = Random(count), (5, 6)
+    contents = [random_contents(rng, size, rng.choice((0, 0, 1, 3)))[:count] for _ in range(80)]
+    queues = [[random_contents(rng, size, 1)[0] for _ in range(rng.randint(0, 3))] for _ in range(80)]
+    limits, rules = [rng.randint(1, count) for _ in range(80)], [rng.randrange(2) for _ in range(80)]
+    episode = Episode(bin_items=torch.tensor(limits), refill=torch.tensor(rules)) if varies else Episode()
+    cell, empty = CellSpec(bin_size=(*size, 1), bin_items=count), torch.full((80, 6, 6), EMPTY, dtype=torch.int32)
+    tote_height, coming = torch.full((80,), 5), as_items(queues, 3)
+    after = let_in(cell, State(empty, tote_height, as_items(contents, count), episode, coming=coming))
+    awaits = awaits_unseen(cell, after).tolist()
+    for n, (found, queue) in enumerate(zip(contents, queues, strict=True)):
+        most, is_batch = (limits[n], REFILLS[rules[n]] == "batch") if varies else (count, False)
+        closed = is_batch and bool(found)
+        while queue and len(found) < most and not closed:
+            x, y, w, d, h = queue[0]
+            full = {part for other in found for part in cells(other[:2], other[2:4])}
+            places = [
+                place for place in product(range(size[0] - w + 1), range(size[1] - d + 1))
+                if full.isdisjoint(cells(place, (w, d)))
+            ]  # fmt: skip
+            if not places:
+                break
+            found = [*found, (*(places[0] if found else (x, y)), w, d, h)]
+            queue = queue[1:]
+        assert [tuple(item) for item in after.items.cuboids[n].tolist() if item[4]] == found
+        assert [tuple(item) for item in after.coming.cuboids[n].tolist() if item[4]] == queue
+        assert awaits[n] == (len(found) < most and not (is_batch and found) and not queue)
+    assert {*awaits} == {False, True}
 
 
 def test_places_are_drawn_evenly():

@@ -31,6 +31,8 @@ from pickplace.rules.support.rules import Hull
         *(({"height_unit": value}, f"height_unit={value}: .* between 0.001 and 1000") for value in (1e-4, 2000)),
         ({"longest_side": 0}, "longest_side=0: expected a whole number >= 1"),
         ({"bin_items": 0}, "bin_items=0: expected a whole number >= 1 and <= 100"),
+        ({"preview": -1}, "preview=-1: expected a whole number >= 0 and <= 100"),
+        ({"preview": 1, "tipping": True, "bin_items": 3}, "preview=1: expected 0 with tipping=true"),
         ({"refill": "all"}, "refill='all': expected 'each' or 'batch'"),
         ({"tote_sizes": (6, 6, 5)}, r"tote_sizes=\(6, 6, 5\): expected one of bin_size, tote_size, .*, height_unit"),
     ],
@@ -44,7 +46,7 @@ def test_every_setting_reaches_the_cell_of_the_environment():
     given = {
         "bin_size": [4, 6, 2], "tote_size": [5, 7, 6], "gripper": Overlap([2, 4], "disc", "disc", [2, 4]),
         "rotations": 3, "support": Hull(0.3), "height_unit": 0.5, "cell_size": 0.02,
-        "reach": Annulus([0, 99], [0, 9], [-9, 0, 0], [2, 0, 0]), "bin_items": 2, "refill": "batch",
+        "reach": Annulus([0, 99], [0, 9], [-9, 0, 0], [2, 0, 0]), "bin_items": 2, "refill": "batch", "preview": 3,
         "handling": True, "tipping": False,
     }  # fmt: skip
     assert tuple(given) == CELL_SETTINGS

@@ -92,6 +92,22 @@ def test_several_items_in_the_bin_are_resumed_exactly(refill, tmp_path, no_repor
     assert_same(whole, killed)
 
 
+def test_a_preview_is_resumed_exactly(tmp_path, no_report):
+    """And trained with: the values learn from what comes."""
+    preview = ["env.preview=3", "env.bin_items=2", "curriculum.levels=[{tote_height: 2, preview: 1}, {}]"]
+    preview += ["experiment=afterstate", "curriculum=mixture", "env.tote_size=[5,5,3]", "env.num_envs=8"]
+    preview += ["rollout_length=8", "algo.minibatch_size=32", "model.actor.filters=4", "model.actor.hidden=16"]
+    preview += [f"checkpoint_interval={2 * ITERATION}", f"total_frames={4 * ITERATION}", "evaluation.episodes=4"]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    whole.mkdir()
+    with after_batch(3, lambda _: shutil.copytree(whole, killed)):
+        train(composed(*preview), whole)
+    resume_run([f"resume={killed}"])
+    assert_same(whole, killed)
+    state, _ = checkpoint.read(locate(whole, "last"))
+    assert state["policy"]["network.waiting.sum.weight"].abs().max() > 0
+
+
 def test_a_run_killed_before_its_first_last_resumes_from_best(undisturbed, tmp_path, no_report):
     whole, killed = undisturbed("single")
     run_dir = shutil.copytree(killed, tmp_path / "run")
@@ -343,10 +359,11 @@ def test_a_checkpoint_that_no_training_wrote_is_not_resumed(smoke_run, tmp_path,
         (lambda saved: saved["item"].select(2, 4).fill_(9), "item: expected sizes of the distribution"),
         (lambda saved: saved["item"].copy_(saved["item"][:, :1].expand(-1, 2, -1)), "item: expected items that do not"),
         (lambda saved: saved["arrived"].add_(1), "arrived: expected the items placed and those in the bin"),
+        (lambda saved: saved["coming"].copy_(saved["coming"].flip(1)), "coming: expected the next items of this"),
     ],
 )
 def test_a_bin_that_no_episode_leads_to_is_refused(change, words):
-    env = PickPlaceEnv(num_envs=4, bin_items=2)
+    env = PickPlaceEnv(num_envs=4, bin_items=2, preview=3)
     carried = env.reset()
     saved = {"environment": {key: value.clone() for key, value in env.state_dict().items()}, "carried": carried}
     check_saved_states(env, saved)

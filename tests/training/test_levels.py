@@ -19,11 +19,11 @@ from pickplace.training.curriculum.transform import ToteHeightCurriculum
 from pickplace.training.train import resume_run, train
 
 PAPER = Kinds(PAPER_KINDS)
-SIZES = {"bin_size": (6, 6, 1), "tote_size": (6, 6, 5), "bin_items": 3}
+SIZES = {"bin_size": (6, 6, 1), "tote_size": (6, 6, 5), "bin_items": 3, "preview": 2}
 LEVELS = [
     {"tote_height": 2, "items": {"weights": [1, 0, 0, 0]}, "rotations": 1, "bin_items": 1},
     {"tote_height": 3, "items": {"width": [1, 2], "depth": [1, 1]}, "rotations": [0, 3]},
-    {"items": {"weights": [1, 0, 0, 0]}, "refill": "batch"},
+    {"items": {"weights": [1, 0, 0, 0]}, "refill": "batch", "preview": 0},
     {},
 ]
 
@@ -38,7 +38,7 @@ def test_levels_are_numbered_from_1_and_what_they_leave_out_is_that_of_the_full_
     numbers = {key: column[:, 0].tolist() for key, column in levels.entries.items() if key != "rotations"}
     assert numbers == {
         "tote_height": [2, 3, 5, 5], "level": [1, 2, 3, 4], "item_mix": [1, 2, 1, 0], "bin_items": [1, 3, 3, 3],
-        "refill": [0, 0, 1, 0],
+        "refill": [0, 0, 1, 0], "preview": [2, 2, 0, 2],
     }  # fmt: skip
     assert levels.entries["rotations"].int().tolist() == [[1, 0, 0, 0], [1, 0, 0, 1], [1] * 4, [1] * 4]
     assert [levels.items.arrives(mix).int().tolist() for mix in range(3)] == [[1] * 4, [1, 0, 0, 0], [1, 1, 0, 0]]
@@ -63,6 +63,7 @@ def test_episodes_play_what_their_level_sets():
         mix, sizes, exists = levels.entries["item_mix"][level, 0], td["items"][..., 2:], td["items"][..., 4] > 0
         assert ((sizes == 1).all(-1) | ~exists)[mix == 1].all() and ((sizes[..., 1] == 1) | ~exists)[mix == 2].all()
         assert (exists.sum(1) <= td["bin_items"][:, 0]).all()
+        assert ((td["coming"][..., 4] > 0).sum(1) == td["preview"][:, 0]).all()
         turned = td["action_mask"].unflatten(1, (-1, 4)).any(1)
         assert not (turned & ~td["rotations"]).any()
         action = td["action_mask"].float().multinomial(1)[:, 0]
@@ -79,7 +80,7 @@ ERRORS = [
     ([{}, {"tote_heigth": 2}], r"curriculum.levels\[1\].tote_heigth: .*did you mean 'tote_height'"),
     ([{"level": 2}], r"curriculum.levels\[0\].level: there is no key 'level' .*; expected one of tote_height, items"),
     ([{"tote_size": [3, 3, 3]}], r"levels\[0\].tote_size: .* chain two runs: .* warm_start.weights=outputs/first"),
-    ([{"gripper": "point"}], r"levels\[0\].gripper: a level sets tote_height, items, rotations, bin_items, refill\."),
+    ([{"gripper": "point"}], r"levels\[0\].gripper: a level sets tote_height, items, .*, refill, preview\."),
     ([{"tote_height": 6}], r"levels\[0\].tote_height=6: .* <= 5"),
     ([{"tote_height": None}], r"levels\[0\].tote_height=None: expected a whole number"),
     ([{"rotations": 5}], r"levels\[0\].rotations=5: expected how many quarter turns, 1 to 4"),
@@ -89,6 +90,7 @@ ERRORS = [
     ([{"items": []}], r"levels\[0\]: items=\[\]: expected {weights: "),
     ([{"rotations": [4]}], r"levels\[0\].rotations=\[4\]"),
     ([{"bin_items": 4}], r"levels\[0\].bin_items=4: .* <= 3"),
+    ([{"preview": 3}], r"levels\[0\].preview=3: .* >= 0 and <= 2, env.preview"),
     ([{"refill": "never"}], r"levels\[0\].refill='never': expected 'each' or 'batch'"),
     ([{"items": {"weights": [1]}}], r"levels\[0\]: items.weights=\[1\]: expected 4 numbers"),
     ([{"items": {"weights": [0] * 4}}], r"levels\[0\]: items.weights=.*not all 0"),

@@ -25,6 +25,7 @@ CELLS = {
     "paper": {},
     "odd": {**ODD, "items": Kinds([(1, 2, 2)])},
     "mixed": {"tote_size": (6, 5, 4), "effector_size": (4, 3), "items": Uniform((1, 3), (1, 3), (1, 2))},
+    "preview": {"preview": 2, "items": Uniform((1, 2), (1, 3), (1, 2))},
     "several": {"bin_size": (6, 5, 1), "bin_items": 3, "items": Uniform((1, 2), (1, 3), (1, 2))},
 }
 PLANNERS = {
@@ -87,6 +88,19 @@ def test_several_items_lie_in_the_bin_until_they_are_taken():
     episode, recording = unpack(replay.page(result.recordings, cell, ""))["episodes"][0], result.recordings[0]
     assert [[tuple(item) for item in others] for others in episode["others"]] == [m.others for m in recording.moves]
     assert [tuple(item) for item in episode["waiting"]] == recording.waiting
+
+
+def test_recordings_say_what_is_seen_to_come():
+    """The next items of the episode, in their order."""
+    cell, result = record("preview", "joint_dbl")
+    for recording in result.recordings:
+        sizes = [move.item[2:] for move in recording.moves] + [item[2:] for item in recording.waiting]
+        assert len(recording.moves) > 3
+        for n, move in enumerate(recording.moves):
+            seen = [item[2:] for item in move.coming]
+            assert len(seen) == 2 and seen[: len(sizes) - n - 1] == sizes[n + 1 : n + 3]
+    episode, recording = unpack(replay.page(result.recordings, cell, ""))["episodes"][0], result.recordings[0]
+    assert [[tuple(item) for item in coming] for coming in episode["coming"]] == [m.coming for m in recording.moves]
 
 
 def test_items_that_are_never_taken_have_a_colour():
@@ -348,6 +362,27 @@ THREE.InstancedMesh.prototype.setMatrixAt = function (n, m) {
   return set.call(this, n, m);
 };
 """
+
+
+def test_page_names_what_is_seen_to_come(browser, tmp_path):
+    kinds = [(0, 0, 1, 1, n) for n in (1, 2, 3, 4, 5)]
+    moves = [
+        Move((0, 0, 2, 1, 1), (0, 0), (0, 0), 0, (0, 0, 2, 1), 0, Failure.NONE, coming=kinds[:n]) for n in (2, 5, 0)
+    ]
+    state = open_page(browser, written(tmp_path, [Recording(0, 5, moves, Failure.NONE, [], 0.1)], CellSpec(preview=5)))
+    browser.execute_script("document.getElementById('seek').step = 'any'")
+    ends = (
+        "at height 0; next 1 × 1 × 1, 1 × 1 × 2",
+        "; next 1 × 1 × 1, 1 × 1 × 2, 1 × 1 × 3, 1 × 1 × 4, ...",
+        "set down at height 0",
+    )
+    for step, end in enumerate(ends):
+        browser.execute_script(
+            "const s = document.getElementById('seek'); s.value = arguments[0]; s.oninput()", step + 0.05
+        )
+        wait_until(browser, f"document.getElementById('which').textContent === 'Item {step + 1} of 3'")
+        assert browser.find_element("id", "what").text.endswith(end)
+    assert state()["moves"] == 3 and errors(browser) == []
 
 
 def test_page_puts_things_where_they_are(browser, tmp_path):

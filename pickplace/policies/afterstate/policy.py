@@ -11,9 +11,9 @@ from pickplace.policies.base import MASKED
 from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintPolicy, count_ways
 from pickplace.rules.bin import remove_item
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.item import Observation, items_from_observation
+from pickplace.rules.item import Observation, coming_from_observation, items_from_observation
 from pickplace.rules.masks import action_footprints, action_mask, placing_maps
-from pickplace.rules.observation import STANDARD_TERMS, Items, observe
+from pickplace.rules.observation import STANDARD_TERMS, SeenItems, observe, seen_items
 from pickplace.rules.state import State
 from pickplace.rules.step import put_down
 
@@ -24,7 +24,8 @@ class Afterstate(FootprintPolicy):
 
     The reward of an item is its volume wherever it lies, so that placements of one item differ only in the tote that
     they leave, the *afterstate* (Sutton & Barto 2018, section 6.8). Its value is what ``algo=td`` learns; the logit is
-    the sum, scaled as rewards are, divided by a temperature.
+    the sum, scaled as rewards are, divided by a temperature. The value also depends on the items that wait, those that
+    are left in the bin and those that are seen to come, as one set.
 
     Args:
         cell: the sizes.
@@ -49,13 +50,16 @@ class Afterstate(FootprintPolicy):
         """Return about how many bytes a frame takes, measured at totes of 10 to 100 cells."""
         return self.network.learning_bytes(*self.cell.tote_size[:2])
 
+    def item_keys(self, cell: CellSpec) -> tuple[str, ...]:
+        return (*super().item_keys(cell), "coming") if cell.preview else super().item_keys(cell)
+
     def items_left(self, observation: Observation, choice: Tensor) -> Tensor:
-        items = items_from_observation(observation)
-        return remove_item(self.cell, items, choice // self.cell.num_footprints).cuboids
+        left = remove_item(self.cell, items_from_observation(observation), choice // self.cell.num_footprints)
+        return seen_items(left, coming_from_observation(observation))
 
     def judge(self, before: State, choice: Tensor) -> tuple[State, Tensor, Tensor]:
         after, item = put_down(self.cell, before, choice)
-        seen = observe({**STANDARD_TERMS, "items": Items()}, self.cell, after, self.network.in_keys)
+        seen = observe({**STANDARD_TERMS, "items": SeenItems()}, self.cell, after, self.network.in_keys)
         value = self.network(*(seen[key] for key in self.network.in_keys))[:, 0]
         return after, item.volume, value
 

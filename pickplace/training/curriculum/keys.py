@@ -6,7 +6,7 @@ from pickplace.common.errors import unknown_key
 from pickplace.common.validate import short_text
 
 #: The keys of a level.
-KEYS = ("tote_height", "items", "rotations", "bin_items", "refill")
+KEYS = ("tote_height", "items", "rotations", "bin_items", "refill", "preview")
 
 
 def check_keys(levels: Sequence[Mapping]) -> None:
