@@ -1,4 +1,5 @@
-# The service: docker build -t pickplace . && docker run -p 8000:8000 -e PICKPLACE_TOKEN=$(openssl rand -hex 32) pickplace
+# The service:
+# docker build -t pickplace . && export PICKPLACE_TOKEN=$(openssl rand -hex 32) && docker run -p 8000:8000 -e PICKPLACE_TOKEN pickplace
 # Other weights or settings: docker run ... pickplace pretrained/mixed --host 0.0.0.0 --tote-size 8 8 8
 FROM python:3.12-slim
 WORKDIR /app

@@ -1,6 +1,6 @@
 """Make the paper's comparison: python benchmarks/paper.py
 
-Trains with three seeds, plays the test stream, and writes docs/results/paper.csv and the figures of docs/results.md.
+Trains with three seeds, plays the test stream, and writes a table and figures into docs/results/paper.
 What was trained or played before, in outputs/paper, is read; what was stopped goes on.
 ``python benchmarks/paper.py fcn4d-R4-0`` only trains what it names, so that several processes can share the work.
 """
@@ -10,21 +10,20 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from itertools import product
-from statistics import mean, stdev
 from typing import NamedTuple
 
+import numpy as np
 from common import ROOT, evaluate, run
 from matplotlib.ticker import EngFormatter
+from scipy.stats import t
 
 from pickplace.runs.loggers import read_csv
 from pickplace.views.figures import COLOURS, figure_of
 
-RESULTS, RUNS = ROOT / "docs" / "results", ROOT / "outputs" / "paper"
-TABLE = RESULTS / "paper.csv"
+RESULTS, RUNS = ROOT / "docs" / "results" / "paper", ROOT / "outputs" / "paper"
 SMALL, LARGE = ("6x6x5", "6x6x10", "10x10x5", "10x10x10"), ("30x30x5", "30x30x10")
 CANDIDATES = (1, 2, 3, 5, 10, 20, 50)
 MANY, FEW = 100, 10  # episodes; few where a tote takes minutes
-STUDENT = {2: 12.706, 3: 4.303}  # half a 95% interval of a mean of so many, in standard errors
 
 
 class Training(NamedTuple):
@@ -106,16 +105,18 @@ def play(cell: Cell) -> list[float]:
     return evaluate(folder, *words)["occupancy"]["per_episode"]
 
 
-def interval(values: list[float]) -> dict:
-    """Return mean and 95% interval: Student's over training seeds, normal over episodes."""
-    error = stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
-    half, middle = STUDENT.get(len(values), 1.96) * error, mean(values)
-    return {"mean": middle, "low": middle - half, "high": middle + half}
+def half_interval(values: np.ndarray) -> float:
+    """Return half of Student's 95% interval of a mean; 0 of one value."""
+    return float(t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / len(values) ** 0.5) if len(values) > 1 else 0.0
 
 
-def over_seeds(seeds: list[list[float]]) -> dict:
-    """Return mean and interval of a method: over its training seeds, or over the episodes of the only one."""
-    return {"seeds": len(seeds), **interval([*map(mean, seeds)] if len(seeds) > 1 else seeds[0])}
+def summary(seeds: list[list[float]]) -> dict:
+    """Return the mean over training seeds and episodes, with a 95% interval: that over episodes, which all seeds share,
+    and that over seeds, added as independent errors."""
+    values = np.array(seeds)  # [seeds, episodes]
+    half = float(np.hypot(half_interval(values.mean(0)), half_interval(values.mean(1))))
+    middle, counts = float(values.mean()), dict(zip(("seeds", "episodes"), values.shape, strict=True))
+    return {**counts, "mean": middle, "low": middle - half, "high": middle + half}
 
 
 def measure() -> list[dict]:
@@ -125,8 +126,8 @@ def measure() -> list[dict]:
         played[cell._replace(seed=None)].append(play(cell))
     rows = []
     for cell, seeds in played.items():
-        same = {"method": cell.method, "R": cell.R, "tote": cell.tote, "K": cell.K, "episodes": len(seeds[0])}
-        rows.append({"kind": "played", **same, **over_seeds(seeds)})
+        same = {"method": cell.method, "R": cell.R, "tote": cell.tote, "K": cell.K}
+        rows.append({"kind": "played", **same, **summary(seeds)})
         for other in played:
             same_play = other.method != cell.method == "fcn4d" and other[1:3] == cell[1:3]
             if same_play and other.K in (None, cell.K):
@@ -143,7 +144,7 @@ def measure() -> list[dict]:
 def less(seeds: list[list[float]], others: list[list[float]]) -> dict:
     """Return the difference of two methods in the same episodes, seed by seed; an only seed meets all of the other."""
     others = others * len(seeds) if len(others) == 1 else others
-    return over_seeds([[a - b for a, b in zip(*pair, strict=False)] for pair in zip(seeds, others, strict=False)])
+    return summary([[a - b for a, b in zip(*pair, strict=False)] for pair in zip(seeds, others, strict=False)])
 
 
 def found(rows: list[dict], **wanted) -> dict | None:
@@ -245,7 +246,10 @@ def draw_methods(rows: list[dict]) -> None:
 
 def main() -> None:
     trainings = [(*key, seed) for key, training in TRAININGS.items() for seed in range(training.seeds)]
-    named = [key for key in trainings if "{}-R{}-{}".format(*key) in sys.argv[1:]]
+    names = {"{}-R{}-{}".format(*key): key for key in trainings}
+    if unknown := [name for name in sys.argv[1:] if name not in names]:
+        sys.exit(f"{unknown[0]}: expected names of {', '.join(names)}")
+    named = [names[name] for name in sys.argv[1:]]
     left = [key for key in named or trainings if not (RUNS / "{}-R{}-{}".format(*key) / "report.html").is_file()]
     hours = sum(TRAININGS[key[:2]].hours for key in left)
     sys.stdout.write(f"{len(left)} trainings are left, about {hours:.0f} hours of one core.\n")
@@ -255,7 +259,8 @@ def main() -> None:
         return
     rows = measure()
     columns = [*dict.fromkeys(key for row in rows for key in row)]
-    with TABLE.open("w", newline="") as file:
+    RESULTS.mkdir(exist_ok=True)
+    with (RESULTS / "paper.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows({key: round(v, 5) if isinstance(v, float) else v for key, v in row.items()} for row in rows)

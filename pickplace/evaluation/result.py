@@ -186,9 +186,10 @@ def read_comparison(path: Path, expected: dict, trust: Collection[str] = ()) -> 
         refuse_foreign_targets(env, trust, "env")
         other_cell = build_cell(env, reach=None)  # what is missing has its default
     reaches = ("env.reach", expected["env"].get("reach"), env.get("reach"))
+    matters = {"env.refill": cell.bin_items > 1, "env.preview": False}  # whether other items are played
     for key, ours, theirs in (*differences(cell_settings(cell), cell_settings(other_cell), "env"), reaches):
         refuse_if(
-            not is_same(ours, theirs) and (key != "env.refill" or cell.bin_items > 1),
+            not is_same(ours, theirs) and matters.get(key, True),
             f"compare={excerpt(str(path))}: {key}={excerpt(theirs)}, expected {ours}.",
         )
     count = expected["episodes"]

@@ -116,6 +116,8 @@ class _Column(NamedTuple):
         """Return the value in a row as a number, in the unit of the column; a ``ValueError`` if it is none."""
         value = row[self.key]
         refuse_if(isinstance(value, bool), "a bool is no number")
+        if isinstance(value, str) and self.decimal == "," and self.unit == 1:  # mm or g, which have no three decimals
+            refuse_if(re.fullmatch(r"\s*\d{1,3}(,\d{3})+\s*", value), "a comma that may separate thousands")
         return float(value.replace(self.decimal, ".") if isinstance(value, str) else value)
 
 
@@ -280,7 +282,8 @@ def _read_row(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[Or
         with suppress(TypeError, ValueError, OverflowError):
             if 0 < (number := columns[name].number(row)) * unit <= most:
                 return number * unit
-        what = "a number with a decimal point" if "," in str(row[key]) else "a number"
+        comma = {",": "a number without separators of thousands", ".": "a number with a decimal point"}
+        what = comma[columns[name].decimal] if "," in str(row[key]) else "a number"
         raise ValueError(f"{place}: {key}={excerpt(row[key])}: expected {what} above 0, at most {most / unit:,g}.")
 
     length, width, height = (read(name, MAX_LENGTH) for name in SIDES)

@@ -70,14 +70,15 @@ class Beam(MapPlanner):
         nothing = torch.zeros_like(number)
         plans = _Plans(number, nothing - 1, nothing, nothing.float(), State.from_observation(observation))
         mask, ended = self.policy.with_cell(cell).ranked(maps), []
-        for depth in range(1, self.depth + 1):
+        for depth in range(self.depth + 1):
             goes_on = mask.any(1)
             ended.append(self._without_choice(plans.rows(~goes_on)))
-            if not goes_on.any():
-                plans = plans.rows(goes_on)
+            plans, mask = plans.rows(goes_on), mask[goes_on]
+            if depth == self.depth or not len(mask) or (depth and self._is_late(start, depth)):
                 break
             plans = self._longer(plans, mask)
-            if depth == self.depth or self._is_late(start, depth):
+            is_last = depth + 1 == self.depth or self._is_late(start, depth + 1)
+            if is_last and plans.state.coming is None:  # whether what arrives fits is part of the value
                 break
             mask = self.policy.ranked(placing_maps(self.cell, plans.state))
         problem, first, _, total = map(torch.cat, zip(*(part[:4] for part in [*ended, plans]), strict=True))

@@ -288,6 +288,15 @@ def test_decimal_commas_of_a_spreadsheet(tmp_path, separator):
     assert item[:5] == ("a,1", 100.5, 20.0, 30.25, 1250) and item.max_load == 2500
 
 
+def test_separators_of_thousands_are_refused(tmp_path):
+    """Where commas are decimals, 1,200 mm could be 1.2; 1,250 kg is 1.25."""
+    (path := tmp_path / "a.csv").write_text("l;w;h;kg\n1,200;100;20;1,250\n")
+    with pytest.raises(ValueError, match="line 2: l='1,200': expected a number without separators of thousands above 0"):
+        read_orders(path)
+    path.write_text("l/m;w/m;h/m;kg\n1,200;1;2;1,250\n")
+    assert read_orders(path)[0].items[0][1:5] == (1200, 1000, 2000, 1250)
+
+
 LIMITS = [
     ("", "", "", "", NO_LIMIT, ORIENTATIONS), ("2.5", "", "", "any", 2500, ORIENTATIONS),
     ("0", "", "", "", 0, ORIENTATIONS),

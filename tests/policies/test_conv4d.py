@@ -131,6 +131,17 @@ def test_tiles_equal_the_naive_4d_convolution(bin_size, tote_size, batch, data):
         assert_close(model(*maps), naive(model, *maps), 1e-10)
 
 
+def test_no_tiles_in_low_precision():
+    maps = depths((5, 5), (6, 6), batch=8)
+    with torch.no_grad():
+        for dtype in (torch.bfloat16, torch.float16):
+            assert not (model := network().to(dtype))._by_tiles(*model._prepare(*maps))
+        model = network()
+        assert model._by_tiles(*model._prepare(*maps))
+        with torch.autocast("cpu", torch.bfloat16):
+            assert not model._by_tiles(*model._prepare(*maps))
+
+
 def test_rounding_of_tiles_is_small():
     model, maps = network(4, 64), depths((5, 5), (6, 6), batch=8)
     with torch.no_grad():

@@ -228,8 +228,10 @@ class Conv4dNet(nn.Module):
 
     def _by_tiles(self, bins: Tensor, totes: Tensor) -> bool:
         """Return whether minimal filtering is faster; with gradients it would hold more memory."""
-        exact = self._dtype == self.first.weight.dtype and not torch.is_grad_enabled()
-        return exact and bins.device.type == "cpu" and len(bins) * tile_count(*_sizes(bins, totes)) >= FEW_TILES
+        if bins.device.type != "cpu" or torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
+            return False
+        is_exact = self._dtype in (torch.float32, torch.float64)  # in less the transforms lose too many digits
+        return is_exact and len(bins) * tile_count(*_sizes(bins, totes)) >= FEW_TILES
 
     def _logits_by_tiles(self, bins: Tensor, totes: Tensor) -> Tensor:
         """Return `_logits` of padded maps by minimal filtering, up to rounding."""
