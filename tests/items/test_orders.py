@@ -291,7 +291,7 @@ def test_decimal_commas_of_a_spreadsheet(tmp_path, separator):
 def test_separators_of_thousands_are_refused(tmp_path):
     """Where commas are decimals, 1,200 mm could be 1.2; 1,250 kg is 1.25."""
     (path := tmp_path / "a.csv").write_text("l;w;h;kg\n1,200;100;20;1,250\n")
-    with pytest.raises(ValueError, match="line 2: l='1,200': expected a number without separators of thousands above 0"):
+    with pytest.raises(ValueError, match="line 2: l='1,200': expected a number without separators of thousands"):
         read_orders(path)
     path.write_text("l/m;w/m;h/m;kg\n1,200;1;2;1,250\n")
     assert read_orders(path)[0].items[0][1:5] == (1200, 1000, 2000, 1250)
