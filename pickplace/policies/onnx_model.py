@@ -16,7 +16,7 @@ from pickplace.common.validate import refuse_if, short_text
 from pickplace.policies.base import ScoresAnySize
 from pickplace.policies.restore import TrainedPolicy, cell_settings, load_policy
 
-TOLERANCE = 1e-5  # greatest difference between onnxruntime and torch, as a share of the greatest score
+TOLERANCE = 5e-5  # greatest difference between onnxruntime and torch, as a share of the greatest score
 #: Cells by which the totes, and the bins, of the check are larger than those of the training.
 CHECKS = (((1, 4), (0, 0)), ((3, 0), (0, 0)), ((7, 5), (1, 2)))
 ENVS, STEPS = 3, 8  # each check has ENVS * STEPS problems at most
