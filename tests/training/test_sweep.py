@@ -94,13 +94,13 @@ def test_settings_are_compared_over_their_seeds(tmp_path, caplog):
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("metrics.csv", b"frames,eval/occupancy\n\xff,1\n", "metrics.csv: 'utf-8' codec"),
+        ("metrics.csv", b"frames,eval/occupancy\n\xff,1\n", "metrics.csv, line 2: got the byte 0xff"),
         ("metrics.csv", b"\0\0", "metrics.csv, line 1: expected a column frames"),
         ("metrics.csv", b"a,b\n", "metrics.csv, line 1: expected a column frames, got 'a,b'"),
         (".hydra/overrides.yaml", b"\xff", "overrides.yaml=None: expected the overrides"),
         (".hydra/overrides.yaml", b"algo.lr=1", "overrides.yaml='algo.lr=1': expected the overrides"),
         (".hydra/overrides.yaml", b"- [3]", "overrides.yaml=[[3]]: expected the overrides"),
-        ("failure.txt", b"\xff", "failure.txt: 'utf-8' codec"),
+        ("failure.txt", b"\xff", "failure.txt, line 1: got the byte 0xff"),
     ],
 )
 def test_a_run_that_cannot_be_read_leaves_the_others_alone(tmp_path, name, content, words):
