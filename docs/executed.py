@@ -52,7 +52,7 @@ for moment in [
     time.sleep(0.05)
     pictures.append(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB"))
 browser.quit()
-# What any picture shows, and a margin.
+# Crop all pictures to the area in which any of them shows something, and a margin.
 boxes = np.array([ImageChops.difference(p, Image.new("RGB", p.size, p.getpixel((2, 2)))).getbbox() for p in pictures])
 left, top, right, bottom = *(boxes[:, :2].min(0) - 20).clip(0), *(boxes[:, 2:].max(0) + 20).clip(0, pictures[0].size)
 size = SIDE, round(SIDE * (bottom - top) / (right - left))

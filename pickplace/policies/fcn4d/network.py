@@ -136,7 +136,7 @@ class Conv4dNet(nn.Module):
             bins = windows[row, pick // deep, pick % deep]
         if torch.compiler.is_exporting():  # at once: the number of pieces depends on the sizes
             out = self._logits(bins, totes)
-        elif self._by_tiles(bins, totes):
+        elif pick is None and self._by_tiles(bins, totes):  # one pick alone is faster at once
             out = self._logits_by_tiles(bins, totes)
         else:
             out = self._logits_by_chunks(bins, totes)
