@@ -16,6 +16,16 @@ use_threads("threads", None)
 print(torch.get_num_threads(), os.environ["OMP_WAIT_POLICY"])
 """
 
+FAULTS = """
+import resource, torch
+from pickplace.common.machine import keep_memory
+keep_memory()
+for _ in range(3):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    torch.ones(2**26, dtype=torch.uint8)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
 
 @pytest.fixture
 def threads():
@@ -43,3 +53,10 @@ def test_quota_limits_the_default_only(threads, monkeypatch):
     assert torch.get_num_threads() == 3
     with pytest.raises(ValueError, match="--threads=0: expected a whole number >= 1"):
         use_threads("--threads", 0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
+def test_memory_that_was_freed_is_used_again():
+    """It has 16,384 pages of 4 KiB; each would be a page fault if it had been returned."""
+    out = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True, check=True)
+    assert int(out.stdout) < 1_000

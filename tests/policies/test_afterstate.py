@@ -7,6 +7,8 @@ import pytest
 import torch
 from commands import composed
 from dynamic_programming import optimal_occupancy
+from hypothesis import given
+from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from problems import SETTINGS, late_state, random_states
 from tensordict import TensorDict
@@ -164,7 +166,7 @@ def test_a_finer_grid_shows_the_same_tote(scale):
 def test_heights_are_told_apart_at_whole_steps_of_the_tote():
     """By plain comparisons of fractions: step k of 4 is passed where height / tote height > k / 4."""
     net, (depth, height) = network(), random_totes(3, 6, 5, 7)
-    picture = net._picture(depth, height[:, 0])
+    picture = net._planes(net._picture(depth, height[:, 0]), torch.float32)
     for n, x, y, k in torch.cartesian_prod(*map(torch.arange, (3, 6, 5, 4))).tolist():
         assert picture[n, k, x, y] == (4 * (7 - int(depth[n, x, y])) > 7 * k)
     assert picture[:, 4].all()
@@ -173,10 +175,25 @@ def test_heights_are_told_apart_at_whole_steps_of_the_tote():
 def test_edges_are_where_the_surface_is_not_level():
     """By plain comparisons with the cell before; the wall before the first cell is an edge."""
     net, (depth, height) = network(), random_totes(10, 6, 5, 2)
-    picture = net._picture(depth, height[:, 0])
+    picture = net._planes(net._picture(depth, height[:, 0]), torch.float32)
     for n, x, y in torch.cartesian_prod(*map(torch.arange, (10, 6, 5))).tolist():
         assert picture[n, 5, x, y] == (x == 0 or depth[n, x, y] != depth[n, x - 1, y])
         assert picture[n, 6, x, y] == (y == 0 or depth[n, x, y] != depth[n, x, y - 1])
+
+
+@given(
+    sides=st.tuples(st.integers(2, 9), st.integers(2, 9)),
+    grid=st.tuples(st.integers(2, 7), st.integers(2, 7), st.integers(1, 6)),
+    field=st.sampled_from([1, 3, 5]),
+    high=st.integers(1, 9),
+)
+def test_a_value_without_gradients_is_that_of_the_convolution(sides, grid, field, high):
+    """Without them a CPU finds the first convolution's terms in a table."""
+    net, (depth, height) = network(grid=grid, receptive_field=field), random_totes(5, *sides, high)
+    torch.nn.init.normal_(net.around.bias)
+    with_gradients = net(depth, height, random_items(5))
+    with torch.no_grad():
+        torch.testing.assert_close(net(depth, height, random_items(5)), with_gradients)
 
 
 @pytest.mark.parametrize(

@@ -82,12 +82,12 @@ class CellsValue(ToteValue):
         wide, deep = depth.shape[1:]
         dtype = matrix_dtype(self.compute_dtype, depth.device.type)
         with torch.autocast(depth.device.type, dtype, enabled=dtype != torch.float32):
-            x = F.relu(self.around(F.pad(self._planes(depth, bearing, dtype), [1, self.patch] * 2)))
+            x = self.around(F.pad(self._planes(depth, bearing, dtype), [1, self.patch] * 2)).relu_()
             for halve in self.halves:
-                x = F.relu(halve(x))
+                x = halve(x).relu_()
             x = x + self.waiting(items, depth.new_tensor([1.0, 1.0, 1.0 / self.level]))[:, :, None, None]
             for layer, mean in zip(self.layers, self.means, strict=True):
-                x = x + F.relu(layer(x) + mean(x.mean((2, 3)))[:, :, None, None])
+                x = x + (layer(x) + mean(x.mean((2, 3)))[:, :, None, None]).relu_()
         logits = F.conv2d(x.float(), self.head.weight, self.head.bias)
         share = torch.sigmoid(F.pixel_shuffle(logits, self.joined))[:, 0]
         for axis, side in ((1, wide), (2, deep)):  # a slice would tie an exported network to even or to odd sides

@@ -23,6 +23,9 @@ class PictureValue(ToteValue):
     surface is not level with the cell before, along x and along y, as items rest on level cells. Two convolutions, the
     second with stride 2, and two linear layers follow. The first of these also sees the items that wait.
 
+    A cell looks in one of few ways. So a CPU finds the terms of the first convolution in a table and only adds them,
+    unless it needs gradients; the result is the same up to rounding.
+
     Args:
         grid: cells of the picture along x and y, and steps of the height.
         filters: width of the convolutions.
@@ -56,16 +59,19 @@ class PictureValue(ToteValue):
         self.head = nn.Linear(hidden, 1)
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.bias, 0.5)
+        self.register_buffer("looks", looks(steps), persistent=False)
 
     def some_parts(self, *entries: Tensor) -> Tensor:
         """Return the value of totes ``[N, W_T, D_T]`` of heights ``[N, 1]`` while items ``[N, M, 5]`` wait, ``[N, 1]``;
         there is one part."""
         depth, height, items = entries
-        dtype = matrix_dtype(self.compute_dtype, depth.device.type)
+        picture, dtype = self._picture(depth, height[:, 0]), matrix_dtype(self.compute_dtype, depth.device.type)
         with torch.autocast(depth.device.type, dtype, enabled=dtype != torch.float32):
-            planes = self._picture(depth, height[:, 0]).to(dtype, memory_format=torch.channels_last)
-            x = F.relu(self.wider(F.relu(self.around(planes))))
-            x = F.relu(self.hidden(x.flatten(1)) + self.waiting(items, self._scale(depth, height)))
+            by_table = depth.device.type == "cpu" and dtype == torch.float32  # where it is faster
+            by_table &= not (torch.is_grad_enabled() or torch.compiler.is_exporting())
+            x = self._around_by_table(picture) if by_table else self.around(self._planes(picture, dtype))
+            x = self.wider(x.relu_()).relu_()
+            x = (self.hidden(x.flatten(1)) + self.waiting(items, self._scale(depth, height))).relu_()
         return self.reward_scale * depth.sum((1, 2))[:, None] * torch.sigmoid(self.head(x.float()))
 
     def credit(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Tensor:
@@ -88,16 +94,43 @@ class PictureValue(ToteValue):
 
     @torch.no_grad()
     def _picture(self, depth: Tensor, height: Tensor) -> Tensor:
-        """Return which cells of the picture rise above each step of the height, a plane of ones, and the edges along x
-        and y, bool ``[N, planes, *grid[:2]]``; walls are edges."""
+        """Return how each cell of the picture looks, int32 ``[N, *grid[:2]]``: a row of :func:`looks`; walls are
+        edges."""
         wide, deep, steps = self.grid
         if depth.shape[1:] != (wide, deep):
             depth = -F.adaptive_max_pool2d(-depth[:, None], (wide, deep))[:, 0]
-        raised = steps * (height[:, None, None] - depth)  # in parts of the tote's height, so that it stays exact
-        least = torch.arange(steps, device=depth.device)[:, None] * height
-        above = raised[:, None] > least.t()[:, :, None, None]
-        edges = [
-            F.pad(depth.diff(dim=1) != 0, (0, 0, 1, 0), value=True),
-            F.pad(depth.diff(dim=2) != 0, (1, 0), value=True),
-        ]
-        return torch.cat([above, torch.ones_like(above[:, :1]), torch.stack(edges, 1)], 1)
+        above = height[:, None, None]
+        above = (steps * (above - depth) / above).ceil_()  # multiplied first, so that whole steps are exact
+        above = above.clamp_(0, steps).int()
+        along_x = F.pad(depth.diff(dim=1) != 0, (0, 0, 1, 0), value=True)
+        along_y = F.pad(depth.diff(dim=2) != 0, (1, 0), value=True)
+        return (above * 4).add_(along_x, alpha=2).add_(along_y).add_(1)
+
+    def _planes(self, picture: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return the planes of a picture, ``[N, planes, *grid[:2]]``, channels last."""
+        return F.embedding(picture, self.looks).to(dtype).permute(0, 3, 1, 2)
+
+    def _around_by_table(self, picture: Tensor) -> Tensor:
+        """Return the first convolution, ``[N, filters, *grid[:2]]``, channels last: a sum over the cells around each,
+        whose terms are found in a table."""
+        weight, margin, (wide, deep, _) = self.around.weight, self.around.padding[0], self.grid
+        side = weight.shape[-1]
+        table = self.looks @ weight.permute(2, 3, 1, 0)  # [side, side, looks, filters]
+        table[margin, margin] += self.around.bias  # of the cell itself, which is never outside
+        begins = torch.arange(side**2, dtype=torch.int32) * len(self.looks)
+        padded = F.pad(picture, [margin] * 4)
+        around = [padded[:, x : x + wide, y : y + deep] for x in range(side) for y in range(side)]
+        terms = torch.stack(around, -1).view(-1, side**2).add_(begins)
+        x = F.embedding_bag(terms, table.flatten(0, 2), mode="sum")
+        return x.view(-1, wide, deep, x.shape[1]).permute(0, 3, 1, 2)
+
+
+def looks(steps: int) -> Tensor:
+    """Return how cells of a picture can look, float32 ``[1 + 4 * (steps + 1), steps + 3]``.
+
+    Row 0 is outside the tote. Row ``1 + 4 * above + 2 * x + y`` is a cell that rises above so many steps of the height
+    and is an edge along x or along y, or is not. Columns: one for each step, a 1, and the edges along x and y.
+    """
+    above, along_x, along_y = torch.meshgrid(torch.arange(steps + 1), *2 * [torch.arange(2)], indexing="ij")
+    columns = [*(above > step for step in range(steps)), torch.ones_like(above), along_x, along_y]
+    return F.pad(torch.stack([column.flatten() for column in columns], 1).float(), (0, 0, 1, 0))
