@@ -89,9 +89,8 @@ results: $(STAMP)  ## draw the figures and write the tables of docs/results.md (
 paper: $(STAMP)  ## run the paper's comparison again: train, play, draw (35 hours of one core; goes on where it was stopped)
 	$(BIN)/python benchmarks/paper.py $(ARGS)
 
-docs: $(STAMP)  ## write docs/reference.md, and build the site in outputs/site
+docs: $(STAMP)  ## build the site of the docs, with a page of all settings, in outputs/site
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[docs]'
-	$(BIN)/python docs/reference.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --config-file .ci/mkdocs.yml
 	@echo "Open outputs/site/index.html; with its search: $(BIN)/python -m http.server --directory outputs/site"
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
+from reference import page as reference_page
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {"README.md": "overview.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
@@ -16,9 +17,10 @@ LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
 
 
 def on_files(files, config):
-    """Add the top-level pages and the style sheet."""
+    """Add the top-level pages, the reference of all settings and the style sheet."""
     for source, name in PAGES.items():
         files.append(File.generated(config, name, abs_src_path=str(ROOT / source)))
+    files.append(File.generated(config, "reference.md", content=reference_page()))
     files.append(File.generated(config, "site.css", content=STYLE))
     return files
 

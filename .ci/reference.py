@@ -1,5 +1,6 @@
-"""Write docs/reference.md, the reference of all settings, from the comments in conf/: python docs/reference.py"""
+"""The page of the site that lists all settings, made from the comments in conf/. To print it: python .ci/reference.py"""
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,14 +9,11 @@ import yaml
 from pickplace.config.help import GROUPS
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
-PAGE = Path(__file__).with_suffix(".md")
 PRESETS = ("benchmark", "experiment")  # groups whose options set keys of others
 COMMANDS = {"train": "pickplace-train", "evaluate": "pickplace-evaluate"}
 
 INTRODUCTION = """\
 # Reference of the settings
-
-<!-- Made by `python docs/reference.py` from the comments in conf/. Edit those. -->
 
 Every setting of `pickplace-train` and `pickplace-evaluate`, with its default. A setting is changed on the command line
 as `key=value`, such as `algo.lr=1e-3`, and a group as `group=option`, such as `items=mixed`. Lengths are in cells.
@@ -169,4 +167,4 @@ def page() -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page())
+    sys.stdout.write(page())
