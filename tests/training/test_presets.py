@@ -25,11 +25,12 @@ def test_every_preset_runs(name, tmp_path, monkeypatch):
         "mixed_grasp": [7, 7, 3],
         "mixed_bin3": [7, 7, 3],
         "mixed": [7, 7, 3],
+        "buffer": [7, 7, 5],
         "warehouse": [16, 12, 60],
     }
     extra = [f"env.tote_size={sizes[name]}".replace(" ", "")] if name in sizes else []
     extra += ["items.depth=[9,10]"] * (name == "warehouse")  # fewer kinds
-    extra += ["warm_start.weights=null"] * (name == "mixed_bin3")  # of another size than these networks
+    extra += ["warm_start.weights=null"] * (name in ("mixed_bin3", "buffer"))  # of another size than these networks
     tiny = TINY if composed(f"experiment={name}")["model"]["critic"] else ONE_NETWORK
     assert 0 <= train(composed(f"experiment={name}", *tiny, *extra), tmp_path) <= 1
     assert [row["frames"] for row in read_csv(tmp_path / "metrics.csv")] == [16]
