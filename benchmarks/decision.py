@@ -1,15 +1,13 @@
-"""Time of one decision on one core, and of start-up: python benchmarks/decision.py
+"""Time of one decision on one core: python benchmarks/decision.py
 
 Decisions have feasibility and candidates included, batch 1, ``R=4``, and states from the middle of episodes; networks
 are as in the configs, with fresh weights.
 """
 
-import subprocess
-import sys
 from functools import partial
 
 import torch
-from common import console_command, interleave, save, use_one_core
+from common import interleave, save, use_one_core
 
 from pickplace import PickPlaceEnv
 from pickplace.planners.policy import PolicyPlanner
@@ -22,12 +20,6 @@ POLICIES = {
     "fcn4d": partial(Fcn4d, mask_infeasible=True, compute_dtype="bfloat16"),
 }
 CANDIDATES = (10, "all")
-
-#: Measured from the start of the process.
-COMMANDS = {
-    "import pickplace": [sys.executable, "-c", "import pickplace"],
-    "pickplace-train --help": [console_command("pickplace-train"), "--help"],
-}
 
 
 def deciders(tote_size) -> dict:
@@ -43,8 +35,6 @@ def deciders(tote_size) -> dict:
 
 
 def main() -> None:
-    run = partial(subprocess.run, check=True, stdout=subprocess.DEVNULL)
-    save("startup", {"rows": interleave({name: partial(run, words) for name, words in COMMANDS.items()}, repeats=10)})
     use_one_core()
     torch.manual_seed(0)
     calls = {"x".join(map(str, tote)): deciders(tote) for tote in TOTES}
