@@ -1,4 +1,4 @@
-"""The page of the site that lists all settings, made from the comments in conf/. To print it: python .ci/reference.py"""
+"""Page of the site with all settings, from the comments in conf/. To print it: python .ci/reference.py"""
 
 import sys
 from dataclasses import dataclass, field

@@ -8,12 +8,12 @@ from common import RESULTS
 PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 HEAD = """# Performance
 
-On two CPU cores a training with `experiment=quick` fills 97.5% of the paper's tote after {learnt:.0f} s. On one core the
-environment makes {steps:,} steps/s, {ratio:.0f} times as many as {peer}, which is compiled, and a decision takes
-{decision:.0f} ms.
+On two CPU cores a training with `experiment=quick` fills 97.5% of the paper's tote after {learnt:.0f} s. On one core
+the environment makes {steps:,} steps/s, {ratio:.0f} times as many as {peer}, which is compiled, and a decision
+takes {decision:.0f} ms.
 
-`make bench` measures all this on an idle machine, and writes this page from `benchmarks/results/`. Times are medians, with
-the 10th to 90th percentile in brackets. They were measured with `env=paper`. Nothing here is of a GPU.
+`make bench` measures all this on an idle machine, and writes this page from `benchmarks/results/`. Times are medians,
+with the 10th to 90th percentile in brackets. They were measured with `env=paper`. Nothing here is of a GPU.
 """
 
 
@@ -92,7 +92,7 @@ def environment(result: dict) -> str:
     return section(
         "Environment",
         "A call of `step_and_maybe_reset`, which also finds the mask over all 3,600 actions, at the paper's sizes. The "
-        f"peer is {result['peer'] or 'not installed'} with `BinPack-v2`, compiled by JAX. Its task differs, so that the "
+        f"peer is {result['peer'] or 'not installed'} with `BinPack-v2`, compiled by JAX. Its task differs: the "
         "ratio of the steps/s compares what a step costs, not how well is packed. The two run in turn.",
         table("batch | ms | steps/s | peer, ms | peer, steps/s | ratio", rows),
     )
@@ -120,8 +120,8 @@ def answers(result: dict) -> str:
     rows = [(what, *(f"{figures[key]:.0f}" for key in keys)) for what, figures in asked]
     return section(
         "One answer to a robot",
-        "Milliseconds for a call of `Planner.plan` with ten alternatives, in cells and in metres, from an empty tote to a "
-        "full one.",
+        "Milliseconds for a call of `Planner.plan` with ten alternatives, in cells and in metres, from an empty tote to "
+        "a full one.",
         table("what | median | 95% | slowest", rows),
     )
 
