@@ -26,7 +26,7 @@ def table(head: str, rows) -> str:
 
 
 def machine(result: dict) -> str:
-    """Return the machine of a measurement in a few words."""
+    """Return a short description of the machine of a measurement."""
     m = result["machine"]
     return f"{m['cpu']}, torch {m['torch']}, {m['threads']} thread{'s' * (m['threads'] > 1)}"
 
