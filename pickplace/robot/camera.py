@@ -120,7 +120,7 @@ class Camera:
             depth: an image.
             cell: the sizes.
             cell_size: side of a cell, m.
-            tote_height: of the rim, m; None: that of ``cell.tote_size``.
+            tote_height: of the rim, m; None: from ``cell.tote_size``.
             accuracy: greatest error of a height, m.
             placed: the items that this planner put into the tote before: :attr:`Plan.placed` of each plan that was
                 carried out.
@@ -160,8 +160,8 @@ class Camera:
             accuracy: greatest error of a height, m.
             sizes: the sizes of the items, ``(w, d, h)`` in metres; None: not known. Two items that touch and are
                 equally high look like one in a depth image; their sizes reveal it.
-            greatest_height: of an item, m; None: that of ``cell.tote_size``, as a higher one fits into no tote.
-            bin_height: of the bin's walls, m; None: that of ``cell.bin_size``.
+            greatest_height: of an item, m; None: from ``cell.tote_size``, as a higher item fits into no tote.
+            bin_height: of the bin's walls, m; None: from ``cell.bin_size``.
 
         Raises:
             DepthMapError: for an image that does not show the bin, a floor that is not where the camera's pose says,

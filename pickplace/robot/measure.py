@@ -84,7 +84,7 @@ def whole_map(name: str, values, grid: Sequence[int], most: int, unit: str = "",
         values: numpy, torch or lists.
         grid: the expected shape.
         unit: of the numbers, for messages.
-        kinds: as of :func:`as_array`.
+        kinds: see :func:`as_array`.
 
     Raises:
         DepthMapError: naming the first cell that is out of range, or no whole number.

@@ -112,7 +112,7 @@ class MeasuredProblem(Problem):
 
 
 def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[float]] = ()) -> Problem:
-    """Return the problem of a scene in metres; arguments and errors as of :meth:`Planner.plan`."""
+    """Return the problem of a scene in metres; see :meth:`Planner.plan` for arguments and errors."""
     cell_size = cast(float, scene.cell_size)
     boxes, clearance = _read_boxes(cell, scene, cell_size)
     error = clearance if scene.placement_error is None else scene.placement_error

@@ -106,7 +106,7 @@ class Planner:
 
     Args:
         cell: the cell's sizes and options.
-        policy: a policy made for this cell, if the planner needs one.
+        policy, critic: a policy made for this cell and its critic, if the planner needs them.
         candidates: as in :class:`~pickplace.planners.policy.PolicyPlanner`: ``"all"``, or ``K``.
         terms: of the observation, by key; None: the standard ones.
         planner: makes the decisions: the short name of a planner (``"joint_dbl"``), a config of the group ``planner``

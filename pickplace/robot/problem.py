@@ -193,7 +193,7 @@ def without_excluded(cell: CellSpec, exclude: Sequence[Sequence[float]]) -> Cell
 
 
 def read_grid(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[float]] = ()) -> Problem:
-    """Return the problem of a scene in whole cells; arguments and errors as of :meth:`Planner.plan`."""
+    """Return the problem of a scene in whole cells; see :meth:`Planner.plan` for arguments and errors."""
     assert isinstance(scene.items, BinMap)
     unit = " cells" if cell.height_unit == 1 else " height units"
     height = cell.tote_size[2] if scene.tote_height is None else round(scene.tote_height)

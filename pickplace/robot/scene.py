@@ -55,12 +55,12 @@ class Scene:
     #: the place whose height each value of a tote's map in metres gives, to within ``accuracy``: ``"area"``, all of its
     #: square; or ``"centre"``, the point in its middle
     tote_samples: str = "area"
-    tote_height: float | None = None  #: height of the tote's rim above its floor; None: that of ``cell.tote_size``
+    tote_height: float | None = None  #: height of the tote's rim above its floor; None: from ``cell.tote_size``
     #: with ``support="bearing"``, ``[W_T, D_T]``, 1 where a cell bears weight, else 0: ``tote_bearing`` of the plan
     #: before; None: every cell bears weight. For a map in metres with one value a cell, None means that only the floor
     #: does, as such a map does not tell whether a cell is level
     tote_bearing: Any = None
-    bin_height: float | None = None  #: height of the bin's walls above its floor; None: that of ``cell.bin_size``
+    bin_height: float | None = None  #: height of the bin's walls above its floor; None: from ``cell.bin_size``
     #: everything that lies in the tote: :attr:`Plan.placed` of each plan that was carried out; None: not known. Needed
     #: if a box has a ``max_load``; for scenes in metres only
     placed: Sequence[Box] | None = None

@@ -73,7 +73,7 @@ def load_planner(args: argparse.Namespace, cell: dict | None = None) -> tuple["P
 
     Args:
         args: the command line.
-        cell: settings of the cell, which replace those of the command line.
+        cell: settings of the cell, which replace the command line's.
 
     Raises:
         ValueError: for arguments or a checkpoint that cannot be used.
