@@ -1,9 +1,9 @@
-"""Time of every answer that a robot gets, on one core: python benchmarks/answers.py [checkpoint ...]
+"""Measure the time of every answer that a robot gets, on one core: python benchmarks/answers.py [checkpoint ...]
 
-Each shipped checkpoint fills totes of its own cell with its own items. Every state is planned in cells and in metres,
-with ten alternatives: until nothing fits (stuck), with an item that fits in no tote (impossible), and with a bin whose
-item is no cuboid (refused); and once more by a planner with one candidate (rejected). The first plan after loading
-counts, too. Images that become a scene before that are timed alone.
+Each shipped checkpoint fills totes of its own cell with its own items, until nothing fits (stuck). Every state is
+planned in cells and in metres, with ten alternatives, and once more by a planner with one candidate (rejected). So are
+an item that fits in no tote (impossible), and a bin whose item is no cuboid (refused). The first plan after loading
+counts, too. The time from images to a scene is measured separately.
 """
 
 import sys
@@ -25,7 +25,7 @@ EPISODES = 2
 
 
 def maps_of(env) -> dict[str, np.ndarray | float]:
-    """Return bin and tote of an environment with one slot as whole cells."""
+    """Return the maps of bin and tote of an environment with one slot, in whole cells."""
     state = env.state
     bin_depth, labels = np.zeros((2, *env.cell.bin_size[:2]), dtype=int)
     for number, (x, y, w, d, h) in enumerate(items_in_bin(state.items, 0), 1):
@@ -39,14 +39,14 @@ def maps_of(env) -> dict[str, np.ndarray | float]:
 
 
 def in_metres(maps: dict, cell: CellSpec) -> dict:
-    """Return the same in metres."""
+    """Return the same scene in metres."""
     lengths = {key: maps[key] * cell.height_unit * cell.cell_size for key in ("bin_depth", "tote_depth", "tote_height")}
     return {**maps, **lengths, "cell_size": cell.cell_size}
 
 
 def scenes(planner: Planner, env):
-    """Yield the maps of every state of some episodes, and at last an item that is too high, and one that is no
-    cuboid."""
+    """Yield the maps of every state of some episodes; after each episode, also maps of too high an item, and of an
+    item that is no cuboid."""
     for episode in range(EPISODES):
         env.set_seed(episode)
         data = env.reset()
@@ -71,7 +71,7 @@ def answer(planner: Planner, maps: dict) -> tuple[str, float]:
 
 
 def row(path: str) -> dict:
-    """Return percentiles of the times of one checkpoint's answers, and how often each status came."""
+    """Return percentiles of the times of one checkpoint's answers, and the count of each status."""
     env = load_policy(path).make_env(num_envs=1)
     planners = {"all": Planner.load(path), "one candidate": Planner.load(path, candidates=1)}
     found: dict[str, list] = {name: [] for name in planners}
@@ -82,7 +82,7 @@ def row(path: str) -> dict:
 
 
 def images(count: int = 40) -> dict:
-    """Return percentiles of the times in which two depth images of 640 x 480 pixels become a scene, or are refused.
+    """Return percentiles of the time from two depth images of 640 x 480 pixels to a scene, or to its refusal.
 
     The images are those of ``tests/long/camera_truth.py``, good and bad ones.
     """

@@ -1,4 +1,4 @@
-"""Measure what the choice among several items in the bin is worth: python benchmarks/bins.py
+"""Measure the gain from a choice among several items in the bin: python benchmarks/bins.py
 
 Every method plays the same 100 episodes of the test stream at 8x8x8 with mixed items, for each number of items in the
 bin. Writes docs/results/bins.csv and docs/bins.png, and prints the table of docs/results.md.
@@ -14,7 +14,7 @@ from pickplace.views.figures import COLOURS, INK, figure_of
 TABLE, FIGURE, RUNS = ROOT / "docs" / "results" / "bins.csv", ROOT / "docs" / "bins.png", ROOT / "outputs" / "bins"
 COUNTS = (1, 2, 3, 5)
 VALUES, GRASP, MIXED = ["checkpoint=pretrained/mixed"], ["checkpoint=pretrained/mixed_bin3"], ["items=mixed"]
-#: Method -> what a reader calls it, and words for pickplace-evaluate.
+#: Method -> its label, and words for pickplace-evaluate.
 METHODS = {
     "learned": ("values of totes, any item", VALUES),
     "beam": ("values of totes, beam search", [*VALUES, "planner=beam"]),
@@ -32,7 +32,7 @@ COLUMNS = ("method", "bin_items", "episodes", "mean", "low", "high", "minus_lear
 
 
 def measure(method: str, count: int) -> dict:
-    """Return a row of the table; what was played before is not played again."""
+    """Return a row of the table; episodes that were played before are not played again."""
     folder, learned = (RUNS / f"{name}-{count}" for name in (method, "learned"))
     words = [*METHODS[method][1], "env.tote_size=[8,8,8]", "env.bin_size=[8,8,1]", f"env.bin_items={count}"]
     if method != "learned":

@@ -1,4 +1,4 @@
-"""Shared by the benchmarks: running commands, one core, interleaved timing, percentiles, and where results go."""
+"""Helpers of the benchmarks: run commands, use one core, time functions in turn, compute percentiles, save results."""
 
 import json
 import os
@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-# Threads that wait spin, here and in the commands: the machine is idle. OpenMP reads this when torch is loaded.
+# Waiting threads spin, here and in the commands, as the machine is idle. OpenMP reads this when torch is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "ACTIVE")
 
 import torch  # noqa: E402
@@ -19,7 +19,7 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def use_one_core() -> None:
-    """Pin this process to one core and torch to one thread, so that every library has the same machine."""
+    """Pin this process to one core and torch to one thread, so that every library has the same resources."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     torch.set_num_threads(1)
@@ -36,7 +36,7 @@ def run(name: str, *words: str) -> None:
 
 
 def evaluate(folder: Path, *words: str) -> dict:
-    """Return the ``evaluation.json`` in a folder; it is played unless that was done before."""
+    """Return the ``evaluation.json`` in a folder; play the evaluation first if it is missing."""
     path = folder / "evaluation.json"
     if not path.is_file():
         run("pickplace-evaluate", *words, "evaluation.replay=0", "threads=1", f"hydra.run.dir={folder}")
@@ -48,8 +48,8 @@ def interleave(functions: dict, repeats: int, warmup: int = 2) -> dict[str, dict
 
     Args:
         functions: name -> function without arguments, which returns when its work is done.
-        repeats: number of timed calls of each.
-        warmup: number of untimed calls before.
+        repeats: number of timed calls of each function.
+        warmup: number of untimed calls before these.
 
     Returns:
         name -> ``{"ms": median, "low": 10th percentile, "high": 90th percentile, "repeats": n}``.

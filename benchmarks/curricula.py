@@ -1,7 +1,7 @@
 """Count the frames that a policy needs with each curriculum, with three seeds: python benchmarks/curricula.py
 
-A training ends at the first validation that reaches 95% of the occupancy of the shipped weights, or after about three
-times the frames that this takes without a curriculum. What was trained before is read, and what was stopped goes on.
+A training ends at the first validation that reaches 95% of the occupancy of the shipped weights. It also ends after
+about three times the frames that this takes without a curriculum. Finished trainings are read, stopped ones go on.
 Writes docs/results/curricula.csv.
 """
 
@@ -14,7 +14,7 @@ from common import ROOT, run
 from pickplace.runs.loggers import read_csv
 
 TABLE, RUNS = ROOT / "docs" / "results" / "curricula.csv", ROOT / "outputs" / "curricula"
-#: Problem -> occupancy that is to be reached, and words of the training.
+#: Problem -> occupancy to reach, and words of the training.
 PROBLEMS = {
     "mixed": (
         0.95 * 0.8879,
@@ -25,10 +25,10 @@ PROBLEMS = {
         ["experiment=afterstate", "benchmark=gopt_rs", "total_frames=240_000", "evaluation_interval=8_000"],
     ),
 }
-#: Of each level, the greatest side of its items and the height of its tote; None: as in the full task.
+#: Greatest side of the items and height of the tote at each level; None: as in the full task.
 SIDES = {"mixed": (2, None), "gopt_rs": (3, 4, None)}
 TOTES = {"mixed": (4, None), "gopt_rs": (6, 8, None)}
-#: Frames after which a staircase leaves a level that is not packed well yet: some share of what the full task takes.
+#: Frames after which a staircase leaves a level, even if it is not packed well yet: a share of the full task's frames.
 FRAMES = {"mixed": 50_000, "gopt_rs": 10_000}
 
 

@@ -1,7 +1,7 @@
-"""Time of one decision on one core: python benchmarks/decision.py
+"""Measure the time of one decision on one core: python benchmarks/decision.py
 
-Decisions have feasibility and candidates included, batch 1, ``R=4``, and states from the middle of episodes; networks
-are as in the configs, with fresh weights.
+A decision includes feasibility and candidates, at batch 1, with ``R=4``, in states from the middle of episodes. The
+networks are those of the configs, with fresh weights.
 """
 
 from functools import partial
@@ -23,7 +23,7 @@ CANDIDATES = (10, "all")
 
 
 def deciders(tote_size) -> dict:
-    """Return a function that decides once, for each policy and number of candidates."""
+    """Return a function that makes one decision, for each policy and number of candidates."""
     env = PickPlaceEnv(tote_size=tote_size, num_envs=1)
     state = env.rollout(tote_size[0] ** 2 // 2, break_when_any_done=False)[:, -1]["next"]
     calls = {}

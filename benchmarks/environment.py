@@ -1,10 +1,10 @@
-"""Environment steps a second on one core, the full joint mask included, against Jumanji's BinPack-v2.
+"""Measure environment steps a second on one core, with the full joint mask, against Jumanji's BinPack-v2.
 
-python benchmarks/environment.py    (the peer: pip install jumanji; without it, it is skipped)
+python benchmarks/environment.py    (pip install jumanji; without it, only ours is measured)
 
-Both environments are natively batched, take random feasible actions and reset by themselves; choosing the actions is
-not timed. Jumanji's task differs (items of any size go into empty maximal spaces, and there is no end effector), so the
-ratio compares the cost of a step, not the quality of a packing.
+Both environments are natively batched, take random feasible actions and reset by themselves; the choice of the actions
+is not timed. Jumanji's task differs: items of any size go into empty maximal spaces, and there is no end effector. So
+the ratio compares the cost of a step, not the quality of a packing.
 """
 
 import os

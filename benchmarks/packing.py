@@ -1,7 +1,7 @@
 """Play the public packing benchmarks, without a gripper and with one: python benchmarks/packing.py
 
 Writes docs/results/packing.csv and the tables of docs/benchmarks.md after each row, and prints the row. All rows take
-hours; `--match` plays some, such as `^cut1`, and the others stay as they are. `--tables` plays none.
+hours. `--match` plays only some, such as `^cut1`, and keeps the others; `--tables` plays none.
 """
 
 import argparse
@@ -17,17 +17,17 @@ from common import ROOT, evaluate
 
 TABLE, PAGE = ROOT / "docs" / "results" / "packing.csv", ROOT / "docs" / "benchmarks.md"
 PLATES = {"plate_3x3": 3, "plate_5x5": 5}
-SCALED = {"gopt_30": 3, "gopt_50": 5, "gopt_100": 10}  # times as many cells along each side as gopt_rs
-#: By their names in the table. Those that pick first grip the item in its middle, whatever lies in the tote.
+SCALED = {"gopt_30": 3, "gopt_50": 5, "gopt_100": 10}  # factor of the cells along each side to gopt_rs
+#: By their names in the table. Those that pick first grip the item in its middle, independent of the tote.
 PLANNERS = {
     "learned": [],
     "learned_pick_first": ["planner.pick=middle"],
     "joint_dbl": ["planner=joint_dbl"],
     "dbl_pick_first": ["planner=individual_heuristic", "planner.candidates=cells", "planner.pick=middle"],
 }
-#: Rotations of the weights; ``pct1`` and the larger totes have those of ``gopt_rs``.
+#: Rotations of the weights; ``pct1`` and the larger totes use the weights of ``gopt_rs``.
 TRAINED = {"gopt_rs": 2, "pct1": 2, "cdrl_rs": 1, "cut1": 1, "cut2": 1}
-#: The best published figure, and others; their sources are on the page.
+#: The best published result, and others; the page names their sources.
 PUBLISHED = {
     "gopt_rs": ("GOPT 76.1", "Xiong 73.8, PCT 72.7, Zhao 70.9"),
     "gopt_30": ("GOPT 76.0", ""),
@@ -67,9 +67,9 @@ class Row(NamedTuple):
 
 
 def rows() -> list[Row]:
-    """Return all rows: without a gripper and with one; then the larger totes.
+    """Return all rows: without a gripper and with one, then the larger totes.
 
-    Weights serve no more rotations than they were trained with. A point has but one way to pick.
+    Weights serve at most the rotations of their training. A point has only one way to pick.
     """
     listed = []
     for name, rotations in TRAINED.items():
@@ -104,7 +104,7 @@ def read() -> dict[str, dict]:
 
 
 def update(row: Row, line: dict) -> None:
-    """Write a line into the table, which has those of :func:`rows` in their order."""
+    """Write a line into the table, which keeps the order of :func:`rows`."""
     lines = read()
     lines[row.name] = {key: round(value, 4) if isinstance(value, float) else value for key, value in line.items()}
     with TABLE.open("w", newline="") as file:
@@ -114,7 +114,7 @@ def update(row: Row, line: dict) -> None:
 
 
 def interval(line: dict | None, column: str = "mean") -> str:
-    """Return a mean with its interval in per cent, ``81.04 (80.69 to 81.39)``; nothing where there is no line."""
+    """Return a mean with its interval in per cent, ``81.04 (80.69 to 81.39)``; empty if there is no line."""
     names = (column, "low", "high") if column == "mean" else (column, f"{column}_low", f"{column}_high")
     return "" if line is None else "{:.2f} ({:.2f} to {:.2f})".format(*(100 * float(line[name]) for name in names))
 

@@ -1,8 +1,8 @@
 """Make the paper's comparison: python benchmarks/paper.py
 
 Trains with three seeds, plays the test stream, and writes a table and figures into docs/results/paper.
-What was trained or played before, in outputs/paper, is read; what was stopped goes on.
-``python benchmarks/paper.py fcn4d-R4-0`` only trains what it names, so that several processes can share the work.
+Finished trainings and episodes in outputs/paper are read; stopped trainings go on.
+``python benchmarks/paper.py fcn4d-R4-0`` runs only this training, so that several processes can share the work.
 """
 
 import csv
@@ -23,7 +23,7 @@ from pickplace.views.figures import COLOURS, figure_of
 RESULTS, RUNS = ROOT / "docs" / "results" / "paper", ROOT / "outputs" / "paper"
 SMALL, LARGE = ("6x6x5", "6x6x10", "10x10x5", "10x10x10"), ("30x30x5", "30x30x10")
 CANDIDATES = (1, 2, 3, 5, 10, 20, 50)
-MANY, FEW = 100, 10  # episodes; few where a tote takes minutes
+MANY, FEW = 100, 10  # numbers of episodes; few if a tote takes minutes
 
 
 class Training(NamedTuple):
@@ -45,7 +45,7 @@ TRAININGS = {
     ("typical", 4): Training("experiment=paper_fast model=typical", 4.0, ("6x6x5",), 1),
     ("paper", 4): Training("experiment=paper total_frames=250_000", 2.0, ("6x6x5",), 1),
 }
-#: Method -> what the figures call it.
+#: Method -> its label in the figures.
 LABELS = {
     "individual_heuristic": "individual_heuristic",
     "individual_rl": "individual_rl",
@@ -74,7 +74,7 @@ class Cell(NamedTuple):
 
 
 def cells() -> Iterator[Cell]:
-    """Yield everything that is played."""
+    """Yield all cells that are played."""
     for (method, turns), training in TRAININGS.items():
         for tote, seed in product(training.totes, range(training.seeds)):
             every = CANDIDATES if (turns, tote) == (3, "6x6x5") else (1, 10)
@@ -86,7 +86,7 @@ def cells() -> Iterator[Cell]:
 
 
 def train(method: str, turns: int, seed: int) -> None:
-    """Train, or go on with a training, unless it is done."""
+    """Train, or go on with a training, unless it is finished."""
     folder = RUNS / f"{method}-R{turns}-{seed}"
     if not (folder / "report.html").is_file():
         new = [*TRAININGS[method, turns].words.split(), f"seed={seed}", f"hydra.run.dir={folder}"]
@@ -106,13 +106,13 @@ def play(cell: Cell) -> list[float]:
 
 
 def half_interval(values: np.ndarray) -> float:
-    """Return half of Student's 95% interval of a mean; 0 of one value."""
+    """Return half of Student's 95% interval of a mean; 0 for a single value."""
     return float(t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / len(values) ** 0.5) if len(values) > 1 else 0.0
 
 
 def summary(seeds: list[list[float]]) -> dict:
-    """Return the mean over training seeds and episodes, with a 95% interval: that over episodes, which all seeds share,
-    and that over seeds, added as independent errors."""
+    """Return the mean over training seeds and episodes, with a 95% interval. It adds, as independent errors, the
+    interval over episodes, which all seeds share, and the interval over seeds."""
     values = np.array(seeds)  # [seeds, episodes]
     half = float(np.hypot(half_interval(values.mean(0)), half_interval(values.mean(1))))
     middle, counts = float(values.mean()), dict(zip(("seeds", "episodes"), values.shape, strict=True))
@@ -142,18 +142,18 @@ def measure() -> list[dict]:
 
 
 def less(seeds: list[list[float]], others: list[list[float]]) -> dict:
-    """Return the difference of two methods in the same episodes, seed by seed; an only seed meets all of the other."""
+    """Return the difference of two methods in the same episodes, seed by seed; a single seed is paired with all."""
     others = others * len(seeds) if len(others) == 1 else others
     return summary([[a - b for a, b in zip(*pair, strict=False)] for pair in zip(seeds, others, strict=False)])
 
 
 def found(rows: list[dict], **wanted) -> dict | None:
-    """Return the row of what is played with these values."""
+    """Return the row of played episodes with these values; None without one."""
     return next((r for r in rows if r["kind"] == "played" and all(r.get(key) == v for key, v in wanted.items())), None)
 
 
 def panels(count: int = 1, width: float = 8, height: float = 4.2, **shared):
-    """Return a figure, and its axes without what distracts."""
+    """Return a figure, and its axes in a plain style."""
     figure = figure_of(width, height)
     every = figure.subplots(1, count, squeeze=False, sharey=True, **shared)[0]
     for axes in every:

@@ -1,4 +1,4 @@
-"""Measure what a physics engine keeps of plans: python benchmarks/physics.py
+"""Measure how well plans hold in a physics engine: python benchmarks/physics.py
 
 Plans of the test stream are carried out by `settle` or `execute`. A row of docs/results/physics.csv is a set of totes:
 
@@ -6,9 +6,9 @@ Plans of the test stream are carried out by `settle` or `execute`. A row of docs
 - methods with and without joint planning, 100 totes, `execute`;
 - the trained policy on 27 kinds of items, 50 totes, `execute`, with errors of placement, other gaps and frictions.
 
-Rows that are there are not computed again, so the run can be stopped and started again. To use several cores, start
-several runs with different --match; each kind of items has plans of its own. Prints the tables of docs/physics.md,
-and draws docs/physics.png.
+Existing rows are not computed again, so the run can be stopped and started again. To use several cores, start several
+runs with different --match; each kind of items has its own plans. Prints the tables of docs/physics.md, and draws
+docs/physics.png.
 """
 
 import argparse
@@ -36,7 +36,7 @@ TABLE, RUNS = ROOT / "docs" / "results" / "physics.csv", ROOT / "outputs" / "phy
 ITEMS = {"kinds": "6x6x5", "mixed": "8x8x8", "tall": "6x6x5"}
 RULES = ("half", "more_than_half", "hull", "bearing", "bearing+0.25", "full")  # and the margin after the +
 OF_METHODS = "bearing+0.25"  # the rule under which methods are compared
-#: What decides, as words for pickplace-evaluate; rectpack plans places alone.
+#: Words for pickplace-evaluate that name what decides; rectpack plans only places.
 METHODS = {
     "rectpack": None,
     "individual_heuristic": ["planner=individual_heuristic"],
@@ -48,7 +48,7 @@ METHODS = {
 COMPARED = [name for name in METHODS if name != "random"]
 #: Friction and gap of the second table.
 CONDITIONS = ((0.3, 1.0), (0.9, 1.0), (0.6, 0.0), (0.6, 3.0))
-#: Panels of the figure: what varies, the legend, and friction, gap and noise of each point.
+#: Panels of the figure: the varied quantity, the legend, and friction, gap and noise of each point.
 ROBUSTNESS = (
     ("error of placement, standard deviation, mm", "gap 1 mm", [(0.6, 1.0, noise) for noise in (0.0, 0.5, 1.0, 2.0)]),
     ("error of placement, standard deviation, mm", "gap 4 mm", [(0.6, 4.0, n) for n in (0.0, 0.5, 1.0, 2.0, 3.0, 5.0)]),
@@ -58,7 +58,7 @@ ROBUSTNESS = (
 
 
 class Cell(NamedTuple):
-    """The settings of a row of the table: what is packed, who plans, and what carries it out."""
+    """The settings of a row of the table: items, planner and simulation."""
 
     items: str
     tote: str
@@ -101,7 +101,7 @@ def wanted() -> Iterator[tuple[Cell, int]]:
 
 
 def read() -> dict[Cell, dict[str, float]]:
-    """Return the figures of the table's rows."""
+    """Return the values of the table's rows."""
     if not TABLE.is_file():
         return {}
     rows = {}
@@ -126,7 +126,7 @@ def write(cell: Cell, figures: dict) -> None:
 
 
 def plan(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
-    """Return the occupancy by the rules, and the plans, of episodes; they are played unless that was done before."""
+    """Return the occupancy by the rules and the plans of episodes; play the episodes unless that was done before."""
     if (words := METHODS[cell.method]) is None:
         return pack_without_gripper(cell, totes)
     trained = RUNS / "train" / f"individual_grasp-R{cell.R}"
@@ -169,7 +169,7 @@ def planned_placements(env: PickPlaceEnv) -> Iterator[tuple[Item, int, int, int,
 
 
 def pack_without_gripper(cell: Cell, totes: int) -> tuple[list[float], list[EpisodePlan]]:
-    """Return what rectpack plans, which knows no gripper; it is held over the middle of each item."""
+    """Return the plans of rectpack, which does not know the gripper: it is put over the middle of each item."""
     occupancy, plans = [], []
     for episode in range(totes):
         size = [int(side) for side in cell.tote.split("x")]
@@ -192,7 +192,7 @@ def pack_without_gripper(cell: Cell, totes: int) -> tuple[list[float], list[Epis
 
 
 def measure(cell: Cell, totes: int) -> dict[str, float]:
-    """Return the figures of a cell."""
+    """Return the values of a cell."""
     planned, plans = plan(cell, totes)
     settings = {"friction": cell.friction, "gap": cell.gap_mm / 1e3, "noise": cell.noise_mm / 1e3}
     simulation = build("physics", {"_target_": cell.simulation, **settings})
@@ -208,7 +208,7 @@ def measure(cell: Cell, totes: int) -> dict[str, float]:
 
 # ---------------------------------------------------------------------- tables
 def share(row: dict) -> str:
-    """Return how many totes lost an item."""
+    """Return the number of totes that lost an item, with an interval of their share."""
     low, high = proportion95(row["lost"], row["totes"])
     return f"{row['lost']} of {row['totes']} ({low:.1%} to {high:.1%})"
 
@@ -245,7 +245,7 @@ def tables() -> str:
 
 
 def figure() -> None:
-    """Draw how errors of placement, gaps and friction change what a gantry carries out, in docs/physics.png."""
+    """Draw the effect of placement errors, gaps and friction on plans that a gantry carries out: docs/physics.png."""
     rows, names = read(), list(dict.fromkeys(name for name, _, _ in ROBUSTNESS))
     chart, panels = plt.subplots(1, len(names), figsize=(11, 3.2), sharey=True, layout="constrained")
     for name, label, points in ROBUSTNESS:

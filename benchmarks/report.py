@@ -29,7 +29,7 @@ def table(head: str, rows) -> str:
 
 
 def machine(result: dict) -> str:
-    """Return the machine of a measurement in a few words."""
+    """Return a short description of the machine of a measurement."""
     m = result["machine"]
     return f"{m['cpu']}, torch {m['torch']}, {m['threads']} thread{'s' * (m['threads'] > 1)}"
 
@@ -120,8 +120,8 @@ def answers(result: dict) -> str:
     rows = [(what, *(f"{figures[key]:.0f}" for key in keys)) for what, figures in asked]
     return section(
         "One answer to a robot",
-        "Milliseconds for a call of `Planner.plan` with ten alternatives, in cells and in metres, from an empty tote to "
-        "a full one.",
+        "Milliseconds for a call of `Planner.plan` with ten alternatives, in cells and in metres, from an empty tote "
+        "to a full one.",
         table("what | median | 95% | slowest", rows),
     )
 

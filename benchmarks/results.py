@@ -26,7 +26,7 @@ RESULTS = Path(__file__).parents[1] / "docs" / "results"
 TABLE, PAGE = RESULTS / "paper.csv", RESULTS.parent / "results.md"
 STYLE, FIGURES, TABLES = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text()).values()
 FEW = 20  # episodes below which a mean is marked
-KEY = ("kind", "cell", "versus", "frames")  # what a row of the table is about
+KEY = ("kind", "cell", "versus", "frames")  # columns that identify a row of the table
 
 
 def read() -> list[dict]:
@@ -36,7 +36,7 @@ def read() -> list[dict]:
 
 
 def number(column: str, text: str) -> int | float | str:
-    """Return a number where the text is one and the column may hold numbers, else the text."""
+    """Return the text as a number if it is one and the column may hold numbers; else return the text."""
     for kind in () if column in ("cell", "versus", "commit") else (int, float):
         with suppress(ValueError):
             return kind(text)
@@ -78,7 +78,7 @@ def add(name: str, path: Path) -> None:
 
 
 def update(rows: list[dict]) -> None:
-    """Add rows to the table, or replace those about the same."""
+    """Add rows to the table; a row replaces an older one with the same :data:`KEY`."""
 
     def key(row):
         return [str(row.get(name, "")) for name in (KEY if row["kind"] == "validation" else KEY[:3])]
@@ -115,7 +115,7 @@ def pooled(names: str | list[str], results: dict[str, dict]) -> dict | None:
 
 
 def widen(axes) -> None:
-    """Widen an axis of occupancies towards 1: logarithmic in the empty share."""
+    """Stretch an axis of occupancies near 1: it is logarithmic in the empty share."""
     axes.set_yscale("function", functions=(lambda y: -np.log10(np.maximum(1 - y, 1e-4)), lambda z: 1 - 10.0**-z))
     ticks = (0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 0.9998)
     axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])

@@ -22,12 +22,12 @@ CARD = "card.json"
 
 
 def export(source, folder: Path, evaluations: list[Path]) -> None:
-    """Write the networks of a checkpoint, without what only training needs, and its card.
+    """Write the networks of a checkpoint, without the state that only training needs, and its card.
 
     Args:
         source: a run folder or a checkpoint.
-        folder: where the weights go; an older version is replaced.
-        evaluations: ``evaluation.json`` files of this very checkpoint.
+        folder: folder for the weights; an older version is replaced.
+        evaluations: ``evaluation.json`` files of exactly this checkpoint.
 
     Raises:
         ValueError: for a checkpoint or an evaluation that cannot be read, or that do not belong together.
@@ -53,12 +53,12 @@ def export(source, folder: Path, evaluations: list[Path]) -> None:
 
 
 def critic_serves_any_tote(cfg: DictConfig) -> bool:
-    """Return whether the critic of a checkpoint's config is of use for other totes, such as to ``planner=lookahead``.
+    """Return whether the critic of a checkpoint's config also serves other totes, such as for ``planner=lookahead``.
 
-    Another one is tied to the tote of the training, and larger than the policy; or it is the policy's own network.
+    Other critics are tied to the training's tote and larger than the policy, or are the policy's own network.
     """
     env: Any = OmegaConf.to_container(cfg.env, resolve=True)
-    cell = build_cell(env, reach=None)  # a table of reach may be elsewhere
+    cell = build_cell(env, reach=None)  # the file of a table of reach may be missing here
     if cfg.model.critic is None:
         return False
     for key in ("actor", "critic"):

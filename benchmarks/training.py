@@ -1,4 +1,4 @@
-"""Time to a good policy, parts of the training time, worker processes: python benchmarks/training.py"""
+"""Measure time to a good policy, parts of the training time, and worker processes: python benchmarks/training.py"""
 
 import logging
 import re
@@ -23,7 +23,7 @@ from pickplace.training.train import train
 
 #: Preset, the class of its policy, frames.
 TRAININGS = (("quick", FcnGrasp, 300_000), ("paper", Fcn4d, 8_000), ("paper_fast", Fcn4d, 60_000))
-#: One validation, after the last batch, too short to count.
+#: A single validation after the last batch, too short to matter.
 NO_EVALUATION = ["evaluation_interval=1_000_000_000", "evaluation.episodes=1", "evaluation.batch_size=1"]
 
 MARKS, SEEDS = (0.95, 0.975), (0, 1, 2)
@@ -40,7 +40,7 @@ COLLECTORS = {"single": ["collector=single"], "multi_sync, 2 workers": ["collect
 def learn(seed: int) -> dict:
     """Return the validations of ``experiment=quick``: seconds since the process began, frames, occupancy.
 
-    Only the first seed trains to the end, the others until the last of :data:`MARKS` is reached.
+    Only the first seed trains to the end; the others end when the last of :data:`MARKS` is reached.
     """
     with tempfile.TemporaryDirectory() as folder:
         words = ["experiment=quick", "threads=null", f"seed={seed}", "evaluation_interval=50_000"]
@@ -105,7 +105,7 @@ def batches(overrides: list[str]) -> list[float]:
 
 
 def measure_workers() -> dict:
-    """Return the times of a batch, collected by one process and by workers, in turn."""
+    """Return the times of a batch, collected in turn by one process and by workers."""
     times: dict = {case: {name: [] for name in COLLECTORS} for case in WORKER_CASES}
     for _ in range(WORKER_REPEATS):
         for case, overrides in WORKER_CASES.items():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 _is_command = os.path.basename(next(iter(sys.argv), "")).startswith("pickplace-")
 if _is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(signal.SIGINT, lambda *_: os._exit(130))  # no traceback of a Ctrl-C; cli.py goes on from here
+    signal.signal(signal.SIGINT, lambda *_: os._exit(130))  # Ctrl-C prints no traceback; cli.py replaces this handler
 
 import gymnasium  # noqa: E402
 
@@ -27,13 +27,13 @@ gymnasium.register(
     "pickplace/PickPlace-v0",
     entry_point="pickplace.views.gymnasium:RenderedPickPlaceEnv",
     vector_entry_point="pickplace.envs.gymnasium:PickPlaceVectorEnv",
-    order_enforce=False,  # no wrappers, which hide action_masks(); the environment itself refuses a step before reset
+    order_enforce=False,  # a wrapper would hide action_masks(); the environment itself refuses a step before reset
     disable_env_checker=True,
 )
 
 __version__ = "0.1.0"
 
-#: The module of each public name; it is imported when it is asked for, since torch and torchrl take seconds.
+#: The module of each public name. It is imported on first use, as torch and torchrl take seconds.
 _MODULES = {
     "Box": "robot.box",
     "Camera": "robot.camera",

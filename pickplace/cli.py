@@ -8,15 +8,15 @@ from functools import partial
 
 from pickplace.common.interrupts import end_process, import_quietly, on_interrupt
 
-# A thread that waits for others sleeps. If it spun, it would hold up those that share its core. OpenMP reads this when
-# torch is loaded.
+# Let waiting threads sleep: a spinning thread would slow down others on its core. OpenMP reads this when torch is
+# loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def _run(module: str) -> None:
-    """Import the module of a command, and run its ``main``; after that has ended, Ctrl-C ends the process quietly."""
+    """Import the module of a command, and run its ``main``. Once that has ended, Ctrl-C ends the process quietly."""
     for name in ("stdin", "stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed: its number would go to the next file that is opened
+        if getattr(sys, name) is None:  # closed: the next file that is opened would get its number
             os.open(os.devnull, os.O_RDWR)
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115  open until the end
     logging.raiseExceptions = False  # else each line prints a traceback on a closed terminal or a full disk

@@ -4,7 +4,7 @@ import time
 
 
 def wait_until(browser, script, seconds=20):
-    """Wait until a script returns something true, and return it."""
+    """Wait until a script returns a true value, and return it."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if value := browser.execute_script(f"return {script}"):

@@ -1,4 +1,4 @@
-"""Commands and configs for tests: composed configs, trainings that are disturbed, and trainings in other processes."""
+"""Commands and configs for tests: composed configs, interrupted trainings, and trainings in other processes."""
 
 import copy
 import functools
@@ -28,7 +28,7 @@ from pickplace.training.trainer import Trainer
 
 ITERATION = 8 * 8  # frames of a batch of SETTINGS: env.num_envs * rollout_length
 
-#: A small training that draws in all its parts, and saves and validates at intervals that do not meet.
+#: A small training that draws random numbers in all its parts, and saves and validates at different frames.
 SETTINGS = [
     "experiment=smoke",
     "rollout_length=8",
@@ -40,7 +40,7 @@ SETTINGS = [
     "curriculum.advance.occupancy=0.3",
     "curriculum.advance.window=10",
     "warm_start=imitate",
-    "planner@warm_start.teacher=random",  # a teacher that draws
+    "planner@warm_start.teacher=random",  # a teacher that draws random numbers
     f"warm_start.frames={4 * ITERATION}",
     f"warm_start.critic_frames={2 * ITERATION}",
     f"total_frames={10 * ITERATION}",
@@ -57,7 +57,7 @@ TINY = [
     "env.tote_size=[5,5,2]", "model.actor.filters=8", "model.critic.filters=8", "model.critic.hidden=8", "threads=1",
 ]  # fmt: skip
 
-#: Processes are forked from one that has imported torch and more and has not used it, which saves seconds for each.
+#: Processes are forked from one that has imported but not used torch and more. This saves seconds for each.
 FORKSERVER = multiprocessing.get_context("forkserver")
 FORKSERVER.set_forkserver_preload([
     "pickplace.training.train", "scipy.stats", "matplotlib.figure", "matplotlib.backends.backend_agg",
@@ -115,7 +115,7 @@ def options(group):
 
 @contextmanager
 def after_batch(iteration, act):
-    """Call ``act(trainer)`` when a training in this process has finished that batch: trained, logged and saved."""
+    """Call ``act(trainer)`` once a training in this process has trained, logged and saved the batch ``iteration``."""
     finish = Trainer.finish_batch
 
     def finish_and_act(trainer, metrics, before):
@@ -129,7 +129,7 @@ def after_batch(iteration, act):
 
 
 class Training:
-    """``pickplace-train`` with these overrides in a process of its own, in a context that a function makes there."""
+    """``pickplace-train`` with these overrides in a process of its own; ``context`` makes a context there."""
 
     def __init__(self, *overrides, context=nullcontext):
         self.output = Path(tempfile.mkdtemp())
@@ -142,19 +142,19 @@ class Training:
         return self.process.exitcode, *((self.output / name).read_text() for name in ("stdout", "stderr"))
 
     def finish(self):
-        """Wait for the end, which must be a success; return standard output."""
+        """Wait for a successful end; return standard output."""
         code, out, err = self.end()
         assert code == 0, err
         return out
 
     def kill(self):
-        """Kill it, and wait."""
+        """Kill the process, and wait for its end."""
         self.process.kill()
         self.process.join()
 
 
 def write_to(folder):
-    """Let this process write its standard output and error to files ``stdout`` and ``stderr``."""
+    """Redirect this process's standard output and error to files ``stdout`` and ``stderr``."""
     for number, name in ((1, "stdout"), (2, "stderr")):
         os.dup2(os.open(folder / name, os.O_WRONLY | os.O_CREAT), number)
     sys.stdout, sys.stderr = (os.fdopen(number, "w", buffering=1) for number in (1, 2))
@@ -162,7 +162,7 @@ def write_to(folder):
 
 def _train(overrides, output, context):
     write_to(output)
-    multiprocessing.set_start_method("spawn", force=True)  # as in a process that nobody forked
+    multiprocessing.set_start_method("spawn", force=True)  # the default in a process that was not forked
     from pickplace.training import command
 
     sys.argv = ["pickplace-train", *overrides]

@@ -17,7 +17,7 @@ from pickplace.training import command as train_command
 from pickplace.training import train
 from pickplace.training.trainer import Trainer
 
-# A busy machine is no fault of the code.
+# A test must not fail because the machine is busy.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")
 
@@ -34,7 +34,7 @@ MAINS = {"train": train_command.main, "evaluate": evaluate.main}
 def run(monkeypatch, tmp_path, capsys):
     """Run a command in this process, in an empty folder; returns exit code, standard output and standard error."""
     monkeypatch.chdir(tmp_path)
-    # Hydra composes the whole config once more to know its mode, which the command has composed before.
+    # Hydra would compose the whole config again to know its mode; the command has composed it already.
     monkeypatch.setattr(Hydra, "get_mode", lambda hydra, **given: HydraConfig.get().mode)
 
     def call(command, *arguments):
@@ -45,7 +45,7 @@ def run(monkeypatch, tmp_path, capsys):
         except SystemExit as exit:
             code = exit.code or 0
         finally:
-            logging.root.handlers.clear()  # the files of this run may be gone when the next one logs
+            logging.root.handlers.clear()  # the next run must not log into this run's files
         captured = capsys.readouterr()
         return code, captured.out, captured.err
 
@@ -54,7 +54,7 @@ def run(monkeypatch, tmp_path, capsys):
 
 @pytest.fixture(scope="session")
 def smoke():
-    """Trains experiment=smoke in this process."""
+    """A function that trains experiment=smoke in this process."""
 
     def run(run_dir, *overrides):
         run_dir.mkdir(exist_ok=True)
@@ -74,13 +74,13 @@ def smoke_run(smoke, tmp_path_factory):
 
 @pytest.fixture
 def no_report(monkeypatch):
-    """Trainings in this process draw no figures and write no report, which is more than half of a small one."""
+    """Skip figures and report in trainings of this process; they take more than half of a small training."""
     monkeypatch.setattr(Trainer, "report", lambda trainer, stopped: None)
 
 
 @pytest.fixture(scope="module")
 def browser():
-    """A window of a real browser, without any network but this machine."""
+    """A window of a real browser that reaches only this machine."""
     webdriver = pytest.importorskip("selenium.webdriver")
     from selenium.webdriver.chrome.service import Service
 

@@ -1,7 +1,7 @@
 """The exact optimum on totes of height 1, by dynamic programming over every state of the tote.
 
-With all heights 1 nothing in the tote is ever higher than a placed item's top, nor is the rim: the end effector never
-collides, and a state is the set of filled cells. Written from the rules, without any code of the package.
+With all heights 1, neither the rim nor an item in the tote is ever higher than a placed item's top. So the end effector
+never collides, and a state is the set of filled cells. Written from the rules, without any code of the package.
 """
 
 from functools import cache
@@ -10,7 +10,7 @@ PAPER_SIDES = ((1, 1), (2, 1), (1, 2), (2, 2))
 
 
 def optimal_occupancy(width: int, depth: int, rotations: int, sides=PAPER_SIDES) -> float:
-    """Greatest expected occupancy of a ``width x depth x 1`` tote, the items' sides being equally likely."""
+    """Greatest expected occupancy of a ``width x depth x 1`` tote, if all sides of items are equally likely."""
 
     def footprints(w, d):
         """Bit masks of every position of a ``w x d`` footprint."""
@@ -27,7 +27,7 @@ def optimal_occupancy(width: int, depth: int, rotations: int, sides=PAPER_SIDES)
 
     @cache
     def value(filled: int) -> float:
-        """Expected volume still to be placed before an item arrives that fits nowhere."""
+        """Expected volume that can still be placed until an item arrives that fits nowhere."""
         total = 0.0
         for area, masks in choices:
             total += max((area + value(filled | mask) for mask in masks if not filled & mask), default=0.0)

@@ -1,6 +1,6 @@
-"""A slow, plain-Python implementation of the task's rules, cell by cell, to compare the package with.
+"""A slow implementation of the task's rules in plain Python, cell by cell, to test the package against.
 
-It shares no code with the package and uses nothing but lists and integers. Grids are lists of columns (`grid[x][y]`),
+It shares no code with the package, and uses only lists and integers. Grids are lists of columns (`grid[x][y]`),
 and a flat action is `(((x_bin * D_B + y_bin) * W_T + x_tote) * D_T + y_tote) * R + r`.
 """
 
@@ -23,7 +23,7 @@ Grid = list[list[int]]
 
 @dataclass(frozen=True)
 class Rules:
-    """The sizes and options that stay the same from episode to episode."""
+    """The sizes and options that are the same in all episodes."""
 
     bin_size: Triple = (5, 5, 1)
     tote_size: Triple = (6, 6, 5)
@@ -34,7 +34,7 @@ class Rules:
     support_margin: float = 0.0
     body: str | Grid = "rectangle"  # rectangle, disc or `[W_E][D_E]` of 0 and 1
     cup: str | Grid = "rectangle"
-    cup_size: Pair | None = None  # of a rectangle or disc in the middle; None: as large as the body
+    cup_size: Pair | None = None  # size of a rectangle or disc in the middle; None: as large as the body
     min_seal: float = 1.0
     bin_items: int = 1
     refill: str = "each"
@@ -96,7 +96,7 @@ def shape_cells(shape: str | Grid, size: Pair, inner: Pair) -> list[Pair]:
 
 
 def in_disc(cell: Pair, size: Pair) -> bool:
-    """Whether the inside of a cell meets the ellipse inscribed in a rectangle: its point nearest the centre does."""
+    """Whether a cell's inside meets the ellipse inscribed in a rectangle: its point nearest the centre decides."""
     total = Fraction(0)
     for at, side in zip(cell, size, strict=True):
         centre = Fraction(side, 2)
@@ -139,7 +139,7 @@ def is_stable(rules: Rules, supporting: list[Pair], size: Pair) -> bool:
 
 
 def in_hull_of_middles(supporting: list[Pair], size: Pair) -> bool:
-    """Whether the middle of a rectangle is one of the middles of cells, or on a line or in a triangle of some."""
+    """Whether the middle of a rectangle is a middle of one of the cells, or on a line or in a triangle of middles."""
     centre, points = size, [(2 * x + 1, 2 * y + 1) for x, y in supporting]
     for a, b, c in combinations_with_replacement(points, 3):
         turns = [cross(p, q, centre) for p, q in ((a, b), (b, c), (c, a))]
@@ -150,7 +150,7 @@ def in_hull_of_middles(supporting: list[Pair], size: Pair) -> bool:
 
 
 def on_near_edge(supporting: list[Pair], size: Pair) -> bool:
-    """Whether no middle of a cell has less y than that of a rectangle, and the middles are not all on a line."""
+    """Whether no cell's middle has a smaller y than the rectangle's, and the cells' middles are not all on a line."""
     points = [(2 * x + 1, 2 * y + 1) for x, y in supporting]
     flat = not any(cross(a, b, c) for a, b, c in combinations_with_replacement(points, 3))
     return min(y for _, y in points) >= size[1] and not flat
@@ -189,23 +189,23 @@ class Placed:
     most: int | None
 
     def rests_on(self, other: Placed) -> bool:
-        """Whether this one's underside and the other's top are level and have an area in common."""
+        """Whether this item's underside and the other's top are level and share an area."""
         ends, others = ([a + b for a, b in zip(box.corner, box.size, strict=True)] for box in (self, other))
         shared = [min(ends[i], others[i]) - max(self.corner[i], other.corner[i]) for i in range(2)]
         return others[2] == self.corner[2] and min(shared) > 0
 
 
 def piles_below(items: list[Placed]) -> list[set[int]]:
-    """For each item the numbers of those on which it rests, and of those on which these rest, down to the floor."""
+    """For each item, the numbers of all items in the pile below it, down to the floor."""
     found: list[set[int]] = []
-    for item in items:  # what an item rests on was there before
+    for item in items:  # an item rests only on earlier ones
         on = {other for other in range(len(found)) if item.rests_on(items[other])}
         found.append(on.union(*(found[other] for other in on)))
     return found
 
 
 def loads(items: list[Placed]) -> list[int]:
-    """The mass that counts on each item: that of every item in whose pile below it is."""
+    """The load of each item: the mass of every item whose pile includes it."""
     below = piles_below(items)
     return [sum(item.mass for item, on in zip(items, below, strict=True) if n in on) for n in range(len(items))]
 
@@ -214,8 +214,8 @@ def loads(items: list[Placed]) -> list[int]:
 class Oracle:
     """One environment: an episode's tote and the item that waits in the bin.
 
-    `item` is `(w, d, h)` and `position` the bin cell of its corner; `others` are further items in the bin with theirs;
-    `heights` is `[W_T][D_T]`, and so is `bearing`, 1 where a cell bears weight.
+    `item` is `(w, d, h)`, and `position` is the bin cell of its corner. `others` are further items in the bin and their
+    positions. `heights` and `bearing`, 1 where a cell bears weight, are `[W_T][D_T]`.
     """
 
     rules: Rules
@@ -226,7 +226,7 @@ class Oracle:
     volume: int = 0
     bearing: Grid = field(default_factory=list)
     others: list[tuple[Triple, Pair]] = field(default_factory=list)
-    picks: dict[Pair, tuple[int, int | None]] = field(default_factory=dict)  # those that were tried: they come up often
+    picks: dict[Pair, tuple[int, int | None]] = field(default_factory=dict)  # results of tried picks, which recur
     placed: list[Placed] = field(default_factory=list)  # with handling
 
     def __post_init__(self):
@@ -248,7 +248,7 @@ class Oracle:
         return [(self.item, self.position), *self.others]
 
     def taken(self, action: int) -> int | None:
-        """The number of the item that an action's pick takes: the highest that the cup grips; of equals the first."""
+        """The number of the item that an action takes: the highest that the cup grips; among equals the first."""
         return self.try_pick(self.rules.split(action)[0])[1]
 
     def try_pick(self, pick: Pair) -> tuple[int, int | None]:
@@ -276,7 +276,7 @@ class Oracle:
         return best
 
     def _lift(self, pick: Pair, number: int) -> int:
-        """The failure code of taking an item that is gripped."""
+        """The failure code of lifting an item that is gripped."""
         (w, d, h), position = self.contents[number]
         corner, grid, item = corner_for(pick, self.rules.effector_size), self.bin_depth(), cells(position, (w, d))
         for x, y in ((corner[0] + x, corner[1] + y) for x, y in self.rules.body_cells[0]):
@@ -296,7 +296,7 @@ class Oracle:
         return self.volume / (width * depth * self.tote_height)
 
     def try_action(self, action: int) -> tuple[int, Grid | None]:
-        """The failure code of an action and, on success only, the heights it leaves."""
+        """The failure code of an action and, only on success, the heights after it."""
         rules, heights = self.rules, self.heights
         pick, place, r = rules.split(action)
         failure, number = self.try_pick(pick)
@@ -363,7 +363,7 @@ class Oracle:
         return Placed((x, y, z), (*size, h), *self.rules.handling[w, d, h][1:])
 
     def bearing_after(self, action: int) -> Grid:
-        """1 for each cell that bears weight after an action that succeeds; of an item: inside its support's hull."""
+        """1 for each cell that bears weight after a successful action; on an item, only inside its support's hull."""
         after = [column[:] for column in self.bearing]
         if self.rules.support != "bearing":
             return after
@@ -396,10 +396,10 @@ class Oracle:
     def step(
         self, action: int, next_item: Triple, next_position: Pair, try_first=(), others=()
     ) -> tuple[int, bool, int]:
-        """Takes an action; returns reward, terminated and failure code.
+        """Take an action; return reward, terminated and failure code.
 
-        The next item arrives only after a success, and decides whether the episode is stuck. `others` are what else
-        lies in the bin then.
+        The next item arrives only after a success, and decides whether the episode is stuck. `others` are the other
+        items in the bin then.
         """
         failure, after = self.try_action(action)
         if failure != SUCCESS:
@@ -415,7 +415,7 @@ class Oracle:
 
 
 def can_always_start(rules: Rules, kinds: list[Triple]) -> bool:
-    """Whether every kind has a feasible action on the empty tote, from every bin position and at every tote height."""
+    """Whether each kind has a feasible action on the empty tote, from each bin position and at each tote height."""
     (bin_w, bin_d, _), greatest = rules.bin_size, max(h for _, _, h in kinds)
     if greatest > rules.tote_size[2] or any(w > bin_w or d > bin_d for w, d, _ in kinds):
         return False

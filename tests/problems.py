@@ -1,4 +1,4 @@
-"""Random problems, as the package and as the plain-Python oracle see them; shared by the tests of several rooms."""
+"""Random problems, in the forms of the package and of the plain-Python oracle; shared by tests of several packages."""
 
 from dataclasses import replace
 from itertools import product
@@ -41,8 +41,8 @@ SUPPORTS = [
 
 
 class Case(NamedTuple):
-    """The state of a problem: height of the tote, heights ``[W_T, D_T]`` in it, where they bear weight, and one
-    ``(x, y, w, d, h)`` in the bin, or more."""
+    """The state of a problem: height of the tote, heights ``[W_T, D_T]`` in it, 1 where they bear weight, and one or
+    more items ``(x, y, w, d, h)`` in the bin."""
 
     rim: int
     heights: np.ndarray
@@ -52,12 +52,12 @@ class Case(NamedTuple):
 
 
 def support_of(name: str | float, margin: float) -> Support:
-    """Return an entry of :data:`SUPPORTS` as a rule of the package."""
+    """Return the package's rule of an entry of :data:`SUPPORTS`."""
     return RULES[name](margin) if name in ("hull", "bearing") else read_support(name)
 
 
 def state_of(*cases: Case) -> State:
-    """Return cases as the state of a batch."""
+    """Return the state of a batch of cases."""
     heights, bearing = (
         torch.from_numpy(np.stack([getattr(case, key) for case in cases])) for key in ("heights", "bearing")
     )
@@ -67,7 +67,7 @@ def state_of(*cases: Case) -> State:
 
 
 def oracle_of(cell: CellSpec, case: Case) -> Oracle:
-    """Return a case as the oracle sees it."""
+    """Return the oracle of a case."""
     tables = {} if cell.limits is None else {k: v.tolist() for k, v in vars(cell.limits).items() if v is not None}
     names = (name for name in CELL_SETTINGS if name not in NOT_OF_THE_ORACLE)
     name = next((name for name, kind in RULES.items() if type(cell.support) is kind), None)
@@ -82,19 +82,19 @@ def oracle_of(cell: CellSpec, case: Case) -> Oracle:
 
 
 def random_limits(cell: CellSpec, seed: int) -> Limits:
-    """Return tables that forbid some of everything."""
+    """Return tables of limits that forbid a part of the picks, places and heights."""
     random = np.random.default_rng(seed)
     places = (cell.rotations, *cell.tote_size[:2])
     lowest = random.integers(-1, 4, places)
-    highest = lowest + random.integers(-1, 5, places)  # an empty range at times
+    highest = lowest + random.integers(-1, 5, places)  # the range is sometimes empty
     pick_ok = random.random(cell.num_picks) < 0.7
     picks = (random.choice(values, cell.num_picks, p=[0.7, 0.3]) for values in ((0, 2), (4, 1)))
-    tables = (pick_ok, lowest, highest, *picks)[: random.choice([3, 5])]  # heights of picks may not matter
+    tables = (pick_ok, lowest, highest, *picks)[: random.choice([3, 5])]  # with or without heights of picks
     return Limits(*map(torch.from_numpy, tables))
 
 
 def random_effector(random: Random, size: tuple[int, int], kind: str | None = None) -> dict:
-    """Return a body, of a kind or of any, a cup in it and a least share, at random."""
+    """Return a random body, of the given kind if there is one, a random cup in it, and a random least share."""
 
     def mask(share, within):
         return [[int(within[x][y] and random.random() < share) for y in range(size[1])] for x in range(size[0])]
@@ -106,7 +106,7 @@ def random_effector(random: Random, size: tuple[int, int], kind: str | None = No
     inside = [[int((x, y) in held) for y in range(size[1])] for x in range(size[0])]
     if body == "mask":
         inside = mask(random.choice((0.4, 0.8)), everything)
-        for x, y in ((0, -1), (-1, 0)) if random.random() < 0.5 else ((0, 0), (-1, -1)):  # on every edge there is one
+        for x, y in ((0, -1), (-1, 0)) if random.random() < 0.5 else ((0, 0), (-1, -1)):  # each edge needs a 1
             inside[x][y] = 1
         body = inside
     if cup == "mask":
@@ -125,7 +125,7 @@ def random_effector(random: Random, size: tuple[int, int], kind: str | None = No
 
 @st.composite
 def problems(draw, effector_sides=SIDES, rotations=(1, 2, 3, 4), limited=NEVER, count=1, shaped=NEVER):
-    """Return a cell and ``count`` cases in it; ``shaped`` says whether body and cup are other than rectangles."""
+    """Return a cell and ``count`` cases in it; ``shaped`` decides whether body and cup may differ from rectangles."""
     effector = draw(effector_sides), draw(effector_sides)
     bin_w, bin_d, tote_w, tote_d = (draw(st.integers(least, most)) for least, most in ((2, 5), (2, 4), (3, 5), (2, 4)))
     shape = random_effector(Random(draw(st.integers(0, 99_999))), effector) if draw(shaped) else {}
@@ -186,8 +186,8 @@ def late_state(steps=8, **settings):
 
 
 def results_by_hand(env, observation, row: int) -> dict[int, tuple[int, int, int, int, int, int]]:
-    """Return every feasible flat action of a problem, in plain Python: ``{action: (top, y, x, w, d, number)}``, of
-    where the item comes to lie, and its number in the bin."""
+    """Return the result of each feasible flat action of a problem, in plain Python: ``{action: (top, y, x, w, d,
+    number)}``, where the item lies then, and its number in the bin."""
     first, *others = [tuple(item) for item in env.state.items.cuboids[row].tolist() if item[4]]
     heights, bearing = env.state.heights[row].numpy(), env.state.bearing[row].int().numpy()
     case = Case(int(env.tote_height[row]), heights, bearing, first, tuple(others))
@@ -204,7 +204,7 @@ def results_by_hand(env, observation, row: int) -> dict[int, tuple[int, int, int
 
 
 def tie_by_hand(found) -> tuple:
-    """Return what decides between equal costs of an entry of :func:`results_by_hand`: item, narrower side, x, y."""
+    """Return the order of an entry of :func:`results_by_hand` among equal costs: item, narrower side, x, y."""
     _, y, x, w, d, number = found
     return number, w > d, x, y
 
@@ -214,7 +214,7 @@ def occupancies(planner, env: PickPlaceEnv) -> torch.Tensor:
     """Return the occupancy that a planner reaches in one episode of each slot, float64 ``[N]``."""
     observation, reached = env.reset(), torch.zeros(env.num_envs, dtype=torch.float64)
     running = torch.arange(env.num_envs)
-    while len(running):  # what has ended plays on, uncounted
+    while len(running):  # ended episodes go on, but do not count
         action = torch.zeros(env.num_envs, dtype=torch.int64)
         action[running] = planner.decide(observation[running])
         after = env.step(observation.set("action", action))["next"]

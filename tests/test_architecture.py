@@ -1,4 +1,4 @@
-"""The walls of the house: who imports whom, and how long a module may be."""
+"""The dependencies between the packages of pickplace, and the greatest length of a module."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -9,7 +9,7 @@ import pytest
 import pickplace
 
 ROOT = Path(pickplace.__file__).parent
-#: A room may import itself and the rooms that follow it.
+#: A package may import itself and the packages that follow it.
 ROOMS = (
     "cli", "serve", "training", "algorithms", "evaluation", "robot", "physics", "views", "planners", "policies", "envs",
     "runs", "config", "items", "rules", "common",
@@ -22,7 +22,7 @@ MODULES = {
 
 
 def imports(own: str) -> set[str]:
-    """Return the other modules of pickplace that a module imports, at the top or in a function."""
+    """Return the other modules of pickplace that a module imports, at its top or in a function."""
     found, path = set(), MODULES[own]
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -51,7 +51,7 @@ def test_no_module_imports_itself_in_a_circle():
 
 
 def test_the_rules_need_torch_alone():
-    """What ``task/`` imports beside the standard library."""
+    """``rules/`` imports no other library for numbers, training or configs."""
     for module, path in MODULES.items():
         if module.startswith("pickplace.rules."):
             nodes = list(ast.walk(ast.parse(path.read_text())))

@@ -1,4 +1,4 @@
-"""Files, folders and streams that are damaged, endless, taken or full: one sentence, and nothing is lost."""
+"""Damaged, endless, occupied or full files, folders and streams: the error is one sentence, and nothing is lost."""
 
 import copy
 import csv
@@ -53,7 +53,7 @@ FULL = OSError(28, "No space left on device")
 
 @pytest.fixture
 def told(capsys):
-    """Call a function, which must fail; return what a command prints then."""
+    """Call a function that must fail; return the text that a command prints then."""
 
     def call(function, *arguments):
         with pytest.raises(SystemExit) as end, one_sentence():
@@ -65,7 +65,7 @@ def told(capsys):
 
 
 def make(kind: str, path: Path) -> Path:
-    """Make something that is no file to read, and return its path."""
+    """Make an entry that is no readable file, and return its path."""
     if kind.startswith("/"):
         return Path(kind)
     if kind == "pipe":
@@ -117,7 +117,7 @@ def test_a_note_of_hydra_is_never_resolved(tmp_path, note):
     changed = {word.partition("=")[0] for word in changed_values(tmp_path, cfg)}
     assert note != "interpolation" or "seed" not in changed
     OmegaConf.save(cfg, tmp_path / ".hydra" / "config.yaml")
-    cfg.algo.epochs, cfg.model.critic.tote_clip = 3, 4  # the latter over a reference
+    cfg.algo.epochs, cfg.model.critic.tote_clip = 3, 4  # the second one replaces a reference
     assert changed_values(tmp_path, cfg) == ["model.critic.tote_clip=4", "algo.epochs=3"]
 
 
@@ -155,8 +155,8 @@ def test_a_comparison_is_checked(told, tmp_path, change, words):
     path.write_text(json.dumps(content))
     read_comparison(path, ours)
     path.write_text(json.dumps({**content, "env": {k: v for k, v in ours["env"].items() if k != "height_unit"}}))
-    read_comparison(path, ours)  # a default is a default
-    if isinstance(change.get("env"), dict) and change["env"]:  # a key that an older file lacks
+    read_comparison(path, ours)  # a missing key stands for its default
+    if isinstance(change.get("env"), dict) and change["env"]:  # as in an older file without the key
         change = {"env": {key: value for key, value in ours["env"].items() if key not in change["env"]}}
     path.write_text(json.dumps({**content, **change}))
     err = told(read_comparison, path, ours)
@@ -259,7 +259,7 @@ def test_no_command_runs_in_a_part_of_a_run(run, noted_run):
 
 
 def test_a_run_whose_checkpoints_were_deleted_is_not_overwritten(noted_run):
-    """Such as to save space."""
+    """A user may delete them to save space."""
     shutil.rmtree(noted_run / "checkpoints")
     before = files(noted_run)
     with pytest.raises(OccupiedError, match=f"^{noted_run}: there is a report of a training already"):
@@ -298,7 +298,7 @@ LINKS = {  # makers, and the words for each kind
 
 @pytest.fixture
 def prepared(tmp_path):
-    """A folder prepared by others for a run, which is reached by a link of the user's, and a file of the user's."""
+    """A run folder prepared by a stranger, which the user reaches by a link, and a file of the user."""
     (tmp_path / "disk" / "one" / ".hydra").mkdir(parents=True)
     (tmp_path / "runs").symlink_to("disk")
     (tmp_path / "mine.txt").write_text("mine")
@@ -308,7 +308,7 @@ def prepared(tmp_path):
 @pytest.mark.parametrize("kind", LINKS)
 @pytest.mark.parametrize("name", ["train.log", "evaluate.log", ".hydra/config.yaml", ".lock"])
 def test_a_new_run_is_refused_where_a_link_is(prepared, kind, name):
-    """By itself, as a job of a sweep, and before the sweep begins."""
+    """Test a single run, a job of a sweep, and a sweep before it begins."""
     folder, other = prepared
     (make_link, words), notes = LINKS[kind], [".hydra", "train.log"]
     ways = [
@@ -345,7 +345,7 @@ def test_a_new_run_writes_through_no_link(run, tmp_path, prepared, command, flag
 
 
 def test_a_job_writes_through_no_link(run, tmp_path):
-    """Also below a folder of the sweep, where it is seen when the job begins."""
+    """Also test a link below the sweep's folder, which is found when the job begins."""
     other, folder = tmp_path / "mine.txt", tmp_path / "runs" / "a" / "b"
     other.write_text("mine")
     folder.mkdir(parents=True)
@@ -447,7 +447,7 @@ def test_an_impossible_environment_is_not_resumed(smoke_run, tmp_path):
 
 
 class Noise(ToteDepth):
-    """A term that draws."""
+    """A term that draws random numbers."""
 
     def value(self, cell, state):
         return torch.rand_like(super().value(cell, state))
@@ -470,7 +470,7 @@ def test_negative_moments_are_refused(key, value):
 
 @pytest.mark.parametrize("kind", [torch.optim.SGD, torch.optim.AdamW, torch.optim.RMSprop])
 def test_any_optimizer_with_several_groups_is_restored(kind):
-    """But for its settings, which are the config's."""
+    """Its settings are not restored: the config has them."""
 
     def make(**settings):
         torch.manual_seed(0)
@@ -536,7 +536,7 @@ def test_maps_are_named_by_their_files(plan, tmp_path):
 
 def test_an_endless_line_is_answered_and_skipped():
     class Endless:
-        """A stream whose first line has 100 bytes; no more than a few may be asked for at a time."""
+        """A stream whose first line has 100 bytes; a reader may ask for at most 9 at a time."""
 
         content = b"x" * 100 + b"\n{}\n" + b" " * 8 + b"\n" + b"y" * 9
 

@@ -1,4 +1,4 @@
-"""Bad values of every setting: each is legal and works, or is refused in one short sentence that names its key."""
+"""Bad values of every setting: each value works, or is refused in one short sentence that names its key."""
 
 import copy
 import functools
@@ -36,10 +36,10 @@ from pickplace.training.trainer import Trainer
 
 VALUES = [None, True, "x", -1, 0, 1.5, math.inf, math.nan, 10**20, [], {}, [1, 2], "y" * 100_000]
 
-#: Large groups. Their form in a checkpoint is not checked here, but with the smaller groups, which have the same.
+#: Large groups. Their form in a checkpoint is not checked: the smaller groups have the same form.
 LARGE_GROUPS = ("algo", "env", "items", "model")
 
-#: Trainings that between them have most leaves of ``conf/``, by the groups that each is asked about.
+#: Trainings that together have most leaves of ``conf/``; the keys name the groups that each one tests.
 TRAININGS = {
     "env": [],
     "algo": [],
@@ -89,7 +89,7 @@ def changed(cfg, path, value):
 
 
 def share_parts(monkeypatch, tested):
-    """Let trainers share what no setting of the tested groups changes, and make no collector, which takes long."""
+    """Let trainers share the parts that the tested groups do not change, and make no collector, which is slow."""
     envs, networks, restored = {}, {}, Trainer._restored
 
     def build_once(place, node, **given):
@@ -178,7 +178,7 @@ def test_every_argument_of_the_environment(key, value):
 
 LARGE_FCN4D = "model=fcn4d model.mask_infeasible=false env.bin_size=[30,30,1] env.tote_size=[30,30,2]"
 
-#: Settings each of which is possible, but not together, or that would fill the memory; and words of the refusal.
+#: Settings that are valid one by one but not together, or that would fill the memory; and words of the refusal.
 LARGE = [
     ("env.bin_size=[3000,3000,1]", "bin_size=.*<= 2,000"),
     ("env.bin_size=[1999,1999,1]", "the bin has 3,996,001 cells"),
@@ -262,7 +262,7 @@ HANDED_OVER = [
 
 @pytest.mark.parametrize(("place", "key", "value"), HANDED_OVER)
 def test_what_pickplace_hands_over_cannot_be_set(place, key, value, tmp_path):
-    """Neither on the command line nor in a checkpoint: both are built from a config."""
+    """Test the command line and a checkpoint: both are built from a config."""
     cfg = composed("experiment=smoke", "warm_start=imitate", "warm_start.frames=128", "threads=1")
     OmegaConf.set_struct(cfg, False)
     OmegaConf.select(cfg, place)[key] = value
@@ -334,7 +334,7 @@ def test_a_large_config_is_refused_before_it_is_made(key, value, message):
     "part", [{"_target_": "theirs.Thing"}, {"x": "${oc.env:HOME}"}, nested(900), {str(n): n for n in range(10**5)}, 5]
 )
 def test_what_a_policy_is_not_restored_from_is_not_looked_at(group, part):
-    """No trust, no memory, no resolver."""
+    """They cost no trust and no memory, and are not resolved."""
     cfg = trusted_config(content(**{group: part}))
     assert group not in cfg and cfg.model.actor.filters == 96
     with pytest.raises(ValueError) if part != 5 else pytest.raises(AssertionError):

@@ -74,7 +74,7 @@ def test_python_blocks_run(page, monkeypatch, tmp_path):
 
 @pytest.fixture
 def reference(monkeypatch):
-    """Makes the page of all settings."""
+    """Make the page of all settings."""
     monkeypatch.syspath_prepend(str(ROOT / ".ci"))
     return importlib.import_module("reference")
 
@@ -102,7 +102,7 @@ def check_command(command, search, words, is_new):
 
 
 def run_of_sweep(word, number):
-    """Return an override as one run of a sweep has it."""
+    """Return an override of one run of a sweep."""
     override = OverridesParser.create().parse_override(word)
     if not override.is_sweep_override():
         return word
@@ -147,7 +147,7 @@ def test_the_page_of_the_python_interface_has_every_public_name():
 
 
 def test_the_site_builds(tmp_path):
-    """Strictly, where its tools are installed: a broken link fails, and so does anything fetched from elsewhere."""
+    """Build the site strictly, if its tools are installed: a broken link or content from elsewhere is an error."""
     pytest.importorskip("mkdocs")
     pytest.importorskip("mkdocstrings_handlers.python")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--config-file", ".ci/mkdocs.yml"]

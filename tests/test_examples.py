@@ -62,7 +62,7 @@ def example(run, no_report, monkeypatch, tmp_path):
 
 
 def trained(name, folder, *words):
-    """Train with an example's folder, which costs half of the command; return the run folder."""
+    """Train with an example's folder, in half of the command's time; return the run folder."""
     folder.mkdir()
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(EXAMPLES / name))
@@ -100,7 +100,7 @@ def test_own_planner_draws_by_its_seed(monkeypatch):
 
 
 def test_own_planner_teaches(example, tmp_path):
-    """A training that was resumed while it imitates draws what an undisturbed one draws."""
+    """A training that is resumed while it imitates draws the same numbers as an uninterrupted one."""
     imitate = ["warm_start=imitate", "planner@warm_start.teacher=soft_dbl", "warm_start.teacher.temperature=1"]
     imitate += ["warm_start.frames=128", "warm_start.critic_frames=64", "curriculum=none", "algo.lr_decay_start=null"]
     imitate += ["model.actor.filters=8"]
@@ -176,7 +176,7 @@ def test_own_support(example, tmp_path):
     planner = Planner.load(folder, trust=["own_support"])
     assert type(planner.cell.support).__name__ == "CornersOrHull"
     tote = np.full((5, 5), 0.2)
-    tote[:2] = 0.15  # something lies there
+    tote[:2] = 0.15  # there are items
     plan = planner.plan(Scene([Box(0.1, 0.1, 0.09, 0.09, 0.05)], tote, cell_size=0.05))
     assert plan.status == "ok"
 
@@ -191,7 +191,7 @@ def test_own_gripper(example, tmp_path):
     assert ours["env"]["gripper"]["_target_"] == "own_gripper.TwoCells" and ours["env"]["gripper"]["cells"] == 1
     planner = Planner.load(folder, trust=["own_gripper"])
     assert type(planner.cell.gripper).__name__ == "TwoCells"
-    wide = Box(0.12, 0.12, 0.14, 0.14, 0.05)  # of three cells along each side one is covered for sure
+    wide = Box(0.12, 0.12, 0.14, 0.14, 0.05)  # along each side, one of three cells is surely covered
     plan = planner.plan(Scene([wide], np.full((6, 6), 0.25), cell_size=0.05))
     assert plan.status == "ok"
 
@@ -206,7 +206,7 @@ SMALL += ["evaluation_interval=128", "evaluation.episodes=2", "threads=1", "seed
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_own_algorithm(name, example, tmp_path):
-    """Trained, stopped and resumed exactly, and evaluated; the evaluation asks for no trust in it."""
+    """Trained, stopped and resumed exactly, and evaluated; the evaluation needs no trust in the algorithm."""
     words = [*ALGORITHMS[name], *SMALL]
     whole, folder = trained(name, tmp_path / "whole", *words), tmp_path / "part"
     with after_batch(3, lambda _: signal.raise_signal(signal.SIGTERM)), pytest.raises(KeyboardInterrupt):
@@ -316,7 +316,7 @@ def test_own_curriculum(name, levels):
 
 
 def test_own_advance(example, tmp_path):
-    """It draws the levels, and a resumed training equals one that was never stopped."""
+    """The rule draws the levels; a resumed training equals an uninterrupted one."""
     words = ["curriculum/advance=worst_first", "curriculum.advance.keep=0.5", "algo.lr_decay_start=null", *TRAINING]
     words += ["model.actor.filters=8", "logger=csv"]
     whole = trained("own_advance", tmp_path / "whole", *words, "total_frames=256")
@@ -339,7 +339,7 @@ def test_torchrl_ppo(monkeypatch, total_frames, gain):
 
 
 class FakeStudy:
-    """Stands in for Optuna's study: proposes these learning rates, and keeps what it is told."""
+    """A substitute for Optuna's study, which proposes these learning rates and stores the results."""
 
     def __init__(self, *rates):
         self.rates, self.told = rates, []
@@ -357,7 +357,7 @@ class FakeStudy:
 
 
 def test_a_search_with_optuna_leaves_the_tables_of_a_sweep(monkeypatch, tmp_path, no_report):
-    """With a stand-in for Optuna; the next test has Optuna itself."""
+    """Uses a substitute for Optuna; the next test uses Optuna itself."""
     monkeypatch.syspath_prepend(str(EXAMPLES))
     search, study = importlib.import_module("optuna_search").search, FakeStudy(1e-3, -1.0)
     search(study, tmp_path, 2, [*TRAINING, "curriculum=none", "model.actor.filters=8"])
@@ -380,7 +380,7 @@ NOTEBOOK = EXAMPLES / "quickstart.ipynb"
 
 
 def assert_shown(notebook):
-    """Check that a notebook shows a curve, a replay, and what was learnt."""
+    """Check that a notebook shows a curve, a replay, and the result of the training."""
     shown = [output["data"] for cell in notebook.cells for output in cell.get("outputs", [])]
     assert [kind for data in shown for kind in data if "image" in kind] == ["image/png", "image/gif"]
     means = ast.literal_eval(shown[1]["text/plain"])

@@ -33,7 +33,7 @@ def test_a_mean_over_seeds_covers_their_intervals():
 
 
 def test_an_evaluation_becomes_a_row(tmp_path, monkeypatch):
-    """And a newer one of the same name replaces it."""
+    """A newer evaluation of the same name replaces the row."""
     table, run = tmp_path / "paper.csv", tmp_path / "run"
     table.write_text(results.TABLE.read_text().splitlines()[0] + "\nevaluation,other\n")
     monkeypatch.setattr(results, "TABLE", table)

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
-    # Built from a copy, so that the checkout stays as it is.
+    # Built from a copy, so that the checkout is not changed.
     for name in ("pickplace", "conf"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
@@ -36,7 +36,7 @@ def test_wheel_holds_every_file(wheel):
 
 
 def test_commands_of_the_wheel_from_another_directory(wheel, tmp_path):
-    """The commands import neither torch nor matplotlib before they need it, and play shipped weights."""
+    """The commands import torch and matplotlib only when they need them, and play shipped weights."""
     site = tmp_path / "site"
     zipfile.ZipFile(wheel).extractall(site)
     (listed,) = site.glob("*.dist-info/entry_points.txt")

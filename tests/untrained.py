@@ -1,4 +1,4 @@
-"""Untrained policies, which prefer some actions clearly, and checkpoints of them."""
+"""Untrained policies that clearly prefer some actions, and checkpoints of them."""
 
 import pytest
 import torch
@@ -36,7 +36,7 @@ every_policy = pytest.mark.parametrize("kind", POLICIES)
 
 
 def small(kind, cell, **settings):
-    """Return a small policy with random weights, of which the distribution is far from even."""
+    """Return a small policy with random weights, whose distribution is far from uniform."""
     torch.manual_seed(0)
     return kind(cell, **POLICIES[kind], **settings)
 

@@ -1,1 +1,1 @@
-"""Plans carried out in MuJoCo, which knows none of our rules."""
+"""Carry out plans in MuJoCo, which does not use our rules."""

@@ -11,7 +11,7 @@ def main() -> None:
     """Entry point of ``pickplace-physics``."""
     with one_sentence():
         arguments = parser().parse_intermixed_args()
-        from omegaconf import OmegaConf  # not before help is answered
+        from omegaconf import OmegaConf  # here, so that --help does not wait for it
         from yaml import YAMLError
 
         from pickplace.physics.engine import build_engine

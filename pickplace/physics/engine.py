@@ -13,22 +13,22 @@ from pickplace.views.motion import Outcome
 
 @runtime_checkable
 class Engine(Protocol):
-    """Carries out the plans of episodes. The arguments of its class are the keys of its config.
+    """Engine that carries out the plans of episodes. The arguments of its class are the keys of its config.
 
     Attributes:
         name: its name in tables and in ``evaluation.json``.
-        grips: optional; whether it carries items from the bin with a gripper.
+        grips: whether it carries items from the bin with a gripper; optional.
     """
 
     name: str
 
     def carry_out(self, plans: Iterable[EpisodePlan], record: Collection[int] = ()) -> Iterator[Outcome]:
-        """Yield the outcome of each plan, in their order; with the motion, for the episodes in ``record``."""
+        """Yield the outcome of each plan, in order; it includes the motion for the episodes in ``record``."""
         ...
 
 
 def build_engine(node: DictConfig) -> Engine:
-    """Return the engine that a config of the group ``physics`` names.
+    """Build the engine of a config of the group ``physics``.
 
     Raises:
         ValueError: for settings that make no sense, or a class that is no engine.

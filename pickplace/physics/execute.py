@@ -12,13 +12,13 @@ from pickplace.physics.plans import TOLERANCE, EpisodePlan, Placement, Point
 from pickplace.physics.scene import STIFF, TIMESTEP, WALL, Scene, mujoco
 from pickplace.physics.simulation import Loss, Simulation, wait
 
-HEADROOM = 0.02  # distance between what is carried and the rims, m
+HEADROOM = 0.02  # distance between the carried item and the rims, m
 TURNING_SPEED = 4.0  # greatest speed of the hinge, rad/s
 STIFFNESS = 2e5, 2e3  # stiffness of the drives of the slides, N/m, and of the hinge, N m/rad
-SLOW_WAY = 0.03  # length of the slow part of a way down, its last, and of a way up, its first; m
+SLOW_WAY = 0.03  # length of the slow part, the last one of a way down and the first one of a way up; m
 SETTLING_TIME = 0.05  # time for the plate to come to rest, s
 WAKING_FORCE = 1e-6  # force that wakes a body, N
-REACH = 0.0005  # distance by which a lip can be drawn out, m
+REACH = 0.0005  # distance by which suction can stretch a lip, m
 STEPS_PER_LOOK = 2  # steps of the simulation between two looks at contacts and forces
 
 
@@ -28,22 +28,21 @@ class Execute(Simulation):
     turns, down, release, up. An item that lies in the bin beside others stays there until it is taken.
 
     Losses besides ``collapsed``: ``dropped``, the plate reached no item or lost it; ``effector_contact``, the plate
-    touched a wall or another item, or its lip reached an item in the bin that it shall not take; ``disturbed``, an item
-    that waits in the bin moved, by whatever pushed it; ``wedged``, the item is not where it was planned to be at its
-    release.
+    touched a wall or another item, or its lip reached another item in the bin; ``disturbed``, an item that waits in the
+    bin moved, for any reason; ``wedged``, the item is not at its planned place when it is released.
 
     Args:
         plate_thickness: thickness of the end effector; m.
-        plate_diameter: of a round end effector in the middle of its cells, which it may cover in part; m. None: it
-            covers the cells of its body.
+        plate_diameter: diameter of a round end effector, which lies in the middle of its cells and may cover them in
+            part; m. None: it covers the cells of its body.
         plate_mass: mass of the end effector; kg.
         lip: length of the suction cup's lip, between plate and item; m.
-        release_height: of an item above its planned pose when it is released; m.
-        suction: force along any direction that the suction bears; N.
-        contact_force: force on the plate from which on a contact counts; N.
+        release_height: height of an item above its planned pose when it is released; m.
+        suction: greatest force, in any direction, that the suction bears; N.
+        contact_force: force on the plate above which a contact is a loss; N.
         tolerance: greatest error of an item's position at release, and in the bin while it waits; m.
         speed: greatest speed of the plate; m/s.
-        slow_speed: the same on its last centimetres down and its first ones up; m/s.
+        slow_speed: greatest speed on the last centimetres down and the first centimetres up; m/s.
     """
 
     plate_thickness: float = 0.01
@@ -117,16 +116,16 @@ class Gantry(Scene):
         plan: has the sizes.
 
     Attributes:
-        rim: height of the highest of tote, bin and what waits in it.
+        rim: greatest height of the tote, the bin and the items that wait in it.
         goal: commanded centre of the plate's lower face and its turn, m and rad, ``[4]``.
-        holding: whether the plate holds the last one of :attr:`boxes`.
+        holding: whether the plate holds the last item of :attr:`boxes`.
     """
 
     def __init__(self, options: Execute, plan: EpisodePlan):
         super().__init__(options.friction, options.density, options.gap, options.sleep, options.contact_damping)
         self.options, self.holding = options, False
         self.weld: Any = None  # MuJoCo's, between the plate and the last one of the boxes
-        # So far apart that an end effector that hangs over a wall of one hits no wall of the other.
+        # An end effector that hangs over a wall of one container must not hit a wall of the other.
         distance = 2 * WALL + 2 * max(plan.effector) + 0.1
         self.bin = np.array((-plan.bin[0] - distance, (plan.tote[1] - plan.bin[1]) / 2))
         self.rim = max(
@@ -169,7 +168,7 @@ class Gantry(Scene):
         self.data.ctrl[:] = self.goal
 
     def fill(self, boxes: Iterable[Point]) -> None:
-        """Put items into the bin, but those that wait there already.
+        """Put items into the bin, except for those that wait there already.
 
         Args:
             boxes: near corner in the bin and sides, x, y, w, d, h.
@@ -180,9 +179,9 @@ class Gantry(Scene):
             self.record()
 
     def take(self, box: Point, planned: Point, mass: float) -> None:
-        """Choose the item that is carried next, ``box`` as of :meth:`fill`; ``planned`` is its centre in the tote.
+        """Choose the item to carry next, ``box`` as in :meth:`fill`; ``planned`` is its centre in the tote.
 
-        It has its ``mass`` from now on; until then it waited with that of the density.
+        It has its ``mass`` from now on; while it waited, the density gave its mass.
         """
         if (known := self._find(box)) is None:
             self.add((*(self.bin + box[:2]), 0.0), box[2:], planned, mass=mass)
@@ -193,16 +192,16 @@ class Gantry(Scene):
             self.compile()
 
     def _find(self, box: Point) -> Point | None:
-        """Return the waiting item that lies where ``box`` does and has its size, as it is named in :attr:`waiting`."""
+        """Return the key in :attr:`waiting` of the item with the place and the size of ``box``; None without one."""
         return next((one for one in self.waiting if np.abs(np.subtract(one, box)).max() <= TOLERANCE), None)
 
     @property
     def centre(self) -> np.ndarray:
-        """The centre of the item that is carried, the last one of :attr:`boxes`, m, ``[3]``."""
+        """The centre of the carried item, the last one of :attr:`boxes`, m, ``[3]``."""
         return self.data.xpos[self.boxes[-1].id]
 
     def loss(self, reason: str) -> Loss:
-        """Return the loss of that item."""
+        """Return the loss of the carried item."""
         return Loss(reason, len(self.boxes) - 1)
 
     def travel(self, goal, speed: float | None = None) -> Loss | None:
@@ -223,10 +222,10 @@ class Gantry(Scene):
         return None
 
     def bring(self, pick, place, height: float) -> Loss | None:
-        """Carry the last one of :attr:`boxes` from one place to another one, where it is held; return the first loss.
+        """Carry the last item of :attr:`boxes` to its place, and hold it there; return the first loss.
 
         Args:
-            pick, place: goals of the plate, where it sucks and where it shall let go.
+            pick, place: goals of the plate at the pick and before the release.
             height: of the item, m.
         """
         (*over_pick, _, start), (*over_place, _, turn), high = pick, place, self.rim + height + HEADROOM
@@ -242,12 +241,12 @@ class Gantry(Scene):
     def release(self) -> None:
         """Let go of the item."""
         self.data.eq_active[self.weld.id] = self.holding = False
-        self.data.xfrc_applied[self.boxes[-1].id, 2] = -WAKING_FORCE  # else it could sleep on in the air
+        self.data.xfrc_applied[self.boxes[-1].id, 2] = -WAKING_FORCE  # else it could stay asleep in the air
         self.step(1)
         self.data.xfrc_applied[self.boxes[-1].id, 2] = 0.0
 
     def leave(self, height: float) -> Loss | None:
-        """Let go of an item of a height, move up, and wait until all items are at rest."""
+        """Let go of an item, move up, and wait until all items are at rest; ``height`` is the item's, m."""
         self.release()
         loss = self.lift(self.rim + height + HEADROOM)
         wait(self)
@@ -267,7 +266,7 @@ class Gantry(Scene):
         return self.travel((x, y, low + SLOW_WAY, turn), self.options.slow_speed) or self.travel((x, y, z, turn))
 
     def grip(self) -> Loss | None:
-        """Suck the item in the bin; return the loss if the lip does not reach it, or another one as well."""
+        """Grip the item in the bin; return a loss if the lip does not reach it, or also reaches another item."""
         plate, item = self.plate.id, self.boxes[-1].id
         if not self._is_reached(self.boxes[-1]):
             return self.loss("dropped")
@@ -282,16 +281,16 @@ class Gantry(Scene):
         return None
 
     def _is_reached(self, body, below: bool = False) -> bool:
-        """Return whether the lip reaches an item; with ``below`` only one below the plate, not beside it."""
+        """Return whether the lip reaches an item; with ``below``, an item beside the plate does not count."""
         for geom in self.plate.geoms:
-            ends = np.zeros(6)  # of the shortest line between the two
+            ends = np.zeros(6)  # ends of the shortest line between the two
             distance = mujoco.mj_geomDistance(self.model, self.data, geom.id, body.geoms[0].id, 0.1, ends)
             if distance <= self.options.lip + REACH and not (below and np.hypot(*(ends[3:5] - ends[:2])) > TOLERANCE):
                 return True
         return False
 
     def _step(self) -> Loss | None:
-        """Let a little time pass; return what was lost in it."""
+        """Simulate :data:`STEPS_PER_LOOK` steps; return the loss during them."""
         item = self.boxes[-1]
         velocity = self.data.qvel[self.model.body_dofadr[item.id] :][:3]
         before = velocity.copy()
@@ -306,7 +305,7 @@ class Gantry(Scene):
         if total > self.options.contact_force:
             return self.loss("effector_contact")
         if self.holding:
-            # From the motion: with drives that are integrated implicitly, the weld's force is not what it transmits.
+            # From the motion: as the drives are integrated implicitly, the weld does not report the force it transmits.
             acceleration = (velocity - before) / (STEPS_PER_LOOK * TIMESTEP) - self.model.opt.gravity
             if self.model.body_mass[item.id] * np.linalg.norm(acceleration) > self.options.suction:
                 return self.loss("dropped")

@@ -1,4 +1,4 @@
-"""Boxes by their place: which of many may touch a new one, without looking at all of them."""
+"""Index of boxes by their place, to find those that may touch a new box without checking all."""
 
 import math
 from collections import defaultdict
@@ -11,8 +11,8 @@ Key = tuple[int, ...]
 class BoxIndex:
     """Boxes in three dimensions, numbered in the order in which they were added.
 
-    Boxes of like sides share a grid, whose cells are as long along each axis as the next power of two above the side,
-    so that a box lies in at most eight cells, and few boxes that do not overlap lie in one.
+    Boxes of similar sides share a grid. Along each axis, a cell is as long as the next power of two above the side. So
+    a box lies in at most eight cells, and a cell holds few boxes that do not overlap.
     """
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class BoxIndex:
         self._count += 1
 
     def near(self, corner: Sequence[float], size: Sequence[float], margin: float) -> list[int]:
-        """Return the numbers of all boxes that may be within a margin of a box, ascending; some may be further off."""
+        """Return the numbers of all boxes within a margin of a box, ascending; some further ones may be included."""
         found: set[int] = set()
         for exponents, grid in self._grids.items():
             ranges = _cells(exponents, corner, size, margin)

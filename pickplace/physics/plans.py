@@ -1,4 +1,4 @@
-"""Plans as files: one placement a line, as JSON, in metres (``plans.jsonl``).
+"""Files of plans, ``plans.jsonl``: one placement a line, as JSON, in metres.
 
 A line has the keys
 
@@ -7,15 +7,15 @@ A line has the keys
 * ``corner``: near corner of the item at rest in the tote, ``[x, y, z]``, from the tote's near corner on its floor.
 * ``size``: sides of the item as it lies in the tote, ``[w, d, h]``.
 
-and, if the item's mass is known, ``mass``, kg. That is all that ``settle`` needs. For a robot there are also (of these
-only their types are checked, and that nothing overlaps in the bin)
+and, if the item's mass is known, ``mass``, kg. ``settle`` needs no more. Lines for a robot have further keys. Only
+their types are checked, that body and neighbours lie in effector and bin, and that nothing overlaps in the bin:
 
 * ``bin``: inner sides of the bin, ``[w, d, h]``; ``item``: near corner of the item in the bin, ``[x, y]``.
 * ``effector``: sides of the end effector as it hangs over the bin, ``[w, d]``; ``body``, if it is not a rectangle:
   rectangles that make it up, ``[[x, y, w, d], ...]``, from its near corner.
 * ``pick`` and ``place``: its centre when it sucks and when it releases, ``[x, y]``, in the frames of bin and tote.
 * ``rotation``: turn between the two, counter-clockwise seen from above; 0, 90, 180 or 270 degrees.
-* ``neighbours``, if the item does not lie alone: what else lies in the bin, ``[[x, y, w, d, h], ...]``, near corners
+* ``neighbours``, if the item does not lie alone: the other items in the bin, ``[[x, y, w, d, h], ...]``, near corners
   and sides. An item lies there from the first line that names it until it is taken.
 """
 
@@ -39,24 +39,24 @@ MAX_LENGTH = 100.0  # greatest length or coordinate, m
 MAX_MASS = 1e5  # greatest mass of an item, kg
 MAX_FILE = 2**28  # greatest size of a file, bytes
 
-MAX_BODY = 2_048  # rectangles of a body
+MAX_BODY = 2_048  # greatest number of rectangles of a body
 
 
 def _are_numbers(value, count: int, sides: int = 0) -> bool:
-    """Return whether a value is a list of lengths and coordinates, the last ones of them ``sides`` above 0."""
+    """Return whether a value is a list of ``count`` lengths and coordinates, the last ``sides`` of them above 0."""
     is_list = isinstance(value, list) and len(value) == count and all(map(is_number, value))
     return is_list and max(map(abs, value)) <= MAX_LENGTH and all(side >= 1e-6 for side in value[count - sides :])
 
 
 def _are_boxes(value, count: int, sides: int, most: int) -> bool:
-    """Return whether a value is a list of at most so many lists, see :func:`_are_numbers`."""
+    """Return whether a value is a list of at most ``most`` boxes; see :func:`_are_numbers`."""
     return isinstance(value, list) and len(value) <= most and all(_are_numbers(box, count, sides) for box in value)
 
 
 SIDES = "3 lengths above 0, in metres", partial(_are_numbers, count=3, sides=3)
 POINT = "2 coordinates, in metres", partial(_are_numbers, count=2)
-#: What a key holds, and a function that tells whether a value is that: of every line, of one for a robot, and of what a
-#: robot may do without.
+#: Expected content of each key, and a function that checks a value: keys of every line, of lines for a robot, and
+#: optional ones.
 KEYS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "episode": ("a whole number >= 0", lambda value: is_whole(value) and value >= 0),
     "tote": SIDES,
@@ -91,7 +91,7 @@ Point = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Placement:
-    """One item: where it comes to rest, and how a robot brings it there, if that is planned; in metres and degrees."""
+    """The place where an item comes to rest and, if planned, the motion of the robot; in metres and degrees."""
 
     corner: Point
     size: Point
@@ -99,8 +99,8 @@ class Placement:
     pick: Point = ()
     place: Point = ()
     rotation: int = 0
-    neighbours: tuple[Point, ...] = ()  # what else lies in the bin, x, y, w, d, h
-    mass: float = 0.0  # kg; 0: not known, it follows from the density of the simulation
+    neighbours: tuple[Point, ...] = ()  # the other items in the bin, x, y, w, d, h
+    mass: float = 0.0  # kg; 0: not known, so the density of the simulation gives it
 
     @property
     def centre(self) -> Point:
@@ -122,7 +122,7 @@ class EpisodePlan:
     bin: Point = ()
     effector: Point = ()
     placements: list[Placement] = field(default_factory=list)
-    body: tuple[Point, ...] = ()  # rectangles of the end effector, x, y, w, d; none: it is one
+    body: tuple[Point, ...] = ()  # rectangles of the end effector, x, y, w, d; empty: it is a single one
 
 
 def to_lines(plans: Iterable[EpisodePlan]) -> str:
@@ -200,12 +200,12 @@ def _read_line(line: str) -> dict:
 
 
 def _frozen(value: list) -> tuple:
-    """Return a list, or a list of lists, as tuples of floats."""
+    """Convert a list, or a list of lists, to tuples of floats."""
     return tuple(_frozen(part) if isinstance(part, list) else float(part) for part in value)
 
 
 def _shared(corner: Point, size: Point, other: Point, other_size: Point) -> list[float]:
-    """Return the length that two boxes share along each axis; below 0: the distance between them."""
+    """Return the length that two boxes share along each axis; a negative value is the distance between them."""
     return [
         min(a + length, b + other_length) - max(a, b)
         for a, length, b, other_length in zip(corner, size, other, other_size, strict=True)
@@ -213,7 +213,7 @@ def _shared(corner: Point, size: Point, other: Point, other_size: Point) -> list
 
 
 def _check_place(placement: Placement, plan: EpisodePlan, placed: BoxIndex) -> None:
-    """Refuse an item that cannot lie where it is planned; ``placed`` are the placements of the plan so far."""
+    """Refuse an item that cannot lie at its planned place; ``placed`` holds the placements of the plan so far."""
     size, corner = placement.size, placement.corner
     for name, low, side, most in zip("xyz", corner, size, plan.tote, strict=True):
         refuse_if(
@@ -231,7 +231,7 @@ def _check_place(placement: Placement, plan: EpisodePlan, placed: BoxIndex) -> N
 
 
 def _gap(placement: Placement, others: Iterable[Placement]) -> float:
-    """Return the distance from an item down to the highest of some others below it, or to the floor; m."""
+    """Return the distance from an item down to the highest other one below it, or to the floor; m."""
     size, corner, below = placement.size, placement.corner, 0.0
     for other in others:
         top = other.corner[2] + other.size[2]

@@ -1,4 +1,4 @@
-"""Plans of recorded episodes."""
+"""Make plans of recorded episodes."""
 
 from pickplace.physics.plans import EpisodePlan, Placement, Point
 from pickplace.rules.cell import CellSpec
@@ -9,14 +9,14 @@ def plan_of(recording: Recording, cell: CellSpec) -> EpisodePlan:
     """Return the plan of a recorded episode."""
 
     def metres(*values: float) -> Point:
-        # Of lengths in cells a third one is a height. Nanometres: 0.15000000000000002 would only be harder to read.
+        # The third length, if there is one, is a height. Rounded, as 0.15000000000000002 is harder to read.
         scales = (cell.cell_size, cell.cell_size, cell.cell_size * cell.height_unit)
         return tuple(round(value * scale, 9) for value, scale in zip(values, scales, strict=False))
 
     def middle(corner, sides) -> Point:
         return metres(*(at + side / 2 for at, side in zip(corner, sides, strict=True)))
 
-    gripped = not cell.tipping  # no gripper tips an item: then only places are planned
+    gripped = not cell.tipping  # no gripper tips an item, so with tipping only places are planned
     placements = [
         Placement(
             metres(*move.footprint[:2], move.z), metres(*move.footprint[2:], move.item[4]), metres(*move.item[:2]),
@@ -34,6 +34,6 @@ def plan_of(recording: Recording, cell: CellSpec) -> EpisodePlan:
 
 
 def body_of(cell: CellSpec) -> tuple[Point, ...]:
-    """Return the rectangles of the end effector's body in metres; none if it is one rectangle."""
+    """Return the rectangles of the end effector's body in metres; empty if the body is a single rectangle."""
     boxes = cell.effector(0).body
     return tuple(tuple(round(part * cell.cell_size, 9) for part in box) for box in boxes) if len(boxes) > 1 else ()

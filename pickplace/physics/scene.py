@@ -1,4 +1,4 @@
-"""Containers and boxes as a MuJoCo model; in metres, kilograms and seconds.
+"""A MuJoCo model of containers and boxes; in metres, kilograms and seconds.
 
 The frame's origin is the tote's near corner on its floor; z points up.
 """
@@ -13,8 +13,8 @@ from pickplace.views.motion import INTERVAL, Motion
 try:
     import mujoco
 
-    mujoco.set_mju_user_warning(lambda *_: None)  # else it writes MUJOCO_LOG.TXT; `diverged` tells what matters
-except ImportError:  # an extra; Simulation says so
+    mujoco.set_mju_user_warning(lambda *_: None)  # else it writes MUJOCO_LOG.TXT; `diverged` reports what matters
+except ImportError:  # MuJoCo is an extra; Simulation reports that it is missing
     mujoco = None
 
 #: Contacts and welds are stiff: a tower of six boxes sinks by 0.02 mm.
@@ -30,20 +30,20 @@ class Scene:
 
     Args:
         friction: sliding friction between all surfaces.
-        density: of the boxes whose mass is not known.
+        density: of boxes of unknown mass.
         gap: total narrowing of a box along x and along y.
         sleep: let bodies that do not move sleep.
         contact_damping: damping ratio of contacts.
 
     Attributes:
-        spec, model, data: MuJoCo's; the latter two are new ones after each :meth:`add`.
+        spec, model, data: MuJoCo's; each :meth:`add` replaces the last two.
         bodies: MuJoCo's body of each box, in the order in which they were added.
-        boxes: those of them that are in the tote or on the way to it, in the order of the placements.
-        waiting: the other ones, by near corner in the bin and sides where they shall lie, x, y, w, d, h.
+        boxes: the bodies in the tote or on the way to it, in the order of the placements.
+        waiting: the bodies in the bin, by near corner and sides at their planned places there, x, y, w, d, h.
         plate: MuJoCo's body of the end effector, if there is one.
         bin: near corner of the bin, if there is one.
-        planned: centre of each box where it is planned to rest, ``[n, 3]``.
-        motion: records the poses, if there is one.
+        planned: planned centre at rest of each of :attr:`boxes`, ``[n, 3]``.
+        motion: recorder of the poses, if there is one.
     """
 
     plate: Any = None
@@ -63,7 +63,7 @@ class Scene:
         option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         if sleep:
             option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
-            # In m/s. With MuJoCo's own, 1e-3, items fall asleep while they begin to tilt; with 2e-4 `execute` is slow.
+            # In m/s. At MuJoCo's default, 1e-3, items fall asleep while they begin to tilt; at 2e-4 `execute` is slow.
             option.sleep_tolerance = 5e-4
         self.bodies: list = []
         self.boxes: list = []
@@ -75,7 +75,7 @@ class Scene:
         self.data = mujoco.MjData(self.model)
 
     def compile(self) -> None:
-        """Make the model anew, in the state in which it is."""
+        """Compile the model again, and keep its state."""
         self.model, self.data = self.spec.recompile(self.model, self.data)
 
     def add_container(self, size: Vector, origin: Vector = (0.0, 0.0)) -> None:
@@ -94,9 +94,9 @@ class Scene:
         Args:
             corner: its near corner now, before it is turned about its centre.
             size: its planned sides.
-            planned: centre of the box where it is planned to rest.
+            planned: planned centre of the box at rest.
             yaw: its turn, rad.
-            mass: of the box; 0: by the density.
+            mass: of the box; 0: the density gives it.
         """
         self.planned = np.vstack([self.planned, planned])
         self.boxes.append(self._add_body(corner, size, yaw))
@@ -105,7 +105,7 @@ class Scene:
         self.record()
 
     def weigh(self, mass: float) -> None:
-        """Give the last one of :attr:`boxes` a mass; 0: by the density."""
+        """Set the mass of the last one of :attr:`boxes`; 0: the density gives it."""
         if mass:
             self.boxes[-1].geoms[0].mass = mass
 
@@ -125,11 +125,11 @@ class Scene:
         return body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=np.divide(size, 2), pos=centre, **self._surface)
 
     def run(self, seconds: float) -> None:
-        """Let time pass."""
+        """Simulate a time in seconds."""
         self.step(round(seconds / TIMESTEP))
 
     def step(self, count: int) -> None:
-        """Let time steps pass."""
+        """Simulate ``count`` time steps."""
         if self.motion is None:
             mujoco.mj_step(self.model, self.data, nstep=count)
             return
@@ -142,14 +142,14 @@ class Scene:
         """Add a picture to the motion, if there is one."""
         if self.motion is None:
             return
-        mujoco.mj_kinematics(self.model, self.data)  # of what was added since the last step, too
+        mujoco.mj_kinematics(self.model, self.data)  # includes boxes that were added since the last step
         poses = np.hstack([self.data.xpos, self.data.xquat])
         plate = None if self.plate is None else poses[self.plate.id]
         self.motion.add(poses[[body.id for body in self.bodies]], plate)
         self._next_picture = self.data.time + INTERVAL
 
     def finish_motion(self) -> None:
-        """Add the last picture to the motion, and sort its boxes: first those of the placements."""
+        """Add the last picture to the motion, and sort its boxes: the placed ones first."""
         assert self.motion is not None
         self.record()
         poses = {body.name: poses for body, poses in zip(self.bodies, self.motion.boxes, strict=True)}
@@ -158,12 +158,12 @@ class Scene:
 
     @property
     def diverged(self) -> bool:
-        """Whether the simulation has become impossible: forces or speeds without bounds, or too many contacts."""
+        """Whether the simulation has failed: unbounded forces or speeds, or too many contacts."""
         return bool(self.data.warning.number[: mujoco.mjtWarning.mjWARN_BADCTRL].any())
 
     @property
     def shifts(self) -> np.ndarray:
-        """The distance of each box's centre from where it is planned to rest, ``[n]``."""
+        """The distance of each box's centre from its planned place, ``[n]``."""
         return np.linalg.norm(self.data.xpos[[body.id for body in self.boxes]] - self.planned, axis=1)
 
     @property

@@ -1,4 +1,4 @@
-"""``settle``: items appear a little above their planned poses, one after the other, and come to rest."""
+"""``settle``: items appear slightly above their planned poses, one after the other, and come to rest."""
 
 from dataclasses import dataclass
 from typing import ClassVar

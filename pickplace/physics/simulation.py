@@ -21,7 +21,7 @@ from pickplace.views.motion import Motion, Outcome
 REST_SPEEDS = np.repeat((0.002, 0.02), 3)
 #: Time for items to come to rest after a placement, at least and at most, and at the end of an episode; s.
 MIN_WAIT, MAX_WAIT, FINAL_WAIT = 0.06, 1.0, 1.0
-AFTERMATH = 1.0  # time that a recorded motion goes on after a collapse, s
+AFTERMATH = 1.0  # time for which a recorded motion goes on after a collapse, s
 LOOK = 0.02  # time between two looks at the speeds, s
 
 
@@ -34,24 +34,24 @@ class Loss(NamedTuple):
 
 @dataclass(frozen=True)
 class Simulation(ABC):
-    """A physics engine (:class:`~pickplace.physics.engine.Engine`) with MuJoCo, and the options of every such one.
+    """Base class of physics engines with MuJoCo (see :class:`~pickplace.physics.engine.Engine`), and their options.
 
     An episode ends at the first loss. ``collapsed``: an item has moved or tilted too far from its planned pose.
-    ``diverged``: the simulation has become impossible.
+    ``diverged``: the simulation has failed.
 
     Args:
         friction: sliding friction between all surfaces.
-        density: of the items whose mass the plan does not tell; kg/m^3.
+        density: of the items of unknown mass; kg/m^3.
         gap: total narrowing of an item along x and along y; m.
-        noise: standard deviation of the error of a placement along x and along y; m. With ``settle`` an error of
-            more than half the gap may put an item into its neighbour.
+        noise: standard deviation of the error of a placement along x and along y; m. With ``settle``, an error of
+            more than half the gap may make an item overlap its neighbour.
         max_shift: distance beyond which an item is lost, m.
         max_tilt: angle beyond which an item is lost; degrees.
-        contact_damping: damping ratio of contacts. With 1 a light item on another one may tremble and creep, by up to
+        contact_damping: damping ratio of contacts. With 1, a light item on another one may tremble and creep by up to
             some millimetres in an episode; with 2 it does not.
         sleep: let bodies that hardly move sleep, which is faster.
         seed: of the errors of placement.
-        workers: processes, each with an episode of its own.
+        workers: number of processes; each simulates one episode at a time.
     """
 
     friction: float = 0.6
@@ -66,7 +66,7 @@ class Simulation(ABC):
     workers: int = 1
 
     name: ClassVar[str]
-    #: What the reader of a replay is told of each ending: a sentence about the lost item, and a word or two.
+    #: Texts of a replay for each ending: a sentence about the lost item, and a label of a few words.
     endings: ClassVar[dict[str, tuple[str, str]]] = {
         "done": ("Carried out: every item stayed in its place.", "carried out"),
         "collapsed": ("Item {} left its place.", "item {} left its place"),
@@ -95,23 +95,23 @@ class Simulation(ABC):
         """Place the next item, with an error along x and y, m, ``[2]``; return the loss if there is one."""
 
     def carry_out(self, plans: Iterable[EpisodePlan], record: Collection[int] = ()) -> Iterator[Outcome]:
-        """Yield the outcome of each plan; with the motion, for the episodes in ``record``."""
+        """Yield the outcome of each plan; it includes the motion for the episodes in ``record``."""
         plans = list(plans)
         recorded = [plan.episode in record for plan in plans]
         if self.workers == 1:
             yield from map(self.carry_out_one, plans, recorded)
         else:
-            # Ctrl-C reaches all processes; this one ends the others, which ignore it.
+            # Ctrl-C reaches all processes. The workers ignore it, and this process ends them.
             with ProcessPoolExecutor(
                 self.workers, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
             ) as pool:
                 yield from pool.map(self.carry_out_one, plans, recorded)
 
     def carry_out_one(self, plan: EpisodePlan, record: bool = False) -> Outcome:
-        """Return the outcome of a plan; with the motion, if ``record``.
+        """Return the outcome of a plan; it includes the motion if ``record``.
 
         Raises:
-            ValueError: for an item or an end effector that is hardly wider than the gap.
+            ValueError: for an item or an end effector that is less than twice as wide as the gap.
         """
         for index, placement in enumerate(plan.placements, 1):
             self.check_width(f"episode {plan.episode}, item {index}", placement.size)
@@ -154,14 +154,14 @@ class Simulation(ABC):
         return outcome
 
     def check_width(self, name: str, size: Sequence[float]) -> None:
-        """Refuse what is hardly wider than the gap, with a ``ValueError`` that names it."""
+        """Refuse a body less than twice as wide as the gap, with a ``ValueError`` that names it."""
         refuse_if(
             min(size[:2]) < 2 * self.gap,
             f"{name}: {min(size[:2]):g} m wide; expected sides of at least twice physics.gap, {2 * self.gap:g} m.",
         )
 
     def find_loss(self, scene: Scene) -> Loss | None:
-        """Return the item that has moved furthest of those that have moved or tilted too far, if any has."""
+        """Return the loss of the item that moved furthest, among those that moved or tilted too far; else None."""
         if scene.diverged:
             return Loss("diverged", len(scene.boxes) - 1)
         shifts, tilts = scene.shifts, scene.tilts
@@ -170,9 +170,9 @@ class Simulation(ABC):
 
 
 def wait(scene: Scene) -> None:
-    """Let time pass until all items are at rest, or :data:`MAX_WAIT`."""
+    """Simulate until all items are at rest, for at most :data:`MAX_WAIT`."""
     scene.run(MIN_WAIT)
     for _ in range(round((MAX_WAIT - MIN_WAIT) / LOOK)):
-        if (np.abs(scene.data.qvel[-6 * len(scene.bodies) :].reshape(-1, 6)) < REST_SPEEDS).all():  # of each body
+        if (np.abs(scene.data.qvel[-6 * len(scene.bodies) :].reshape(-1, 6)) < REST_SPEEDS).all():  # six speeds a body
             return
         scene.run(LOOK)

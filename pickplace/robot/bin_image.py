@@ -1,4 +1,4 @@
-"""Items in a bin, read from a depth image: boxes that can be picked, and what is only in the way."""
+"""Read the items in a bin from a depth image: boxes that can be picked, and obstacles."""
 
 import math
 from collections.abc import Sequence
@@ -13,25 +13,25 @@ from pickplace.robot.depth_image import AROUND, Heights, Room, distance_outside,
 from pickplace.robot.measure import SNAPPED, is_inside, smallest_rectangle, turned_axes
 from pickplace.robot.room_check import fit_plane
 
-MOST_MISSING = 0.01  # greatest share of the inside of its rectangle that an item's top leaves free
-BORDER = 2.5  # width of the part of the rectangle that is not its inside, pixels
-LONGEST_GAP = 3.5  # beyond the seen edge of an item, pixels; behind a longer one it may go on unseen
+MOST_MISSING = 0.01  # greatest share of the inside of its rectangle that an item's top may leave free
+BORDER = 2.5  # width of the rectangle's border, pixels; the rest is its inside
+LONGEST_GAP = 3.5  # longest gap beyond the seen edge of an item, pixels; behind a longer one it may go on unseen
 HIDDEN_PIXELS = 1.5  # distance from a box at which its edge should be seen, pixels
-EDGE_POINTS = 32  # along each side of a box, and along each ray
-MIN_ITEM_PIXELS = 9  # pixels of the smallest thing in a bin that counts
+EDGE_POINTS = 32  # number of points along each side of a box, and along each ray
+MIN_ITEM_PIXELS = 9  # fewest pixels of a thing in a bin; smaller ones are ignored
 MOST_HIDDEN = 0.25  # greatest share of the bin's floor that holes may hide
 
 
 def find_boxes(
     seen: Heights, room: Room, margin: float, accuracy: float, greatest: float, labels: np.ndarray | None, sizes
 ) -> list[Box]:
-    """Return the items in a bin, and as :class:`UnknownBox` what may be one; see :meth:`Camera.items`.
+    """Return the items in a bin, and an :class:`UnknownBox` for each place that may hold one; see :meth:`Camera.items`.
 
     Args:
-        seen: of an image that was checked.
-        margin: width of the border along the walls in which a point may be one of the wall, m.
+        seen: the heights of an image that was checked.
+        margin: width of the border along the walls, m; a point in it may belong to a wall.
         greatest: height of the highest item that may lie there, m.
-        labels: in the shape of ``seen``; None: items are told apart by steps.
+        labels: the item of each pixel, in the shape of ``seen``; None: steps of the height tell items apart.
     """
     within, band = seen.is_within(room, margin), level_range(accuracy)
     above = within & (seen.height > band)
@@ -91,13 +91,13 @@ def _read_box(
     seen: Heights, room: Room, surface: np.ndarray, segments: np.ndarray, number: int, above: np.ndarray,
     accuracy: float, narrowed: bool,
 ) -> tuple[Box, tuple]:  # fmt: skip
-    """Return the cuboid whose top fills a segment, and the centre, the sides and the yaw of what is seen of its top.
+    """Return the cuboid whose top fills a segment, and the seen part of its top: centre, sides and yaw.
 
-    It is an :class:`UnknownBox` if it may go on where nothing is seen.
+    The cuboid is an :class:`UnknownBox` if it may go on where nothing is seen.
 
     Args:
         surface: see :meth:`Heights.surface`.
-        narrowed: whether the filter of steps took the outermost pixels off the segment; else labels made it.
+        narrowed: whether the filter of steps removed the outermost pixels of the segment; False if labels made it.
     """
     top, band = segments == number, level_range(accuracy)
     height = float(np.quantile(seen.height[top], 0.95))
@@ -110,9 +110,9 @@ def _read_box(
     # Each side may be as far out as the first ray in front of it that passes the height of the top.
     known = ~np.isnan(seen.height)
     passed = known & ~top & (np.abs(seen.height - height) > band)
-    if not narrowed:  # labels tell it from others that are as high
+    if not narrowed:  # labels separate it from others of the same height
         passed |= (segments > 0) & ~top
-    # It cannot stand on a place that is seen either.
+    # Nor can the box stand on a place that is seen.
     axes = turned_axes(math.radians(yaw))
     free = np.concatenate([points[passed], seen.points[passed & (seen.height < height)]]) - (x, y)
     beyond, corners = ([each @ axis for axis in axes] for each in (free, room.corners - (x, y)))
@@ -141,11 +141,11 @@ def _read_box(
 def _least_beyond(
     points: Sequence[np.ndarray], sides: Sequence[float], axis: int, sign: int, pixel: float
 ) -> float:  # fmt: skip
-    """Return the least distance in front of a side of a rectangle at which one of the points lies, m; else inf.
+    """Return the distance from a side of a rectangle to the nearest point in front of it, m; inf if there is none.
 
     Args:
         points: x and y of each point in the frame of the rectangle.
-        axis, sign: tell which of its four sides.
+        axis, sign: select one of its four sides.
     """
     other = sides[1 - axis] / 2
     beyond = sign * points[axis] - sides[axis] / 2
@@ -192,7 +192,7 @@ def _check_top(
 
 
 def _rest(seen: Heights, above: np.ndarray, boxes: Sequence[Box]) -> list[Box]:
-    """Return what lies in the bin beside its boxes as boxes that are in the way."""
+    """Return an :class:`UnknownBox` around each thing in the bin that lies outside the boxes."""
     left, points = above.copy(), seen.points
     for box in boxes:
         left &= ~is_inside(points, (box.x, box.y), (box.w + 5 * seen.pixel, box.d + 5 * seen.pixel), box.yaw)
@@ -208,10 +208,10 @@ def _rest(seen: Heights, above: np.ndarray, boxes: Sequence[Box]) -> list[Box]:
 def _behind_holes(
     seen: Heights, room: Room, surface: np.ndarray, accuracy: float, free: np.ndarray, greatest: float
 ) -> list[Box]:  # fmt: skip
-    """Return what the holes of the image may hide on the floor, as high as an item may be.
+    """Return an :class:`UnknownBox`, as high as an item may be, for each place on the floor that a hole may hide.
 
     Args:
-        free: where no item stands: a hole beyond shows its side, bool.
+        free: bool, False where an item stands: a hole there shows the item's side.
     """
     floor = seen.at(0.0)
     holes = seen.holes_above(0.0, surface, room, accuracy, free)
@@ -233,13 +233,13 @@ def _behind_holes(
 
 
 def _around(points: np.ndarray, pixel: float, height: float) -> Box:
-    """Return the box around points ``[M, 2]``, a pixel away from them, that is in the way."""
+    """Return an :class:`UnknownBox` around points ``[M, 2]``, wider than they are by a pixel on each side."""
     x, y, w, d, yaw = smallest_rectangle(points)
     return UnknownBox(x, y, float(w + 2 * pixel), float(d + 2 * pixel), height, yaw).upright()
 
 
 def _hidden_length(seen: Heights, box: Box, boxes: Sequence[Box]) -> float:
-    """Return how far a box may go on where higher ones hide what is beside it, m; 0 if its whole edge is seen."""
+    """Return the length by which a box may go on behind higher ones, m; 0 if its whole edge is seen."""
     camera = seen.origin
     pixel = seen.pixel * (camera[2] - box.h) / camera[2]
     side, grown = np.linspace(-1, 1, EDGE_POINTS), HIDDEN_PIXELS * pixel
@@ -251,13 +251,13 @@ def _hidden_length(seen: Heights, box: Box, boxes: Sequence[Box]) -> float:
         share = (other.h - box.h) / (camera[2] - box.h)  # of the ray that runs below the other's top
         ray = edge + np.linspace(0, share, EDGE_POINTS)[:, None, None] * to_camera
         inside = is_inside(ray, (other.x, other.y), (other.w, other.d), other.yaw)
-        hidden = to_camera[inside.any(0) & ~inside[0]]  # what lies in the other is no part of the box
+        hidden = to_camera[inside.any(0) & ~inside[0]]  # a point in the other box is not in this one
         longest = max(longest, float((share * np.linalg.norm(hidden, axis=1)).max(initial=0.0)))
     return longest if longest > pixel / 2 else 0.0
 
 
 def _check_reading(box: Box, sizes, tolerance: float) -> None:
-    """Refuse a box that could be two items of known sizes, or is none; both readings are named."""
+    """Refuse a box that could be two items of known sizes, or has no known size; the message names both readings."""
     tall = [(w, d) for a, b, h in sizes for w, d in {(a, b), (b, a)} if abs(box.h - h) <= tolerance]
 
     def is_like(w: float, d: float) -> bool:

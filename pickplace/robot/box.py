@@ -1,15 +1,15 @@
-"""Measured boxes, and the defaults of a measurement. Needs no torch: ``--help`` is answered without it."""
+"""Measured boxes, and the defaults of a measurement. Imports no torch, so that ``--help`` does not wait for it."""
 
 import math
 from dataclasses import dataclass, replace
 
 MILLIMETRE = 1e-3  # height unit of measured maps, m
-ACCURACY = 0.003  # greatest error of a measured height unless a scene says otherwise, m
-CLEARANCE = 0.005  # least distance of an item from what stands beside it unless a scene says otherwise, m
+ACCURACY = 0.003  # default of the greatest error of a measured height, m
+CLEARANCE = 0.005  # default of the least distance between an item and its neighbours, m
 
 
 class DepthMapError(ValueError):
-    """A depth map, or an argument beside it, that cannot be planned with; the message is one sentence."""
+    """Error of a depth map, or of an argument beside it, that allows no plan; the message is one sentence."""
 
 
 class EmptyBinError(DepthMapError):
@@ -26,8 +26,8 @@ class Box:
     d: float  #: side along y
     h: float  #: height of its top above the bin's floor
     yaw: float = 0.0  #: turn about the vertical axis, counter-clockwise seen from above
-    edge_error: float = 0.0  #: greatest distance by which a side may end inside ``w`` or ``d``
-    mass: float = 0.0  #: kg; 0: not known, so that it may lie only on what bears any load
+    edge_error: float = 0.0  #: greatest distance by which a side may lie inside the measured ``w`` or ``d``
+    mass: float = 0.0  #: kg; 0: not known: the box may lie only on items that bear any load
     max_load: float | None = None  #: greatest mass on top of it, kg; 0: nothing may lie on it; None: any
 
     def upright(self) -> "Box":
@@ -39,7 +39,7 @@ class Box:
 
 @dataclass(frozen=True)
 class HiddenBox(Box):
-    """A box behind a higher one, of which a camera may not see all: it is in the way, and is not picked."""
+    """A box that a higher one may hide in part: an obstacle, which is not picked."""
 
 
 @dataclass(frozen=True)

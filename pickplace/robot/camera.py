@@ -1,9 +1,9 @@
-"""From depth images to what the planner takes: the heights in a tote, and the items in a bin.
+"""Turn depth images into the inputs of the planner: the heights in a tote, and the items in a bin.
 
 A depth image ``[rows, columns]`` holds distances along the optical axis, in metres; 0 or NaN where nothing is known. In
 the camera's frame x points to the right of the image, y down and z forward. Single wrong values are removed by a
-median of 3x3 pixels. What must not be hit is widened by a pixel, what may support an item is narrowed by one. Unknown
-space is occupied: what no pixel shows counts as the worst that may be there.
+median of 3x3 pixels. Obstacles are widened by a pixel; surfaces that may support an item are narrowed by one. Unknown
+space counts as occupied, by the worst that may be there.
 """
 
 import math
@@ -30,9 +30,9 @@ class Camera:
 
     Args:
         fx, fy: focal lengths; pixels.
-        cx, cy: where the optical axis meets the image; pixels, from the centre of the first one.
-        pose: ``[4, 4]``, from the camera's frame to that of the bin or the tote: its last column is the camera's
-            position, in metres.
+        cx, cy: point where the optical axis meets the image; pixels, from the centre of the first pixel.
+        pose: transform ``[4, 4]`` from the camera's frame to the frame of the bin or the tote. Its last column is the
+            camera's position, in metres.
         shape: of its images, ``(rows, columns)``.
 
     Raises:
@@ -91,12 +91,12 @@ class Camera:
         """Return the position of every pixel in the frame of the bin or tote, ``[rows, columns, 3]``; NaN if unknown.
 
         Raises:
-            DepthMapError: for an image that is none, of another shape than :attr:`shape`, or not in metres.
+            DepthMapError: if ``depth`` is no image, has another shape than :attr:`shape`, or is not in metres.
         """
         return self.rays() * self._distances(depth)[..., None] + self.pose[:3, 3]
 
     def rays(self) -> np.ndarray:
-        """Return the way along every pixel's ray that goes one metre along the optical axis, ``[rows, columns, 3]``."""
+        """Return the ray of every pixel, one metre long along the optical axis, ``[rows, columns, 3]``."""
         row, column = np.indices(self.shape)
         return (
             np.stack([(column - self.cx) / self.fx, (row - self.cy) / self.fy, np.ones(self.shape)], -1)
@@ -113,21 +113,21 @@ class Camera:
     ) -> ToteMap:  # fmt: skip
         """Return the heights in the tote, for a :class:`~pickplace.robot.scene.Scene`.
 
-        A place that a higher one hides may be as high as that. One that pixels without depth may show counts up to the
-        rim, unless an item that was placed before explains them. Both support nothing.
+        A place hidden by a higher one counts as equally high. A place that pixels without depth may show counts up to
+        the rim, unless an item placed before explains these pixels. Both support nothing.
 
         Args:
             depth: an image.
             cell: the sizes.
             cell_size: side of a cell, m.
-            tote_height: of the rim, m; None: that of ``cell.tote_size``.
+            tote_height: of the rim, m; None: from ``cell.tote_size``.
             accuracy: greatest error of a height, m.
-            placed: the items that this planner put into the tote before, :attr:`Plan.placed` of each plan that was
+            placed: the items that this planner put into the tote before: :attr:`Plan.placed` of each plan that was
                 carried out.
 
         Raises:
-            DepthMapError: for an image that does not show the tote, or too little of it, or a floor that is not where
-                the camera's pose says.
+            DepthMapError: for an image that shows too little of the tote, or a floor that is not where the camera's
+                pose says.
         """
         rim = cell.tote_size[2] * cell.height_unit * cell_size if tote_height is None else tote_height
         pixel = self.pixel()
@@ -147,21 +147,21 @@ class Camera:
     ) -> list[Box]:  # fmt: skip
         """Return the items in the bin, for a :class:`~pickplace.robot.scene.Scene`.
 
-        What a higher item hides in part is a :class:`~pickplace.robot.box.HiddenBox`, as large as it may be: the
-        planner takes others first. An item that is wholly hidden is not known of. A place that pixels without depth
-        may show is a :class:`~pickplace.robot.box.UnknownBox`, as large and as high as may be.
+        An item that a higher one hides in part is a :class:`~pickplace.robot.box.HiddenBox` of its greatest possible
+        size; the planner takes others first. A wholly hidden item is not noticed. A place that pixels without depth
+        may show is a :class:`~pickplace.robot.box.UnknownBox` of the greatest possible size and height.
 
         Args:
             depth: an image.
             cell: the sizes.
             cell_size: side of a cell, m.
-            labels: an image of whole numbers, 0 for the background, another one for each item; None: items are told
-                apart by steps of the depth.
+            labels: an image of whole numbers: 0 for the background, another number for each item; None: steps of the
+                depth tell items apart.
             accuracy: greatest error of a height, m.
-            sizes: known sizes of items, ``(w, d, h)`` in metres, if they are known. Two items that touch and are
-                equally high look like one to a depth image; with their sizes this is noticed.
-            greatest_height: of an item, m; None: that of ``cell.tote_size``, as a higher one fits into no tote.
-            bin_height: of the bin's walls, m; None: that of ``cell.bin_size``.
+            sizes: the sizes of the items, ``(w, d, h)`` in metres; None: not known. Two items that touch and are
+                equally high look like one in a depth image; their sizes reveal it.
+            greatest_height: of an item, m; None: from ``cell.tote_size``, as a higher item fits into no tote.
+            bin_height: of the bin's walls, m; None: from ``cell.bin_size``.
 
         Raises:
             DepthMapError: for an image that does not show the bin, a floor that is not where the camera's pose says,
@@ -189,7 +189,7 @@ class Camera:
         return Room(name, (size[0] * cell_size, size[1] * cell_size), rim)
 
     def _look(self, depth, room: Room, accuracy: float, placed: Sequence[Box] = ()) -> Heights:
-        """Return the heights that an image shows in a room, once it was checked that it shows the room."""
+        """Return the heights that an image shows in a room; refuse an image that does not show the room."""
         distances, origin = self._distances(depth), self.pose[:3, 3]
         seen = read_heights(self.rays(), origin, distances, room, self.pixel(), accuracy, placed)
         within = seen.is_within(room, self._wall())
@@ -204,7 +204,7 @@ class Camera:
         return seen
 
     def _distances(self, depth) -> np.ndarray:
-        """Return an image that was checked, float64, NaN where nothing is known."""
+        """Check an image, and return it as float64, NaN where nothing is known."""
         image = np.asarray(depth)
         refuse_if(
             image.ndim != 2 or image.dtype.kind not in "fiu",
@@ -230,5 +230,5 @@ class Camera:
         return image
 
     def _wall(self) -> float:
-        """Return the distance from a wall up to which a point may be one of the wall, not of the contents; m."""
+        """Return the width of the border along the walls, m; a point in it may belong to a wall."""
         return max(2 * self.pixel(), 0.004)

@@ -1,8 +1,8 @@
-"""A depth image as heights above a floor: noise and single gaps are removed, and what stays unknown is told apart.
+"""Convert a depth image to heights above a floor: remove noise, fill single gaps, and mark what stays unknown.
 
-A pixel without depth is *unknown*. Gaps of at most three pixels, such as those at the edges of items, are too narrow to
-hide a thing that counts: they are filled, inside a level top by its height, elsewhere by bounds of it. A wider gap is a
-*hole*, and may hide anything.
+A pixel without depth is *unknown*. A gap of at most three pixels, such as at the edge of an item, is too narrow to hide
+a thing that matters. In a level top it is filled with the top's height; elsewhere it has bounds of the height. A wider
+gap is a *hole*, and may hide anything.
 """
 
 import math
@@ -19,7 +19,7 @@ from pickplace.robot.box import Box, DepthMapError
 
 MOST_MISSING_PIXELS = 0.12  # greatest share of the pixels of level surfaces that may lack a depth
 SEAM = 5  # longest gap in a level top that is filled, pixels; a longer one may part two items
-MARGIN = 24  # pixels around the room that are looked at, too
+MARGIN = 24  # width of the border around the room that is read, too, pixels
 HOLE = np.ones((4, 4), dtype=bool)  # the smallest hole, pixels
 HOLE[::3, ::3] = False
 SQUARE = 1.25  # side of the squares of a seen surface, pixels
@@ -55,7 +55,7 @@ class Heights:
     holes: np.ndarray  # bool: pixels of holes
 
     def at(self, height) -> np.ndarray:
-        """Return where each pixel's ray passes a height, ``[rows, columns, 2]``; of a height or one for each pixel."""
+        """Return the point where each pixel's ray passes a height, one for all or one each, ``[rows, columns, 2]``."""
         way = (height - self.origin[2]) / self.rays[..., 2]
         return np.stack([self.origin[axis] + self.rays[..., axis] * way for axis in (0, 1)], -1)
 
@@ -65,7 +65,7 @@ class Heights:
         return self.at(self.height)
 
     def surface(self, room: Room) -> np.ndarray:
-        """Return the greatest height that is seen in each square of :data:`SQUARE` pixels, -inf where none is."""
+        """Return the greatest height that is seen in each square of :data:`SQUARE` pixels, -inf where none is seen."""
         side = SQUARE * self.pixel
         highest = np.full([math.ceil(length / side) for length in room.sides], -np.inf)
         known = distance_outside(self.points, room) < 0
@@ -75,14 +75,14 @@ class Heights:
     def holes_above(
         self, height: float, surface: np.ndarray, room: Room, accuracy: float, where: np.ndarray | bool = True
     ) -> np.ndarray:
-        """Return the pixels of holes that may show a thing that stands on a surface of a height, bool.
+        """Return a mask of the hole pixels that may show a thing on a surface at the given height, bool.
 
         Such a thing hides the whole surface below it. Pixels are left out if they can show only walls, or the sides of
         boxes whose tops are seen, or a strip that is narrower than a hole.
 
         Args:
             surface: see :meth:`surface`.
-            where: other pixels show no such thing, bool.
+            where: bool: the pixels to consider; the others show no such thing.
         """
         points = self.at(height)
         inside = self.holes & where & (distance_outside(points, room) < 0)
@@ -91,12 +91,12 @@ class Heights:
         return holes_in(inside)
 
     def is_within(self, room: Room, margin: float) -> np.ndarray:
-        """Return which pixels show something inside the room, at least ``margin`` from its walls, bool."""
+        """Return a mask of the pixels that show something inside the room, at least ``margin`` from its walls, bool."""
         return distance_outside(self.points, room) < -margin
 
 
 def holes_in(unknown: np.ndarray) -> np.ndarray:
-    """Return which of the unknown pixels belong to a hole, bool ``[rows, columns]``."""
+    """Return a mask of the unknown pixels that belong to a hole, bool ``[rows, columns]``."""
     holes = np.zeros_like(unknown)
     for part in ndimage.find_objects(unknown.astype(np.uint8)):  # most images have few unknown pixels, or none
         holes[part] = ndimage.binary_opening(unknown[part], HOLE)
@@ -104,7 +104,7 @@ def holes_in(unknown: np.ndarray) -> np.ndarray:
 
 
 def distance_outside(points: np.ndarray, room: Room) -> np.ndarray:
-    """Return how far points ``[..., 2]`` lie beyond the nearest wall, m; below 0 inside."""
+    """Return the distance of points ``[..., 2]`` beyond the nearest wall, m; below 0 inside."""
     x, y = points[..., 0], points[..., 1]
     return np.maximum(np.maximum(-x, x - room.sides[0]), np.maximum(-y, y - room.sides[1]))
 
@@ -122,7 +122,7 @@ def read_heights(
         room: the bin or the tote.
         pixel: side of a pixel's square on the floor, m.
         accuracy: greatest error of a height, m.
-        record: boxes that are known to stand in the room; an unknown pixel shows them, if its ray meets one.
+        record: boxes that are known to stand in the room; they explain the holes whose rays meet one.
 
     Raises:
         DepthMapError: if the image does not show the whole room, or lacks too many pixels.
@@ -131,10 +131,10 @@ def read_heights(
     rays = rays[rows, columns]
     raw = depth[rows, columns] * rays[..., 2] + origin[2]
     known, recorded = ~np.isnan(raw), np.full_like(raw, np.nan)
-    if record and (lost := holes_in(~known)).any():  # the record is for holes, as it may be off its place
+    if record and (lost := holes_in(~known)).any():  # holes only, as an item may be off its recorded place
         recorded[lost] = np.fmax.reduce([_entered(rays[lost], origin, box, accuracy) for box in record])
     is_recorded = ~np.isnan(recorded)
-    # Unknown pixels must not pull the median up or down: in it each has the height of the nearest one.
+    # Unknown pixels must not shift the median: there each has the height of the nearest known one.
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     smooth = median_of_nine(raw[tuple(nearest)])
     height = np.where(is_recorded, recorded, np.where(known, smooth, np.nan))
@@ -170,12 +170,12 @@ def read_heights(
 
 
 def level_range(accuracy: float) -> float:
-    """Return by how much heights of neighbouring pixels on a level top may differ, m."""
+    """Return the greatest difference of heights between neighbouring pixels on a level top, m."""
     return max(3 * accuracy, 0.005)
 
 
 def _window(rays: np.ndarray, origin: np.ndarray, room: Room) -> tuple[slice, slice]:
-    """Return the rows and columns that show a room, and what is beside it."""
+    """Return the rows and columns that show a room and a border around it."""
     shown = np.zeros(rays.shape[:2], dtype=bool)
     for height in (0.0, min(room.rim, 0.9 * origin[2])):
         way = (height - origin[2]) / rays[..., 2]
@@ -196,7 +196,7 @@ def _window(rays: np.ndarray, origin: np.ndarray, room: Room) -> tuple[slice, sl
 
 
 def _entered(rays: np.ndarray, origin: np.ndarray, box: Box, accuracy: float) -> np.ndarray:
-    """Return the height at which each ray enters a box in the tote, wider by what its place may be wrong; else NaN."""
+    """Return the height at which each ray enters a box, widened by the error of its place; NaN if it misses it."""
     angle = math.radians(box.yaw)
     cos, sin = math.cos(angle), math.sin(angle)
     axes = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -209,7 +209,7 @@ def _entered(rays: np.ndarray, origin: np.ndarray, box: Box, accuracy: float) ->
 
 
 def median_of_nine(image: np.ndarray) -> np.ndarray:
-    """Return the median of the 3x3 pixels around each pixel of an image without NaN; SciPy's filter takes longer.
+    """Return the median of the 3x3 pixels around each pixel of an image without NaN, faster than SciPy's filter.
 
     It is the median of three numbers: the greatest of the columns' least values, the median of their medians, and the
     least of their greatest values.
@@ -243,7 +243,7 @@ def _greatest_beside(heights: np.ndarray, gaps: np.ndarray) -> np.ndarray:
 
 
 def _is_short(gaps: np.ndarray) -> np.ndarray:
-    """Return which gaps are single: no longer than a few pixels, and so no line between two items; bool."""
+    """Return a mask of the single gaps: at most :data:`SEAM` pixels long, so they do not part two items; bool."""
     numbers, _ = ndimage.label(gaps, AROUND)
     short = [False, *(max(side.stop - side.start for side in part) <= SEAM for part in ndimage.find_objects(numbers))]
     return np.array(short)[numbers]

@@ -1,4 +1,4 @@
-"""The loads on what lies in a tote, from the record of what was placed there."""
+"""Loads on the items in a tote, from the record of the placed items."""
 
 import math
 from typing import cast
@@ -12,21 +12,20 @@ from pickplace.rules.measured_loads import ANY_LOAD, UNKNOWN_MASS, MeasuredLoads
 
 
 def grams_of(box: Box) -> int:
-    """Return the mass of a box, rounded up; grams. One that is not known is more than any limit."""
+    """Return the mass of a box, rounded up; grams. An unknown mass counts as more than any limit."""
     return math.ceil(1000 * box.mass - 1e-6) if box.mass > 0 else UNKNOWN_MASS
 
 
 def read_loads(scene: Scene, tote: MeasuredTote, per_cell: int) -> MeasuredLoads | None:
-    """Return the loads on what lies in the tote; None if no box says what it weighs or bears,
-    or if there are only masses, and no record.
+    """Return the loads on the items in the tote; None if no box has a ``max_load``, and there is no mass or no record.
 
     Args:
         scene: in metres, with the record of the tote.
-        tote: the same tote as it was measured.
-        per_cell: patches of its map along the side of a cell.
+        tote: the same tote, as measured.
+        per_cell: number of patches of its map along the side of a cell.
 
     Raises:
-        DepthMapError: without that record, if some item bears a limited load only.
+        DepthMapError: if an item has a ``max_load``, and the scene has no record.
     """
     items = () if isinstance(scene.items, BinMap) else scene.items
     placed, side = scene.placed, cast(float, scene.cell_size)

@@ -1,4 +1,4 @@
-"""Measured boxes, depth maps and lengths: checked, and counted in whole height units."""
+"""Check measured boxes, depth maps and lengths, and convert lengths to whole height units."""
 
 import math
 from collections.abc import Sequence
@@ -16,13 +16,13 @@ from pickplace.common.validate import refuse_if
 from pickplace.robot.box import MILLIMETRE, Box, DepthMapError, EmptyBinError, HiddenBox
 from pickplace.rules.cell import MAX_BIN_ITEMS
 
-#: A length is taken for the whole number of units that it is so close to: three cells of 0.05 m are not exactly 0.15 m
-#: in binary fractions.
+#: Greatest difference from a whole number of units at which a length counts as that number. In floating point, three
+#: cells of 0.05 m are not exactly 0.15 m.
 ROUNDING = 1e-6
 MAX_PATCHES = 8  # greatest number of patches along a cell; finer maps are reduced to it
 MAX_LABEL = 2**31 - 1
 LABEL_HINT = "; of several items give bin_labels, too"
-#: Width of the border of an item that is taken to be parallel to the walls, as a share of its side: sine of a degree.
+#: Width of an item's border, as a share of its side, if the item counts as parallel to the walls: sine of a degree.
 SNAPPED = 0.02
 
 
@@ -31,16 +31,16 @@ class ToteMap(NamedTuple):
 
     highest: np.ndarray
     lowest: np.ndarray
-    likely: "ToteMap | None" = None  #: the map if places that pixels without depth show are like those beside them
-    has_holes: bool = False  #: whether places of which nothing is known count up to the rim
+    likely: "ToteMap | None" = None  #: the map if each place without depth is like those beside it
+    has_holes: bool = False  #: whether some places are unknown, and so count up to the rim
 
 
 def refuse(name: str, bad: np.ndarray, values: np.ndarray, unit: str, expected: str) -> None:
-    """Raise a :class:`DepthMapError` that names the first cell of a map that is bad, if one is.
+    """Raise a :class:`DepthMapError` that names the first bad cell of a map, if there is one.
 
     Args:
         bad: bool, in the shape of the map's values.
-        unit: of a value, for the message, with what else is to be said of it.
+        unit: of a value, for the message; may include a remark on it.
         expected: what a good cell has.
     """
     if bad.any():
@@ -49,10 +49,10 @@ def refuse(name: str, bad: np.ndarray, values: np.ndarray, unit: str, expected: 
 
 
 def as_array(name: str, values, grid: Sequence[int], kinds: str = "iuf") -> np.ndarray:
-    """Return a map as a numpy array; ``kinds`` are those of numpy's types.
+    """Return a map as a numpy array; ``kinds`` are the kinds of numpy's types that are accepted.
 
     Args:
-        grid: the shape; or each side a whole multiple of it, the same multiple.
+        grid: the expected shape; the map may be finer by a whole factor, the same along both sides.
     """
     try:
         if isinstance(values, Tensor):
@@ -84,7 +84,7 @@ def whole_map(name: str, values, grid: Sequence[int], most: int, unit: str = "",
         values: numpy, torch or lists.
         grid: the expected shape.
         unit: of the numbers, for messages.
-        kinds: as of :func:`as_array`.
+        kinds: see :func:`as_array`.
 
     Raises:
         DepthMapError: naming the first cell that is out of range, or no whole number.
@@ -116,27 +116,27 @@ def metric_map(name: str, values, grid: Sequence[int], least: float, most: float
         DepthMapError: naming the first value that is out of range.
     """
     array = as_array(name, values, grid).astype(np.float64)
-    # Not the opposite comparisons: all are False for NaN.
+    # Negated, so that NaN is refused, too: each comparison with it is False.
     refuse(name, ~((array >= least - ROUNDING) & (array <= most + ROUNDING)), array, " m", f"{least:g} to {most:g} m")
     return array
 
 
 def bounds_of_points(array: np.ndarray, grid: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the greatest and the least value of each patch, as :func:`patches`, of a map that was taken at points.
+    """Return the greatest and the least value of each patch of a map that was measured at points; see :func:`patches`.
 
-    Each value is that of the middle of its square. An edge may pass between there and a neighbour's middle, so a square
-    has any value that it or one of its eight neighbours has. What is narrower than two squares may be missed.
+    Each value was measured in the middle of its square. An edge may pass between two middles, so a square may have its
+    own value or the value of any of its eight neighbours. A thing narrower than two squares may be missed.
     """
     near = sliding_window_view(np.pad(array, 1, mode="edge"), (3, 3))
     return patches(near.max((2, 3)), grid)[0], patches(near.min((2, 3)), grid)[1]
 
 
 def patches(array: np.ndarray, grid: Sequence[int], most: int = MAX_PATCHES) -> tuple[np.ndarray, np.ndarray]:
-    """Return the greatest and the least value of each patch of a map, with at most so many patches along a cell."""
+    """Return the greatest and the least value of each patch of a map, with at most ``most`` patches along a cell."""
     along, highest, lowest = array.shape[0] // grid[0], array, array
     count = min(along, most)
     for axis, cells in enumerate(grid):
-        edges = np.arange(cells * count) * along  # over `count`: where a patch begins, in values
+        edges = np.arange(cells * count) * along  # divided by `count`: where a patch begins, in values
         # A value that lies in two patches belongs to both.
         parts = [range(*part) for part in zip(edges // count, -(-(edges + along) // count), strict=True)]
         highest = np.stack([highest.take(part, axis).max(axis) for part in parts], axis)
@@ -151,14 +151,14 @@ def whole_units(lengths, unit: float, up: bool) -> Tensor:
 
 
 def segments_of_map(labels, heights: np.ndarray, least: float) -> dict[str, np.ndarray]:
-    """Return where each item of a bin lies, bool in the shape of ``heights``; by ascending labels.
+    """Return a mask of each item in a bin, bool in the shape of ``heights``; by ascending labels.
 
-    The keys tell items apart in messages: ``" with label 3"``; empty if there are no labels, and one item lies there.
+    The keys name the items in messages, such as ``" with label 3"``. Without labels there is one item, its key is "".
 
     Args:
         labels: ``bin_labels``: whole numbers, 0 where the bin is empty; or None.
         heights: ``bin_depth``.
-        least: a height above it is an item's, so it must have a label, and each label must have one.
+        least: a cell above this height belongs to an item and needs a label; each label needs such a cell.
 
     Raises:
         EmptyBinError: for an empty bin.
@@ -186,7 +186,7 @@ def turned_axes(angle: float) -> np.ndarray:
 
 
 def is_inside(points: np.ndarray, centre: Sequence[float], sides: Sequence[float], yaw: float) -> np.ndarray:
-    """Return which of the points ``[..., 2]`` lie in a rectangle with a yaw in degrees, bool ``[...]``."""
+    """Return a mask of the points ``[..., 2]`` that lie in a rectangle with a yaw in degrees, bool ``[...]``."""
     axes, away = turned_axes(math.radians(yaw)), points - centre
     return (np.abs(away @ axes[0]) < sides[0] / 2) & (np.abs(away @ axes[1]) < sides[1] / 2)
 
@@ -197,9 +197,9 @@ def rectangle(w: float, d: float, yaw: float) -> np.ndarray:
 
 
 def touches(centres: np.ndarray, corners: np.ndarray, box: Box) -> np.ndarray:
-    """Return at which centres ``[P, 2]`` a convex polygon overlaps a box in plan view, bool ``[P]``; an edge does not.
+    """Return a mask of the centres ``[P, 2]`` at which a convex polygon overlaps a box in plan view, bool ``[P]``.
 
-    Two convex polygons are apart if they are along the normal of one of their sides.
+    Two that only touch do not overlap. Convex polygons are apart if they are apart along the normal of one side.
 
     Args:
         corners: of the polygon from its centre, counter-clockwise, ``[n, 2]``; m.
@@ -214,13 +214,13 @@ def touches(centres: np.ndarray, corners: np.ndarray, box: Box) -> np.ndarray:
 
 
 def refuse_stacked(boxes: list[Box], tolerance: float) -> None:
-    """Refuse boxes of which one stands on another, as the lower one would be lifted with it.
+    """Refuse a box that stands on another: each box counts as standing on the bin's floor.
 
-    Those that a camera sees in part only may seem to reach below others.
+    Boxes that a camera sees only in part are not checked: they may seem to reach below others.
 
     Args:
         boxes: the items.
-        tolerance: by which each side may be measured too long, m.
+        tolerance: greatest distance by which a side may be measured too far out, m.
     """
     seen = [
         (number, replace(box, **{key: max(getattr(box, key) - 2 * tolerance, MILLIMETRE) for key in "wd"}))
@@ -246,14 +246,14 @@ def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: b
     """Return the one cuboid that a bin's map shows.
 
     Args:
-        heights: above the bin's floor, m; not all of them the floor's.
+        heights: above the bin's floor, m; at least one is an item's.
         side: of a value's square, m.
         accuracy: greatest error of a height, m.
-        is_cell_map: whether the map has one value a cell: then the item is all cells in which it lies.
+        is_cell_map: whether the map has one value a cell: then the item fills each cell in which it lies.
         name: of the item, see :func:`segments_of_map`.
 
     Raises:
-        DepthMapError: for something else than one cuboid.
+        DepthMapError: for anything but one cuboid.
     """
     where = np.argwhere(heights > least_height(accuracy))
     corners = np.unique(np.concatenate([where + step for step in product((0, 1), repeat=2)]), axis=0)
@@ -271,13 +271,13 @@ def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: b
 def smallest_rectangle(points: np.ndarray) -> tuple[float, float, float, float, float]:
     """Return the smallest rectangle around points ``[M, 2]``: centre, sides, and yaw in degrees, in [0, 90).
 
-    One along the axes is returned if it is hardly larger, as it is for a turn of a degree.
+    A rectangle along the axes is preferred if it is hardly larger, such as for a turn of a degree.
     """
     try:
         hull = points[ConvexHull(points).vertices]
     except QhullError:  # all lie on a line
         hull = points
-    hull = np.roll(hull, -np.lexsort(hull.T[::-1])[0], 0)  # of equally good rectangles the same is taken each time
+    hull = np.roll(hull, -np.lexsort(hull.T[::-1])[0], 0)  # so that the choice of equals is always the same
     edges = np.roll(hull, -1, 0) - hull
     least, best = math.inf, (0.0, 0.0, 0.0, 0.0, 0.0)
     for angle in [0.0, *(np.arctan2(edges[:, 1], edges[:, 0]) % (math.pi / 2)).tolist()]:

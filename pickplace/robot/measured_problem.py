@@ -44,7 +44,7 @@ from pickplace.rules.state import State, surface_from
 
 
 class MeasuredItem(NamedTuple):
-    """An item on a grid that lies along it, and what decides which actions succeed with it."""
+    """An item on a grid along its sides, and the data that decide which actions succeed with it."""
 
     limits: Limits  # of the robot on this item
     cell: CellSpec  # with these limits
@@ -59,9 +59,9 @@ class MeasuredItem(NamedTuple):
 class MeasuredProblem(Problem):
     """Items and one tote, in metres; heights are counted in millimetres.
 
-    Each item has a grid along it, with pick cells of its own, so that no two items share an action. The robot's limits
-    forbid picks at which the end effector would touch another box in the bin that may be as high. A
-    :class:`~pickplace.robot.box.HiddenBox` is no item, and only in the way.
+    Each item has a grid along its sides, with pick cells of its own, so that no two items share an action. The robot's
+    limits forbid picks at which the end effector would touch another box in the bin that may be as high. A
+    :class:`~pickplace.robot.box.HiddenBox` is an obstacle, not an item.
     """
 
     parts: list[MeasuredItem]
@@ -105,14 +105,14 @@ class MeasuredProblem(Problem):
         return *part.centres[x_bin * self.cell.bin_size[1] + y_bin], part.grip
 
     def _placed(self, action: Tensor) -> tuple[MeasuredItem, Item, int]:
-        """Return the part of the item that an action takes, the item, and the footprint that it leaves."""
+        """Return the measured item that an action takes, the same item on its grid, and its footprint in the tote."""
         part = self.parts[int(self.taken_items(action))]
         _, rotation, _, (x, y, *_) = carry(part.cell, part.measured.maps.item, action)
         return part, part.measured.maps.item, int(footprint_index(self.cell.tote_size, rotation % 2, x, y))
 
 
 def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[float]] = ()) -> Problem:
-    """Return the problem of a scene in metres; arguments and errors as of :meth:`Planner.plan`."""
+    """Return the problem of a scene in metres; see :meth:`Planner.plan` for arguments and errors."""
     cell_size = cast(float, scene.cell_size)
     boxes, clearance = _read_boxes(cell, scene, cell_size)
     error = clearance if scene.placement_error is None else scene.placement_error
@@ -125,7 +125,7 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
     )
     each = [_on_grid(cell, boxes[place], cell_size, clearance, f"items[{place}]", device) for place in numbers]
     items = join_items(each)
-    # What an item covers for sure decides where it is gripped, and what supports it.
+    # Only the area that an item surely covers decides where it is gripped, and what supports it.
     sides = [
         (max(box.w - 2 * box.edge_error, 0.0) / cell_size, max(box.d - 2 * box.edge_error, 0.0) / cell_size)
         for box in (boxes[place] for place in numbers)
@@ -175,9 +175,9 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
 
 
 def _join(parts: list[MeasuredItem], items: Item) -> tuple[CellSpec, PlacingMaps]:
-    """Return the cell and the maps of all items ``[1, M]``; of several the maps forbid the picks that fail.
+    """Return the cell and the maps of all items ``[1, M]``; for several items, the maps forbid the picks that fail.
 
-    The cell's inset is the least of any item: it must not exclude a pick that grips another one.
+    The cell's inset is the least of all items, so that it excludes no pick that grips one of them.
     """
     cell, each = parts[0].cell, [part.measured.maps for part in parts]
     if len(parts) == 1:
@@ -193,7 +193,7 @@ def _join(parts: list[MeasuredItem], items: Item) -> tuple[CellSpec, PlacingMaps
 
 
 def _inset(item: Item, sides: tuple[float, float], clearance: float) -> tuple[int, int]:
-    """Return how many cells at each edge an item, narrower by its clearance, does not cover whole; all in cells."""
+    """Return the number of cells at each edge that an item, narrowed by its clearance, does not cover in full; x, y."""
     x, y = (
         math.ceil((int(whole) - side) / 2 + clearance - ROUNDING) for whole, side in zip(item[2:4], sides, strict=True)
     )
@@ -203,7 +203,7 @@ def _inset(item: Item, sides: tuple[float, float], clearance: float) -> tuple[in
 def _taken_items(cell: CellSpec, items: list[Item], insets: list[tuple[int, int]]) -> Tensor:
     """Return the number of the item that each pick cell takes, int64 ``[P]``; -1 if it grips none.
 
-    Each item has a grid of its own. A pick cell that grips several stands for the highest, as on the grid.
+    Each item has a grid of its own. A pick cell that grips several items takes the highest, as by the rules.
     """
     free = replace(cell, reach=None)
     lifted = [all_grasps(replace(free, item_inset=own), item)[0] for item, own in zip(items, insets, strict=True)]
@@ -215,8 +215,8 @@ def _effector_centres(cell: CellSpec, item: Item, box: Box, side: float) -> np.n
     """Return the centre of the end effector in the bin's frame at every pick cell of a grid along an item; m.
 
     Args:
-        item: of one problem, on that grid.
-        box: the same as it was measured.
+        item: one item, on that grid.
+        box: the same item, as measured.
         side: length of a cell, m.
     """
     (ee_w, ee_d), (x, y, w, d) = cell.gripper.size, map(int, item[:4])
@@ -226,7 +226,7 @@ def _effector_centres(cell: CellSpec, item: Item, box: Box, side: float) -> np.n
 
 
 def _read_boxes(cell: CellSpec, scene: Scene, side: float) -> tuple[list[Box], float]:
-    """Return the items, and the clearance that they need: none if a map with one value a cell shows them."""
+    """Return the boxes in the bin, and their clearance, m: 0 if a map with one value a cell shows them."""
     accuracy, clearance = scene.accuracy, scene.clearance
     if isinstance(scene.items, BinMap):
         least = -max(4 * accuracy, 0.01)
@@ -261,7 +261,7 @@ def _read_tote(cell: CellSpec, scene: Scene, unit: float, error: float, device) 
 
     Args:
         unit: length of a height unit, m.
-        error: greatest distance of an item from where a plan sets it down, in cells.
+        error: greatest distance between an item and its planned place, in cells.
     """
     grid, slack, height = cell.tote_size[:2], math.ceil(scene.accuracy / MILLIMETRE - ROUNDING), scene.tote_height
     if height is None:
@@ -283,7 +283,7 @@ def _read_tote(cell: CellSpec, scene: Scene, unit: float, error: float, device) 
 
 
 def _on_grid(cell: CellSpec, box: Box, cell_size: float, clearance: float, name: str, device) -> Item:
-    """Return an item at whole cells of a grid that lies along it, in millimetres; refuse one that is too large."""
+    """Return an item at whole cells of a grid along its sides, its height in millimetres; refuse too large an item."""
     whole = [max(1, math.ceil((side + 2 * clearance) / cell_size - ROUNDING)) for side in (box.w, box.d)]
     for key, size, most_cells in zip("wd", whole, cell.bin_size[:2], strict=True):
         refuse_if(
@@ -303,10 +303,10 @@ def _on_grid(cell: CellSpec, box: Box, cell_size: float, clearance: float, name:
 def _clear_picks(
     cell: CellSpec, scene: Scene, index: int, boxes: list[Box], centres: np.ndarray, clearance: float
 ) -> np.ndarray:
-    """Return at which of its centres ``[P, 2]`` the end effector hits nothing in the bin, bool ``[P]``.
+    """Return a mask of the end effector's centres ``[P, 2]`` at which it hits nothing in the bin, bool ``[P]``.
 
-    Its body decides, which is turned with the item. It misses the bin's walls, or passes over them. It touches no other
-    box, wider by the clearance, that may be as high; boxes that are clearly lower are ignored.
+    Its body, turned with the item, must miss the bin's walls or pass over them. It must not touch another box, widened
+    by the clearance, that may be as high; boxes that are clearly lower are ignored.
 
     Args:
         index: of the item that is picked, among the boxes.
@@ -326,12 +326,12 @@ def _clear_picks(
 
 
 def _limits(cell: CellSpec, free: CellSpec, bin_clear: Tensor, centres: np.ndarray, grip: int, release: int) -> Limits:
-    """Return the limits of the robot, with tops in millimetres, and the picks at which no wall is hit.
+    """Return the limits of the robot, with tops in millimetres; they forbid the picks that hit something in the bin.
 
     Args:
         cell: of the robot, with its limits, if any.
-        free: the same with heights in millimetres, for which those of a reach were computed anew.
-        bin_clear: bool ``[P]``.
+        free: the same cell with heights in millimetres; the limits of its reach were computed anew.
+        bin_clear: bool ``[P]``, see :func:`_clear_picks`.
         centres: of the end effector in the bin at each pick cell, in cells, ``[P, 2]``.
         grip: height of the suction face when it grips the item, mm.
         release: height of the suction face above the item's planned top when it lets go, mm.
@@ -340,7 +340,7 @@ def _limits(cell: CellSpec, free: CellSpec, bin_clear: Tensor, centres: np.ndarr
     if limits is None:
         places = torch.zeros(cell.rotations, *cell.tote_size[:2], dtype=torch.int64, device=device)
         return Limits(bin_clear, places, places + FAR)
-    # Millimetres in a unit of the limits: tables are in the height units of the cell.
+    # Millimetres per height unit of the limits: a table has the height units of the cell.
     ratio = cell.height_unit / free.height_unit if isinstance(cell.reach, Limits) else 1.0
     return Limits(
         bin_clear & _reached_picks(free, limits, ratio, centres, torch.tensor(grip)).to(device),
@@ -350,11 +350,11 @@ def _limits(cell: CellSpec, free: CellSpec, bin_clear: Tensor, centres: np.ndarr
 
 
 def _reached_picks(cell: CellSpec, limits: Limits, ratio: float, centres: np.ndarray, face: Tensor) -> Tensor:
-    """Return at which of its centres ``[P, 2]`` in the bin the robot reaches an item, bool ``[P]``.
+    """Return a mask of the end effector's centres ``[P, 2]`` in the bin that the robot reaches, bool ``[P]``.
 
     Args:
-        limits: of picks at whole cells; the centres lie between these, and all neighbours must be allowed.
-        ratio: millimetres of their height unit.
+        limits: of picks at whole cells. A centre lies between these, and all its neighbours must be allowed.
+        ratio: millimetres per height unit of the limits.
         face: height of the suction face, mm.
     """
     if cell.reach is not None and (exact := cell.reach.picks(cell, *torch.from_numpy(centres).unbind(1))):

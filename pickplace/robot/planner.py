@@ -1,4 +1,4 @@
-"""The planner for a robot cell: from depth maps or measured boxes to one pick and one place, with reasons if none.
+"""The planner for a robot cell: from depth maps or measured boxes to one pick and one place, or the reasons for none.
 
 Several items may lie in the bin; the planner chooses one of them.
 
@@ -37,7 +37,7 @@ from pickplace.rules.masks import footprint_mask
 from pickplace.rules.observation import HANDLING_TERMS, Term, ToteCapacity, check_terms, observe
 from pickplace.rules.state import Failure
 
-ACTIONS_AT_ONCE = 2**16  # whose reasons are looked up at a time
+ACTIONS_AT_ONCE = 2**16  # greatest number of actions whose reasons are looked up at once
 MAX_ALTERNATIVES = 100_000  # greatest number of choices that a plan may report
 CHOOSERS = "expected one item, or a checkpoint of model=afterstate, or of model=fcn_grasp that was trained with a mask"
 
@@ -71,8 +71,8 @@ class Plan:
     #: the item that is taken, as the policy sees it: x, y, w, d in cells, h in height units; None if several items lie
     #: in the bin and none is taken
     item: dict[str, int] | None
-    #: the same item as it was measured, in metres, with a yaw above -45 and at most 45 degrees: of a box given with
-    #: another yaw ``w`` and ``d`` may change places; None without cell_size
+    #: the same item as measured, in metres, with its yaw brought above -45 and to at most 45 degrees, which may
+    #: exchange ``w`` and ``d``; None without cell_size
     box: Box | None
     pick: Pose | None  #: in the bin's frame
     place: Pose | None  #: in the tote's frame; the end effector lets go there
@@ -86,14 +86,14 @@ class Plan:
     reasons: dict[str, int] | None  #: if stuck or impossible: how many of all flat actions fail for each reason
     #: with ``support="bearing"``: 1 where the tote bears weight once the item rests, for the next call; else None
     tote_bearing: list[list[int]] | None
-    warnings: list[str]  #: what lies outside the policy's training
+    warnings: list[str]  #: a sentence for each thing that lies outside the policy's training
     #: of the item that is taken, from 0: in ``items``, or among the ascending labels; None if none is taken
     item_number: int | None = None
     #: if stuck or impossible: a sentence for each item that the gripper cannot grip, wherever it lies; such as
     #: "items[1]: the cup does not fit on this item; no pick takes it."
     hints: list[str] = field(default_factory=list)
-    #: the item as it lies in the tote once it rests, in the tote's frame, ``h`` the height of its top: for the record
-    #: that the next scene needs; None without an action, or without ``cell_size``
+    #: the item at rest in the tote, in the tote's frame; ``h`` is the height of its top. For ``placed`` of the next
+    #: scene; None without an action, or without ``cell_size``
     placed: Box | None = None
 
     def as_dict(self) -> dict:
@@ -106,16 +106,16 @@ class Planner:
 
     Args:
         cell: the cell's sizes and options.
-        policy: a policy made for this cell, if the planner needs one.
+        policy, critic: a policy made for this cell and its critic, if the planner needs them.
         candidates: as in :class:`~pickplace.planners.policy.PolicyPlanner`: ``"all"``, or ``K``.
         terms: of the observation, by key; None: the standard ones.
-        planner: what decides: None: the policy; the short name of a planner (``"joint_dbl"``), or a config of the group
-            ``planner`` (``{"_target_": "beam", "depth": 3}``), or a planner that was made.
-        items: the item distribution, for a search to imagine.
-        training: what the policy was trained with, for :attr:`Plan.warnings`; None: it is not known.
+        planner: makes the decisions: the short name of a planner (``"joint_dbl"``), a config of the group ``planner``
+            (``{"_target_": "beam", "depth": 3}``), or a planner object; None: the policy.
+        items: the item distribution, from which a search draws items that it imagines.
+        training: items and sizes of the policy's training, for :attr:`Plan.warnings`; None: not known.
 
-    Any number of items may lie in the bin, and be seen to come, whatever ``cell.bin_items`` and ``cell.preview`` are. A
-    planner that was made must have been made for several.
+    The bin may hold any number of items, and any number may be seen to come, whatever ``cell.bin_items`` and
+    ``cell.preview`` are. Only a planner object must have been made for several items.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class Planner:
     ):
         refuse_if(cell.tipping, "env.tipping=true: a robot's gripper does not tip items; expected false.")
         self._handling = cell.handling
-        cell = replace(cell, handling=False, preview=0)  # loads, and what comes, are those of a scene
+        cell = replace(cell, handling=False, preview=0)  # each scene has its own loads and preview
         loads = [key for key, term in (terms or {}).items() if key in HANDLING_TERMS or isinstance(term, ToteCapacity)]
         read = [key for key in loads if policy is not None and key in policy.in_keys]
         refuse_if(read, f"policy: it reads {', '.join(read)}, which a scene does not have; expected another.")
@@ -157,8 +157,8 @@ class Planner:
 
         Args:
             path, device, trust, **sizes: see :func:`~pickplace.policies.restore.load_policy`, as for errors.
-            candidates: ``"all"``, or ``K``: how many of the most probable actions are tried.
-            planner: the short name of what decides, such as ``"beam"``, or its config; None: the policy.
+            candidates: ``"all"``, or ``K``: number of most probable actions that are tried.
+            planner: the short name of a planner, such as ``"beam"``, or its config; None: the policy.
         """
         trained = load_policy(path, device, trust, **sizes)
         items = build("items", trained.config["items"])
@@ -170,20 +170,20 @@ class Planner:
 
     @torch.inference_mode()
     def plan(self, scene: Scene, *, alternatives: int = 10, exclude: Sequence[Sequence[float]] = ()) -> Plan:
-        """Return which item in the bin to pick and where, where to place it and how to turn it.
+        """Choose an item in the bin, its pick, its place and its turn.
 
         Args:
-            scene: what lies in bin and tote.
-            alternatives: how many of the most probable choices to report, and the chosen one if it is further down;
-                0 is fastest.
+            scene: measured contents of bin and tote.
+            alternatives: number of most probable choices to report, and the chosen one if it is further down; 0 is
+                fastest.
             exclude: points ``(x, y, ...)`` in the bin's frame, such as ``pick.center`` of plans whose grasp failed: no
                 pick within half a cell of one is planned. Metres with ``cell_size``, else cells.
 
         Raises:
             EmptyBinError: for a map of an empty bin.
             DepthMapError: for a map of another shape or type, a value that is not finite or out of range, or anything
-                but one cuboid in the bin, or for each label; it names the cell. Also for several items among which the
-                planner cannot choose.
+                but one cuboid in the bin or under each label; it names the cell. Also for several items if the planner
+                cannot choose among them.
             ValueError: for another argument that cannot be used.
         """
         refuse_if(
@@ -235,7 +235,7 @@ class Planner:
         )
 
     def _refuse_unknown(self, scene: Scene, device) -> None:
-        """Refuse a scene without a plan if there may be one where images left something unknown."""
+        """Refuse a scene that has no plan, if images with fewer unknown places might allow one."""
         may_have_plan = scene.has_holes
         if not may_have_plan and (likely := scene.without_gaps()) is not None:
             problem = read_metric(self.cell, likely, device)
@@ -248,10 +248,10 @@ class Planner:
         )
 
     def _planner_of(self, count: int, preview: int, is_metric: bool) -> tuple[MapPlanner, Mapping[str, Term]]:
-        """Return what decides with so many items in the bin, and to come, and the terms of the observation.
+        """Return the planner for these numbers of items in the bin and to come, and the terms of the observation.
 
         Raises:
-            DepthMapError: for a planner that cannot.
+            DepthMapError: for a planner that cannot choose among several items.
         """
         terms = check_terms(self.terms, replace(self.cell, bin_items=max(count, self.cell.bin_items), preview=preview))
         if self._settings is not None and (count, preview) not in self._planners:
@@ -267,7 +267,7 @@ class Planner:
         return planner, terms
 
     def _make(self, cell: CellSpec, policy: Policy | None, terms: Mapping[str, Term]) -> MapPlanner:
-        """Return the planner of the settings, for a cell, a policy made for it and the terms of the observation."""
+        """Make the planner of the settings for a cell, a policy of this cell and the terms of the observation."""
         assert self._settings is not None
         name = self._settings["_target_"]
         maker = find("planner", name)
@@ -283,7 +283,7 @@ class Planner:
 
 
 def _at_rest(box: Box, pick: Pose, place: Pose, turn: float, drop_height: float) -> Box:
-    """Return an item as it lies in the tote; a turn in degrees."""
+    """Return an item at rest in the tote; the turn is in degrees."""
     cos, sin = math.cos(math.radians(turn)), math.sin(math.radians(turn))
     x, y = box.x - pick.center[0], box.y - pick.center[1]
     centre = {"x": place.center[0] + x * cos - y * sin, "y": place.center[1] + x * sin + y * cos}
@@ -293,7 +293,7 @@ def _at_rest(box: Box, pick: Pose, place: Pose, turn: float, drop_height: float)
 def planner_settings(
     planner: str | Mapping[str, Any] | None, candidates: int | Literal["all"] = "all"
 ) -> dict[str, Any]:
-    """Return a planner's short name or its config as a config; of the policy with its ``candidates``."""
+    """Return the config of a planner, given its short name or its config; the policy's includes ``candidates``."""
     settings = dict(planner) if isinstance(planner, Mapping) else {"_target_": planner or "policy"}
     expect(isinstance(settings.get("_target_"), str), "planner", planner, "a config with the key _target_")
     if settings["_target_"] != "policy" or candidates == "all":
@@ -329,7 +329,7 @@ def _several_items(policy, count: int) -> DepthMapError:
 def _decide(
     planner: MapPlanner, problem: Problem, observation: Observation
 ) -> tuple[str, Tensor | None, Ranking | None]:
-    """Return the status, the action if one was found that succeeds, and the choices of a policy if it was asked."""
+    """Return the status, the action if it succeeds, and the policy's ranking if a policy was asked; else None."""
     if not footprint_mask(problem.cell, problem.maps).any():
         return "stuck" if problem.is_feasible_in_an_empty_tote() else "impossible", None, None
     cell, ranking = problem.cell, None
@@ -347,7 +347,7 @@ def _decide(
 
 
 def _reasons(problem: Problem) -> dict[str, int]:
-    """Return how many of all flat actions fail for each reason, each with the item that its pick takes."""
+    """Count the flat actions that fail for each reason, each with the item that its pick takes."""
     cell, device = problem.cell, problem.state.surface.device
     picks = torch.arange(cell.num_picks, device=device)
     codes = problem.failures(join_pick(cell, picks, 0))

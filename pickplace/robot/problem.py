@@ -1,4 +1,4 @@
-"""The problem that a robot's planner solves for the items in a bin, and how it is read from the maps of a grid."""
+"""The problem that a robot's planner solves for the items in a bin, and its version in whole cells of a grid."""
 
 import math
 from abc import ABC, abstractmethod
@@ -53,7 +53,7 @@ class Pose:
 
 @dataclass(frozen=True, kw_only=True)
 class Problem(ABC):
-    """The items in a bin, one tote, and what decides which actions succeed.
+    """The items in a bin, one tote, and the data that decide which actions succeed.
 
     The states have items ``[1, M]``.
     """
@@ -78,11 +78,11 @@ class Problem(ABC):
 
     @abstractmethod
     def bearing_after(self, action: Tensor | None) -> Tensor:
-        """Return where the tote bears weight after an action that succeeds, bool ``[W_T, D_T]``."""
+        """Return a mask of the cells that bear weight after a successful action; None: now; bool ``[W_T, D_T]``."""
 
     @abstractmethod
     def shares(self, number: int) -> tuple[float, float]:
-        """Return the shares of the tote's volume that are below its surface, 0 to 1, and that an item takes."""
+        """Return two shares of the tote's volume, 0 to 1: the part below its surface, and the volume of an item."""
 
     @abstractmethod
     def suction_face(self, number: int, x_bin: int, y_bin: int) -> tuple[float, float, float]:
@@ -154,18 +154,18 @@ class GridProblem(Problem):
 
 
 def _point(x: float, y: float, z: float) -> tuple[float, float, float]:
-    return round(float(x), 9), round(float(y), 9), round(float(z), 9)  # without the tail of binary fractions
+    return round(float(x), 9), round(float(y), 9), round(float(z), 9)  # without the rounding errors of floating point
 
 
 def is_excluded(exclude: Sequence[Sequence[float]], centres: np.ndarray, side: float) -> np.ndarray:
-    """Return which centres ``[P, 2]`` of the suction face are within half a cell of a point, bool ``[P]``.
+    """Return a mask of the centres ``[P, 2]`` of the suction face within half a cell of a point, bool ``[P]``.
 
     Args:
         exclude: points ``(x, y, ...)``, in the unit of the centres.
         side: of a cell, in the same.
 
     Raises:
-        ValueError: naming the first point that is none.
+        ValueError: naming the first entry that is no point.
     """
     refuse_if(
         not isinstance(exclude, (list, tuple)) or len(exclude) > MAX_EXCLUDED,
@@ -180,7 +180,7 @@ def is_excluded(exclude: Sequence[Sequence[float]], centres: np.ndarray, side: f
 
 
 def without_excluded(cell: CellSpec, exclude: Sequence[Sequence[float]]) -> CellSpec:
-    """Return a cell whose robot does not reach the picks that :func:`is_excluded` excludes; points in cells."""
+    """Return the cell, with excluded picks out of the robot's reach; see :func:`is_excluded`, with points in cells."""
     x_bin, y_bin = np.divmod(np.arange(cell.num_picks), cell.bin_size[1])
     (wide, deep), limits = cell.gripper.size, cell.limits
     centres = np.stack([effector_centre(x_bin, wide), effector_centre(y_bin, deep)], -1)
@@ -193,7 +193,7 @@ def without_excluded(cell: CellSpec, exclude: Sequence[Sequence[float]]) -> Cell
 
 
 def read_grid(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[float]] = ()) -> Problem:
-    """Return the problem of a scene in whole cells; arguments and errors as of :meth:`Planner.plan`."""
+    """Return the problem of a scene in whole cells; see :meth:`Planner.plan` for arguments and errors."""
     assert isinstance(scene.items, BinMap)
     unit = " cells" if cell.height_unit == 1 else " height units"
     height = cell.tote_size[2] if scene.tote_height is None else round(scene.tote_height)
@@ -217,12 +217,12 @@ def read_grid(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[f
 
 
 def join_items(items: list[Item]) -> Item:
-    """Return items ``[1]`` as those of one bin, ``[1, M]``."""
+    """Join items ``[1]`` to the items of one bin, ``[1, M]``."""
     return Item(*(torch.stack(parts, 1) for parts in zip(*items, strict=True)))
 
 
 def _read_cuboid(bin_map: np.ndarray, segment: np.ndarray, unit: str, name: str) -> Item:
-    """Return the item of a segment of the bin, bool ``[W_B, D_B]``; refuse all but a box filled at one height."""
+    """Return the item of a segment of the bin, bool ``[W_B, D_B]``; refuse one that is no box of a single height."""
     heights, filled = np.where(segment, bin_map, 0), np.argwhere(segment)
     (x, y), (w, d), h = filled.min(0), np.ptp(filled, 0) + 1, heights.max()
     bad = np.zeros_like(segment)
@@ -235,7 +235,7 @@ def _read_cuboid(bin_map: np.ndarray, segment: np.ndarray, unit: str, name: str)
 
 
 def check_longest(cell: CellSpec, item: Item, key: str) -> Item:
-    """Return an item; refuse one that is longer than the tables of grasps hold."""
+    """Return the item; refuse it if it is too long for the tables of grasps."""
     longest = max(int(item.w), int(item.d))
     refuse_if(
         cell.gripper.largest_item is None and longest > cell.max_side,
@@ -246,11 +246,11 @@ def check_longest(cell: CellSpec, item: Item, key: str) -> Item:
 
 
 def read_bearing(cell: CellSpec, tote_bearing, on_floor: Tensor) -> Tensor:
-    """Return where the tote bears weight, int64 ``[W_T, D_T]``: as plans before say, and on the floor."""
+    """Return 1 where the tote bears weight, int64 ``[W_T, D_T]``: on the floor, and where earlier plans say so."""
     if tote_bearing is None:
         return torch.ones_like(on_floor, dtype=torch.int64)
     bearing = torch.from_numpy(whole_map("tote_bearing", tote_bearing, cell.tote_size[:2], 1, kinds="biuf"))
-    bearing = torch.where(on_floor, 1, bearing)  # this may be another tote
+    bearing = torch.where(on_floor, 1, bearing)  # the map may be of an earlier tote
     refuse_if(
         not cell.support.marks_bearing and not bearing.all(),
         f"tote_bearing: got a 0 with support={cell.support}, expected support=bearing.",

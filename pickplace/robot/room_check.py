@@ -1,4 +1,4 @@
-"""Whether an image shows the bin or the tote that it should, where the camera's pose says it is."""
+"""Check that an image shows the expected bin or tote, where the camera's pose says it is."""
 
 import numpy as np
 from scipy import ndimage
@@ -7,12 +7,12 @@ from pickplace.common.validate import refuse_if
 from pickplace.robot.box import DepthMapError
 from pickplace.robot.depth_image import AROUND, Heights, Room, distance_outside, level_range
 
-FEW = 12  # pixels that may be wrong
-LEAST_FLOOR = 0.02  # share of what is seen that must be floor for it to be checked
-LEAST_RIM = 0.25  # share of the rim, a pixel wide, that must be seen where no floor is
-MOST_BELOW = 0.01  # greatest share of what is seen that may be below the floor
+FEW = 12  # number of pixels that may be wrong
+LEAST_FLOOR = 0.02  # least share of the seen pixels on the floor; with less, the rim is checked instead
+LEAST_RIM = 0.25  # least share of the rim, taken as a pixel wide, that must be seen then
+MOST_BELOW = 0.01  # greatest share of the seen pixels that may be below the floor
 MOST_OPEN = 0.2  # greatest share of a wall that may be open
-RIM_WIDTH = 0.015  # of the rim that is looked at, m
+RIM_WIDTH = 0.015  # width of the strip of the rim that is checked, m
 HINT = "check the camera's pose, its calibration, and that this is the image of the {}"
 
 
@@ -20,7 +20,7 @@ def check_room(seen: Heights, room: Room, accuracy: float, margin: float) -> Non
     """Check that the floor is level, at height 0 and ends at the walls, and that nothing reaches over them.
 
     Args:
-        margin: width of the border along the walls in which a point may be one of the wall, m.
+        margin: width of the border along the walls, m; a point in it may belong to a wall.
 
     Raises:
         DepthMapError: naming what is wrong.
@@ -69,13 +69,13 @@ def _check_level(seen: Heights, room: Room, floor: np.ndarray, accuracy: float) 
 
 
 def fit_plane(points: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """Return the heights of the plane through points ``[M, 2]`` with heights ``[M]``, at the points, ``[M]``."""
+    """Fit a plane to heights ``[M]`` at points ``[M, 2]``, and return its heights at these points, ``[M]``."""
     matrix = np.column_stack([points - points.mean(0), np.ones(len(points))])
     return matrix @ np.linalg.lstsq(matrix, heights, rcond=None)[0]
 
 
 def _check_size(seen: Heights, room: Room, floor: np.ndarray, band: float, accuracy: float) -> None:
-    """Refuse a floor that goes on beyond the walls. Where it ends before them, something may stand at the wall."""
+    """Refuse a floor that goes on beyond the walls. It may end before them, as something may stand at a wall."""
     if room.rim <= 2 * band:  # such walls are not seen
         return
     raw = np.nan_to_num(seen.raw, nan=np.inf)
@@ -92,7 +92,7 @@ def _check_size(seen: Heights, room: Room, floor: np.ndarray, band: float, accur
 
 
 def _check_walls(seen: Heights, room: Room) -> None:
-    """Refuse an image in which rays that should end at a wall go on far below."""
+    """Refuse an image in which rays that should end at a wall end far below."""
     ways = []
     for axis, length in enumerate(room.sides):
         ray = seen.rays[..., axis]
@@ -116,7 +116,7 @@ def _check_walls(seen: Heights, room: Room) -> None:
 
 
 def _refuse_over_wall(seen: Heights, room: Room, band: float) -> None:
-    """Refuse what is seen above the rim on both sides of a wall's inner face, such as an arm."""
+    """Refuse a thing, such as an arm, that is seen above the rim on both sides of a wall's inner face."""
     outside = distance_outside(seen.points, room)
     parts, count = ndimage.label(seen.height > room.rim + band, AROUND)
     beyond = parts * ((outside > 1.5 * seen.pixel) & (outside < 1.5 * seen.pixel + 0.006))

@@ -1,4 +1,4 @@
-"""A scene: what lies in the bin and in the tote, as it was measured, and how exactly."""
+"""A scene: the measured contents of the bin and the tote, and the accuracy of the measurement."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -23,14 +23,14 @@ class BinMap(NamedTuple):
     """Heights above the bin's floor, ``[W_B, D_B]`` or a whole multiple of it, 0 where it is empty."""
 
     depth: Any  #: numpy, torch or lists
-    #: where several items lie in the bin, whole numbers in the same shape: 0 where it is empty, another number for each
-    #: item; None: one item lies there
+    #: for several items, whole numbers in the same shape: 0 where the bin is empty, another number for each item; None:
+    #: one item lies there
     labels: Any = None
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What lies in the bin and in the tote, for :meth:`~pickplace.robot.planner.Planner.plan`.
+    """Measured contents of the bin and the tote, for :meth:`~pickplace.robot.planner.Planner.plan`.
 
     With ``cell_size`` all lengths are in metres. Without it maps and ``tote_height`` are whole numbers of height units,
     as in training.
@@ -44,28 +44,28 @@ class Scene:
     #: everything that lies in the bin: boxes in metres, or a map, see :meth:`from_maps`
     items: Sequence[Box] | BinMap
     #: ``[W_T, D_T]``, or a whole multiple of it: remaining height, from the surface up to the rim; numpy, torch or
-    #: lists. Of a map with one value a cell each value is the least that was measured in the cell. Or a `ToteMap`
+    #: lists. With one value a cell, each is the least that was measured in the cell. Or a `ToteMap`
     tote: Any
     cell_size: float | None = None  #: side of a cell, m; None: maps of whole cells
     accuracy: float = ACCURACY  #: greatest error of a measured height, m
     clearance: float = CLEARANCE  #: least distance that an item keeps from what stands beside it, on each side; m
-    #: greatest distance of an item from where the robot sets it down, in any direction, at most ``clearance``; m; None:
-    #: the clearance. What carries an item counts if it carries it wherever it is then
+    #: greatest distance between an item and its planned place, in any direction, at most ``clearance``; m; None: the
+    #: clearance. A support counts only if it carries the item at all these places
     placement_error: float | None = None
-    #: what a value of a map of the tote in metres holds for, to within ``accuracy``: ``"area"``, all of its square; or
-    #: ``"centre"``, the point in the middle of it
+    #: the place whose height each value of a tote's map in metres gives, to within ``accuracy``: ``"area"``, all of its
+    #: square; or ``"centre"``, the point in its middle
     tote_samples: str = "area"
-    tote_height: float | None = None  #: height of the tote's rim above its floor; None: that of ``cell.tote_size``
-    #: with ``support="bearing"``, ``[W_T, D_T]``, 1 where a cell bears weight, else 0: what the plan before this one
-    #: returned; None: every cell bears weight. In metres, of a map with one value a cell, only the floor does then:
-    #: nothing tells whether a cell is level
+    tote_height: float | None = None  #: height of the tote's rim above its floor; None: from ``cell.tote_size``
+    #: with ``support="bearing"``, ``[W_T, D_T]``, 1 where a cell bears weight, else 0: ``tote_bearing`` of the plan
+    #: before; None: every cell bears weight. For a map in metres with one value a cell, None means that only the floor
+    #: does, as such a map does not tell whether a cell is level
     tote_bearing: Any = None
-    bin_height: float | None = None  #: height of the bin's walls above its floor; None: that of ``cell.bin_size``
-    #: everything that lies in the tote, :attr:`Plan.placed` of each plan that was carried out; None: not known. Needed
-    #: where a box has a ``max_load``, in metres alone
+    bin_height: float | None = None  #: height of the bin's walls above its floor; None: from ``cell.bin_size``
+    #: everything that lies in the tote: :attr:`Plan.placed` of each plan that was carried out; None: not known. Needed
+    #: if a box has a ``max_load``; for scenes in metres only
     placed: Sequence[Box] | None = None
-    #: the items that arrive next, in their order, each as it will lie in the bin; None: not known. What is feasible
-    #: does not depend on them; ``afterstate``, ``afterstate_fcn`` and searches plan with them. In metres alone
+    #: the items that arrive next, in their order, each as it will lie in the bin; None: not known. They do not change
+    #: what is feasible; ``afterstate``, ``afterstate_fcn`` and searches plan with them. For scenes in metres only
     coming: Sequence[Box] | None = None
 
     def __post_init__(self):
@@ -107,7 +107,7 @@ class Scene:
 
     @classmethod
     def from_maps(cls, bin_depth, tote_depth, bin_labels=None, **settings) -> "Scene":
-        """Return a scene that two maps show: of whole cells, or in metres.
+        """Return the scene of two maps, in whole cells or in metres.
 
         Args:
             bin_depth, bin_labels: see :class:`BinMap`.
@@ -128,14 +128,14 @@ class Scene:
             cell: the sizes.
             bin_view, tote_view: a camera above each, and its depth image. One camera may see both: give it twice, with
                 a pose for each.
-            labels, sizes: of the items, see :meth:`~pickplace.robot.camera.Camera.items`, as for errors.
+            labels, sizes: of the items, see :meth:`~pickplace.robot.camera.Camera.items`, also for errors.
             greatest_height: of an item, m; None: the height of the tote's rim.
             placed: the items that lie in the tote, see :meth:`~pickplace.robot.camera.Camera.tote_map`.
             **settings: the other fields.
 
         Raises:
             EmptyBinError: if the bin is seen, and nothing lies in it.
-            DepthMapError: for an image that cannot be planned from; another one may do.
+            DepthMapError: for an image that allows no plan; another image may do.
         """
         (over_bin, bin_image), (over_tote, tote_image) = bin_view, tote_view
         greatest = tote_height if greatest_height is None else greatest_height
@@ -147,14 +147,14 @@ class Scene:
 
     @property
     def has_holes(self) -> bool:
-        """Whether images left places in bin or tote of which nothing is known."""
+        """Whether images left unknown places in the bin or the tote."""
         boxes = () if isinstance(self.items, BinMap) else self.items
         return any(isinstance(box, UnknownBox) for box in boxes) or (
             isinstance(self.tote, ToteMap) and self.tote.has_holes
         )
 
     def without_gaps(self) -> "Scene | None":
-        """Return the scene that is likely if images have narrow gaps, at edges; None if they have none."""
+        """Return the likely scene if images have narrow gaps, such as at edges; None if they have none."""
         likely = self.tote.likely if isinstance(self.tote, ToteMap) else None
         boxes = () if isinstance(self.items, BinMap) else self.items
         if likely is None and not any(box.edge_error for box in boxes):

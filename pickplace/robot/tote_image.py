@@ -1,4 +1,4 @@
-"""The heights in a tote, read from a depth image."""
+"""Read the heights in a tote from a depth image."""
 
 import math
 from collections.abc import Sequence
@@ -12,19 +12,19 @@ from pickplace.robot.depth_image import AROUND, Heights, Room, distance_outside,
 from pickplace.robot.measure import ToteMap
 from pickplace.robot.room_check import FEW
 
-MOST_UNSEEN = 0.25  # greatest share of a tote that the camera may not see
-THICKEST = 0.02  # of the walls, m
-NARROWEST = 0.02  # of a hand or a tool, m
+MOST_UNSEEN = 0.25  # greatest share of a tote that may be unseen
+THICKEST = 0.02  # greatest thickness of the walls, m
+NARROWEST = 0.02  # least width of a hand or a tool, m
 
 
 def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: Sequence[int], along: int) -> ToteMap:
     """Return the heights in each patch of a tote.
 
     Args:
-        seen: of an image that was checked.
-        margin: width of the border along the walls in which a point may be one of the wall, m.
+        seen: the heights of an image that was checked.
+        margin: width of the border along the walls, m; a point in it may belong to a wall.
         grid: of the tote, in cells.
-        along: patches along a cell.
+        along: number of patches along a cell.
 
     Raises:
         DepthMapError: for something above the rim, or too much that is not seen.
@@ -49,7 +49,7 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     _check_rim(seen, room)
     highest[unknown] = room.rim
     lowest[np.isinf(lowest)] = 0.0
-    # At the walls the nearest place that is seen; there the camera sees the wall, not what is beside it.
+    # At the walls the nearest seen place counts: there the camera sees the wall instead of the contents.
     border = np.ones(shape, dtype=bool)
     edge = math.ceil(margin * shape[0] / room.sides[0])
     border[edge:-edge, edge:-edge] = False
@@ -69,8 +69,7 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
 def _check_rim(seen: Heights, room: Room) -> None:
     """Refuse an image in which a wide hole goes from the inside of a tote over its wall to the outside.
 
-    What stands in a tote hides no rim. A thing that does is higher, so that it is not below the hole: it cannot be told
-    where it is.
+    The contents of a tote cannot hide its rim. A thing that does is above the rim, and the hole does not tell where.
     """
     if not seen.holes.any():
         return
@@ -96,13 +95,13 @@ def _patch_heights(
         highest: of each pixel, NaN if unknown; widened by a pixel.
         lowest: of each pixel, inf if unknown; narrowed by a pixel.
     """
-    # A gap is as wide as what may be there; what is seen may end up to a pixel further out.
+    # A gap is already as wide as a thing in it may be; a seen thing may end up to a pixel further out.
     high = np.where(np.isnan(highest), -np.inf, highest)
     high = np.maximum(high, ndimage.maximum_filter(np.where(np.isnan(seen.height), -np.inf, seen.height), 3))
     low = ndimage.minimum_filter(lowest, 3)
     greatest, least = np.full(shape, -np.inf), np.full(shape, np.inf)
     for places, is_own in ((highest, True), (np.where(np.isinf(high), np.nan, high), False)):
-        # A pixel beside a higher one stands for the place at that height, too.
+        # A pixel beside a higher one also stands for the place at that height.
         points = seen.at(places)
         within = distance_outside(points, room) < -margin
         at = tuple((points[within] / (room.sides[0] / shape[0])).astype(int).clip(0, shape - 1).T)
@@ -117,16 +116,16 @@ def _nearest(heights: np.ndarray, missing: np.ndarray) -> np.ndarray:
 
 
 def _likely(seen: Heights, room: Room, margin: float, shape: np.ndarray) -> ToteMap:
-    """Return the map if all that has no depth is like what is beside it."""
+    """Return the map in which each place without depth is like those beside it."""
     high, low = _patch_heights(seen, room, margin, shape, seen.height, np.nan_to_num(seen.height, nan=np.inf))
     missing = np.isinf(high) | np.isinf(low)
     return ToteMap(_nearest(high, missing).clip(0, None), _nearest(low, missing).clip(0, None))
 
 
 def _behind_holes(seen: Heights, room: Room, margin: float, accuracy: float, shape: np.ndarray) -> np.ndarray:
-    """Return the patches of which nothing is known: what stands on a surface there would be in a hole; bool ``shape``.
+    """Return a mask of the unknown patches: a thing on a surface there would show only in a hole; bool ``shape``.
 
-    The rays of such pixels are followed up to the rim, as the surface itself may not be seen.
+    The rays of the hole's pixels are followed up to the rim, as the surface itself may not be seen.
     """
     unknown = np.zeros(shape, dtype=bool)
     if not seen.holes.any():

@@ -1,4 +1,4 @@
-"""The items, sizes and rules of a policy's training, and warnings about what lies outside of them."""
+"""The items, sizes and rules of a policy's training, and warnings about scenes outside them."""
 
 from dataclasses import dataclass
 from typing import cast
@@ -10,7 +10,7 @@ from pickplace.policies.restore import build_cell, cell_settings, differences
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item
 
-#: Options of the cell that are no sizes; a policy should meet its own.
+#: Options of the cell, beside the sizes, that should be the same as in a policy's training.
 RULES = ("support", "gripper")
 
 
@@ -20,7 +20,7 @@ class TrainingEnvelope:
 
     Attributes:
         kinds: every size ``(w, d, h)`` of its items, in cells and height units.
-        cell: its sizes, with the greatest tote, and its rules.
+        cell: the sizes, with the highest tote, and the rules of the training.
     """
 
     kinds: frozenset[tuple[int, int, int]]
@@ -28,13 +28,13 @@ class TrainingEnvelope:
 
     @classmethod
     def of(cls, config: DictConfig, items: ItemDistribution) -> "TrainingEnvelope":
-        """Return what a checkpoint's config says."""
+        """Return the envelope that a checkpoint's config states."""
         kinds = frozenset((int(w), int(d), int(h)) for w, d, h in items.sizes.tolist())
-        # Without a table of reach, which may be elsewhere.
+        # No table of reach is read, as its file may be missing here.
         return cls(kinds, build_cell(cast(dict, OmegaConf.to_container(config.env, resolve=True)), reach=None))
 
     def warnings(self, cell: CellSpec, items: Item) -> list[str]:
-        """Return a sentence for each thing that the policy never met: an item, the tote, the effector, the rule.
+        """Return a sentence for each thing that the policy never met: an item, the tote, the end effector, the rule.
 
         Args:
             cell: the sizes.

@@ -1,1 +1,1 @@
-"""Run folders: configs, checkpoints, resuming, loggers."""
+"""Run folders: configs, checkpoints, resume, loggers."""

@@ -1,9 +1,9 @@
-"""Checkpoints: how they are written, found and read.
+"""Write and read checkpoints.
 
 A checkpoint is a folder with ``state.safetensors`` (all tensors, random generators included) and ``state.json``
 (config, counters, and the checksum of the tensors). It is data: reading one unpickles nothing and imports nothing.
-It is written beside its place and renamed into it, so that a reader finds the old one or the new one, both whole, also
-after a power failure.
+It is written beside its place and then renamed. So a reader finds either the old or the new one, and always a whole
+one, also after a power failure.
 """
 
 import hashlib
@@ -37,10 +37,10 @@ def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> No
         folder: the checkpoint folder.
         state: nested dicts of tensors and plain values.
         facts: further content of the readable JSON file: config, counters, metrics.
-        keep: a name under which the older one stays beside it; None: it is removed.
+        keep: name under which the older one is kept beside it; None: it is removed.
 
     Raises:
-        CheckpointError: if it cannot be written; the older one is whole, and nothing half-written stays.
+        CheckpointError: if it cannot be written. The older one stays whole, and nothing half-written remains.
     """
     new, old = folder.with_name(f".{folder.name}.new"), folder.with_name(f".{folder.name}.old")
     tensors, rest = flatten(state)
@@ -61,7 +61,7 @@ def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> No
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-        sync_folder(new)  # its names are on the disk before it takes the place of the older one
+        sync_folder(new)  # its names must be on the disk before it replaces the older one
         if old.exists() and not folder.exists():  # the process was killed between the renames below
             old.rename(folder)
         shutil.rmtree(old, ignore_errors=True)
@@ -98,7 +98,7 @@ def unflatten(tensors: dict[str, Tensor], facts: dict) -> dict:
     """Return the tree that :func:`flatten` split; lists come back as dicts with whole-number keys.
 
     Raises:
-        ValueError: for a path that goes on below the end of another.
+        ValueError: for a path that goes on below another value, or occurs twice.
     """
     tree: dict = {}
     for path, value in [*tensors.items(), *facts.items()]:
@@ -112,10 +112,10 @@ def unflatten(tensors: dict[str, Tensor], facts: dict) -> dict:
 
 
 def read(folder: Path) -> tuple[dict, dict]:
-    """Read a checkpoint folder: its state, and its facts.
+    """Return the state and the facts of a checkpoint folder.
 
     Raises:
-        CheckpointError: if a file is missing, truncated or altered, or of another schema; the sentence names the
+        CheckpointError: if a file is missing, truncated or altered, or of another schema; the message names the
             newest whole checkpoint beside it, if there is one.
     """
     before = _identity(folder)
@@ -136,7 +136,7 @@ def read(folder: Path) -> tuple[dict, dict]:
 
 
 def _identity(folder: Path) -> list[tuple[int, int]] | None:
-    """Return inodes and times of a checkpoint's files, which its successor does not have; None if one is missing."""
+    """Return inodes and times of a checkpoint's files, which no other checkpoint has; None if a file is missing."""
     try:
         found = [(folder / name).lstat() for name in (FACTS, TENSORS)]
     except OSError:
@@ -145,7 +145,7 @@ def _identity(folder: Path) -> list[tuple[int, int]] | None:
 
 
 def _read(folder: Path) -> tuple[dict, dict]:
-    """Read a checkpoint's two files, and compare schema and checksum."""
+    """Read a checkpoint's two files, and check schema and checksum."""
     with reworded(
         (OSError, ValueError, RecursionError),  # a RecursionError from deeply nested JSON
         lambda error: CheckpointError(f"{folder}: the checkpoint cannot be read ({error})."),
@@ -188,12 +188,12 @@ def _read(folder: Path) -> tuple[dict, dict]:
 
 
 def restore(make: Callable[[], Module], state: dict, what: str) -> Module:
-    """Return the module that ``make()`` makes, with a checkpoint's tensors.
+    """Return the module of ``make()`` with a checkpoint's tensors.
 
-    Sizes are compared before memory is allocated: a config that asks for too much does not fit the tensors.
+    Sizes are compared before memory is allocated, so a config that asks for too much memory is refused.
 
     Raises:
-        CheckpointError: as :func:`matching_state`, and for a tensor that the module does not have.
+        CheckpointError: see :func:`matching_state`; also for a tensor that the module does not have.
     """
     with torch.device("meta"):
         own = make().state_dict()
@@ -209,11 +209,11 @@ def restore(make: Callable[[], Module], state: dict, what: str) -> Module:
 
 
 def matching_state(saved, own: dict, what: str, path: str = "") -> dict:
-    """Return the part of a checkpoint's state that is named, typed and shaped like a running training's.
+    """Return the part of a checkpoint's state that the training needs; check its names, types and shapes.
 
     Args:
         saved: the checkpoint's state.
-        own: nested dicts of tensors and plain values, as the training has them.
+        own: the training's state: nested dicts of tensors and plain values.
         what: name of the state, for messages.
         path: place in the state, for messages.
 

@@ -1,4 +1,4 @@
-"""Run folders: one process and one training in each, and Hydra's notes on the command that began it."""
+"""Run folders: each belongs to one process and one training, and holds Hydra's notes on the command of the run."""
 
 import logging
 import os
@@ -69,7 +69,7 @@ def is_claimed(run_dir: Path) -> bool:
 
 
 def refuse_occupied(run_dir: Path) -> None:
-    """Refuse a folder for a new run if it holds the results of another: the files of two runs would be mixed.
+    """Refuse a folder for a new run if it holds the results of another run: the files of both would be mixed.
 
     Raises:
         OccupiedError: naming the folder.
@@ -85,7 +85,7 @@ def refuse_occupied(run_dir: Path) -> None:
 
 
 def refuse_training(is_there: bool, run_dir: Path) -> None:
-    """Refuse a folder that holds another training, if it does."""
+    """Refuse a folder if another training ``is_there``."""
     refuse_if(
         is_there,
         f"{run_dir}: there is a training already; expected another run folder, or resume={run_dir}.",
@@ -94,7 +94,7 @@ def refuse_training(is_there: bool, run_dir: Path) -> None:
 
 
 def refuse_parts(run_dir: Path) -> None:
-    """Refuse the folder of another run's notes or checkpoints, and a folder in it, for a new run.
+    """Refuse, for a new run, the folder of another run's notes or checkpoints, and any folder in it.
 
     Raises:
         OccupiedError: naming the folder.
@@ -111,7 +111,7 @@ def refuse_parts(run_dir: Path) -> None:
 
 
 def refuse_links(run_dir: Path) -> None:
-    """Refuse a run folder, which may come from others, that redirects what is written elsewhere.
+    """Refuse a run folder with links, which would redirect written files; the folder may come from strangers.
 
     Raises:
         ValueError: for a link, a file with a second name (a hard link), a pipe or a device in it, naming it.
@@ -122,20 +122,20 @@ def refuse_links(run_dir: Path) -> None:
 
 
 def refuse_for_run(run_dir: Path, notes: Sequence[str] = ()) -> None:
-    """Refuse a folder in which a new run cannot be written: another run's, one that is in use, or one with links."""
+    """Refuse a folder that cannot hold a new run: it belongs to another run, is in use, or has links."""
     refuse_for_job(run_dir)
     refuse_claimed(run_dir)
     refuse_occupied(run_dir)
 
 
 def refuse_for_job(run_dir: Path) -> None:
-    """Refuse a part of another run's folder, or a folder with links; a run of a sweep may go on in its own."""
+    """Refuse a part of another run's folder, or a folder with links; a sweep's run may go on in its own folder."""
     refuse_parts(run_dir)
     refuse_links(run_dir)
 
 
 def refuse_for_sweep(sweep: Path, notes: Sequence[str]) -> None:
-    """Refuse the folder of a sweep if it, or a folder of a run with any of these notes in it, has links."""
+    """Refuse the folder of a sweep if it has links, or if a run folder in it, one with any of these notes, has."""
     refuse_links(sweep)
     for folder in sweep.iterdir() if sweep.is_dir() else ():
         if any(os.path.lexists(folder / name) for name in notes):
@@ -145,7 +145,7 @@ def refuse_for_sweep(sweep: Path, notes: Sequence[str]) -> None:
 def _refuse_link(path: Path) -> None:
     try:
         found = path.lstat()
-    except FileNotFoundError:  # or removed, by the process that works there
+    except FileNotFoundError:  # missing, or just removed by the process that works there
         return
     refuse_if(
         not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)),
@@ -159,19 +159,19 @@ def _refuse_link(path: Path) -> None:
 
 
 def note_failure(run_dir: Path, error: Exception) -> None:
-    """Write the error of a run of a sweep into its folder, unless another run is there."""
+    """Write the error of a sweep's run into its folder, unless another run occupies the folder."""
     if not isinstance(error, OccupiedError):
         with suppress(OSError), replaced_file(run_dir / FAILURE) as new:  # the disk may be full
             new.write_text(f"{sentence(error)}\n")
 
 
 def remove_empty(folder: Path, notes: Sequence[str], is_sweep: bool) -> None:
-    """Remove the folder of a run in which there is nothing but notes, or that of a sweep of such runs alone.
+    """Remove the folder of a run if it holds only notes, or the folder of a sweep if it holds only such runs.
 
     Args:
         folder: the folder.
         notes: names of Hydra's notes in the folder of a run.
-        is_sweep: whether it is a sweep's.
+        is_sweep: whether it is the folder of a sweep.
     """
     logging.shutdown()
     names = {LOCK, FAILURE, *notes}
@@ -185,7 +185,7 @@ def remove_empty(folder: Path, notes: Sequence[str], is_sweep: bool) -> None:
 
 
 def noted_command(run_dir: Path) -> list[str]:
-    """Return the words of the command that began a run, folders of config files first; empty if Hydra noted none."""
+    """Return the words of a run's command, the words with folders of configs first; empty if Hydra noted none."""
     try:
         words = read_note(run_dir, "hydra.yaml")["hydra"]["overrides"]["hydra"]
     except (KeyError, TypeError):
@@ -199,10 +199,10 @@ def _texts(values) -> list[str]:
 
 
 def changed_values(run_dir: Path, cfg: DictConfig) -> list[str]:
-    """Return the values, as ``key=value``, in which a config differs from the one with which its run began.
+    """Return the values of a config, as ``key=value``, that have changed since its run began.
 
-    Nothing in the note is resolved. An interpolation that checkpoints do not keep, such as of a variable of the
-    environment, is taken as unchanged.
+    Nothing in Hydra's note is resolved. An interpolation that checkpoints do not keep, such as of an environment
+    variable, counts as unchanged.
     """
     if not isinstance(began := read_note(run_dir, "config.yaml"), dict):
         return []
@@ -219,7 +219,7 @@ def changed_values(run_dir: Path, cfg: DictConfig) -> list[str]:
 
 
 class _NoteLoader(yaml.SafeLoader):
-    """A loader without aliases, which Hydra does not write: a few of them unfold to more than any memory holds."""
+    """A loader that refuses aliases. Hydra writes none, and a few of them can unfold to more than any memory holds."""
 
     def compose_node(self, parent, index):
         if self.check_event(yaml.AliasEvent):
@@ -228,8 +228,8 @@ class _NoteLoader(yaml.SafeLoader):
 
 
 def read_note(run_dir: Path, name: str):
-    """Return the content of a note of Hydra's, such as ``config.yaml``, unresolved; None if it cannot be read."""
+    """Return the unresolved content of one of Hydra's notes, such as ``config.yaml``; None if it cannot be read."""
     try:
         return yaml.load(read_file(Path(run_dir) / ".hydra" / name, MAX_NOTE), _NoteLoader)
-    except Exception:  # of any type: PyYAML's constructors do not check what they read
+    except Exception:  # any type, as PyYAML's constructors do not check what they read
         return None

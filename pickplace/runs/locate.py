@@ -1,4 +1,4 @@
-"""Where checkpoints are, and the facts of one: what a command can know of it before it imports torch."""
+"""Find checkpoints and read their facts, without torch."""
 
 import json
 from pathlib import Path
@@ -14,20 +14,20 @@ MAX_BYTES = {FACTS: 2**25, TENSORS: 2**32}  # greatest size of each file
 
 
 class CheckpointError(ValueError):
-    """A checkpoint is missing or damaged, or does not fit; the message is one sentence."""
+    """Error of a checkpoint that is missing, damaged or does not fit; the message is one sentence."""
 
 
 def locate(path, prefer: str = "best", key: str | None = None) -> Path:
-    """Return the checkpoint folder that a user means.
+    """Return the checkpoint folder at a path that a user gives.
 
     Args:
         path: a run folder (then its ``checkpoints/<prefer>``), a checkpoint, or ``pretrained/<name>``: weights that
             the package ships, unless the working directory has a folder of that name.
-        prefer: ``"best"``; or ``"last"`` to resume a run, from ``best`` if it was killed before its first ``last``.
+        prefer: ``"best"``; or ``"last"`` to resume a run. A run killed before its first ``last`` resumes from ``best``.
         key: the setting that names the path, for messages; None: ``checkpoint``, or ``resume`` with ``"last"``.
 
     Raises:
-        CheckpointError: if there is none.
+        CheckpointError: if there is no checkpoint.
     """
     key = key or ("resume" if prefer == "last" else "checkpoint")
     parts = Path(path).parts
@@ -62,6 +62,6 @@ def read_facts(path, prefer: str = "best") -> dict:
 
 
 def are_facts(facts) -> bool:
-    """Return whether the content of a ``state.json`` has frames and a config."""
+    """Return whether the content of a ``state.json`` has valid frames and a config."""
     frames: Any = facts.get("frames") if isinstance(facts, dict) else None
     return is_whole(frames) and 0 <= frames < 2**63 and isinstance(facts.get("config"), dict)

@@ -21,13 +21,13 @@ log = logging.getLogger(__name__)
 class CsvLogger:
     """A table, ``metrics.csv``: a row for each batch, a column ``frames``, and a column for each metric.
 
-    A new metric adds a column. On resume, rows after the checkpoint, which a killed run may have left, are dropped.
-    A table that is deleted or replaced meanwhile is written again, with all rows.
+    A new metric adds a column. A killed run may have left rows after its checkpoint; a resume drops them. A table that
+    is deleted or replaced during training is written again, with all rows.
 
     Args:
         folder: the run folder.
         frames: frames trained so far; 0 for a new run.
-        settings: the run's config, for backends that show it beside the curves.
+        settings: the run's config, for backends that show it with the curves.
     """
 
     def __init__(self, folder, frames: int = 0, settings: dict | None = None):
@@ -41,7 +41,7 @@ class CsvLogger:
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
             writer.writerows(rows)
-        self._file: IO[str] = self.path.open("a+", newline="")  # it can be read when its name is gone
+        self._file: IO[str] = self.path.open("a+", newline="")  # readable, also after its name is gone
         self._writer = csv.DictWriter(self._file, self._columns)
 
     def log(self, metrics: dict[str, float], frames: int) -> None:
@@ -65,7 +65,7 @@ class CsvLogger:
             return read_rows(self.path, file.read())
 
     def _restore(self) -> None:
-        """Write the table again, with a warning, if its path no longer leads to the open file, or if that was cut."""
+        """Write the table again, with a warning, if its path no longer leads to the open file, or the file was cut."""
         ours = os.fstat(self._file.fileno())
         with suppress(FileNotFoundError):
             if os.path.samestat(ours, self.path.stat()) and ours.st_size >= self._file.tell():
@@ -83,13 +83,13 @@ class CsvLogger:
 
 
 class BackendLogger(CsvLogger):
-    """A backend beside the table; subclasses state how to send metrics as ``_send``, to end a run as ``_end_run``.
+    """A backend beside the table. Subclasses define ``_send``, which sends metrics, and ``_end_run``, which ends a run.
 
-    A resumed run continues under the run's id, if the backend has ids; the run folder keeps it in a file.
+    A resumed run keeps its id, if the backend has ids; a file in the run folder stores it.
 
     Args:
         folder, frames: as in `CsvLogger`.
-        id_file: the name of that file.
+        id_file: name of this file.
     """
 
     _send: Callable[[dict[str, float], int], Any]
@@ -116,7 +116,7 @@ class TensorboardLogger(BackendLogger):
         with needs_extra("logger", "tensorboard"):
             from torch.utils.tensorboard import SummaryWriter
         super().__init__(folder, frames)
-        # purge_step: TensorBoard hides events after the checkpoint of a resumed run.
+        # purge_step: TensorBoard hides the events that came after the checkpoint of a resumed run.
         events = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
 
         def send(metrics: dict[str, float], frames: int) -> None:
@@ -211,24 +211,24 @@ class NoLogger:
         pass
 
     def log(self, metrics: dict[str, float], frames: int) -> None:
-        """Forget the metrics."""
+        """Do nothing."""
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing: no file is open."""
 
 
 def read_csv(path) -> list[dict[str, float]]:
-    """Return the complete rows of a ``metrics.csv`` as numbers; errors as of :func:`read_rows`."""
+    """Return the complete rows of a ``metrics.csv`` as numbers; see :func:`read_rows` for errors."""
     numbers = ({key: float(value) for key, value in row.items()} for row in read_rows(path))
     return [row | {"frames": int(row["frames"])} for row in numbers]
 
 
 def read_rows(path, text: str | None = None) -> list[dict[str, str]]:
-    """Return the complete rows of a ``metrics.csv`` as they are written, 4 or 4.0; empty cells are left out.
+    """Return the complete rows of a ``metrics.csv`` as text, such as 4 or 4.0; empty cells are left out.
 
     Args:
         path: the file.
-        text: its content, if it is read already.
+        text: its content, if it was read before; None: it is read now.
 
     Raises:
         ValueError: naming file and line, for a cell that is no number.

@@ -1,4 +1,4 @@
-"""Origin of a result: versions, commit, and what a training began with."""
+"""Origin of a result: versions, commit, and the start of a training."""
 
 import platform
 import subprocess
@@ -26,7 +26,7 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """Return the commit of the checkout that the package runs from, ``+`` if files outside docs/ are modified.
+    """Return the commit of the checkout that the package runs from, with ``+`` if files outside docs/ are modified.
 
     None without a checkout.
     """
@@ -44,11 +44,11 @@ def commit() -> str | None:
 
 
 def first_steps(cfg: dict) -> dict[str, str | None]:
-    """Return what a run with this saved config, unchecked, began with.
+    """Return the start of a run, from its saved config, which may be invalid.
 
     Returns:
-        ``warm_start``, the name of the planner that it imitated first, and ``first_weights``, the checkpoint with whose
-        weights it began, or None.
+        ``warm_start``, the name of the planner that the run imitated first, and ``first_weights``, the path of the
+        checkpoint with its first weights; None without one.
     """
     warm_start = _group(cfg, "warm_start")
     name = _group(warm_start, "teacher").get("_target_") if warm_start.get("frames") else None

@@ -1,4 +1,4 @@
-"""How a training is stopped and resumed: stop requests, the checkpoint to resume from, and what may change then."""
+"""Stop and resume a training: stop requests, the checkpoint to resume from, and the settings that may change."""
 
 import json
 import logging
@@ -26,24 +26,24 @@ FACT_TYPES = {
     "commit": str | None, "versions": dict,
 }  # fmt: skip
 
-#: Settings that may leave the run folder or the machine, and their values that do not. The user must repeat others on
-#: resume.
+#: Settings that may write outside the run folder or the machine, and their values that do not. The user must repeat
+#: other values on resume.
 LOCAL_VALUES = {
     "collector.address": ("local", None),
     "logger.uri": ("null", None),
     "logger.offline": ("true", True, None),
 }
 
-#: Settings that a resumed run cannot change, as all of ``env``, since the state of its episodes depends on them.
+#: Settings that a resumed run cannot change, and so all of ``env``: the state of its episodes depends on them.
 FIXED_KEYS = (
     "seed", "items", "model.mask_infeasible", "collector.workers", "curriculum.levels", "warm_start.weights",
 )  # fmt: skip
 
 
 def checkpoint_config(cfg: DictConfig) -> tuple[dict, str]:
-    """Return the config as checkpoints hold it, and the words to repeat on resume, such as `` trust=[my_models]``.
+    """Return the config as checkpoints store it, and the words to repeat on resume, such as `` trust=[my_models]``.
 
-    A config that could be saved but not be loaded again causes a warning now, not after hours.
+    Warn now, not after hours, if the config can be saved but not loaded again.
     """
     content = saved_form(cfg)
     own = modules_to_trust(OmegaConf.to_container(cfg, resolve=True))
@@ -60,21 +60,21 @@ def _remote_values(cfg: DictConfig) -> list[tuple]:
 
 
 def resumed_place(overrides: list[str]) -> tuple[str, list[str]]:
-    """Return what ``resume=`` names among the words of a command line, and the other words."""
+    """Return the value of ``resume=`` among the words of a command line, and the other words."""
     words = [word for word in overrides if not word.startswith("resume=")]
     return next(word.partition("=")[2] for word in overrides if word not in words), words
 
 
 def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
-    """Return a checkpoint's config with overrides of values on top.
+    """Return a checkpoint's config with overrides of values applied.
 
     Args:
-        place: what the user resumes, for messages.
+        place: the run folder or checkpoint that the user resumes, for messages.
         facts: as :func:`pickplace.runs.checkpoint.read` returns them.
         overrides: the command line without ``resume=``.
 
     Raises:
-        ValueError: for a checkpoint that no training wrote, or a change that a resumed run cannot follow.
+        ValueError: for a checkpoint that no training wrote, or a change that a resumed run cannot make.
     """
     _check_facts(place, facts)
     given = parse(overrides)
@@ -132,9 +132,9 @@ def _check_facts(place: str, facts: dict) -> None:
 
 
 def interrupted_run(cfg: DictConfig, run_dir: Path) -> tuple[dict, dict, Path] | None:
-    """Return the checkpoint from which a run with this very config goes on in its folder, or None for a new run.
+    """Return the checkpoint of an interrupted run with exactly this config in its folder; None for a new run.
 
-    That is a job of a sweep that a scheduler stopped and starts again.
+    Such a run is a job of a sweep that a scheduler stopped and starts again.
 
     Returns:
         The checkpoint's state, facts and folder.
@@ -155,38 +155,38 @@ def interrupted_run(cfg: DictConfig, run_dir: Path) -> tuple[dict, dict, Path] |
 
 
 def stale_best_frames(run_dir: Path, frames: int, config: dict) -> int | None:
-    """Return the frames of a run's ``best`` if it is of later frames than ``frames`` and of another config, or None.
+    """Return the frames of a run's ``best`` if it is later than ``frames`` and has another config; else None.
 
-    A run that goes on from ``frames`` with this config may never reach that policy.
+    A run that goes on from ``frames`` with this config may never reach the policy of that ``best``.
 
     Args:
         run_dir: the run folder.
         frames: frames trained so far.
-        config: the settings from now on, in the form that checkpoints hold.
+        config: the settings from now on, in the form that checkpoints store.
     """
     facts = read_facts(run_dir)
     return facts["frames"] if facts and facts["frames"] > frames and not has_config(facts, config) else None
 
 
 def has_config(facts: dict, config: dict) -> bool:
-    """Return whether a checkpoint is of this config, given in the form that checkpoints hold."""
+    """Return whether a checkpoint has this config, given in the form that checkpoints store."""
     return facts["config"] == json.loads(json.dumps(config))
 
 
 def is_validated_alike(facts: dict, config: dict) -> bool:
-    """Return whether a checkpoint's best was measured as this config, in the form that checkpoints hold, says."""
+    """Return whether a checkpoint's best was validated by the settings of a config, in the form of checkpoints."""
     now = json.loads(json.dumps(config))
     return all(facts["config"].get(group) == now.get(group) for group in ("evaluation", "planner"))
 
 
-#: Signals after which a training saves and ends: Ctrl-C, a scheduler's, and that of a closed terminal.
+#: Signals after which a training saves and ends: from Ctrl-C, from a scheduler, and from a closed terminal.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequest:
-    """A signal to stop: the loop finishes its batch and saves. Ctrl-C after it ends the process at once.
+    """A request to stop, by a signal: the loop finishes its batch and saves. A later Ctrl-C ends the process at once.
 
-    A closed terminal is ignored if it was before, as under ``nohup``.
+    A closed terminal is ignored if it was ignored before, as under ``nohup``.
 
     Attributes:
         signal: number of the first signal; None: there was none.
@@ -201,7 +201,7 @@ class StopRequest:
     def _request(self, number, frame):
         if self.signal and number == signal.SIGINT:
             os._exit(130)
-        if not self.signal:  # a terminal sends several
+        if not self.signal:  # a terminal may send several
             self.signal = number
             log.warning("stopping after this batch; Ctrl-C stops at once")
 
@@ -214,12 +214,12 @@ class StopRequest:
 def checkpoint_hint(
     latest: Callable[[], Path | None], arguments: str = "", errors: type[Exception] = Exception
 ) -> AbstractContextManager:
-    """Add to an error that ends a training the command that resumes it.
+    """Add the command that resumes a training to the error that ends it.
 
     Args:
         latest: returns the folder of the latest whole checkpoint, or None.
-        arguments: further words of that command, such as `` trust=[my_models]``.
-        errors: the type of errors to which it is added.
+        arguments: further words of this command, such as `` trust=[my_models]``.
+        errors: type of the errors to which the command is added.
     """
 
     def hinted(error: Exception) -> Exception:

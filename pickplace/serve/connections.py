@@ -1,11 +1,11 @@
-"""Connections of ``pickplace-serve``: their number is limited, and so is the time that each waits for its client."""
+"""Limit the number of connections of ``pickplace-serve``, and the time that each may wait for its client."""
 
 from fastapi.responses import JSONResponse
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-CONNECTIONS = 32  # at a time; each may hold one request in memory
+CONNECTIONS = 32  # greatest number at a time; each may hold one request in memory
 CLIENT_SECONDS = 10  # time that a client has to send the headers of a request, or to read an answer
-CHECKS = 10  # in that time
+CHECKS = 10  # number of checks in that time
 
 CROWDED = JSONResponse(
     {"error": f"more than {CONNECTIONS} requests are open; expected the next one after 1 s."},
@@ -21,17 +21,16 @@ AMBIGUOUS = JSONResponse(
 
 
 class Connection(H11Protocol):
-    """One connection, which ends where its client takes too long: uvicorn alone waits for headers without end.
+    """One connection, which ends if its client takes too long: uvicorn alone waits for headers without end.
 
-    Of more than :data:`CONNECTIONS` the one ends whose client has kept the service waiting the longest: idle ones keep
-    nobody out. If the service has yet to answer all of them, the new one gets the answer 503, in JSON: uvicorn's own
-    limit answers in plain text. The time that a client has for a body is limited where the body is read, and a plan may
-    take until its deadline.
+    With more than :data:`CONNECTIONS`, the service ends the connection whose client has kept it waiting the longest, so
+    that idle ones keep nobody out. If it has yet to answer all of them, the new one gets the answer 503, in JSON;
+    uvicorn's own limit answers in plain text. The time for a body is limited where it is read. A plan has its deadline.
     """
 
     def connection_made(self, transport) -> None:
         super().connection_made(transport)
-        transport.set_write_buffer_limits(0)  # so that writing pauses as soon as the client reads too slowly
+        transport.set_write_buffer_limits(0)  # pause writing as soon as the client reads too slowly
         self.app = _refuse_ambiguous(self.config.loaded_app)
         self.since = self.loop.time()  # when the connection was made, or its last answer written
         if len(self.connections) > CONNECTIONS:
@@ -44,7 +43,7 @@ class Connection(H11Protocol):
 
     @property
     def is_clients_move(self) -> bool:
-        """Whether the client has to send a request, or to read an answer, before anything else happens."""
+        """Whether the service waits for the client: to send a request, or to read an answer."""
         return self.cycle is None or self.cycle.response_complete or self.flow.write_paused
 
     def on_response_complete(self) -> None:
@@ -57,7 +56,7 @@ class Connection(H11Protocol):
         self.transport.abort()
 
     def _check(self, last_cycle, waits: int) -> None:
-        """End the connection if it was the client's move at each of the last checks, with no request between them."""
+        """End the connection if it waited for its client at each of the last checks, with no request between them."""
         waits = waits + 1 if self.is_clients_move and self.cycle is last_cycle else 0
         if waits > CHECKS:
             self.end()

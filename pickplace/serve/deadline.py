@@ -1,4 +1,4 @@
-"""A limit on the time that an answer takes, and the cancellation of a plan that nobody waits for any more."""
+"""Limit the time that an answer may take, and cancel a plan that nobody waits for any more."""
 
 import ctypes
 import threading
@@ -6,22 +6,22 @@ import time
 
 
 class Interrupt(BaseException):
-    """Ends a plan. Not an ``Exception``: code of a user's own planner must not take it for a fault of its own."""
+    """End of a plan. Not an ``Exception``: a user's planner must not catch it as an error of its own."""
 
 
 class Deadline:
-    """A context in which a thread ends once its time is up, or another thread has cancelled it.
+    """A limit on the time of a function call, which another thread can also cancel.
 
     The interpreter raises :class:`Interrupt` in the thread before its next instruction in Python. Planning is thousands
-    of short calls of torch, so that it ends within milliseconds; unlike a check in each call, this costs nothing.
+    of short calls of torch, so it ends within milliseconds. Unlike a check in each call, this costs nothing.
 
     Args:
-        seconds: from now on, not from the beginning of the context: waiting for one's turn counts.
+        seconds: time from now on, not from the start of the call: waiting in the queue counts.
     """
 
     def __init__(self, seconds: float):
         self.seconds, self._end = seconds, time.monotonic() + seconds
-        self._lock, self._thread = threading.Lock(), 0  # 0: none is in the context
+        self._lock, self._thread = threading.Lock(), 0  # 0: no thread runs a function
         self._is_cancelled = self._is_over = False
 
     def left(self) -> float:
@@ -29,7 +29,7 @@ class Deadline:
         return max(0.0, self._end - time.monotonic())
 
     def cancel(self) -> None:
-        """End the context, or let it not begin; from another thread."""
+        """End the call, or keep it from starting; another thread calls this."""
         self._is_cancelled = True
         self._interrupt()
 
@@ -40,23 +40,23 @@ class Deadline:
                 ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread), ctypes.py_object(Interrupt))
 
     def error(self) -> TimeoutError:
-        """Return the error of a context that was ended, in one sentence."""
+        """Return the error of a call that was ended, in one sentence."""
         if self._is_cancelled:
             return TimeoutError("cancelled: the client has left before its plan was ready.")
         return TimeoutError(f"no plan within {self.seconds:g} s; expected a greater deadline, or a faster planner.")
 
     def run(self, function):
-        """Return what a function returns.
+        """Call a function, and return its result.
 
         Raises:
-            TimeoutError: if the deadline comes before that, or has come before, or after a cancellation.
+            TimeoutError: if the deadline comes first or has passed already, or after a cancellation.
         """
         timer = threading.Timer(self.left(), self._interrupt)
         timer.daemon = True
         try:
             try:
-                # First, as up to Python 3.11 a thread that starts has the identity of the one that starts it: it would
-                # be interrupted instead, and waited for without end.
+                # Before the thread is noted: up to Python 3.11, a new thread has its parent's identity while it starts,
+                # so the timer would be interrupted instead, and then waited for without end.
                 timer.start()
                 with self._lock:
                     if self._is_over or not self.left():
@@ -66,11 +66,11 @@ class Deadline:
             finally:
                 with self._lock:
                     thread, self._thread = self._thread, 0
-                    if thread:  # what was to be raised, and was not yet, must not hit what the thread does next
+                    if thread:  # a pending Interrupt must not hit the thread's next task
                         ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), None)
                 timer.cancel()
         except Interrupt:
             with self._lock:
-                self._thread = 0  # if it came within the lines above
+                self._thread = 0  # if Interrupt came within the lines above
             timer.cancel()
             raise self.error() from None

@@ -1,7 +1,7 @@
-"""The decision log: every request with its plan and what made it, one line of JSON each; and its replay.
+"""The decision log: every request with its plan, one line of JSON each, and the planner that made them; its replay.
 
-A line that begins a service has ``start``: versions, planner, checkpoint and its checksum, and the cell. The lines
-after it have ``time``, ``seconds``, ``request``, with the settings that it did not state, and ``reply``.
+The first line of a service has ``start``: versions, planner, checkpoint and its checksum, and the cell. The lines after
+it have ``time``, ``seconds``, ``request``, completed by the default settings, and ``reply``.
 """
 
 import json
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 
 class DecisionLog:
-    """A file to which lines are appended; each is written at once, and the file may be moved away meanwhile.
+    """A file to which lines are appended. Each is written at once, and the file may be moved away meanwhile.
 
     Args:
         path: the file.
-        start: what is served, see :func:`what_is_served`.
+        start: facts of the service, see :func:`what_is_served`.
 
     Raises:
         OSError: if it cannot be written.
@@ -37,22 +37,22 @@ class DecisionLog:
         self._append()
 
     def add(self, request: PlanRequest | None, reply: dict, seconds: float) -> None:
-        """Append a request with all its settings, None if it could not be read, and its answer."""
+        """Append a request with all its settings (None if it could not be read) and its answer."""
         given = request and {key: value for key, value in vars(request).items() if value is not None}
         self._append({"time": time.time(), "seconds": round(seconds, 6), "request": given, "reply": reply})
 
     def _append(self, line: dict | None = None) -> None:
         with self._path.open("a") as file:
-            if self._is_new or file.tell() == 0:  # each file says what made its plans
+            if self._is_new or file.tell() == 0:  # each file names the planner of its plans
                 file.write(json.dumps({"start": self._start, "time": time.time()}) + "\n")
                 self._is_new = False
             if line is not None:
-                file.write(json.dumps(line, default=vars) + "\n")  # of boxes
+                file.write(json.dumps(line, default=vars) + "\n")  # `default` is for boxes
 
 
 def what_is_served(planner: "Planner", args) -> dict[str, Any]:
-    """Return what :func:`replay` needs to make the planner of a command line again."""
-    from pickplace.policies.restore import cell_settings  # here, so that --help need not wait for torch
+    """Return the facts from which :func:`replay` makes the planner of a command line again."""
+    from pickplace.policies.restore import cell_settings  # here, so that --help does not wait for torch
     from pickplace.runs.locate import read_facts
     from pickplace.runs.provenance import commit, versions
 
@@ -68,11 +68,11 @@ def replay(path: str, make) -> tuple[int, list[str]]:
 
     Args:
         path: the log.
-        make: makes the planner of the value of a ``start``.
+        make: makes a planner from the value of ``start``.
 
     Returns:
-        how many plans are the same, and a sentence for each that is not. Requests without a plan are left out, such as
-        those whose deadline came.
+        The number of equal plans, and a sentence for each plan that differs. Requests without a plan are left out, such
+        as those that passed their deadline.
 
     Raises:
         ValueError: naming the file and the line, for a line that no service wrote, or a planner that cannot be made
@@ -98,7 +98,7 @@ def replay(path: str, make) -> tuple[int, list[str]]:
 
 
 def _again(planner: "Planner", line: dict) -> Answer:
-    """Return the answer to the request of a line."""
+    """Answer the request of a line again."""
     beginning = {key: line["reply"][key] for key in ("id",) if key in line["reply"]}
     return solve(planner, PlanRequest.parse(line["request"], {}), beginning, Deadline(MAX_DEADLINE))
 

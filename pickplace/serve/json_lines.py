@@ -111,11 +111,11 @@ def run(args: argparse.Namespace) -> None:
 
 
 def replay_log(args: argparse.Namespace) -> None:
-    """Plan the requests of a decision log again, and write how many plans are the same and which are not.
+    """Plan the requests of a decision log again, and write the number of equal plans and the ones that differ.
 
     Raises:
-        ValueError: as of :func:`~pickplace.serve.decisions.replay`.
-        SystemExit: with the code 1, if a plan is not the same.
+        ValueError: see :func:`~pickplace.serve.decisions.replay`.
+        SystemExit: with the code 1, if a plan differs.
     """
     given = [args.checkpoint, args.planner, args.bin, args.tote, *(getattr(args, part) for part, *_ in PARTS)]
     refuse_if(
@@ -150,7 +150,7 @@ def replay_log(args: argparse.Namespace) -> None:
 
 
 def read_lines(stream: BinaryIO, most: int) -> Iterator[bytes]:
-    """Yield the lines of a stream; of a line longer than ``most`` bytes only the first ones, at once."""
+    """Yield the lines of a stream. A line longer than ``most`` bytes is cut, and yielded before its end is read."""
     while line := stream.readline(most + 1):
         yield line
         while len(line) > most and not line.endswith(b"\n"):
@@ -159,11 +159,11 @@ def read_lines(stream: BinaryIO, most: int) -> Iterator[bytes]:
 
 @contextmanager
 def latency(is_printed: bool) -> Iterator[None]:
-    """Print the time that something takes on standard error, if asked for."""
+    """Print the time that the block takes on standard error, if ``is_printed``."""
     start = time.perf_counter()
     yield
     if is_printed:
-        sys.stderr.write(f"planned in {(time.perf_counter() - start) * 1e3:.1f} ms\n")  # a line leaves at once
+        sys.stderr.write(f"planned in {(time.perf_counter() - start) * 1e3:.1f} ms\n")  # each line is written at once
 
 
 def read_map(path: str) -> np.ndarray:
@@ -171,11 +171,11 @@ def read_map(path: str) -> np.ndarray:
 
     Raises:
         ValueError: naming the file.
-        OSError: if there is none, or it cannot be read.
+        OSError: if the file is missing or cannot be read.
     """
     content = read_file(path, MAX_MAP, empty=False)
     with reworded(
-        Exception,  # of any type: numpy evaluates the header
+        Exception,  # any type, as numpy evaluates the header
         lambda _: ValueError(f"{path}: cannot be read; expected a .npy file with one array of numbers."),
     ):
         values = np.load(io.BytesIO(content), allow_pickle=False)

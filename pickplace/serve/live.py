@@ -1,4 +1,4 @@
-"""The live page of a service: the last plans in 3D, drawn as the replay page draws episodes."""
+"""The live page of a service: the last plans in 3D, in the style of the replay page."""
 
 import base64
 import hashlib
@@ -18,7 +18,7 @@ MOST_COLUMNS = 60  # greatest number of columns along a side of the tote that th
 
 
 def page(cell: CellSpec) -> str:
-    """Return the page of a service for a cell; it loads nothing but ``/plans`` of the service itself."""
+    """Return the page of a service for a cell; it loads only ``/plans`` of this service."""
     wide, deep, height = cell.bin_size
     data = {
         "bin": [wide, deep, height * cell.height_unit],
@@ -30,7 +30,7 @@ def page(cell: CellSpec) -> str:
 
 
 def content_policy(html: str) -> str:
-    """Return the ``Content-Security-Policy`` of a page: its own scripts run, and nothing else does."""
+    """Return the ``Content-Security-Policy`` of a page: only its own scripts may run."""
     digests = [hashlib.sha256(script.encode()).digest() for script in re.findall(r"(?s)<script>(.*?)</script>", html)]
     allowed = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     return (
@@ -40,14 +40,14 @@ def content_policy(html: str) -> str:
 
 
 def entry(cell: CellSpec, number: int, request: PlanRequest | None, reply: dict, seconds: float) -> dict:
-    """Return what the page shows of an answer, as plain values; lengths are in cells.
+    """Return the content of the page for an answer, as plain values; lengths are in cells.
 
     Args:
         cell: the sizes.
         number: of the answer, from 1.
         request: None if it could not be read.
         reply: a plan, or an error.
-        seconds: how long it took.
+        seconds: time that it took.
     """
     return {
         "number": number,
@@ -63,11 +63,11 @@ def entry(cell: CellSpec, number: int, request: PlanRequest | None, reply: dict,
 def _scene(cell: CellSpec, request: PlanRequest, plan: dict) -> dict:
     """Return the bin, the tote and the move of a plan; lengths in cells, angles in degrees."""
     side = request.cell_size
-    along, up = (1.0, cell.height_unit) if side is None else (1 / side, 1 / side)  # cells in a length
+    along, up = (1.0, cell.height_unit) if side is None else (1 / side, 1 / side)  # cells per unit of length
     height = cell.tote_size[2] * cell.height_unit if request.tote_height is None else request.tote_height * up
     sides = cell.tote_size[:2]
     heights, _ = patches(height - np.asarray(request.tote_depth, float) * up, sides, max(1, MOST_COLUMNS // max(sides)))
-    box, item = plan["box"], plan["item"]  # both None: of several items none is taken
+    box, item = plan["box"], plan["item"]  # both None if there are several items and none is taken
     if item and not box:
         box = {**item, "x": item["x"] + item["w"] / 2, "y": item["y"] + item["d"] / 2, "yaw": 0.0}
 

@@ -1,4 +1,4 @@
-"""Figures of a service for Prometheus: how many answers of which kind, and how long they took."""
+"""Metrics of a service for Prometheus: the number of answers of each kind, and the time that they took."""
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
@@ -36,9 +36,9 @@ class Metrics:
         self._answers.labels(str(http_status), plan_status).inc()
 
     def time(self, seconds: float) -> None:
-        """Note how long a plan took."""
+        """Record the time that a plan took."""
         self._seconds.observe(seconds)
 
     def text(self) -> bytes:
-        """Return the figures in the format of Prometheus."""
+        """Return the metrics in the format of Prometheus."""
         return generate_latest(self._registry)

@@ -1,4 +1,4 @@
-"""The options of ``pickplace-plan`` and ``pickplace-serve`` that say how to plan, and the planner that they name."""
+"""The options of planning, shared by ``pickplace-plan`` and ``pickplace-serve``, and the planner that they name."""
 
 import argparse
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pickplace.robot.planner import Planner
 
 MAX_PART = 2**24  # greatest size of a file with a part of the cell, in bytes
-#: Parts of the cell that the command line may choose: the key, what it is, an example.
+#: Parts of the cell that the command line may choose: key, meaning, example.
 PARTS = (
     ("gripper", "the end effector", "cup_round"),
     ("support", "the rule for stability", "bearing"),
@@ -26,7 +26,7 @@ PARTS = (
 
 
 def planner_options() -> dict[str, dict[str, Any]]:
-    """Return the options that say how to plan, which :func:`load_planner` reads; see :class:`Parser`."""
+    """Return the options of planning, which :func:`load_planner` reads, for :class:`Parser`."""
     of_requests = {
         f"--{key.name.replace('_', '-')}": {
             "type": key.metadata["option"], "metavar": "N", "default": key.default,
@@ -69,18 +69,18 @@ def planner_options() -> dict[str, dict[str, Any]]:
 
 
 def load_planner(args: argparse.Namespace, cell: dict | None = None) -> tuple["Planner", dict]:
-    """Return the planner that a command line names, and the settings of its requests unless they say otherwise.
+    """Return the planner that a command line names, and the default settings of requests.
 
     Args:
         args: the command line.
-        cell: settings of the cell, instead of those of the command line.
+        cell: settings of the cell, which replace the command line's.
 
     Raises:
         ValueError: for arguments or a checkpoint that cannot be used.
     """
     from pickplace.common.machine import use_threads
     from pickplace.config.allowlist import own_modules, refuse_foreign_targets
-    from pickplace.robot.planner import MAX_ALTERNATIVES, Planner  # here, so that --help need not wait for torch
+    from pickplace.robot.planner import MAX_ALTERNATIVES, Planner  # here, so that --help does not wait for torch
     from pickplace.rules.cell import CellSpec
 
     use_threads("--threads", args.threads)
@@ -107,33 +107,32 @@ def load_planner(args: argparse.Namespace, cell: dict | None = None) -> tuple["P
         )
         planner = Planner(CellSpec(**sizes), planner=decides)
     defaults = {key.name: getattr(args, key.name) for key in PLAN_OPTIONS}
-    PlanRequest(**defaults).scene()  # refuses settings now, not in the answer to each request
+    PlanRequest(**defaults).scene()  # refuse bad settings now, not in the answer to each request
     whole_number("--alternatives", args.alternatives, 0, MAX_ALTERNATIVES)
     number("--deadline", args.deadline, 0.001, MAX_DEADLINE, "seconds")
-    check_bytes("--planner", 0)  # refuses a bad limit on the memory now
+    check_bytes("--planner", 0)  # refuse a bad limit on the memory now
     return planner, defaults
 
 
 def plan_once(planner: "Planner") -> None:
-    """Plan for an item in an empty tote, so that the first request takes no longer than others, and a policy that
-    cannot decide is refused at the start.
+    """Plan once for an item in an empty tote: the first request then takes no longer, and a faulty policy fails early.
 
     Raises:
         FloatingPointError: for a policy whose scores are not finite.
     """
-    from pickplace.robot.scene import Scene  # here, so that --help need not wait for torch
+    from pickplace.robot.scene import Scene  # here, so that --help does not wait for torch
 
     (wide, deep, _), sides = planner.cell.bin_size, planner.cell.tote_size
     w, d, h = (1, 1, 1) if planner.training is None else min(planner.training.kinds)
     bin_depth, x, y = np.zeros((wide, deep), dtype=np.int64), (wide - w) // 2, (deep - d) // 2
     bin_depth[x : x + w, y : y + d] = h
-    with suppress(DepthMapError, TimeoutError):  # of a planner that serves no such item, or is slow
+    with suppress(DepthMapError, TimeoutError):  # the planner may not serve such an item, or be slow
         scene = Scene.from_maps(bin_depth, np.full(sides[:2], sides[2]))
         Deadline(DEADLINE).run(lambda: planner.plan(scene, alternatives=1))
 
 
 def read_planner(name: str | Mapping[str, Any] | None) -> str | Mapping[str, Any] | None:
-    """Return the settings of a planner from a file ``.yaml`` such as those of ``conf/planner``; a short name as it is.
+    """Return a planner's settings from a ``.yaml`` file like those in ``conf/planner``; return a short name as it is.
 
     Raises:
         ValueError: for a file that cannot be read, or holds no settings.
@@ -147,7 +146,7 @@ def read_planner(name: str | Mapping[str, Any] | None) -> str | Mapping[str, Any
 
 
 def read_part(key: str, name: str):
-    """Return a part of the cell that an option of ``conf/`` describes, or a file such as those there.
+    """Return a part of the cell from an option of ``conf/``, or from a file like those there.
 
     Args:
         key: ``gripper``, ``support`` or ``reach``.
@@ -167,7 +166,7 @@ def read_part(key: str, name: str):
 
 
 def _read_yaml(option: str, name: str, path, expected: str) -> Any:
-    """Return the content of a file that the value ``name`` of an option means; ``expected`` ends its errors."""
+    """Return the content of the file at ``path``, the value ``name`` of an option; ``expected`` ends its errors."""
     from yaml import YAMLError, safe_load  # here, so that --help is fast
 
     with reworded(

@@ -1,4 +1,4 @@
-"""A request for a plan: a line of ``pickplace-plan``, or the body of an HTTP request. Each key is stated here, once."""
+"""A request for a plan: a line of ``pickplace-plan``, or the body of an HTTP request. All keys are defined here."""
 
 import json
 import math
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pickplace.rules.cell import CellSpec
 
 MAX_REQUEST = 2**24  # greatest length of a request, in bytes, whatever the cell
-DEADLINE, MAX_DEADLINE = 10.0, 3600.0  # of an answer, in seconds
+DEADLINE, MAX_DEADLINE = 10.0, 3600.0  # default and greatest time until an answer, in seconds
 
 Map = list[list[float]]
 Labels = list[list[int]]
@@ -26,15 +26,15 @@ Labels = list[list[int]]
 
 @dataclass(frozen=True)
 class Limits:
-    """The greatest request for a cell: its maps, each with :data:`FINE` values along a cell, and some more."""
+    """Limits of a request for a cell: its maps, each with :data:`FINE` values along a cell, and some more."""
 
     size: int  # in bytes
-    lists: int  # brackets: each costs as much to read as a row of a map
+    lists: int  # number of lists: each costs as much to read as a row of a map
 
     FINE = 64  # pixels of 2 mm in a cell of 128 mm
     VALUE = 8  # bytes of a value, such as 0.1234 with a comma and a space
-    REST = 2**16  # bytes of all that is no map, such as boxes
-    OTHERS = 1_000  # lists that are no rows of maps
+    REST = 2**16  # bytes of everything but maps, such as boxes
+    OTHERS = 1_000  # number of lists that are not rows of maps
 
     @classmethod
     def of(cls, cell: "CellSpec") -> Self:
@@ -44,19 +44,19 @@ class Limits:
         return cls(min(MAX_REQUEST, cls.REST + cls.VALUE * values), cls.OTHERS + rows)
 
     def check(self, text: bytes) -> None:
-        """Refuse a text that is no request for the cell, before anything is made of it, with a ``ValueError``."""
+        """Refuse, with a ``ValueError``, a text with too many bytes or lists for the cell, before it is parsed."""
         refuse_if(len(text) > self.size, f"the request has more than {self.size:,} bytes; expected a shorter one.")
         at_most("the request has", text.count(b"["), "lists, rows of maps included", self.lists)
 
 
 def _key(description: str, default: Any = None, option: type | None = None) -> Any:
-    """Return a key of a request; with ``option``, a type, the command line can set it for all requests."""
+    """Define a key of a request; with ``option``, a type, the command line can set it for all requests."""
     return field(default=default, metadata={"description": description, "option": option})
 
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """A bin and a tote; without ``cell_size`` in whole cells and height units, else in metres.
+    """A bin and a tote; in metres with ``cell_size``, else in whole cells and height units.
 
     The bin and the tote have a frame each: its origin is the outer corner of cell (0, 0) on the inner floor, x runs
     along the first axis of a map, y along the second, z upwards.
@@ -110,8 +110,8 @@ class PlanRequest:
         """Return the request that an object in JSON states.
 
         Args:
-            given: its keys and values; a null is as good as no key.
-            defaults: values of keys that it does not have.
+            given: its keys and values; a null counts as a missing key.
+            defaults: values of missing keys.
 
         Raises:
             ValueError: naming the first key that is unknown or missing, or the first box with other keys.
@@ -140,16 +140,16 @@ class PlanRequest:
         """Return the scene that the request describes.
 
         Raises:
-            ValueError: as of :class:`~pickplace.robot.scene.Scene`.
+            ValueError: see :class:`~pickplace.robot.scene.Scene`.
         """
-        from pickplace.robot.scene import BinMap, Scene  # here, so that --help need not wait for torch
+        from pickplace.robot.scene import BinMap, Scene  # here, so that --help does not wait for torch
 
         settings = {key.name: getattr(self, key.name) for key in fields(Scene) if key.name not in ("items", "tote")}
         items = BinMap(self.bin_depth, self.bin_labels) if self.items is None else self.items
         return Scene(items, self.tote_depth, **settings)
 
     def plan(self, planner: "Planner") -> "Plan":
-        """Return the plan for the request; errors as of :meth:`Planner.plan`."""
+        """Return the plan for the request; see :meth:`Planner.plan` for errors."""
         return planner.plan(self.scene(), alternatives=self.alternatives, exclude=self.exclude or ())
 
 
@@ -161,7 +161,7 @@ def read_boxes(key: str, items) -> list[Box]:
     """Return the boxes of a request's ``items``, ``placed`` or ``coming``.
 
     Raises:
-        ValueError: naming the first one with other keys.
+        ValueError: naming the first box with other keys.
     """
     boxes = []
     for at, item in enumerate(items if isinstance(items, list) else [items]):
@@ -173,7 +173,7 @@ def read_boxes(key: str, items) -> list[Box]:
 
 
 def parse_json(text: bytes) -> dict:
-    """Return the object that a request's text holds, whatever its keys.
+    """Return the object in a request's text; its keys are not checked.
 
     Raises:
         ValueError: for a text that is no object in JSON, or has a key twice.
@@ -192,16 +192,16 @@ def parse_json(text: bytes) -> dict:
 
 
 def finite_float(text: str) -> float:
-    """Return a number of a JSON text; refuse NaN, Infinity and 1e999, which Python reads and JSON does not have."""
+    """Return a number of a JSON text; refuse NaN, Infinity and 1e999, which Python accepts."""
     if math.isfinite(value := float(text)):
         return value
     raise ValueError(f"the request is not JSON: got {text[:20]}, expected a finite number.")
 
 
 def read_request(text: bytes, limits: Limits, defaults: dict) -> tuple[int, dict, PlanRequest | None]:
-    """Return the request that a text states, with the status 200 and the beginning of its reply, the ``id``.
+    """Return the HTTP status 200, the beginning of the reply with the ``id``, and the request that a text states.
 
-    Of a bad one: the status in HTTP, ``{"error": ...}`` in one sentence, and None.
+    For a bad request: the HTTP status, ``{"error": ...}`` in one sentence, and None.
     """
     status, reply = 400, {}
     try:
@@ -216,13 +216,13 @@ def read_request(text: bytes, limits: Limits, defaults: dict) -> tuple[int, dict
 class Answer(NamedTuple):
     """An answer to a request."""
 
-    status: int  # in HTTP
+    status: int  # HTTP status
     reply: dict  # a plan, or ``{"error": ...}`` in one sentence; with the request's ``id``
-    text: str  # the same as JSON
+    text: str  # the reply as JSON
 
 
 def solve(planner: "Planner", request: PlanRequest, reply: dict, deadline: Deadline) -> Answer:
-    """Return the answer to a request: its ``reply`` so far with a plan, or with an error."""
+    """Return the answer to a request: the beginning of its ``reply``, completed by a plan or an error."""
     try:
         reply = {**reply, **deadline.run(lambda: request.plan(planner)).as_dict()}
         return Answer(200, reply, to_json(reply))
@@ -236,7 +236,7 @@ def to_json(reply: dict, **settings) -> str:
     """Return a plan as JSON.
 
     Raises:
-        FloatingPointError: for a number that JSON does not have. Only weights that no training made lead to one.
+        FloatingPointError: for a number that is not finite, which comes only from weights that no training made.
     """
     with reworded(
         ValueError,
@@ -246,7 +246,7 @@ def to_json(reply: dict, **settings) -> str:
 
 
 def answer(planner: "Planner", text: bytes, defaults: dict) -> Answer:
-    """Return the answer to a line."""
+    """Return the answer to a line of ``pickplace-plan``."""
     status, reply, request = read_request(text, Limits.of(planner.cell), defaults)
     if request is None:
         return Answer(status, reply, json.dumps(reply))

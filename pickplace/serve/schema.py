@@ -1,4 +1,4 @@
-"""What the OpenAPI description says of requests and plans: units, frames and examples."""
+"""OpenAPI schemas of requests and plans: units, frames and examples."""
 
 import inspect
 import re
@@ -35,7 +35,7 @@ def request_schema() -> dict[str, dict]:
 
 
 def with_comments(schemas: dict[str, dict]) -> None:
-    """Describe each part of a plan by the comment at its field, from which the reference in the docs is made, too."""
+    """Describe each field of a plan by its comment; the reference in the docs is made from the same comments."""
     for part in (Plan, Pose, Alternative, Box):
         schema = schemas[part.__name__]
         schema["description"] = " ".join(f"{inspect.getdoc(part)} {FRAME}".replace("``", "").split())
@@ -44,7 +44,7 @@ def with_comments(schemas: dict[str, dict]) -> None:
 
 
 def comments(part: type) -> dict[str, str]:
-    """Return the ``#:`` comments of a dataclass, before or behind its fields, by their names."""
+    """Return the ``#:`` comments of a dataclass, before or behind its fields, by the fields' names."""
     found: dict[str, str] = {}
     before: list[str] = []
     for line in inspect.getsource(part).splitlines():

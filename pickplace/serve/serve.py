@@ -11,8 +11,8 @@ from pickplace.common.validate import excerpt, number, refuse_if, short_text, wh
 from pickplace.serve.decisions import DecisionLog, what_is_served
 from pickplace.serve.options import load_planner, plan_once, planner_options
 
-TOKEN = "PICKPLACE_TOKEN"  # the environment variable; a command line can be read by every user of the machine
-LEAST_TOKEN = 16  # letters
+TOKEN = "PICKPLACE_TOKEN"  # an environment variable, as every user of the machine can read a command line
+LEAST_TOKEN = 16  # fewest letters
 
 
 @one_sentence()
@@ -80,9 +80,9 @@ def run(args: argparse.Namespace) -> None:
     plan_once(planner)
     log = None if args.log is None else DecisionLog(args.log, what_is_served(planner, args))
     host = f"[{args.host}]" if ":" in args.host else args.host
-    # The names by which clients may call the service. A page of a stranger that has its name lead to this machine (DNS
-    # rebinding) calls it by another. Where the service listens at all addresses and no name is given, any will do: the
-    # token, which the page lacks, is asked for anyway.
+    # The names by which clients may call the service. A foreign page whose name leads to this machine (DNS rebinding)
+    # uses another name. If the service listens at all addresses and no name is given, any name is accepted: the token
+    # is needed anyway, and the page lacks it.
     is_any = args.host in ("0.0.0.0", "::") and not args.allow_host
     hosts = ["*"] if is_any else ["localhost", "127.0.0.1", "[::1]", host, *args.allow_host]
     name = args.planner or "policy"
@@ -113,7 +113,7 @@ def is_local(host: str) -> bool:
 
 
 def checked_token(host: str) -> str | None:
-    """Return the token that clients must send, None if this machine alone is served and there is none.
+    """Return the token that clients must send; None if there is no token and only this machine is served.
 
     Raises:
         ValueError: for another host without a token, or a token that is too short or no ASCII.

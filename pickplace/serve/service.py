@@ -33,19 +33,19 @@ from pickplace.serve.metrics import Metrics
 from pickplace.serve.request import Answer, Limits, PlanRequest, read_request, solve
 from pickplace.serve.schema import request_schema, with_comments
 
-MAX_WAITING = 16  # requests whose body is read, or that wait for their turn
+MAX_WAITING = 16  # greatest number of requests whose body is read, or that wait for their turn
 BODY_SECONDS = 30  # time that a client has to send its request
 
 
 class Refusal(BaseModel):
-    """Why a request has no plan, in one sentence."""
+    """The reason for which a request has no plan, in one sentence."""
 
     error: str
     id: object = None
 
 
 class Health(BaseModel):
-    """The version of the service, and the planner and the cell that it answers for."""
+    """The version of the service, its planner and its cell."""
 
     status: str
     version: str
@@ -55,7 +55,7 @@ class Health(BaseModel):
 
 
 class Ready(BaseModel):
-    """That the service takes requests, and how many it has taken and not yet answered."""
+    """Confirmation that the service takes requests, and the number of requests that it has yet to answer."""
 
     status: str
     waiting: int
@@ -64,10 +64,10 @@ class Ready(BaseModel):
 class Rate:
     """A budget of plans, which fills up evenly.
 
-    A request whose body is refused has spent its plan: a client could send wrong ones without end otherwise.
+    A request whose body is refused costs a plan, too: otherwise a client could send bad ones without end.
 
     Args:
-        per_minute: plans a minute, and as many at once.
+        per_minute: greatest number of plans a minute; all of them may come at once.
     """
 
     def __init__(self, per_minute: float):
@@ -75,7 +75,7 @@ class Rate:
         self.full_at = 0.0  # the time at which the budget is full again
 
     def take(self) -> float:
-        """Take one plan and return 0, or the seconds after which there is one."""
+        """Take one plan and return 0; if the budget is empty, return the seconds until the next plan."""
         now = time.monotonic()
         full_at = max(now, self.full_at) + self.seconds
         if (wait := full_at - now - 60) > 1e-6:
@@ -85,12 +85,12 @@ class Rate:
 
 
 class Service:
-    """The planner, one request at a time in a thread of its own, and the last answers.
+    """The planner, which serves one request at a time in a thread of its own, and the last answers.
 
     Args:
         planner, defaults: as :func:`pickplace.serve.options.load_planner` returns them.
-        history: how many answers are kept.
-        log: of all answers; None: there is none.
+        history: number of answers that are kept.
+        log: log of all answers; None: no log.
     """
 
     def __init__(self, planner: Planner, defaults: dict, history: int, log: DecisionLog | None):
@@ -102,9 +102,9 @@ class Service:
         self.history: deque[dict] = deque(maxlen=history)
 
     async def answer(self, body: bytes, wait_for_client: Callable[[], Awaitable]) -> Answer:
-        """Return the answer to a request; ``wait_for_client`` ends when the client leaves, and so does the plan then.
+        """Return the answer to a request. ``wait_for_client`` ends when the client leaves, which cancels the plan.
 
-        Bodies are read in other threads than plans are computed in, so that a deadline counts from the beginning.
+        Bodies are parsed in other threads than plans are computed in, so that a deadline includes the waiting.
         """
         status, reply, request = await asyncio.to_thread(read_request, body, self.limits, self.defaults)
         if request is None:
@@ -122,7 +122,7 @@ class Service:
             gone.cancel()
 
     def plan(self, request: PlanRequest, reply: dict, deadline: Deadline) -> Answer:
-        """Return the answer to a request that could be read; only the worker calls it."""
+        """Return the answer to a request that was read without error; only the worker calls this."""
         start = time.perf_counter()
         found = solve(self.planner, request, reply, deadline)
         seconds = time.perf_counter() - start
@@ -131,21 +131,21 @@ class Service:
         return found
 
     def note(self, request: PlanRequest | None, found: Answer, seconds: float) -> None:
-        """Keep an answer for the page, the figures and the log."""
+        """Record an answer for the page, the metrics and the log."""
         entry = live.entry(self.planner.cell, 0, request, found.reply, seconds)
-        with self.lock:  # two threads come here
+        with self.lock:  # two threads may call this
             self.metrics.count(found.status, found.reply.get("status", ""))
             if self.log is not None:
                 self.log.add(request, found.reply, seconds)
             self.history.append({**entry, "number": self.count + 1})
-            self.count += 1  # now: who knows of a number finds its answer
+            self.count += 1  # last, so that each number that a reader sees has its answer
 
 
 async def read_body(request: Request, most: int) -> bytes:
     """Return the body of a request.
 
     Raises:
-        HTTPException: 413 for more than ``most`` bytes, 408 for a client that is too slow, 400 for one that
+        HTTPException: 413 for more than ``most`` bytes, 408 for a client that is too slow, 400 for a client that
             leaves.
     """
     body = bytearray()
@@ -157,7 +157,7 @@ async def read_body(request: Request, most: int) -> bytes:
                     raise HTTPException(413, f"the body has more than {most:,} bytes; expected a shorter one.")
     except TimeoutError as error:
         raise HTTPException(408, f"the body took more than {BODY_SECONDS} s; expected a faster one.") from error
-    except ClientDisconnect as error:  # nobody reads the answer, but it is no fault of the service
+    except ClientDisconnect as error:  # nobody reads this answer, but it must not count as 500
         raise HTTPException(400, "the connection ended within the body; expected a whole one.") from error
     return bytes(body)
 
@@ -177,12 +177,12 @@ def make_app(
 
     Args:
         planner, defaults: as :func:`pickplace.serve.options.load_planner` returns them.
-        name, checkpoint: what decides, for ``/health``.
-        token: what clients must send as ``Authorization: Bearer <token>``; None: nothing.
-        rate: most plans a minute.
-        history: answers that the page shows.
-        hosts: names by which clients may call it, ``"*"``: any.
-        log: to which all answers are appended; None: none.
+        name, checkpoint: names of the planner and its checkpoint, for ``/health``.
+        token: sent by clients as ``Authorization: Bearer <token>``; None: not needed.
+        rate: greatest number of plans a minute.
+        history: number of answers that the page shows.
+        hosts: names by which clients may call the service; ``"*"``: any.
+        log: log to which all answers are appended; None: no log.
     """
     service, budget = Service(planner, defaults, history, log), Rate(rate)
     reach = node_of("env.reach", planner.cell.reach)
@@ -203,7 +203,7 @@ def make_app(
         service.worker.shutdown(wait=False, cancel_futures=True)
 
     async def check_host(request: Request) -> None:
-        # Not Starlette's TrustedHostMiddleware, whose answer is plain text.
+        # Starlette's TrustedHostMiddleware would answer in plain text.
         host = request.headers.get("host", "")
         if "*" not in hosts and re.sub(r":\d*$", "", host).lower() not in map(str.lower, hosts):
             raise HTTPException(400, f"Host: got {excerpt(host)}; expected a name of this service, see --allow-host.")
@@ -247,12 +247,12 @@ def make_app(
     async def plan(request: Request):
         """Plan one pick and one place. The body is a line of ``pickplace-plan``, and so is the answer."""
         if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-            # A page of a stranger can send forms and plain text without asking, but no JSON.
+            # A foreign page can send forms and plain text without permission, but no JSON.
             raise HTTPException(415, "Content-Type: expected application/json.")
         if seconds := math.ceil(1 if service.waiting >= MAX_WAITING else budget.take()):
             detail = f"too many plans are asked for; expected the next request after {seconds} s."
             raise HTTPException(429, detail, {"Retry-After": str(seconds)})
-        service.waiting += 1  # from now on: reading a slow body takes up a place, too
+        service.waiting += 1  # before reading: a slow body takes up a place, too
         try:
             service.metrics.waiting.set(service.waiting)
             body = await read_body(request, service.limits.size)
@@ -264,33 +264,33 @@ def make_app(
 
     @app.get("/health")
     async def get_health() -> Health:
-        """Say that the service lives and what it serves, also while a plan is computed; needs no token."""
+        """Return the version, the planner and the cell, also while a plan is computed; needs no token."""
         return health
 
     @app.get("/ready", responses={503: {"description": "The queue is full", "model": Refusal}})
     async def get_ready() -> Ready:
-        """Say whether a request would be taken now, for what spreads requests over services; needs no token."""
+        """Say whether a request would be taken now, for a load balancer; needs no token."""
         if service.waiting >= MAX_WAITING:
             raise HTTPException(503, "too many requests wait; expected the next one after 1 s.", {"Retry-After": "1"})
         return Ready(status="ready", waiting=service.waiting)
 
     @app.get("/metrics", dependencies=[Depends(authorize)], response_class=Response)
     async def get_metrics():
-        """Return figures for Prometheus: answers by status, times, and requests that wait."""
+        """Return metrics for Prometheus: answers by status, times, and waiting requests."""
         return Response(service.metrics.text(), media_type=service.metrics.content_type)
 
     @app.get("/plans", dependencies=[Depends(authorize)])
     async def plans(after: int = 0) -> dict:
-        """Return the last answers for the page, of those with a number above ``after``; lengths are in cells."""
+        """Return the last answers with a number above ``after``, for the page; lengths are in cells."""
         news = [entry for entry in list(service.history) if entry["number"] > after]
         return {"last": news[-1]["number"] if news else service.count, "most": history, "plans": news}
 
     @app.get("/", response_class=HTMLResponse)
     async def show():
-        """Return the page, which asks for ``/plans``; it holds no plans itself and needs no token."""
+        """Return the page. It loads its plans from ``/plans``, and needs no token itself."""
         return HTMLResponse(page, headers=page_headers)
 
-    # FastAPI does not see what requests are, as it does not parse them.
+    # FastAPI does not know the schema of requests, as it does not parse them.
     described = app.openapi()
     schemas = described["components"]["schemas"]
     schemas |= request_schema()

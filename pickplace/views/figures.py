@@ -1,4 +1,4 @@
-"""Figures of a training run: the learning curve, and the reasons for which episodes ended."""
+"""Figures of a training run: the learning curve, and the reasons why episodes ended."""
 
 import io
 import logging
@@ -12,7 +12,7 @@ from pickplace.runs.loggers import read_csv
 
 WALL, INK, POINT, LINE = "#9aa3ab", "#263238", "#c2410c", "#0072b2"
 
-#: Okabe and Ito's colours, told apart by colour-blind readers too.
+#: Okabe and Ito's colours, which colour-blind readers can tell apart, too.
 COLOURS = ["#56b4e9", "#e69f00", "#009e73", "#f0e442", "#cc79a7", "#0072b2", "#d55e00", "#8c8c8c"]
 
 #: A colour for each reason that ends an episode, by its name in the metrics; ``stuck``, the good one, is grey.
@@ -24,7 +24,7 @@ FAILURES = {
 
 
 def figure_of(width: float, height: float):
-    """Return a figure that needs no display; matplotlib is imported here, so that importing pickplace stays fast."""
+    """Return a figure that needs no display. matplotlib is imported here, so that importing pickplace stays fast."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -32,7 +32,7 @@ def figure_of(width: float, height: float):
 
 
 def save(figure, path: Path) -> None:
-    """Write a figure as PNG, and beside it as PDF and SVG for a paper, each as a whole.
+    """Write a figure as PNG, and beside it as PDF and SVG for a paper; no file is left half-written.
 
     Args:
         figure: the figure.
@@ -45,9 +45,9 @@ def save(figure, path: Path) -> None:
 
     legends = [legend for axes in figure.axes if (legend := axes.get_legend())]
     for legend in legends:
-        legend.set_in_layout(False)  # the picture grows by it; the axes keep their size
+        legend.set_in_layout(False)  # a legend enlarges the picture; the axes keep their size
     shown = [*figure.get_default_bbox_extra_artists(), *legends]
-    logging.getLogger("fontTools").setLevel(logging.WARNING)  # it tells what it leaves out of each font
+    logging.getLogger("fontTools").setLevel(logging.WARNING)  # else it logs the omitted parts of each font
     with rc_context({"pdf.fonttype": 42, "svg.hashsalt": "pickplace"}):  # no Type 3 fonts; the same file each time
         for kind, dates in ((".png", {}), (".pdf", {"CreationDate": None}), (".svg", {"Date": None})):
             with replaced_file(path.with_suffix(kind)) as new:
@@ -57,13 +57,13 @@ def save(figure, path: Path) -> None:
 def learning_curve(metrics: Path, path: Path, levels: tuple[str, int] = ("level", 1), ended: str = "") -> None:
     """Draw occupancy over frames, and below it the occupancy at each level, unless only the last level was played.
 
-    What the table lacks is left out: a run that was stopped early has no validation, one batch may end no episode.
+    Missing values are left out: a run that was stopped early has no validation, and a batch may end no episode.
 
     Args:
         metrics: a ``metrics.csv``, see :class:`pickplace.runs.loggers.CsvLogger`.
         path: the PNG to write; PDF and SVG beside it.
-        levels: what a level of the curriculum is, and the number of the last one.
-        ended: why a callback has ended the training, if one has.
+        levels: name of a level of the curriculum, and the number of the last level.
+        ended: the reason why a callback ended the training; empty if none did.
     """
     rows = read_csv(metrics)
     played = played_levels(rows)
@@ -80,7 +80,7 @@ def learning_curve(metrics: Path, path: Path, levels: tuple[str, int] = ("level"
 
 
 def played_levels(rows: list[dict]) -> list[int]:
-    """Return the numbers of the levels of which an episode has ended, in order."""
+    """Return the numbers of the levels at which an episode has ended, ascending."""
     prefix = "curriculum/occupancy_at_"
     names = {key.removeprefix(prefix) for row in rows for key in row if key.startswith(prefix)}
     return sorted(int(name) for name in names if name.isdecimal())  # a rule may log other names
@@ -103,13 +103,13 @@ def _draw_levels(axes, rows: list[dict], levels: range) -> None:
 
 
 def _columns(rows: list[dict], *keys: str) -> np.ndarray:
-    """Return frames and metrics ``[1 + keys, rows]``, of the rows that have them all."""
+    """Return frames and metrics ``[1 + keys, rows]`` of the rows that have all of them."""
     table = [[row[key] for key in ("frames", *keys)] for row in rows if all(key in row for key in keys)]
     return np.array(table, dtype=float).reshape(-1, 1 + len(keys)).T
 
 
 def _running_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the weighted mean over the latest 1% of the batches, for each batch that has as many before it."""
+    """Return the weighted mean over a window of 1% of the batches, for each batch that ends a whole window."""
     window = np.ones(max(1, len(values) // 100))
     total = np.maximum(np.convolve(weights, window, mode="valid"), 1e-9)
     return np.convolve(values * weights, window, mode="valid") / total
@@ -150,7 +150,7 @@ def _draw_occupancy(axes, rows: list[dict], ended: str) -> None:
 
 
 def failure_mix(rows: list[dict]) -> bytes:
-    """Return a PNG with the share of training episodes that ended for each reason, over frames; empty for one reason.
+    """Return a PNG of the share of training episodes that ended for each reason, over frames; empty for one reason.
 
     Args:
         rows: of a ``metrics.csv``.

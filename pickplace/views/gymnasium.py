@@ -1,4 +1,4 @@
-"""The Gymnasium environment with pictures: what ``gymnasium.make("pickplace/PickPlace-v0")`` makes."""
+"""The Gymnasium environment with pictures, as ``gymnasium.make("pickplace/PickPlace-v0")`` returns it."""
 
 import os
 import sys
@@ -25,7 +25,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
     Args:
         items: an item distribution, or a list of ``(w, d, h)``.
         render_mode: ``"rgb_array"``, ``"human"`` (a window) or None.
-        **settings: as of :class:`~pickplace.envs.torchrl.PickPlaceEnv`.
+        **settings: see :class:`~pickplace.envs.torchrl.PickPlaceEnv`.
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 4}
@@ -48,7 +48,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         env, moves = self._env, []
         if self._recording is not None and self.action_space.contains(action):
             moves = record_moves(env.cell, None, None, env.state, torch.as_tensor([int(action)], device=env.device))
-        *result, terminated, truncated, info = super().step(action)  # may refuse it, and changes the state in place
+        *result, terminated, truncated, info = super().step(action)  # may refuse the action; changes the state in place
         if self._recording is not None:
             self._recording.moves += moves
             if terminated or truncated:
@@ -61,7 +61,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         return self._picture() if self.render_mode == "rgb_array" else None  # the window is kept up to date
 
     def _picture(self) -> np.ndarray:
-        """Return a picture of the tote in 3D, its height map and the bin, uint8 ``[600, 1200, 3]``."""
+        """Return a picture of the tote in 3D, the tote's height map and the bin, uint8 ``[600, 1200, 3]``."""
         from matplotlib.patches import Rectangle
 
         if self._recording is None:
@@ -71,7 +71,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         inset = scene.add_axes((0.01, 0.04, 0.09, 0.18))
         bin_depth = bin_depth_from_items(items, cell.bin_size)[0].cpu().numpy()
         inset.imshow(bin_depth.T, origin="lower", cmap="YlOrBr", vmin=0)
-        for x, y, w, d, _ in items_in_bin(items, 0):  # so that items side by side are told apart
+        for x, y, w, d, _ in items_in_bin(items, 0):  # outlines separate items that lie side by side
             inset.add_patch(Rectangle((x - 0.5, y - 0.5), w, d, fill=False, edgecolor=INK, linewidth=1))
         inset.set_title("bin", fontsize="medium")
         inset.set(xticks=[], yticks=[])

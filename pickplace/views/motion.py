@@ -1,4 +1,4 @@
-"""An episode that a physics engine carried out: its end, and the poses of the bodies, picture by picture."""
+"""The end of an episode that a physics engine carried out, and the poses of the bodies, picture by picture."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,16 +13,16 @@ STILL = np.repeat((1e-4, 1e-3), (3, 4))  # change below which a body has not mov
 class Motion:
     """Recorded poses.
 
-    A pose is a picture's number, a position in m, and a quaternion ``(w, x, y, z)``. Poses of pictures in which a body
-    has not moved are left out.
+    A pose is a picture's number, a position in m, and a quaternion ``(w, x, y, z)``. A body has no pose for a picture
+    in which it has not moved.
 
     Attributes:
         bin: near corner of the bin, ``[2]``, m; None without a gantry.
         pictures: number of pictures, at most :data:`INTERVAL` apart.
-        plate: poses of the end effector: of the middle of its lower face.
-        boxes: poses of each box: of its middle. First the boxes that were carried, in that order.
-        left: sides of the other ones, which stayed in the bin, m.
-        ends: number of pictures when each placement had ended.
+        plate: poses of the middle of the end effector's lower face.
+        boxes: poses of the middle of each box: first the boxes that were carried, in order, then those left in the bin.
+        left: sides of the boxes that stayed in the bin, m.
+        ends: number of pictures at the end of each placement.
     """
 
     bin: tuple[float, float] | None = None
@@ -37,7 +37,7 @@ class Motion:
 
         Args:
             boxes: position and quaternion of every box, ``[n, 7]``.
-            plate: those of the end effector, ``[7]``, if there is one.
+            plate: position and quaternion of the end effector, ``[7]``; None without one.
         """
         self.boxes += [[] for _ in range(len(boxes) - len(self.boxes))]
         bodies = list(zip(self.boxes, boxes, strict=True))
@@ -54,15 +54,15 @@ class Outcome:
     episode: int
     ending: str  # "done", or the reason of the first loss
     lost: int | None  # number of the lost item, from 0
-    during: int | None  # number of the placement during which it was lost; the number of placements: at the end
-    placed: int  # items placed before the loss
+    during: int | None  # number of the placement during which it was lost; after the last: the number of placements
+    placed: int  # number of items placed before the loss
     occupancy: float  # share of the tote that they fill
-    drift: float = 0.0  # greatest distance of a placed item that was not lost from its planned pose, m
+    drift: float = 0.0  # greatest distance of a placed item, other than the lost one, from its planned place, m
     cpu_seconds: float = 0.0
     sentence: str = ""  # the ending for the reader of a replay
     label: str = ""  # the same in a word or two
-    motion: Motion | None = field(default=None, repr=False)  # of an episode that was to be recorded
+    motion: Motion | None = field(default=None, repr=False)  # None if the episode was not recorded
 
     def facts(self) -> dict[str, Any]:
-        """Return the figures, as ``pickplace-physics`` prints them."""
+        """Return the values that ``pickplace-physics`` prints."""
         return {key: value for key, value in vars(self).items() if key not in ("sentence", "label", "motion")}

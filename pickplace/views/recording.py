@@ -15,7 +15,7 @@ from pickplace.rules.step import Step, apply
 from pickplace.views.motion import Outcome
 
 if TYPE_CHECKING:
-    from tensordict import TensorDictBase  # its import takes a second, and packing an order needs none
+    from tensordict import TensorDictBase  # its import takes a second, and packing an order does not need it
 
 FULL = "The tote is full."
 
@@ -43,7 +43,7 @@ class PlacedItem(NamedTuple):
 class Move:
     """One decision and its effect; in cells and height units."""
 
-    item: InBin  # the one that is taken
+    item: InBin  # the item that is taken
     pick: tuple[int, int]  # min corner of the end effector in the bin
     place: tuple[int, int]  # min corner of the turned end effector in the tote
     rotation: int  # quarter turns, counter-clockwise seen from above
@@ -51,9 +51,9 @@ class Move:
     z: int  # height of the item's underside once it rests
     failure: Failure
     heat: np.ndarray | None = None  # uint8 [W_T, D_T]: the policy's preference for each place cell, 255 the highest
-    others: list[InBin] = field(default_factory=list)  # what else lies in the bin
+    others: list[InBin] = field(default_factory=list)  # the other items in the bin
     grams: int = 0  # mass of the item; 0: not known
-    coming: list[InBin] = field(default_factory=list)  # what is seen to arrive next, in its order
+    coming: list[InBin] = field(default_factory=list)  # the items that are seen to arrive next, in order
 
 
 @dataclass
@@ -63,8 +63,8 @@ class Recording:
     episode: int  # its number in the stream
     tote_height: int
     moves: list[Move] = field(default_factory=list)
-    ending: Failure | None = None  # None while it goes on; Failure.NONE where the item stream ended
-    waiting: list[InBin] = field(default_factory=list)  # what lies in the bin at the end, of a stuck episode
+    ending: Failure | None = None  # None while it goes on; Failure.NONE if the item stream ended
+    waiting: list[InBin] = field(default_factory=list)  # items left in the bin at the end of a stuck episode
     occupancy: float = 0.0
     carried_out: Outcome | None = None  # by a physics engine
 
@@ -78,7 +78,7 @@ class Recording:
         ]
 
     def describe_ending(self, num_places: int) -> str:
-        """Return why the episode ended, in a sentence; empty while it goes on."""
+        """Return the reason why the episode ended, as a sentence; empty while it goes on."""
         if self.ending == Failure.STUCK:
             if sum(box.volume for box in self.boxes) == num_places * self.tote_height:
                 return FULL
@@ -88,7 +88,7 @@ class Recording:
 
 
 def items_in_bin(items: Item, row: int) -> list[InBin]:
-    """Return the items in one of the bins ``[N, M]``, in the order of arrival."""
+    """Return the items in the bin of one row of ``[N, M]``, in the order of arrival."""
     return [tuple(item) for item in items.rows(row).cuboids.tolist() if item[4] > 0]
 
 
@@ -96,15 +96,15 @@ def record_moves(
     cell: CellSpec, planner, observation: "TensorDictBase | None", state: State, action: Tensor,
     step: Step | None = None,
 ) -> list[Move]:  # fmt: skip
-    """Return the moves that actions make, one for each row.
+    """Record the moves that actions make, one for each row.
 
     Args:
         cell: the sizes.
         planner: the planner that decided; its ``heat_map`` is recorded if it has one.
-        observation: what the planner saw, ``[N]``; it is needed for heat maps alone.
+        observation: the planner's observation, ``[N]``; only heat maps need it.
         state: the states before the moves.
         action: int64 ``[N]``.
-        step: what the actions do, if it is known.
+        step: the step of these actions, if it is known; None: it is computed.
     """
     step = apply(cell, state, action) if step is None else step
     x_bin, y_bin, x_tote, y_tote, rotation = (part.tolist() for part in split_action(cell, action))

@@ -29,7 +29,7 @@ def page(recordings: list[Recording], cell: CellSpec, title: str, at_end: bool =
         recordings: at least one episode.
         cell: the sizes.
         title: a short line, such as the planner's name and the stream.
-        at_end: whether it opens at the end of the first episode, not at its beginning.
+        at_end: open at the end of the first episode instead of its beginning.
     """
     items = [item for one in recordings for move in one.moves for item in (move.item, *move.others)]
     colours = item_colours(items + [item for one in recordings for item in one.waiting])
@@ -50,36 +50,36 @@ def page(recordings: list[Recording], cell: CellSpec, title: str, at_end: bool =
 
 
 def effector_parts(cell: CellSpec) -> dict:
-    """Return what the scene draws of the end effector: its sides, the rectangles of its body, the cells of its cup."""
+    """Return the parts of the end effector that a page draws: its sides, its body's rectangles, its cup's cells."""
     cups = [[x, y] for x, column in enumerate(cell.gripper.cup_mask) for y, is_cup in enumerate(column) if is_cup]
     return {"effector": cell.gripper.size, "body": cell.effector(0).body, "cups": cups}
 
 
 @cache
 def asset(name: str) -> str:
-    """Return a file that pages are made of."""
+    """Return the text of a file from which pages are made."""
     return (ASSETS / name).read_text(encoding="utf-8")
 
 
 def filled(template: str, **parts: str) -> str:
-    """Return a page: a template in which ``{{name}}`` stands for a part, or for what all pages share."""
+    """Fill a template, in which ``{{name}}`` stands for one of the parts, or for a part that all pages share."""
     shared = {
         "style": asset("page.css").rstrip(),
         "scene": asset("scene.js").rstrip(),
-        "three": asset("three.min.js").replace("</script", "<\\/script"),  # it stands in a script element
+        "three": asset("three.min.js").replace("</script", "<\\/script"),  # this would end the script element
     }
-    # In one pass, so that no content is taken for a placeholder.
+    # In one pass, so that the content of a part is not read as a placeholder.
     return re.sub(r"\{\{(\w+)\}\}", lambda mark: {**shared, **parts}[mark[1]], asset(template))
 
 
 def _cells(height: int, cell: CellSpec) -> int | float:
-    """Return a height in cells, without the tail of binary fractions."""
+    """Return a height in cells, without the rounding errors of floating point."""
     cells = round(height * cell.height_unit, 9)
     return int(cells) if cells.is_integer() else cells
 
 
 def _episode(recording: Recording, cell: CellSpec) -> dict:
-    """Return an episode for the page; all lengths are in cells."""
+    """Return the page's data of an episode; all lengths are in cells."""
     heat = [move.heat for move in recording.moves if move.heat is not None]
     ending = recording.describe_ending(cell.num_places)
     label = "goes on" if recording.ending is None else "full" if ending == FULL else recording.ending.label
@@ -107,7 +107,7 @@ def _episode(recording: Recording, cell: CellSpec) -> dict:
 
 
 def _physics(outcome: Outcome, facts: dict, cell: CellSpec) -> dict:
-    """Return what physics changes in the facts of an episode for the page, and its motion."""
+    """Return the entries that physics changes in the page's data of an episode, and its motion."""
     lost, motion = outcome.lost is not None, outcome.motion
     sentence = outcome.sentence or f"Carried out: {outcome.ending}."
     changed = {
@@ -142,11 +142,11 @@ def _item(item: InBin, cell: CellSpec) -> list[int | float]:
 
 # ---------------------------------------------------------------------- pictures
 def picture(recording: Recording, cell: CellSpec, path: Path) -> None:
-    """Draw the tote at the end of an episode, beside its height map, as PNG, and as PDF and SVG beside it.
+    """Draw the tote at the end of an episode with its height map, as PNG, PDF and SVG.
 
     Args:
         recording, cell: the episode and the sizes.
-        path: the PNG to write.
+        path: the PNG to write; PDF and SVG beside it.
     """
     save(draw_scene(recording, cell, item_colours(recording.boxes)), path)
 
@@ -159,8 +159,8 @@ def animation(
     Args:
         recording, cell: the episode and the sizes.
         path: the file to write.
-        seconds: how long it plays; the last picture stays for two more.
-        frames: greatest number of pictures; a longer episode leaves moves out.
+        seconds: length of the animation; the last picture stays for two more seconds.
+        frames: greatest number of pictures; moves of a longer episode are left out.
         dpi: pixels an inch; a picture is 12 inches wide.
     """
     from PIL import Image  # comes with matplotlib

@@ -1,4 +1,4 @@
-"""Drawing of a packed tote: boxes in isometric projection, and the height map from above."""
+"""Draw a packed tote: boxes in isometric projection, and the height map from above."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
@@ -9,13 +9,13 @@ from pickplace.rules.cell import CellSpec
 from pickplace.views.figures import COLOURS, INK, WALL, figure_of
 from pickplace.views.recording import PlacedItem, Recording
 
-#: ColorBrewer's diverging scheme "Spectral"; matplotlib has it, but a page without figures need not import that.
+#: ColorBrewer's diverging scheme "Spectral". It is copied here, so that a page without figures imports no matplotlib.
 SPECTRUM = (
     "#9e0142", "#d53e4f", "#f46d43", "#fdae61", "#fee08b", "#ffffbf", "#e6f598", "#abdda4", "#66c2a5", "#3288bd",
     "#5e4fa2",
 )  # fmt: skip
 
-#: Size of an item ``(w, d, h)`` with ``w <= d``, so that it does not depend on how the item is turned.
+#: Size of an item ``(w, d, h)`` with ``w <= d``, so that it does not depend on the item's rotation.
 Kind = tuple[int, int, int]
 
 
@@ -26,7 +26,7 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
         recording: the episode.
         cell: the sizes.
         colours: of the kinds of items, see :func:`item_colours`.
-        moves: how many moves have been made; None: all, and the caption says how the episode ended.
+        moves: number of moves made; None: all, and the caption names the end of the episode.
     """
     from matplotlib.patches import Patch
 
@@ -45,7 +45,7 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
         patches = [Patch(facecolor=c, edgecolor=INK, label=_sides(kind, cell)) for kind, c in colours.items()]
         figure.legend(handles=patches, title="items (cells)", loc="outside left upper", frameon=False, alignment="left")
     _draw_plan(plan, heights, highest, recording.tote_height, cell)
-    share = np.floor(1000 * sum(box.volume for box in boxes) / np.prod(size) + 1e-9) / 10  # not rounded: 100% is full
+    share = np.floor(1000 * sum(box.volume for box in boxes) / np.prod(size) + 1e-9) / 10  # down: 100% is full
     caption = f"{_sides(size, cell)} tote, {share:.1f}% full, {len(boxes)} items placed"
     if len(done) == len(recording.moves) and recording.ending is not None:
         caption += f". {recording.describe_ending(cell.num_places)}"
@@ -54,13 +54,13 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
 
 
 def kind_of(item: Sequence[int]) -> Kind:
-    """Return the size of an item ``(..., w, d, h)``, whichever way it is turned."""
+    """Return the kind of an item ``(..., w, d, h)``: its size, independent of its rotation."""
     *_, w, d, h = item
     return min(w, d), max(w, d), h
 
 
 def item_colours(items: Iterable[Sequence[int]]) -> dict[Kind, str]:
-    """Return a colour for each kind of items ``(..., w, d, h)``, the small ones first; many kinds share a spectrum."""
+    """Return a colour for each kind of items ``(..., w, d, h)``, small ones first; many kinds get a spectrum."""
     kinds = sorted(set(map(kind_of, items)), key=lambda kind: (np.prod(kind), kind))
     if len(kinds) <= len(COLOURS):
         return dict(zip(kinds, COLOURS, strict=False))
@@ -79,7 +79,7 @@ FACES = [
 
 
 def _to_paper(a, b) -> tuple[float, float]:
-    """Return where a lattice point ``(x - z, y - z)`` lies on paper."""
+    """Return the position on paper of a lattice point ``(x - z, y - z)``."""
     return (a - b) * 3**0.5 / 2, -(a + b) / 2
 
 
@@ -90,7 +90,7 @@ def draw_tote(axes, size: tuple[float, float, float]) -> None:
     wide, deep, high = size
 
     def corner(x, y, z):
-        return _to_paper(x - z, deep - y - z)  # y turned around, so that the viewer is at (1, 1, 1)
+        return _to_paper(x - z, deep - y - z)  # y mirrored, so that the viewer is at (1, 1, 1)
 
     floor, rim = ([corner(x, y, z) for x, y in ((0, 0), (wide, 0), (wide, deep), (0, deep))] for z in (0, high))
     far_walls = [[floor[near], floor[3], rim[3], rim[near]] for near in (0, 2)]
@@ -108,12 +108,12 @@ def draw_tote(axes, size: tuple[float, float, float]) -> None:
 
 
 def draw_items(axes, items: list[PlacedItem], colours: dict[Kind, str], size: tuple[int, ...], unit: float) -> None:
-    """Draw items in a tote of this size, in the projection of :func:`draw_tote`; ``unit`` is a height unit in cells."""
+    """Draw items in a tote of ``size``, in the projection of :func:`draw_tote`; ``unit`` is a height unit in cells."""
     from matplotlib import collections, colors
 
     wide, deep, _ = size
     table = np.array(items)
-    table[:, 1] = deep - table[:, 1] - table[:, 4]  # y turned around, as the tote is
+    table[:, 1] = deep - table[:, 1] - table[:, 4]  # y mirrored, as in draw_tote
     low, high = table[:, :3], table[:, :3] + table[:, 3:]
     side = np.sqrt(table[:, 3] * table[:, 4]).mean() / (wide + deep)
     pen = (*colors.to_rgb(INK), 1.0), float(np.clip(5 * side, 0.35, 1.1))  # colour and width
@@ -141,13 +141,13 @@ def draw_items(axes, items: list[PlacedItem], colours: dict[Kind, str], size: tu
 
 
 def _back_to_front(parts: np.ndarray) -> Iterator[list[int]]:
-    """Yield boxes in an order in which none hides a later one from the direction (1, 1, 1); some are cut for it.
+    """Yield boxes from back to front as seen from the direction (1, 1, 1); some boxes are cut.
 
-    A plane between boxes splits them in those behind it and those before it, and so on with both. Where every such
-    plane passes a box, the one that passes the fewest cuts them.
+    A plane between boxes splits them into those behind it and those before it, and each part is split again. If every
+    such plane passes through a box, the plane that passes through the fewest cuts them.
 
     Args:
-        parts: rows of a number and the least and the greatest x, y and z, ``[N, 7]``; boxes that are apart.
+        parts: number, least x, y, z and greatest x, y, z of each box, ``[N, 7]``; the boxes do not overlap.
     """
     waiting = [parts]
     while waiting:
@@ -170,7 +170,7 @@ def _back_to_front(parts: np.ndarray) -> Iterator[list[int]]:
 
 
 def _is_covered(low: np.ndarray, high: np.ndarray, number: int, axis: int) -> bool:
-    """Return whether other boxes cover the far face of a box along an axis; their corners are ``[N, 3]``."""
+    """Return whether other boxes cover a box's face at its greatest coordinate of an axis; corners are ``[N, 3]``."""
     others = [other for other in range(3) if other != axis]
     touching = low[:, axis] == high[number, axis]
     shared = np.minimum(high[touching], high[number]) - np.maximum(low[touching], low[number])
@@ -178,7 +178,7 @@ def _is_covered(low: np.ndarray, high: np.ndarray, number: int, axis: int) -> bo
 
 
 def _is_edge(start: list[int], end: list[int], low: np.ndarray, high: np.ndarray) -> bool:
-    """Return whether the line between two corners of a part's face is part of an edge of the item, and no cut."""
+    """Return whether the line between two corners of a part's face lies on an edge of the item, not on a cut."""
     return all(at in (low[axis], high[axis]) for axis, at in enumerate(start) if at == end[axis])
 
 
@@ -189,7 +189,7 @@ def _sides(size: tuple[int, ...], cell: CellSpec) -> str:
 def _draw_plan(axes, heights: np.ndarray, highest: np.ndarray, limit: int, cell: CellSpec) -> None:
     """Draw a height map ``[W_T, D_T]`` from above, in at most 256 colours up to ``limit``.
 
-    Where the number of the ``highest`` item changes from one cell to the next, a line shows the items' sides.
+    A line shows the side of an item between two cells whose ``highest`` items differ.
     """
     from matplotlib import collections, colormaps, colors, ticker
 
