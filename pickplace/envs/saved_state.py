@@ -20,7 +20,7 @@ from pickplace.runs.locate import CheckpointError
 
 
 def check_saved_states(env: PickPlaceEnv, collector: Mapping) -> None:
-    """Refuse a collector's state with an environment of which values are out of range or inconsistent.
+    """Refuse a collector's state if values of its environment are out of range or inconsistent.
 
     Args:
         env: an environment of the same settings, with any number of problems.

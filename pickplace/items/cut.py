@@ -143,9 +143,9 @@ class Cut(ItemDistribution):
         return tuple(map(torch.cat, zip(*done, strict=True)))  # type: ignore[return-value]
 
     def _arrival(self, low: Tensor, high: Tensor, uniform: Tensor) -> Tensor:
-        """Return times whose order is that of CUT-2, float64 ``[E, K]``.
+        """Return times of arrival that give the order of CUT-2, float64 ``[E, K]``.
 
-        Each item arrives an exponentially distributed time after the last of those that it lies on. Because such a
+        Each item arrives an exponentially distributed time after the last item on which it lies. Because such a
         time has no memory, all items that may arrive next are equally likely.
 
         Args:

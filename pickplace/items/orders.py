@@ -1,4 +1,4 @@
-"""Orders: an episode is an order of a file, or one that is drawn from the lines of these."""
+"""Orders: an episode is an order of a file, or a new one, drawn from the lines of these."""
 
 import math
 from collections.abc import Sequence

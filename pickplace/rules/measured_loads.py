@@ -42,7 +42,7 @@ class MeasuredLoads(NamedTuple):
         below = _meet(bounds[:, :2], bounds[:, :2]) & _meet(bounds[:, 2:], bounds[:, 2:])
         # Any lower item may carry it: its underside is unknown.
         below &= tops[:, None] > tops  # [B, B]: the second may lie below the first
-        for middle in tops.argsort().tolist():  # what lies on an item lies on all that is below it, too
+        for middle in tops.argsort().tolist():  # what lies on an item also lies on all items below it
             below |= below[:, middle, None] & below[middle]
         spare = max_load - torch.where(below, grams[:, None], 0).sum(0)
         held = torch.where(below | torch.eye(len(tops), dtype=torch.bool, device=tops.device), spare, ANY_LOAD)
